@@ -1,0 +1,48 @@
+# The verbs are the steps of continuous integration; each sets up what it needs.
+PYTHON ?= python3
+VENV   ?= .venv
+BIN    := $(VENV)/bin
+PACKAGES := sern_core sern_runtime sern_relay sern_client sern_sim sern_tools benchmarks tests
+
+.PHONY: help setup lint format types test bench demo schemas clean
+
+help:
+	@echo "make setup    create $(VENV) with pinned dependencies"
+	@echo "make demo     relay, robot and site over a bad link, on this machine, next to plain ZMQ"
+	@echo "make test     every test;  make lint, make types: static checks"
+	@echo "make bench    the quick benchmarks;  make schemas: regenerate schemas/ and the configuration reference"
+
+$(VENV)/.ready: pyproject.toml constraints.txt
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev,bench,report]'
+	@touch $@
+
+setup: $(VENV)/.ready
+
+lint: setup
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/lint-imports --no-cache
+
+format: setup
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+types: setup
+	$(BIN)/mypy
+
+test: setup
+	$(BIN)/python -m pytest
+
+bench: setup
+	$(BIN)/python -m benchmarks.scheduler --quick
+	$(BIN)/python -m benchmarks.relay --quick
+
+demo: setup
+	$(BIN)/sern demo
+
+schemas: setup
+	$(BIN)/python -m sern_runtime.config.export schemas docs/configuration.md
+
+clean:
+	rm -rf $(VENV) build *.egg-info .mypy_cache .ruff_cache .pytest_cache .import_linter_cache

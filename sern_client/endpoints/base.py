@@ -1,0 +1,57 @@
+"""The endpoint protocol: where messages come from and go to (ROS 1, ROS 2, a bag, a simulated robot).
+
+An endpoint deals in *local* topic names and raw serialised bodies; namespaces, priorities and the link are not
+its business. All calls happen on the event-loop thread; an endpoint with threads of its own hands over with
+`call_soon_threadsafe`.
+"""
+
+from collections.abc import Callable
+from typing import Protocol
+
+from sern_core.message import TopicInfo
+from sern_core.types import TopicName
+
+Sink = Callable[[bytes, int], bool]
+"""`sink(body, stamp_ns) -> accepted`. False: refused (a reliable queue is full); the endpoint may hold the message
+and offer it again (a bag can wait), or count it as lost (a live sensor cannot). `stamp_ns` is wall time."""
+
+
+class TopicEvents(Protocol):
+    """Told by the endpoint as topics come and go; calls are idempotent per topic name."""
+
+    def topic_added(self, info: TopicInfo) -> None: ...
+
+    def topic_removed(self, name: TopicName) -> None: ...
+
+
+class Subscription(Protocol):
+    def close(self) -> None: ...
+
+
+class Publisher(Protocol):
+    """Publishes on a local topic that came from the far side."""
+
+    def publish(self, body: bytes, stamp_ns: int) -> None: ...
+
+    def close(self) -> None: ...
+
+
+class Endpoint(Protocol):
+    """Life cycle: `start` once, any calls, `stop` once. `stop` flushes files and leaves nothing running.
+
+    `subscribe` raises UsageError for a topic never announced through `TopicEvents`. `advertise` raises ConfigError
+    with one line when the type cannot be published here. An endpoint never announces what it itself advertises.
+    """
+
+    async def start(self, events: TopicEvents) -> None: ...
+
+    async def stop(self) -> None: ...
+
+    def subscribe(self, name: TopicName, sink: Sink) -> Subscription: ...
+
+    def advertise(self, info: TopicInfo) -> Publisher: ...
+
+    @property
+    def exhausted(self) -> bool:
+        """True when a finite source (a bag without loop) has offered all it has and all of it was accepted."""
+        ...

@@ -1,0 +1,86 @@
+"""Names, units and closed vocabularies shared by every layer.
+
+Units are in names throughout the project: `_s` seconds, `_ns` nanoseconds, `_bytes`, `_bps` bits per second.
+Time inside the core is a float in seconds on a monotonic clock that the caller hands in as `now`.
+"""
+
+from enum import IntEnum, StrEnum
+from typing import Final, NewType
+
+TopicName = NewType("TopicName", str)
+"""A ROS topic name with its leading slash, e.g. `/jackal1/odom`; global unless a docstring says local."""
+
+ClientName = NewType("ClientName", str)
+"""The name of a client daemon: `[a-z][a-z0-9_]{0,62}`; bound to a CURVE key at the relay."""
+
+
+class PriorityClass(IntEnum):
+    """The paper's three classes (section "Distribution of ROS Data", idea 1); lower is more urgent."""
+
+    CONTROL = 0  # commands, pose, velocity, timing
+    STATE = 1  # map corrections, obstacle summaries, selected perception outputs
+    BULK = 2  # everything else: clouds, images, debug output
+
+
+CLASSES: Final = tuple(PriorityClass)
+CLASS_LABELS: Final = tuple(c.name.lower() for c in PriorityClass)
+
+
+class Ordering(StrEnum):
+    """How the scheduler orders classes: `class` is (class, -P); `paper` is Alg. prioritize as printed."""
+
+    CLASS = "class"
+    PAPER = "paper"
+
+
+class Reliability(StrEnum):
+    BEST_EFFORT = "best_effort"
+    RELIABLE = "reliable"
+
+
+class Durability(StrEnum):
+    VOLATILE = "volatile"
+    TRANSIENT_LOCAL = "transient_local"
+
+
+class Encoding(StrEnum):
+    """How a message body is serialised; bodies pass through unchanged."""
+
+    ROS1 = "ros1"
+    CDR = "cdr"
+    RAW = "raw"
+
+
+class ObjectKind(StrEnum):
+    """The kinds of cross-reality object (paper, idea 2, "A common cross reality representation")."""
+
+    TOPIC = "topic"
+    TRANSFORM = "transform"
+    NODE = "node"
+    PATCH = "patch"
+    COMMAND = "command"
+
+
+class DropReason(StrEnum):
+    """Why a message did not go on. Closed: it is a metric label, a log field and a wire value (`DROP_CODES`)."""
+
+    LIFESPAN = "lifespan"  # older than the topic's lifespan
+    SUPERSEDED = "superseded"  # a newer sample of a keep-last topic took its place
+    RATE_CAP = "rate_cap"  # the topic's max_rate_hz
+    UNWANTED = "unwanted"  # nobody subscribes
+    REFUSED = "refused"  # a reliable queue is full; the sender was told
+    FORBIDDEN = "forbidden"  # access rules
+    RETENTION = "retention"  # a reliable message was not delivered within its retention
+    STALE = "stale"  # ordering `paper`: stale in the lowest class (Alg. prioritize, line 9)
+    LOST = "lost"  # a best-effort message lost fragments that are no longer wanted
+    DUPLICATE = "duplicate"  # arrived more than once; not a loss
+    TOO_LARGE = "too_large"  # above max_message_bytes
+    UNKNOWN_CHANNEL = "unknown_channel"  # data for a stream that was never announced or was closed
+    REASSEMBLY = "reassembly"  # the receiver's reassembly limit
+    LOOP = "loop"  # came back to its origin
+    DISCONNECTED = "disconnected"  # the peer went away for good
+    SHUTDOWN = "shutdown"  # the daemon stopped before it was sent
+
+
+DROP_CODES: Final[dict[DropReason, int]] = {reason: code for code, reason in enumerate(DropReason, start=1)}
+DROP_REASONS: Final[dict[int, DropReason]] = {code: reason for reason, code in DROP_CODES.items()}
