@@ -226,10 +226,6 @@ class LinkModel:
         )
 
 
-PERFECT: Final = LinkModel()
-"""No rate, no delay, no loss."""
-
-
 def _check_probability(name: str, value: float) -> None:
     if not 0.0 <= value <= 1.0:
         raise UsageError(f"{name} is {value}: give a probability from 0 to 1 (2 % is 0.02)")
@@ -238,3 +234,7 @@ def _check_probability(name: str, value: float) -> None:
 def _check_rate(name: str, rate_bps: float | None) -> None:
     if rate_bps is not None and not 1.0 <= rate_bps < inf:
         raise UsageError(f"{name} is {rate_bps}: give bits per second, 1 or more; leave it out for no limit")
+
+
+PERFECT: Final = LinkModel()
+"""No rate, no delay, no loss."""

@@ -60,8 +60,8 @@ class LinkProfile:
 
     def next_change_s(self, t_s: float) -> float | None:
         """When a rate or the blackout state changes next, strictly after `t_s`; None: never again."""
-        changes = [change for change in (self.up.next_change_s(t_s), self.down.next_change_s(t_s)) if change is not None]
-        return min(changes, default=None)
+        changes = (self.up.next_change_s(t_s), self.down.next_change_s(t_s))
+        return min((change_s for change_s in changes if change_s is not None), default=None)
 
     def as_stream(self, *, disconnect_after_s: float | None = None, reconnect_s: float | None = None) -> "LinkProfile":
         """The same path as a TCP-like connection sees it, both directions."""
