@@ -1,0 +1,464 @@
+"""Names, topic rules and access rules: what the configuration says about a topic, as plain data.
+
+Rules of this file:
+- every pattern is a regular expression that must match the whole name;
+- the first rule that matches wins, for topics and for access; nothing is merged;
+- a *local* name is what the endpoint of one site calls a topic, a *global* name is what everyone else calls it;
+- all values here were checked by the configuration, and the functions below still refuse what would be unsafe.
+"""
+
+import re
+import warnings
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from enum import Enum, StrEnum
+from typing import Final
+
+from sern_core.errors import ConfigError, UsageError
+from sern_core.message import (
+    DEFAULT_COMMAND_LIFESPAN_S,
+    DEFAULT_LIFESPAN_S,
+    DEFAULT_RELIABLE_QUEUE_BYTES,
+    DEFAULT_RETENTION_S,
+    KAPPA,
+    TopicInfo,
+    TopicSpec,
+)
+from sern_core.types import ClientName, Durability, PriorityClass, Reliability, TopicName
+
+NAME_MAX_CHARS: Final = 255
+"""Longest topic name; ROS 2 middleware allows no more."""
+PATTERN_MAX_CHARS: Final = 512
+DEFAULT_RELIABLE_DEPTH: Final = 10
+DEFAULT_BEST_EFFORT_DEPTH: Final = 1
+LEASE_REPEAT_HZ: Final = 10.0
+LEASE_REPEAT_S: Final = 1.0
+"""When a lease runs out its message is published at `LEASE_REPEAT_HZ` for `LEASE_REPEAT_S`, then no more."""
+
+COMMAND_TYPES: Final = frozenset({"geometry_msgs/Twist", "geometry_msgs/TwistStamped"})
+"""Types whose all-zero message means "stand still": the only ones that `on_link_loss` may publish."""
+MANY_WRITER_TOPICS: Final = frozenset({"/tf", "/tf_static"})
+"""Topics that several nodes own by convention of ROS; `many_writers` defaults to true for them."""
+
+# ROS 1 lets a later part of a name start with a digit, ROS 2 does not; a name that either accepts is accepted.
+_NAME: Final = re.compile(r"/[A-Za-z_][A-Za-z0-9_]*(?:/[A-Za-z0-9_]+)*")
+_CLIENT_NAME: Final = re.compile(r"[a-z][a-z0-9_]{0,62}")
+_SELF: Final = "{self}"
+
+
+class Auto(Enum):
+    """The value of a setting that follows from the rest (class, type, what the publisher offers)."""
+
+    AUTO = "auto"
+
+
+AUTO: Final = Auto.AUTO
+
+
+# Names ---------------------------------------------------------------------------------------------------------------
+
+
+def name_problem(name: str) -> str | None:
+    """What is wrong with `name` as an absolute ROS topic name, as a phrase, or None."""
+    if len(name) > NAME_MAX_CHARS:
+        return f"is longer than {NAME_MAX_CHARS} characters"
+    if not name.startswith("/"):
+        return "must start with '/'"
+    if not _NAME.fullmatch(name):
+        return "is not a ROS name: letters, digits and '_' between single '/', no '/' at the end"
+    return None
+
+
+def topic_name(name: str) -> TopicName:
+    """`name` as a checked TopicName; UsageError when it is not an absolute ROS name."""
+    problem = name_problem(name)
+    if problem is not None:
+        raise UsageError(f"topic name {name[:80]!r} {problem}")
+    return TopicName(name)
+
+
+def client_name(name: str) -> ClientName:
+    """`name` as a checked ClientName; UsageError otherwise."""
+    if not _CLIENT_NAME.fullmatch(name):
+        raise UsageError(f"client name {name[:80]!r} must be a lower-case letter, then up to 62 of a-z, 0-9, '_'")
+    return ClientName(name)
+
+
+def normal_namespace(namespace: str) -> str:
+    """A namespace as `/` or `/part/part`; a missing leading slash is added. UsageError when it is no ROS name."""
+    if namespace == "/":
+        return namespace
+    return topic_name(namespace if namespace.startswith("/") else "/" + namespace)
+
+
+def to_global(local: TopicName, namespace: str) -> TopicName:
+    """The name that other sites use for this site's `local` topic. `namespace` is normal (`normal_namespace`)."""
+    return local if namespace == "/" else TopicName(namespace + local)
+
+
+def in_namespace(name: TopicName, namespace: str) -> bool:
+    """True when the global `name` lies in `namespace`; the namespace `/` holds every name."""
+    return namespace == "/" or name.startswith(namespace + "/")
+
+
+def to_local(name: TopicName, namespace: str) -> TopicName:
+    """What this site calls the global `name`: without its own namespace; other sites' names stay as they are."""
+    if namespace == "/" or not name.startswith(namespace + "/"):
+        return name
+    return TopicName(name[len(namespace) :])
+
+
+def plain_type(type_name: str) -> str:
+    """`geometry_msgs/msg/Twist` (ROS 2) as `geometry_msgs/Twist` (ROS 1): one spelling to compare types by."""
+    return type_name.replace("/msg/", "/", 1)
+
+
+# Patterns ------------------------------------------------------------------------------------------------------------
+
+
+def compile_pattern(text: str) -> re.Pattern[str]:
+    """A pattern for `fullmatch`; UsageError with one line for anything that is not a plain regular expression.
+
+    Refuses global flags such as `(?i)`, because patterns are combined with namespaces.
+    """
+    if not text:
+        raise UsageError("is empty; '.*' matches everything")
+    if len(text) > PATTERN_MAX_CHARS:
+        raise UsageError(f"is longer than {PATTERN_MAX_CHARS} characters")
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")  # "possible nested set": the meaning would change with the Python version
+            re.compile(f"(?:{text})")
+            return re.compile(text)
+    except (re.error, Warning, OverflowError, RecursionError) as error:
+        reason = error.msg if isinstance(error, re.error) else str(error)
+        raise UsageError(f"is not a regular expression ({reason.splitlines()[0].split(' at position')[0]})") from error
+
+
+def compile_self_pattern(text: str, client: ClientName) -> re.Pattern[str]:
+    """A pattern of an access rule, with `{self}` replaced by the client's name (the one its key is bound to)."""
+    return compile_pattern(text.replace(_SELF, client))
+
+
+def matches_any(patterns: Iterable[re.Pattern[str]], name: str) -> bool:
+    return any(pattern.fullmatch(name) for pattern in patterns)
+
+
+# Topic rules ---------------------------------------------------------------------------------------------------------
+
+
+class Direction(StrEnum):
+    SEND = "send"  # from this site's endpoint to the link
+    RECEIVE = "receive"  # from the link to this site's endpoint
+    BOTH = "both"
+
+    @property
+    def sends(self) -> bool:
+        return self is not Direction.RECEIVE
+
+    @property
+    def receives(self) -> bool:
+        return self is not Direction.SEND
+
+
+class LossAction(StrEnum):
+    ZERO = "zero"  # the all-zero message of the topic's type
+
+
+@dataclass(frozen=True, slots=True)
+class Lease:
+    """A command topic is a lease: without a fresh command for `after_s`, whatever the cause, `publish` happens."""
+
+    publish: LossAction
+    after_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class TopicRule:
+    """One line of `topics:`. `match` is tried on the local name, `type_match` on both spellings of the type.
+
+    AUTO and None stand for the defaults that `RuleSet.resolve` documents; `lifespan_s` None means for ever.
+    """
+
+    match: re.Pattern[str]
+    type_match: re.Pattern[str] | None = None
+    priority: PriorityClass = PriorityClass.BULK
+    direction: Direction = Direction.BOTH
+    weight: float | None = None
+    reliability: Reliability | None = None
+    durability: Durability | None = None
+    depth: int | None = None
+    lifespan_s: float | Auto | None = AUTO
+    deadline_s: float | None = None
+    max_rate_hz: float | None = None
+    retention_s: float | None = None
+    max_queue_bytes: int = DEFAULT_RELIABLE_QUEUE_BYTES
+    many_writers: bool | None = None
+    remap: TopicName | None = None
+    lease: Lease | None = None
+
+    @property
+    def plain_name(self) -> TopicName | None:
+        """The one topic this rule is about, when `match` is a name without any wildcard."""
+        text = self.match.pattern
+        return TopicName(text) if name_problem(text) is None else None
+
+    def accepts(self, local_name: TopicName, type_name: str) -> bool:
+        if not self.match.fullmatch(local_name):
+            return False
+        if self.type_match is None:
+            return True
+        return matches_any((self.type_match,), type_name) or matches_any((self.type_match,), plain_type(type_name))
+
+
+@dataclass(frozen=True, slots=True)
+class ResolvedTopic:
+    """What the rules say about one topic. `rule` is the index of the rule, None when no rule matched.
+
+    `name` is the local name after `remap`: the one to give to `to_global`.
+    """
+
+    spec: TopicSpec
+    direction: Direction
+    name: TopicName
+    lease: Lease | None
+    rule: int | None
+
+
+class RuleError(UsageError):
+    """Rule `index` can not work together with the others. `field` is the key at fault."""
+
+    def __init__(self, index: int, field_name: str, problem: str) -> None:
+        super().__init__(f"topics.{index}.{field_name}: {problem}")
+        self.index = index
+        self.field = field_name
+        self.problem = problem
+
+
+@dataclass(frozen=True, slots=True)
+class RuleSet:
+    """The `topics:` of one client. Raises RuleError when two rules contradict each other.
+
+    `retention_s` is the default for reliable topics whose rule gives none.
+    """
+
+    rules: tuple[TopicRule, ...] = ()
+    retention_s: float = DEFAULT_RETENTION_S
+    _inward: dict[TopicName, TopicName] = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        inward: dict[TopicName, TopicName] = {}
+        for index, rule in enumerate(self.rules):
+            name = rule.plain_name
+            if rule.remap is not None and (name is None or rule.type_match is not None):
+                raise RuleError(index, "remap", "needs a plain topic name in `match` and no `type`")
+            if name is not None:
+                self._refuse_shadowed(index, rule, name)
+            if rule.remap is not None and name is not None:
+                if rule.remap in inward:
+                    raise RuleError(index, "remap", f"{rule.remap} is already the new name of {inward[rule.remap]}")
+                inward[rule.remap] = name
+        object.__setattr__(self, "_inward", inward)
+
+    def _refuse_shadowed(self, index: int, rule: TopicRule, name: TopicName) -> None:
+        """A rule for one name after a rule that takes that name would never be used: always a mistake."""
+        for earlier_index, earlier in enumerate(self.rules[:index]):
+            certain = earlier.type_match is None or rule.remap is not None
+            if certain and earlier.match.fullmatch(name):
+                problem = f"is never used: topics.{earlier_index} ({earlier.match.pattern!r}) matches first; move it up"
+                raise RuleError(index, "match", problem)
+
+    def find(self, type_name: str, local_name: TopicName) -> int | None:
+        """The index of the first rule that matches, or None."""
+        for index, rule in enumerate(self.rules):
+            if rule.accepts(local_name, type_name):
+                return index
+        return None
+
+    def resolve(self, info: TopicInfo, *, local_name: TopicName) -> ResolvedTopic:
+        """What to do with the topic that this site calls `local_name`.
+
+        No rule: bulk, best effort, depth 1, lifespan 1 s; of the publisher's QoS only the latch is kept. Else, where
+        the rule says nothing:
+        - reliability, durability: the publisher's; a publisher that does not say (ROS 1) is reliable if it latches;
+        - depth: 10 if reliable, else 1;
+        - lifespan: 0.3 s for a velocity command in class control; for ever if reliable or latched; else 1 s;
+        - weight κ: by class; many_writers: true for `/tf` and `/tf_static`.
+
+        Raises ConfigError when the rule has `on_link_loss` and the type is known to be no velocity command, and when
+        the topic has the name that `remap` gave to another one.
+        """
+        index = self.find(info.type_name, local_name)
+        durability = Durability.TRANSIENT_LOCAL if info.latched else Durability.VOLATILE
+        many_writers = local_name in MANY_WRITER_TOPICS
+        if local_name in self._inward and (index is None or self.rules[index].remap is None):
+            raise ConfigError(
+                f"{local_name} is a local topic and also the new name that `remap` gives to {self._inward[local_name]}"
+            )
+        if index is None:
+            spec = TopicSpec(
+                durability=durability,
+                lifespan_s=None if info.latched else DEFAULT_LIFESPAN_S,
+                many_writers=many_writers,
+                retention_s=self.retention_s,
+            )
+            return ResolvedTopic(spec, Direction.BOTH, local_name, None, None)
+        rule = self.rules[index]
+        command = plain_type(info.type_name) in COMMAND_TYPES
+        if rule.lease is not None and info.type_name and not command:
+            raise ConfigError(
+                f"{local_name} is {info.type_name}; on_link_loss can publish only {', '.join(sorted(COMMAND_TYPES))}",
+                key=f"topics.{index}.on_link_loss",
+            )
+        durability = rule.durability or durability
+        reliability = rule.reliability or _offered_reliability(info)
+        reliable = reliability is Reliability.RELIABLE
+        if rule.lifespan_s is not AUTO:
+            lifespan_s = rule.lifespan_s
+        elif command and rule.priority is PriorityClass.CONTROL:
+            lifespan_s = DEFAULT_COMMAND_LIFESPAN_S
+        else:
+            lifespan_s = None if reliable or durability is Durability.TRANSIENT_LOCAL else DEFAULT_LIFESPAN_S
+        spec = TopicSpec(
+            priority=rule.priority,
+            weight=KAPPA[rule.priority] if rule.weight is None else rule.weight,
+            reliability=reliability,
+            durability=durability,
+            depth=rule.depth or (DEFAULT_RELIABLE_DEPTH if reliable else DEFAULT_BEST_EFFORT_DEPTH),
+            lifespan_s=lifespan_s,
+            deadline_s=rule.deadline_s,
+            max_rate_hz=rule.max_rate_hz,
+            retention_s=self.retention_s if rule.retention_s is None else rule.retention_s,
+            max_queue_bytes=rule.max_queue_bytes,
+            many_writers=many_writers if rule.many_writers is None else rule.many_writers,
+        )
+        return ResolvedTopic(spec, rule.direction, rule.remap or local_name, rule.lease, index)
+
+    def outward(self, info: TopicInfo, *, local_name: TopicName, namespace: str) -> TopicName:
+        """The global name of a local topic: `remap`, then the namespace."""
+        return to_global(self.resolve(info, local_name=local_name).name, namespace)
+
+    def inward(self, name: TopicName, *, namespace: str) -> TopicName:
+        """The local name of a global one: out of the own namespace, then `remap` backwards.
+
+        `inward(outward(x)) == x`. A remap holds for this site's own names, and with the namespace `/` for all.
+        """
+        local = to_local(name, namespace)
+        return self._inward.get(local, local) if in_namespace(name, namespace) else local
+
+    def receive_patterns(self, namespace: str) -> tuple[re.Pattern[str], ...]:
+        """What to subscribe to because of rules with direction `receive`: patterns of global names.
+
+        The pattern of a late rule may cover names that an earlier rule takes; `resolve` has the last word.
+        """
+        prefix = "" if namespace == "/" else re.escape(namespace)
+        return tuple(
+            re.compile(f"{prefix}(?:{rule.remap or rule.match.pattern})")
+            for rule in self.rules
+            if rule.direction is Direction.RECEIVE
+        )
+
+
+def _offered_reliability(info: TopicInfo) -> Reliability:
+    """The publisher's reliability; where the middleware does not say, latched means that each sample matters."""
+    reliable = info.latched if info.reliable is None else info.reliable
+    return Reliability.RELIABLE if reliable else Reliability.BEST_EFFORT
+
+
+class DiscoveryMode(StrEnum):
+    MANUAL = "manual"  # only topics that a rule names
+    DYNAMIC = "dynamic"  # everything that `allow` lets through, with or without a rule
+
+
+@dataclass(frozen=True, slots=True)
+class Discovery:
+    """Which local topics are offered to the link at all."""
+
+    mode: DiscoveryMode = DiscoveryMode.MANUAL
+    allow: tuple[re.Pattern[str], ...] = (re.compile(".*"),)
+    deny: tuple[re.Pattern[str], ...] = ()
+
+    def wants(self, local_name: TopicName, *, listed: bool) -> bool:
+        """`listed`: some rule matches the topic. `deny` wins over everything, then `allow` and the mode both decide."""
+        if matches_any(self.deny, local_name) or not matches_any(self.allow, local_name):
+            return False
+        return listed or self.mode is DiscoveryMode.DYNAMIC
+
+
+# Access rules --------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Grant:
+    """What one client may do at the relay, on global names. The empty grant forbids everything.
+
+    Limits: `max_rate_hz` messages/s and `max_bytes_per_s` taken from the client over all its topics,
+    `max_queue_bytes` held at the relay on their way to it; None is no limit.
+    """
+
+    publish: tuple[re.Pattern[str], ...] = ()
+    subscribe: tuple[re.Pattern[str], ...] = ()
+    max_rate_hz: float | None = None
+    max_bytes_per_s: float | None = None
+    max_queue_bytes: int | None = None
+
+    def may_publish(self, name: TopicName) -> bool:
+        return matches_any(self.publish, name)
+
+    def may_subscribe(self, name: TopicName) -> bool:
+        return matches_any(self.subscribe, name)
+
+
+NO_GRANT: Final = Grant()
+
+
+@dataclass(frozen=True, slots=True)
+class AccessRule:
+    """One line of `access:`. `publish` and `subscribe` are pattern texts in which `{self}` is the client's name."""
+
+    client: re.Pattern[str]
+    publish: tuple[str, ...] = ()
+    subscribe: tuple[str, ...] = ()
+    max_rate_hz: float | None = None
+    max_bytes_per_s: float | None = None
+    max_queue_bytes: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class AccessTable:
+    """Default deny: a client that no rule names may connect, and may do nothing."""
+
+    rules: tuple[AccessRule, ...] = ()
+
+    def grant(self, client: ClientName) -> Grant:
+        """The grant of the first rule that matches `client`. Call it once a session: it compiles the patterns."""
+        for rule in self.rules:
+            if rule.client.fullmatch(client):
+                return Grant(
+                    publish=tuple(compile_self_pattern(text, client) for text in rule.publish),
+                    subscribe=tuple(compile_self_pattern(text, client) for text in rule.subscribe),
+                    max_rate_hz=rule.max_rate_hz,
+                    max_bytes_per_s=rule.max_bytes_per_s,
+                    max_queue_bytes=rule.max_queue_bytes,
+                )
+        return NO_GRANT
+
+
+@dataclass(frozen=True, slots=True)
+class FeedRole:
+    """One pair of plain ZMQ sockets on the relay. `ingest_endpoint` None: nobody can publish through this role."""
+
+    name: str
+    publish_endpoint: str
+    ingest_endpoint: str | None = None
+    subscribe: tuple[re.Pattern[str], ...] = ()
+    publish: tuple[re.Pattern[str], ...] = ()
+    allow_control: bool = False
+
+    def may_see(self, name: TopicName) -> bool:
+        return matches_any(self.subscribe, name)
+
+    def may_publish(self, name: TopicName, priority: PriorityClass) -> bool:
+        if priority is PriorityClass.CONTROL and not self.allow_control:
+            return False
+        return matches_any(self.publish, name)
