@@ -1,0 +1,255 @@
+"""The one place that knows ROS message types: names, definitions, hashes, and (de)serialising where it is needed.
+
+Bodies pass through the daemon unread. What is needed of a type is its name, its definition text and its hash, so that
+the far side can advertise it; only the simulated robot, the operator stand-in and the command lease build or read
+messages. Two typestores serve that: ROS 1 Noetic and ROS 2 Jazzy, both with `tf2_msgs` and `map_msgs`.
+
+`type_name` is always the three-part form `nav_msgs/msg/Odometry`. A definition is the concatenated text that bags and
+connection headers carry: the type itself, then every type it uses below a line of 80 `=` and `MSG: package/Name`.
+"""
+
+import re
+from functools import cache, lru_cache
+from hashlib import md5
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from rosbags.interfaces import Nodetype
+from rosbags.interfaces.typing import FieldDesc, Typesdict
+from rosbags.serde import SerdeError
+from rosbags.typesys import Stores, TypesysError, get_types_from_idl, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
+
+from sern_core.errors import ConfigError
+from sern_core.message import TopicInfo
+from sern_core.types import Encoding, TopicName
+
+MAX_DEFINITION_BYTES: Final = 2**20
+"""A definition text above this is refused: the largest in a ROS desktop install is about 50 kB."""
+
+_SEPARATOR: Final = "=" * 80
+_NAME: Final = re.compile(r"[A-Za-z]\w*/(?:(?:msg|srv|action)/)?[A-Za-z]\w*")
+_EXTRA: Final = {
+    "tf2_msgs/msg/TFMessage": "geometry_msgs/TransformStamped[] transforms\n",
+    "map_msgs/msg/OccupancyGridUpdate": (
+        "std_msgs/Header header\nint32 x\nint32 y\nuint32 width\nuint32 height\nint8[] data\n"
+    ),
+}
+_ROS1_BUILTIN: Final = frozenset(
+    {"bool", "int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", "uint64"}
+    | {"float32", "float64", "string", "time", "duration", "char", "byte"}
+)
+_STOPPABLE: Final = frozenset({"geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"})
+
+
+class TypeText(NamedTuple):
+    """What a publisher must say of its type: the definition text and the hash (ROS 1 md5sum or RIHS01)."""
+
+    definition: str
+    type_hash: str
+
+
+def canonical(type_name: str) -> str:
+    """`nav_msgs/Odometry` or `nav_msgs/msg/Odometry` -> `nav_msgs/msg/Odometry`. ConfigError for anything else."""
+    if not _NAME.fullmatch(type_name):
+        raise ConfigError(f"{type_name!r} is not a message type; write it like nav_msgs/msg/Odometry")
+    package, *kind, name = type_name.split("/")
+    return f"{package}/{kind[0] if kind else 'msg'}/{name}"
+
+
+def ros1_name(type_name: str) -> str:
+    """`nav_msgs/msg/Odometry` -> `nav_msgs/Odometry`, the form ROS 1 uses on the wire and in bags."""
+    package, _, name = canonical(type_name).split("/")
+    return f"{package}/{name}"
+
+
+@cache
+def typestore(encoding: Encoding) -> Typestore:
+    """The shared typestore of an encoding: ROS 1 Noetic or ROS 2 Jazzy. ConfigError for `raw`."""
+    if encoding is Encoding.RAW:
+        raise ConfigError("raw bodies have no ROS type; use encoding ros1 or cdr")
+    store = get_typestore(Stores.ROS1_NOETIC if encoding is Encoding.ROS1 else Stores.ROS2_JAZZY)
+    for name, text in _EXTRA.items():
+        if name not in store.fielddefs:
+            store.register(get_types_from_msg(text, name))
+    return store
+
+
+@lru_cache(maxsize=1024)
+def describe(type_name: str, encoding: Encoding) -> TypeText | None:
+    """Definition and hash of a type the typestore knows; None for one it does not."""
+    store = typestore(encoding)
+    name = canonical(type_name)
+    if name not in store.fielddefs:
+        return None
+    if encoding is Encoding.ROS1:
+        return TypeText(*store.generate_msgdef(name, ros_version=1))
+    return TypeText(store.generate_msgdef(name, ros_version=2)[0], store.hash_rihs01(name))
+
+
+def topic_info(
+    name: str, type_name: str, encoding: Encoding, *, latched: bool = False, reliable: bool | None = None
+) -> TopicInfo:
+    """A `TopicInfo` with definition and hash filled in. ConfigError for a type the typestore does not know."""
+    text = describe(type_name, encoding)
+    if text is None:
+        raise ConfigError(f"{name}: type {type_name} is unknown here; its definition must come with the topic")
+    return TopicInfo(
+        TopicName(name), canonical(type_name), encoding, text.type_hash, text.definition, latched, reliable
+    )
+
+
+@lru_cache(maxsize=1024)
+def hash_of(type_name: str, definition: str, encoding: Encoding) -> str:
+    """The hash that belongs to a definition text: md5sum (ROS 1) or RIHS01.
+
+    Only parses; nothing is registered. ConfigError when the text cannot be read as a definition of this type.
+    """
+    name = canonical(type_name)
+    types = _parse(name, definition)
+    try:
+        if encoding is Encoding.ROS1:
+            return _ros1_md5(name, definition)
+        scratch = get_typestore(Stores.EMPTY)
+        # rosbag2 texts may leave out types that every ROS 2 install has.
+        scratch.fielddefs.update(typestore(Encoding.CDR).fielddefs)
+        scratch.fielddefs.update(types)
+        return scratch.hash_rihs01(name)
+    except (KeyError, RecursionError) as error:
+        raise ConfigError(f"type {name}: its definition uses a type it does not define ({error})") from None
+
+
+def register(type_name: str, definition: str, encoding: Encoding) -> None:
+    """Make a type usable with `serialise` and `deserialise`, from the definition text that came with its topic.
+
+    ConfigError when the text cannot be parsed, or names a known type with other fields (both hashes are named).
+    """
+    name = canonical(type_name)
+    store = typestore(encoding)
+    types = {key: value for key, value in _parse(name, definition).items() if key not in store.fielddefs}
+    if name not in types:
+        known = describe(name, encoding)
+        offered = hash_of(name, definition, encoding)
+        if known is not None and known.type_hash != offered:
+            raise ConfigError(f"type {name}: offered hash {offered} differs from the known {known.type_hash}")
+        return
+    try:
+        store.register(types)
+    except TypesysError as error:
+        raise ConfigError(f"type {name}: {_one_line(error)}") from None
+    describe.cache_clear()
+
+
+def serialise(message: object, type_name: str, encoding: Encoding) -> bytes:
+    """Message object -> body."""
+    store = typestore(encoding)
+    if encoding is Encoding.ROS1:
+        return bytes(store.serialize_ros1(message, type_name))
+    return bytes(store.serialize_cdr(message, type_name))
+
+
+def deserialise(body: bytes, type_name: str, encoding: Encoding) -> Any:
+    """Body -> message object with the type's fields as attributes. ConfigError when the bytes do not fit the type."""
+    store = typestore(encoding)
+    if type_name not in store.fielddefs:
+        raise ConfigError(f"type {type_name} is unknown here; register its definition first")
+    try:
+        if encoding is Encoding.ROS1:
+            return store.deserialize_ros1(body, type_name)
+        return store.deserialize_cdr(body, type_name)
+    except (SerdeError, AssertionError, IndexError) as error:
+        raise ConfigError(f"type {type_name}: {len(body)} bytes do not decode: {_one_line(error)}") from None
+
+
+def new(type_name: str, encoding: Encoding, **fields: Any) -> Any:
+    """A message object of this type, zero in every field but those given by name."""
+    store = typestore(encoding)
+    definition = store.fielddefs[type_name][1]
+    values = {name: fields[name] if name in fields else _zero(desc, encoding) for name, desc in definition}
+    return store.types[type_name](**values)
+
+
+def zero_message(type_name: str, encoding: Encoding) -> bytes | None:
+    """The body that stops a robot: an all-zero Twist or TwistStamped. None for types where zero is no safe command."""
+    name = canonical(type_name)
+    if name not in _STOPPABLE or encoding is Encoding.RAW:
+        return None
+    return serialise(new(name, encoding), name, encoding)
+
+
+def _zero(desc: FieldDesc, encoding: Encoding) -> Any:
+    """The zero of one field: number, string, message, numpy array of numbers, or list of strings or messages."""
+    if desc[0] == Nodetype.BASE:
+        base = str(desc[1][0])
+        return "" if base == "string" else False if base == "bool" else 0.0 if base.startswith("float") else 0
+    if desc[0] == Nodetype.NAME:
+        return new(str(desc[1]), encoding)
+    item, count = desc[1]
+    length = int(count) if desc[0] == Nodetype.ARRAY else 0
+    if item[0] == Nodetype.BASE and item[1][0] != "string":
+        base = str(item[1][0])
+        return np.zeros(length, dtype="uint8" if base in {"byte", "char"} else base)
+    return [_zero(item, encoding) for _ in range(length)]
+
+
+def _parse(type_name: str, definition: str) -> Typesdict:
+    if len(definition) > MAX_DEFINITION_BYTES:
+        raise ConfigError(f"type {type_name}: its definition of {len(definition)} characters is over the limit")
+    idl_mark = f"{_SEPARATOR}\nIDL: "
+    try:
+        if not definition.startswith(idl_mark):
+            return get_types_from_msg(definition, type_name)
+        types: Typesdict = {}
+        for part in definition.split(f"{_SEPARATOR}\n")[1:]:
+            types.update(get_types_from_idl(part.partition("\n")[2]))
+        return types
+    except (TypesysError, RecursionError) as error:
+        raise ConfigError(f"type {type_name}: its definition cannot be parsed: {_one_line(error)}") from None
+
+
+def _ros1_md5(type_name: str, definition: str) -> str:
+    """ROS 1 md5sum (wiki.ros.org/ROS/Technical%20Overview): constants as written, then fields, types by their md5.
+
+    Worked out from the text, not from the parsed types: a constant counts as it is spelt (`0x0F`, `1e-3`).
+    """
+    texts = {ros1_name(type_name): ""}
+    current = ros1_name(type_name)
+    for line in definition.splitlines():
+        if line.startswith("MSG: "):
+            current = line[5:].strip()
+            texts.setdefault(current, "")  # a type may have no fields
+        elif line.rstrip() != _SEPARATOR:
+            texts[current] += line + "\n"
+    sums: dict[str, str] = {}
+    return _ros1_md5_of(ros1_name(type_name), texts, sums)
+
+
+def _ros1_md5_of(name: str, texts: dict[str, str], sums: dict[str, str]) -> str:
+    if name in sums:
+        return sums[name]
+    constants, fields = [], []
+    for line in texts[name].splitlines():
+        clean = line.partition("#")[0].strip()
+        if not clean:
+            continue
+        base, _, rest = clean.partition(" ")
+        if "=" in rest:
+            # A string constant is the whole rest of its line, `#` included.
+            source = line.strip().partition(" ")[2] if base == "string" else rest
+            label, _, value = source.partition("=")
+            constants.append(f"{base} {label.strip()}={value.strip()}")
+            continue
+        element = base.partition("[")[0]
+        if element in _ROS1_BUILTIN:
+            fields.append(f"{base} {rest.strip()}")
+            continue
+        if "/" not in element:
+            element = "std_msgs/Header" if element == "Header" else f"{name.partition('/')[0]}/{element}"
+        fields.append(f"{_ros1_md5_of(element, texts, sums)} {rest.strip()}")
+    sums[name] = md5("\n".join(constants + fields).encode(), usedforsecurity=False).hexdigest()
+    return sums[name]
+
+
+def _one_line(error: BaseException) -> str:
+    text = " ".join(str(error).split()) or type(error).__name__
+    return text if len(text) <= 160 else text[:157] + "..."
