@@ -136,7 +136,7 @@ def register(type_name: str, definition: str, encoding: Encoding) -> None:
     try:
         store.register(types)
     except TypesysError as error:
-        raise ConfigError(f"type {name}: {_one_line(error)}") from None
+        raise ConfigError(f"type {name}: {one_line(error)}") from None
     describe.cache_clear()
 
 
@@ -158,7 +158,7 @@ def deserialise(body: bytes, type_name: str, encoding: Encoding) -> Any:
             return store.deserialize_ros1(body, type_name)
         return store.deserialize_cdr(body, type_name)
     except (SerdeError, AssertionError, IndexError) as error:
-        raise ConfigError(f"type {type_name}: {len(body)} bytes do not decode: {_one_line(error)}") from None
+        raise ConfigError(f"type {type_name}: {len(body)} bytes do not decode: {one_line(error)}") from None
 
 
 def new(type_name: str, encoding: Encoding, **fields: Any) -> Any:
@@ -204,7 +204,7 @@ def _parse(type_name: str, definition: str) -> Typesdict:
             types.update(get_types_from_idl(part.partition("\n")[2]))
         return types
     except (TypesysError, RecursionError) as error:
-        raise ConfigError(f"type {type_name}: its definition cannot be parsed: {_one_line(error)}") from None
+        raise ConfigError(f"type {type_name}: its definition cannot be parsed: {one_line(error)}") from None
 
 
 def _ros1_md5(type_name: str, definition: str) -> str:
@@ -250,6 +250,7 @@ def _ros1_md5_of(name: str, texts: dict[str, str], sums: dict[str, str]) -> str:
     return sums[name]
 
 
-def _one_line(error: BaseException) -> str:
+def one_line(error: BaseException) -> str:
+    """The text of an error on one line of at most 160 characters; its class where it says nothing."""
     text = " ".join(str(error).split()) or type(error).__name__
     return text if len(text) <= 160 else text[:157] + "..."
