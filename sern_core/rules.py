@@ -1,8 +1,8 @@
-"""Names, topic rules and access rules: what the configuration says about a topic, as plain data.
+"""Names and topic rules: what the configuration says about a topic, as plain data.
 
 Rules of this file:
 - every pattern is a regular expression that must match the whole name;
-- the first rule that matches wins, for topics and for access; nothing is merged;
+- the first rule that matches wins; nothing is merged;
 - a *local* name is what the endpoint of one site calls a topic, a *global* name is what everyone else calls it;
 - all values here were checked by the configuration, and the functions below still refuse what would be unsafe.
 """
@@ -43,7 +43,6 @@ MANY_WRITER_TOPICS: Final = frozenset({"/tf", "/tf_static"})
 # ROS 1 lets a later part of a name start with a digit, ROS 2 does not; a name that either accepts is accepted.
 _NAME: Final = re.compile(r"/[A-Za-z_][A-Za-z0-9_]*(?:/[A-Za-z0-9_]+)*")
 _CLIENT_NAME: Final = re.compile(r"[a-z][a-z0-9_]{0,62}")
-_SELF: Final = "{self}"
 
 
 class Auto(Enum):
@@ -133,11 +132,6 @@ def compile_pattern(text: str) -> re.Pattern[str]:
     except (re.error, Warning, OverflowError, RecursionError) as error:
         reason = error.msg if isinstance(error, re.error) else str(error)
         raise UsageError(f"is not a regular expression ({reason.splitlines()[0].split(' at position')[0]})") from error
-
-
-def compile_self_pattern(text: str, client: ClientName) -> re.Pattern[str]:
-    """A pattern of an access rule, with `{self}` replaced by the client's name (the one its key is bound to)."""
-    return compile_pattern(text.replace(_SELF, client))
 
 
 def matches_any(patterns: Iterable[re.Pattern[str]], name: str) -> bool:
@@ -385,63 +379,7 @@ class Discovery:
         return listed or self.mode is DiscoveryMode.DYNAMIC
 
 
-# Access rules --------------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, slots=True)
-class Grant:
-    """What one client may do at the relay, on global names. The empty grant forbids everything.
-
-    Limits: `max_rate_hz` messages/s and `max_bytes_per_s` taken from the client over all its topics,
-    `max_queue_bytes` held at the relay on their way to it; None is no limit.
-    """
-
-    publish: tuple[re.Pattern[str], ...] = ()
-    subscribe: tuple[re.Pattern[str], ...] = ()
-    max_rate_hz: float | None = None
-    max_bytes_per_s: float | None = None
-    max_queue_bytes: int | None = None
-
-    def may_publish(self, name: TopicName) -> bool:
-        return matches_any(self.publish, name)
-
-    def may_subscribe(self, name: TopicName) -> bool:
-        return matches_any(self.subscribe, name)
-
-
-NO_GRANT: Final = Grant()
-
-
-@dataclass(frozen=True, slots=True)
-class AccessRule:
-    """One line of `access:`. `publish` and `subscribe` are pattern texts in which `{self}` is the client's name."""
-
-    client: re.Pattern[str]
-    publish: tuple[str, ...] = ()
-    subscribe: tuple[str, ...] = ()
-    max_rate_hz: float | None = None
-    max_bytes_per_s: float | None = None
-    max_queue_bytes: int | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class AccessTable:
-    """Default deny: a client that no rule names may connect, and may do nothing."""
-
-    rules: tuple[AccessRule, ...] = ()
-
-    def grant(self, client: ClientName) -> Grant:
-        """The grant of the first rule that matches `client`. Call it once a session: it compiles the patterns."""
-        for rule in self.rules:
-            if rule.client.fullmatch(client):
-                return Grant(
-                    publish=tuple(compile_self_pattern(text, client) for text in rule.publish),
-                    subscribe=tuple(compile_self_pattern(text, client) for text in rule.subscribe),
-                    max_rate_hz=rule.max_rate_hz,
-                    max_bytes_per_s=rule.max_bytes_per_s,
-                    max_queue_bytes=rule.max_queue_bytes,
-                )
-        return NO_GRANT
+# The feed -------------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)

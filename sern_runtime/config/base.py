@@ -1,0 +1,199 @@
+"""What every configuration model is made of: the base class, the checked text types, and `fault`.
+
+A model field has a docstring below it (its description in the schema and in the reference) and a unit in its name.
+Validators raise `fault(...)` with a finished phrase; `load.py` puts file, line and key in front of it.
+"""
+
+import ipaddress
+import re
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Final
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, WrapValidator
+from pydantic_core import PydanticCustomError
+
+from sern_core.access import SELF, compile_peer_pattern
+from sern_core.errors import RefusedError, UsageError
+from sern_core.rules import client_name, compile_pattern, normal_namespace, topic_name
+from sern_runtime.config.yaml import Loc
+
+_HOST: Final = re.compile(r"[A-Za-z0-9_](?:[A-Za-z0-9_.-]{0,251}[A-Za-z0-9_])?")
+_TCP: Final = re.compile(r"tcp://(\[[0-9A-Fa-f:.%a-z]+\]|[^:/\[\]]+):([0-9]{1,5})")
+_IPC_MAX_CHARS: Final = 100  # a Unix socket path holds 107 bytes on Linux
+_LOOPBACK_NAMES: Final = frozenset({"localhost", "ip6-localhost"})
+
+
+class Section(BaseModel):
+    """A mapping in a configuration file: unknown keys are errors, and nothing is converted behind the writer's back."""
+
+    model_config = ConfigDict(
+        extra="forbid",
+        frozen=True,
+        strict=True,
+        allow_inf_nan=False,
+        use_attribute_docstrings=True,
+        hide_input_in_errors=True,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class FileProblem:
+    """Something about a file that the configuration names. A warning does not stop anything."""
+
+    loc: Loc
+    problem: str
+    warning: bool = False
+
+
+class FileModel(Section):
+    """A whole file. `file_problems` is the second step of checking: it looks at the other files that this one names."""
+
+    def file_problems(self, base_dir: Path) -> Iterator[FileProblem]:
+        """Problems with the files this one names; relative paths start at `base_dir`."""
+        raise NotImplementedError
+
+
+def fault(problem: str, *at: str | int) -> PydanticCustomError:
+    """The error a validator raises. `at` leads from the validated value to the part at fault."""
+    return PydanticCustomError("fault", "{problem}", {"problem": problem, "at": at})
+
+
+def unexpected(expected: str) -> PydanticCustomError:
+    """Like `fault`, for a value that is nothing like `expected`; the message shows the value."""
+    return PydanticCustomError("unexpected", "expected {expected}", {"expected": expected})
+
+
+def described(expected: str) -> WrapValidator:
+    """Replaces whatever a union of types says by one phrase."""
+
+    def validate(value: Any, handler: Callable[[Any], Any]) -> Any:
+        try:
+            return handler(value)
+        except ValidationError as error:
+            raise unexpected(expected) from error
+
+    return WrapValidator(validate)
+
+
+def _checked(check: Callable[[str], object]) -> AfterValidator:
+    """A validator that leaves the text as it is and reports the UsageError or RefusedError of `check`."""
+
+    def validate(text: str) -> str:
+        try:
+            check(text)
+        except (UsageError, RefusedError) as error:
+            raise fault(str(error)) from error
+        return text
+
+    return AfterValidator(validate)
+
+
+def _check_self_pattern(text: str) -> None:
+    compile_pattern(text.replace(SELF, "(?:a)"))
+
+
+def _check_path(text: str) -> None:
+    if not text or "\n" in text:
+        raise UsageError("must be the path of a file, relative to this one or absolute")
+
+
+def _check_phrase(text: str) -> None:
+    if not re.fullmatch(r"[a-z][a-z0-9_-]{0,62}", text):
+        raise UsageError("must be a lower-case letter, then up to 62 of a-z, 0-9, '_', '-'")
+
+
+def split_tcp(endpoint: str) -> tuple[str, int] | None:
+    """Host and port of `tcp://host:port`, brackets of IPv6 removed; None for anything else."""
+    match = _TCP.fullmatch(endpoint)
+    return None if match is None else (match[1].strip("[]"), int(match[2]))
+
+
+def is_local(endpoint: str) -> bool:
+    """True for ipc and for tcp on the loopback interface: nobody else's packets get there."""
+    if endpoint.startswith("ipc://"):
+        return True
+    parts = split_tcp(endpoint)
+    return parts is not None and _is_loopback(parts[0])
+
+
+def _is_loopback(host: str) -> bool:
+    address = _address(host)
+    return host in _LOOPBACK_NAMES if address is None else address.is_loopback
+
+
+def _address(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
+    try:
+        return ipaddress.ip_address(host)
+    except ValueError:
+        return None
+
+
+def _check_ipc(endpoint: str) -> None:
+    path = endpoint.removeprefix("ipc://")
+    if not path or len(path.encode()) > _IPC_MAX_CHARS or "\n" in path:
+        raise UsageError(f"ipc:// needs a path of 1 to {_IPC_MAX_CHARS} bytes")
+
+
+def _check_port(port: int) -> None:
+    if not 1 <= port <= 65535:
+        raise UsageError(f"port {port} is not in 1..65535")
+
+
+def _check_connect(endpoint: str) -> None:
+    if endpoint.startswith("ipc://"):
+        return _check_ipc(endpoint)
+    parts = split_tcp(endpoint)
+    if parts is None or not (_HOST.fullmatch(parts[0]) or _address(parts[0])):
+        raise UsageError(f"{_shown(endpoint)} is not an endpoint; accepted: tcp://host:port, ipc://path")
+    return _check_port(parts[1])
+
+
+def _check_bind(endpoint: str) -> None:
+    if endpoint.startswith("ipc://"):
+        return _check_ipc(endpoint)
+    parts = split_tcp(endpoint)
+    if parts is None:
+        raise UsageError(
+            f"{_shown(endpoint)} is not an address; accepted: tcp://address:port, tcp://*:port, ipc://path"
+        )
+    if parts[0] != "*" and _address(parts[0]) is None:
+        raise UsageError(f"{_shown(parts[0])} is a name; listen on an address of this host, 127.0.0.1, 0.0.0.0 or *")
+    return _check_port(parts[1])
+
+
+def _check_http(listen: str) -> None:
+    parts = split_tcp("tcp://" + listen)
+    if parts is None or _address(parts[0]) is None:
+        raise UsageError(f"{_shown(listen)} is not address:port, such as 127.0.0.1:5580")
+    _check_port(parts[1])
+
+
+def _shown(text: str) -> str:
+    return repr(text if len(text) <= 80 else text[:77] + "...")
+
+
+Pattern = Annotated[str, _checked(compile_pattern), Field(json_schema_extra={"format": "regex"})]
+PeerPattern = Annotated[str, _checked(compile_peer_pattern), Field(json_schema_extra={"format": "regex"})]
+"""A pattern that the relay will be asked to match: it refuses those that can take long."""
+SelfPattern = Annotated[str, _checked(_check_self_pattern)]
+TopicText = Annotated[str, _checked(topic_name)]
+ClientText = Annotated[str, _checked(client_name)]
+NamespaceText = Annotated[str, _checked(normal_namespace)]
+RoleText = Annotated[str, _checked(_check_phrase)]
+PathText = Annotated[str, _checked(_check_path)]
+ConnectEndpoint = Annotated[str, _checked(_check_connect)]
+BindEndpoint = Annotated[str, _checked(_check_bind)]
+HttpListen = Annotated[str, _checked(_check_http)]
+
+Seconds = Annotated[float, Field(gt=0, le=1e7)]
+SecondsOrZero = Annotated[float, Field(ge=0, le=1e7)]
+Hertz = Annotated[float, Field(gt=0, le=1e6)]
+Bytes = Annotated[int, Field(ge=1, le=1 << 40)]
+Count = Annotated[int, Field(ge=1, le=1_000_000)]
+
+
+def resolve(base_dir: Path, text: str) -> Path:
+    """A path from a configuration file: `~` is the home directory, relative ones start at the file's directory."""
+    return base_dir / Path(text).expanduser()
