@@ -1,0 +1,366 @@
+"""Who may publish, subscribe and ask for replays, and how much: per-client access rules, default deny.
+
+The first rule whose `client` pattern matches a name holds for that client; nothing is merged, so exceptions go above
+the general rule. A client that no rule names may do nothing.
+
+Patterns are full-match regular expressions. In a topic pattern `{self}` stands for the client's own name, literally:
+`/{self}/.*` grants `jackal1` what is under `/jackal1/` and nothing of `jackal10`.
+
+Rules come from the operator's own file, so any regular expression is accepted in them. Patterns that arrive from a
+peer go through `compile_peer_pattern`, which refuses those that a backtracking matcher could be kept busy with.
+"""
+
+import math
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Final, NamedTuple
+
+from sern_core.errors import ConfigError, RefusedError, UsageError
+from sern_core.rules import NAME_MAX_CHARS, compile_pattern, matches_any
+from sern_core.types import ClientName, TopicName
+
+SELF: Final = "{self}"
+"""Placeholder for the client's own name in topic patterns."""
+CACHE_ENTRIES: Final = 65_536
+"""Decisions remembered in all; when full the cache is emptied, so that invented names cannot grow it."""
+CLIENT_ENTRIES: Final = 4_096
+"""Clients whose compiled patterns are remembered; clients are bounded by the key directory anyway."""
+MAX_PATTERN_COST: Final = 8 * NAME_MAX_CHARS**3
+"""Ways a peer's pattern may split a name of NAME_MAX_CHARS: three `.*` and a few alternatives."""
+DEFAULT_BURST_S: Final = 1.0
+"""Seconds of its rate that a client may use at once."""
+
+
+class Right(StrEnum):
+    """What a rule grants."""
+
+    PUBLISH = "publish"
+    SUBSCRIBE = "subscribe"
+    REPLAY = "replay"
+
+
+@dataclass(frozen=True, slots=True)
+class AccessRule:
+    """Grants for the clients whose name `client` matches (full match).
+
+    `replay` None follows `subscribe`; a replay always needs `subscribe` as well. A limit None is no limit.
+    """
+
+    client: str
+    publish: tuple[str, ...] = ()
+    subscribe: tuple[str, ...] = ()
+    replay: tuple[str, ...] | None = None
+    max_bytes_per_s: float | None = None
+    max_rate_hz: float | None = None
+    max_queue_bytes: int | None = None
+
+
+class ClientLimits(NamedTuple):
+    """Limits of one client; None: unlimited."""
+
+    max_bytes_per_s: float | None = None
+    max_rate_hz: float | None = None
+    max_queue_bytes: int | None = None
+
+
+class LostAccess(NamedTuple):
+    """A right that a reload took away."""
+
+    client: ClientName
+    topic: TopicName
+    right: Right
+
+
+class AccessReload(NamedTuple):
+    """The table after a reload and what it took away; swap the table in, then act on `lost`."""
+
+    table: "AccessTable"
+    lost: tuple[LostAccess, ...]
+
+
+class _Grants(NamedTuple):
+    """The patterns of one client, compiled, and its limits."""
+
+    limits: ClientLimits
+    publish: tuple[re.Pattern[str], ...]
+    subscribe: tuple[re.Pattern[str], ...]
+    replay: tuple[re.Pattern[str], ...]
+
+
+_NOTHING: Final = _Grants(ClientLimits(), (), (), ())
+
+
+class AccessTable:
+    """Decides by (client, topic). Immutable apart from its cache: a reload makes a new one with `replaced`.
+
+    Raises ConfigError that names a bad pattern or limit and its key, `access[2].publish[0]`.
+    """
+
+    __slots__ = ("_cache", "_client_patterns", "_grants", "_rules")
+
+    def __init__(self, rules: Iterable[AccessRule] = ()) -> None:
+        self._rules = tuple(rules)
+        self._client_patterns = tuple(_checked(rule, index) for index, rule in enumerate(self._rules))
+        self._grants: dict[ClientName, _Grants] = {}
+        self._cache: dict[tuple[Right, ClientName, TopicName], bool] = {}
+
+    @property
+    def rules(self) -> tuple[AccessRule, ...]:
+        return self._rules
+
+    def may_publish(self, client: ClientName, topic: TopicName) -> bool:
+        return self.allows(Right.PUBLISH, client, topic)
+
+    def may_subscribe(self, client: ClientName, topic: TopicName) -> bool:
+        return self.allows(Right.SUBSCRIBE, client, topic)
+
+    def may_replay(self, client: ClientName, topic: TopicName) -> bool:
+        """Whether the client may be sent this topic's earlier messages (late joiner, backfill)."""
+        return self.allows(Right.REPLAY, client, topic)
+
+    def allows(self, right: Right, client: ClientName, topic: TopicName) -> bool:
+        key = (right, client, topic)
+        known = self._cache.get(key)
+        if known is not None:
+            return known
+        if len(self._cache) >= CACHE_ENTRIES:
+            self._cache.clear()
+        allowed = self._decide(right, client, topic)
+        self._cache[key] = allowed
+        return allowed
+
+    def limits(self, client: ClientName) -> ClientLimits:
+        """The limits of the client's rule; no limits for a client without one, which may do nothing anyway."""
+        return self._granted(client).limits
+
+    def replaced(self, rules: Iterable[AccessRule], pairs: Iterable[tuple[ClientName, TopicName]] = ()) -> AccessReload:
+        """A table of the new rules, and which rights over `pairs` it no longer gives; this one stays as it is.
+
+        `pairs` are the (client, topic) pairs in use: the cache is bounded, so the table cannot know them itself.
+        Raises ConfigError for bad rules; then the old table stays in force.
+        """
+        table = AccessTable(rules)
+        lost = tuple(
+            LostAccess(client, topic, right)
+            for client, topic in dict.fromkeys(pairs)
+            for right in Right
+            if self.allows(right, client, topic) and not table.allows(right, client, topic)
+        )
+        return AccessReload(table, lost)
+
+    def _decide(self, right: Right, client: ClientName, topic: TopicName) -> bool:
+        if len(topic) > NAME_MAX_CHARS:
+            return False
+        granted = self._granted(client)
+        if right is Right.PUBLISH:
+            return matches_any(granted.publish, topic)
+        if not matches_any(granted.subscribe, topic):
+            return False
+        return right is Right.SUBSCRIBE or matches_any(granted.replay, topic)
+
+    def _granted(self, client: ClientName) -> _Grants:
+        granted = self._grants.get(client)
+        if granted is None:
+            if len(self._grants) >= CLIENT_ENTRIES:
+                self._grants.clear()
+            granted = self._compiled(client)
+            self._grants[client] = granted
+        return granted
+
+    def _compiled(self, client: ClientName) -> _Grants:
+        for rule, pattern in zip(self._rules, self._client_patterns, strict=True):
+            if pattern.fullmatch(client) is not None:
+                return _Grants(
+                    ClientLimits(rule.max_bytes_per_s, rule.max_rate_hz, rule.max_queue_bytes),
+                    _for_client(rule.publish, client),
+                    _for_client(rule.subscribe, client),
+                    _for_client(rule.subscribe if rule.replay is None else rule.replay, client),
+                )
+        return _NOTHING
+
+
+class RateGuard:
+    """Token buckets for one client's messages and bytes per second; None means no limit.
+
+    A message is admitted when its tokens are there. One that is larger than the whole bucket is admitted from a full
+    bucket and leaves a debt, so that it is slowed to the rate and not refused for ever. Over any T seconds at most
+    `rate·(T + burst_s)` plus one message passes.
+    """
+
+    __slots__ = ("_bytes", "_bytes_full", "_bytes_per_s", "_messages", "_messages_full", "_rate_hz", "_updated_s")
+
+    def __init__(
+        self,
+        *,
+        max_bytes_per_s: float | None = None,
+        max_rate_hz: float | None = None,
+        burst_s: float = DEFAULT_BURST_S,
+        now: float,
+    ) -> None:
+        for name, rate in (("max_bytes_per_s", max_bytes_per_s), ("max_rate_hz", max_rate_hz), ("burst_s", burst_s)):
+            if rate is not None and not (rate > 0 and math.isfinite(rate)):
+                raise UsageError(f"RateGuard: {name} is {rate}; give a positive number or None")
+        self._bytes_per_s = math.inf if max_bytes_per_s is None else max_bytes_per_s
+        self._rate_hz = math.inf if max_rate_hz is None else max_rate_hz
+        self._bytes_full = self._bytes_per_s * burst_s
+        # Fewer than one message in the bucket would let none through.
+        self._messages_full = max(1.0, self._rate_hz * burst_s)
+        self._bytes = self._bytes_full
+        self._messages = self._messages_full
+        self._updated_s = now
+
+    @classmethod
+    def of(cls, limits: ClientLimits, *, now: float) -> "RateGuard":
+        return cls(max_bytes_per_s=limits.max_bytes_per_s, max_rate_hz=limits.max_rate_hz, now=now)
+
+    def admit(self, size_bytes: int, *, now: float) -> bool:
+        """Take the tokens of one message, or take none and say no."""
+        messages, tokens_bytes = self._filled(now)
+        if messages < 1.0 or tokens_bytes < min(size_bytes, self._bytes_full):
+            return False
+        self._messages = messages - 1.0
+        self._bytes = tokens_bytes - size_bytes
+        self._updated_s = max(now, self._updated_s)
+        return True
+
+    def ready_in_s(self, size_bytes: int, *, now: float) -> float:
+        """Seconds until a message of this size would be admitted; 0 when it would be now."""
+        messages, tokens_bytes = self._filled(now)
+        missing_s = max(0.0, 1.0 - messages) / self._rate_hz
+        if math.isfinite(self._bytes_per_s):
+            missing_s = max(missing_s, (min(size_bytes, self._bytes_full) - tokens_bytes) / self._bytes_per_s)
+        return missing_s
+
+    def _filled(self, now: float) -> tuple[float, float]:
+        """Tokens at `now`: messages and bytes. A clock that runs backwards earns nothing."""
+        elapsed_s = now - self._updated_s
+        if elapsed_s <= 0.0:
+            return self._messages, self._bytes
+        return (
+            min(self._messages_full, self._messages + elapsed_s * self._rate_hz),
+            min(self._bytes_full, self._bytes + elapsed_s * self._bytes_per_s),
+        )
+
+
+def compile_peer_pattern(text: str) -> re.Pattern[str]:
+    """Compile a topic pattern that a peer sent; full match is the caller's.
+
+    Accepted: literals, `.`, classes, escapes other than back-references, groups `(…)` and `(?:…)`, alternatives and
+    repeats, as long as a backtracking matcher can try at most MAX_PATTERN_COST ways to split a name (a repeat inside
+    a repeat is the classic that cannot be bounded). Raises RefusedError(code `bad_pattern`).
+    """
+    try:
+        compiled = compile_pattern(text)
+    except UsageError as error:
+        raise RefusedError("bad_pattern", f"pattern {text[:80]!r} {error}") from None
+    if _PatternCost(text).total() > MAX_PATTERN_COST:
+        raise RefusedError(
+            "bad_pattern",
+            f"pattern {text[:80]!r} could take too long to match; use plain groups, at most three of * or +, "
+            "and no repeat inside a repeat",
+        )
+    return compiled
+
+
+class _PatternCost:
+    """Upper bound on the ways a backtracking matcher can split a name of NAME_MAX_CHARS, infinite when unbounded.
+
+    A sequence multiplies its items, alternatives add, `?` adds one way, a repeat of something that matches in one
+    way only has as many ways as it has lengths. Called on patterns that `re` has accepted.
+    """
+
+    _QUANTIFIER = re.compile(r"(?:\*|\+|\?|\{(?!\})(\d*)(,?)(\d*)\})[?+]?")
+    _CLASS = re.compile(r"\[\^?\]?(?:\\.|[^\]\\])*\]", re.DOTALL)
+
+    def __init__(self, text: str) -> None:
+        self._text = text
+        self._at = 0
+
+    def total(self) -> float:
+        try:
+            cost = self._alternatives()
+        except (OverflowError, RecursionError):
+            return math.inf
+        return cost if self._at == len(self._text) else math.inf
+
+    def _alternatives(self) -> float:
+        ways = 0.0
+        while True:
+            ways += self._sequence()
+            if not self._text.startswith("|", self._at):
+                return ways
+            self._at += 1
+
+    def _sequence(self) -> float:
+        ways = 1.0
+        while self._at < len(self._text) and self._text[self._at] not in "|)":
+            ways *= self._repeated(self._atom())
+        return ways
+
+    def _atom(self) -> float:
+        text, at = self._text, self._at
+        if text[at] == "(":
+            if text.startswith("(?", at) and not text.startswith("(?:", at):
+                self._at = len(text) + 1  # look-around, flags, conditionals, named groups: not counted, so refused
+                return math.inf
+            self._at += 3 if text.startswith("(?:", at) else 1
+            ways = self._alternatives()
+            self._at += 1  # the closing parenthesis: `re` has checked that it is there
+            return ways
+        if text[at] == "[":
+            klass = self._CLASS.match(text, at)
+            self._at = klass.end() if klass else len(text) + 1
+            return 1.0
+        if text[at] == "\\":
+            self._at += 2
+            return math.inf if text[at + 1].isdigit() else 1.0  # a back-reference
+        self._at += 1
+        return 1.0
+
+    def _repeated(self, ways: float) -> float:
+        quantifier = self._QUANTIFIER.match(self._text, self._at)
+        if quantifier is None:
+            return ways
+        self._at = quantifier.end()
+        kind = quantifier[0][0]
+        if kind == "?":
+            return ways + 1.0
+        if kind in "*+":
+            least, most = 0, NAME_MAX_CHARS
+        else:
+            least = int(quantifier[1] or 0)
+            most = NAME_MAX_CHARS if quantifier[2] and not quantifier[3] else int(quantifier[3] or least)
+        if ways == 1.0:
+            return max(1.0, float(min(most, NAME_MAX_CHARS) - least + 1))
+        return math.inf if most > NAME_MAX_CHARS or kind in "*+" else (ways + 1.0) ** most
+
+
+def _with_self(text: str, client: str) -> str:
+    # In a group of its own, so that `{self}?` means the whole name.
+    return text.replace(SELF, f"(?:{re.escape(client)})")
+
+
+def _for_client(texts: tuple[str, ...], client: ClientName) -> tuple[re.Pattern[str], ...]:
+    return tuple(re.compile(_with_self(text, client)) for text in texts)
+
+
+def _checked(rule: AccessRule, index: int) -> re.Pattern[str]:
+    """Compile every pattern of a rule once, so that a bad one is found before the rule is in force."""
+    where = f"access[{index}]"
+    for right, texts in ((Right.PUBLISH, rule.publish), (Right.SUBSCRIBE, rule.subscribe), (Right.REPLAY, rule.replay)):
+        for position, text in enumerate(texts or ()):
+            _compile_rule(_with_self(text, "self"), text, f"{where}.{right}[{position}]")
+    limits = ClientLimits(rule.max_bytes_per_s, rule.max_rate_hz, rule.max_queue_bytes)
+    for name, limit in limits._asdict().items():
+        if limit is not None and not (limit > 0 and math.isfinite(limit)):
+            raise ConfigError(f"{limit} is not a limit; give a positive number or leave it out", key=f"{where}.{name}")
+    return _compile_rule(rule.client, rule.client, f"{where}.client")
+
+
+def _compile_rule(pattern: str, text: str, key: str) -> re.Pattern[str]:
+    try:
+        return compile_pattern(pattern)
+    except UsageError as error:
+        raise ConfigError(f"pattern {text!r} {error}", key=key) from None
