@@ -128,6 +128,8 @@ class LinkModel:
                 _check_probability(f"burst_loss.{name}", value)
             if self.burst_loss.enter and not self.burst_loss.leave:
                 raise UsageError("burst_loss.leave is 0: a burst must end, give a probability above 0")
+        if self.streaming and self.mean_loss >= 1.0:
+            raise UsageError("loss is 1 in stream mode, so nothing would ever arrive: use a blackout")
         _check_rate("rate_bps", self.rate_bps)
         if self.queue_packets < 1:
             raise UsageError(f"queue_packets is {self.queue_packets}: give 1 or more")
