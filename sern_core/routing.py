@@ -18,6 +18,7 @@ Who announces is the caller's business: `StreamInfo.id.origin` must be the name 
 """
 
 import re
+from bisect import bisect_left
 from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -313,7 +314,8 @@ class RoutingTable:
                     elif client != origin and name not in interest.exact:
                         change.denied.add(Denied(client, name, by_name=False))
         topic.streams[origin] = stream.id
-        self._reroute(stream.id, topic, change)
+        change.before.setdefault(stream.id, ())
+        self._routes[stream.id] = tuple(sorted(topic.takers - {origin}))
 
     def _remove(self, stream: StreamId, change: "_Collector") -> None:
         change.removed.add(stream)
@@ -354,11 +356,10 @@ class RoutingTable:
         (topic.takers.add if takes else topic.takers.discard)(client)
         for stream in topic.streams.values():
             if stream.origin != client:
-                self._reroute(stream, topic, change)
-
-    def _reroute(self, stream: StreamId, topic: _Topic, change: "_Collector") -> None:
-        change.before.setdefault(stream, self._routes.get(stream, ()))
-        self._routes[stream] = tuple(sorted(client for client in topic.takers if client != stream.origin))
+                route = self._routes[stream]
+                change.before.setdefault(stream, route)
+                at = bisect_left(route, client)
+                self._routes[stream] = (*route[:at], client, *route[at:]) if takes else route[:at] + route[at + 1 :]
 
     def validate(self) -> None:
         """Check the tables against each other and against brute force; raises AssertionError."""
@@ -408,8 +409,8 @@ class _Collector:
             after = routes.get(stream, ())
             if before == after:
                 continue
-            matched += [Match(client, stream) for client in after if client not in before]
-            unmatched += [Match(client, stream) for client in before if client not in after]
+            matched += [Match(client, stream) for client in set(after).difference(before)]
+            unmatched += [Match(client, stream) for client in set(before).difference(after)]
             if not before:
                 wanted.append(stream)
             elif not after and stream not in self.removed:
