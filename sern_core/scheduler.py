@@ -103,8 +103,7 @@ class _Bucket:
             return
         rate = max(self._share * rate_bps / 8.0, _MIN_RATE)  # bytes/s
         burst_bytes = max(float(BURST_BYTES), BURST_S * rate)
-        tokens = (now - self.ready_s) / self._s_per_byte if self._s_per_byte else burst_bytes
-        tokens = min(max(tokens, -burst_bytes), burst_bytes)
+        tokens = min(max(self.tokens_bytes(now), -burst_bytes), burst_bytes)
         self._s_per_byte = 1.0 / rate
         self._burst_s = burst_bytes / rate
         self.ready_s = now - tokens / rate
