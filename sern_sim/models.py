@@ -163,7 +163,7 @@ class LinkModel:
     def mean_loss(self) -> float:
         """The long-run share of packets lost on the path, outside blackouts and without queue drops."""
         burst = self.burst_loss.mean_loss if self.burst_loss else 0.0
-        return 1.0 - (1.0 - self.loss) * (1.0 - burst)
+        return self.loss + burst - self.loss * burst
 
     def rate_bps_at(self, t_s: float) -> float | None:
         """The rate at scenario time `t_s`, whether or not the path is blacked out; None: unlimited."""
