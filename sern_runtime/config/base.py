@@ -51,8 +51,9 @@ class FileModel(Section):
     """A whole file. `file_problems` is the second step of checking: it looks at the other files that this one names."""
 
     def file_problems(self, base_dir: Path) -> Iterator[FileProblem]:
-        """Problems with the files this one names; relative paths start at `base_dir`."""
-        raise NotImplementedError
+        """Problems with the files this one names; relative paths start at `base_dir`. By default it names none."""
+        del base_dir
+        return iter(())
 
 
 def fault(problem: str, *at: str | int) -> PydanticCustomError:
@@ -102,6 +103,11 @@ def _check_path(text: str) -> None:
 def _check_phrase(text: str) -> None:
     if not re.fullmatch(r"[a-z][a-z0-9_-]{0,62}", text):
         raise UsageError("must be a lower-case letter, then up to 62 of a-z, 0-9, '_', '-'")
+
+
+def _check_frame_prefix(text: str) -> None:
+    if not re.fullmatch(r"[A-Za-z0-9_/]{1,64}", text):
+        raise UsageError("must be 1 to 64 letters, digits, '_' or '/', such as jackal1/")
 
 
 def split_tcp(endpoint: str) -> tuple[str, int] | None:
@@ -182,6 +188,7 @@ TopicText = Annotated[str, _checked(topic_name)]
 ClientText = Annotated[str, _checked(client_name)]
 NamespaceText = Annotated[str, _checked(normal_namespace)]
 RoleText = Annotated[str, _checked(_check_phrase)]
+FramePrefix = Annotated[str, _checked(_check_frame_prefix)]
 PathText = Annotated[str, _checked(_check_path)]
 ConnectEndpoint = Annotated[str, _checked(_check_connect)]
 BindEndpoint = Annotated[str, _checked(_check_bind)]

@@ -75,7 +75,7 @@ def check_document(document: Document, path: Path, model: type[M], *, files: boo
         # JSON, because pydantic's strict mode then takes lists for tuples and words for enums, and nothing else.
         value = model.model_validate_json(json.dumps(document.data))
     except ValidationError as error:
-        details = error.errors(include_url=False, include_input=False)
+        details = _without_echoes(error.errors(include_url=False, include_input=False))
         return Checked(None, _in_order(_render(document, model, item) for item in details))
     if not files:
         return Checked(Loaded(value, path))
@@ -85,6 +85,16 @@ def check_document(document: Document, path: Path, model: type[M], *, files: boo
         return Checked(None, _in_order(errors))
     warnings = [document.error(item.loc, item.problem) for item in problems if item.warning]
     return Checked(Loaded(value, path, tuple(str(warning) for warning in warnings)))
+
+
+def _without_echoes(details: list[ErrorDetails]) -> list[ErrorDetails]:
+    """Without "too short" for a list of which pydantic has only taken out the items that have errors of their own."""
+    locs = [item["loc"] for item in details]
+    return [
+        item
+        for item in details
+        if item["type"] != "too_short" or not any(loc[: len(item["loc"])] == item["loc"] != loc for loc in locs)
+    ]
 
 
 def _in_order(errors: Iterable[ConfigError]) -> tuple[ConfigError, ...]:
@@ -224,6 +234,7 @@ _PHRASES: Final[dict[str, Callable[[dict[str, Any], _Place], str]]] = {
     "list_type": _expected("a list"),
     "tuple_type": _expected("a list"),
     "model_type": _expected("a mapping (key: value)"),
+    "dict_type": _expected("a mapping (key: value)"),
     "model_attributes_type": _expected("a mapping (key: value)"),
     "enum": _choice,
     "literal_error": _choice,
@@ -231,6 +242,6 @@ _PHRASES: Final[dict[str, Callable[[dict[str, Any], _Place], str]]] = {
     "greater_than_equal": _bound(">=", "ge"),
     "less_than": _bound("<", "lt"),
     "less_than_equal": _bound("<=", "le"),
-    "too_short": lambda context, _: f"needs at least {context['min_length']} item(s)",
-    "too_long": lambda context, _: f"has more than {context['max_length']} items",
+    "too_short": lambda context, _: f"is too short; at least {context['min_length']} needed",
+    "too_long": lambda context, _: f"is too long; at most {context['max_length']} accepted",
 }

@@ -1,0 +1,299 @@
+"""The file of a client daemon (`sern-client`): who it is, its relay, its endpoints, and what to do with which topic."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Discriminator, Field, Tag, model_validator
+
+from sern_core.access import compile_peer_pattern
+from sern_core.errors import RefusedError
+from sern_core.message import DEFAULT_RELIABLE_QUEUE_BYTES
+from sern_core.rules import (
+    AUTO,
+    COMMAND_TYPES,
+    Direction,
+    Discovery,
+    DiscoveryMode,
+    Lease,
+    LossAction,
+    RuleError,
+    RuleSet,
+    TopicRule,
+    compile_pattern,
+    normal_namespace,
+)
+from sern_core.types import ClientName, Durability, PriorityClass, Reliability, TopicName
+from sern_runtime.config.base import (
+    Bytes,
+    ClientText,
+    ConnectEndpoint,
+    FileModel,
+    FileProblem,
+    FramePrefix,
+    Hertz,
+    NamespaceText,
+    PathText,
+    Pattern,
+    PeerPattern,
+    Seconds,
+    Section,
+    TopicText,
+    described,
+    fault,
+    is_local,
+)
+from sern_runtime.config.endpoints import EndpointSection
+from sern_runtime.config.load import Loaded, load
+from sern_runtime.config.shared import (
+    HttpSection,
+    LinkSection,
+    LogSection,
+    SchedulerSection,
+    output_problems,
+    public_key_problems,
+    secret_key_problems,
+)
+
+ClassWord = Literal["control", "state", "bulk"]
+
+
+class ClientSection(Section):
+    """Who this client is."""
+
+    name: ClientText
+    """Its name: the one its key has at the relay, and the default namespace of its topics."""
+    namespace: NamespaceText | None = None
+    """Put before the names of its topics for everyone else: /odom of jackal1 is /jackal1/odom. null: the client's
+    name; "/": names are global as they are."""
+    frame_prefix: FramePrefix | None = None
+    """Put before the frame ids in messages that leave this site, such as "jackal1/"; null: unchanged."""
+
+    @property
+    def normal_namespace(self) -> str:
+        """`/` or `/part`: what `sern_core.rules.to_global` takes."""
+        return normal_namespace(self.namespace or self.name)
+
+
+class RelayConnection(Section):
+    """The relay this client connects to, and the keys for it."""
+
+    endpoint: ConnectEndpoint
+    """tcp://host:port, or ipc://path on the same machine."""
+    server_key_file: PathText | None = None
+    """The relay's public key file (.pub): the client talks to nobody else."""
+    secret_key_file: PathText | None = None
+    """This client's secret key file (.key)."""
+    insecure: bool = False
+    """No keys and no encryption; only for ipc and loopback, for trials on one machine."""
+
+    @model_validator(mode="after")
+    def _keys(self) -> "RelayConnection":
+        if self.insecure:
+            if not is_local(self.endpoint):
+                raise fault("is accepted only for ipc:// and loopback endpoints; use keys (sern keygen)", "insecure")
+            for key in ("server_key_file", "secret_key_file"):
+                if getattr(self, key) is not None:
+                    raise fault("has no use with insecure: true; remove one of the two", key)
+            return self
+        for key in ("server_key_file", "secret_key_file"):
+            if getattr(self, key) is None:
+                raise fault("is missing; make keys with sern keygen (insecure: true only on one machine)", key)
+        return self
+
+
+class DiscoverySection(Section):
+    """Which topics of the endpoints are offered to the link."""
+
+    mode: DiscoveryMode = DiscoveryMode.MANUAL
+    """`manual`: only topics that a rule in `topics` matches; `dynamic`: also all others, as they appear."""
+    allow: tuple[Pattern, ...] = (".*",)
+    """Only topics (local names) that one of these patterns matches."""
+    deny: tuple[Pattern, ...] = ()
+    """No topic (local name) that one of these patterns matches; wins over everything else."""
+
+    def filter(self) -> Discovery:
+        return Discovery(
+            mode=self.mode,
+            allow=tuple(compile_pattern(text) for text in self.allow),
+            deny=tuple(compile_pattern(text) for text in self.deny),
+        )
+
+
+class LossSection(Section):
+    """What this site publishes on a command topic when commands stop coming."""
+
+    publish: LossAction
+    """`zero`: the all-zero command (stand still)."""
+    after_s: Annotated[float, Field(gt=0, le=60)]
+    """Without a fresh command for so long, whatever the cause; repeated at 10 Hz for 1 s."""
+
+
+class TopicSection(Section):
+    """One rule. The first rule that matches a topic holds for it."""
+
+    match: Pattern
+    """Regular expression for the whole topic name, as this site calls it (local name)."""
+    type: Pattern | None = None
+    """Regular expression for the whole message type, such as sensor_msgs/PointCloud2; null: any."""
+    priority: Annotated[ClassWord, Field(alias="class")] = "bulk"
+    """Urgency: `control` (commands, pose, timing), `state` (maps, obstacle summaries), `bulk` (clouds, images)."""
+    direction: Direction = Direction.BOTH
+    """`send`: from here to the link; `receive`: from the link to here, and subscribe to it; `both`: both, but
+    receive only what `subscribe` asks for."""
+    weight: Annotated[float, Field(gt=0, le=1e6)] | None = None
+    """κ of the score, within a class; null: 10, 3, 1 for control, state, bulk."""
+    reliability: Literal["auto", "reliable", "best_effort"] = "auto"
+    """`reliable`: kept and resent until delivered or `retention_s` is over; `best_effort`: freshest first;
+    `auto`: as the publisher offers (ROS 1: reliable if latched)."""
+    durability: Literal["auto", "volatile", "transient_local"] = "auto"
+    """`transient_local`: the last `depth` messages reach late joiners; `auto`: as the publisher offers."""
+    history: Literal["keep_last"] = "keep_last"
+    """The only kind of history there is; its length is `depth`."""
+    depth: Annotated[int, Field(ge=1, le=10_000)] | None = None
+    """Messages kept; null: 10 if reliable, else 1."""
+    lifespan_s: Annotated[
+        Annotated[float, Field(gt=0, le=1e7)] | Literal["auto"] | None,
+        described("a number of seconds above 0, null (for ever) or auto"),
+    ] = "auto"
+    """Older messages are not sent and not delivered; null: for ever; `auto`: 0.3 for velocity commands in class
+    control, for ever if reliable or transient_local, else 1."""
+    deadline_s: Seconds | None = None
+    """Expected time between messages: longer gaps are reported; null: no expectation."""
+    max_rate_hz: Hertz | None = None
+    """Faster messages are thinned to this rate; null: all."""
+    retention_s: Seconds | None = None
+    """How long an undelivered reliable message is kept; null: `link.retention_s`."""
+    max_queue_bytes: Bytes = DEFAULT_RELIABLE_QUEUE_BYTES
+    """Undelivered reliable messages kept at most; beyond, new ones are refused to their publisher."""
+    many_writers: bool | None = None
+    """Several clients may publish this global name; null: only /tf and /tf_static."""
+    remap: TopicText | None = None
+    """Another name for this topic outside this site, before the namespace; needs a plain name in `match`."""
+    on_link_loss: LossSection | None = None
+    """For topics of type geometry_msgs/Twist or TwistStamped that come in: what to publish when commands stop."""
+
+    @model_validator(mode="after")
+    def _consistent(self) -> "TopicSection":
+        if self.direction is Direction.RECEIVE:
+            try:
+                compile_peer_pattern(self.match)
+            except RefusedError as error:
+                raise fault(str(error), "match") from error
+        if self.on_link_loss is not None:
+            if self.direction is Direction.SEND:
+                raise fault("acts where commands arrive; direction is send", "on_link_loss")
+            if self.type is not None and not self._takes_commands():
+                allowed = ", ".join(sorted(COMMAND_TYPES))
+                raise fault(f"is only for {allowed}; type {self.type!r} matches neither", "on_link_loss")
+        return self
+
+    def _takes_commands(self) -> bool:
+        pattern = compile_pattern(self.type or ".*")
+        spellings = [name for plain in COMMAND_TYPES for name in (plain, plain.replace("/", "/msg/"))]
+        return any(pattern.fullmatch(name) for name in spellings)
+
+    def rule(self) -> TopicRule:
+        """The rule as the core reads it."""
+        loss = self.on_link_loss
+        return TopicRule(
+            match=compile_pattern(self.match),
+            type_match=None if self.type is None else compile_pattern(self.type),
+            priority=PriorityClass[self.priority.upper()],
+            direction=self.direction,
+            weight=self.weight,
+            reliability=None if self.reliability == "auto" else Reliability(self.reliability),
+            durability=None if self.durability == "auto" else Durability(self.durability),
+            depth=self.depth,
+            lifespan_s=AUTO if self.lifespan_s == "auto" else self.lifespan_s,
+            deadline_s=self.deadline_s,
+            max_rate_hz=self.max_rate_hz,
+            retention_s=self.retention_s,
+            max_queue_bytes=self.max_queue_bytes,
+            many_writers=self.many_writers,
+            remap=None if self.remap is None else TopicName(self.remap),
+            lease=None if loss is None else Lease(publish=loss.publish, after_s=loss.after_s),
+        )
+
+
+def _one_or_list(value: Any) -> str:
+    return "<list>" if isinstance(value, (list, tuple)) else "<one>"
+
+
+class ClientFile(FileModel):
+    """Configuration of one client daemon."""
+
+    client: ClientSection
+    """Who this client is."""
+    relay: RelayConnection
+    """The relay it connects to."""
+    endpoint: Annotated[
+        Annotated[EndpointSection, Tag("<one>")]
+        | Annotated[tuple[EndpointSection, ...], Field(min_length=1), Tag("<list>")],
+        Discriminator(_one_or_list),
+    ]
+    """Where messages come from and go to: one mapping, or a list of them. `kind` selects what it is."""
+    discovery: DiscoverySection = DiscoverySection()
+    """Which topics are offered to the link."""
+    topics: tuple[TopicSection, ...] = ()
+    """Rules for topics, first match wins. A topic without a rule: bulk, best effort, depth 1, lifespan 1 s."""
+    subscribe: tuple[PeerPattern, ...] = ()
+    """Regular expressions for the whole global names that this site wants, beside rules with direction `receive`."""
+    scheduler: SchedulerSection = SchedulerSection()
+    """Which message the link carries next."""
+    link: LinkSection = LinkSection()
+    """The link to the relay."""
+    http: HttpSection = HttpSection()
+    """Metrics and health over HTTP; off by default."""
+    log: LogSection = LogSection()
+    """The log."""
+    message_log: PathText | None = None
+    """CSV file with a line for every message offered and delivered; null: none. For trials: it grows without end."""
+    summary: PathText | None = None
+    """JSON file with the counters, written at exit; null: none."""
+
+    @model_validator(mode="after")
+    def _rules_fit(self) -> "ClientFile":
+        try:
+            self.rules()
+        except RuleError as error:
+            raise fault(error.problem, "topics", error.index, error.field) from error
+        return self
+
+    @property
+    def name(self) -> ClientName:
+        return ClientName(self.client.name)
+
+    @property
+    def namespace(self) -> str:
+        return self.client.normal_namespace
+
+    @property
+    def endpoints(self) -> tuple[EndpointSection, ...]:
+        """The endpoints, also when the file names just one."""
+        return self.endpoint if isinstance(self.endpoint, tuple) else (self.endpoint,)
+
+    def rules(self) -> RuleSet:
+        """The topic rules as the core reads them."""
+        return RuleSet(tuple(section.rule() for section in self.topics), retention_s=self.link.retention_s)
+
+    def subscribe_patterns(self) -> tuple[str, ...]:
+        """What to ask the relay for, on global names: `subscribe`, and the rules with direction `receive`."""
+        received = (pattern.pattern for pattern in self.rules().receive_patterns(self.namespace))
+        return tuple(dict.fromkeys((*self.subscribe, *received)))
+
+    def file_problems(self, base_dir: Path) -> Iterator[FileProblem]:
+        if self.relay.server_key_file is not None:
+            yield from public_key_problems(base_dir, self.relay.server_key_file, ("relay", "server_key_file"))
+        if self.relay.secret_key_file is not None:
+            yield from secret_key_problems(base_dir, self.relay.secret_key_file, ("relay", "secret_key_file"))
+        several = isinstance(self.endpoint, tuple)
+        for index, endpoint in enumerate(self.endpoints):
+            yield from endpoint.file_problems(base_dir, ("endpoint", index) if several else ("endpoint",))
+        yield from output_problems(base_dir, self.message_log, ("message_log",))
+        yield from output_problems(base_dir, self.summary, ("summary",))
+
+
+def load_client(path: Path, *, files: bool = True) -> Loaded[ClientFile]:
+    """The client file at `path`; raises ConfigError. `files`: also check the files that it names."""
+    return load(path, ClientFile, files=files)

@@ -1,0 +1,149 @@
+"""Endpoint sections: where a client's messages come from and go to.
+
+To add a kind: write a section with `kind: Literal["name"]` and its settings, and add it to `EndpointSection`. Messages,
+schema and reference follow from there; `sern_client` makes the endpoint from the section.
+"""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Discriminator, Field, Tag
+
+from sern_runtime.config.base import (
+    FileProblem,
+    Hertz,
+    NamespaceText,
+    PathText,
+    Pattern,
+    SecondsOrZero,
+    Section,
+    TopicText,
+    resolve,
+    unexpected,
+)
+from sern_runtime.config.yaml import Loc
+
+MAX_SYNTHETIC_TOPICS = 20
+
+
+class EndpointBase(Section):
+    """What all endpoint sections share."""
+
+    def file_problems(self, base_dir: Path, loc: Loc) -> Iterator[FileProblem]:
+        """Problems with the files this endpoint reads or writes; `loc` is its place. By default it has none."""
+        del base_dir, loc
+        return iter(())
+
+
+class BagEndpoint(EndpointBase):
+    """Plays a recording (ROS 1 .bag, rosbag2 directory, .db3, .mcap) as if it were a robot."""
+
+    kind: Literal["bag"]
+    """Plays a recording."""
+    path: PathText
+    """The .bag, .db3 or .mcap file, or a rosbag2 directory."""
+    rate: Annotated[float, Field(ge=0, le=1000)] = 1.0
+    """Playback speed; 2 is twice as fast as recorded, 0 as fast as messages are accepted."""
+    loop: bool = False
+    """Start again at the end."""
+    namespaces: tuple[NamespaceText, ...] = ()
+    """Play the recording once for each of these namespaces, as so many robots; empty: once, with its own names."""
+    topics: tuple[Pattern, ...] | None = None
+    """Play only topics whose name in the recording matches one of these; null: all."""
+    start_delay_s: SecondsOrZero = 0.0
+    """Wait so long before the first message."""
+    wait_for: tuple[TopicText, ...] = ()
+    """Start only when each of these topics has a subscriber at the far side."""
+    on_refused: Literal["wait", "drop"] = "wait"
+    """When a reliable queue is full: `wait` holds playback, `drop` counts the message as lost, like a live sensor."""
+    stamps: Literal["now", "bag"] = "now"
+    """Time stamps of messages on the link: when they are played, or when they were recorded."""
+
+    def file_problems(self, base_dir: Path, loc: Loc) -> Iterator[FileProblem]:
+        path = resolve(base_dir, self.path)
+        if not path.exists():
+            yield FileProblem((*loc, "path"), f"{path}: no such file or directory")
+
+
+def _topics_tag(value: Any) -> str | None:
+    """Which member of the union a value of `topics` is meant to be; bool is an int to Python and not meant."""
+    if isinstance(value, bool):
+        return None
+    return "number" if isinstance(value, int) else "list" if isinstance(value, (list, tuple)) else None
+
+
+_TOPICS_EXPECTED = unexpected("a number of topics or a list of topic names")
+
+
+class SyntheticEndpoint(EndpointBase):
+    """A simulated robot, or the operator who drives it. The same seed gives the same messages."""
+
+    kind: Literal["synthetic"]
+    """A simulated robot or operator."""
+    role: Literal["robot", "operator"]
+    """`robot`: publishes odometry, scan, cloud, map, tf and obeys commands; `operator`: sends commands."""
+    seed: Annotated[int, Field(ge=0, lt=1 << 63)] = 0
+    """Start value of the random generator."""
+    encoding: Literal["ros1", "cdr"] = "cdr"
+    """How bodies are serialised: `ros1` or `cdr` (ROS 2)."""
+    topics: Annotated[
+        Annotated[Annotated[int, Field(ge=1, le=MAX_SYNTHETIC_TOPICS)], Tag("number")]
+        | Annotated[tuple[TopicText, ...], Tag("list")],
+        Discriminator(
+            _topics_tag,
+            custom_error_type=_TOPICS_EXPECTED.type,
+            custom_error_message=_TOPICS_EXPECTED.message_template,
+            custom_error_context=_TOPICS_EXPECTED.context,
+        ),
+    ] = 20
+    """How many of its topics the robot publishes, most urgent first, or their names."""
+    patrol: bool = False
+    """The robot drives a round by itself while it has no commands."""
+    cloud_bytes: Annotated[int, Field(ge=1000, le=50_000_000)] = 100_000
+    """Size of one point cloud."""
+    cloud_rate_hz: Hertz = 10.0
+    """Point clouds a second."""
+    map_bytes: Annotated[int, Field(ge=1000, le=50_000_000)] = 20_000
+    """Size of one occupancy grid."""
+    map_rate_hz: Hertz = 1.0
+    """Occupancy grids a second."""
+    pose_rate_hz: Hertz = 50.0
+    """Odometry messages a second."""
+    load_factor: Annotated[float, Field(gt=0, le=100)] = 1.0
+    """Multiplies the size of bulk messages: offered load as a factor of the usual one."""
+    command_topic: TopicText = "/cmd_vel"
+    """The topic (local name) on which commands come in, or go out for an operator."""
+    command_rate_hz: Hertz = 10.0
+    """Commands a second of an operator."""
+    counter_topics: tuple[TopicText, ...] = ()
+    """Extra reliable topics that carry a counter: they show gaps and duplicates."""
+    cloud_files: tuple[PathText, ...] = ()
+    """Real scans (.ply) to send in turn in place of made-up clouds."""
+
+    def file_problems(self, base_dir: Path, loc: Loc) -> Iterator[FileProblem]:
+        for index, text in enumerate(self.cloud_files):
+            path = resolve(base_dir, text)
+            if not path.is_file():
+                yield FileProblem((*loc, "cloud_files", index), f"{path}: no such file")
+
+
+class RecordEndpoint(EndpointBase):
+    """Records what arrives: ROS 1 messages into a .bag, ROS 2 (CDR) messages into an .mcap."""
+
+    kind: Literal["record"]
+    """Records what arrives."""
+    path: PathText
+    """A .bag or .mcap file (the other encoding goes beside it), a directory (files are named by date), or a stem."""
+    overwrite: bool = False
+    """Replace files that exist."""
+
+    def file_problems(self, base_dir: Path, loc: Loc) -> Iterator[FileProblem]:
+        path = resolve(base_dir, self.path)
+        if path.is_file() and not self.overwrite:
+            yield FileProblem((*loc, "path"), f"{path} exists; set overwrite: true or name another file")
+        elif not path.is_dir() and not path.parent.is_dir():
+            yield FileProblem((*loc, "path"), f"{path.parent}: no such directory; create it first")
+
+
+EndpointSection = Annotated[BagEndpoint | SyntheticEndpoint | RecordEndpoint, Field(discriminator="kind")]

@@ -1,0 +1,244 @@
+"""The file of the relay daemon (`sern-relay`): where it listens, who may do what, and its limits."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import Field, model_validator
+
+from sern_core.access import AccessRule
+from sern_core.errors import ConfigError
+from sern_core.rules import FeedRole, compile_pattern
+from sern_core.types import ClientName
+from sern_runtime.config.base import (
+    BindEndpoint,
+    Bytes,
+    ClientText,
+    Count,
+    FileModel,
+    FileProblem,
+    Hertz,
+    HttpListen,
+    PathText,
+    Pattern,
+    RoleText,
+    Section,
+    SelfPattern,
+    fault,
+    is_local,
+    resolve,
+)
+from sern_runtime.config.load import Loaded, load
+from sern_runtime.config.shared import LinkSection, LogSection, SchedulerSection, secret_key_problems
+from sern_runtime.keys import KeyDirectory
+
+DEFAULT_HTTP_LISTEN = "127.0.0.1:5580"
+
+
+class RelaySection(Section):
+    """The relay itself."""
+
+    name: ClientText
+    """Its name, as in its key file."""
+    listen: Annotated[tuple[BindEndpoint, ...], Field(min_length=1, max_length=16)]
+    """Where clients connect: tcp://address:port, tcp://*:port (every address), ipc://path; one or more."""
+    secret_key_file: PathText | None = None
+    """The relay's secret key file (.key)."""
+    clients_dir: PathText | None = None
+    """Directory with the public key files (.pub) of the clients that may connect."""
+    insecure: bool = False
+    """No keys and no encryption, clients are who they say they are; only for ipc and loopback."""
+    max_connections: Count = 256
+    """Connections at a time, beyond which new ones are refused."""
+    handshake_interval_s: Annotated[float, Field(ge=1, le=120)] = 10.0
+    """Time for a connection to prove its key. It takes 4 round trips: below 5 s satellite links are locked out."""
+
+    @model_validator(mode="after")
+    def _keys(self) -> "RelaySection":
+        if len(set(self.listen)) != len(self.listen):
+            raise fault("names an address twice", "listen")
+        keys = ("secret_key_file", "clients_dir")
+        if self.insecure:
+            for index, endpoint in enumerate(self.listen):
+                if not is_local(endpoint):
+                    raise fault(
+                        "is open to the network, and insecure: true is only for ipc and loopback", "listen", index
+                    )
+            for key in keys:
+                if getattr(self, key) is not None:
+                    raise fault("has no use with insecure: true; remove one of the two", key)
+            return self
+        for key in keys:
+            if getattr(self, key) is None:
+                raise fault("is missing; make keys with sern keygen (insecure: true only on one machine)", key)
+        return self
+
+
+class RelayHttpSection(Section):
+    """The HTTP server with /metrics, /healthz and /readyz."""
+
+    listen: HttpListen | None = DEFAULT_HTTP_LISTEN
+    """`address:port`; null: no HTTP server. It has no access control: keep it on loopback or behind a proxy."""
+
+
+class AccessSection(Section):
+    """What some clients may do. The first rule that matches a client's name holds for it; without one, nothing."""
+
+    client: Pattern
+    """The client's name, or a regular expression for the whole of it."""
+    publish: tuple[SelfPattern, ...] = ()
+    """Patterns of the global names it may publish; `{self}` is its own name."""
+    subscribe: tuple[SelfPattern, ...] = ()
+    """Patterns of the global names it may receive; `{self}` is its own name."""
+    replay: tuple[SelfPattern, ...] | None = None
+    """Patterns of the names whose earlier messages it may be sent too; null: as `subscribe`."""
+    max_rate_hz: Hertz | None = None
+    """Messages a second taken from it over all its topics; null: no limit."""
+    max_bytes_per_s: Annotated[float, Field(gt=0, le=1e12)] | None = None
+    """Bytes a second taken from it over all its topics; null: no limit."""
+    max_queue_bytes: Bytes | None = None
+    """Bytes that may wait for it at the relay; null: no limit beside those of the topics."""
+
+    def rule(self) -> AccessRule:
+        return AccessRule(
+            client=self.client,
+            publish=self.publish,
+            subscribe=self.subscribe,
+            replay=self.replay,
+            max_bytes_per_s=self.max_bytes_per_s,
+            max_rate_hz=self.max_rate_hz,
+            max_queue_bytes=self.max_queue_bytes,
+        )
+
+
+class FeedRoleSection(Section):
+    """One pair of sockets of the feed: whoever reaches its address has this role."""
+
+    name: RoleText
+    """The name of the role, in logs and metrics."""
+    publish_endpoint: BindEndpoint
+    """Where subscribers connect (the relay binds an XPUB socket)."""
+    ingest_endpoint: BindEndpoint | None = None
+    """Where publishers connect (the relay binds an XSUB socket); null: nobody publishes through this role."""
+    subscribe: tuple[Pattern, ...] = ()
+    """Patterns of the global names this role may see."""
+    publish: tuple[Pattern, ...] = ()
+    """Patterns of the global names this role may publish."""
+    allow_control: bool = False
+    """Let this role publish in class control (commands)."""
+    insecure: bool = False
+    """Accept an address beyond ipc and loopback: the feed has no keys, so the network itself must be trusted."""
+
+    @model_validator(mode="after")
+    def _consistent(self) -> "FeedRoleSection":
+        for key in ("publish_endpoint", "ingest_endpoint"):
+            endpoint = getattr(self, key)
+            if endpoint is not None and not is_local(endpoint) and not self.insecure:
+                raise fault("is open to the network and the feed has no keys; insecure: true accepts that", key)
+        if self.publish and self.ingest_endpoint is None:
+            raise fault("is missing, and publish names topics", "ingest_endpoint")
+        if self.ingest_endpoint is not None and not self.publish:
+            raise fault("names no topic, so ingest_endpoint has no use", "publish")
+        if self.allow_control and not self.publish:
+            raise fault("has no use without publish", "allow_control")
+        return self
+
+    def role(self) -> FeedRole:
+        return FeedRole(
+            name=self.name,
+            publish_endpoint=self.publish_endpoint,
+            ingest_endpoint=self.ingest_endpoint,
+            subscribe=tuple(compile_pattern(text) for text in self.subscribe),
+            publish=tuple(compile_pattern(text) for text in self.publish),
+            allow_control=self.allow_control,
+        )
+
+
+class FeedSection(Section):
+    """Plain ZMQ for programs on the local network, in any language. Off unless a role is given."""
+
+    roles: tuple[FeedRoleSection, ...] = ()
+    """The roles; each has sockets of its own."""
+
+
+class ReplaySection(Section):
+    """What the relay keeps for clients that come late or come back."""
+
+    cache_bytes: Annotated[int, Field(ge=0, le=1 << 40)] = 64 * 2**20
+    """Messages of transient_local topics kept for late joiners, over all topics."""
+    resume_s: Annotated[float, Field(ge=0, le=86_400)] = 600.0
+    """How long the state of a client that went away is kept, so that it goes on where it was."""
+
+
+class RelayFile(FileModel):
+    """Configuration of the relay daemon."""
+
+    relay: RelaySection
+    """The relay itself."""
+    access: tuple[AccessSection, ...] = ()
+    """Who may do what, first match wins. Without rules nobody may do anything."""
+    feed: FeedSection = FeedSection()
+    """Plain ZMQ for programs on the local network."""
+    replay: ReplaySection = ReplaySection()
+    """What is kept for clients that come late or come back."""
+    scheduler: SchedulerSection = SchedulerSection()
+    """Which message each client's link carries next."""
+    link: LinkSection = LinkSection()
+    """The links to the clients."""
+    http: RelayHttpSection = RelayHttpSection()
+    """Metrics and health over HTTP."""
+    log: LogSection = LogSection()
+    """The log."""
+
+    @model_validator(mode="after")
+    def _addresses(self) -> "RelayFile":
+        taken = {endpoint: f"relay.listen.{index}" for index, endpoint in enumerate(self.relay.listen)}
+        names: set[str] = set()
+        for index, role in enumerate(self.feed.roles):
+            if role.name in names:
+                raise fault(f"{role.name} is already the name of another role", "feed", "roles", index, "name")
+            names.add(role.name)
+            for key in ("publish_endpoint", "ingest_endpoint"):
+                endpoint = getattr(role, key)
+                if endpoint in taken:
+                    raise fault(f"{endpoint} is already used by {taken[endpoint]}", "feed", "roles", index, key)
+                if endpoint is not None:
+                    taken[endpoint] = f"feed.roles.{index}.{key}"
+        return self
+
+    @property
+    def name(self) -> ClientName:
+        return ClientName(self.relay.name)
+
+    def access_rules(self) -> tuple[AccessRule, ...]:
+        """The rules for `sern_core.access.AccessTable`."""
+        return tuple(section.rule() for section in self.access)
+
+    def feed_roles(self) -> tuple[FeedRole, ...]:
+        return tuple(section.role() for section in self.feed.roles)
+
+    def file_problems(self, base_dir: Path) -> Iterator[FileProblem]:
+        if self.relay.secret_key_file is not None:
+            yield from secret_key_problems(base_dir, self.relay.secret_key_file, ("relay", "secret_key_file"))
+        if self.relay.clients_dir is None:
+            return
+        loc = ("relay", "clients_dir")
+        try:
+            directory = KeyDirectory(resolve(base_dir, self.relay.clients_dir))
+        except ConfigError as error:
+            yield FileProblem(loc, str(error))
+            return
+        for warning in directory.warnings:
+            yield FileProblem(loc, warning, warning=True)
+        if not directory.names:
+            yield FileProblem(loc, f"{directory.path} holds no .pub file: no client can connect", warning=True)
+        rules = [compile_pattern(section.client) for section in self.access]
+        for name in directory.names:
+            if not any(rule.fullmatch(name) for rule in rules):
+                problem = f"no rule matches client {name}: it may connect and do nothing"
+                yield FileProblem(("access",), problem, warning=True)
+
+
+def load_relay(path: Path, *, files: bool = True) -> Loaded[RelayFile]:
+    """The relay file at `path`; raises ConfigError. `files`: also check the files that it names."""
+    return load(path, RelayFile, files=files)

@@ -1,0 +1,146 @@
+"""Sections that relay and client files have in common; defaults come from the dataclasses that the core reads."""
+
+import os
+from collections.abc import Iterator
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import Field
+
+from sern_core.errors import ConfigError
+from sern_core.params import LinkParams, SchedulerParams, WindowAlgorithm, WindowParams
+from sern_core.types import Ordering
+from sern_runtime.config.base import Bytes, FileProblem, HttpListen, PathText, Seconds, SecondsOrZero, Section, resolve
+from sern_runtime.config.yaml import Loc
+from sern_runtime.keys import load_public, load_secret, secret_warning
+
+_SCHEDULER = SchedulerParams()
+_LINK = LinkParams()
+
+
+class SchedulerSection(Section):
+    """Which message the link carries next. P(m) = κ[1 + η·a(m)] / (s(m) + ε), the paper's eq. (priority_score)."""
+
+    ordering: Ordering = _SCHEDULER.ordering
+    """`class`: more urgent classes first, P within a class, fragments and floors; `paper`: Alg. prioritize as printed,
+    without fragments."""
+    eta: Annotated[float, Field(ge=0, le=1e6)] = _SCHEDULER.eta
+    """η in 1/s: how much one second of waiting raises a score. 0: no ageing."""
+    epsilon_bytes: Annotated[float, Field(gt=0, le=1e9)] = _SCHEDULER.epsilon_bytes
+    """ε: keeps tiny messages from winning on size alone; about the overhead of one fragment."""
+    a_max_s: SecondsOrZero = _SCHEDULER.a_max_s
+    """Ages count up to here."""
+    interval_s: Annotated[float, Field(gt=0, le=10)] = _SCHEDULER.interval_s
+    """Δt: the budget of bytes is set once an interval."""
+    floor: Annotated[float, Field(ge=0, lt=0.5)] = _SCHEDULER.floor
+    """Share of the link that each lower class keeps while more urgent ones are backlogged."""
+    class0_share: Annotated[float, Field(gt=0, le=1)] = _SCHEDULER.class0_share
+    """Largest share of the link for class control while others are backlogged."""
+
+    def params(self) -> SchedulerParams:
+        return SchedulerParams(
+            ordering=self.ordering,
+            eta=self.eta,
+            epsilon_bytes=self.epsilon_bytes,
+            a_max_s=self.a_max_s,
+            interval_s=self.interval_s,
+            floor=self.floor,
+            class0_share=self.class0_share,
+        )
+
+
+class WindowSection(Section):
+    """How many bytes may be in flight."""
+
+    algorithm: WindowAlgorithm = _LINK.window.algorithm
+    """`delay`: measured, keeps the standing queue short; `fixed`: always `fixed_bytes`."""
+    fixed_bytes: Bytes = _LINK.window.fixed_bytes
+    """The window of algorithm `fixed`: capacity × round-trip time."""
+
+    def params(self) -> WindowParams:
+        return WindowParams(algorithm=self.algorithm, fixed_bytes=self.fixed_bytes)
+
+
+class LinkSection(Section):
+    """The link between this daemon and its peer."""
+
+    window: WindowSection = WindowSection()
+    """The window of bytes in flight."""
+    fragment_bytes_max: Annotated[int, Field(ge=1200, le=65_536)] = _LINK.fragment_bytes_max
+    """Largest fragment; the size used is what the link carries in 3 ms, at least 1200."""
+    heartbeat_timeout_s: Annotated[float, Field(ge=0.5, le=600)] = _LINK.heartbeat_timeout_s
+    """A peer that is silent for so long is gone, and its connection is rebuilt. Satellite links need more than 2 s."""
+    retention_s: Seconds = _LINK.retention_s
+    """How long an undelivered reliable message is kept when its topic has no `retention_s`."""
+    max_message_bytes: Annotated[int, Field(ge=1024, le=1 << 30)] = _LINK.max_message_bytes
+    """Larger messages are dropped and counted as `too_large`."""
+
+    def params(self) -> LinkParams:
+        return LinkParams(
+            window=self.window.params(),
+            fragment_bytes_max=self.fragment_bytes_max,
+            heartbeat_timeout_s=self.heartbeat_timeout_s,
+            retention_s=self.retention_s,
+            max_message_bytes=self.max_message_bytes,
+        )
+
+
+class HttpSection(Section):
+    """The HTTP server with /metrics, /healthz and /readyz."""
+
+    listen: HttpListen | None = None
+    """`address:port`, such as 127.0.0.1:5581; null: no HTTP server. It has no access control: keep it on loopback."""
+
+
+class LogLevel(StrEnum):
+    DEBUG = "debug"
+    INFO = "info"
+    WARNING = "warning"
+    ERROR = "error"
+
+
+class LogFormat(StrEnum):
+    TEXT = "text"
+    JSON = "json"
+
+
+class LogSection(Section):
+    """The log, on standard error."""
+
+    level: LogLevel = LogLevel.INFO
+    """The least severe messages that are written."""
+    format: LogFormat = LogFormat.TEXT
+    """`text`: a line a person reads; `json`: one object a line."""
+
+
+def public_key_problems(base_dir: Path, text: PathText, loc: Loc) -> Iterator[FileProblem]:
+    try:
+        load_public(resolve(base_dir, text))
+    except ConfigError as error:
+        yield FileProblem(loc, str(error))
+
+
+def secret_key_problems(base_dir: Path, text: PathText, loc: Loc) -> Iterator[FileProblem]:
+    path = resolve(base_dir, text)
+    try:
+        load_secret(path)
+    except ConfigError as error:
+        yield FileProblem(loc, str(error))
+        return
+    warning = secret_warning(path)
+    if warning is not None:
+        yield FileProblem(loc, warning, warning=True)
+
+
+def output_problems(base_dir: Path, text: PathText | None, loc: Loc) -> Iterator[FileProblem]:
+    """Problems of a file that will be written: its directory must be there and writable."""
+    if text is None:
+        return
+    path = resolve(base_dir, text)
+    if path.is_dir():
+        yield FileProblem(loc, f"{path} is a directory; a file is needed")
+    elif not path.parent.is_dir():
+        yield FileProblem(loc, f"{path.parent}: no such directory; create it first")
+    elif not os.access(path.parent, os.W_OK):
+        yield FileProblem(loc, f"{path.parent}: may not be written")

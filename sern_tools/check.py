@@ -1,0 +1,139 @@
+"""`sern check FILE`: is this relay, client or key file right? Offline: nothing is connected to or changed."""
+
+import difflib
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Annotated, Final
+
+import typer
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from sern_core.errors import ConfigError
+from sern_runtime import keys
+from sern_runtime.config.base import FileModel
+from sern_runtime.config.client import ClientFile
+from sern_runtime.config.load import Checked, Loaded, check_document
+from sern_runtime.config.relay import RelayFile
+from sern_runtime.config.yaml import Document, read_document
+
+EXIT_OK: Final = 0
+EXIT_USER_ERROR: Final = 2
+_KEY_FILES: Final[dict[str, type[FileModel]]] = {"public": keys.PublicKeyFile, "secret": keys.SecretKeyFile}
+
+
+def run_check(path: Path, *, out: Console | None = None, err: Console | None = None) -> int:
+    """Check the file at `path` and the files it names; print a summary, or one line an error. 0 if right, else 2."""
+    out = out or Console(highlight=False)
+    err = err or Console(stderr=True, highlight=False)
+    try:
+        document = read_document(path)
+        model = detect(document)
+        checked: Checked[FileModel] = check_document(document, path, model, files=True)
+    except ConfigError as error:
+        _lines(err, [str(error)])
+        return EXIT_USER_ERROR
+    if checked.loaded is None:
+        _lines(err, [str(error) for error in checked.errors])
+        return EXIT_USER_ERROR
+    loaded = checked.loaded
+    if isinstance(loaded.model, keys.SecretKeyFile):
+        warning = keys.secret_warning(path)
+        _lines(err, [f"warning: {warning}"] if warning else [])
+    _lines(err, [f"warning: {text}" for text in loaded.warnings])
+    _summary(out, loaded)
+    return EXIT_OK
+
+
+def detect(document: Document) -> type[FileModel]:
+    """What kind of file this is, by its keys; ConfigError when it is none of ours."""
+    data = document.data if isinstance(document.data, dict) else {}
+    if "sern_key" in data:
+        return _KEY_FILES.get(str(data["sern_key"]), keys.PublicKeyFile)
+    # A client file has a section `relay` too: its connection to the relay.
+    if "client" in data or "endpoint" in data:
+        return ClientFile
+    if "relay" in data:
+        return RelayFile
+    words = ("client", "endpoint", "relay", "sern_key")
+    close = [word for key in data for word in difflib.get_close_matches(key, words, n=1)]
+    hint = f" (did you mean {close[0]}?)" if close else ""
+    problem = (
+        f"neither a client file (client, relay, endpoint), nor a relay file (relay), nor a key file (sern_key){hint}"
+    )
+    raise document.error((), problem)
+
+
+def _lines(console: Console, lines: Iterable[str]) -> None:
+    for line in lines:
+        console.print(Text(line), soft_wrap=True)
+
+
+def _summary(out: Console, loaded: Loaded[FileModel]) -> None:
+    model = loaded.model
+    if isinstance(model, ClientFile):
+        _client_summary(out, model)
+    elif isinstance(model, RelayFile):
+        _relay_summary(out, model)
+    elif isinstance(model, keys.PublicKeyFile):
+        _lines(out, [f"public key file of {model.name}, {len(model.keys)} key(s)"])
+    elif isinstance(model, keys.SecretKeyFile):
+        _lines(out, [f"secret key file of {model.name}"])
+    _lines(out, [f"{loaded.path}: right"])
+
+
+def _client_summary(out: Console, model: ClientFile) -> None:
+    safety = "no encryption" if model.relay.insecure else "CURVE"
+    _lines(
+        out,
+        [
+            f"client {model.name}, namespace {model.namespace}",
+            f"relay {model.relay.endpoint} ({safety})",
+            *(f"endpoint {endpoint.kind}" for endpoint in model.endpoints),
+            f"discovery {model.discovery.mode}, scheduler {model.scheduler.ordering}, window {model.link.window.algorithm}",
+        ],
+    )
+    table = Table("#", "match", "class", "direction", "reliability", "lifespan s", "rate Hz", box=None, pad_edge=False)
+    for index, rule in enumerate(model.topics):
+        lifespan = "for ever" if rule.lifespan_s is None else str(rule.lifespan_s)
+        rate = "" if rule.max_rate_hz is None else f"{rule.max_rate_hz:g}"
+        cells = (str(index), rule.match, rule.priority, rule.direction, rule.reliability, lifespan, rate)
+        table.add_row(*(Text(cell) for cell in cells))
+    if model.topics:
+        out.print(table)
+    _lines(out, [f"subscribes to {pattern}" for pattern in model.subscribe_patterns()])
+
+
+def _relay_summary(out: Console, model: RelayFile) -> None:
+    safety = "no encryption" if model.relay.insecure else "CURVE"
+    _lines(
+        out,
+        [
+            f"relay {model.name}",
+            *(f"listens on {endpoint} ({safety})" for endpoint in model.relay.listen),
+            f"http {model.http.listen or 'off'}",
+        ],
+    )
+    table = Table("#", "client", "may publish", "may subscribe", box=None, pad_edge=False)
+    for index, rule in enumerate(model.access):
+        cells = (str(index), rule.client, " ".join(rule.publish), " ".join(rule.subscribe))
+        table.add_row(*(Text(cell) for cell in cells))
+    if model.access:
+        out.print(table)
+    else:
+        _lines(out, ["no access rules: nobody may do anything"])
+    _lines(out, [f"feed role {role.name} on {role.publish_endpoint}" for role in model.feed.roles])
+
+
+app = typer.Typer(help="Check a relay, client or key file without starting anything.")
+
+
+@app.callback(invoke_without_command=True)
+def check_command(file: Annotated[Path, typer.Argument(help="The file to check.")]) -> None:
+    """Check FILE and the files it names. Exit code 0 when it is right, 2 when it is not."""
+    raise typer.Exit(run_check(file))
+
+
+if __name__ == "__main__":
+    app()

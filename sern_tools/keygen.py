@@ -1,0 +1,96 @@
+"""`sern keygen relay NAME` and `sern keygen client NAME`: make a key pair, and say what to copy where."""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from sern_core.errors import ConfigError, SernError
+from sern_core.rules import client_name
+from sern_runtime import keys
+
+EXIT_USER_ERROR = 2
+
+Role = Literal["relay", "client"]
+
+
+def run_keygen(role: Role, name: str, *, out: Path = Path(), force: bool = False) -> str:
+    """Write `NAME.pub` and `NAME.key` into `out`, and return what the person should do next.
+
+    Raises UsageError for a bad name, ConfigError when a file exists (without `force`) or can not be written; then
+    nothing was written, or what was written is named.
+    """
+    owner = client_name(name)
+    public_path = out / f"{name}{keys.PUBLIC_SUFFIX}"
+    secret_path = out / f"{name}{keys.SECRET_SUFFIX}"
+    if not force:
+        for path in (public_path, secret_path):
+            if path.exists() or path.is_symlink():
+                raise ConfigError("exists already; --force replaces it (and locks out whoever uses it)", file=str(path))
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"can not be made: {error.strerror or error}", file=str(out)) from error
+    pair = keys.generate(owner)
+    keys.write_secret(secret_path, pair, replace=force)
+    keys.write_public(public_path, keys.PublicKeys(owner, (keys.PublicKey(pair.public_key),)), replace=force)
+    advice = _relay_advice if role == "relay" else _client_advice
+    return f"wrote {secret_path} (secret, mode 0600) and {public_path} (public)\n" + advice(
+        name, secret_path, public_path
+    )
+
+
+def _relay_advice(name: str, secret: Path, public: Path) -> str:
+    return f"""\
+Next:
+  1. Keep {secret.name} on the relay, and name it in relay.yaml:
+       relay: {{name: {name}, secret_key_file: {secret.name}, clients_dir: clients, ...}}
+  2. Copy {public.name} to every client, and name it in client.yaml:
+       relay: {{server_key_file: {public.name}, ...}}
+"""
+
+
+def _client_advice(name: str, secret: Path, public: Path) -> str:
+    return f"""\
+Next:
+  1. Keep {secret.name} on the client, and name it in client.yaml:
+       client: {{name: {name}}}
+       relay: {{secret_key_file: {secret.name}, ...}}
+  2. Copy {public.name} into the relay's clients_dir.
+  3. Grant it something in relay.yaml. This lets it publish its own topics and receive what others send it:
+       access:
+         - {{client: {name}, publish: ["/{{self}}/.*"], subscribe: ["/{{self}}/.*"]}}
+     and this is an operator who sees every topic and commands every robot:
+         - {{client: {name}, publish: [".*/cmd_vel"], subscribe: [".*"]}}
+"""
+
+
+app = typer.Typer(help="Make a CURVE key pair for a relay or a client.", no_args_is_help=True)
+
+_Name = Annotated[str, typer.Argument(help="Name: a lower-case letter, then up to 62 of a-z, 0-9, '_'.")]
+_Out = Annotated[Path, typer.Option("--out", help="Directory for the two files; made if it is not there.")]
+_Force = Annotated[bool, typer.Option("--force", help="Replace files that exist.")]
+
+
+def _command(role: Role, name: str, out: Path, force: bool) -> None:
+    try:
+        typer.echo(run_keygen(role, name, out=out, force=force), nl=False)
+    except SernError as error:
+        typer.echo(str(error), err=True)
+        raise typer.Exit(EXIT_USER_ERROR) from error
+
+
+@app.command("relay")
+def relay_command(name: _Name, out: _Out = Path(), force: _Force = False) -> None:
+    """Make the key pair of a relay."""
+    _command("relay", name, out, force)
+
+
+@app.command("client")
+def client_command(name: _Name, out: _Out = Path(), force: _Force = False) -> None:
+    """Make the key pair of a client."""
+    _command("client", name, out, force)
+
+
+if __name__ == "__main__":
+    app()
