@@ -1,0 +1,251 @@
+"""Clock offset, skew and their uncertainty from link pings, and the round-trip estimator of a hop.
+
+A ping leaves at t1 (local clock), arrives at t2 and is answered at t3 (peer's clock), and the answer arrives at t4
+(local clock). As in NTP (RFC 5905, section 8):
+
+    θ = ((t2−t1) + (t3−t4)) / 2        offset, peer's clock minus local clock
+    δ = (t4−t1) − (t3−t2)              round trip without the peer's processing time
+
+The offset that one ping shows is wrong by at most δ/2, whatever the asymmetry of the path. Queueing only ever adds
+to δ, so the ping of least δ among the last eight tells most (RFC 5905, section 10, the clock filter).
+
+Clocks also drift apart. The skew is the least-squares slope of those best offsets over 60 s. Its own uncertainty
+follows from how far each of them was above the least δ seen: the fixed part of the path delays every one alike and
+cancels in the slope. Skew is used only where it is known better than MAX_SKEW_PPM, the tolerance of any clock.
+
+Two offsets whose error bounds do not overlap cannot be of one pair of clocks: one of them was stepped (or suspended),
+and the estimate starts over from the newer one.
+"""
+
+import math
+from collections import deque
+from typing import Final, NamedTuple
+
+from sern_core.errors import UsageError
+
+FILTER_SAMPLES: Final = 8
+"""Stages of the clock filter (RFC 5905, section 7.2, NSTAGE)."""
+SKEW_WINDOW_S: Final = 60.0
+"""Span of the offsets that the skew is fitted to, and the greatest age of a sample in the filter."""
+MAX_SKEW_PPM: Final = 500.0
+"""Frequency tolerance that every clock keeps (RFC 5905, section 7.2, MAXFREQ: 500e-6 s/s)."""
+WANDER_PPM: Final = 15.0
+"""How fast a skew that is known may change (RFC 5905, section 7.2, PHI: 15e-6 s/s)."""
+MAX_FIT_POINTS: Final = 256
+"""Offsets kept for the skew; a faster ping rate thins them out by keeping only every new best one."""
+RTT_WINDOW_S: Final = 10.0
+"""Window of the least round-trip time."""
+RTT_GRANULARITY_S: Final = 0.001
+"""G of RFC 6298: the least margin of the retransmission timeout over the smoothed RTT."""
+MIN_RTO_S: Final = 0.1
+"""Least retransmission timeout; RFC 6298 says 1 s, which is long for a pose at 50 Hz."""
+MAX_RTO_S: Final = 60.0
+_PPM: Final = 1e-6
+
+
+class OneWayDelay(NamedTuple):
+    """A delay in seconds, and by how much it may be wrong either way; the true one is never negative."""
+
+    delay_s: float
+    uncertainty_s: float
+
+
+class _Sample(NamedTuple):
+    """One ping: local time of its middle, offset, round trip, and the bound of the offset's error."""
+
+    at_s: float
+    offset_s: float
+    rtt_s: float
+    bound_s: float
+
+
+class RttEstimator:
+    """Smoothed round-trip time and its variation (RFC 6298, section 2), and the least one over a window.
+
+    Before the first sample `srtt_s` and `rttvar_s` are 0, `min_s` is infinite and `rto_s` is 1 s (RFC 6298, 2.1).
+    """
+
+    __slots__ = ("_least", "_window_s", "latest_s", "rttvar_s", "samples", "srtt_s")
+
+    def __init__(self, *, window_s: float = RTT_WINDOW_S) -> None:
+        if not window_s > 0.0:
+            raise UsageError(f"RttEstimator: window_s is {window_s}; give a positive number of seconds")
+        self._window_s = window_s
+        self._least: deque[tuple[float, float]] = deque()  # (time, rtt), both rising: the first is the least
+        self.srtt_s = 0.0
+        self.rttvar_s = 0.0
+        self.latest_s = 0.0
+        self.samples = 0
+
+    def sample(self, rtt_s: float, *, now: float) -> None:
+        """Take one round-trip time; raises UsageError when it is negative or not finite."""
+        if not (rtt_s >= 0.0 and math.isfinite(rtt_s)):
+            raise UsageError(f"RttEstimator: a round-trip time of {rtt_s} s cannot be; measure it on one clock")
+        if self.samples:
+            self.rttvar_s += (abs(self.srtt_s - rtt_s) - self.rttvar_s) / 4.0
+            self.srtt_s += (rtt_s - self.srtt_s) / 8.0
+        else:
+            self.srtt_s = rtt_s
+            self.rttvar_s = rtt_s / 2.0
+        self.samples += 1
+        self.latest_s = rtt_s
+        least = self._least
+        while least and least[-1][1] >= rtt_s:
+            least.pop()
+        least.append((now, rtt_s))
+        while least[0][0] < now - self._window_s:
+            least.popleft()
+
+    @property
+    def min_s(self) -> float:
+        """The least sample of the window that ends at the newest sample."""
+        return self._least[0][1] if self._least else math.inf
+
+    @property
+    def rto_s(self) -> float:
+        """Retransmission timeout: SRTT + max(G, 4·RTTVAR), between MIN_RTO_S and MAX_RTO_S."""
+        if not self.samples:
+            return 1.0
+        return min(MAX_RTO_S, max(MIN_RTO_S, self.srtt_s + max(RTT_GRANULARITY_S, 4.0 * self.rttvar_s)))
+
+    def reset(self) -> None:
+        """Forget everything: the path is another one."""
+        self._least.clear()
+        self.srtt_s = self.rttvar_s = self.latest_s = 0.0
+        self.samples = 0
+
+
+class ClockSync:
+    """Offset and skew of one peer's clock. Local times are those of the caller's monotonic clock, in seconds.
+
+    Until the first sample `ready` is false, the offset is 0 and every uncertainty infinite.
+    """
+
+    def __init__(self) -> None:
+        self.rtt = RttEstimator()
+        self.rejected = 0
+        """Samples that no pair of clocks can give (not finite, negative times); a peer's fault, or a step between."""
+        self.steps = 0
+        """How often either clock was stepped."""
+        self._filter: deque[_Sample] = deque(maxlen=FILTER_SAMPLES)
+        self._best: _Sample | None = None
+        self._fit: deque[_Sample] = deque(maxlen=MAX_FIT_POINTS)
+        self._skew = 0.0
+        self._skew_bound = math.inf
+
+    def sample(self, t1: float, t2: float, t3: float, t4: float) -> bool:
+        """Take one ping: t1 and t4 local, t2 and t3 the peer's, in seconds. False when it was rejected."""
+        rtt_s = (t4 - t1) - (t3 - t2)
+        offset_s = ((t2 - t1) + (t3 - t4)) / 2.0
+        drift_s = MAX_SKEW_PPM * _PPM * (t4 - t1)
+        # The peer's processing time is measured on its clock, so a tiny round trip may come out below zero.
+        possible = math.isfinite(rtt_s) and math.isfinite(offset_s) and t4 >= t1 and t3 >= t2
+        if not possible or rtt_s < -drift_s - 1e-6:
+            self.rejected += 1
+            return False
+        rtt_s = max(0.0, rtt_s)
+        new = _Sample((t1 + t4) / 2.0, offset_s, rtt_s, rtt_s / 2.0 + drift_s)
+        best = self._best
+        if best is not None:
+            apart_s = abs(new.offset_s - best.offset_s)
+            if apart_s > new.bound_s + best.bound_s + MAX_SKEW_PPM * _PPM * abs(new.at_s - best.at_s):
+                self._restart()
+                self.steps += 1
+        self.rtt.sample(rtt_s, now=t4)
+        self._filter.append(new)
+        best = min(
+            (held for held in self._filter if held.at_s >= new.at_s - SKEW_WINDOW_S),
+            key=lambda held: (held.rtt_s, -held.at_s),
+        )
+        if best is not self._best:
+            self._best = best
+            self._fit_skew(best)
+        return True
+
+    def reset(self) -> None:
+        """Forget everything: the peer is another process, or the path another one. The counters stay."""
+        self._restart()
+        self.rtt.reset()
+
+    @property
+    def ready(self) -> bool:
+        return self._best is not None
+
+    @property
+    def offset_s(self) -> float:
+        """Peer's clock minus local clock at the best recent sample."""
+        return self._best.offset_s if self._best is not None else 0.0
+
+    @property
+    def error_s(self) -> float:
+        """Bound of the offset's error at that sample: half its round trip."""
+        return self._best.rtt_s / 2.0 if self._best is not None else math.inf
+
+    @property
+    def skew_ppm(self) -> float:
+        """How much faster the peer's clock runs, in parts per million; 0 until it is known well enough."""
+        return self._skew / _PPM
+
+    @property
+    def skew_error_ppm(self) -> float:
+        """Bound of the skew's error, MAX_SKEW_PPM while the skew is unknown."""
+        return min(self._skew_bound / _PPM, MAX_SKEW_PPM)
+
+    def offset_at(self, local_s: float) -> tuple[float, float]:
+        """Offset at a local time, and its uncertainty, which grows with the distance from the best sample."""
+        best = self._best
+        if best is None:
+            return 0.0, math.inf
+        away_s = local_s - best.at_s
+        rate = MAX_SKEW_PPM * _PPM
+        if math.isfinite(self._skew_bound):
+            rate = min(rate, self._skew_bound + WANDER_PPM * _PPM)
+        return best.offset_s + self._skew * away_s, best.bound_s + rate * abs(away_s)
+
+    def to_local_s(self, peer_s: float) -> tuple[float, float]:
+        """A time on the peer's clock as local time, and its uncertainty."""
+        # The offset changes by parts per million: that of about the right moment is the right one.
+        near_s = peer_s - self.offset_s
+        offset_s, uncertainty_s = self.offset_at(near_s)
+        return peer_s - offset_s, uncertainty_s
+
+    def one_way_delay_s(self, sent_peer_s: float, received_local_s: float) -> OneWayDelay:
+        """How long something was under way that left at `sent_peer_s` (peer's clock); (0, inf) before any sample.
+
+        Add both parts to an age that must not be judged too young.
+        """
+        sent_local_s, uncertainty_s = self.to_local_s(sent_peer_s)
+        if math.isinf(uncertainty_s):
+            return OneWayDelay(0.0, math.inf)
+        return OneWayDelay(max(0.0, received_local_s - sent_local_s), uncertainty_s)
+
+    def _restart(self) -> None:
+        self._filter.clear()
+        self._fit.clear()
+        self._best = None
+        self._skew = 0.0
+        self._skew_bound = math.inf
+
+    def _fit_skew(self, newest: _Sample) -> None:
+        fit = self._fit
+        fit.append(newest)
+        while fit[0].at_s < newest.at_s - SKEW_WINDOW_S:
+            fit.popleft()
+        # Times and offsets relative to the newest point: the clocks' absolute values would eat the digits.
+        count = len(fit)
+        mean_t = sum(point.at_s - newest.at_s for point in fit) / count
+        mean_o = sum(point.offset_s - newest.offset_s for point in fit) / count
+        least_s = min(point.rtt_s for point in fit)
+        spread = slope = error = 0.0
+        for point in fit:
+            t = point.at_s - newest.at_s - mean_t
+            spread += t * t
+            slope += t * (point.offset_s - newest.offset_s - mean_o)
+            # Noise of this offset beyond the path's fixed asymmetry, and drift while the ping was under way.
+            error += abs(t) * ((point.rtt_s - least_s) / 2.0 + point.bound_s - point.rtt_s / 2.0)
+        if spread > 0.0 and error < MAX_SKEW_PPM * _PPM * spread and abs(slope) <= MAX_SKEW_PPM * _PPM * spread:
+            self._skew = slope / spread
+            self._skew_bound = error / spread
+        else:
+            self._skew = 0.0
+            self._skew_bound = math.inf
