@@ -89,7 +89,9 @@ class SimulatedJackal:
         self._patrol_period_s = random.uniform(22.0, 28.0)
         self._steps = 0
         self._driven_mps = 0.0  # what the wheels would give on free ground
+        # Motion and sensors draw apart, so that what is looked at does not change where the robot goes.
         self._random = random
+        self._sensor_random = Random(random.getrandbits(64))
         # numpy's generator, seeded from the one handed in: thousands of points need their noise at once.
         self._noise = np.random.default_rng(random.getrandbits(64))
 
@@ -142,12 +144,12 @@ class SimulatedJackal:
         side = 1.0 if (time_s % self._patrol_period_s) < self._patrol_period_s / 2 else -1.0
         return self._patrol_speed_mps, side * 4 * math.pi / self._patrol_period_s
 
-    # Sensors: each reads the present state; noise comes from the seed, in the order of the calls
+    # Sensors: each reads the present state; their noise is seeded too, in the order of the calls
 
     def imu(self) -> tuple[float, float, float]:
         """(yaw rate rad/s, forward and leftward acceleration m/s²), with bias and noise."""
         state = self.state
-        gauss = self._random.gauss
+        gauss = self._sensor_random.gauss
         return (
             state.yaw_rate_radps + self._gyro_bias_radps + gauss(0.0, GYRO_NOISE_RADPS),
             state.accel_mps2 + gauss(0.0, ACCEL_NOISE_MPS2),

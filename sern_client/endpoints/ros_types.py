@@ -20,7 +20,7 @@ from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, TypesysError, get_types_from_idl, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from sern_core.errors import ConfigError
+from sern_core.errors import ConfigError, UsageError
 from sern_core.message import TopicInfo
 from sern_core.types import Encoding, TopicName
 
@@ -162,11 +162,26 @@ def deserialise(body: bytes, type_name: str, encoding: Encoding) -> Any:
 
 
 def new(type_name: str, encoding: Encoding, **fields: Any) -> Any:
-    """A message object of this type, zero in every field but those given by name."""
+    """A message object of this type, zero in every field but those given by name. UsageError for an unknown field."""
     store = typestore(encoding)
     definition = store.fielddefs[type_name][1]
+    if fields and not fields.keys() <= {name for name, _ in definition}:
+        raise UsageError(f"{type_name} has no field {sorted(fields.keys() - {name for name, _ in definition})}")
     values = {name: fields[name] if name in fields else _zero(desc, encoding) for name, desc in definition}
     return store.types[type_name](**values)
+
+
+def time_of(stamp_ns: int, encoding: Encoding) -> Any:
+    """A builtin_interfaces/Time (ROS 1 `time`)."""
+    return new("builtin_interfaces/msg/Time", encoding, sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
+
+
+def header(stamp_ns: int, frame_id: str, encoding: Encoding, seq: int = 0) -> Any:
+    """A std_msgs/Header; `seq` exists in ROS 1 only."""
+    fields: dict[str, Any] = {"stamp": time_of(stamp_ns, encoding), "frame_id": frame_id}
+    if encoding is Encoding.ROS1:
+        fields["seq"] = seq
+    return new("std_msgs/msg/Header", encoding, **fields)
 
 
 def zero_message(type_name: str, encoding: Encoding) -> bytes | None:

@@ -1,0 +1,160 @@
+"""Several endpoints as one: topics from any of them, publications to all that accept them."""
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+from sern_client.endpoints.base import Endpoint, Publisher, Sink, Subscription, TopicEvents
+from sern_core.errors import ConfigError, UsageError
+from sern_core.message import TopicInfo
+from sern_core.types import TopicName
+
+_LOG = logging.getLogger(__name__)
+
+
+@dataclass(slots=True, eq=False)
+class _Joined:
+    """One subscription of the daemon: a subscription at every member that gives the topic."""
+
+    name: TopicName
+    sink: Sink
+    owner: "CompositeEndpoint"
+    parts: dict[int, Subscription] = field(default_factory=dict)
+
+    def close(self) -> None:
+        self.owner.forget(self)
+        for part in self.parts.values():
+            part.close()
+        self.parts.clear()
+
+
+class _Members:
+    """The `TopicEvents` handed to one member."""
+
+    def __init__(self, owner: "CompositeEndpoint", index: int) -> None:
+        self._owner = owner
+        self._index = index
+
+    def topic_added(self, info: TopicInfo) -> None:
+        self._owner.member_added(self._index, info)
+
+    def topic_removed(self, name: TopicName) -> None:
+        self._owner.member_removed(self._index, name)
+
+
+class _Publishers:
+    def __init__(self, publishers: list[Publisher]) -> None:
+        self._publishers = publishers
+
+    def publish(self, body: bytes, stamp_ns: int) -> None:
+        for publisher in self._publishers:
+            publisher.publish(body, stamp_ns)
+
+    def close(self) -> None:
+        for publisher in self._publishers:
+            publisher.close()
+
+
+class CompositeEndpoint:
+    """An `Endpoint` made of others, which it starts and stops.
+
+    A topic that several members give is announced once, as the first of them describes it, and removed with the last;
+    a member that gives it with another type or encoding is left out of it, with a warning.
+    """
+
+    def __init__(self, endpoints: Sequence[Endpoint]) -> None:
+        if not endpoints:
+            raise UsageError("a composite endpoint needs at least one member")
+        self._members = list(endpoints)
+        self._events: TopicEvents | None = None
+        self._started: list[Endpoint] = []
+        self._givers: dict[TopicName, dict[int, TopicInfo]] = {}  # members in the order they announced
+        self._joined: list[_Joined] = []
+
+    async def start(self, events: TopicEvents) -> None:
+        """Starts the members in order; if one fails, those already started are stopped and its error is raised."""
+        self._events = events
+        try:
+            for index, member in enumerate(self._members):
+                await member.start(_Members(self, index))
+                self._started.append(member)
+        except BaseException:
+            await self.stop()
+            raise
+
+    async def stop(self) -> None:
+        """Stops every member, the last first, also when one of them fails; then raises the first failure."""
+        failure: Exception | None = None
+        while self._started:
+            try:
+                await self._started.pop().stop()
+            except Exception as error:  # noqa: BLE001  the others must be stopped too; raised below
+                failure = failure or error
+        if failure is not None:
+            raise failure
+
+    def subscribe(self, name: TopicName, sink: Sink) -> Subscription:
+        if name not in self._givers:
+            raise UsageError(f"{name}: no endpoint announced such a topic")
+        joined = _Joined(name, sink, self)
+        self._joined.append(joined)
+        for index in self._givers[name]:
+            joined.parts[index] = self._members[index].subscribe(name, sink)
+        return joined
+
+    def advertise(self, info: TopicInfo) -> Publisher:
+        """At every member that takes it. ConfigError, with every reason, when none does."""
+        publishers: list[Publisher] = []
+        refusals: list[ConfigError] = []
+        for member in self._members:
+            try:
+                publishers.append(member.advertise(info))
+            except ConfigError as error:
+                refusals.append(error)
+        if publishers:
+            return _Publishers(publishers)
+        if len(refusals) == 1:
+            raise refusals[0]
+        raise ConfigError("; ".join(dict.fromkeys(str(error) for error in refusals)))
+
+    @property
+    def exhausted(self) -> bool:
+        return all(member.exhausted for member in self._members)
+
+    # For the parts of this module
+
+    def member_added(self, index: int, info: TopicInfo) -> None:
+        assert self._events is not None
+        givers = self._givers.setdefault(info.name, {})
+        if not givers or set(givers) == {index}:
+            givers[index] = info
+            self._events.topic_added(info)
+            return
+        first = next(iter(givers.values()))
+        if (info.type_name, info.encoding) != (first.type_name, first.encoding):
+            _LOG.warning(
+                "%s: two endpoints give it, as %s (%s) and as %s (%s); the second is left out",
+                info.name, first.type_name, first.encoding, info.type_name, info.encoding,
+            )  # fmt: skip
+            return
+        known = index in givers
+        givers[index] = info
+        for joined in self._joined:
+            if joined.name == info.name and not known:
+                joined.parts[index] = self._members[index].subscribe(info.name, joined.sink)
+
+    def member_removed(self, index: int, name: TopicName) -> None:
+        assert self._events is not None
+        givers = self._givers.get(name, {})
+        if givers.pop(index, None) is None:
+            return
+        for joined in self._joined:
+            if joined.name == name and (part := joined.parts.pop(index, None)) is not None:
+                part.close()
+        if not givers:
+            del self._givers[name]
+            self._events.topic_removed(name)
+
+    def forget(self, joined: _Joined) -> None:
+        if joined in self._joined:
+            self._joined.remove(joined)
