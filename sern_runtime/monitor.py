@@ -1,0 +1,474 @@
+"""What happens to connections: libzmq's socket monitor, and the TCP socket underneath.
+
+libzmq owns its file descriptors and closes them when it likes, so a number from an event may be reused by the time
+it is read. `TcpHandle` therefore keeps the number *and* the inode of the socket; each use duplicates the number,
+compares the inode of the duplicate, acts on it and closes it. No duplicate is kept, as it would keep the connection
+open after libzmq closed it.
+"""
+
+import asyncio
+import errno
+import logging
+import os
+import socket as socketlib
+import stat
+import struct
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from itertools import count
+from typing import Final, NamedTuple
+
+import zmq
+
+from sern_runtime.zmq_socket import HANDSHAKE_IVL_MS, FrameSocket
+
+EventKind = zmq.Event
+EVENTS: Final = int(
+    EventKind.CONNECTED
+    | EventKind.CONNECT_RETRIED
+    | EventKind.ACCEPTED
+    | EventKind.ACCEPT_FAILED
+    | EventKind.CLOSED
+    | EventKind.DISCONNECTED
+    | EventKind.HANDSHAKE_SUCCEEDED
+    | EventKind.HANDSHAKE_FAILED_AUTH
+    | EventKind.HANDSHAKE_FAILED_PROTOCOL
+    | EventKind.HANDSHAKE_FAILED_NO_DETAIL
+)
+TCP_RTO_MAX_MS: Final = 44
+"""Linux 6.15 and later; not yet in the socket module."""
+RTO_MAX_MS: Final = 1000
+"""Bounds the kernel's backoff in a blackout: a fresh pose 0.65 s after 30 s without a link, instead of 7.1 s."""
+
+_log = logging.getLogger(__name__)
+_monitor_numbers = count(1)
+_EVENT: Final = struct.Struct("=HI")
+_TCP_INFO: Final = struct.Struct("=8x24I2Q2Q6IQ")  # struct tcp_info up to tcpi_delivery_rate
+
+
+class MonitorEvent(NamedTuple):
+    """One event. `value` is the fd for CONNECTED, ACCEPTED, CLOSED and DISCONNECTED; the ZAP status for
+    HANDSHAKE_FAILED_AUTH; an errno or libzmq's protocol error number for the other failures; 0 for
+    HANDSHAKE_SUCCEEDED, which does not say whose."""
+
+    kind: EventKind
+    value: int
+    endpoint: str
+
+
+class SocketMonitor:
+    """Reads a socket's monitor in the running loop. Close it before the socket. Attach it before connect or bind."""
+
+    def __init__(
+        self, socket: "zmq.Socket[bytes]", on_event: Callable[[MonitorEvent], None], *, events: int = EVENTS
+    ) -> None:
+        self._watched = socket
+        self._on_event = on_event
+        address = f"inproc://sern.monitor.{next(_monitor_numbers)}"
+        socket.monitor(address, events)
+        pair = socket.context.socket(zmq.PAIR)
+        pair.setsockopt(zmq.RCVHWM, 0)  # libzmq drops events at the mark; the count of connections must stay right
+        pair.connect(address)
+        self._socket = FrameSocket(pair, self._on_frames)
+
+    def close(self) -> None:
+        """Idempotent. Events that were not read are lost."""
+        if not self._watched.closed and not self._socket.closed:
+            self._watched.disable_monitor()
+        self._socket.close()
+
+    def drain(self) -> None:
+        """Deliver what has arrived, now."""
+        self._socket.drain()
+
+    def _on_frames(self, frames: list[zmq.Frame]) -> None:
+        if len(frames) != 2:
+            return
+        number, value = _EVENT.unpack(frames[0].bytes)
+        self._on_event(MonitorEvent(EventKind(number), value, frames[1].bytes.decode("utf-8", "replace")))
+
+
+@dataclass(frozen=True, slots=True)
+class TcpInfo:
+    """The part of Linux's struct tcp_info that SERN reads."""
+
+    rtt_s: float
+    rttvar_s: float
+    min_rtt_s: float
+    unacked_segments: int
+    lost_segments: int
+    retransmitted_segments: int  # since the connection began
+    sent_segments: int  # data segments since the connection began
+    congestion_window_segments: int
+    unsent_bytes: int  # in the send buffer, not yet handed to the network
+    delivery_rate_bps: int
+
+
+class TcpHandle:
+    """A TCP socket that belongs to libzmq. Every method answers None or False once the connection is gone."""
+
+    __slots__ = ("fd", "inode", "local", "peer")
+
+    def __init__(self, fd: int, inode: int, local: tuple[str, int], peer: tuple[str, int]) -> None:
+        self.fd = fd
+        self.inode = inode
+        self.local = local
+        self.peer = peer
+
+    @classmethod
+    def of(cls, fd: int, *, local_port: int | None = None, peer_port: int | None = None) -> "TcpHandle | None":
+        """A handle on `fd`, or None when it is no connected TCP socket (any more), or is one with other ports.
+
+        Give the port that is known (of the endpoint listened on, or connected to): the event may be late and the
+        number reused meanwhile.
+        """
+        try:
+            duplicate = os.dup(fd)
+        except OSError:
+            return None
+        try:
+            status = os.fstat(duplicate)
+            if not stat.S_ISSOCK(status.st_mode):
+                return None
+            with socketlib.socket(fileno=os.dup(duplicate)) as connection:
+                if connection.family not in (socketlib.AF_INET, socketlib.AF_INET6):
+                    return None
+                local, peer = connection.getsockname()[:2], connection.getpeername()[:2]
+        except OSError:
+            return None
+        finally:
+            os.close(duplicate)
+        if local_port not in (None, local[1]) or peer_port not in (None, peer[1]):
+            return None
+        return cls(fd, status.st_ino, local, peer)
+
+    def info(self) -> TcpInfo | None:
+        """The kernel's view of the connection (TCP_INFO)."""
+        with self._connection() as connection:
+            if connection is None:
+                return None
+            raw = connection.getsockopt(socketlib.IPPROTO_TCP, socketlib.TCP_INFO, 256)
+        return _parse_tcp_info(raw)
+
+    def congestion(self) -> str | None:
+        """The name of the congestion control, for example `cubic`."""
+        with self._connection() as connection:
+            if connection is None:
+                return None
+            raw = connection.getsockopt(socketlib.IPPROTO_TCP, socketlib.TCP_CONGESTION, 16)
+        return raw.rstrip(b"\0").decode("ascii", "replace")
+
+    def set_congestion(self, name: str) -> bool:
+        """Choose the congestion control. False when the kernel does not have it or does not allow it."""
+        return self._set(socketlib.TCP_CONGESTION, name.encode())
+
+    def set_user_timeout(self, timeout_s: float) -> bool:
+        """Give the connection up when data stays unacknowledged this long (RFC 5482)."""
+        return self._set(socketlib.TCP_USER_TIMEOUT, round(timeout_s * 1000))
+
+    def set_rto_max(self, rto_max_ms: int = RTO_MAX_MS) -> bool:
+        """Bound the retransmission timeout. False on kernels before 6.15, which is no error."""
+        return self._set(TCP_RTO_MAX_MS, rto_max_ms)
+
+    def cut(self) -> bool:
+        """End the connection now, both ways; libzmq notices and cleans up. False when it is gone already."""
+        with self._connection() as connection:
+            if connection is None:
+                return False
+            with suppress(OSError):
+                connection.shutdown(socketlib.SHUT_RDWR)
+            return True
+
+    def _set(self, option: int, value: int | bytes) -> bool:
+        with self._connection() as connection:
+            if connection is None:
+                return False
+            try:
+                connection.setsockopt(socketlib.IPPROTO_TCP, option, value)
+            except OSError as error:
+                if error.errno not in (errno.ENOPROTOOPT, errno.ENOENT, errno.EPERM, errno.EINVAL):
+                    raise
+                return False
+            return True
+
+    @contextmanager
+    def _connection(self) -> Iterator[socketlib.socket | None]:
+        """The connection through a duplicate that lives as long as the block; None when it is gone."""
+        try:
+            duplicate = os.dup(self.fd)
+        except OSError:
+            yield None
+            return
+        if os.fstat(duplicate).st_ino != self.inode:
+            os.close(duplicate)
+            yield None
+            return
+        with socketlib.socket(fileno=duplicate) as connection:
+            yield connection
+
+
+def _parse_tcp_info(raw: bytes) -> TcpInfo:
+    """Fields by position in struct tcp_info (linux/tcp.h); kernels that know fewer give zeros."""
+    fields = _TCP_INFO.unpack_from(raw.ljust(_TCP_INFO.size, b"\0"))
+    return TcpInfo(
+        rtt_s=fields[15] / 1e6,
+        rttvar_s=fields[16] / 1e6,
+        min_rtt_s=fields[31] / 1e6,
+        unacked_segments=fields[4],
+        lost_segments=fields[6],
+        retransmitted_segments=fields[23],
+        sent_segments=fields[33],
+        congestion_window_segments=fields[18],
+        unsent_bytes=fields[30],
+        delivery_rate_bps=fields[34] * 8,
+    )
+
+
+def port_of(endpoint: str) -> int | None:
+    """The port of a tcp endpoint, None for others."""
+    if endpoint.startswith("tcp://"):
+        with suppress(ValueError):
+            return int(endpoint.rpartition(":")[2])
+    return None
+
+
+class TransportWatch:
+    """A client's transport in three calls.
+
+    `on_up(handle)` after the handshake (`handle` None on ipc); `on_down(reason)` when a transport that was up is
+    gone, or an attempt failed for a new reason; `on_rebuild(reason)` when libzmq has given up for good (the relay
+    said 400, or does not speak our protocol), so that the caller makes a new socket, with jittered backoff.
+    """
+
+    def __init__(
+        self,
+        socket: "zmq.Socket[bytes]",
+        on_up: Callable[[TcpHandle | None], None],
+        on_down: Callable[[str], None],
+        on_rebuild: Callable[[str], None],
+    ) -> None:
+        self.up = False
+        self.reason = "not connected yet"
+        self._on_up = on_up
+        self._on_down = on_down
+        self._on_rebuild = on_rebuild
+        self._handle: TcpHandle | None = None
+        self._shaking = False
+        self._monitor = SocketMonitor(socket, self._on_event)
+
+    def close(self) -> None:
+        """Before the socket. Idempotent."""
+        self._monitor.close()
+
+    def _on_event(self, event: MonitorEvent) -> None:
+        match event.kind:
+            case EventKind.CONNECTED:
+                self._shaking = True
+                self._handle = TcpHandle.of(event.value, peer_port=port_of(event.endpoint))
+            case EventKind.HANDSHAKE_SUCCEEDED:
+                self._shaking = False
+                self.up = True
+                self.reason = ""
+                self._on_up(self._handle)
+            case EventKind.HANDSHAKE_FAILED_AUTH:
+                self._shaking = False
+                self._refused(event.value)
+            case EventKind.HANDSHAKE_FAILED_PROTOCOL:
+                self._shaking = False
+                self._give_up(_protocol_problem(event.value))
+            case EventKind.HANDSHAKE_FAILED_NO_DETAIL:
+                self._shaking = False
+                self._down(_NO_HANDSHAKE)
+            case EventKind.DISCONNECTED if self._shaking:
+                self._shaking = False
+                self._down(_NO_HANDSHAKE)
+            case EventKind.DISCONNECTED if self.up:
+                self._down("the connection to the relay was lost")
+            case EventKind.CLOSED if not self.up:
+                self._down("the relay does not answer: connecting failed")
+            case _:
+                pass
+
+    def _refused(self, status: int) -> None:
+        if status == _ZAP_UNKNOWN_KEY:
+            self._give_up("relay refused our key: it is not in the relay's directory, or has expired")
+        else:  # libzmq 4.3 says nothing to the client in this case and lets the handshake time out
+            self._down("relay refused us for now: it is full or being reconfigured")
+
+    def _give_up(self, reason: str) -> None:
+        self._down(reason)
+        self._on_rebuild(reason)
+
+    def _down(self, reason: str) -> None:
+        if self.up or reason != self.reason:
+            self.up = False
+            self.reason = reason
+            self._on_down(reason)
+
+
+_ZAP_UNKNOWN_KEY: Final = 400
+_MECHANISM_MISMATCH: Final = 0x11000002  # ZMQ_PROTOCOL_ERROR_ZMTP_MECHANISM_MISMATCH
+_NO_HANDSHAKE: Final = (
+    "the relay ended the handshake: its key is not the one in server_key_file, it is full, or this is no SERN relay"
+)
+
+
+def _protocol_problem(code: int) -> str:
+    if code == _MECHANISM_MISMATCH:
+        return "the handshake with the relay failed: one side has keys configured and the other has not"
+    return f"the handshake with the relay failed (libzmq protocol error {code:#x}): is this a SERN relay?"
+
+
+@dataclass(slots=True)
+class Connection:
+    """One accepted connection. `user` is empty until `ConnectionTable.bind_user`."""
+
+    handle: TcpHandle | None
+    source: str
+    user: str = ""
+
+
+class ConnectionTable:
+    """The accepted connections of a server socket, by fd: caps, and cutting a user off.
+
+    Half-open connections are capped by source address and in all, connections in all too; what comes above a cap is
+    cut at once and counted in `capped`. A cap of 0 means none. libzmq does not say which connection finished its
+    handshake, but it ends those that did not after HANDSHAKE_IVL: so a connection is half-open until `bind_user`,
+    or until it is older than that.
+    """
+
+    def __init__(
+        self,
+        socket: "zmq.Socket[bytes]",
+        *,
+        max_half_open_per_source: int = 32,
+        max_half_open: int = 256,
+        max_connections: int = 1024,
+        on_change: Callable[[], None] | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self.capped = 0
+        self.accepted = 0
+        self.accept_failed = 0
+        self.handshake_failed = 0
+        self.max_half_open_per_source = max_half_open_per_source
+        self.max_half_open = max_half_open
+        self.max_connections = max_connections
+        self._connections: dict[int, Connection] = {}
+        self._half_open_until_s: dict[int, float] = {}  # by fd, oldest first
+        self._half_open_by_source: Counter[str] = Counter()
+        self._on_change = on_change
+        self._clock = clock
+        self._monitor = SocketMonitor(socket, self._on_event)
+
+    def close(self) -> None:
+        """Before the socket. Idempotent."""
+        self._monitor.close()
+
+    def __len__(self) -> int:
+        return len(self._connections)
+
+    @property
+    def half_open(self) -> int:
+        self._expire()
+        return len(self._half_open_until_s)
+
+    def by_fd(self, fd: int) -> Connection | None:
+        return self._connections.get(fd)
+
+    def bind_user(self, fd: int, user: str) -> None:
+        """Remember whose connection this is; `fd` and `user` from a frame that came over it."""
+        connection = self._connections.get(fd)
+        if connection is None:  # the frame overtook its event
+            self._monitor.drain()
+            connection = self._connections.get(fd)
+        if connection is not None:
+            connection.user = user
+            self._not_half_open(fd, connection)
+
+    def handles_of(self, user: str) -> list[TcpHandle]:
+        return [c.handle for c in self._connections.values() if c.user == user and c.handle is not None]
+
+    def cut_user(self, user: str) -> int:
+        """End every connection of a user; returns how many."""
+        return sum(handle.cut() for handle in self.handles_of(user))
+
+    def _on_event(self, event: MonitorEvent) -> None:
+        match event.kind:
+            case EventKind.ACCEPTED:
+                self._accepted(event)
+            case EventKind.DISCONNECTED | EventKind.CLOSED:
+                self._gone(event.value)
+            case EventKind.ACCEPT_FAILED:
+                self.accept_failed += 1
+                _log.warning("a connection could not be accepted: %s", os.strerror(event.value))
+            case EventKind.HANDSHAKE_SUCCEEDED:
+                pass
+            case _:
+                self.handshake_failed += 1
+        if self._on_change is not None:
+            self._on_change()
+
+    def _accepted(self, event: MonitorEvent) -> None:
+        fd = event.value
+        self._gone(fd)  # a number in use again means that its connection ended, whatever we were told
+        self.accepted += 1
+        handle = TcpHandle.of(fd, local_port=port_of(event.endpoint))
+        source = handle.peer[0] if handle is not None else ""
+        self._connections[fd] = Connection(handle, source)
+        self._expire()
+        self._half_open_until_s[fd] = self._clock() + HANDSHAKE_IVL_MS / 1000
+        self._half_open_by_source[source] += 1
+        if handle is not None and self._above_cap(source):
+            self.capped += 1
+            handle.cut()
+
+    def _above_cap(self, source: str) -> bool:
+        return any(
+            cap and value > cap
+            for cap, value in (
+                (self.max_half_open_per_source, self._half_open_by_source[source]),
+                (self.max_half_open, len(self._half_open_until_s)),
+                (self.max_connections, len(self._connections)),
+            )
+        )
+
+    def _expire(self) -> None:
+        now_s = self._clock()
+        while self._half_open_until_s:
+            fd, until_s = next(iter(self._half_open_until_s.items()))
+            if until_s > now_s:
+                break
+            self._not_half_open(fd, self._connections[fd])
+
+    def _gone(self, fd: int) -> None:
+        connection = self._connections.pop(fd, None)
+        if connection is not None:
+            self._not_half_open(fd, connection)
+
+    def _not_half_open(self, fd: int, connection: Connection) -> None:
+        if self._half_open_until_s.pop(fd, None) is not None:
+            self._half_open_by_source[connection.source] -= 1
+            if not self._half_open_by_source[connection.source]:
+                del self._half_open_by_source[connection.source]
+
+
+async def wait_for_event(
+    socket: "zmq.Socket[bytes]", wanted: Callable[[MonitorEvent], bool], *, timeout_s: float
+) -> MonitorEvent:
+    """The next event that `wanted` accepts. TimeoutError when none comes. For checks at start and for tests."""
+    found: asyncio.Future[MonitorEvent] = asyncio.get_running_loop().create_future()
+
+    def on_event(event: MonitorEvent) -> None:
+        if not found.done() and wanted(event):
+            found.set_result(event)
+
+    monitor = SocketMonitor(socket, on_event)
+    try:
+        async with asyncio.timeout(timeout_s):
+            return await found
+    finally:
+        monitor.close()

@@ -1,0 +1,576 @@
+"""Plain ZeroMQ sockets in the event loop, and the options every SERN socket gets.
+
+`zmq.asyncio` costs about 25 µs a message in futures; a plain socket whose file descriptor is watched and which is
+drained without blocking costs 1–2 µs. Its price is one rule, kept by `DrainedSocket` and nowhere else:
+
+    ZMQ_FD is edge-triggered. It becomes readable when something *may* have changed, and not again before
+    everything was taken. So: receive until EAGAIN; when the batch is capped, `call_soon` for the rest; look again
+    after a send (sending consumes edges too); and look anyway every `TICK_S`, so that a missed edge is a delay.
+
+    RouterSocket   [routing id, body] from many peers; every message with the CURVE identity of its sender
+    DealerSocket   [body] from one peer
+    FrameSocket    any number of frames, as zmq.Frame: ZAP, monitors, the feed
+
+Routing ids and identity: clients set no routing id, and a name is never taken from one. The sender of a message is
+the `User-Id` that the ZAP handler gave to its connection, and it is read from every message. It could be remembered
+per routing id, as libzmq never gives an automatic id twice, but a peer may *claim* an id: once the connection that
+had it is gone, ROUTER_HANDOVER=0 no longer stands in the way, and a remembered name would be inherited. Reading it
+costs 0.3 µs of about 1.1 µs a message (measured, 1 kB); nothing is remembered, nothing can be inherited. Messages of
+peers that claim a routing id at all are refused.
+"""
+
+import asyncio
+import errno
+import ipaddress
+import logging
+from collections.abc import Callable, Sequence
+from enum import Enum
+from typing import Final, NamedTuple, Protocol
+
+import zmq
+
+from sern_core.errors import ConfigError, UsageError
+
+HEARTBEAT_IVL_MS: Final = 500
+"""A ZMTP ping twice a second: keeps NAT bindings, and finds a dead TCP connection within the timeout."""
+HEARTBEAT_TIMEOUT_MS: Final = 5000
+"""Default for how long a silent connection is believed; to be derived from the path's RTT where that is known. Loss
+of the *link* is decided by the core's stall rule, which is faster; this only clears away the connection."""
+CONNECT_TIMEOUT_MS: Final = 3000
+"""A SYN that is lost in a blackout would else wait for the kernel's minutes of backoff."""
+HANDSHAKE_IVL_MS: Final = 10_000
+"""The first message of CURVE needs about 4 RTT: 2 s never connects over 600 ms RTT. Half-open connections are bounded
+by `sern_runtime.monitor.ConnectionTable` instead of by haste."""
+RECONNECT_IVL_MS: Final = 100
+RECONNECT_IVL_MAX_MS: Final = 500
+"""Short: after an outage the first fresh pose waits for this. A storm of clients is spread by CURVE's cost."""
+SNDHWM: Final = 16
+"""Messages that may wait in a pipe: few, because what waits there can no longer be overtaken."""
+RCVHWM: Final = 256
+"""Messages of one peer that may wait for us: with MAX_MESSAGE_BYTES it bounds what a peer can make us hold."""
+MAX_MESSAGE_BYTES: Final = 64 * 1024
+"""Frames above it close the connection. Without it eight unauthenticated connections cost 479 MB (measured)."""
+BACKLOG: Final = 512
+TOS_EXPEDITED: Final = 0xB8
+"""DSCP EF, for the connection that carries class 0 alone."""
+
+BATCH: Final = 200
+"""Messages taken in one callback, about 0.3 ms: others in the loop get their turn."""
+TICK_S: Final = 0.2
+ZERO_COPY_BYTES: Final = 32 * 1024
+"""Bodies from this size on are sent without a copy (measured: it pays above 16–64 kB)."""
+
+AUTO_ROUTING_ID_BYTES: Final = 5  # a zero byte and a counter of 32 bits, libzmq's router.cpp
+
+_log = logging.getLogger(__name__)
+_NOBLOCK: Final = int(zmq.NOBLOCK)
+_SNDMORE: Final = int(zmq.SNDMORE)
+_NOBLOCK_MORE: Final = _NOBLOCK | _SNDMORE
+
+
+class SendResult(Enum):
+    """What became of a send. True only for OK."""
+
+    OK = "ok"  # libzmq took it; that is no delivery receipt
+    FULL = "full"  # high-water mark, or nobody connected yet (EAGAIN); `on_writable` tells when to try again
+    GONE = "gone"  # the routing id names no connection (EHOSTUNREACH)
+
+    def __bool__(self) -> bool:
+        return self is SendResult.OK
+
+
+class CurvePair(Protocol):
+    """A CURVE key pair, Z85 text."""
+
+    @property
+    def public_key(self) -> str: ...
+
+    @property
+    def secret_key(self) -> str: ...
+
+
+class PeerDetails(NamedTuple):
+    """Where the message being handled came from. `fd` is libzmq's: use `sern_runtime.monitor.TcpHandle` on it."""
+
+    address: str
+    fd: int
+
+
+def _raise_if_alive(socket: "zmq.Socket[bytes]", error: zmq.ZMQError) -> None:
+    """Swallow an error that only says that a handler closed the socket under the drain loop."""
+    if not (socket.closed or error.errno in (zmq.ETERM, zmq.ENOTSOCK)):
+        raise error
+
+
+class DrainedSocket:
+    """A socket in the running loop. Subclasses say what a message looks like in `_take`.
+
+    All calls on the loop's thread. `close()` once; it closes the socket too (linger 0). `on_writable` is called once
+    after a FULL send, when libzmq reports any change: try again, and be told FULL again if it was another one.
+    A handler that raises is reported by the loop's exception handler; the next message is delivered all the same.
+    """
+
+    def __init__(
+        self,
+        socket: "zmq.Socket[bytes]",
+        *,
+        on_writable: Callable[[], None] | None = None,
+        batch: int = BATCH,
+        tick_s: float = TICK_S,
+        loop: asyncio.AbstractEventLoop | None = None,
+    ) -> None:
+        if batch < 1:
+            raise UsageError(f"batch is {batch}, it must be at least 1")
+        self.socket = socket
+        self.on_writable = on_writable
+        self.malformed = 0
+        """Messages dropped whole because their frames were not what this socket takes."""
+        self.drains = 0
+        """Counts every look at the socket, the tick's included: the liveness of this socket's reader."""
+        self.late = 0
+        """Messages that only the tick found. Stays 0 while the edge rule is kept."""
+        self._loop = loop or asyncio.get_running_loop()
+        self._batch = batch
+        self._tick_s = tick_s
+        self._scheduled: asyncio.Handle | None = None
+        self._blocked = False
+        self._closed = False
+        self._fd = int(socket.FD)
+        self._loop.add_reader(self._fd, self.drain)
+        self._tick = self._loop.call_later(tick_s, self._on_tick)
+        self.kick()  # what arrived before the watcher was set made its edge already
+
+    def kick(self) -> None:
+        """Look at the socket again soon. Needed after using `socket` directly."""
+        if self._scheduled is None and not self._closed:
+            self._scheduled = self._loop.call_soon(self._drain_rest)
+
+    def send(self, body: bytes) -> SendResult:
+        """Send one frame without waiting."""
+        try:
+            if len(body) < ZERO_COPY_BYTES:
+                self.socket.send(body, _NOBLOCK)
+            else:
+                self.socket.send(body, _NOBLOCK, copy=False)
+        except zmq.ZMQError as error:
+            return self._unsent(error)
+        if self._scheduled is None:
+            self.kick()
+        return SendResult.OK
+
+    def send_frames(self, frames: "Sequence[bytes | zmq.Frame]") -> SendResult:
+        """Send one message of several frames without waiting: all of it or nothing."""
+        try:
+            self.socket.send_multipart(frames, _NOBLOCK, copy=True)
+        except zmq.ZMQError as error:
+            return self._unsent(error)
+        if self._scheduled is None:
+            self.kick()
+        return SendResult.OK
+
+    def close(self) -> None:
+        """Stop watching and close the socket; nothing is flushed. Idempotent; allowed inside a handler."""
+        if self._closed:
+            return
+        self._closed = True
+        self._tick.cancel()
+        if self._scheduled is not None:
+            self._scheduled.cancel()
+        if not self.socket.closed:
+            self._loop.remove_reader(self._fd)
+            self.socket.close(linger=0)
+
+    @property
+    def closed(self) -> bool:
+        return self._closed
+
+    def _unsent(self, error: zmq.ZMQError) -> SendResult:
+        if error.errno == zmq.EAGAIN:
+            self._blocked = True
+            self.kick()
+            return SendResult.FULL
+        if error.errno == zmq.EHOSTUNREACH:
+            return SendResult.GONE
+        raise error
+
+    def _on_tick(self) -> None:
+        before = self._received()
+        self._tick = self._loop.call_later(self._tick_s, self._on_tick)
+        pending = self._scheduled is not None
+        self.drain()
+        if not pending and not self._closed:
+            self.late += self._received() - before
+
+    def _received(self) -> int:
+        return 0
+
+    def _drain_rest(self) -> None:
+        self._scheduled = None
+        self.drain()
+
+    def drain(self) -> None:
+        """Take what has arrived, now, up to one batch; the rest follows by itself."""
+        if self._closed:
+            return
+        self.drains += 1
+        more = True  # also when a handler raises: the edge is used up, so the rest must be asked for
+        try:
+            more = self._take(self._batch)
+        except zmq.Again:
+            more = False
+        except zmq.ZMQError as error:
+            more = False
+            _raise_if_alive(self.socket, error)
+        finally:
+            if more:
+                self.kick()
+        if self._blocked and not self._closed and self.on_writable is not None:
+            self._blocked = False
+            self.on_writable()
+
+    def _take(self, count: int) -> bool:
+        """Receive and hand over up to `count` messages. True: there may be more. zmq.Again: all taken."""
+        raise NotImplementedError
+
+    def _skip_rest(self, frame: zmq.Frame) -> None:
+        """Drop the remaining frames of a message, without which they would pass for a message of their own."""
+        self.malformed += 1
+        while frame.more:
+            frame = self.socket.recv(_NOBLOCK, copy=False)
+
+
+class RouterSocket(DrainedSocket):
+    """A ROUTER of single-frame messages.
+
+    `on_message(routing_id, user, body)`: `user` is the sender's User-Id as the ZAP handler gave it, empty on a socket
+    without CURVE. It and `send_to` are all there is to identity: nothing else in a message says who sent it.
+    """
+
+    def __init__(
+        self,
+        socket: "zmq.Socket[bytes]",
+        on_message: Callable[[bytes, str, bytes], None],
+        *,
+        on_writable: Callable[[], None] | None = None,
+        batch: int = BATCH,
+        tick_s: float = TICK_S,
+    ) -> None:
+        super().__init__(socket, on_writable=on_writable, batch=batch, tick_s=tick_s)
+        self.on_message = on_message
+        self.messages = 0
+        self.refused_routing_ids = 0
+        """Messages of peers that claimed a routing id of their own choice."""
+        self._frame: zmq.Frame | None = None
+
+    def peer_details(self) -> PeerDetails:
+        """Address and file descriptor of the sender; only inside `on_message`."""
+        if self._frame is None:
+            raise UsageError("peer_details() is for use inside on_message")
+        return PeerDetails(_text(self._frame, "Peer-Address"), int(self._frame.get(zmq.SRCFD)))
+
+    def send_to(self, routing_id: bytes, body: bytes) -> SendResult:
+        """Send to one peer without waiting. GONE when its connection is over (ROUTER_MANDATORY)."""
+        try:
+            self.socket.send(routing_id, _NOBLOCK_MORE)
+            if len(body) < ZERO_COPY_BYTES:
+                self.socket.send(body, _NOBLOCK)
+            else:
+                self.socket.send(body, _NOBLOCK, copy=False)
+        except zmq.ZMQError as error:
+            return self._unsent(error)
+        if self._scheduled is None:
+            self.kick()
+        return SendResult.OK
+
+    def _received(self) -> int:
+        return self.messages
+
+    def _take(self, count: int) -> bool:
+        recv = self.socket.recv
+        on_message = self.on_message
+        try:
+            for _ in range(count):
+                routing_id = recv(_NOBLOCK)
+                frame = recv(_NOBLOCK, copy=False)  # a Frame knows `more` and User-Id; RCVMORE alone costs as much
+                self.messages += 1
+                if frame.more:
+                    self._skip_rest(frame)
+                elif len(routing_id) != AUTO_ROUTING_ID_BYTES or routing_id[0] != 0:
+                    self.refused_routing_ids += 1
+                else:
+                    self._frame = frame
+                    on_message(routing_id, user_of(frame), frame.bytes)
+        finally:
+            self._frame = None
+        return True
+
+
+class DealerSocket(DrainedSocket):
+    """A DEALER (or PAIR) of single-frame messages. `on_message(body)`."""
+
+    def __init__(
+        self,
+        socket: "zmq.Socket[bytes]",
+        on_message: Callable[[bytes], None],
+        *,
+        on_writable: Callable[[], None] | None = None,
+        batch: int = BATCH,
+        tick_s: float = TICK_S,
+    ) -> None:
+        super().__init__(socket, on_writable=on_writable, batch=batch, tick_s=tick_s)
+        self.on_message = on_message
+        self.messages = 0
+
+    def _received(self) -> int:
+        return self.messages
+
+    def _take(self, count: int) -> bool:
+        recv = self.socket.recv
+        on_message = self.on_message
+        for _ in range(count):
+            frame = recv(_NOBLOCK, copy=False)
+            self.messages += 1
+            if frame.more:
+                self._skip_rest(frame)
+            else:
+                on_message(frame.bytes)
+        return True
+
+
+class FrameSocket(DrainedSocket):
+    """Any socket, any number of frames up to `max_frames`. `on_message(frames)`; longer ones are dropped whole."""
+
+    def __init__(
+        self,
+        socket: "zmq.Socket[bytes]",
+        on_message: Callable[[list[zmq.Frame]], None],
+        *,
+        max_frames: int = 8,
+        on_writable: Callable[[], None] | None = None,
+        batch: int = BATCH,
+        tick_s: float = TICK_S,
+        loop: asyncio.AbstractEventLoop | None = None,
+    ) -> None:
+        super().__init__(socket, on_writable=on_writable, batch=batch, tick_s=tick_s, loop=loop)
+        self.on_message = on_message
+        self.max_frames = max_frames
+        self.messages = 0
+
+    def _received(self) -> int:
+        return self.messages
+
+    def _take(self, count: int) -> bool:
+        recv = self.socket.recv
+        on_message = self.on_message
+        max_frames = self.max_frames
+        for _ in range(count):
+            frame = recv(_NOBLOCK, copy=False)
+            frames = [frame]
+            while frame.more:
+                frame = recv(_NOBLOCK, copy=False)
+                if len(frames) == max_frames:
+                    self._skip_rest(frame)
+                    frames = []
+                    break
+                frames.append(frame)
+            self.messages += 1
+            if frames:
+                on_message(frames)
+        return True
+
+
+def _text(frame: zmq.Frame, name: str) -> str:
+    """A connection property of a frame, empty where the connection has none (no ZAP, inproc)."""
+    try:
+        return str(frame.get(name))
+    except zmq.ZMQError:
+        return ""
+
+
+def user_of(frame: zmq.Frame) -> str:
+    """The User-Id that the ZAP handler gave to the connection of this frame; empty without one."""
+    return _text(frame, "User-Id")
+
+
+def apply_common_options(
+    socket: "zmq.Socket[bytes]",
+    *,
+    heartbeat_timeout_ms: int = HEARTBEAT_TIMEOUT_MS,
+    max_message_bytes: int = MAX_MESSAGE_BYTES,
+    sndhwm: int = SNDHWM,
+    rcvhwm: int = RCVHWM,
+    tos: int = 0,
+) -> None:
+    """The options that every SERN socket over TCP has; see the constants for the reasons."""
+    socket.setsockopt(zmq.LINGER, 0)
+    socket.setsockopt(zmq.IMMEDIATE, 1)  # nothing queues for a connection that does not exist yet
+    socket.setsockopt(zmq.HEARTBEAT_IVL, HEARTBEAT_IVL_MS)
+    socket.setsockopt(zmq.HEARTBEAT_TIMEOUT, heartbeat_timeout_ms)
+    socket.setsockopt(zmq.HEARTBEAT_TTL, heartbeat_timeout_ms)
+    socket.setsockopt(zmq.CONNECT_TIMEOUT, CONNECT_TIMEOUT_MS)
+    socket.setsockopt(zmq.HANDSHAKE_IVL, HANDSHAKE_IVL_MS)
+    socket.setsockopt(zmq.RECONNECT_IVL, RECONNECT_IVL_MS)
+    socket.setsockopt(zmq.RECONNECT_IVL_MAX, RECONNECT_IVL_MAX_MS)
+    socket.setsockopt(zmq.SNDHWM, sndhwm)
+    socket.setsockopt(zmq.RCVHWM, rcvhwm)
+    socket.setsockopt(zmq.MAXMSGSIZE, max_message_bytes)
+    if tos:
+        socket.setsockopt(zmq.TOS, tos)
+
+
+def is_local(endpoint: str) -> bool:
+    """Does this endpoint stay on this machine? ipc, inproc, or tcp on a loopback address."""
+    if endpoint.startswith(("ipc://", "inproc://")):
+        return True
+    host = endpoint.removeprefix("tcp://").rpartition(":")[0].strip("[]")
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+def bind_all(socket: "zmq.Socket[bytes]", endpoints: Sequence[str]) -> tuple[str, ...]:
+    """Bind one socket to several endpoints; returns them as bound (a port `*` resolved).
+
+    Raises ConfigError of one line for the first that cannot be had; the caller closes the socket.
+    """
+    bound = []
+    for endpoint in endpoints:
+        if "[" in endpoint or endpoint.startswith("tcp://*:"):
+            socket.setsockopt(zmq.IPV6, 1)
+        try:
+            socket.bind(endpoint)
+        except zmq.ZMQError as error:
+            raise ConfigError(f"cannot listen on {endpoint}: {_bind_problem(error)}") from error
+        bound.append(socket.getsockopt_string(zmq.LAST_ENDPOINT))
+    return tuple(bound)
+
+
+def _bind_problem(error: zmq.ZMQError) -> str:
+    match error.errno:
+        case zmq.EADDRINUSE:
+            return "the port is in use; stop the other process or choose another port"
+        case errno.ENODEV | zmq.EADDRNOTAVAIL:
+            return "this machine has no such interface or address; see `ip address`, or listen on tcp://0.0.0.0:PORT"
+        case errno.EACCES:
+            return "not permitted; choose a port above 1023 or a directory that this user may write"
+        case errno.ENOENT:
+            return "no such directory; create it first"
+        case errno.EINVAL | errno.EPROTONOSUPPORT | zmq.ENOCOMPATPROTO:
+            return "not an endpoint; write for example tcp://0.0.0.0:5555"
+        case _:
+            return (error.strerror or str(error)).lower()
+
+
+def serve_curve(socket: "zmq.Socket[bytes]", keys: CurvePair | None, zap_domain: str) -> None:
+    """Make a socket a CURVE server whose every connection is put to the ZAP handler. Before bind.
+
+    Both halves matter: with an empty domain libzmq asks no handler and lets anyone in, and without
+    ZAP_ENFORCE_DOMAIN it also does so when the handler is missing (seen on 4.3.5).
+    """
+    if keys is None:
+        return
+    if not zap_domain:
+        raise UsageError("zap_domain is empty: libzmq would let anyone in")
+    socket.setsockopt(zmq.CURVE_SERVER, 1)
+    socket.setsockopt(zmq.CURVE_SECRETKEY, keys.secret_key.encode())
+    socket.setsockopt(zmq.CURVE_PUBLICKEY, keys.public_key.encode())
+    socket.setsockopt(zmq.ZAP_DOMAIN, zap_domain.encode())
+    socket.setsockopt(zmq.ZAP_ENFORCE_DOMAIN, 1)
+
+
+def check_plain(endpoints: Sequence[str], keys: CurvePair | None) -> None:
+    """Without keys only endpoints that stay on this machine are allowed. Raises ConfigError."""
+    if keys is None:
+        for endpoint in endpoints:
+            if not is_local(endpoint):
+                raise ConfigError(f"{endpoint} without keys would be open to the network; set keys or use 127.0.0.1")
+
+
+def make_server(
+    ctx: "zmq.Context[zmq.Socket[bytes]]",
+    endpoints: Sequence[str],
+    keys: CurvePair | None,
+    zap_domain: str = "sern",
+    *,
+    heartbeat_timeout_ms: int = HEARTBEAT_TIMEOUT_MS,
+    max_message_bytes: int = MAX_MESSAGE_BYTES,
+    sndhwm: int = SNDHWM,
+) -> "zmq.Socket[bytes]":
+    """A ROUTER bound to all `endpoints`. Start the ZAP handler of the same context first.
+
+    `keys` None means no CURVE, for ipc and loopback only. Raises ConfigError of one line naming the endpoint.
+    """
+    check_plain(endpoints, keys)
+    socket = ctx.socket(zmq.ROUTER)
+    try:
+        apply_common_options(
+            socket, heartbeat_timeout_ms=heartbeat_timeout_ms, max_message_bytes=max_message_bytes, sndhwm=sndhwm
+        )
+        socket.setsockopt(zmq.BACKLOG, BACKLOG)
+        socket.setsockopt(zmq.ROUTER_MANDATORY, 1)  # without it a full or lost peer is dropped silently
+        socket.setsockopt(zmq.ROUTER_HANDOVER, 0)  # with it a claimed routing id takes over another's traffic
+        serve_curve(socket, keys, zap_domain)
+        bind_all(socket, endpoints)
+    except BaseException:
+        socket.close(linger=0)
+        raise
+    return socket
+
+
+def make_client(
+    ctx: "zmq.Context[zmq.Socket[bytes]]",
+    endpoint: str,
+    keys: CurvePair | None,
+    server_key: str | None,
+    *,
+    heartbeat_timeout_ms: int = HEARTBEAT_TIMEOUT_MS,
+    max_message_bytes: int = MAX_MESSAGE_BYTES,
+    sndhwm: int = SNDHWM,
+    tos: int = 0,
+    before_connect: "Callable[[zmq.Socket[bytes]], None] | None" = None,
+) -> "zmq.Socket[bytes]":
+    """A DEALER, without routing id, connecting to `endpoint`; `server_key` is the relay's public key (Z85).
+
+    `before_connect` is the place to attach a monitor, so that no event is missed. Raises ConfigError.
+    """
+    if (keys is None) != (server_key is None):
+        raise UsageError("keys and server_key go together")
+    check_plain([endpoint], keys)
+    socket = ctx.socket(zmq.DEALER)
+    try:
+        apply_common_options(
+            socket,
+            heartbeat_timeout_ms=heartbeat_timeout_ms,
+            max_message_bytes=max_message_bytes,
+            sndhwm=sndhwm,
+            tos=tos,
+        )
+        if "[" in endpoint:
+            socket.setsockopt(zmq.IPV6, 1)
+        connect_curve(socket, keys, server_key)
+        if before_connect is not None:
+            before_connect(socket)
+        try:
+            socket.connect(endpoint)
+        except zmq.ZMQError as error:
+            raise ConfigError(f"cannot connect to {endpoint}: {_connect_problem(error)}") from error
+    except BaseException:
+        socket.close(linger=0)
+        raise
+    return socket
+
+
+def connect_curve(socket: "zmq.Socket[bytes]", keys: CurvePair | None, server_key: str | None) -> None:
+    """Make a socket a CURVE client that pins `server_key`. Before connect."""
+    if keys is None or server_key is None:
+        return
+    socket.setsockopt(zmq.CURVE_SERVERKEY, server_key.encode())
+    socket.setsockopt(zmq.CURVE_PUBLICKEY, keys.public_key.encode())
+    socket.setsockopt(zmq.CURVE_SECRETKEY, keys.secret_key.encode())
+
+
+def _connect_problem(error: zmq.ZMQError) -> str:
+    if error.errno in (errno.EINVAL, errno.EPROTONOSUPPORT, zmq.ENOCOMPATPROTO):
+        return "not an endpoint; write for example tcp://relay.example:5555"
+    return (error.strerror or str(error)).lower()
