@@ -1,0 +1,133 @@
+"""The daemon's small HTTP server: /metrics, /healthz, /readyz and JSON for the tools. Read-only."""
+
+import errno
+import json
+import logging
+from collections.abc import Awaitable, Callable, Mapping
+from typing import Final, NamedTuple
+
+from aiohttp import web
+from prometheus_client import CollectorRegistry
+from prometheus_client.exposition import choose_encoder
+
+from sern_core.errors import ConfigError, UsageError
+
+Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
+JsonSource = Callable[[], object]
+"""Gives what `json.dumps` takes, from state, at once."""
+
+_SHUTDOWN_S: Final = 1.0
+_log = logging.getLogger(__name__)
+
+
+class Health(NamedTuple):
+    """An answer for /healthz or /readyz. `reason` is one line, shown whatever the answer is."""
+
+    ok: bool
+    reason: str
+
+
+HealthCheck = Callable[[], Health]
+
+
+def parse_listen(listen: str) -> tuple[str, int]:
+    """`127.0.0.1:9464` or `[::1]:9464` as host and port. Port 0: any free one. Raises ConfigError."""
+    host, separator, port_text = listen.rpartition(":")
+    host = host[1:-1] if host.startswith("[") and host.endswith("]") else host
+    if not separator or not host or not port_text.isdecimal() or int(port_text) > 65535:
+        raise ConfigError(f"{listen!r} is not HOST:PORT; write for example 127.0.0.1:9464")
+    return host, int(port_text)
+
+
+class HttpServer:
+    """Serves while started. `start` and `stop` once each; `stop` also after a failed `start`.
+
+    `health` says whether the process works (a supervisor restarts it otherwise), `ready` whether it does its job now.
+    `json_routes` maps paths, such as /api/link, to what gives their content.
+    """
+
+    def __init__(
+        self,
+        listen: str,
+        registry: CollectorRegistry,
+        *,
+        health: HealthCheck,
+        ready: HealthCheck,
+        json_routes: Mapping[str, JsonSource] | None = None,
+    ) -> None:
+        self.listen = listen
+        self._host, self._port = parse_listen(listen)
+        self._registry = registry
+        self._runner: web.AppRunner | None = None
+        self._app = web.Application()
+        self._app.router.add_get("/metrics", self._metrics)
+        self._app.router.add_get("/healthz", _health_route(health))
+        self._app.router.add_get("/readyz", _health_route(ready))
+        for path, source in (json_routes or {}).items():
+            self.add_json(path, source)
+
+    def add_json(self, path: str, source: JsonSource) -> None:
+        """Add a JSON route. Before `start`."""
+        if self._runner is not None:
+            raise UsageError("routes are added before the server is started")
+        self._app.router.add_get(path, _json_route(path, source))
+
+    @property
+    def port(self) -> int:
+        """The port in use, also when 0 was asked for."""
+        if self._runner is None or not self._runner.addresses:
+            raise UsageError("the server is not started")
+        return int(self._runner.addresses[0][1])
+
+    async def start(self) -> None:
+        """Raises ConfigError of one line when it cannot listen."""
+        runner = web.AppRunner(self._app, access_log=None, handle_signals=False, shutdown_timeout=_SHUTDOWN_S)
+        self._runner = runner
+        await runner.setup()
+        try:
+            await web.TCPSite(runner, self._host, self._port).start()
+        except OSError as error:
+            await self.stop()
+            raise ConfigError(f"cannot listen on http://{self.listen}: {_problem(error)}") from error
+
+    async def stop(self) -> None:
+        if self._runner is not None:
+            runner, self._runner = self._runner, None
+            await runner.cleanup()
+
+    async def _metrics(self, request: web.Request) -> web.Response:
+        encode, content_type = choose_encoder(request.headers.get("Accept", ""))
+        return web.Response(body=encode(self._registry), headers={"Content-Type": content_type})
+
+
+def _problem(error: OSError) -> str:
+    # The loop wraps the cause in its own words; the number is what can be relied on.
+    match error.errno:
+        case errno.EADDRINUSE:
+            return "the port is in use; stop the other process or choose another port"
+        case errno.EADDRNOTAVAIL | errno.ENODEV:
+            return "this machine has no such address; see `ip address`"
+        case errno.EACCES:
+            return "not permitted; choose a port above 1023"
+        case _:
+            return (error.strerror or str(error)).lower()
+
+
+def _health_route(check: HealthCheck) -> Handler:
+    async def handle(_request: web.Request) -> web.Response:
+        answer = check()
+        return web.Response(status=200 if answer.ok else 503, text=answer.reason + "\n")
+
+    return handle
+
+
+def _json_route(path: str, source: JsonSource) -> Handler:
+    async def handle(_request: web.Request) -> web.Response:
+        try:
+            text = json.dumps(source())
+        except Exception:  # noqa: BLE001  (a view that fails is told to its reader and the log, and ends nothing)
+            _log.exception("%s could not be answered", path)
+            return web.json_response({"error": "internal error, see the log"}, status=500)
+        return web.Response(text=text, content_type="application/json", headers={"Cache-Control": "no-store"})
+
+    return handle
