@@ -9,9 +9,11 @@ A ping leaves at t1 (local clock), arrives at t2 and is answered at t3 (peer's c
 The offset that one ping shows is wrong by at most δ/2, whatever the asymmetry of the path. Queueing only ever adds
 to δ, so the ping of least δ among the last eight tells most (RFC 5905, section 10, the clock filter).
 
-Clocks also drift apart. The skew is the least-squares slope of those best offsets over 60 s. Its own uncertainty
-follows from how far each of them was above the least δ seen: the fixed part of the path delays every one alike and
-cancels in the slope. Skew is used only where it is known better than MAX_SKEW_PPM, the tolerance of any clock.
+Clocks also drift apart. The skew is the least-squares slope of those best offsets over 60 s. The fixed part of the
+path's delay shifts them all alike and cancels in the slope, so the error of each is taken as how far its δ was above
+the least δ, and once more the mean of that, because the least one may have met a queue as well. The sum of these
+errors at their worst signs bounds the skew's error as long as the path keeps its asymmetry. Skew is used only where
+it is known better than MAX_SKEW_PPM, the tolerance of any clock.
 
 Two offsets whose error bounds do not overlap cannot be of one pair of clocks: one of them was stepped (or suspended),
 and the estimate starts over from the newer one.
@@ -33,6 +35,9 @@ WANDER_PPM: Final = 15.0
 """How fast a skew that is known may change (RFC 5905, section 7.2, PHI: 15e-6 s/s)."""
 MAX_FIT_POINTS: Final = 256
 """Offsets kept for the skew; a faster ping rate thins them out by keeping only every new best one."""
+MIN_FIT_POINTS: Final = 6
+MIN_FIT_SPAN_S: Final = 20.0
+"""Fewer offsets, or closer ones, tell too little about the path's least delay to judge a skew."""
 RTT_WINDOW_S: Final = 10.0
 """Window of the least round-trip time."""
 RTT_GRANULARITY_S: Final = 0.001
@@ -223,6 +228,9 @@ class ClockSync:
         self._filter.clear()
         self._fit.clear()
         self._best = None
+        self._forget_skew()
+
+    def _forget_skew(self) -> None:
         self._skew = 0.0
         self._skew_bound = math.inf
 
@@ -231,21 +239,25 @@ class ClockSync:
         fit.append(newest)
         while fit[0].at_s < newest.at_s - SKEW_WINDOW_S:
             fit.popleft()
+        if len(fit) < MIN_FIT_POINTS or newest.at_s - fit[0].at_s < MIN_FIT_SPAN_S:
+            self._forget_skew()
+            return
         # Times and offsets relative to the newest point: the clocks' absolute values would eat the digits.
         count = len(fit)
         mean_t = sum(point.at_s - newest.at_s for point in fit) / count
         mean_o = sum(point.offset_s - newest.offset_s for point in fit) / count
         least_s = min(point.rtt_s for point in fit)
+        mean_excess_s = sum(point.rtt_s for point in fit) / count - least_s
         spread = slope = error = 0.0
         for point in fit:
             t = point.at_s - newest.at_s - mean_t
             spread += t * t
             slope += t * (point.offset_s - newest.offset_s - mean_o)
-            # Noise of this offset beyond the path's fixed asymmetry, and drift while the ping was under way.
-            error += abs(t) * ((point.rtt_s - least_s) / 2.0 + point.bound_s - point.rtt_s / 2.0)
-        if spread > 0.0 and error < MAX_SKEW_PPM * _PPM * spread and abs(slope) <= MAX_SKEW_PPM * _PPM * spread:
+            excess_s = point.rtt_s - least_s + mean_excess_s
+            drift_s = point.bound_s - point.rtt_s / 2.0
+            error += abs(t) * (excess_s / 2.0 + drift_s)
+        if error < MAX_SKEW_PPM * _PPM * spread and abs(slope) <= MAX_SKEW_PPM * _PPM * spread:
             self._skew = slope / spread
             self._skew_bound = error / spread
         else:
-            self._skew = 0.0
-            self._skew_bound = math.inf
+            self._forget_skew()
