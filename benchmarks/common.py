@@ -1,0 +1,186 @@
+"""What every benchmark shares: arguments, the table, the JSON, the exit code, and fair measuring.
+
+`python -m benchmarks.NAME [--quick] [--json FILE]` prints a table and, with --json, writes
+
+    {"benchmark": NAME, "commit": HASH,
+     "rows":  [{"case": ..., "system": ..., "<metric>_<unit>": number, ...}, ...],
+     "reach": [{"name": ..., "value": number, "limit": number, "ok": bool}, ...]}
+
+A reach is a figure the project set out to keep. Missing one is printed plainly and is not an error: the exit code is
+non-zero only if the benchmark could not run.
+"""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TypeVar
+
+from rich.console import Console
+from rich.table import Table
+
+from sern_core.errors import SernError
+
+ROOT = Path(__file__).resolve().parent.parent
+REALTIME_PRIORITY = 10
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Row:
+    """One measured system in one case; the metrics' names end in their unit, e.g. `decision_us`."""
+
+    case: str
+    system: str
+    metrics: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class Reach:
+    """A figure against its limit; `at_least` when larger is better."""
+
+    name: str
+    value: float
+    limit: float
+    at_least: bool = False
+
+    @property
+    def ok(self) -> bool:
+        return self.value >= self.limit if self.at_least else self.value <= self.limit
+
+
+@dataclass
+class Report:
+    """What a benchmark found, in the order it found it. `notes` say under which conditions."""
+
+    benchmark: str
+    rows: list[Row] = field(default_factory=list)
+    reaches: list[Reach] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+    def row(self, case: str, system: str, **metrics: float) -> None:
+        self.rows.append(Row(case, system, metrics))
+
+    def reach(self, name: str, value: float, limit: float, *, at_least: bool = False) -> None:
+        self.reaches.append(Reach(name, value, limit, at_least))
+
+    def note(self, text: str) -> None:
+        self.notes.append(text)
+
+    def value(self, case: str, system: str, metric: str) -> float:
+        """A metric measured before. Raises KeyError if there is none."""
+        for row in self.rows:
+            if (row.case, row.system) == (case, system) and metric in row.metrics:
+                return row.metrics[metric]
+        raise KeyError((case, system, metric))
+
+    def as_json(self) -> dict[str, object]:
+        return {
+            "benchmark": self.benchmark,
+            "commit": commit(),
+            "rows": [{"case": row.case, "system": row.system, **row.metrics} for row in self.rows],
+            "reach": [{"name": r.name, "value": r.value, "limit": r.limit, "ok": r.ok} for r in self.reaches],
+        }
+
+    def print(self, console: Console) -> None:
+        metrics = list(dict.fromkeys(name for row in self.rows for name in row.metrics))
+        table = Table(title=f"{self.benchmark} ({commit()})", title_justify="left")
+        table.add_column("case")
+        table.add_column("system")
+        for name in metrics:
+            quantity, _, unit = name.rpartition("_")
+            table.add_column(f"{quantity.replace('_', ' ')} [{unit}]", justify="right", header_style="bold")
+        previous = None
+        for row in self.rows:
+            case = "" if row.case == previous else row.case
+            previous = row.case
+            table.add_row(case, row.system, *(_number(row.metrics.get(name)) for name in metrics))
+        console.print(table, markup=False)
+        for text in self.notes:
+            console.print(text, markup=False, highlight=False)
+        for r in self.reaches:
+            verdict = "reached" if r.ok else "MISSED "
+            wanted = f"{'≥' if r.at_least else '≤'} {_number(r.limit)}"
+            console.print(f"{verdict}  {r.name}: {_number(r.value)} (wanted {wanted})", markup=False, highlight=False)
+
+
+def _number(value: float | None) -> str:
+    if value is None:
+        return ""
+    return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.3g}"
+
+
+def commit() -> str:
+    """The checkout's short commit hash, with `-dirty` if tracked files differ; `unknown` outside a checkout."""
+    try:
+        hash_ = _git("rev-parse", "--short=12", "HEAD")
+        return hash_ + ("-dirty" if _git("status", "--porcelain", "--untracked-files=no") else "")
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"
+
+
+def _git(*words: str) -> str:
+    done = subprocess.run(["git", "-C", str(ROOT), *words], check=True, capture_output=True, text=True)
+    return done.stdout.strip()
+
+
+def pin_cpu(cpu: int | None = None) -> str:
+    """Keep this process on one CPU (the last allowed one by default). A note for the report; never fails."""
+    try:
+        allowed = os.sched_getaffinity(0)
+        chosen = max(allowed) if cpu is None else cpu
+        os.sched_setaffinity(0, {chosen})
+    except OSError as error:
+        return f"not pinned to a CPU: {error.strerror}"
+    return f"pinned to CPU {chosen}"
+
+
+def try_realtime(priority: int = REALTIME_PRIORITY) -> str:
+    """Ask for what `chrt -r` gives, so that other load does not count as latency. A note; never fails."""
+    try:
+        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(priority))
+    except OSError as error:
+        return f"no real-time priority ({error.strerror}): other load on this machine is in the figures"
+    return f"real-time priority {priority}"
+
+
+def interleaved(systems: Mapping[str, Callable[[], T]], rounds: int) -> dict[str, list[T]]:
+    """Measure each system once a round, back and forth (A B, B A, ...), so that drift falls on all alike."""
+    results: dict[str, list[T]] = {name: [] for name in systems}
+    order = list(systems)
+    for _ in range(rounds):
+        for name in order:
+            results[name].append(systems[name]())
+        order.reverse()
+    return results
+
+
+def main(
+    benchmark: str,
+    run: Callable[[argparse.Namespace, Report], None],
+    *,
+    description: str | None = None,
+    arguments: Callable[[argparse.ArgumentParser], None] | None = None,
+) -> int:
+    """Parse the arguments, run, print, write; the exit code. `arguments` may add options of the benchmark's own."""
+    parser = argparse.ArgumentParser(prog=f"python -m benchmarks.{benchmark}", description=description)
+    parser.add_argument("--quick", action="store_true", help="fewer repetitions, for continuous integration")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="also write the figures to FILE")
+    if arguments is not None:
+        arguments(parser)
+    options = parser.parse_args()
+    report = Report(benchmark)
+    try:
+        run(options, report)
+        report.print(Console(width=None if sys.stdout.isatty() else 140))
+        if options.json is not None:
+            options.json.write_text(json.dumps(report.as_json(), indent=2, allow_nan=False) + "\n")
+    except (SernError, OSError) as error:
+        print(f"benchmarks.{benchmark}: {error}", file=sys.stderr)
+        return 1
+    return 0
