@@ -169,31 +169,44 @@ def test_a_debt_outlives_the_backlog_that_made_it() -> None:
     scheduler.validate()
 
 
-def test_credit_survives_encoding_and_ends_with_the_backlog() -> None:
+@pytest.mark.parametrize("lower", [STATE, BULK])
+def test_credit_survives_encoding_and_ends_with_the_backlog(lower: PriorityClass) -> None:
     scheduler = Scheduler(SchedulerParams(class0_share=1.0), now=T0)
     for encoding, expected in ((True, 3), (False, 1)):
         offer(scheduler, 1, CONTROL, 1e6)
-        offer(scheduler, 3, BULK, 1e6)
+        offer(scheduler, 3, lower, 1e6)
         scheduler.charge(CONTROL, 12_000, now=T0)
         assert scheduler.pick(now=T0) == 3
         scheduler.withdraw(3, encoding=encoding)
         assert scheduler.pick(now=T0) == 1
-        offer(scheduler, 3, BULK, 1e6)
+        offer(scheduler, 3, lower, 1e6)
         assert scheduler.pick(now=T0) == expected
         scheduler.withdraw(3)
         scheduler.withdraw(1)
         scheduler.validate()
 
 
-def test_credit_is_lost_when_an_encoding_is_given_up() -> None:
+@pytest.mark.parametrize("lower", [STATE, BULK])
+def test_a_class_earns_credit_while_its_message_is_encoded(lower: PriorityClass) -> None:
     scheduler = Scheduler(SchedulerParams(class0_share=1.0), now=T0)
     offer(scheduler, 1, CONTROL, 1e6)
-    offer(scheduler, 3, BULK, 1e6)
+    offer(scheduler, 3, lower, 1e6)
+    scheduler.withdraw(3, encoding=True)
+    scheduler.charge(CONTROL, 12_000, now=T0)
+    offer(scheduler, 3, lower, 1e6)
+    assert scheduler.pick(now=T0) == 3
+
+
+@pytest.mark.parametrize("lower", [STATE, BULK])
+def test_credit_is_lost_when_an_encoding_is_given_up(lower: PriorityClass) -> None:
+    scheduler = Scheduler(SchedulerParams(class0_share=1.0), now=T0)
+    offer(scheduler, 1, CONTROL, 1e6)
+    offer(scheduler, 3, lower, 1e6)
     scheduler.charge(CONTROL, 12_000, now=T0)
     scheduler.withdraw(3, encoding=True)
     scheduler.withdraw(3)
     scheduler.validate()
-    offer(scheduler, 3, BULK, 1e6)
+    offer(scheduler, 3, lower, 1e6)
     assert scheduler.pick(now=T0) == 1
 
 
