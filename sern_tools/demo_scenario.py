@@ -1,0 +1,226 @@
+"""What the demo runs: the load, the rules, and the configuration files of relay, robot and site.
+
+The load is shaped to the link: poses, commands, a map and a counter that fit through its narrowest moment, and point
+clouds that bring the whole to `overload` times its usual rate. Robot topics are `/robot/...` for everyone.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from ruamel.yaml import YAML
+
+from sern_core.errors import ConfigError
+from sern_core.params import SchedulerParams
+from sern_core.rules import client_name
+from sern_runtime import keys
+from sern_runtime.config.relay import RelayFile
+from sern_runtime.keys import PublicKey, PublicKeys
+from sern_sim.profiles import LinkProfile
+from sern_tools.shaping import RateSchedule
+
+HOST: Final = "127.0.0.1"
+RELAY, ROBOT, SITE = "relay", "robot", "site"
+COMMAND_TOPIC: Final = "/robot/cmd_vel"
+POSE_TOPIC: Final = "/robot/odometry/filtered"
+COUNTER_TOPIC: Final = "/counter"
+COMMAND_LIFESPAN_S: Final = 0.3
+STATE_OVERTAKEN_LIMIT: Final = SchedulerParams().floor
+"""Class bulk keeps this share of the link while class state is backlogged, so it may overtake as often."""
+CONTROL_OVERTAKEN_LIMIT: Final = 0.01
+COMFORTABLE_BPS: Final = 1e6
+"""From this rate on the small topics run at full rate and size; on slower links they shrink with it."""
+FULL_POSE_RATE_HZ: Final = 50.0
+FULL_MAP_BYTES: Final = 20_000
+CLOUD_RATE_HZ: Final = 10.0
+ODOMETRY_BYTES: Final = 730
+POSE_BYTES: Final = 110
+CLOUD_LIFESPAN_S: Final = 3.0
+"""A cloud of the demo may take a while on a link that has just become four times slower, and is still of use."""
+
+
+@dataclass(frozen=True)
+class Ports:
+    """TCP ports on loopback; `link` is the proxy's, towards the robot."""
+
+    relay: int
+    link: int
+    relay_http: int
+    robot_http: int
+    site_http: int
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """One demo: the link, how long, how much, and whether a bag or the simulated robot plays."""
+
+    profile: LinkProfile
+    duration_s: float
+    overload: float = 2.0
+    seed: int = 1
+    bag: Path | None = None
+
+    @property
+    def usual_bps(self) -> float:
+        """The rate of the link when the script begins."""
+        rate = self.profile.rate_bps_at(0.0)
+        if rate is None:
+            raise ConfigError(f"profile {self.profile.name} has no rate: the demo overloads a link that has one")
+        return rate
+
+    @property
+    def lowest_bps(self) -> float:
+        """The lowest rate above nothing during the run."""
+        steps = RateSchedule.of(self.profile.up, until_s=self.duration_s).steps
+        return min(rate for _, rate in steps if rate > 0)
+
+    @property
+    def comfort(self) -> float:
+        return min(1.0, self.lowest_bps / COMFORTABLE_BPS)
+
+    @property
+    def pose_rate_hz(self) -> float:
+        return max(5.0, round(FULL_POSE_RATE_HZ * self.comfort))
+
+    @property
+    def map_bytes(self) -> int:
+        return max(1000, int(FULL_MAP_BYTES * self.comfort))
+
+    @property
+    def cloud_bytes(self) -> int:
+        """What brings the offered load to `overload` times the usual rate."""
+        small = self.pose_rate_hz * (ODOMETRY_BYTES + POSE_BYTES) + self.map_bytes
+        clouds = self.overload * self.usual_bps / 8 - small
+        return max(1000, int(clouds / CLOUD_RATE_HZ))
+
+    @property
+    def robot_endpoints(self) -> list[dict[str, Any]]:
+        robot: dict[str, Any] = {
+            "kind": "synthetic",
+            "role": "robot",
+            "seed": self.seed,
+            "patrol": True,
+            "topics": ["/odometry/filtered", "/pose", "/map", "/points"],
+            "pose_rate_hz": self.pose_rate_hz,
+            "map_bytes": self.map_bytes,
+            "map_rate_hz": 1.0,
+            "cloud_bytes": self.cloud_bytes,
+            "cloud_rate_hz": CLOUD_RATE_HZ,
+            "counter_topics": [COUNTER_TOPIC],
+        }
+        if self.bag is None:
+            return [robot]
+        # Clouds, to overload the link, and the counter come from the simulated robot; the bag brings the rest.
+        bag = {"kind": "bag", "path": str(self.bag.resolve()), "loop": True, "topics": [r"(?!/points$|/counter$).*"]}
+        return [bag, {**robot, "topics": ["/points"]}]
+
+    @property
+    def robot_rules(self) -> list[dict[str, Any]]:
+        """First match wins. By name for the simulated robot, and by type for whatever a bag holds."""
+        control = {"class": "control", "direction": "send", "reliability": "best_effort", "depth": 1}
+        state = {"class": "state", "direction": "send", "reliability": "reliable"}
+        bulk = {"class": "bulk", "direction": "send", "reliability": "best_effort"}
+        rules: list[dict[str, Any]] = [
+            {
+                "match": "/cmd_vel",
+                "class": "control",
+                "direction": "receive",
+                "lifespan_s": COMMAND_LIFESPAN_S,
+                "on_link_loss": {"publish": "zero", "after_s": 0.5},
+            },
+            {"match": "/points", **bulk, "lifespan_s": CLOUD_LIFESPAN_S},
+            {"match": COUNTER_TOPIC, **state},
+            {"match": "/map", **state, "durability": "transient_local", "depth": 1},
+            {"match": "/odometry/filtered|/pose", **control},
+        ]
+        if self.bag is not None:
+            rules += [
+                {"match": ".*", "type": "nav_msgs/Odometry|geometry_msgs/(Pose|Twist).*|tf(2_msgs)?/.*", **control},
+                {"match": ".*", "type": "sensor_msgs/Imu", **control},
+                {"match": ".*", "type": "nav_msgs/OccupancyGrid|sensor_msgs/(NavSatFix|BatteryState)", **state},
+                {"match": ".*", "type": "diagnostic_msgs/.*", **state},
+                {"match": ".*", **bulk},
+            ]
+        return rules
+
+
+def write_files(directory: Path, scenario: Scenario, ports: Ports) -> dict[str, Path]:
+    """Keys and configuration files of one run, by the names relay, robot and site. The directory must be new."""
+    clients = directory / "clients"
+    clients.mkdir(parents=True)
+    for name in (RELAY, ROBOT, SITE):
+        pair = keys.generate(client_name(name))
+        public = PublicKeys(client_name(name), (PublicKey(pair.public_key),))
+        keys.write_secret(directory / f"{name}.key", pair)
+        keys.write_public((directory if name == RELAY else clients) / f"{name}.pub", public)
+    files = {
+        RELAY: _relay(ports),
+        ROBOT: _client(
+            ROBOT, ports.link, ports.robot_http, scenario.robot_endpoints, scenario.robot_rules, discovery="dynamic"
+        ),
+        SITE: _site(scenario, ports),
+    }
+    written = {}
+    for name, content in files.items():
+        written[name] = directory / f"{name}.yaml"
+        with written[name].open("w", encoding="utf-8") as stream:
+            YAML(typ="safe", pure=True).dump(content, stream)
+    return written
+
+
+def _relay(ports: Ports) -> dict[str, Any]:
+    content: dict[str, Any] = {
+        "relay": {
+            "name": RELAY,
+            "listen": [f"tcp://{HOST}:{ports.relay}"],
+            "secret_key_file": f"{RELAY}.key",
+            "clients_dir": "clients",
+        },
+        "access": [
+            {"client": ROBOT, "publish": ["/{self}/.*"], "subscribe": [COMMAND_TOPIC]},
+            {"client": SITE, "publish": [COMMAND_TOPIC], "subscribe": [f"/{ROBOT}/.*"]},
+        ],
+        "http": {"listen": f"{HOST}:{ports.relay_http}"},
+    }
+    if "summary" in RelayFile.model_fields:
+        content["summary"] = "relay.summary.json"
+    return content
+
+
+def _client(
+    name: str, relay_port: int, http_port: int, endpoint: Sequence[dict[str, Any]], topics: Sequence[dict[str, Any]],
+    **discovery: str,
+) -> dict[str, Any]:  # fmt: skip
+    content: dict[str, Any] = {
+        "client": {"name": name},
+        "relay": {
+            "endpoint": f"tcp://{HOST}:{relay_port}",
+            "server_key_file": f"{RELAY}.pub",
+            "secret_key_file": f"{name}.key",
+        },
+        "endpoint": list(endpoint),
+        "topics": list(topics),
+        "http": {"listen": f"{HOST}:{http_port}"},
+        "message_log": f"{name}.csv",
+        "summary": f"{name}.summary.json",
+    }
+    if discovery:
+        content["discovery"] = {"mode": discovery["discovery"]}
+    return content
+
+
+def _site(scenario: Scenario, ports: Ports) -> dict[str, Any]:
+    operator = {
+        "kind": "synthetic",
+        "role": "operator",
+        "seed": scenario.seed,
+        "command_topic": COMMAND_TOPIC,
+        "command_rate_hz": 10.0,
+    }
+    commands = {"match": COMMAND_TOPIC, "class": "control", "direction": "send", "reliability": "best_effort"}
+    rules = [{**commands, "depth": 1, "lifespan_s": COMMAND_LIFESPAN_S}]
+    content = _client(SITE, ports.relay, ports.site_http, [operator], rules)
+    content["client"]["namespace"] = "/"  # it commands the robot by the robot's own topic
+    content["subscribe"] = [f"/{ROBOT}/.*"]
+    return content
