@@ -4,7 +4,9 @@ from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
 from sern_core.types import (
+    DROP_REASONS,
     ClientName,
+    DropReason,
     Durability,
     Encoding,
     PriorityClass,
@@ -100,6 +102,11 @@ class Message:
 
     def age_s(self, now: float) -> float:
         return now - self.born_s
+
+    @property
+    def drop_reason(self) -> DropReason:
+        """Why the message that this tombstone stands for was dropped."""
+        return DROP_REASONS.get(self.tombstone, DropReason.LOST)
 
 
 @dataclass(slots=True)

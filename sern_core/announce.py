@@ -1,0 +1,115 @@
+"""Control messages between the two ends of a hop, as typed data and as envelopes (schemas/wire.md, "Control").
+
+Every control message is a map with its kind under "t". Definitions travel once a process and hash: a stream's
+announcement names the hash, the receiver asks with `need` if it lacks the text, the answer is `define`.
+"""
+
+import hashlib
+from dataclasses import dataclass
+from typing import Final
+
+from sern_core import wire
+from sern_core.errors import WireError
+from sern_core.message import StreamId, StreamInfo, TopicInfo, TopicSpec
+from sern_core.types import ClientName, Durability, Encoding, PriorityClass, Reliability, TopicName
+
+DEFINITION_HASH_CHARS: Final = 32
+MAX_DEPTH: Final = 100_000
+MAX_TIME_S: Final = 1e9
+MAX_STRINGS: Final = 48
+"""Items of one list in an envelope (below wire.MAX_ENVELOPE_ITEMS); longer lists are sent in parts."""
+
+
+def definition_hash(definition: str) -> str:
+    """What a definition is called on the wire: the first half of its SHA-256; empty for no definition."""
+    if not definition:
+        return ""
+    return hashlib.sha256(definition.encode()).hexdigest()[:DEFINITION_HASH_CHARS]
+
+
+@dataclass(frozen=True, slots=True)
+class Announcement:
+    """A stream on a channel of this session. `first`: nothing below this seq will come. `owed`: who must get it."""
+
+    channel: int
+    stream: StreamInfo
+    definition_hash: str
+    first: int
+    owed: tuple[str, ...] = ()
+
+
+def encode_announcement(announcement: Announcement) -> wire.Envelope:
+    stream = announcement.stream
+    info, spec = stream.info, stream.spec
+    return {
+        "t": "announce",
+        "ch": announcement.channel,
+        "or": stream.id.origin,
+        "boot": stream.id.boot,
+        "topic": stream.id.topic,
+        "type": info.type_name,
+        "enc": str(info.encoding),
+        "hash": info.type_hash,
+        "dh": announcement.definition_hash,
+        "first": announcement.first,
+        "owed": list(announcement.owed[:MAX_STRINGS]),
+        "cls": int(spec.priority),
+        "w": spec.weight,
+        "rel": spec.reliable,
+        "lat": spec.latched,
+        "depth": spec.depth,
+        "life": spec.lifespan_s,
+        "dead": spec.deadline_s,
+        "ret": spec.retention_s,
+        "mw": spec.many_writers,
+        "attr": dict(stream.attributes),
+    }
+
+
+def decode_announcement(envelope: wire.Envelope) -> Announcement:
+    """Raises WireError for anything that is not a complete, sane announcement. The definition is not in it."""
+    attributes = envelope.get("attr", {})
+    if not isinstance(attributes, dict) or not all(
+        isinstance(key, str) and isinstance(value, str) for key, value in attributes.items()
+    ):
+        raise WireError("announcement attributes must map strings to strings")
+    encoding = wire.take_str(envelope, "enc", max_length=8)
+    if encoding not in set(Encoding):
+        raise WireError(f"unknown encoding {encoding!r}")
+    topic = TopicName(wire.take_str(envelope, "topic"))
+    if not topic.startswith("/"):
+        raise WireError(f"topic {topic!r} is not absolute")
+    weight = wire.take_float(envelope, "w", low=1e-9, high=1e9)
+    retention_s = wire.take_float(envelope, "ret", low=0.0, high=MAX_TIME_S)
+    if weight is None or retention_s is None:
+        raise WireError("announcement without weight or retention")
+    latched = wire.take_bool(envelope, "lat")
+    spec = TopicSpec(
+        priority=PriorityClass(wire.take_int(envelope, "cls", high=max(PriorityClass))),
+        weight=weight,
+        reliability=Reliability.RELIABLE if wire.take_bool(envelope, "rel") else Reliability.BEST_EFFORT,
+        durability=Durability.TRANSIENT_LOCAL if latched else Durability.VOLATILE,
+        depth=wire.take_int(envelope, "depth", low=1, high=MAX_DEPTH),
+        lifespan_s=wire.take_float(envelope, "life", low=0.0, high=MAX_TIME_S),
+        deadline_s=wire.take_float(envelope, "dead", low=0.0, high=MAX_TIME_S),
+        retention_s=retention_s,
+        many_writers=wire.take_bool(envelope, "mw"),
+    )
+    info = TopicInfo(
+        name=topic,
+        type_name=wire.take_str(envelope, "type"),
+        encoding=Encoding(encoding),
+        type_hash=wire.take_str(envelope, "hash"),
+        latched=latched,
+        reliable=spec.reliable,
+    )
+    identity = StreamId(
+        ClientName(wire.take_str(envelope, "or", max_length=64)), wire.take_int(envelope, "boot"), topic
+    )
+    return Announcement(
+        channel=wire.take_int(envelope, "ch", low=1, high=0xFFFF),
+        stream=StreamInfo(identity, info, spec, dict(attributes)),
+        definition_hash=wire.take_str(envelope, "dh", max_length=DEFINITION_HASH_CHARS),
+        first=wire.take_int(envelope, "first", low=1),
+        owed=tuple(wire.take_strings(envelope, "owed", max_length=64)),
+    )

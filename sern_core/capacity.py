@@ -1,0 +1,63 @@
+"""What a lane can carry and how much of it may be in flight: the interface that every estimator fills.
+
+One estimator a lane. The link feeds it sends, acknowledgements and losses; it answers with a window in bytes, a
+capacity in bits per second (None while unknown) and whether the path has stalled. Algorithms live in
+`sern_core.control`, one a file.
+"""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+
+@dataclass(slots=True)
+class AckSample:
+    """One acknowledgement that moved things forward. `rtt_s` excludes the receiver's acknowledgement delay."""
+
+    now: float
+    rtt_s: float
+    acked_bytes: int
+    inflight_bytes: int  # after this acknowledgement
+    receiver_s: float  # the receiver's clock when the newest acknowledged packet arrived
+    cum_bytes: int  # bytes the receiver has got in all by then
+    app_limited: bool  # the sender had nothing to send when that packet left
+
+
+class CapacityEstimator(ABC):
+    """Window and capacity of one lane. Every method takes the time from its caller."""
+
+    @property
+    @abstractmethod
+    def window_bytes(self) -> float:
+        """Bytes that may be in flight, headers included."""
+
+    @property
+    @abstractmethod
+    def rate_bps(self) -> float | None:
+        """Estimated capacity in bits per second; None while unknown."""
+
+    @property
+    @abstractmethod
+    def rtprop_s(self) -> float | None:
+        """Round-trip time of the empty path; None while unknown."""
+
+    @abstractmethod
+    def on_sent(self, *, now: float, nbytes: int, inflight_bytes: int) -> None:
+        """`nbytes` left; `inflight_bytes` includes them."""
+
+    @abstractmethod
+    def on_ack(self, sample: AckSample) -> None: ...
+
+    @abstractmethod
+    def on_loss(self, *, now: float, nbytes: int) -> None: ...
+
+    @abstractmethod
+    def on_reset(self, *, now: float) -> None:
+        """The transport was replaced: what is in flight is gone, the path may be another."""
+
+    @abstractmethod
+    def on_stall(self, *, now: float) -> None:
+        """No acknowledgement for too long; capacity is zero until the next one."""
+
+    def snapshot(self) -> dict[str, float | None]:
+        """State for /api/link and the metrics."""
+        return {"window_bytes": self.window_bytes, "rate_bps": self.rate_bps, "rtprop_s": self.rtprop_s}

@@ -1,0 +1,241 @@
+"""The client daemon's core: one link to the relay, what this site publishes, what it receives. Pure.
+
+The shell (sern_client) feeds it endpoint messages and lane bytes, and is told through `ClientEvents` which streams
+appear and which messages have their turn. Everything about bandwidth, order, replay and loss is in the link below.
+"""
+
+from typing import Protocol
+
+from sern_core import wire
+from sern_core.announce import MAX_STRINGS, Announcement
+from sern_core.errors import ConfigError, WireError
+from sern_core.fragments import InStream
+from sern_core.ledger import ReceiveLedger
+from sern_core.link import Link
+from sern_core.message import Message, StreamId, StreamInfo, TopicInfo, TopicSpec
+from sern_core.params import LinkParams, SchedulerParams
+from sern_core.queues import OutChannel, OutMessage
+from sern_core.trace import DecisionTrace, TraceEvent
+from sern_core.types import ClientName, DropReason, ObjectKind
+
+RELAY_NAME = ClientName("relay")
+"""What the relay is called until its WELCOME says its own name."""
+
+
+class ClientEvents(Protocol):
+    """What the shell is told."""
+
+    def link_up(self, *, resumed: bool) -> None: ...
+
+    def link_down(self, reason: str) -> None: ...
+
+    def rejected(self, code: str, text: str) -> None:
+        """The relay refused the session."""
+
+    def stream_opened(self, stream: StreamInfo) -> None:
+        """A stream from elsewhere, definition included. Raises ConfigError if this site cannot publish it."""
+
+    def stream_closed(self, stream: StreamInfo) -> None: ...
+
+    def message(self, stream: StreamInfo, message: Message, *, now: float) -> None: ...
+
+    def expired(self, stream: StreamInfo, seq: int, reason: DropReason) -> None:
+        """A reliable message of a stream from elsewhere was dropped on its way; it is reported in its turn."""
+
+    def skipped(self, stream: StreamInfo, count: int) -> None:
+        """`count` messages of a reliable stream were given up before this site was told of it again."""
+
+    def send_dropped(self, stream: StreamInfo, seq: int, reason: DropReason) -> None:
+        """A message of ours was dropped, here or at a later hop."""
+
+    def publication_refused(self, stream: StreamInfo, code: str, text: str) -> None: ...
+
+
+class ClientCore:
+    """One client. `boot` is a random 63-bit number of this process, `now` any monotonic time in seconds."""
+
+    def __init__(
+        self,
+        *,
+        name: ClientName,
+        boot: int,
+        events: ClientEvents,
+        link: LinkParams,
+        scheduler: SchedulerParams,
+        trace: DecisionTrace | None = None,
+        now: float,
+        lossless: bool = True,
+    ) -> None:
+        self.name = name
+        self.boot = boot
+        self.events = events
+        self.trace = trace or DecisionTrace(enabled=False)
+        self.definitions: dict[str, str] = {}
+        self.received = ReceiveLedger()
+        """Counters of what arrives, by topic: delivered, and dropped on arrival for a reason."""
+        self.patterns: tuple[str, ...] = ()
+        self.attributes: dict[str, str] = {}
+        """Metadata of this node, for the object registry."""
+        self._generations: dict[StreamId, int] = {}
+        self._open: set[StreamId] = set()
+        self.link = Link(
+            name=name,
+            boot=boot,
+            peer=RELAY_NAME,
+            initiator=True,
+            handler=self,
+            definitions=self.definitions,
+            link=link,
+            scheduler=scheduler,
+            trace=self.trace,
+            now=now,
+            lossless=lossless,
+        )
+
+    # --- publishing -----------------------------------------------------------------------------------------------
+
+    def publish(self, info: TopicInfo, spec: TopicSpec, *, now: float) -> OutChannel:
+        """Offer a topic under its global name. Offering it again after `unpublish` goes on counting where it ended."""
+        identity = StreamId(self.name, self.boot, info.name)
+        first = self._generations.get(identity, 0) + 1
+        return self.link.open_channel(StreamInfo(identity, info, spec), first=first, now=now)
+
+    def unpublish(self, channel: OutChannel, *, now: float) -> None:
+        self._generations[channel.stream.id] = channel.next_seq - 1
+        self.link.close_channel(channel, DropReason.SHUTDOWN, now=now)
+
+    def send(self, channel: OutChannel, body: bytes, stamp_ns: int, *, now: float) -> bool:
+        """Offer one message. False: refused, the reliable queue is full; offer it again later or count it lost."""
+        message = Message(channel.stream.id, channel.next_seq, body, stamp_ns, now)
+        return self.link.submit(channel, message, now=now)
+
+    # --- receiving ------------------------------------------------------------------------------------------------
+
+    def subscribe(self, patterns: tuple[str, ...], *, now: float) -> None:
+        """Full-match patterns of the global names this site wants; replaces the earlier ones."""
+        self.patterns = patterns
+        if self.link.established:
+            self._send_subscription(now)
+
+    def _send_subscription(self, now: float) -> None:
+        parts = [self.patterns[i : i + MAX_STRINGS] for i in range(0, len(self.patterns), MAX_STRINGS)] or [()]
+        batch: list[str] = []
+        for part in parts:
+            for pattern in part:
+                # An envelope holds 4 KiB: long patterns travel in more parts.
+                if sum(len(item) + 4 for item in batch) + len(pattern) > wire.MAX_ENVELOPE_BYTES // 2:
+                    self.link.send_control({"t": "subscribe", "patterns": batch, "more": True}, now=now)
+                    batch = []
+                batch.append(pattern)
+            if part is not parts[-1]:
+                self.link.send_control({"t": "subscribe", "patterns": batch, "more": True}, now=now)
+                batch = []
+        self.link.send_control({"t": "subscribe", "patterns": batch, "more": False}, now=now)
+
+    def put_object(
+        self,
+        object_id: str,
+        kind: ObjectKind,
+        type_name: str,
+        *,
+        attributes: dict[str, str] | None = None,
+        value: bytes = b"",
+        wall_ns: int,
+        now: float,
+    ) -> None:
+        """Create or replace a cross-reality object of ours at the relay (node metadata, a transform, a patch)."""
+        envelope: wire.Envelope = {
+            "t": "object",
+            "op": "put",
+            "id": object_id,
+            "kind": str(kind),
+            "type": type_name,
+            "attr": dict(attributes or {}),
+            "wall": wall_ns,
+        }
+        self.link.send_control(envelope, value, now=now)
+
+    def delete_object(self, object_id: str, *, now: float) -> None:
+        self.link.send_control({"t": "object", "op": "delete", "id": object_id}, now=now)
+
+    # --- LinkHandler ----------------------------------------------------------------------------------------------
+
+    def on_up(self, link: Link, *, resumed: bool, now: float) -> None:
+        self._send_subscription(now)
+        self.events.link_up(resumed=resumed)
+
+    def on_down(self, link: Link, reason: str, *, now: float) -> None:
+        self.events.link_down(reason)
+
+    def on_rejected(self, link: Link, code: str, text: str, *, now: float) -> None:
+        self.events.rejected(code, text)
+
+    def on_announce(self, link: Link, announcement: Announcement, *, now: float) -> bool | None:
+        stream = link.streams[announcement.stream.id]
+        digest = announcement.definition_hash
+        if digest and digest not in self.definitions:
+            return None  # asked for; answered when it is here
+        return self._open_stream(stream)
+
+    def _open_stream(self, stream: InStream) -> bool:
+        identity = stream.stream.id
+        if identity.origin == self.name:
+            return False  # our own, come back through somebody else
+        if identity not in self._open:
+            info = stream.stream.info
+            digest = stream.stream.attributes.get("definition", "")
+            complete = TopicInfo(
+                info.name,
+                info.type_name,
+                info.encoding,
+                info.type_hash,
+                self.definitions.get(digest, ""),
+                info.latched,
+                info.reliable,
+            )
+            stream.stream = StreamInfo(identity, complete, stream.stream.spec, stream.stream.attributes)
+            try:
+                self.events.stream_opened(stream.stream)
+            except ConfigError:
+                return False  # the shell has logged it; nothing else stops
+            self._open.add(identity)
+        return True
+
+    def on_definition(self, link: Link, digest: str, *, now: float) -> None:
+        for stream in list(link.incoming.values()):
+            if stream.stream.attributes.get("definition") == digest:
+                link.answer(stream, self._open_stream(stream), now=now)
+
+    def on_retract(self, link: Link, stream: InStream, *, now: float) -> None:
+        if stream.stream.id in self._open:
+            self._open.discard(stream.stream.id)
+            self.events.stream_closed(stream.stream)
+
+    def on_message(self, link: Link, stream: InStream, message: Message, *, now: float) -> None:
+        if message.tombstone:
+            reason = message.drop_reason
+            self.received.of(stream.stream).drop_arrived(reason)
+            self.events.expired(stream.stream, message.seq, reason)
+            return
+        self.received.of(stream.stream).arrived(len(message.body), now - message.born_s, now)
+        self.events.message(stream.stream, message, now=now)
+
+    def on_in_drop(self, link: Link, stream: InStream, reason: DropReason, nbytes: int) -> None:
+        self.received.of(stream.stream).drop_arrived(reason)
+        self.trace.record(link.now, stream.stream.id.topic, TraceEvent.DROPPED, reason=reason, peer=link.peer)
+
+    def on_out_drop(self, link: Link, channel: OutChannel, out: OutMessage, reason: DropReason) -> None:
+        self.events.send_dropped(channel.stream, out.seq, reason)
+
+    def on_delivered(self, link: Link, channel: OutChannel, *, now: float) -> None:
+        """The ledger has counted it."""
+
+    def on_refused(self, link: Link, channel: OutChannel, code: str, text: str, *, now: float) -> None:
+        self.events.publication_refused(channel.stream, code, text)
+
+    def on_skipped(self, link: Link, stream: InStream, count: int, *, now: float) -> None:
+        if stream.reliable and stream.stream.id in self._open:
+            self.events.skipped(stream.stream, count)
+
+    def on_control(self, link: Link, envelope: wire.Envelope, attachment: bytes, *, now: float) -> None:
+        raise WireError(f"unknown control message {envelope.get('t')!r}")

@@ -1,0 +1,490 @@
+"""The data plane of one end of a hop: from messages to datagrams and back, for one session after another.
+
+`Link` (link.py) adds the control plane: handshake, announcements, interest. The next fragment is chosen only when the
+lane can take it (late binding), so that nothing waits where it can no longer be overtaken.
+"""
+
+from abc import ABC, abstractmethod
+from typing import Any, Final, NamedTuple
+
+from sern_core import wire
+from sern_core.capacity import AckSample
+from sern_core.clocksync import ClockSync
+from sern_core.errors import WireError
+from sern_core.flight import ACK_DELAY_S
+from sern_core.fragments import InStream, Reassembly
+from sern_core.lanes import LANE_NAMES, LANE_ZMQ, OVERHEAD_BYTES, PROBE_INTERVAL_S, Lane
+from sern_core.ledger import SendCounters, SendLedger
+from sern_core.message import Message, StreamId, StreamInfo, TopicInfo, TopicSpec
+from sern_core.params import LinkParams, SchedulerParams
+from sern_core.queues import OutChannel, OutMessage
+from sern_core.scheduler import Scheduler
+from sern_core.trace import LINK, DecisionTrace, TraceEvent
+from sern_core.types import ClientName, DropReason, Encoding, Ordering, PriorityClass, Reliability, TopicName
+
+CONTROL_CHANNEL: Final = 0
+CONTROL_TOPIC: Final = TopicName("/_sern/control")
+PING_INTERVAL_S: Final = 0.5
+SWEEP_INTERVAL_S: Final = 0.25
+RATE_INTERVAL_S: Final = 0.05
+MIN_SHARE_BYTES: Final = 64
+"""A fragment smaller than this is not worth its header: the datagram ends instead."""
+MAX_WATERMARKS: Final = 64
+
+
+class SentData(NamedTuple):
+    """A fragment that a packet carried."""
+
+    channel: OutChannel
+    out: OutMessage
+    generation: int
+    start: int
+    end: int
+
+
+class SentWatermark(NamedTuple):
+    """A delivered watermark that a packet carried."""
+
+    channel: int
+
+
+class SentPing(NamedTuple):
+    """A packet that only asked for an acknowledgement."""
+
+
+def microseconds(now: float) -> int:
+    return int(now * 1e6)
+
+
+class Hop(ABC):
+    """Queues, scheduler, flight and reassembly of one end. `boot` is this process's random 63-bit number."""
+
+    def __init__(
+        self,
+        *,
+        name: ClientName,
+        boot: int,
+        peer: ClientName,
+        link: LinkParams,
+        scheduler: SchedulerParams,
+        trace: DecisionTrace,
+        now: float,
+        lossless: bool,
+    ) -> None:
+        self.name = name
+        self.boot = boot
+        self.peer = peer
+        self.params = link
+        self.lane = Lane(LANE_ZMQ, link, lossless=lossless)
+        self.scheduler = Scheduler(scheduler, now=now)
+        self._paper = scheduler.ordering is Ordering.PAPER
+        self.trace = trace
+        self.clock = ClockSync()
+        self.ledger = SendLedger()
+        """Counters of what goes out, by topic."""
+        self.strays = 0  # fragments of streams that are unknown here (drop reason `unknown_channel`)
+        self.channels: dict[int, OutChannel] = {}
+        self.incoming: dict[int, InStream] = {}
+        """Streams of this session by the peer's channel number."""
+        self.reassembly = Reassembly(max(64 * 2**20, 2 * link.max_message_bytes))
+        self.established = False
+        self.tag = 0
+        self.dirty = False
+        """Something may be sendable: the owner should poll `next_datagram`."""
+        self._ping = False
+        self._ping_due_s = now
+        self._sweep_due_s = now + SWEEP_INTERVAL_S
+        self._rate_due_s = now
+        self._watermarks: dict[int, int] = {}  # channel -> delivered, not yet on the wire
+        self._rx_stamp_us = 0
+        self._now = now
+        self._begin_control()
+
+    # --- what the control plane provides --------------------------------------------------------------------------
+
+    @abstractmethod
+    def _control_message(self, stream: InStream, message: Message) -> None: ...
+
+    @abstractmethod
+    def _in_drop(self, stream: InStream, reason: DropReason, nbytes: int) -> None: ...
+
+    @abstractmethod
+    def _watermark_moved(self, channel: OutChannel) -> None: ...
+
+    def _begin_control(self) -> None:
+        """A fresh control stream in both directions, for a new session."""
+        spec = TopicSpec(
+            priority=PriorityClass.CONTROL,
+            reliability=Reliability.RELIABLE,
+            lifespan_s=None,
+            retention_s=float("inf"),
+            max_queue_bytes=2**62,
+        )
+        info = TopicInfo(CONTROL_TOPIC, "", Encoding.RAW)
+        stream = StreamInfo(StreamId(self.name, self.boot, CONTROL_TOPIC), info, spec)
+        counters = SendCounters(CONTROL_TOPIC, PriorityClass.CONTROL)
+        self._control = OutChannel(CONTROL_CHANNEL, stream, counters, lambda _out, _reason: None, first=1)
+        self._control.wanted = self._control.ready = True
+        self._control_in = InStream(stream, self.reassembly, self._control_message, self._in_drop, first=1)
+
+    # --- messages out ---------------------------------------------------------------------------------------------
+
+    def submit(self, channel: OutChannel, message: Message, *, now: float, forced: bool = False) -> bool:
+        """Offer a message of an open channel. False: refused, the reliable queue is full.
+
+        `forced` is for forwarding: rate cap and reliable bound were enforced at the origin.
+        """
+        self._now = now
+        nbytes = len(message.body)
+        if nbytes > self.params.max_message_bytes:
+            channel.reject(message, DropReason.TOO_LARGE)
+            self.trace.record(
+                now, message.stream.topic, TraceEvent.DROPPED, seq=message.seq, reason=DropReason.TOO_LARGE
+            )
+            return True
+        backlog = channel.offered
+        accepted = channel.submit(message, now=now, forced=forced)
+        if self.trace.enabled:
+            event = TraceEvent.QUEUED if accepted else TraceEvent.REFUSED
+            self.trace.record(now, message.stream.topic, event, seq=message.seq, peer=self.peer)
+        if not backlog or channel.coalesced:
+            self._refresh(channel, now)
+        return accepted
+
+    def _refresh(self, channel: OutChannel, now: float) -> None:
+        """Tell the scheduler what this channel would send next."""
+        out = channel.head(now) if channel.ready and channel.wanted else None
+        if out is None:
+            if channel.offered:
+                channel.offered = False
+                self.scheduler.withdraw(channel.slot)
+            return
+        spec = channel.spec
+        since_s = out.message.born_s
+        if channel.coalesced and channel.last_sent_s is not None:
+            # With message age each new sample would reset the priority, and the topic could starve.
+            since_s = channel.last_sent_s
+        channel.offered = True
+        self.dirty = True
+        self.scheduler.offer(
+            channel.slot,
+            # A replay for a late joiner competes with deferrable traffic only, never with live state.
+            priority=PriorityClass.BULK if out.message.replay else spec.priority,
+            weight=spec.weight,
+            size_bytes=out.unsent_bytes,
+            since_s=since_s,
+            stale_after_s=spec.lifespan_s if self._paper else None,
+        )
+
+    # --- bytes out ------------------------------------------------------------------------------------------------
+
+    def _next_data(self, now: float) -> bytes | None:
+        """The next kind-16 datagram of an established session, or None."""
+        self._now = now
+        self.dirty = False
+        lane = self.lane
+        frames: list[bytes] = []
+        items: list[SentData | SentWatermark | SentPing] = []
+        if not lane.stalled or now >= lane.probe_due_s:
+            self._compose(frames, items, now)
+            if lane.stalled and items:
+                lane.probe_due_s = now + PROBE_INTERVAL_S
+        arrivals = lane.arrivals
+        if arrivals.unacked and (items or arrivals.due or now >= arrivals.since_s + ACK_DELAY_S):
+            # In front: the receiver's clock estimate has the newest sample before it judges the age of what follows.
+            frames.insert(
+                0,
+                wire.encode_ack(
+                    lane.id, arrivals.highest, arrivals.mask, arrivals.echo_us, arrivals.received_us, arrivals.cum_bytes
+                ),
+            )
+            arrivals.flushed()
+        if not frames:
+            return None
+        if not items:
+            return b"".join((wire.encode_header(wire.Kind.DATA, self.tag, 0, microseconds(now)), *frames))
+        flight = lane.flight
+        header = wire.encode_header(wire.Kind.DATA, self.tag, flight.next_number, microseconds(now))
+        datagram = b"".join((header, *frames))
+        nbytes = len(datagram) + OVERHEAD_BYTES
+        estimator = lane.estimator
+        app_limited = not self.dirty and flight.inflight_bytes + nbytes < estimator.window_bytes
+        flight.sent(now=now, nbytes=nbytes, items=items, app_limited=app_limited)
+        estimator.on_sent(now=now, nbytes=nbytes, inflight_bytes=flight.inflight_bytes)
+        self._ping_due_s = now + PING_INTERVAL_S
+        return datagram
+
+    def _compose(self, frames: list[bytes], items: list[SentData | SentWatermark | SentPing], now: float) -> None:
+        """Fill one datagram: watermarks, control, then what the scheduler picks, of one class."""
+        lane = self.lane
+        limit = lane.fragment_bytes - (wire.ACK.size if lane.arrivals.unacked else 0)
+        scheduler = self.scheduler
+        window_open = lane.window_open and not lane.stalled
+        size = wire.HEADER_BYTES
+        if self._watermarks:
+            for slot in list(self._watermarks)[:MAX_WATERMARKS]:
+                frames.append(wire.encode_watermark(slot, self._watermarks.pop(slot)))
+                items.append(SentWatermark(slot))
+                size += wire.WATERMARK.size
+        control = self._control
+        while size < limit - MIN_SHARE_BYTES and (order := control.head(now)) is not None:
+            before = size
+            size = self._put(control, order, frames, items, size, limit, now)
+            scheduler.charge(PriorityClass.CONTROL, size - before, now=now)
+        served: PriorityClass | None = None
+        while size < limit:
+            chosen = self._pick(now, window_open=window_open)
+            if chosen is None:
+                break
+            channel = self.channels[chosen]
+            out = channel.head(now)
+            if out is None:
+                self._refresh(channel, now)
+                continue
+            priority = channel.spec.priority
+            if frames and (
+                (served is not None and priority is not served)
+                or out.unsent_bytes > limit - size - wire.DATA_FIRST_BYTES
+            ):
+                self.dirty = True
+                break
+            served = priority
+            before = size
+            size = self._put(channel, out, frames, items, size, limit, now)
+            scheduler.charge(priority, size - before, now=now)
+            self._refresh(channel, now)
+            if lane.stalled:
+                break
+        if not items and (self._ping or lane.stalled):
+            frames.append(wire.PING_FRAME)
+            items.append(SentPing())
+        self._ping = False
+        if items:
+            self.dirty = True
+
+    def _pick(self, now: float, *, window_open: bool) -> int | None:
+        """The scheduler's choice; under `ordering: paper` what it found stale is dropped first."""
+        slot = self.scheduler.pick(now=now, window_open=window_open)
+        if self._paper:
+            for stale in self.scheduler.take_stale(now):
+                channel = self.channels[stale]
+                channel.drop_head(DropReason.STALE, now)
+                self._refresh(channel, now)
+        return slot
+
+    def _put(
+        self,
+        channel: OutChannel,
+        out: OutMessage,
+        frames: list[bytes],
+        items: list[SentData | SentWatermark | SentPing],
+        size: int,
+        limit: int,
+        now: float,
+    ) -> int:
+        """Append one fragment of `out`; returns the datagram's new size."""
+        message = out.message
+        if self.trace.enabled and not out.started:
+            self.trace.record(now, message.stream.topic, TraceEvent.CHOSEN, seq=out.seq, peer=self.peer)
+        start, end = channel.take(out, max(limit - size - wire.DATA_FIRST_BYTES, MIN_SHARE_BYTES), now)
+        flags = wire.FLAG_TOMBSTONE if message.tombstone else 0
+        if message.replay:
+            flags |= wire.FLAG_REPLAY
+        if channel.spec.priority is PriorityClass.CONTROL:
+            flags |= wire.FLAG_URGENT
+        if start == 0:
+            age_s = now - message.born_s
+            head = wire.encode_data_first(flags, channel.slot, out.seq, out.size, end, message.stamp_ns, age_s, 0)
+        else:
+            head = wire.encode_data_next(flags, channel.slot, out.seq, start, out.size, end - start)
+        frames.append(head)
+        frames.append(message.body if end - start == out.size else message.body[start:end])
+        items.append(SentData(channel, out, out.generation, start, end))
+        return size + len(head) + end - start
+
+    # --- bytes in -------------------------------------------------------------------------------------------------
+
+    def _receive_data(self, header: wire.Header, data: bytes, now: float) -> None:
+        """A kind-16 datagram of this session."""
+        self._rx_stamp_us = header.stamp_us
+        self._now = now
+        if header.number:
+            arrivals = self.lane.arrivals
+            arrivals.arrived(header.number, header.stamp_us, len(data) + OVERHEAD_BYTES, now=now)
+            if arrivals.due:
+                self.dirty = True
+        wire.decode_frames(data, self)
+
+    def on_data(
+        self,
+        flags: int,
+        channel: int,
+        seq: int,
+        offset: int,
+        total: int,
+        body: bytes,
+        stamp_ns: int,
+        age_s: float,
+        codec: int,
+    ) -> None:
+        """FrameSink: one fragment."""
+        now = self._now
+        if codec:
+            raise WireError(f"codec {codec} was not agreed")
+        if flags & wire.FLAG_URGENT:
+            self.lane.arrivals.due = True
+            self.dirty = True
+        if channel == CONTROL_CHANNEL:
+            stream = self._control_in
+        else:
+            known = self.incoming.get(channel)
+            if known is None:
+                self.strays += 1
+                return
+            stream = known
+        if total > self.params.max_message_bytes:
+            raise WireError(f"message of {total} bytes exceeds max_message_bytes {self.params.max_message_bytes}")
+        wide = wire.widen_seq(seq, stream.delivered)
+        born_s = now
+        if offset == 0:
+            delay_s, error_s = self.clock.one_way_delay_s(self._rx_stamp_us * 1e-6, now)
+            born_s = now - age_s - delay_s
+            # With no idea of the delay a command counts as late; other messages are given the benefit of the doubt.
+            strict = self.clock.ready or stream.stream.spec.priority is PriorityClass.CONTROL
+            stream.error_s = error_s if strict else 0.0
+        stream.fragment(flags, wide, offset, total, body, stamp_ns, born_s, now)
+
+    def on_ack(self, lane: int, highest: int, sack: int, echo_us: int, received_us: int, cum_bytes: int) -> None:
+        """FrameSink: an acknowledgement of what we sent."""
+        state = self.lane
+        flight = state.flight
+        if lane not in LANE_NAMES:
+            raise WireError(f"acknowledgement of unknown lane {lane}")
+        if highest >= flight.next_number:
+            raise WireError(f"acknowledgement of packet {highest}, which was never sent")
+        now = self._now
+        packets = flight.acked(highest, sack, now=now)
+        if packets:
+            state.stalled = False
+            newest = packets[-1]
+            if newest.number == highest:
+                sent_s, stamp_s, received_s = echo_us * 1e-6, self._rx_stamp_us * 1e-6, received_us * 1e-6
+                rtt_s = max(1e-6, now - sent_s - (stamp_s - received_s))
+                flight.rtt.sample(rtt_s, now=now)
+                self.clock.sample(sent_s, received_s, stamp_s, now)
+                acked_bytes = sum(packet.nbytes for packet in packets)
+                state.estimator.on_ack(
+                    AckSample(now, rtt_s, acked_bytes, flight.inflight_bytes, received_s, cum_bytes, newest.app_limited)
+                )
+                if now >= self._rate_due_s:
+                    self._rate_known(now)
+            for packet in packets:
+                for item in packet.items:
+                    if type(item) is SentData:
+                        item.channel.fragment_acked(item.out, item.generation)
+            self._control.settle()
+            self.dirty = True
+        if highest > state.highest_acked:
+            state.highest_acked = highest
+        if not flight.lossless:
+            self._find_losses(now)
+
+    def _rate_known(self, now: float) -> None:
+        self._rate_due_s = now + RATE_INTERVAL_S
+        self.scheduler.set_rate(self.lane.rate_changed() or None, now=now)
+
+    def _find_losses(self, now: float) -> None:
+        lane = self.lane
+        for packet in lane.flight.lost(lane.highest_acked, now=now):
+            lane.estimator.on_loss(now=now, nbytes=packet.nbytes)
+            self._give_back(packet.items, now)
+            self.dirty = True
+
+    def _give_back(self, items: list[Any], now: float) -> None:
+        """What a packet carried did not arrive: send again what is still wanted."""
+        for item in items:
+            if type(item) is SentData:
+                channel = item.channel
+                again = channel.fragment_lost(item.out, item.generation, item.start, item.end, now=now)
+                if again and self.trace.enabled:
+                    self.trace.record(
+                        now, item.out.message.stream.topic, TraceEvent.LOST, seq=item.out.seq, peer=self.peer
+                    )
+                if self.channels.get(channel.slot) is channel:
+                    self._refresh(channel, now)
+            elif type(item) is SentWatermark and item.channel in self.incoming:
+                stream = self.incoming[item.channel]
+                self._watermarks.setdefault(item.channel, stream.confirmed)
+
+    def on_watermark(self, channel: int, delivered: int) -> None:
+        """FrameSink: everything of a reliable channel up to `delivered` has had its turn at the far side."""
+        out_channel = self.channels.get(channel)
+        if out_channel is None or not out_channel.reliable:
+            return
+        wide = wire.widen_seq(delivered, out_channel.watermark)
+        if wide >= out_channel.next_seq:
+            raise WireError(f"watermark {wide} of channel {channel} is beyond what was sent")
+        if wide > out_channel.watermark:
+            out_channel.delivered_to(wide)
+            self._refresh(out_channel, self._now)
+            self._watermark_moved(out_channel)
+
+    def on_ping(self) -> None:
+        """FrameSink: the peer asks for an acknowledgement now."""
+        self.lane.arrivals.due = True
+        self.dirty = True
+
+    def confirm(self, stream: InStream, delivered: int) -> None:
+        """Tell the peer that its reliable stream is delivered up to `delivered`; remembered while it is away."""
+        if delivered > stream.confirmed:
+            stream.confirmed = delivered
+            if stream.channel_id is not None:
+                self._watermarks[stream.channel_id] = delivered
+                self.dirty = True
+
+    # --- time -----------------------------------------------------------------------------------------------------
+
+    def _data_deadline(self) -> float | None:
+        """When `handle_timeout` or `next_datagram` has something to do by time alone."""
+        lane = self.lane
+        deadline = min(self._sweep_due_s, self._ping_due_s)
+        arrivals = lane.arrivals
+        if arrivals.unacked:
+            due_s = arrivals.since_s + ACK_DELAY_S
+            if due_s < deadline:
+                deadline = due_s
+        for candidate in (
+            lane.stall_deadline(),
+            lane.flight.loss_deadline(),
+            lane.probe_due_s if lane.stalled else None,
+            self.scheduler.next_deadline(now=self._now, window_open=lane.window_open and not lane.stalled),
+        ):
+            if candidate is not None and candidate < deadline:
+                deadline = candidate
+        return deadline
+
+    def _data_timeout(self, now: float) -> None:
+        self._now = now
+        lane = self.lane
+        self._find_losses(now)
+        stall_s = lane.stall_deadline()
+        if stall_s is not None and now >= stall_s:
+            lane.stalled = True
+            lane.probe_due_s = now
+            lane.estimator.on_stall(now=now)
+            self.trace.record(now, LINK, TraceEvent.LINK_DOWN, peer=self.peer, reason="no acknowledgement")
+        if now >= self._ping_due_s:
+            self._ping = True
+            self._ping_due_s = now + PING_INTERVAL_S
+        if now >= self._sweep_due_s:
+            self._sweep(now)
+        self.dirty = True
+
+    def _sweep(self, now: float) -> None:
+        """Expire what nobody will send, also while the link is down."""
+        self._sweep_due_s = now + SWEEP_INTERVAL_S
+        for channel in list(self.channels.values()):
+            channel.sweep(now, up=self.established)
+            self._refresh(channel, now)
+        for stream in self.incoming.values():
+            stream.sweep(now)

@@ -1,0 +1,524 @@
+"""The relay's core: one link per client, who gets what, and who has got it. Pure.
+
+Messages arrive whole and in their turn from one link and are offered, unchanged, to the links of all subscribers, each
+with a scheduler and a window of its own: a slow subscriber sheds only its own traffic, by class.
+
+Reliable streams: the origin is told "delivered up to n" when every client that is owed the stream has confirmed n.
+An origin remembers who is owed; a relay that starts anew learns it from the announcement and holds messages for
+those clients before they have come back (they are *awaited*). A client that stays away longer than `resume_s` is
+dropped, and what it was owed is reported to the origins.
+"""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Final, Protocol
+
+from sern_core import wire
+from sern_core.access import AccessTable, RateGuard
+from sern_core.announce import Announcement
+from sern_core.errors import RefusedError, VersionError, WireError
+from sern_core.fragments import InStream
+from sern_core.hop import microseconds
+from sern_core.ledger import ReceiveLedger
+from sern_core.link import Link
+from sern_core.message import Message, StreamId, StreamInfo
+from sern_core.objects import ObjectRegistry
+from sern_core.params import LinkParams, SchedulerParams
+from sern_core.queues import OutChannel, OutMessage
+from sern_core.replay import LatchedCache
+from sern_core.routing import RouteChange, RoutingTable
+from sern_core.trace import DecisionTrace
+from sern_core.types import DROP_CODES, ClientName, DropReason, ObjectKind, TopicName
+
+MAX_SUBSCRIPTION_PARTS: Final = 64
+RESET_INTERVAL_S: Final = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class HubParams:
+    """`cache_bytes`: latched messages kept per stream. `resume_s`: how long an absent client is waited for."""
+
+    cache_bytes: int = 8 * 2**20
+    resume_s: float = 600.0
+
+
+class HubEvents(Protocol):
+    """What the relay's shell is told."""
+
+    def client_up(self, client: ClientName, *, resumed: bool) -> None: ...
+
+    def client_down(self, client: ClientName, reason: str) -> None: ...
+
+    def stream_added(self, stream: StreamInfo) -> None: ...
+
+    def stream_removed(self, stream: StreamInfo) -> None: ...
+
+    def message(self, stream: StreamInfo, message: Message, *, now: float) -> None:
+        """For the plain feed. Tombstones are not reported."""
+
+    def refused(self, client: ClientName, code: str, text: str) -> None: ...
+
+
+class Relayed:
+    """One stream at the relay: where it comes from, where it goes, what is kept of it."""
+
+    __slots__ = ("cache", "definition_known", "outs", "source", "stream")
+
+    def __init__(self, source: Link | None, stream: InStream | None, info: StreamInfo, cache_bytes: int) -> None:
+        self.source = source
+        self.stream = stream
+        self.outs: dict[ClientName, tuple[Link, OutChannel]] = {}
+        self.cache = LatchedCache(info.spec.depth, cache_bytes) if info.spec.latched else None
+
+
+class HubPort:
+    """One transport connection of one client, as the lane below sees it. `client` is bound to the peer's key."""
+
+    def __init__(self, hub: "Hub", client: ClientName) -> None:
+        self.hub = hub
+        self.client = client
+        self.link: Link | None = None
+        self._out: list[bytes] = []
+        self._reset_due_s = -float("inf")
+
+    @property
+    def current(self) -> bool:
+        return self.link is not None and self.hub.port_of.get(self.client) is self
+
+    def connected(self, *, now: float) -> None:
+        """The client speaks first."""
+
+    def disconnected(self, *, now: float) -> None:
+        if self.current and self.link is not None:
+            del self.hub.port_of[self.client]
+            self.link.disconnected(now=now)
+        self.link = None
+
+    def receive(self, data: bytes, *, now: float) -> None:
+        """One datagram. Raises WireError or VersionError; the caller closes the connection."""
+        if self.link is not None and self.current and data[2:3] != b"\x01":
+            self.link.receive(data, now=now)
+            return
+        header = wire.decode_header(data)
+        if header.kind == wire.Kind.HELLO:
+            hello = wire.decode_handshake(data)
+            name = wire.take_str(hello, "name", max_length=64)
+            if name != self.client:
+                self._refuse(header.tag, "name", f"your key belongs to {self.client}, not to {name}", now)
+                return
+            try:
+                self.hub.greet(self, hello, header, now=now)
+            except VersionError as error:
+                self._refuse(header.tag, "version", str(error), now)
+        elif header.kind == wire.Kind.DATA and now >= self._reset_due_s:
+            self._reset_due_s = now + RESET_INTERVAL_S
+            self._out.append(wire.encode_handshake(wire.Kind.RESET, header.tag, microseconds(now), {}))
+
+    def _refuse(self, tag: int, code: str, text: str, now: float) -> None:
+        self._out.append(wire.encode_handshake(wire.Kind.REFUSE, tag, microseconds(now), {"code": code, "why": text}))
+
+    def next_datagram(self, *, now: float) -> bytes | None:
+        if self._out:
+            return self._out.pop(0)
+        return self.link.next_datagram(now=now) if self.link is not None and self.current else None
+
+    def next_deadline(self) -> float | None:
+        return self.link.next_deadline() if self.link is not None and self.current else None
+
+    def handle_timeout(self, *, now: float) -> None:
+        if self.link is not None and self.current:
+            self.link.handle_timeout(now=now)
+
+    @property
+    def dirty(self) -> bool:
+        return bool(self._out) or (self.link is not None and self.current and self.link.dirty)
+
+
+class Hub:
+    """See the module's text. `known` says whether a name is in the directory of clients."""
+
+    def __init__(
+        self,
+        *,
+        name: ClientName,
+        boot: int,
+        access: AccessTable,
+        known: Callable[[ClientName], bool],
+        events: HubEvents,
+        link: LinkParams,
+        scheduler: SchedulerParams,
+        params: HubParams | None = None,
+        wall_ns: Callable[[float], int],
+        trace: DecisionTrace | None = None,
+        now: float,
+        lossless: bool = True,
+    ) -> None:
+        self.name = name
+        self.boot = boot
+        self.access = access
+        self.known = known
+        self.events = events
+        self.params = params or HubParams()
+        self.routing = RoutingTable(access)
+        self.objects = ObjectRegistry(epoch=boot)
+        self.definitions: dict[str, str] = {}
+        self.trace = trace or DecisionTrace(enabled=False)
+        self.received = ReceiveLedger()
+        self.links: dict[ClientName, Link] = {}
+        self.port_of: dict[ClientName, HubPort] = {}
+        self.relayed: dict[StreamId, Relayed] = {}
+        self._link_params = link
+        self._scheduler_params = scheduler
+        self._lossless = lossless
+        self._wall_ns = wall_ns
+        self._guards: dict[ClientName, RateGuard] = {}
+        self._subscriptions: dict[ClientName, list[str]] = {}  # parts that have arrived
+        self._awaited: dict[ClientName, set[TopicName]] = {}
+        self._absent_since: dict[ClientName, float] = {}
+        self._draining: list[tuple[Link, OutChannel]] = []  # streams that ended with reliable messages still owed
+        self._sweep_due_s = now
+
+    # --- connections ----------------------------------------------------------------------------------------------
+
+    def greet(self, port: HubPort, hello: wire.Envelope, header: wire.Header, *, now: float) -> None:
+        """A client says hello on a connection. A newer connection of the same client retires the older one."""
+        link = self._link(port.client, now)
+        link.accept(hello, header.tag, header.stamp_us, now=now)
+        older = self.port_of.get(port.client)
+        if older is not None and older is not port:
+            older.link = None
+        port.link = link
+        self.port_of[port.client] = port
+        self._absent_since.pop(port.client, None)
+
+    def _link(self, client: ClientName, now: float) -> Link:
+        link = self.links.get(client)
+        if link is None:
+            link = self.links[client] = Link(
+                name=self.name,
+                boot=self.boot,
+                peer=client,
+                initiator=False,
+                handler=self,
+                definitions=self.definitions,
+                link=self._link_params,
+                scheduler=self._scheduler_params,
+                trace=self.trace,
+                now=now,
+                lossless=self._lossless,
+                auto_confirm=False,
+            )
+            self._guards[client] = RateGuard.of(self.access.limits(client), now=now)
+            self._absent_since[client] = now
+        return link
+
+    def ports(self) -> list[HubPort]:
+        return list(self.port_of.values())
+
+    def sweep(self, *, now: float) -> None:
+        """Let go of clients that stay away, and of ended streams that are fully delivered. Call about once a second."""
+        for client, since_s in list(self._absent_since.items()):
+            link = self.links[client]
+            if link.established:
+                continue
+            link.handle_timeout(now=now)  # retention goes on while a client is away
+            if now - since_s > self.params.resume_s:
+                self._forget(client, now)
+        for link, channel in list(self._draining):
+            if not channel.retained or not channel.reliable:
+                self._draining.remove((link, channel))
+                if link.channels.get(channel.slot) is channel:
+                    link.close_channel(channel, DropReason.DISCONNECTED, now=now)
+
+    def _forget(self, client: ClientName, now: float) -> None:
+        link = self.links[client]
+        self._apply(self.routing.drop_client(client), now)
+        for channel in list(link.channels.values()):
+            link.close_channel(channel, DropReason.DISCONNECTED, now=now)
+        self._draining = [(other, channel) for other, channel in self._draining if other is not link]
+        del self.links[client]
+        self._absent_since.pop(client, None)
+        self._awaited.pop(client, None)
+        self._guards.pop(client, None)
+        self.objects.delete_owned(client)
+
+    def revoke(self, access: AccessTable, *, now: float) -> None:
+        """New access rules: what they no longer allow ends now."""
+        self.access = access
+        for client in self.links:
+            self._guards[client] = RateGuard.of(access.limits(client), now=now)
+        self._apply(self.routing.set_access(access), now)
+
+    # --- routes -----------------------------------------------------------------------------------------------------
+
+    def _apply(self, change: RouteChange, now: float) -> None:
+        touched: set[StreamId] = set(change.wanted) | set(change.unwanted)
+        for identity in change.removed:
+            self._remove(identity, now)
+        for client, identity in change.unmatched:
+            relayed = self.relayed.get(identity)
+            pair = relayed.outs.pop(client, None) if relayed is not None else None
+            if pair is not None:
+                pair[0].close_channel(pair[1], DropReason.UNWANTED, now=now)
+                touched.add(identity)
+        for client, identity in change.matched:
+            self._open(client, identity, now)
+            touched.add(identity)
+        for identity in sorted(touched):
+            relayed = self.relayed.get(identity)
+            if relayed is not None and relayed.source is not None and relayed.stream is not None:
+                relayed.source.answer(relayed.stream, self._wanted(relayed), now=now, owed=tuple(relayed.outs))
+                self._confirm(relayed)
+        for denied in change.denied:
+            if denied.by_name:
+                self.events.refused(denied.client, "forbidden", f"{denied.client} may not subscribe to {denied.topic}")
+
+    def _wanted(self, relayed: Relayed) -> bool:
+        assert relayed.stream is not None
+        return bool(relayed.outs) or relayed.cache is not None or self.tap(relayed.stream.stream)
+
+    def tap(self, stream: StreamInfo) -> bool:
+        """Whether the relay itself wants the stream (a feed subscriber). Replaced by the shell."""
+        return False
+
+    def refresh_interest(self, *, now: float) -> None:
+        """The answer of `tap` may have changed: tell the origins."""
+        for relayed in self.relayed.values():
+            if relayed.source is not None and relayed.stream is not None:
+                relayed.source.answer(relayed.stream, self._wanted(relayed), now=now, owed=tuple(relayed.outs))
+
+    def _open(self, client: ClientName, identity: StreamId, now: float) -> None:
+        relayed = self.relayed[identity]
+        assert relayed.stream is not None
+        link = self._link(client, now)
+        for ended, channel in list(self._draining):
+            if ended is link and channel.stream.id == identity:  # it came back before it was gone
+                self._draining.remove((ended, channel))
+                relayed.outs[client] = (link, channel)
+                return
+        cached = relayed.cache.replay() if relayed.cache is not None else []
+        if cached and not self.access.may_replay(client, identity.topic):
+            cached = []
+        following = relayed.stream.delivered + 1
+        first = cached[0].seq if cached else following
+        channel = link.open_channel(relayed.stream.stream, first=first, now=now)
+        relayed.outs[client] = (link, channel)
+        expected = first
+        for message in cached:
+            if channel.reliable:
+                # Only what is contiguous can be in order; an older gap was reported when it arose.
+                while expected < message.seq:
+                    channel.reject(_gap(message, expected), DropReason.RETENTION)
+                    expected += 1
+                expected = message.seq + 1
+            link.submit(channel, message, now=now, forced=True)
+        if channel.reliable:
+            while expected < following:
+                channel.reject(_gap(cached[-1], expected), DropReason.RETENTION)
+                expected += 1
+
+    def _remove(self, identity: StreamId, now: float) -> None:
+        relayed = self.relayed.pop(identity, None)
+        if relayed is None:
+            return
+        for link, channel in relayed.outs.values():
+            if channel.reliable and channel.retained:
+                self._draining.append((link, channel))
+            else:
+                link.close_channel(channel, DropReason.DISCONNECTED, now=now)
+        if relayed.stream is not None:
+            self.objects.delete_stream(identity)
+            self.events.stream_removed(relayed.stream.stream)
+
+    def _confirm(self, relayed: Relayed) -> None:
+        """Tell the origin how far everybody who is owed has got."""
+        stream, source = relayed.stream, relayed.source
+        if stream is None or source is None or not stream.reliable:
+            return
+        delivered = stream.delivered
+        for _link, channel in relayed.outs.values():
+            delivered = min(delivered, channel.watermark)
+        source.confirm(stream, delivered)
+
+    # --- LinkHandler ----------------------------------------------------------------------------------------------
+
+    def on_up(self, link: Link, *, resumed: bool, now: float) -> None:
+        self._absent_since.pop(link.peer, None)
+        self.events.client_up(link.peer, resumed=resumed)
+
+    def on_down(self, link: Link, reason: str, *, now: float) -> None:
+        self._absent_since[link.peer] = now
+        self.events.client_down(link.peer, reason)
+
+    def on_rejected(self, link: Link, code: str, text: str, *, now: float) -> None:
+        """A relay is never the initiator."""
+        raise WireError("REFUSE is not for a relay")
+
+    def on_announce(self, link: Link, announcement: Announcement, *, now: float) -> bool | None:
+        stream = link.streams[announcement.stream.id]
+        identity = stream.stream.id
+        if identity.origin != link.peer or identity.boot != link.peer_boot:
+            raise RefusedError("origin", f"{link.peer} announced a stream of {identity.origin}")
+        relayed = self.relayed.get(identity)
+        if relayed is None:
+            relayed = self.relayed[identity] = Relayed(link, stream, stream.stream, self.params.cache_bytes)
+        relayed.stream = stream
+        try:
+            change = self.routing.announce(stream.stream)
+        except RefusedError as refusal:
+            self.relayed.pop(identity, None)
+            self.events.refused(link.peer, refusal.code, str(refusal))
+            raise
+        if change.added:
+            self.events.stream_added(stream.stream)
+            try:
+                self.objects.put_stream(stream.stream, wall_ns=self._wall_ns(now), now=now)
+            except RefusedError as refusal:
+                self.events.refused(link.peer, refusal.code, str(refusal))
+        self._apply(change, now)
+        if stream.reliable:
+            self._await(announcement.owed, identity, now)
+        relayed.source = link
+        link.answer(stream, self._wanted(relayed), now=now, owed=tuple(relayed.outs))
+        return None
+
+    def _await(self, owed: Iterable[str], identity: StreamId, now: float) -> None:
+        """Hold a reliable stream for clients that an earlier run of this relay owed it to."""
+        for text in owed:
+            client = ClientName(text)
+            link = self.links.get(client)
+            if (link is not None and link.established) or client == identity.origin or not self.known(client):
+                continue
+            self._link(client, now)
+            topics = self._awaited.setdefault(client, set())
+            topics.add(identity.topic)
+            if self.routing.info(identity) is not None and client not in self.routing.subscribers(identity):
+                try:
+                    self._apply(self.routing.subscribe(client, (), exact=topics), now)
+                except RefusedError as refusal:
+                    self.events.refused(client, refusal.code, str(refusal))
+
+    def on_retract(self, link: Link, stream: InStream, *, now: float) -> None:
+        self._apply(self.routing.withdraw(stream.stream.id), now)
+        self._remove(stream.stream.id, now)
+
+    def on_message(self, link: Link, stream: InStream, message: Message, *, now: float) -> None:
+        relayed = self.relayed.get(stream.stream.id)
+        if relayed is None:
+            return
+        nbytes = len(message.body)
+        if not self._guards[link.peer].admit(nbytes, now=now):
+            self.received.of(stream.stream).drop_arrived(DropReason.RATE_CAP)
+            if not stream.reliable:
+                return
+            code = DROP_CODES[DropReason.RATE_CAP]
+            message = Message(message.stream, message.seq, bytes([code]), message.stamp_ns, message.born_s, code)
+            link.report_drop(stream, message.seq, DropReason.RATE_CAP, self.name, now=now)
+        elif message.tombstone:
+            self.received.of(stream.stream).drop_arrived(message.drop_reason)
+        else:
+            self.received.of(stream.stream).arrived(nbytes, now - message.born_s, now)
+        for out_link, channel in relayed.outs.values():
+            out_link.submit(channel, message, now=now, forced=True)
+        if not message.tombstone:
+            if relayed.cache is not None:
+                relayed.cache.add(message)
+            self.objects.observe(stream.stream.id, message.seq, message.body, wall_ns=message.stamp_ns, now=now)
+            self.events.message(stream.stream, message, now=now)
+        if stream.reliable and not relayed.outs:
+            self._confirm(relayed)
+
+    def on_in_drop(self, link: Link, stream: InStream, reason: DropReason, nbytes: int) -> None:
+        self.received.of(stream.stream).drop_arrived(reason)
+
+    def on_out_drop(self, link: Link, channel: OutChannel, out: OutMessage, reason: DropReason) -> None:
+        if not channel.reliable:
+            return
+        relayed = self.relayed.get(channel.stream.id)
+        if relayed is not None and relayed.source is not None and relayed.stream is not None:
+            relayed.source.report_drop(relayed.stream, out.seq, reason, link.peer, now=link.now)
+
+    def on_delivered(self, link: Link, channel: OutChannel, *, now: float) -> None:
+        relayed = self.relayed.get(channel.stream.id)
+        if relayed is not None:
+            self._confirm(relayed)
+
+    def on_refused(self, link: Link, channel: OutChannel, code: str, text: str, *, now: float) -> None:
+        self.events.refused(link.peer, code, text)
+
+    def on_skipped(self, link: Link, stream: InStream, count: int, *, now: float) -> None:
+        """Messages of the origin that were given up before they got here: subscribers go on behind them."""
+        relayed = self.relayed.get(stream.stream.id)
+        if relayed is None or not stream.reliable:
+            return
+        for out_link, channel in relayed.outs.values():
+            while channel.next_seq <= stream.delivered:
+                gap = Message(stream.stream.id, channel.next_seq, b"", 0, now)
+                channel.reject(gap, DropReason.RETENTION)
+            out_link.handle_timeout(now=now)
+
+    def on_definition(self, link: Link, digest: str, *, now: float) -> None:
+        for other in self.links.values():
+            other.definition_known(digest, now=now)
+
+    def on_control(self, link: Link, envelope: wire.Envelope, attachment: bytes, *, now: float) -> None:
+        kind = envelope["t"]
+        if kind == "subscribe":
+            self._subscribe(link.peer, envelope, now)
+        elif kind == "object":
+            self._object(link.peer, envelope, attachment, now)
+        else:
+            raise WireError(f"unknown control message {kind!r}")
+
+    def _subscribe(self, client: ClientName, envelope: wire.Envelope, now: float) -> None:
+        parts = self._subscriptions.setdefault(client, [])
+        parts += wire.take_strings(envelope, "patterns")
+        if wire.take_bool(envelope, "more"):
+            if len(parts) > MAX_SUBSCRIPTION_PARTS * wire.MAX_ENVELOPE_ITEMS:
+                raise WireError(f"more than {MAX_SUBSCRIPTION_PARTS * wire.MAX_ENVELOPE_ITEMS} subscription patterns")
+            return
+        del self._subscriptions[client]
+        self._awaited.pop(client, None)
+        try:
+            self._apply(self.routing.subscribe(client, parts), now)
+        except RefusedError as refusal:
+            self.events.refused(client, refusal.code, str(refusal))
+
+    def _object(self, client: ClientName, envelope: wire.Envelope, attachment: bytes, now: float) -> None:
+        object_id = wire.take_str(envelope, "id")
+        attributes = envelope.get("attr", {})
+        kind = wire.take_str(envelope, "kind", max_length=16, default="node")
+        if kind not in set(ObjectKind) or not isinstance(attributes, dict):
+            raise WireError(f"bad object {object_id!r}")
+        if not all(isinstance(key, str) and isinstance(value, str) for key, value in attributes.items()):
+            raise WireError(f"attributes of object {object_id!r} must map strings to strings")
+        try:
+            if wire.take_str(envelope, "op", max_length=8) == "delete":
+                self.objects.delete(object_id, owner=client)
+            else:
+                self.objects.put(
+                    object_id,
+                    owner=client,
+                    kind=ObjectKind(kind),
+                    type_name=wire.take_str(envelope, "type", default=""),
+                    attributes=attributes,
+                    value=attachment or None,
+                    wall_ns=wire.take_int(envelope, "wall", default=0),
+                    now=now,
+                )
+        except RefusedError as refusal:
+            self.events.refused(client, refusal.code, str(refusal))
+
+    def validate(self) -> None:
+        """Internal consistency, for tests."""
+        for link in self.links.values():
+            link.validate()
+        self.routing.validate()
+        self.objects.validate()
+        for identity, relayed in self.relayed.items():
+            outs = set(self.routing.subscribers(identity))
+            assert set(relayed.outs) == outs, f"{identity.topic}: channels {set(relayed.outs)} but routes {outs}"
+
+
+def _gap(near: Message, seq: int) -> Message:
+    return Message(near.stream, seq, b"", near.stamp_ns, near.born_s)

@@ -1,0 +1,73 @@
+"""One lane of a hop: its flight, its arrivals, its estimator, its fragment size."""
+
+from typing import Final
+
+from sern_core.capacity import CapacityEstimator
+from sern_core.control.delay import DelayWindow
+from sern_core.control.fixed import FixedWindow
+from sern_core.flight import Arrivals, Flight
+from sern_core.params import LinkParams, WindowAlgorithm
+
+LANE_ZMQ: Final = 0
+LANE_NAMES: Final = {LANE_ZMQ: "zmq"}
+
+MIN_FRAGMENT_BYTES: Final = 1200
+FRAGMENT_TIME_S: Final = 0.003
+"""On a stream lane one fragment takes about 3 ms of the link: what a more urgent message may have to wait."""
+UNKNOWN_RATE_FRAGMENT_BYTES: Final = 1400
+OVERHEAD_BYTES: Final = 60
+"""What one datagram costs beside its own bytes: ZMTP, CURVE, TCP/IP or UDP/IP and AEAD."""
+STALL_MIN_S: Final = 0.5
+STALL_RTTS: Final = 4.0
+PROBE_INTERVAL_S: Final = 0.2
+"""While stalled, one fresh class-0 message goes out this often and finds out whether the path is back."""
+
+
+class Lane:
+    """State of one lane of one link. `lossless`: a stream (TCP) underneath."""
+
+    def __init__(self, lane: int, params: LinkParams, *, lossless: bool) -> None:
+        self.id = lane
+        self.lossless = lossless
+        self.fragment_bytes_max = params.fragment_bytes_max if lossless else MIN_FRAGMENT_BYTES
+        self.estimator: CapacityEstimator
+        if params.window.algorithm is WindowAlgorithm.FIXED:
+            self.estimator = FixedWindow(params.window.fixed_bytes)
+        else:
+            self.estimator = DelayWindow(fragment_bytes=MIN_FRAGMENT_BYTES + OVERHEAD_BYTES)
+        self.flight = Flight(lossless=lossless)
+        self.arrivals = Arrivals()
+        self.stalled = False
+        self.probe_due_s = 0.0
+        self.highest_acked = 0
+        self.fragment_bytes = self._fragment_bytes(None)
+
+    def _fragment_bytes(self, rate_bps: float | None) -> int:
+        if not self.lossless:
+            return MIN_FRAGMENT_BYTES
+        if rate_bps is None:
+            return min(UNKNOWN_RATE_FRAGMENT_BYTES, self.fragment_bytes_max)
+        return int(min(max(FRAGMENT_TIME_S * rate_bps / 8, MIN_FRAGMENT_BYTES), self.fragment_bytes_max))
+
+    def rate_changed(self) -> float | None:
+        """Adopt the estimator's capacity; returns it."""
+        rate_bps = self.estimator.rate_bps
+        self.fragment_bytes = self._fragment_bytes(rate_bps)
+        return rate_bps
+
+    @property
+    def window_open(self) -> bool:
+        return self.flight.inflight_bytes < self.estimator.window_bytes
+
+    def stall_deadline(self) -> float | None:
+        flight = self.flight
+        if self.stalled or not flight.packets or flight.last_progress_s is None:
+            return None
+        return flight.last_progress_s + max(STALL_MIN_S, STALL_RTTS * (flight.rtt.srtt_s or 0.0))
+
+    def new_session(self) -> None:
+        """Numbers start again; the flight was abandoned before."""
+        self.flight = Flight(lossless=self.lossless)
+        self.arrivals = Arrivals()
+        self.stalled = False
+        self.highest_acked = 0

@@ -1,0 +1,117 @@
+"""Message and byte accounting of one link: every message offered has exactly one fate, every drop a reason.
+
+Plain integers bumped by the hot path; metrics are collected from them at scrape. Counters of a topic exist, at zero,
+from the moment its stream does, so that a rate over them never misses the first event.
+"""
+
+from typing import Final
+
+from sern_core.message import StreamInfo
+from sern_core.types import DropReason, PriorityClass, TopicName
+
+MAX_TOPICS: Final = 4096
+OTHER_TOPIC: Final = TopicName("/other")
+"""Where topics beyond MAX_TOPICS are counted together: a peer cannot grow this table without bound."""
+
+
+class SendCounters:
+    """One topic's way out: offered = delivered + dropped + queued + in flight. Refused messages were not offered."""
+
+    __slots__ = (
+        "by_reason",
+        "delivered",
+        "delivered_bytes",
+        "dropped",
+        "dropped_bytes",
+        "offered",
+        "offered_bytes",
+        "priority",
+        "refused",
+        "refused_bytes",
+        "topic",
+    )
+
+    def __init__(self, topic: TopicName, priority: PriorityClass) -> None:
+        self.topic = topic
+        self.priority = priority
+        self.offered = self.offered_bytes = 0
+        self.delivered = self.delivered_bytes = 0
+        self.dropped = self.dropped_bytes = 0
+        self.refused = self.refused_bytes = 0
+        self.by_reason: dict[DropReason, int] = dict.fromkeys(DropReason, 0)
+
+    def offer(self, nbytes: int) -> None:
+        self.offered += 1
+        self.offered_bytes += nbytes
+
+    def deliver(self, nbytes: int) -> None:
+        """The peer has it: acknowledged (best effort) or below its watermark (reliable)."""
+        self.delivered += 1
+        self.delivered_bytes += nbytes
+
+    def drop(self, reason: DropReason, nbytes: int) -> None:
+        self.dropped += 1
+        self.dropped_bytes += nbytes
+        self.by_reason[reason] += 1
+
+    def refuse(self, nbytes: int) -> None:
+        """A reliable queue was full and the caller was told."""
+        self.refused += 1
+        self.refused_bytes += nbytes
+        self.by_reason[DropReason.REFUSED] += 1
+
+
+class ReceiveCounters:
+    """One topic's way in. `age_s` is the age of the newest delivered message when it was delivered."""
+
+    __slots__ = ("age_s", "by_reason", "delivered", "delivered_bytes", "last_born_s", "priority", "topic")
+
+    def __init__(self, topic: TopicName, priority: PriorityClass) -> None:
+        self.topic = topic
+        self.priority = priority
+        self.delivered = self.delivered_bytes = 0
+        self.age_s = 0.0
+        self.last_born_s: float | None = None
+        self.by_reason: dict[DropReason, int] = dict.fromkeys(DropReason, 0)
+
+    def arrived(self, nbytes: int, age_s: float, now: float) -> None:
+        self.delivered += 1
+        self.delivered_bytes += nbytes
+        self.age_s = age_s
+        self.last_born_s = now - age_s
+
+    def drop_arrived(self, reason: DropReason) -> None:
+        self.by_reason[reason] += 1
+
+    def age_of_information_s(self, now: float) -> float | None:
+        """How old the freshest delivered sample is now; None before the first."""
+        return None if self.last_born_s is None else now - self.last_born_s
+
+
+class SendLedger:
+    """Counters of what goes out over one link, by topic."""
+
+    def __init__(self) -> None:
+        self.topics: dict[TopicName, SendCounters] = {}
+
+    def topic(self, topic: TopicName, priority: PriorityClass) -> SendCounters:
+        name = topic if topic in self.topics or len(self.topics) < MAX_TOPICS else OTHER_TOPIC
+        counters = self.topics.get(name)
+        if counters is None:
+            counters = self.topics[name] = SendCounters(name, priority)
+        return counters
+
+
+class ReceiveLedger:
+    """Counters of what arrives, by topic; `strays` is data of streams that are unknown here, by count."""
+
+    def __init__(self) -> None:
+        self.topics: dict[TopicName, ReceiveCounters] = {}
+
+    def of(self, stream: StreamInfo) -> ReceiveCounters:
+        topic = stream.id.topic
+        name = topic if topic in self.topics or len(self.topics) < MAX_TOPICS else OTHER_TOPIC
+        counters = self.topics.get(name)
+        if counters is None:
+            counters = self.topics[name] = ReceiveCounters(name, stream.spec.priority)
+        return counters

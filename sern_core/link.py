@@ -1,0 +1,566 @@
+"""One end of a hop: data plane (`Hop`) plus handshake, announcements and interest; no I/O, clock or randomness.
+
+A hop is a pair of links. The client's end says HELLO; the relay's end answers WELCOME. After that both are alike:
+each announces the streams it has, is told which of them are wanted, and sends those as scheduler and window allow.
+
+    initiator:  idle --connected--> greeting --WELCOME--> up --disconnected--> idle
+                                    greeting --REFUSE--> greeting (later)    up --RESET, CLOSE--> greeting
+    acceptor:   idle --HELLO--> up --HELLO (another)--> up    up --disconnected, CLOSE--> idle
+
+A link lives as long as its owner remembers the peer's name; sessions come and go inside it. What survives a session:
+queues, retained reliable messages, delivered counts. What does not: channel numbers and control messages, so every
+session announces everything again.
+
+The owner calls `submit`, `receive`, `next_datagram`, `next_deadline` and `handle_timeout`, each with the time, and is
+told what happens through its `LinkHandler`.
+"""
+
+from collections import deque
+from collections.abc import Callable
+from typing import Final, Protocol
+
+from sern_core import wire
+from sern_core.announce import MAX_STRINGS, Announcement, decode_announcement, definition_hash, encode_announcement
+from sern_core.clocksync import ClockSync
+from sern_core.errors import RefusedError, UsageError, WireError
+from sern_core.fragments import InStream
+from sern_core.hop import PING_INTERVAL_S, Hop, microseconds
+from sern_core.message import Message, StreamId, StreamInfo
+from sern_core.params import LinkParams, SchedulerParams
+from sern_core.queues import OutChannel, OutMessage
+from sern_core.trace import LINK, DecisionTrace, TraceEvent
+from sern_core.types import DROP_CODES, DROP_REASONS, ClientName, DropReason
+
+HELLO_INTERVAL_S: Final = 1.0
+REFUSED_INTERVAL_S: Final = 5.0
+MAX_DEFINITIONS: Final = 4096
+
+
+class LinkHandler(Protocol):
+    """What the owner of a link is told. Calls happen inside `receive`, `submit` and `handle_timeout`."""
+
+    def on_up(self, link: "Link", *, resumed: bool, now: float) -> None:
+        """A session exists. `resumed`: the peer is the same process as before."""
+
+    def on_down(self, link: "Link", reason: str, *, now: float) -> None: ...
+
+    def on_rejected(self, link: "Link", code: str, text: str, *, now: float) -> None:
+        """The peer refused the session itself."""
+
+    def on_announce(self, link: "Link", announcement: Announcement, *, now: float) -> bool | None:
+        """The peer has a stream: is it wanted? None: `Link.answer` says so later. Raises RefusedError to refuse."""
+
+    def on_retract(self, link: "Link", stream: InStream, *, now: float) -> None: ...
+
+    def on_message(self, link: "Link", stream: InStream, message: Message, *, now: float) -> None:
+        """A message (or tombstone) has its turn."""
+
+    def on_in_drop(self, link: "Link", stream: InStream, reason: DropReason, nbytes: int) -> None: ...
+
+    def on_out_drop(self, link: "Link", channel: OutChannel, out: OutMessage, reason: DropReason) -> None: ...
+
+    def on_delivered(self, link: "Link", channel: OutChannel, *, now: float) -> None:
+        """The peer's watermark of a reliable channel moved to `channel.watermark`."""
+
+    def on_refused(self, link: "Link", channel: OutChannel, code: str, text: str, *, now: float) -> None: ...
+
+    def on_skipped(self, link: "Link", stream: InStream, count: int, *, now: float) -> None:
+        """`count` messages of the stream will not come; they were reported where they were dropped."""
+
+    def on_definition(self, link: "Link", digest: str, *, now: float) -> None:
+        """`Link.definitions` has a new text."""
+
+    def on_control(self, link: "Link", envelope: wire.Envelope, attachment: bytes, *, now: float) -> None:
+        """A control message that is not the link's own business. Raises WireError if it is nobody's."""
+
+
+class Link(Hop):
+    """One end of one hop towards `peer`.
+
+    `definitions` maps digest to text and is shared by all links of a process. `auto_confirm`: what had its turn here
+    is delivered; a relay confirms by hand, when its subscribers have.
+    """
+
+    def __init__(
+        self,
+        *,
+        name: ClientName,
+        boot: int,
+        peer: ClientName,
+        initiator: bool,
+        handler: LinkHandler,
+        definitions: dict[str, str],
+        link: LinkParams,
+        scheduler: SchedulerParams,
+        trace: DecisionTrace,
+        now: float,
+        lossless: bool = True,
+        auto_confirm: bool = True,
+    ) -> None:
+        self.initiator = initiator
+        self.handler = handler
+        self.definitions = definitions
+        self.auto_confirm = auto_confirm
+        self.peer_boot: int | None = None
+        self.transport_up = False
+        self.version = wire.VERSION_MAX
+        self.by_stream: dict[StreamId, OutChannel] = {}
+        self.streams: dict[StreamId, InStream] = {}
+        """Incoming streams across sessions."""
+        self._handshake_out: deque[bytes] = deque()
+        self._hello_due_s: float | None = None
+        self._next_channel = 1
+        self._asked: set[str] = set()  # definitions the peer asked for before we had them
+        self._resumed = False
+        self._missing: dict[StreamId, float] = {}  # not announced by a new peer, and since when
+        super().__init__(
+            name=name, boot=boot, peer=peer, link=link, scheduler=scheduler, trace=trace, now=now, lossless=lossless
+        )
+
+    # --- transport and handshake --------------------------------------------------------------------------------
+
+    def connected(self, *, now: float) -> None:
+        """The lane's transport is there. The initiator says hello; the other side waits for it."""
+        self.transport_up = True
+        if self.initiator:
+            self._greet(now, now)
+
+    def disconnected(self, *, now: float, reason: str = "connection lost") -> None:
+        """The lane's transport is gone, and with it whatever was in flight."""
+        self.transport_up = False
+        self._hello_due_s = None
+        self._handshake_out.clear()
+        self._end_session(reason, now)
+
+    def _greet(self, due_s: float, now: float) -> None:
+        self._end_session("new session", now)
+        self.tag = self.tag % 255 + 1
+        self._hello_due_s = due_s
+        self.dirty = True
+
+    def _hello(self, now: float) -> bytes:
+        self._hello_due_s = now + HELLO_INTERVAL_S
+        hello = {"name": self.name, "boot": self.boot, "vmin": wire.VERSION_MIN, "vmax": wire.VERSION_MAX}
+        return wire.encode_handshake(wire.Kind.HELLO, self.tag, microseconds(now), hello)
+
+    def accept(self, hello: wire.Envelope, tag: int, stamp_us: int, *, now: float) -> None:
+        """The relay's end: a peer whose name and key were checked says hello; WELCOME is queued.
+
+        Raises WireError, or VersionError when no wire version is common; the caller refuses then.
+        """
+        boot = wire.take_int(hello, "boot")
+        version = wire.agree_version(wire.take_int(hello, "vmin"), wire.take_int(hello, "vmax"))
+        self.transport_up = True
+        again = self.established and tag == self.tag and boot == self.peer_boot  # our WELCOME was lost
+        if not again:
+            self._end_session("new session", now)
+            self.tag = tag
+            self.version = version
+        at_us = microseconds(now)
+        welcome = {"name": self.name, "boot": self.boot, "version": version, "echo": stamp_us, "at": at_us}
+        self._handshake_out.append(wire.encode_handshake(wire.Kind.WELCOME, tag, at_us, welcome))
+        self.dirty = True
+        if not again:
+            self._establish(boot, now)
+
+    def close(self, reason: str, *, now: float) -> None:
+        """End the session on purpose and tell the peer. The transport stays."""
+        if self.established:
+            why = {"why": reason[:200]}
+            self._handshake_out.append(wire.encode_handshake(wire.Kind.CLOSE, self.tag, microseconds(now), why))
+            self.dirty = True
+        self._end_session(reason, now)
+
+    def _establish(self, peer_boot: int, now: float) -> None:
+        resumed = self._resumed = self.peer_boot == peer_boot
+        if not resumed:
+            for channel in self.channels.values():
+                channel.peer_restarted()
+            self.clock = ClockSync()
+        self.peer_boot = peer_boot
+        self.established = True
+        self._hello_due_s = None
+        self.lane.new_session()
+        self.lane.estimator.on_reset(now=now)
+        self._rate_known(now)
+        self._ping_due_s = now
+        self._watermarks.clear()
+        self._asked.clear()
+        self._begin_control()
+        self.trace.record(now, LINK, TraceEvent.LINK_UP, peer=self.peer)
+        self.handler.on_up(self, resumed=resumed, now=now)
+        for channel in list(self.channels.values()):
+            self._announce(channel, now)
+        self.send_control({"t": "synced"}, now=now)
+
+    def _end_session(self, reason: str, now: float) -> None:
+        for packet in self.lane.flight.abandon():
+            self._give_back(packet.items, now)
+        for stream in self.incoming.values():
+            stream.channel_id = None
+        self.incoming.clear()
+        if not self.established:
+            return
+        self.established = False
+        for channel in self.channels.values():
+            channel.ready = False
+            self._refresh(channel, now)
+        self.trace.record(now, LINK, TraceEvent.LINK_DOWN, peer=self.peer, reason=reason)
+        self.handler.on_down(self, reason, now=now)
+
+    # --- bytes and time -------------------------------------------------------------------------------------------
+
+    def next_datagram(self, *, now: float) -> bytes | None:
+        """The next bytes for the lane, or None if nothing may or need be sent now."""
+        if self._handshake_out:
+            return self._handshake_out.popleft()
+        if self._hello_due_s is not None and self.transport_up:
+            if now >= self._hello_due_s:
+                return self._hello(now)
+            self.dirty = False
+            return None
+        if not self.established:
+            self.dirty = False
+            return None
+        return self._next_data(now)
+
+    def receive(self, data: bytes, *, now: float) -> None:
+        """One datagram from the lane. Raises WireError or VersionError for bytes no honest peer sends."""
+        header = wire.decode_header(data)
+        if header.kind != wire.Kind.DATA:
+            self._now = now
+            self._handshake(header, data, now)
+        elif header.tag == self.tag and self.established:
+            self._receive_data(header, data, now)
+        # else: of another session; whatever it carried is sent again in this one
+
+    def next_deadline(self) -> float | None:
+        """When to call `handle_timeout` and `next_datagram` at the latest, if nothing else happens."""
+        if self.established:
+            return self._data_deadline()
+        if self._hello_due_s is not None:
+            return min(self._hello_due_s, self._sweep_due_s)
+        return self._sweep_due_s
+
+    def handle_timeout(self, *, now: float) -> None:
+        if self.established:
+            self._data_timeout(now)
+        elif now >= self._sweep_due_s:
+            self._now = now
+            self._sweep(now)
+        self.dirty = True
+
+    def _handshake(self, header: wire.Header, data: bytes, now: float) -> None:
+        envelope = wire.decode_handshake(data)
+        kind = wire.Kind(header.kind)
+        if kind is wire.Kind.CLOSE:
+            if header.tag == self.tag and self.established:
+                why = f"{self.peer} closed the session: {wire.take_str(envelope, 'why')}"
+                if self.initiator:
+                    self._end_session(why, now)
+                    self._greet(now + HELLO_INTERVAL_S, now)
+                else:
+                    self._end_session(why, now)
+            return
+        if not self.initiator or kind is wire.Kind.HELLO:
+            raise WireError(f"{kind.name} is not for this side")
+        if header.tag != self.tag:
+            return
+        if kind is wire.Kind.WELCOME and self._hello_due_s is not None:
+            self.version = wire.take_int(envelope, "version", low=wire.VERSION_MIN, high=wire.VERSION_MAX)
+            self.peer = ClientName(wire.take_str(envelope, "name", max_length=64))
+            echo_us = wire.take_int(envelope, "echo", high=2**64 - 1)
+            at_us = wire.take_int(envelope, "at", high=2**64 - 1)
+            self._establish(wire.take_int(envelope, "boot"), now)
+            self.clock.sample(echo_us * 1e-6, at_us * 1e-6, header.stamp_us * 1e-6, now)
+        elif kind is wire.Kind.REFUSE:
+            code, text = wire.take_str(envelope, "code", max_length=64), wire.take_str(envelope, "why")
+            self._greet(now + REFUSED_INTERVAL_S, now)
+            self.handler.on_rejected(self, code, text, now=now)
+        elif kind is wire.Kind.RESET and self.established:
+            self._greet(now, now)
+
+    # --- streams out ----------------------------------------------------------------------------------------------
+
+    def open_channel(
+        self, stream: StreamInfo, *, first: int, now: float, owed: tuple[str, ...] = (), wanted: bool | None = None
+    ) -> OutChannel:
+        """Announce a stream to the peer; its messages start at seq `first`. UsageError if it is open already."""
+        if stream.id in self.by_stream:
+            raise UsageError(f"stream {stream.id.topic} of {stream.id.origin} is already open towards {self.peer}")
+        if len(self.channels) >= 0xFFFF:
+            raise UsageError(f"all 65535 channels towards {self.peer} are in use")
+        slot = self._next_channel
+        while slot in self.channels:
+            slot = slot % 0xFFFF + 1
+        self._next_channel = slot % 0xFFFF + 1
+        counters = self.ledger.topic(stream.id.topic, stream.spec.priority)
+        channel = OutChannel(slot, stream, counters, self._reporter(slot), first=first)
+        channel.owed = owed
+        channel.wanted = wanted
+        self.channels[slot] = channel
+        self.by_stream[stream.id] = channel
+        self._define(stream.info.definition)
+        if self.established:
+            self._announce(channel, now)
+        return channel
+
+    def _reporter(self, slot: int) -> Callable[[OutMessage, DropReason], None]:
+        def dropped(out: OutMessage, reason: DropReason) -> None:
+            channel = self.channels.get(slot)
+            if channel is not None:
+                topic = channel.stream.id.topic
+                self.trace.record(self._now, topic, TraceEvent.DROPPED, seq=out.seq, reason=reason, peer=self.peer)
+                self.handler.on_out_drop(self, channel, out, reason)
+
+        return dropped
+
+    def close_channel(self, channel: OutChannel, reason: DropReason, *, now: float) -> None:
+        """The stream is gone: tell the peer, drop what is left for `reason`."""
+        self._now = now
+        channel.clear(reason)
+        channel.ready = False
+        self._refresh(channel, now)
+        self.channels.pop(channel.slot, None)
+        self.by_stream.pop(channel.stream.id, None)
+        if self.established:
+            self.send_control({"t": "retract", "ch": channel.slot}, now=now)
+
+    def _announce(self, channel: OutChannel, now: float) -> None:
+        stream = channel.stream
+        digest = stream.attributes.get("definition") or definition_hash(stream.info.definition)
+        announcement = Announcement(channel.slot, stream, digest, channel.first_seq, channel.owed)
+        self.send_control(encode_announcement(announcement), now=now)
+        # On a stream lane data may follow its announcement at once, if the stream was wanted before.
+        channel.ready = self.lane.lossless and channel.wanted is True
+        self._refresh(channel, now)
+
+    def send_control(self, envelope: wire.Envelope, attachment: bytes = b"", *, now: float) -> None:
+        """Queue a control message: reliable and in order within the session, ahead of everything else."""
+        control = self._control
+        body = wire.encode_control(envelope, attachment)
+        control.submit(Message(control.stream.id, control.next_seq, body, 0, now), now=now, forced=True)
+        self.dirty = True
+
+    def report_drop(self, stream: InStream, seq: int, reason: DropReason, where: str, *, now: float) -> None:
+        """Tell the origin's side that a later hop dropped a reliable message."""
+        if self.established and stream.channel_id is not None:
+            envelope = {"t": "dropped", "ch": stream.channel_id, "seq": seq, "code": DROP_CODES[reason], "to": where}
+            self.send_control(envelope, now=now)
+
+    # --- streams in -----------------------------------------------------------------------------------------------
+
+    def answer(self, stream: InStream, wanted: bool, *, now: float, owed: tuple[str, ...] = ()) -> None:
+        """Tell the peer whether its stream is wanted; `owed` names the clients that must get a reliable one."""
+        if self.established and stream.channel_id is not None:
+            envelope = {"t": "want", "ch": stream.channel_id, "on": wanted, "owed": list(owed[:MAX_STRINGS])}
+            self.send_control(envelope, now=now)
+
+    def refuse(self, stream: InStream, code: str, text: str, *, now: float) -> None:
+        """Take back what `on_announce` allowed (an access rule changed)."""
+        if self.established and stream.channel_id is not None:
+            self.send_control({"t": "refuse", "ch": stream.channel_id, "code": code, "why": text[:400]}, now=now)
+
+    def _announced(self, announcement: Announcement, now: float) -> None:
+        identity = announcement.stream.id
+        slot = announcement.channel
+        stream = self.streams.get(identity)
+        if stream is None or stream.stream.spec != announcement.stream.spec:
+            replaced = stream
+            stream = InStream(
+                announcement.stream, self.reassembly, self._deliver, self._in_drop, first=announcement.first
+            )
+            if replaced is not None:  # the origin was configured anew: what was delivered stays delivered
+                stream.delivered = stream.confirmed = replaced.delivered
+                replaced.close()
+            self.streams[identity] = stream
+        self._missing.pop(identity, None)
+        stream.channel_id = slot
+        self.incoming[slot] = stream
+        definition = self.definitions.get(announcement.definition_hash, "")
+        if announcement.definition_hash:
+            stream.stream.attributes["definition"] = announcement.definition_hash
+            if not definition:
+                self.send_control({"t": "need", "dh": announcement.definition_hash}, now=now)
+        try:
+            wanted = self.handler.on_announce(self, announcement, now=now)
+        except RefusedError as refusal:
+            del self.incoming[slot]
+            del self.streams[identity]
+            self.send_control({"t": "refuse", "ch": slot, "code": refusal.code, "why": str(refusal)[:400]}, now=now)
+            return
+        self._skip(stream, announcement.first, now)
+        if stream.reliable and stream.confirmed >= announcement.first:
+            self._watermarks[slot] = stream.confirmed  # it may not know: ours was lost with the session
+        if wanted is not None:
+            self.answer(stream, wanted, now=now)
+
+    def _skip(self, stream: InStream, first: int, now: float) -> None:
+        left_out = stream.skip_to(first)
+        if left_out:
+            self.handler.on_skipped(self, stream, left_out, now=now)
+            self._confirm_own(stream)
+
+    def _confirm_own(self, stream: InStream) -> None:
+        if self.auto_confirm and stream.reliable:
+            self.confirm(stream, stream.delivered)
+
+    def _deliver(self, stream: InStream, message: Message) -> None:
+        self.handler.on_message(self, stream, message, now=self._now)
+        if stream.reliable:
+            self._confirm_own(stream)
+
+    def _in_drop(self, stream: InStream, reason: DropReason, nbytes: int) -> None:
+        self.handler.on_in_drop(self, stream, reason, nbytes)
+
+    def _watermark_moved(self, channel: OutChannel) -> None:
+        self.handler.on_delivered(self, channel, now=self._now)
+
+    def _synced(self, now: float) -> None:
+        """The peer has announced all it has. What it left out is gone, unless it is a relay that is still learning:
+        a stream it has not been told of yet keeps its delivered count here, so that "once" survives its restart."""
+        for identity, stream in list(self.streams.items()):
+            if stream.channel_id is None:
+                if self.initiator and not self._resumed:
+                    self._missing.setdefault(identity, now)
+                else:
+                    self._retract(stream, now)
+
+    def _retract(self, stream: InStream, now: float) -> None:
+        self.streams.pop(stream.stream.id, None)
+        self._missing.pop(stream.stream.id, None)
+        if stream.channel_id is not None:
+            self.incoming.pop(stream.channel_id, None)
+        self.handler.on_retract(self, stream, now=now)
+        stream.close()
+        stream.channel_id = None
+
+    def _sweep(self, now: float) -> None:
+        super()._sweep(now)
+        for identity, since_s in list(self._missing.items()):
+            if now - since_s > self.params.retention_s:
+                self._retract(self.streams[identity], now)
+
+    # --- control messages -------------------------------------------------------------------------------------------
+
+    def _control_message(self, stream: InStream, message: Message) -> None:
+        envelope, attachment = wire.decode_control(message.body)
+        now = self._now
+        kind = wire.take_str(envelope, "t", max_length=16)
+        if kind == "announce":
+            self._announced(decode_announcement(envelope), now)
+        elif kind in ("want", "refuse", "dropped"):
+            channel = self.channels.get(wire.take_int(envelope, "ch", high=0xFFFF))
+            if channel is not None:  # else closed meanwhile
+                self._about_channel(kind, channel, envelope, now)
+        elif kind in ("first", "retract"):
+            slot = wire.take_int(envelope, "ch", high=0xFFFF)
+            incoming = self.incoming.get(slot)
+            if incoming is None:
+                return
+            if kind == "first":
+                self._skip(incoming, wire.take_int(envelope, "seq", low=1), now)
+            else:
+                self._retract(incoming, now)
+        elif kind == "synced":
+            self._synced(now)
+        elif kind == "need":
+            self._send_definition(wire.take_str(envelope, "dh", max_length=64), now)
+        elif kind == "define":
+            self._defined(envelope, attachment, now)
+        else:
+            self.handler.on_control(self, envelope, attachment, now=now)
+
+    def _about_channel(self, kind: str, channel: OutChannel, envelope: wire.Envelope, now: float) -> None:
+        if kind == "want":
+            wanted = wire.take_bool(envelope, "on")
+            channel.owed = tuple(wire.take_strings(envelope, "owed", max_length=64))
+            if wanted and channel.wanted is False and channel.reliable:
+                self.send_control({"t": "first", "ch": channel.slot, "seq": channel.first_seq}, now=now)
+            channel.set_wanted(wanted)
+            channel.ready = True
+            self._refresh(channel, now)
+        elif kind == "dropped":
+            reason = DROP_REASONS.get(wire.take_int(envelope, "code"), DropReason.LOST)
+            channel.reported(wire.take_int(envelope, "seq"), reason)
+        else:
+            code, why = wire.take_str(envelope, "code", max_length=64), wire.take_str(envelope, "why")
+            channel.wanted = False
+            channel.clear(DropReason.FORBIDDEN if code == "forbidden" else DropReason.UNWANTED)
+            self._refresh(channel, now)
+            self.handler.on_refused(self, channel, code, why, now=now)
+
+    def _define(self, definition: str) -> None:
+        digest = definition_hash(definition)
+        if digest and len(self.definitions) < MAX_DEFINITIONS:
+            self.definitions.setdefault(digest, definition)
+
+    def _send_definition(self, digest: str, now: float) -> None:
+        definition = self.definitions.get(digest)
+        if definition is None:
+            self._asked.add(digest)
+        else:
+            self.send_control({"t": "define", "dh": digest}, definition.encode(), now=now)
+
+    def _defined(self, envelope: wire.Envelope, attachment: bytes, now: float) -> None:
+        digest = wire.take_str(envelope, "dh", max_length=64)
+        try:
+            text = attachment.decode()
+        except UnicodeDecodeError as error:
+            raise WireError("a message definition is not UTF-8") from error
+        if definition_hash(text) != digest:
+            raise WireError("a message definition does not match its hash")
+        if digest not in self.definitions:
+            self._define(text)
+            self.handler.on_definition(self, digest, now=now)
+
+    def definition_known(self, digest: str, *, now: float) -> None:
+        """A text arrived from elsewhere: pass it on if this peer is waiting for it."""
+        if digest in self._asked and self.established:
+            self._asked.discard(digest)
+            self._send_definition(digest, now)
+
+    @property
+    def now(self) -> float:
+        """The time of the call under way, for handlers that are told without it."""
+        return self._now
+
+    # --- views ------------------------------------------------------------------------------------------------------
+
+    def snapshot(self, *, now: float) -> dict[str, object]:
+        """State for /api/link."""
+        flight = self.lane.flight
+        queued = {"control": [0, 0], "state": [0, 0], "bulk": [0, 0]}
+        for channel in self.channels.values():
+            cell = queued[channel.spec.priority.name.lower()]
+            cell[0] += len(channel.queue) + len(channel.active)
+            cell[1] += channel.queued_bytes + sum(out.unsent_bytes for out in channel.active)
+        return {
+            "peer": self.peer,
+            "lane": "zmq",
+            "up": self.established and not self.lane.stalled,
+            "stalled": self.lane.stalled,
+            "version": self.version,
+            "inflight_bytes": flight.inflight_bytes,
+            "srtt_s": flight.rtt.srtt_s,
+            "fragment_bytes": self.lane.fragment_bytes,
+            "clock_offset_s": self.clock.offset_s,
+            "clock_error_s": self.clock.error_s,
+            **self.lane.estimator.snapshot(),
+            "queue": {label: {"messages": cell[0], "bytes": cell[1]} for label, cell in queued.items()},
+        }
+
+    def validate(self) -> None:
+        """Internal consistency, for tests. Raises AssertionError with what does not add up."""
+
+        def check(ok: bool, text: str) -> None:
+            assert ok, f"{self.name}->{self.peer}: {text}"
+
+        for channel in self.channels.values():
+            channel.validate(check)
+        for stream in self.streams.values():
+            stream.validate(check)
+        self.lane.flight.validate(check)
+        self.scheduler.validate()
+        check(self.reassembly.held_bytes >= 0, "negative reassembly bytes")
+        check(PING_INTERVAL_S > 0 and len(self.by_stream) == len(self.channels), "channel tables differ")

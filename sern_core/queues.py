@@ -1,0 +1,477 @@
+"""The sending side of one stream on one hop: its bounded queue, what is in flight, and what must be kept.
+
+Best effort: keep-last `depth`, a newer message takes the oldest one's place unless that has begun transmission.
+Reliable: every message is kept until the peer's delivered watermark passes it, or until its lifespan or retention
+ends, when a one-byte tombstone takes its place so that order survives and nothing is lost silently. Overflow of a
+reliable queue is refused to the caller.
+
+A message is in exactly one of four places: queued (nothing sent yet), in flight (begun), delivered, dropped for a
+reason. `OutChannel.validate` checks that the counters agree.
+"""
+
+from collections import deque
+from collections.abc import Callable
+from typing import Final
+
+from sern_core.ledger import SendCounters
+from sern_core.message import Message, StreamInfo
+from sern_core.types import DROP_CODES, DROP_REASONS, DropReason
+
+RATE_CAP_SLACK: Final = 0.25
+"""A sample this fraction of a period early still passes a rate cap, so that jitter does not halve the rate."""
+
+OnDrop = Callable[["OutMessage", DropReason], None]
+
+
+class OutMessage:
+    """One message on its way over one hop. `ranges` are the parts of the body still to be sent, as [start, end)."""
+
+    __slots__ = (
+        "counted",
+        "fragments_inflight",
+        "generation",
+        "message",
+        "ranges",
+        "seq",
+        "size",
+        "some_acked",
+        "started",
+    )
+
+    def __init__(self, message: Message) -> None:
+        self.message = message
+        self.seq = message.seq
+        self.size = len(message.body)
+        self.ranges: list[tuple[int, int]] | None = None  # None: untouched, send from 0
+        self.generation = 0  # of the body: acknowledgements of an earlier one no longer count
+        self.some_acked = False
+        self.fragments_inflight = 0
+        self.started = False
+        self.counted = False  # already accounted as dropped (a tombstone now)
+
+    @property
+    def unsent_bytes(self) -> int:
+        if self.ranges is None:
+            return self.size
+        return sum(end - start for start, end in self.ranges)
+
+    @property
+    def has_unsent(self) -> bool:
+        return self.ranges is None or bool(self.ranges)
+
+    def restart(self) -> None:
+        """Forget what was sent: the peer is a new process, or the body is another."""
+        self.ranges = None
+        self.generation += 1
+        self.some_acked = False
+        self.fragments_inflight = 0
+
+    def entomb(self, reason: DropReason) -> None:
+        """Become a tombstone: one byte that says why."""
+        old = self.message
+        self.message = Message(
+            old.stream, old.seq, bytes([DROP_CODES[reason]]), old.stamp_ns, old.born_s, tombstone=DROP_CODES[reason]
+        )
+        self.size = 1
+        self.restart()
+        self.counted = True
+
+
+class OutChannel:
+    """One stream towards one peer. The link serves it through `head` and `sent`; `slot` is its scheduler slot."""
+
+    def __init__(self, slot: int, stream: StreamInfo, counters: SendCounters, on_drop: OnDrop, *, first: int) -> None:
+        self.slot = slot
+        self.stream = stream
+        self.spec = stream.spec
+        self.counters = counters
+        self.on_drop = on_drop
+        self.reliable = stream.spec.reliable
+        self.coalesced = not self.reliable and stream.spec.depth == 1
+        self.queue: deque[OutMessage] = deque()  # not begun
+        self.active: deque[OutMessage] = deque()  # begun, with bytes still to send; oldest first
+        self.flying: dict[int, OutMessage] = {}  # begun, by seq, until acknowledged or given up
+        self.retained: deque[OutMessage] = deque()  # reliable: everything above the watermark
+        self.retained_bytes = 0
+        self.queued_bytes = 0
+        self.watermark = first - 1
+        self.next_seq = first  # the next seq expected from `submit`
+        self.last_sent_s: float | None = None
+        self._next_allowed_s: float | None = None
+        self.wanted: bool | None = None  # None until the peer has answered
+        self.ready = False  # announced in this session
+        self.offered = False  # the scheduler knows of a pending message
+        self.owed: tuple[str, ...] = ()  # reliable subscribers behind the peer, as it told us
+
+    # --- entry ------------------------------------------------------------------------------------------------
+
+    def submit(self, message: Message, *, now: float, forced: bool = False) -> bool:
+        """Take one message. False: refused (a reliable queue is full). Drops are counted and reported.
+
+        `forced` skips the rate cap and the reliable bound: the relay's forwarding, where the origin enforces both.
+        """
+        counters = self.counters
+        size = len(message.body)
+        if self.reliable:
+            if not forced and self.retained_bytes + size > self.spec.max_queue_bytes:
+                counters.refuse(size)
+                return False
+            counters.offer(size)
+            self.next_seq = message.seq + 1
+            if self.wanted is False and not self.retained:
+                counters.drop(DropReason.UNWANTED, size)
+                self.watermark = message.seq
+                return True
+            out = OutMessage(message)
+            if message.tombstone:
+                out.counted = True
+                counters.drop(DROP_REASONS[message.tombstone], size)
+        else:
+            counters.offer(size)
+            self.next_seq = message.seq + 1
+            if self.wanted is False:
+                counters.drop(DropReason.UNWANTED, size)
+                return True
+            if self.spec.max_rate_hz is not None and not forced and not self._rate_allows(now):
+                counters.drop(DropReason.RATE_CAP, size)
+                return True
+            if len(self.queue) >= self.spec.depth:
+                self._drop(self._pop_queue(), DropReason.SUPERSEDED)
+            out = OutMessage(message)
+        self._keep(out)
+        return True
+
+    def reject(self, message: Message, reason: DropReason) -> None:
+        """Count a message that cannot travel at all; a reliable stream goes on over its tombstone."""
+        size = len(message.body)
+        self.counters.offer(size)
+        self.counters.drop(reason, size)
+        self.next_seq = message.seq + 1
+        if self.reliable:
+            out = OutMessage(message)
+            out.entomb(reason)
+            self._keep(out)
+
+    def _keep(self, out: OutMessage) -> None:
+        if self.reliable:
+            self.retained.append(out)
+            self.retained_bytes += out.size
+        self.queue.append(out)
+        self.queued_bytes += out.size
+
+    def _rate_allows(self, now: float) -> bool:
+        assert self.spec.max_rate_hz is not None
+        period_s = 1.0 / self.spec.max_rate_hz
+        allowed_s = self._next_allowed_s
+        if allowed_s is not None and now < allowed_s - RATE_CAP_SLACK * period_s:
+            return False
+        self._next_allowed_s = period_s + (now if allowed_s is None or now > allowed_s + period_s else allowed_s)
+        return True
+
+    def _pop_queue(self) -> OutMessage:
+        out = self.queue.popleft()
+        self.queued_bytes -= out.size
+        return out
+
+    def _drop(self, out: OutMessage, reason: DropReason) -> None:
+        self.counters.drop(reason, out.size)
+        self.on_drop(out, reason)
+
+    # --- service ------------------------------------------------------------------------------------------------
+
+    def head(self, now: float) -> OutMessage | None:
+        """The message to serve next: begun ones first, then the queue; what has expired is dropped on the way."""
+        while self.active:
+            out = self.active[0]
+            if not out.has_unsent:
+                self.active.popleft()
+            elif self._expired(out, now):
+                self._expire_begun(out)
+            else:
+                return out
+        while self.queue:
+            out = self.queue[0]
+            if self._expired(out, now):
+                if self.reliable:
+                    self._entomb(out, DropReason.LIFESPAN)
+                    return out
+                self._drop(self._pop_queue(), DropReason.LIFESPAN)
+            else:
+                return out
+        return None
+
+    def _expired(self, out: OutMessage, now: float) -> bool:
+        lifespan_s = self.spec.lifespan_s
+        return lifespan_s is not None and not out.message.tombstone and now - out.message.born_s > lifespan_s
+
+    def _expire_begun(self, out: OutMessage) -> None:
+        if self.reliable:
+            # What is in flight of the old body is harmless: the receiver takes the tombstone in its place.
+            self._entomb(out, DropReason.LIFESPAN)
+            return
+        self.active.popleft()
+        self.flying.pop(out.seq, None)
+        self._drop(out, DropReason.LIFESPAN)
+
+    def _entomb(self, out: OutMessage, reason: DropReason) -> None:
+        size = out.size
+        if not out.started:
+            self.queued_bytes -= size - 1
+        self.retained_bytes -= size - 1
+        self.counters.drop(reason, size)
+        out.entomb(reason)
+        self.on_drop(out, reason)
+
+    def drop_head(self, reason: DropReason, now: float) -> None:
+        """Give up the message that would go next (best effort); a reliable one becomes a tombstone."""
+        out = self.head(now)
+        if out is None or out.counted:
+            return
+        if self.reliable:
+            self._entomb(out, reason)
+            if out.started:
+                self._activate(out)
+            return
+        if out.started:
+            self.active.popleft()
+            self.flying.pop(out.seq, None)
+        else:
+            self._pop_queue()
+        self._drop(out, reason)
+
+    def _begin(self, out: OutMessage, now: float) -> None:
+        """`out` was the head of the queue and its first bytes leave now."""
+        out.started = True
+        popped = self._pop_queue()
+        assert popped is out
+        self.flying[out.seq] = out
+        if out.has_unsent:
+            self.active.append(out)
+        self.last_sent_s = now
+
+    def take(self, out: OutMessage, room: int, now: float) -> tuple[int, int]:
+        """Cut the next fragment of at most `room` body bytes: (start, end). The caller puts it on the wire."""
+        if out.ranges is None:
+            start, end = 0, out.size
+            if end > room:
+                end = room
+                out.ranges = [(end, out.size)]
+            else:
+                out.ranges = []
+        else:
+            start, end = out.ranges[0]
+            if end - start > room:
+                out.ranges[0] = (start + room, end)
+                end = start + room
+            else:
+                del out.ranges[0]
+        if not out.started:
+            self._begin(out, now)
+        out.fragments_inflight += 1
+        return start, end
+
+    # --- outcomes -----------------------------------------------------------------------------------------------
+
+    def fragment_acked(self, out: OutMessage, generation: int) -> None:
+        if out.generation != generation:
+            return
+        out.fragments_inflight -= 1
+        out.some_acked = True
+        if out.fragments_inflight <= 0 and not out.has_unsent and self.flying.get(out.seq) is out:
+            del self.flying[out.seq]
+            if not self.reliable:
+                self.counters.deliver(out.size)
+
+    def fragment_lost(self, out: OutMessage, generation: int, start: int, end: int, *, now: float) -> bool:
+        """A fragment did not arrive. True: it will be sent again; False: the message is no longer wanted."""
+        if out.generation != generation:
+            return False
+        out.fragments_inflight -= 1
+        if self.flying.get(out.seq) is not out:
+            return False  # finished or dropped meanwhile
+        if not self.reliable and self._expired(out, now):
+            reason: DropReason | None = DropReason.LIFESPAN
+        elif self.coalesced and self.queue and not out.ranges and not out.some_acked:
+            reason = DropReason.SUPERSEDED  # nothing of it has arrived and a fresher sample waits
+        else:
+            reason = None
+        if reason is not None:
+            del self.flying[out.seq]
+            if out in self.active:
+                self.active.remove(out)
+            self._drop(out, reason)
+            return False
+        if out.ranges is None:
+            out.ranges = []
+        out.ranges.append((start, end))
+        out.ranges.sort()
+        self._activate(out)
+        return True
+
+    def _activate(self, out: OutMessage) -> None:
+        """A begun message has bytes to send (again): put it back in its place."""
+        self.flying[out.seq] = out
+        if out in self.active:
+            return
+        position = 0
+        while position < len(self.active) and self.active[position].seq < out.seq:
+            position += 1
+        self.active.insert(position, out)
+
+    def delivered_to(self, watermark: int) -> None:
+        """The peer's delivered watermark moved: reliable messages up to it are done."""
+        if watermark <= self.watermark:
+            return
+        self.watermark = watermark
+        retained = self.retained
+        while retained and retained[0].seq <= watermark:
+            out = retained.popleft()
+            self.retained_bytes -= out.size
+            if not out.counted:
+                self.counters.deliver(out.size)
+            self._forget(out)
+
+    def settle(self) -> None:
+        """Let go of reliable messages that the peer has whole, in order: for a stream without a watermark."""
+        while self.retained and self.retained[0].started and self.retained[0].seq not in self.flying:
+            self.delivered_to(self.retained[0].seq)
+
+    def _forget(self, out: OutMessage) -> None:
+        """Take a reliable message out of wherever it still is."""
+        if not out.started:
+            self.queue.remove(out)
+            self.queued_bytes -= out.size
+        else:
+            if self.flying.get(out.seq) is out:
+                del self.flying[out.seq]
+            if out.has_unsent and out in self.active:
+                self.active.remove(out)
+
+    def reported(self, seq: int, reason: DropReason) -> None:
+        """A later hop dropped `seq` and said so."""
+        for out in self.retained:
+            if out.seq == seq:
+                if not out.counted:
+                    self.counters.drop(reason, out.size)
+                    out.counted = True
+                    self.on_drop(out, reason)
+                return
+
+    def sweep(self, now: float, *, up: bool) -> None:
+        """Expire what nobody will send: lifespan and retention, also while the link is down."""
+        if not self.reliable:
+            lifespan_s = self.spec.lifespan_s
+            if lifespan_s is not None:
+                while self.queue and now - self.queue[0].message.born_s > lifespan_s:
+                    self._drop(self._pop_queue(), DropReason.LIFESPAN)
+                while self.active and now - self.active[0].message.born_s > lifespan_s:
+                    self._expire_begun(self.active[0])
+            return
+        lifespan_s, retention_s = self.spec.lifespan_s, self.spec.retention_s
+        for out in self.retained:
+            if out.counted:
+                continue
+            age_s = now - out.message.born_s
+            lapsed = age_s > retention_s
+            # Lifespan stops a message from being sent; once the peer has it whole, the peer watches it.
+            stale = lifespan_s is not None and age_s > lifespan_s and (out.has_unsent or out.fragments_inflight > 0)
+            if not lapsed and not stale:
+                break
+            self._entomb(out, DropReason.RETENTION if lapsed else DropReason.LIFESPAN)
+            if out.started:
+                self._activate(out)
+        if not up:
+            # Nobody to tell in this session: the announcement of the next one starts behind them.
+            while self.retained and self.retained[0].message.tombstone and self.retained[0].counted:
+                out = self.retained.popleft()
+                self.retained_bytes -= out.size
+                self._forget(out)
+                self.watermark = out.seq
+
+    @property
+    def first_seq(self) -> int:
+        """The lowest seq that may still come: what an announcement promises."""
+        if self.reliable:
+            return self.retained[0].seq if self.retained else self.next_seq
+        candidates = [out.seq for out in (*self.flying.values(), *self.queue)]
+        return min(candidates) if candidates else self.next_seq
+
+    def set_wanted(self, wanted: bool) -> None:
+        """The peer's answer: does anybody behind it want this stream?"""
+        self.wanted = wanted
+        if not wanted:
+            self.clear(DropReason.UNWANTED)
+            self.watermark = self.next_seq - 1
+
+    def session_lost(self) -> None:
+        """Fragments in flight were handed back one by one before; nothing is announced any more."""
+        self.ready = False
+
+    def peer_restarted(self) -> None:
+        """A new process at the other end has nothing of what we sent."""
+        for out in list(self.flying.values()):
+            if out.some_acked and not self.reliable:
+                del self.flying[out.seq]
+                if out in self.active:
+                    self.active.remove(out)
+                self._drop(out, DropReason.DISCONNECTED)
+            else:
+                out.restart()
+        if self.reliable:
+            again = [out for out in self.retained if out.started]
+            for out in again:
+                out.restart()
+                self.flying[out.seq] = out
+            self.active = deque(again)
+        else:
+            self.active = deque(sorted(self.flying.values(), key=lambda out: out.seq))
+
+    def clear(self, reason: DropReason) -> None:
+        """The stream ends: whatever is left is dropped for `reason`."""
+        if self.reliable:
+            for out in self.retained:
+                if not out.counted:
+                    self._drop(out, reason)
+            self.retained.clear()
+            self.retained_bytes = 0
+        else:
+            for out in (*self.flying.values(), *self.queue):
+                self._drop(out, reason)
+        self.flying.clear()
+        self.active.clear()
+        self.queue.clear()
+        self.queued_bytes = 0
+
+    # --- accounting -----------------------------------------------------------------------------------------------
+
+    def held(self) -> tuple[int, int, int, int]:
+        """(messages queued, bytes queued, messages in flight, bytes in flight); counted tombstones are neither."""
+        if self.reliable:
+            queued = [out for out in self.retained if not out.started and not out.counted]
+            flying = [out for out in self.retained if out.started and not out.counted]
+        else:
+            queued, flying = list(self.queue), list(self.flying.values())
+        return len(queued), sum(o.size for o in queued), len(flying), sum(o.size for o in flying)
+
+    def validate(self, check: Callable[[bool, str], None]) -> None:
+        name = self.stream.id.topic
+        queued, queued_bytes, flying, flying_bytes = self.held()
+        counters = self.counters
+        check(
+            counters.offered == counters.delivered + counters.dropped + queued + flying,
+            f"{name}: {counters.offered} offered is not {counters.delivered} delivered + {counters.dropped} dropped"
+            f" + {queued} queued + {flying} in flight",
+        )
+        check(
+            counters.offered_bytes == counters.delivered_bytes + counters.dropped_bytes + queued_bytes + flying_bytes,
+            f"{name}: offered bytes do not add up",
+        )
+        check(self.queued_bytes == sum(out.size for out in self.queue), f"{name}: queued bytes do not add up")
+        check(all(not out.started for out in self.queue), f"{name}: a begun message is in the queue")
+        check(self.reliable or len(self.queue) <= self.spec.depth, f"{name}: queue deeper than its depth")
+        if self.reliable:
+            check(
+                self.retained_bytes == sum(out.size for out in self.retained), f"{name}: retained bytes do not add up"
+            )
+            seqs = [out.seq for out in self.retained]
+            check(seqs == sorted(set(seqs)), f"{name}: retained messages are out of order")

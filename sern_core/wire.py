@@ -1,0 +1,352 @@
+"""The wire format of one hop: datagrams, the frames inside them, and the handshake and control envelopes.
+
+A *datagram* is what a lane carries as one unit: one ZMQ message part on the ZMQ lane, one sealed UDP datagram on
+the UDP lane. All integers are big endian.
+
+    0                   1                   2                   3
+    0 1 2 3 4 5 6 7 8 9 0 1 2 3 4 5 6 7 8 9 0 1 2 3 4 5 6 7 8 9 0 1
+   +---------------+---------------+---------------+---------------+
+   | magic 0x53    | version       | kind          | session tag   |
+   +---------------+---------------+---------------+---------------+
+   | packet number (0: unnumbered, never acknowledged)             |
+   +---------------------------------------------------------------+
+   | send stamp, microseconds of the sender's monotonic clock      |
+   |                                                               |
+   +---------------------------------------------------------------+
+   | kind 16: frames until the end; other kinds: one msgpack map   |
+
+Frames of a kind-16 datagram, each starting with its type:
+
+   type 1 DATA (18 bytes, +14 when offset is 0, then `length` body bytes)
+   +------+-------+---------+-------+----------+---------+--------+
+   | type | flags | channel | seq   | offset   | total   | length |
+   |  u8  |  u8   |  u16    |  u32  |  u32     |  u32    |  u16   |
+   +------+-------+---------+-------+----------+---------+--------+
+   | stamp_ns i64 | age u32 (100 us) | codec u8 | reserved u8     |   only when offset is 0
+   +--------------+------------------+----------+-----------------+
+
+   type 2 ACK (38 bytes): lane u8, highest u32, sack u64, echo stamp u64, receive stamp u64, cumulative bytes u64
+       bit i of sack: packet highest-1-i has arrived; the stamps belong to packet `highest`, in microseconds
+   type 3 WATERMARK (7 bytes): channel u16, delivered u32: every seq up to it is delivered, expired or refused
+   type 4 PING (1 byte): asks for an acknowledgement
+
+`seq` is the low 32 bits of a 64-bit count; the receiver widens it next to what it expects (RFC 1982 style).
+Decoding accepts or raises WireError, nothing else.
+"""
+
+import struct
+import zlib
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Any, Final, Protocol, cast
+
+import msgpack
+
+from sern_core.errors import VersionError, WireError
+
+MAGIC: Final = 0x53
+VERSION_MIN: Final = 1
+VERSION_MAX: Final = 1
+"""The wire versions this code speaks; peers agree on the highest common one at hello."""
+
+HEADER: Final = struct.Struct("!BBBBIQ")
+DATA_FIXED: Final = struct.Struct("!BBHIIIH")
+DATA_FIRST: Final = struct.Struct("!BBHIIIHqIBB")
+FIRST_EXTRA: Final = struct.Struct("!qIBB")
+ACK: Final = struct.Struct("!BBIQQQQ")
+WATERMARK: Final = struct.Struct("!BHI")
+HEADER_BYTES: Final = HEADER.size
+DATA_BYTES: Final = DATA_FIXED.size
+DATA_FIRST_BYTES: Final = DATA_FIRST.size
+
+MAX_FRAGMENT_BYTES: Final = 60_000
+"""Largest fragment body; `length` is 16 bits and a ZMQ message on the WAN stays below 64 KiB."""
+MAX_DATAGRAM_BYTES: Final = 65_536
+MAX_ENVELOPE_BYTES: Final = 4096
+MAX_ENVELOPE_ITEMS: Final = 64
+"""Arrays and maps of an envelope; without it one megabyte of empty maps costs 78 MB of memory."""
+MAX_ATTACHMENT_BYTES: Final = 1 << 20
+"""Unpacked size of a control message's attachment (a message definition or an object's value)."""
+AGE_UNIT_S: Final = 1e-4
+MAX_AGE_S: Final = AGE_UNIT_S * 0xFFFFFFFF
+
+FLAG_TOMBSTONE: Final = 0x01  # the message was dropped upstream; the body is one byte, its DROP_CODES value
+FLAG_REPLAY: Final = 0x02  # a transient_local sample for a late joiner
+FLAG_URGENT: Final = 0x04  # class control: acknowledge at once
+KNOWN_FLAGS: Final = FLAG_TOMBSTONE | FLAG_REPLAY | FLAG_URGENT
+
+
+class Kind(IntEnum):
+    HELLO = 1  # client to relay: who, which versions
+    WELCOME = 2  # relay to client: the session exists
+    REFUSE = 3  # relay to client: no, and why
+    RESET = 4  # "I know no such session": the peer says hello again
+    CLOSE = 5  # the session ends on purpose
+    DATA = 16
+
+
+_HANDSHAKE_KINDS: Final = frozenset({Kind.HELLO, Kind.WELCOME, Kind.REFUSE, Kind.RESET, Kind.CLOSE})
+
+FRAME_DATA: Final = 1
+FRAME_ACK: Final = 2
+FRAME_WATERMARK: Final = 3
+FRAME_PING: Final = 4
+
+
+@dataclass(frozen=True, slots=True)
+class Header:
+    version: int
+    kind: int
+    tag: int
+    number: int
+    stamp_us: int
+
+
+class FrameSink(Protocol):
+    """What a decoder of kind-16 datagrams reports to, frame by frame, in order."""
+
+    def on_data(
+        self,
+        flags: int,
+        channel: int,
+        seq: int,
+        offset: int,
+        total: int,
+        body: bytes,
+        stamp_ns: int,
+        age_s: float,
+        codec: int,
+    ) -> None: ...
+
+    def on_ack(self, lane: int, highest: int, sack: int, echo_us: int, received_us: int, cum_bytes: int) -> None: ...
+
+    def on_watermark(self, channel: int, delivered: int) -> None: ...
+
+    def on_ping(self) -> None: ...
+
+
+def encode_header(kind: int, tag: int, number: int, stamp_us: int, *, version: int = VERSION_MAX) -> bytes:
+    """The 16-byte datagram header. `stamp_us` is taken modulo 2^64."""
+    return HEADER.pack(MAGIC, version, kind, tag, number, stamp_us & 0xFFFFFFFFFFFFFFFF)
+
+
+def decode_header(data: bytes) -> Header:
+    """Split off and check the header of any datagram. Raises WireError, or VersionError for an unknown version."""
+    if len(data) < HEADER_BYTES:
+        raise WireError(f"datagram of {len(data)} bytes is shorter than its {HEADER_BYTES}-byte header")
+    if len(data) > MAX_DATAGRAM_BYTES:
+        raise WireError(f"datagram of {len(data)} bytes exceeds {MAX_DATAGRAM_BYTES}")
+    magic, version, kind, tag, number, stamp_us = HEADER.unpack_from(data)
+    if magic != MAGIC:
+        raise WireError(f"first byte 0x{magic:02x} is not a SERN datagram (0x{MAGIC:02x})")
+    if not VERSION_MIN <= version <= VERSION_MAX:
+        raise VersionError(f"wire version {version} is unknown here; this side speaks {VERSION_MIN} to {VERSION_MAX}")
+    if kind != Kind.DATA and kind not in _HANDSHAKE_KINDS:
+        raise WireError(f"unknown datagram kind {kind}")
+    return Header(version, kind, tag, number, stamp_us)
+
+
+def decode_frames(data: bytes, sink: FrameSink) -> None:
+    """Walk the frames of a kind-16 datagram whose header was checked. Raises WireError at the first bad byte."""
+    position = HEADER_BYTES
+    end = len(data)
+    unpack_data = DATA_FIXED.unpack_from
+    while position < end:
+        kind = data[position]
+        if kind == FRAME_DATA:
+            if position + DATA_BYTES > end:
+                raise WireError("truncated DATA frame")
+            _, flags, channel, seq, offset, total, length = unpack_data(data, position)
+            position += DATA_BYTES
+            stamp_ns, age, codec = 0, 0, 0
+            if offset == 0:
+                if position + FIRST_EXTRA.size > end:
+                    raise WireError("truncated DATA frame")
+                stamp_ns, age, codec, reserved = FIRST_EXTRA.unpack_from(data, position)
+                position += FIRST_EXTRA.size
+                if reserved:
+                    raise WireError("reserved byte of a DATA frame is not zero")
+            elif length == 0:
+                raise WireError("empty fragment")
+            if flags & ~KNOWN_FLAGS:
+                raise WireError(f"unknown DATA flags 0x{flags:02x}")
+            if offset + length > total:
+                raise WireError(f"fragment {offset}+{length} lies outside its message of {total} bytes")
+            body = data[position : position + length]
+            if len(body) != length:
+                raise WireError("truncated DATA body")
+            if flags & FLAG_TOMBSTONE and total != 1:
+                raise WireError("a tombstone carries exactly one byte")
+            position += length
+            sink.on_data(flags, channel, seq, offset, total, body, stamp_ns, age * AGE_UNIT_S, codec)
+        elif kind == FRAME_ACK:
+            if position + ACK.size > end:
+                raise WireError("truncated ACK frame")
+            _, lane, highest, sack, echo_us, received_us, cum_bytes = ACK.unpack_from(data, position)
+            position += ACK.size
+            sink.on_ack(lane, highest, sack, echo_us, received_us, cum_bytes)
+        elif kind == FRAME_WATERMARK:
+            if position + WATERMARK.size > end:
+                raise WireError("truncated WATERMARK frame")
+            _, channel, delivered = WATERMARK.unpack_from(data, position)
+            position += WATERMARK.size
+            sink.on_watermark(channel, delivered)
+        elif kind == FRAME_PING:
+            position += 1
+            sink.on_ping()
+        else:
+            raise WireError(f"unknown frame type {kind}")
+
+
+def encode_data_first(
+    flags: int, channel: int, seq: int, total: int, length: int, stamp_ns: int, age_s: float, codec: int
+) -> bytes:
+    """Header of the fragment at offset 0 (32 bytes); the body follows it."""
+    age = int(age_s / AGE_UNIT_S)
+    age = 0 if age < 0 else min(age, 0xFFFFFFFF)
+    return DATA_FIRST.pack(FRAME_DATA, flags, channel, seq & 0xFFFFFFFF, 0, total, length, stamp_ns, age, codec, 0)
+
+
+def encode_data_next(flags: int, channel: int, seq: int, offset: int, total: int, length: int) -> bytes:
+    """Header of a fragment at `offset` > 0 (18 bytes); the body follows it."""
+    return DATA_FIXED.pack(FRAME_DATA, flags, channel, seq & 0xFFFFFFFF, offset, total, length)
+
+
+def encode_ack(lane: int, highest: int, sack: int, echo_us: int, received_us: int, cum_bytes: int) -> bytes:
+    return ACK.pack(
+        FRAME_ACK, lane, highest, sack, echo_us, received_us & 0xFFFFFFFFFFFFFFFF, cum_bytes & 0xFFFFFFFFFFFFFFFF
+    )
+
+
+def encode_watermark(channel: int, delivered: int) -> bytes:
+    return WATERMARK.pack(FRAME_WATERMARK, channel, delivered & 0xFFFFFFFF)
+
+
+PING_FRAME: Final = bytes([FRAME_PING])
+
+
+def widen_seq(low: int, near: int) -> int:
+    """The 64-bit count whose low 32 bits are `low` and which lies nearest to `near` (RFC 1982 arithmetic)."""
+    wide = (near & ~0xFFFFFFFF) | low
+    if wide < near - 0x80000000:
+        return wide + 0x100000000
+    if wide > near + 0x80000000 and wide >= 0x100000000:
+        return wide - 0x100000000
+    return wide
+
+
+# --- envelopes: msgpack maps of the handshake and of control messages -------------------------------------------
+
+Envelope = dict[str, Any]
+
+
+def encode_envelope(envelope: Envelope) -> bytes:
+    packed = cast(bytes, msgpack.packb(envelope, use_bin_type=True))
+    if len(packed) > MAX_ENVELOPE_BYTES:
+        raise WireError(f"envelope of {len(packed)} bytes exceeds {MAX_ENVELOPE_BYTES}")
+    return packed
+
+
+def decode_envelope(data: bytes) -> Envelope:
+    """One msgpack map with string keys, bounded in size, depth of nesting and number of items."""
+    if len(data) > MAX_ENVELOPE_BYTES:
+        raise WireError(f"envelope of {len(data)} bytes exceeds {MAX_ENVELOPE_BYTES}")
+    try:
+        value = msgpack.unpackb(
+            data,
+            raw=False,
+            strict_map_key=True,
+            max_array_len=MAX_ENVELOPE_ITEMS,
+            max_map_len=MAX_ENVELOPE_ITEMS,
+            max_ext_len=0,
+        )
+    except (ValueError, RecursionError, msgpack.exceptions.UnpackException) as error:
+        raise WireError(f"bad msgpack envelope: {type(error).__name__}") from error
+    if not isinstance(value, dict) or not all(isinstance(key, str) for key in value):
+        raise WireError("an envelope must be a map with string keys")
+    return value
+
+
+def encode_control(envelope: Envelope, attachment: bytes = b"") -> bytes:
+    """Body of a message on a system channel: u16 envelope length, envelope, zlib-packed attachment."""
+    head = encode_envelope(envelope)
+    if len(attachment) > MAX_ATTACHMENT_BYTES:
+        raise WireError(f"attachment of {len(attachment)} bytes exceeds {MAX_ATTACHMENT_BYTES}")
+    return struct.pack("!H", len(head)) + head + (zlib.compress(attachment, 9) if attachment else b"")
+
+
+def decode_control(body: bytes) -> tuple[Envelope, bytes]:
+    if len(body) < 2:
+        raise WireError("truncated control message")
+    (length,) = struct.unpack_from("!H", body)
+    if len(body) < 2 + length:
+        raise WireError("truncated control envelope")
+    envelope = decode_envelope(body[2 : 2 + length])
+    packed = body[2 + length :]
+    if not packed:
+        return envelope, b""
+    unpacker = zlib.decompressobj()
+    try:
+        attachment = unpacker.decompress(packed, MAX_ATTACHMENT_BYTES)
+    except zlib.error as error:
+        raise WireError("bad zlib data in a control attachment") from error
+    if not unpacker.eof or unpacker.unused_data:
+        raise WireError(f"control attachment is truncated or unpacks to more than {MAX_ATTACHMENT_BYTES} bytes")
+    return envelope, attachment
+
+
+def take_int(envelope: Envelope, key: str, *, low: int = 0, high: int = 2**63 - 1, default: int | None = None) -> int:
+    value = envelope.get(key, default)
+    if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
+        raise WireError(f"envelope key {key!r} must be an integer from {low} to {high}")
+    return value
+
+
+def take_float(envelope: Envelope, key: str, *, low: float, high: float, default: float | None = None) -> float | None:
+    """A finite number in [low, high], or None where None is sent or the key is absent without a default."""
+    value = envelope.get(key, default)
+    if value is None:
+        return None
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not low <= value <= high:
+        raise WireError(f"envelope key {key!r} must be a number from {low} to {high}")
+    return float(value)
+
+
+def take_str(envelope: Envelope, key: str, *, max_length: int = 512, default: str | None = None) -> str:
+    value = envelope.get(key, default)
+    if not isinstance(value, str) or len(value) > max_length:
+        raise WireError(f"envelope key {key!r} must be a string of at most {max_length} characters")
+    return value
+
+
+def take_strings(envelope: Envelope, key: str, *, max_length: int = 512) -> list[str]:
+    value = envelope.get(key, [])
+    if not isinstance(value, list) or not all(isinstance(item, str) and len(item) <= max_length for item in value):
+        raise WireError(f"envelope key {key!r} must be a list of strings")
+    return list(value)
+
+
+def take_bool(envelope: Envelope, key: str, *, default: bool = False) -> bool:
+    value = envelope.get(key, default)
+    if not isinstance(value, bool):
+        raise WireError(f"envelope key {key!r} must be true or false")
+    return value
+
+
+def encode_handshake(kind: Kind, tag: int, stamp_us: int, envelope: Envelope) -> bytes:
+    return encode_header(kind, tag, 0, stamp_us) + encode_envelope(envelope)
+
+
+def decode_handshake(data: bytes) -> Envelope:
+    """The envelope of a handshake datagram whose header was checked."""
+    return decode_envelope(data[HEADER_BYTES:])
+
+
+def agree_version(low: int, high: int) -> int:
+    """The highest wire version both sides speak. Raises VersionError naming both ranges."""
+    best = min(high, VERSION_MAX)
+    if best < max(low, VERSION_MIN):
+        raise VersionError(
+            f"the peer speaks wire versions {low} to {high}, this side {VERSION_MIN} to {VERSION_MAX}: update the older"
+        )
+    return best
