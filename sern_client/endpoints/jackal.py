@@ -403,5 +403,5 @@ class OperatorSource:
         return ros_types.serialise(message, plan.type_name, self._encoding)
 
 
-def _make(encoding: Encoding, type_name: str, **fields: Any) -> Any:
+def _make(encoding: Encoding, type_name: str, /, **fields: Any) -> Any:
     return ros_types.new(type_name, encoding, **fields)

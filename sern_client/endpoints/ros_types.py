@@ -161,7 +161,7 @@ def deserialise(body: bytes, type_name: str, encoding: Encoding) -> Any:
         raise ConfigError(f"type {type_name}: {len(body)} bytes do not decode: {one_line(error)}") from None
 
 
-def new(type_name: str, encoding: Encoding, **fields: Any) -> Any:
+def new(type_name: str, encoding: Encoding, /, **fields: Any) -> Any:
     """A message object of this type, zero in every field but those given by name. UsageError for an unknown field."""
     store = typestore(encoding)
     definition = store.fielddefs[type_name][1]

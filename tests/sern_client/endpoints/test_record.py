@@ -1,0 +1,282 @@
+"""Recording: what is read back is what was given, byte for byte, and a bad disk does not stop the daemon."""
+
+import asyncio
+import resource
+from collections.abc import Awaitable, Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+from rosbags.highlevel import AnyReader
+from rosbags.interfaces import ConnectionExtRosbag1, ConnectionExtRosbag2, QosDurability
+
+from sern_client.endpoints import ros_types
+from sern_client.endpoints.bag import BagEndpoint, BagOptions
+from sern_client.endpoints.record import RecordEndpoint, RecordOptions
+from sern_client.endpoints.ros_types import topic_info
+from sern_core.errors import ConfigError, UsageError
+from sern_core.message import TopicInfo
+from sern_core.types import Encoding, TopicName
+
+Make = Callable[..., Path]
+Until = Callable[[Callable[[], bool]], Awaitable[None]]
+START_NS = 1_700_000_000_000_000_000
+
+
+def read(path: Path) -> list[tuple[str, int, bytes]]:
+    with AnyReader([path]) as reader:
+        return [(connection.topic, stamp_ns, bytes(body)) for connection, stamp_ns, body in reader.messages()]
+
+
+async def copy(source: Path, target: Path, events: Any, until: Until) -> RecordEndpoint:
+    """Play a bag straight into a recording."""
+    player = BagEndpoint(BagOptions(source, rate=0, stamps="bag"))
+    recorder = RecordEndpoint(RecordOptions(target))
+    await recorder.start(events)
+    await player.start(events)
+    for name, info in events.infos.items():
+        publisher = recorder.advertise(info)
+
+        def sink(body: bytes, stamp_ns: int, publish: Callable[[bytes, int], None] = publisher.publish) -> bool:
+            publish(body, stamp_ns)
+            return True
+
+        player.subscribe(name, sink)
+    await until(lambda: player.exhausted)
+    await player.stop()
+    await recorder.stop()
+    return recorder
+
+
+@pytest.mark.parametrize("kind", ["bag", "db3", "mcap"])
+async def test_round_trip_is_byte_identical(
+    kind: str, make_bag: Make, tmp_path: Path, events: Any, until: Until
+) -> None:
+    source = make_bag(kind, 200)
+    target = tmp_path / ("copy.bag" if kind == "bag" else "copy.mcap")
+    recorder = await copy(source, target, events, until)
+    assert sorted(read(target)) == sorted(read(source))
+    assert recorder.counters.written == 402 and recorder.counters.dropped == 0 and recorder.problem is None
+    assert sorted(p.name for p in tmp_path.iterdir() if "active" in p.name) == []
+    with AnyReader([source]) as before, AnyReader([target]) as after:
+        for old in before.connections:
+            (new,) = [c for c in after.connections if c.topic == old.topic]
+            assert (new.msgtype, new.msgdef) == (old.msgtype, old.msgdef)
+            if kind == "bag":
+                assert new.digest == old.digest
+                assert isinstance(new.ext, ConnectionExtRosbag1) and isinstance(old.ext, ConnectionExtRosbag1)
+                assert bool(new.ext.latching) == bool(old.ext.latching)
+            else:
+                assert isinstance(new.ext, ConnectionExtRosbag2) and isinstance(old.ext, ConnectionExtRosbag2)
+                ours, theirs = new.ext.offered_qos_profiles[0], old.ext.offered_qos_profiles[0]
+                assert (ours.durability, ours.reliability) == (theirs.durability, theirs.reliability)
+    events.infos.clear()
+    again = BagEndpoint(BagOptions(target, rate=0))
+    await again.start(events)
+    assert {i.name: (i.latched, i.reliable, i.type_hash) for i in events.infos.values()}.keys() >= {"/chat", "/map"}
+    assert events.infos["/map"].latched and not events.infos["/chat"].latched
+    await again.stop()
+
+
+@pytest.mark.parametrize("name", ["husky_gps_imu_odom.bag", "jackal_imu_odom.bag"])
+async def test_real_bags_round_trip(
+    name: str, data: Callable[[str], Path], tmp_path: Path, events: Any, until: Until
+) -> None:
+    await copy(data(name), tmp_path / "copy.bag", events, until)
+    assert sorted(read(tmp_path / "copy.bag")) == sorted(read(data(name)))
+
+
+UNKNOWN = "uint8 WALK=1\nuint8 mode\nfloat64[2] legs\n"
+
+
+def unknown(encoding: Encoding, name: str = "/gait") -> TopicInfo:
+    type_name = "recorder_test_msgs/msg/Gait"
+    type_hash = ros_types.hash_of(type_name, UNKNOWN, encoding)
+    return TopicInfo(TopicName(name), type_name, encoding, type_hash, UNKNOWN, latched=True)
+
+
+async def test_unknown_types_and_both_encodings_at_once(tmp_path: Path, events: Any) -> None:
+    recorder = RecordEndpoint(RecordOptions(tmp_path / "deeper" / "mixed"))
+    await recorder.start(events)
+    sent = {}
+    for encoding, topic in ((Encoding.ROS1, "/one"), (Encoding.CDR, "/two")):
+        publisher = recorder.advertise(unknown(encoding, topic))
+        body = bytes(range(17)) if encoding is Encoding.ROS1 else b"\x00\x01\x00\x00" + bytes(24)
+        publisher.publish(body, START_NS)
+        publisher.close()
+        publisher.publish(body, START_NS + 1)  # closed: goes nowhere
+        # The same connection again, and the same topic said another way.
+        recorder.advertise(unknown(encoding, topic)).publish(body, START_NS + 2)
+        sent[encoding] = [(topic, START_NS, body), (topic, START_NS + 2, body)]
+    await recorder.stop()
+    assert read(tmp_path / "deeper" / "mixed.bag") == sent[Encoding.ROS1]
+    assert read(tmp_path / "deeper" / "mixed.mcap") == sent[Encoding.CDR]
+    assert recorder.paths[Encoding.ROS1] == tmp_path / "deeper" / "mixed.bag"
+    with AnyReader([tmp_path / "deeper" / "mixed.mcap"]) as reader:
+        (connection,) = reader.connections
+        assert isinstance(connection.ext, ConnectionExtRosbag2)
+        assert connection.ext.offered_qos_profiles[0].durability is QosDurability.TRANSIENT_LOCAL
+        assert connection.msgdef.data == UNKNOWN
+
+
+async def test_a_folder_gets_files_named_by_date(tmp_path: Path, events: Any) -> None:
+    recorder = RecordEndpoint(RecordOptions(tmp_path))
+    await recorder.start(events)
+    recorder.advertise(unknown(Encoding.ROS1)).publish(bytes(17), START_NS)
+    await recorder.stop()
+    (path,) = tmp_path.iterdir()
+    assert path.name.startswith("sern_") and path.suffix == ".bag" and len(read(path)) == 1
+
+
+async def test_an_empty_recording_leaves_no_file(tmp_path: Path, events: Any) -> None:
+    recorder = RecordEndpoint(RecordOptions(tmp_path / "x.bag"))
+    await recorder.start(events)
+    await recorder.stop()
+    await recorder.stop()  # again is harmless
+    assert list(tmp_path.iterdir()) == [] and recorder.exhausted
+
+
+async def test_refuses_what_it_could_not_read_back(tmp_path: Path, events: Any) -> None:
+    recorder = RecordEndpoint(RecordOptions(tmp_path / "x"))
+    with pytest.raises(UsageError):
+        recorder.advertise(unknown(Encoding.ROS1))
+    await recorder.start(events)
+    name = TopicName("/gait")
+    for info, said in [
+        (TopicInfo(name, "std_msgs/msg/String", Encoding.RAW), "raw bodies"),
+        (TopicInfo(name, "no_msgs/msg/Such", Encoding.CDR), "no definition"),
+        (TopicInfo(name, "no_msgs/msg/Such", Encoding.ROS1, "", "not { a definition"), "cannot be parsed"),
+        (TopicInfo(name, "std_msgs/msg/String", Encoding.ROS1, "0" * 32), "0{32}.*992ce8a1687cec8c8bd883ec73ca41d1"),
+    ]:
+        with pytest.raises(ConfigError, match=said):
+            recorder.advertise(info)
+    recorder.advertise(unknown(Encoding.CDR))
+    other = TopicInfo(TopicName("/b"), "recorder_test_msgs/msg/Gait", Encoding.CDR, "", "int64 x\n")
+    with pytest.raises(ConfigError, match="one definition of a type"):
+        recorder.advertise(other)
+    with pytest.raises(UsageError):
+        recorder.subscribe(name, lambda body, stamp_ns: True)
+    # Without definition or hash, a known type is completed from the typestore.
+    recorder.advertise(TopicInfo(TopicName("/s"), "std_msgs/String", Encoding.ROS1)).publish(b"\x01\x00\x00\x00a", 5)
+    await recorder.stop()
+    assert read(tmp_path / "x.bag") == [("/s", 5, b"\x01\x00\x00\x00a")]
+
+
+@pytest.mark.parametrize("left", ["run.bag", "run.bag.active"])
+async def test_overwrites_only_when_asked(left: str, tmp_path: Path, events: Any) -> None:
+    (tmp_path / left).write_text("precious")
+    with pytest.raises(ConfigError, match="exists already") as caught:
+        await RecordEndpoint(RecordOptions(tmp_path / "run.bag")).start(events)
+    assert left in str(caught.value)
+    recorder = RecordEndpoint(RecordOptions(tmp_path / "run.bag", overwrite=True))
+    await recorder.start(events)
+    recorder.advertise(unknown(Encoding.ROS1)).publish(bytes(17), START_NS)
+    await recorder.stop()
+    assert [p.name for p in tmp_path.iterdir()] == ["run.bag"] and len(read(tmp_path / "run.bag")) == 1
+
+
+async def test_the_other_file_in_the_way_is_seen_at_advertise(tmp_path: Path, events: Any) -> None:
+    (tmp_path / "run.mcap").write_text("precious")
+    recorder = RecordEndpoint(RecordOptions(tmp_path / "run.bag"))
+    await recorder.start(events)
+    with pytest.raises(ConfigError, match=r"run\.mcap: exists already"):
+        recorder.advertise(unknown(Encoding.CDR))
+    await recorder.stop()
+    assert (tmp_path / "run.mcap").read_text() == "precious"
+
+
+async def test_a_place_that_cannot_be_written(tmp_path: Path, events: Any) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ConfigError, match="cannot be made") as caught:
+        await RecordEndpoint(RecordOptions(tmp_path / "file" / "run.bag")).start(events)
+    assert "\n" not in str(caught.value)
+    with pytest.raises(ConfigError, match="not supported"):
+        await RecordEndpoint(RecordOptions(tmp_path / "run.db3")).start(events)
+
+
+async def test_a_place_that_went_away(tmp_path: Path, events: Any, caplog: pytest.LogCaptureFixture) -> None:
+    folder = tmp_path / "usb"
+    recorder = RecordEndpoint(RecordOptions(folder / "run.bag"))
+    await recorder.start(events)
+    folder.rmdir()
+    publisher = recorder.advertise(unknown(Encoding.ROS1))
+    for i in range(5):
+        publisher.publish(bytes(17), START_NS + i)
+    await recorder.stop()
+    assert recorder.counters.dropped == 5 and recorder.counters.errors == 1 and recorder.counters.written == 0
+    assert recorder.problem is not None and "cannot be written" in recorder.problem
+    assert all(record.exc_info is None and "\n" not in record.getMessage() for record in caplog.records)
+
+
+@contextmanager
+def disk_of(size_bytes: int) -> Iterator[None]:
+    """No file of this process grows beyond this: writing fails as on a full disk."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size_bytes, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+@pytest.mark.parametrize("encoding", [Encoding.ROS1, Encoding.CDR])
+@pytest.mark.parametrize("size_bytes", [2_600_000, 3_300_000])
+async def test_a_full_disk_leaves_a_readable_file(
+    encoding: Encoding, size_bytes: int, tmp_path: Path, events: Any, until: Until
+) -> None:
+    """3.2 MB for a smaller disk: what was written before is readable, and every message is accounted for."""
+    recorder = RecordEndpoint(RecordOptions(tmp_path / "run"))
+    with disk_of(size_bytes):
+        await recorder.start(events)
+        publisher = recorder.advertise(topic_info("/blob", "std_msgs/msg/String", encoding))
+        for i in range(32):
+            publisher.publish(bytes([i]) * 100_000, START_NS + i)
+        await recorder.stop()
+    counters = recorder.counters
+    got = read(recorder.paths[encoding])
+    assert [row[1] - START_NS for row in got] == list(range(len(got)))
+    assert len(got) == counters.written > 10 and counters.written + counters.dropped == 32
+    assert (counters.errors > 0) == (counters.dropped > 0) == (size_bytes < 3_200_000)
+
+
+async def test_memory_is_bounded(tmp_path: Path, events: Any) -> None:
+    """Messages beyond the buffer are dropped and counted, with one complaint for the episode."""
+    recorder = RecordEndpoint(RecordOptions(tmp_path / "run.bag", max_buffer_bytes=10_000))
+    await recorder.start(events)
+    publisher = recorder.advertise(topic_info("/blob", "std_msgs/msg/String", Encoding.ROS1))
+    for i in range(50):
+        publisher.publish(bytes(20_000), START_NS + i)
+    publisher.publish(b"\x00\x00\x00\x00", START_NS)
+    publisher.publish(b"\x00\x00\x00\x00", -1)  # no bag holds this time
+    await recorder.stop()
+    assert recorder.counters.dropped == 51 and recorder.counters.written == 1 and recorder.counters.errors == 1
+
+
+async def test_a_cancelled_stop_still_finishes_the_file(tmp_path: Path, events: Any, until: Until) -> None:
+    recorder = RecordEndpoint(RecordOptions(tmp_path / "run.bag"))
+    await recorder.start(events)
+    publisher = recorder.advertise(topic_info("/blob", "std_msgs/msg/String", Encoding.ROS1))
+    for i in range(100):
+        publisher.publish(bytes(50_000), START_NS + i)
+    stopping = asyncio.create_task(recorder.stop())
+    await asyncio.sleep(0)
+    stopping.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await stopping
+    await until((tmp_path / "run.bag").exists)
+    assert len(read(tmp_path / "run.bag")) == 100
+
+
+async def test_the_index_of_written_chunks_is_not_kept(tmp_path: Path, events: Any) -> None:
+    """Many chunks, several topics: counts in the index are right although the per-message index was let go."""
+    recorder = RecordEndpoint(RecordOptions(tmp_path / "run.bag"))
+    await recorder.start(events)
+    publishers = [recorder.advertise(topic_info(f"/t{i}", "std_msgs/msg/String", Encoding.ROS1)) for i in range(3)]
+    for i in range(300):
+        publishers[i % 3].publish(bytes(20_000), START_NS + i)
+    await recorder.stop()
+    with AnyReader([tmp_path / "run.bag"]) as reader:
+        assert reader.message_count == 300
+        assert {name: topic.msgcount for name, topic in reader.topics.items()} == {"/t0": 100, "/t1": 100, "/t2": 100}
+    assert [row[1] - START_NS for row in read(tmp_path / "run.bag")] == list(range(300))
