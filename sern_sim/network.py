@@ -228,6 +228,8 @@ class Network:
         for hop in self.hops:
             if hop._a.node is state or hop._b.node is state:
                 self._schedule_connect(hop, _reconnect_ns(hop, None))
+        for slot in state.slots:
+            self._settle(state, slot)
 
     def _state_of(self, node: Node | Port) -> NodeState:
         state = self._nodes.get(id(node))
@@ -503,6 +505,8 @@ class Network:
                     back_ns = max(back_ns, end_ns)
             if back_ns:
                 self._push(back_ns + hop._wait_ns, _CONNECT, hop, generation)
+                for slot in (hop._a, hop._b):
+                    self._settle(slot.node, slot)  # deadlines are served from the beginning
                 return
         hop.connected = True
         for direction in (hop.forward, hop.backward):

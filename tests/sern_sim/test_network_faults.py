@@ -309,6 +309,30 @@ def test_a_stream_that_starts_in_a_blackout_connects_when_the_path_is_there() ->
     assert is_up(hop) and a.history == b.history == ["connected"]
 
 
+def test_deadlines_are_served_before_the_first_connection_and_of_a_new_node() -> None:
+    class Clock(Ticker):
+        """Runs from the start, connected or not."""
+
+        def __init__(self, begin_s: float) -> None:
+            super().__init__(0.1)
+            self.begin_s = begin_s
+
+        def connected(self, *, now: float) -> None:
+            self.history.append("connected")
+
+    network = Network(1)
+    model = LinkModel(blackouts=(Window(0.0, 100.0),)).as_stream()
+    old = SoloNode(Clock(network.start_s))
+    network.join(old.port, old, Wire(), None, model, model)
+    network.run_until(9.99)
+    new = Clock(network.now)
+    network.replace_node(old, SoloNode(new))
+    network.run_until(20.0)
+    assert isinstance(old.port, Clock)
+    assert (old.port.sent, new.sent) == (100, 101)
+    assert old.port.history == new.history == []
+
+
 def test_a_reconnect_needs_the_path_for_its_whole_time() -> None:
     a, b = Wire(), Wire()
     model = LinkModel(
