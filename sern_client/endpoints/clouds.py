@@ -40,7 +40,8 @@ def read_ply(path: Path) -> NDArray[np.float32]:
     if kind == "ascii":
         rows = data.decode("ascii", errors="replace").splitlines()[:count]
         try:
-            table = np.array([row.split()[: len(columns)] for row in rows], dtype=np.float64).reshape(count, -1)
+            table = np.array([row.split()[: len(columns)] for row in rows], dtype=np.float64)
+            table = table.reshape(count, len(columns))
         except ValueError as error:
             raise ConfigError(f"damaged vertex data ({error}); export it again", file=str(path)) from None
         by_name = {name: table[:, i] for i, (name, _) in enumerate(columns)}

@@ -1,0 +1,169 @@
+"""Several endpoints as one."""
+
+import asyncio
+import logging
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from sern_client.endpoints.bag import BagEndpoint, BagOptions
+from sern_client.endpoints.base import Endpoint, Publisher, Sink, Subscription, TopicEvents
+from sern_client.endpoints.composite import CompositeEndpoint
+from sern_client.endpoints.record import RecordEndpoint, RecordOptions
+from sern_client.endpoints.ros_types import topic_info
+from sern_client.endpoints.synthetic import SyntheticEndpoint, SyntheticOptions
+from sern_core.errors import ConfigError, UsageError
+from sern_core.message import TopicInfo
+from sern_core.types import Encoding, TopicName
+
+Make = Callable[..., Path]
+Until = Callable[[Callable[[], bool]], Awaitable[None]]
+CHAT = TopicName("/chat")
+STRING = topic_info(CHAT, "std_msgs/msg/String", Encoding.ROS1)
+
+
+class Fake:
+    """An endpoint under the test's hand."""
+
+    def __init__(self, problem: str = "") -> None:
+        self.problem = problem
+        self.events: TopicEvents | None = None
+        self.sinks: list[Sink] = []
+        self.got: list[bytes] = []
+        self.stopped = 0
+
+    async def start(self, events: TopicEvents) -> None:
+        if self.problem == "start":
+            raise ConfigError("cannot start")
+        self.events = events
+
+    async def stop(self) -> None:
+        self.stopped += 1
+        if self.problem == "stop":
+            raise ConfigError("cannot stop")
+
+    def subscribe(self, name: TopicName, sink: Sink) -> Subscription:
+        self.sinks.append(sink)
+        fake = self
+
+        class Part:
+            def close(self) -> None:
+                fake.sinks.remove(sink)
+
+        return Part()
+
+    def advertise(self, info: TopicInfo) -> Publisher:
+        if self.problem == "advertise":
+            raise ConfigError("takes nothing")
+        fake = self
+
+        class Out:
+            def publish(self, body: bytes, stamp_ns: int) -> None:
+                fake.got.append(body)
+
+            def close(self) -> None:
+                fake.got.append(b"closed")
+
+        return Out()
+
+    @property
+    def exhausted(self) -> bool:
+        return self.problem == "exhausted"
+
+
+def test_is_an_endpoint() -> None:
+    members: list[Endpoint] = [Fake(), BagEndpoint(BagOptions(Path("x.bag"))), RecordEndpoint(RecordOptions(Path("x")))]
+    members.append(SyntheticEndpoint(SyntheticOptions(topics=0)))
+    whole: Endpoint = CompositeEndpoint(members)
+    assert not whole.exhausted
+    assert CompositeEndpoint([Fake("exhausted"), RecordEndpoint(RecordOptions(Path("x")))]).exhausted
+
+
+async def test_bag_plus_robot_plus_recorder(make_bag: Make, tmp_path: Path, events: Any, until: Until) -> None:
+    robot = SyntheticEndpoint(SyntheticOptions(topics=("/pose",)))
+    bag = BagEndpoint(BagOptions(make_bag("bag"), rate=0, namespaces=("r1",)))
+    recorder = RecordEndpoint(RecordOptions(tmp_path / "out.bag"))
+    whole = CompositeEndpoint([bag, robot, recorder])
+    await whole.start(events)
+    assert {"/r1/chat", "/pose"} <= set(events.infos)
+    got: list[bytes] = []
+
+    def sink(body: bytes, stamp_ns: int) -> bool:
+        got.append(body)
+        return True
+
+    whole.subscribe(TopicName("/r1/chat"), sink)
+    publisher = whole.advertise(topic_info("/cmd_vel", "geometry_msgs/msg/Twist", Encoding.ROS1))
+    publisher.publish(bytes(48), 1)
+    publisher.close()
+    await until(lambda: len(got) == 10 and bag.exhausted)
+    received = robot.received("/cmd_vel")
+    assert received is not None and received.count == 1
+    assert not whole.exhausted
+    await whole.stop()
+    assert recorder.counters.written == 1
+    with pytest.raises(UsageError):
+        whole.subscribe(TopicName("/nothing"), sink)
+
+
+async def test_a_topic_of_two_members(events: Any, caplog: pytest.LogCaptureFixture) -> None:
+    """Announced once, heard from both, also when the second comes later; removed with the last."""
+    one, two, odd = Fake(), Fake(), Fake()
+    whole = CompositeEndpoint([one, two, odd])
+    await whole.start(events)
+    assert one.events is not None and two.events is not None and odd.events is not None
+    one.events.topic_added(STRING)
+    got: list[bytes] = []
+    joined = whole.subscribe(CHAT, lambda body, stamp_ns: bool(got.append(body)))  # type: ignore[func-returns-value]
+    two.events.topic_added(STRING)
+    two.events.topic_added(STRING)
+    with caplog.at_level(logging.WARNING):
+        odd.events.topic_added(topic_info(CHAT, "std_msgs/msg/Bool", Encoding.ROS1))
+    assert len(caplog.records) == 1 and "left out" in caplog.records[0].getMessage()
+    assert [len(member.sinks) for member in (one, two, odd)] == [1, 1, 0]
+    one.sinks[0](b"1", 0)
+    two.sinks[0](b"2", 0)
+    assert got == [b"1", b"2"]
+    one.events.topic_removed(CHAT)
+    odd.events.topic_removed(CHAT)
+    assert events.removed == [] and [len(member.sinks) for member in (one, two)] == [0, 1]
+    joined.close()
+    assert two.sinks == []
+    two.events.topic_removed(CHAT)
+    assert events.removed == [CHAT]
+    await whole.stop()
+
+
+async def test_publishes_to_all_that_accept(events: Any) -> None:
+    one, deaf, two = Fake(), Fake("advertise"), Fake()
+    whole = CompositeEndpoint([one, deaf, two])
+    await whole.start(events)
+    publisher = whole.advertise(STRING)
+    publisher.publish(b"x", 1)
+    publisher.close()
+    assert one.got == two.got == [b"x", b"closed"]
+    await whole.stop()
+    with pytest.raises(ConfigError, match="takes nothing"):
+        CompositeEndpoint([deaf]).advertise(STRING)
+    with pytest.raises(ConfigError, match=r"^takes nothing$"):
+        CompositeEndpoint([deaf, Fake("advertise")]).advertise(STRING)
+
+
+async def test_failures_leave_nothing_running(events: Any) -> None:
+    good, bad, never = Fake(), Fake("start"), Fake()
+    with pytest.raises(ConfigError, match="cannot start"):
+        await CompositeEndpoint([good, bad, never]).start(events)
+    assert (good.stopped, bad.stopped, never.stopped) == (1, 0, 0)
+    first, second = Fake(), Fake("stop")
+    whole = CompositeEndpoint([first, second])
+    await whole.start(events)
+    with pytest.raises(ConfigError, match="cannot stop"):
+        await whole.stop()
+    assert (first.stopped, second.stopped) == (1, 1)
+    await whole.stop()  # again is harmless
+    assert (first.stopped, second.stopped) == (1, 1)
+    with pytest.raises(UsageError):
+        CompositeEndpoint([])
+    assert len(asyncio.all_tasks()) == 1
