@@ -174,6 +174,7 @@ class Hub:
         self._guards: dict[ClientName, RateGuard] = {}
         self._subscriptions: dict[ClientName, list[str]] = {}  # parts that have arrived
         self._awaited: dict[ClientName, set[TopicName]] = {}
+        self._heard: set[ClientName] = set()  # said what they want, to this run of the relay
         self._absent_since: dict[ClientName, float] = {}
         self._draining: list[tuple[Link, OutChannel]] = []  # streams that ended with reliable messages still owed
         self._sweep_due_s = now
@@ -239,6 +240,7 @@ class Hub:
         del self.links[client]
         self._absent_since.pop(client, None)
         self._awaited.pop(client, None)
+        self._heard.discard(client)
         self._guards.pop(client, None)
         self.objects.delete_owned(client)
 
@@ -386,8 +388,8 @@ class Hub:
         """Hold a reliable stream for clients that an earlier run of this relay owed it to."""
         for text in owed:
             client = ClientName(text)
-            link = self.links.get(client)
-            if (link is not None and link.established) or client == identity.origin or not self.known(client):
+            # Connected is not enough: it may not have come to say what it wants yet.
+            if client in self._heard or client == identity.origin or not self.known(client):
                 continue
             self._link(client, now)
             topics = self._awaited.setdefault(client, set())
@@ -479,6 +481,7 @@ class Hub:
             return
         del self._subscriptions[client]
         self._awaited.pop(client, None)
+        self._heard.add(client)
         try:
             self._apply(self.routing.subscribe(client, parts), now)
         except RefusedError as refusal:

@@ -118,6 +118,9 @@ class OutChannel:
                 return False
             counters.offer(size)
             self.next_seq = message.seq + 1
+            if message.seq <= self.watermark:
+                counters.deliver(size)  # the peer has it already, from an earlier run of this relay
+                return True
             if self.wanted is False and not self.retained:
                 counters.drop(DropReason.UNWANTED, size)
                 self.watermark = message.seq
