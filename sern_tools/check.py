@@ -50,7 +50,10 @@ def detect(document: Document) -> type[FileModel]:
     """What kind of file this is, by its keys; ConfigError when it is none of ours."""
     data = document.data if isinstance(document.data, dict) else {}
     if "sern_key" in data:
-        return _KEY_FILES.get(str(data["sern_key"]), keys.PublicKeyFile)
+        kind = _KEY_FILES.get(str(data["sern_key"]))
+        if kind is None:
+            raise document.error(("sern_key",), f"is not accepted as it is; accepted: {', '.join(_KEY_FILES)}")
+        return kind
     # A client file has a section `relay` too: its connection to the relay.
     if "client" in data or "endpoint" in data:
         return ClientFile
@@ -59,10 +62,7 @@ def detect(document: Document) -> type[FileModel]:
     words = ("client", "endpoint", "relay", "sern_key")
     close = [word for key in data for word in difflib.get_close_matches(key, words, n=1)]
     hint = f" (did you mean {close[0]}?)" if close else ""
-    problem = (
-        f"neither a client file (client, relay, endpoint), nor a relay file (relay), nor a key file (sern_key){hint}"
-    )
-    raise document.error((), problem)
+    raise document.error((), f"is no client file (client, relay, endpoint), relay file (relay) or key file{hint}")
 
 
 def _lines(console: Console, lines: Iterable[str]) -> None:
@@ -91,7 +91,8 @@ def _client_summary(out: Console, model: ClientFile) -> None:
             f"client {model.name}, namespace {model.namespace}",
             f"relay {model.relay.endpoint} ({safety})",
             *(f"endpoint {endpoint.kind}" for endpoint in model.endpoints),
-            f"discovery {model.discovery.mode}, scheduler {model.scheduler.ordering}, window {model.link.window.algorithm}",
+            f"discovery {model.discovery.mode}",
+            f"scheduler {model.scheduler.ordering}, window {model.link.window.algorithm}",
         ],
     )
     table = Table("#", "match", "class", "direction", "reliability", "lifespan s", "rate Hz", box=None, pad_edge=False)

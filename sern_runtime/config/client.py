@@ -286,7 +286,8 @@ class ClientFile(FileModel):
         if self.relay.server_key_file is not None:
             yield from public_key_problems(base_dir, self.relay.server_key_file, ("relay", "server_key_file"))
         if self.relay.secret_key_file is not None:
-            yield from secret_key_problems(base_dir, self.relay.secret_key_file, ("relay", "secret_key_file"))
+            loc = ("relay", "secret_key_file")
+            yield from secret_key_problems(base_dir, self.relay.secret_key_file, loc, owner=self.name)
         several = isinstance(self.endpoint, tuple)
         for index, endpoint in enumerate(self.endpoints):
             yield from endpoint.file_problems(base_dir, ("endpoint", index) if several else ("endpoint",))

@@ -219,7 +219,8 @@ class RelayFile(FileModel):
 
     def file_problems(self, base_dir: Path) -> Iterator[FileProblem]:
         if self.relay.secret_key_file is not None:
-            yield from secret_key_problems(base_dir, self.relay.secret_key_file, ("relay", "secret_key_file"))
+            loc = ("relay", "secret_key_file")
+            yield from secret_key_problems(base_dir, self.relay.secret_key_file, loc, owner=self.name)
         if self.relay.clients_dir is None:
             return
         loc = ("relay", "clients_dir")

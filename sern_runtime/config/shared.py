@@ -121,13 +121,16 @@ def public_key_problems(base_dir: Path, text: PathText, loc: Loc) -> Iterator[Fi
         yield FileProblem(loc, str(error))
 
 
-def secret_key_problems(base_dir: Path, text: PathText, loc: Loc) -> Iterator[FileProblem]:
+def secret_key_problems(base_dir: Path, text: PathText, loc: Loc, *, owner: str) -> Iterator[FileProblem]:
+    """Problems of the secret key file of `owner`, the name that the configuration gives to this daemon."""
     path = resolve(base_dir, text)
     try:
-        load_secret(path)
+        key = load_secret(path)
     except ConfigError as error:
         yield FileProblem(loc, str(error))
         return
+    if key.name != owner:
+        yield FileProblem(loc, f"{path} is the key of {key.name}, and this is {owner}; use the key of {owner}")
     warning = secret_warning(path)
     if warning is not None:
         yield FileProblem(loc, warning, warning=True)

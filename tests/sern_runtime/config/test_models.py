@@ -1,0 +1,211 @@
+"""Good files, what they become for the core, and the second step: the files that they name."""
+
+from pathlib import Path
+
+import pytest
+
+from sern_core.access import AccessTable
+from sern_core.message import TopicInfo
+from sern_core.params import LinkParams, SchedulerParams, WindowAlgorithm
+from sern_core.rules import Direction, DiscoveryMode, Lease, LossAction
+from sern_core.types import ClientName, Encoding, Ordering, PriorityClass, Reliability, TopicName
+from sern_runtime import keys
+from sern_runtime.config.base import FileModel, is_local
+from sern_runtime.config.client import ClientFile, load_client
+from sern_runtime.config.endpoints import BagEndpoint, RecordEndpoint, SyntheticEndpoint
+from sern_runtime.config.load import check, check_bytes, load
+from sern_runtime.config.relay import RelayFile, load_relay
+
+HEAD = "client: {name: jackal1}\nrelay: {endpoint: 'ipc:///run/sern.sock', insecure: true}\n"
+ROBOT = HEAD + "endpoint: {kind: synthetic, role: robot}\n"
+
+
+def client(text: str) -> ClientFile:
+    checked = check_bytes(text.encode(), Path("c.yaml"), ClientFile)
+    assert checked.loaded is not None, [str(error) for error in checked.errors]
+    return checked.loaded.model
+
+
+def relay(text: str) -> RelayFile:
+    checked = check_bytes(text.encode(), Path("r.yaml"), RelayFile)
+    assert checked.loaded is not None, [str(error) for error in checked.errors]
+    return checked.loaded.model
+
+
+def problems(path: Path, model: type[FileModel]) -> list[str]:
+    return [str(error).removeprefix(str(path.parent)) for error in check(path, model).errors]
+
+
+def test_defaults_are_those_of_the_core() -> None:
+    model = client(ROBOT)
+    assert model.scheduler.params() == SchedulerParams()
+    assert model.link.params() == LinkParams()
+    assert (model.name, model.namespace, model.http.listen) == ("jackal1", "/jackal1", None)
+    assert model.discovery.filter().mode is DiscoveryMode.MANUAL
+    assert relay("relay: {name: hub, listen: ['ipc://x'], insecure: true}\n").http.listen == "127.0.0.1:5580"
+
+
+def test_settings_reach_the_core() -> None:
+    model = client(
+        ROBOT + "scheduler: {ordering: paper, eta: 0, floor: 0}\nlink: {window: {algorithm: fixed, fixed_bytes: 9}, "
+        "retention_s: 5}\ntopics: [{match: /a, reliability: reliable}]\n"
+    )
+    assert model.scheduler.params() == SchedulerParams(ordering=Ordering.PAPER, eta=0.0, floor=0.0)
+    assert model.link.params().window.algorithm is WindowAlgorithm.FIXED
+    info = TopicInfo(TopicName("/a"), "std_msgs/String", Encoding.ROS1)
+    spec = model.rules().resolve(info, local_name=TopicName("/a")).spec
+    assert (spec.reliability, spec.retention_s) == (Reliability.RELIABLE, 5.0)
+
+
+def test_topic_rules_and_subscriptions() -> None:
+    model = client(
+        ROBOT + "topics:\n"
+        "  - {match: /cmd_vel, class: control, direction: receive, on_link_loss: {publish: zero, after_s: 0.5}}\n"
+        "  - {match: /goal, direction: receive, remap: /target}\n"
+        "  - {match: '/map|/costmap.*', class: state, lifespan_s: null, weight: 7}\n"
+        "subscribe: ['/site/.*']\n"
+    )
+    rules = model.rules()
+    twist = TopicInfo(TopicName("/cmd_vel"), "geometry_msgs/msg/Twist", Encoding.CDR)
+    resolved = rules.resolve(twist, local_name=TopicName("/cmd_vel"))
+    assert resolved.lease == Lease(LossAction.ZERO, 0.5)
+    assert resolved.direction is Direction.RECEIVE
+    assert (resolved.spec.priority, resolved.spec.lifespan_s) == (PriorityClass.CONTROL, 0.3)
+    grid = TopicInfo(TopicName("/costmap/a"), "nav_msgs/OccupancyGrid", Encoding.ROS1)
+    spec = rules.resolve(grid, local_name=TopicName("/costmap/a")).spec
+    assert (spec.weight, spec.lifespan_s) == (7.0, None)
+    assert model.subscribe_patterns() == ("/site/.*", "/jackal1(?:/cmd_vel)", "/jackal1(?:/target)")
+
+
+def test_one_endpoint_or_several() -> None:
+    assert client(ROBOT).endpoints == (SyntheticEndpoint(kind="synthetic", role="robot"),)
+    several = client(
+        HEAD + "endpoint:\n  - {kind: bag, path: a.bag, rate: 0, topics: ['/a.*']}\n  - {kind: record, path: b}\n"
+    )
+    assert several.endpoints == (
+        BagEndpoint(kind="bag", path="a.bag", rate=0, topics=("/a.*",)),
+        RecordEndpoint(kind="record", path="b"),
+    )
+    named = client(HEAD + "endpoint: {kind: synthetic, role: robot, topics: [/odom, /scan]}\n").endpoints[0]
+    assert isinstance(named, SyntheticEndpoint)
+    assert named.topics == ("/odom", "/scan")
+
+
+def test_access_rules_reach_the_table() -> None:
+    model = relay(
+        "relay: {name: hub, listen: ['ipc://x', 'tcp://127.0.0.1:5555'], insecure: true}\n"
+        "access:\n  - {client: site1, subscribe: ['.*'], replay: []}\n"
+        "  - {client: 'jackal.*', publish: ['/{self}/.*'], max_rate_hz: 100}\n"
+    )
+    table = AccessTable(model.access_rules())
+    robot, site, odom = ClientName("jackal1"), ClientName("site1"), TopicName("/jackal1/odom")
+    assert table.may_publish(robot, odom)
+    assert not table.may_publish(robot, TopicName("/jackal2/odom"))
+    assert table.limits(robot).max_rate_hz == 100
+    assert table.may_subscribe(site, odom)
+    assert not table.may_replay(site, odom)
+    assert not table.may_publish(site, odom)
+
+
+def test_feed_roles_reach_the_core() -> None:
+    model = relay(
+        "relay: {name: hub, listen: ['ipc://x'], insecure: true}\nfeed:\n  roles:\n"
+        "    - {name: unity, publish_endpoint: 'tcp://127.0.0.1:5570', ingest_endpoint: 'tcp://127.0.0.1:5571',\n"
+        "       subscribe: ['/r/odom'], publish: ['/r/goal']}\n"
+        "    - {name: lan, publish_endpoint: 'tcp://192.168.1.2:5570', insecure: true}\n"
+    )
+    unity, lan = model.feed_roles()
+    assert unity.may_see(TopicName("/r/odom"))
+    assert not unity.may_see(TopicName("/r/odom_filtered"))
+    assert unity.may_publish(TopicName("/r/goal"), PriorityClass.STATE)
+    assert not unity.may_publish(TopicName("/r/goal"), PriorityClass.CONTROL)
+    assert not lan.may_see(TopicName("/r/odom"))
+
+
+@pytest.mark.parametrize(
+    ("endpoint", "local"),
+    [
+        ("ipc:///run/x", True),
+        ("tcp://127.0.0.1:1", True),
+        ("tcp://127.9.9.9:1", True),
+        ("tcp://[::1]:1", True),
+        ("tcp://localhost:1", True),
+        ("tcp://0.0.0.0:1", False),
+        ("tcp://*:1", False),
+        ("tcp://[::]:1", False),
+        ("tcp://192.168.0.1:1", False),
+        ("tcp://localhost.example:1", False),
+    ],
+)
+def test_what_counts_as_local(endpoint: str, local: bool) -> None:
+    assert is_local(endpoint) is local
+
+
+@pytest.fixture
+def keyed(tmp_path: Path) -> Path:
+    """A directory with the keys of relay `hub` and client `jackal1`."""
+    (tmp_path / "clients").mkdir()
+    for name in ("hub", "jackal1"):
+        pair = keys.generate(ClientName(name))
+        keys.write_secret(tmp_path / f"{name}.key", pair)
+        public = keys.PublicKeys(pair.name, (keys.PublicKey(pair.public_key),))
+        keys.write_public(tmp_path / f"{name}.pub", public)
+        if name != "hub":
+            keys.write_public(tmp_path / "clients" / f"{name}.pub", public)
+    return tmp_path
+
+
+CLIENT_KEYED = (
+    "client: {name: jackal1}\nrelay:\n  endpoint: tcp://relay.example:5555\n"
+    "  server_key_file: hub.pub\n  secret_key_file: jackal1.key\n"
+)
+RELAY_KEYED = "relay:\n  name: hub\n  listen: ['tcp://*:5555']\n  secret_key_file: hub.key\n  clients_dir: clients\n"
+
+
+def test_files_that_are_there(keyed: Path) -> None:
+    path = keyed / "client.yaml"
+    path.write_text(CLIENT_KEYED + "endpoint: {kind: record, path: new.bag}\nsummary: s.json\n", encoding="utf-8")
+    loaded = load_client(path)
+    assert loaded.warnings == ()
+    assert loaded.resolve("s.json") == keyed / "s.json"
+    assert loaded.resolve("/abs") == Path("/abs")
+    path = keyed / "relay.yaml"
+    path.write_text(RELAY_KEYED + "access: [{client: '.*', publish: ['/{self}/.*']}]\n", encoding="utf-8")
+    assert load_relay(path).warnings == ()
+
+
+def test_files_that_are_not_there(keyed: Path) -> None:
+    path = keyed / "client.yaml"
+    path.write_text(
+        CLIENT_KEYED.replace("hub.pub", "hub.key").replace("jackal1.key", "hub.key")
+        + "endpoint:\n  - {kind: bag, path: none.bag}\n  - {kind: synthetic, role: robot, cloud_files: [no.ply]}\n"
+        + "  - {kind: record, path: client.yaml}\nmessage_log: clients\nsummary: none/s.json\n",
+        encoding="utf-8",
+    )
+    base = str(keyed)
+    assert problems(path, ClientFile) == [
+        f"/client.yaml:4: relay.server_key_file: {base}/hub.key:2: is a secret key file; the public one is needed here "
+        "(NAME.pub)",
+        f"/client.yaml:5: relay.secret_key_file: {base}/hub.key is the key of hub, and this is jackal1; "
+        "use the key of jackal1",
+        f"/client.yaml:7: endpoint.0.path: {base}/none.bag: no such file or directory",
+        f"/client.yaml:8: endpoint.1.cloud_files.0: {base}/no.ply: no such file",
+        f"/client.yaml:9: endpoint.2.path: {base}/client.yaml exists; set overwrite: true or name another file",
+        f"/client.yaml:10: message_log: {base}/clients is a directory; a file is needed",
+        f"/client.yaml:11: summary: {base}/none: no such directory; create it first",
+    ]
+    assert load(path, ClientFile, files=False).model.name == "jackal1"
+
+
+def test_warnings_do_not_stop(keyed: Path) -> None:
+    (keyed / "hub.key").chmod(0o644)
+    (keyed / "clients" / "README").write_text("hello", encoding="utf-8")
+    path = keyed / "relay.yaml"
+    path.write_text(RELAY_KEYED, encoding="utf-8")
+    base = str(keyed)
+    assert [warning.removeprefix(base) for warning in load_relay(path).warnings] == [
+        f"/relay.yaml:4: relay.secret_key_file: {base}/hub.key is open to others than its owner (mode 0644); "
+        f"run: chmod 600 {base}/hub.key",
+        f"/relay.yaml:5: relay.clients_dir: {base}/clients/README: is not read, its name does not end in .pub",
+        "/relay.yaml:1: access: no rule matches client jackal1: it may connect and do nothing",
+    ]

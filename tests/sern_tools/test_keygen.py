@@ -1,0 +1,49 @@
+"""`sern keygen`: two files, never overwritten unasked, and what to do with them."""
+
+from pathlib import Path
+
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from sern_core.errors import ConfigError, UsageError
+from sern_runtime import keys
+from sern_tools import keygen
+
+
+@pytest.mark.parametrize("role", ["relay", "client"])
+def test_files_fit_together(tmp_path: Path, role: keygen.Role) -> None:
+    text = keygen.run_keygen(role, "hub", out=tmp_path / "new")
+    secret, public = keys.load_secret(tmp_path / "new" / "hub.key"), keys.load_public(tmp_path / "new" / "hub.pub")
+    assert [key.key for key in public.keys] == [secret.public_key]
+    assert keys.secret_warning(tmp_path / "new" / "hub.key") is None
+    assert secret.secret_key not in text
+    assert "hub.pub" in text and "hub.key" in text
+
+
+def test_nothing_is_overwritten_unasked(tmp_path: Path) -> None:
+    (tmp_path / "hub.pub").write_text("mine", encoding="utf-8")
+    with pytest.raises(ConfigError, match=r"hub\.pub: exists already; --force replaces it"):
+        keygen.run_keygen("relay", "hub", out=tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["hub.pub"]
+    keygen.run_keygen("relay", "hub", out=tmp_path, force=True)
+    assert keys.load_public(tmp_path / "hub.pub").name == "hub"
+    with pytest.raises(UsageError, match="client name 'Hub' must be"):
+        keygen.run_keygen("relay", "Hub", out=tmp_path)
+    with pytest.raises(ConfigError, match="can not be made"):
+        keygen.run_keygen("relay", "hub", out=tmp_path / "hub.pub" / "x")
+
+
+def test_command_line_alone_and_inside_another(tmp_path: Path) -> None:
+    outer = typer.Typer()
+    outer.add_typer(keygen.app, name="keygen")
+    runner = CliRunner()
+    result = runner.invoke(outer, ["keygen", "client", "jackal1", "--out", str(tmp_path)])
+    assert (result.exit_code, result.stderr) == (0, "")
+    assert "clients_dir" in result.stdout
+    result = runner.invoke(keygen.app, ["client", "jackal1", "--out", str(tmp_path)])
+    assert result.exit_code == 2
+    assert result.stderr == (
+        f"{tmp_path / 'jackal1.pub'}: exists already; --force replaces it (and locks out whoever uses it)\n"
+    )
+    assert runner.invoke(keygen.app, ["relay", "hub", "--out", str(tmp_path)]).exit_code == 0
