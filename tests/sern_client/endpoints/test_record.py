@@ -2,6 +2,7 @@
 
 import asyncio
 import resource
+import sys
 from collections.abc import Awaitable, Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -280,3 +281,39 @@ async def test_the_index_of_written_chunks_is_not_kept(tmp_path: Path, events: A
         assert reader.message_count == 300
         assert {name: topic.msgcount for name, topic in reader.topics.items()} == {"/t0": 100, "/t1": 100, "/t2": 100}
     assert [row[1] - START_NS for row in read(tmp_path / "run.bag")] == list(range(300))
+
+
+INTERRUPTED = """
+import asyncio, os, signal, sys
+from pathlib import Path
+from sern_client.endpoints.record import RecordEndpoint, RecordOptions
+from sern_client.endpoints.ros_types import topic_info
+from sern_core.types import Encoding
+
+async def main(stop):
+    recorder = RecordEndpoint(RecordOptions(Path(sys.argv[1])))
+    await recorder.start(None)
+    publisher = recorder.advertise(topic_info("/blob", "std_msgs/msg/String", Encoding.ROS1))
+    try:
+        for i in range(200):
+            publisher.publish(bytes(20_000), i)
+        os.kill(os.getpid(), signal.SIGINT)
+        await asyncio.sleep(60)
+    finally:
+        if stop:
+            await recorder.stop()
+
+asyncio.run(main(sys.argv[2] == "stop"))
+"""
+
+
+@pytest.mark.parametrize("ending", ["stop", "nothing"])
+async def test_ctrl_c_leaves_a_whole_file(ending: str, tmp_path: Path) -> None:
+    """Interrupted with the buffer full; also when nobody gets to call `stop`."""
+    path = tmp_path / "run.bag"
+    process = await asyncio.create_subprocess_exec(
+        sys.executable, "-c", INTERRUPTED, str(path), ending, stderr=asyncio.subprocess.DEVNULL
+    )
+    async with asyncio.timeout(60):
+        assert await process.wait() != 0
+    assert len(read(path)) == 200
