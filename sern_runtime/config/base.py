@@ -197,6 +197,7 @@ HttpListen = Annotated[str, _checked(_check_http)]
 Seconds = Annotated[float, Field(gt=0, le=1e7)]
 SecondsOrZero = Annotated[float, Field(ge=0, le=1e7)]
 Hertz = Annotated[float, Field(gt=0, le=1e6)]
+HertzOrOff = Annotated[float, Field(ge=0, le=1e6)]
 Bytes = Annotated[int, Field(ge=1, le=1 << 40)]
 Count = Annotated[int, Field(ge=1, le=1_000_000)]
 

@@ -12,10 +12,11 @@ from pydantic import Discriminator, Field, Tag
 
 from sern_runtime.config.base import (
     FileProblem,
-    Hertz,
+    HertzOrOff,
     NamespaceText,
     PathText,
     Pattern,
+    Seconds,
     SecondsOrZero,
     Section,
     TopicText,
@@ -85,10 +86,10 @@ class SyntheticEndpoint(EndpointBase):
     """`robot`: publishes odometry, scan, cloud, map, tf and obeys commands; `operator`: sends commands."""
     seed: Annotated[int, Field(ge=0, lt=1 << 63)] = 0
     """Start value of the random generator."""
-    encoding: Literal["ros1", "cdr"] = "cdr"
+    encoding: Literal["ros1", "cdr"] = "ros1"
     """How bodies are serialised: `ros1` or `cdr` (ROS 2)."""
     topics: Annotated[
-        Annotated[Annotated[int, Field(ge=1, le=MAX_SYNTHETIC_TOPICS)], Tag("number")]
+        Annotated[Annotated[int, Field(ge=0, le=MAX_SYNTHETIC_TOPICS)], Tag("number")]
         | Annotated[tuple[TopicText, ...], Tag("list")],
         Discriminator(
             _topics_tag,
@@ -102,24 +103,36 @@ class SyntheticEndpoint(EndpointBase):
     """The robot drives a round by itself while it has no commands."""
     cloud_bytes: Annotated[int, Field(ge=1000, le=50_000_000)] = 100_000
     """Size of one point cloud."""
-    cloud_rate_hz: Hertz = 10.0
-    """Point clouds a second."""
-    map_bytes: Annotated[int, Field(ge=1000, le=50_000_000)] = 20_000
-    """Size of one occupancy grid."""
-    map_rate_hz: Hertz = 1.0
-    """Occupancy grids a second."""
-    pose_rate_hz: Hertz = 50.0
-    """Odometry messages a second."""
-    load_factor: Annotated[float, Field(gt=0, le=100)] = 1.0
-    """Multiplies the size of bulk messages: offered load as a factor of the usual one."""
-    command_topic: TopicText = "/cmd_vel"
-    """The topic (local name) on which commands come in, or go out for an operator."""
-    command_rate_hz: Hertz = 10.0
-    """Commands a second of an operator."""
-    counter_topics: tuple[TopicText, ...] = ()
-    """Extra reliable topics that carry a counter: they show gaps and duplicates."""
+    cloud_rate_hz: HertzOrOff = 10.0
+    """Point clouds a second; 0: none."""
     cloud_files: tuple[PathText, ...] = ()
     """Real scans (.ply) to send in turn in place of made-up clouds."""
+    map_bytes: Annotated[int, Field(ge=1000, le=50_000_000)] = 40_000
+    """Size of one occupancy grid."""
+    map_rate_hz: HertzOrOff = 0.2
+    """Occupancy grids a second; 0: none."""
+    image_bytes: Annotated[int, Field(ge=3, le=50_000_000)] = 9_216
+    """Size of one camera image."""
+    pose_rate_hz: HertzOrOff = 50.0
+    """Odometry messages a second; 0: none."""
+    load_factor: Annotated[float, Field(ge=0, le=100)] = 1.0
+    """Multiplies the rates of bulk topics: offered load as a factor of the usual one."""
+    commands: tuple[TopicText, ...] = ("/cmd_vel",)
+    """The topics (local names) that the robot drives by."""
+    command_timeout_s: Seconds | None = None
+    """The robot stops without a command for so long; null: that is left to `on_link_loss`."""
+    counter_topics: tuple[TopicText, ...] = ()
+    """Extra reliable topics that carry a counter: they show gaps and duplicates."""
+    command_topic: TopicText = "/cmd_vel"
+    """The topic (local name) on which the operator sends commands."""
+    command_stamped: bool = False
+    """The operator sends TwistStamped in place of Twist."""
+    command_rate_hz: HertzOrOff = 10.0
+    """Commands a second of the operator; 0: none."""
+    goal_topic: TopicText = "/goal"
+    """The topic (local name) on which the operator sends goals."""
+    goal_rate_hz: HertzOrOff = 0.2
+    """Goals a second of the operator; 0: none."""
 
     def file_problems(self, base_dir: Path, loc: Loc) -> Iterator[FileProblem]:
         for index, text in enumerate(self.cloud_files):
@@ -137,6 +150,8 @@ class RecordEndpoint(EndpointBase):
     """A .bag or .mcap file (the other encoding goes beside it), a directory (files are named by date), or a stem."""
     overwrite: bool = False
     """Replace files that exist."""
+    max_buffer_bytes: Annotated[int, Field(ge=1 << 20, le=1 << 36)] = 64 * 2**20
+    """What may wait for the disk; beyond, messages are dropped and counted."""
 
     def file_problems(self, base_dir: Path, loc: Loc) -> Iterator[FileProblem]:
         path = resolve(base_dir, self.path)

@@ -68,12 +68,12 @@ def test_load_raises_the_first_of_several(tmp_path: Path) -> None:
 def test_every_problem_is_reported_in_the_order_of_the_file() -> None:
     text = (
         "client: {name: jackal1}\nrelay: {endpoint: 'ipc:///run/sern.sock', insecure: true}\n"
-        "endpoint: {kind: record, path: x, overwrte: true}\n"
+        "endpoint: {kind: synthetic, role: robot}\ndiscovery: {mde: manual}\n"
         "topics:\n  - {match: /a, depth: 0}\n  - {match: /b, class: contrl}\nlog: {level: loud}\n"
     )
     assert said(text, ClientFile, "c.yaml") == [
-        "c.yaml:3: endpoint.overwrte: unknown key (did you mean overwrite?); accepted: kind, path, overwrite",
-        "c.yaml:5: topics.0.depth: must be >= 1, not 0",
-        "c.yaml:6: topics.1.class: 'contrl' is not accepted (did you mean control?); accepted: control, state, bulk",
-        "c.yaml:7: log.level: 'loud' is not accepted; accepted: debug, info, warning, error",
+        "c.yaml:4: discovery.mde: unknown key (did you mean mode?); accepted: mode, allow, deny",
+        "c.yaml:6: topics.0.depth: must be >= 1, not 0",
+        "c.yaml:7: topics.1.class: 'contrl' is not accepted (did you mean control?); accepted: control, state, bulk",
+        "c.yaml:8: log.level: 'loud' is not accepted; accepted: debug, info, warning, error",
     ]
