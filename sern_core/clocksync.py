@@ -7,7 +7,8 @@ A ping leaves at t1 (local clock), arrives at t2 and is answered at t3 (peer's c
     δ = (t4−t1) − (t3−t2)              round trip without the peer's processing time
 
 The offset that one ping shows is wrong by at most δ/2, whatever the asymmetry of the path. Queueing only ever adds
-to δ, so the ping of least δ among the last eight tells most (RFC 5905, section 10, the clock filter).
+to δ, so the ping of least δ among the last eight tells most (RFC 5905, section 10, the clock filter). Every
+acknowledged packet may serve as a ping: samples that come close together count as one, the best of them.
 
 Clocks also drift apart. The skew is the least-squares slope of those best offsets over 60 s. The fixed part of the
 path's delay shifts them all alike and cancels in the slope, so the error of each is taken as how far its δ was above
@@ -27,6 +28,9 @@ from sern_core.errors import UsageError
 
 FILTER_SAMPLES: Final = 8
 """Stages of the clock filter (RFC 5905, section 7.2, NSTAGE)."""
+STAGE_S: Final = 0.25
+"""Samples closer together than this share a stage, which keeps the one of least δ: eight acknowledgements in a row
+may all have stood in the same queue."""
 SKEW_WINDOW_S: Final = 60.0
 """Span of the offsets that the skew is fitted to, and the greatest age of a sample in the filter."""
 MAX_SKEW_PPM: Final = 500.0
@@ -34,7 +38,7 @@ MAX_SKEW_PPM: Final = 500.0
 WANDER_PPM: Final = 15.0
 """How fast a skew that is known may change (RFC 5905, section 7.2, PHI: 15e-6 s/s)."""
 MAX_FIT_POINTS: Final = 256
-"""Offsets kept for the skew; a faster ping rate thins them out by keeping only every new best one."""
+"""Offsets kept for the skew: more than the stages of its window."""
 MIN_FIT_POINTS: Final = 6
 MIN_FIT_SPAN_S: Final = 20.0
 """Fewer offsets, or closer ones, tell too little about the path's least delay to judge a skew."""
@@ -133,6 +137,7 @@ class ClockSync:
         self.steps = 0
         """How often either clock was stepped."""
         self._filter: deque[_Sample] = deque(maxlen=FILTER_SAMPLES)
+        self._stage_s = 0.0  # when the newest stage began
         self._best: _Sample | None = None
         self._fit: deque[_Sample] = deque(maxlen=MAX_FIT_POINTS)
         self._skew = 0.0
@@ -157,7 +162,13 @@ class ClockSync:
                 self._restart()
                 self.steps += 1
         self.rtt.sample(rtt_s, now=t4)
-        self._filter.append(new)
+        if self._filter and new.at_s < self._stage_s + STAGE_S:
+            if new.rtt_s >= self._filter[-1].rtt_s:
+                return True
+            self._filter[-1] = new
+        else:
+            self._filter.append(new)
+            self._stage_s = new.at_s
         best = min(
             (held for held in self._filter if held.at_s >= new.at_s - SKEW_WINDOW_S),
             key=lambda held: (held.rtt_s, -held.at_s),
@@ -236,6 +247,8 @@ class ClockSync:
 
     def _fit_skew(self, newest: _Sample) -> None:
         fit = self._fit
+        if fit and newest.at_s < fit[-1].at_s + STAGE_S and newest.rtt_s <= fit[-1].rtt_s:
+            fit.pop()
         fit.append(newest)
         while fit[0].at_s < newest.at_s - SKEW_WINDOW_S:
             fit.popleft()
