@@ -29,7 +29,7 @@ from sern_core.message import Message, StreamId, StreamInfo
 from sern_core.params import LinkParams, SchedulerParams
 from sern_core.queues import OutChannel, OutMessage
 from sern_core.trace import LINK, DecisionTrace, TraceEvent
-from sern_core.types import DROP_CODES, DROP_REASONS, ClientName, DropReason
+from sern_core.types import CLASS_LABELS, DROP_CODES, DROP_REASONS, ClientName, DropReason
 
 HELLO_INTERVAL_S: Final = 1.0
 REFUSED_INTERVAL_S: Final = 5.0
@@ -527,14 +527,18 @@ class Link(Hop):
 
     # --- views ------------------------------------------------------------------------------------------------------
 
-    def snapshot(self, *, now: float) -> dict[str, object]:
-        """State for /api/link."""
-        flight = self.lane.flight
-        queued = {"control": [0, 0], "state": [0, 0], "bulk": [0, 0]}
+    def queued(self) -> dict[str, tuple[int, int]]:
+        """Messages and bytes that wait for the lane, by class label."""
+        cells = {label: [0, 0] for label in CLASS_LABELS}
         for channel in self.channels.values():
-            cell = queued[channel.spec.priority.name.lower()]
+            cell = cells[CLASS_LABELS[channel.spec.priority]]
             cell[0] += len(channel.queue) + len(channel.active)
             cell[1] += channel.queued_bytes + sum(out.unsent_bytes for out in channel.active)
+        return {label: (messages, nbytes) for label, (messages, nbytes) in cells.items()}
+
+    def snapshot(self) -> dict[str, object]:
+        """State for /api/link; None where a value is not known yet."""
+        flight = self.lane.flight
         return {
             "peer": self.peer,
             "lane": "zmq",
@@ -545,9 +549,9 @@ class Link(Hop):
             "srtt_s": flight.rtt.srtt_s,
             "fragment_bytes": self.lane.fragment_bytes,
             "clock_offset_s": self.clock.offset_s,
-            "clock_error_s": self.clock.error_s,
+            "clock_error_s": self.clock.error_s if self.clock.ready else None,
             **self.lane.estimator.snapshot(),
-            "queue": {label: {"messages": cell[0], "bytes": cell[1]} for label, cell in queued.items()},
+            "queue": {label: {"messages": cell[0], "bytes": cell[1]} for label, cell in self.queued().items()},
         }
 
     def validate(self) -> None:

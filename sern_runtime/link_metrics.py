@@ -1,0 +1,135 @@
+"""Metrics that both daemons have: their links, what goes out over them, what arrives, and how old it is."""
+
+import math
+import time
+from collections.abc import Callable, Collection, Iterable
+
+from sern_core.ledger import ReceiveLedger
+from sern_core.link import Link
+from sern_core.types import CLASS_LABELS
+from sern_runtime.metrics import LATENCY_EDGES_S, Histogram, HistogramCounts, Labels, Metrics
+
+
+class AgeHistograms:
+    """Age of delivered messages at delivery, by class."""
+
+    def __init__(self) -> None:
+        self.by_class = tuple(Histogram(LATENCY_EDGES_S) for _ in CLASS_LABELS)
+
+    def observe(self, priority: int, age_s: float) -> None:
+        self.by_class[priority].observe(age_s)
+
+    def read(self) -> Iterable[tuple[Labels, HistogramCounts]]:
+        for label, histogram in zip(CLASS_LABELS, self.by_class, strict=True):
+            yield (label,), histogram.snapshot()
+
+
+def register_links(metrics: Metrics, links: Callable[[], Collection[Link]]) -> None:
+    """State of every link and the fate of every message offered to it."""
+
+    def per_link(read: Callable[[Link], float | None]) -> Callable[[], list[tuple[Labels, float]]]:
+        def collect() -> list[tuple[Labels, float]]:
+            values = [((link.peer,), read(link)) for link in links()]
+            return [(labels, value) for labels, value in values if value is not None and math.isfinite(value)]
+
+        return collect
+
+    def per_class(index: int) -> Callable[[], list[tuple[Labels, float]]]:
+        def collect() -> list[tuple[Labels, float]]:
+            rows: list[tuple[Labels, float]] = []
+            for link in links():
+                for label, cell in link.queued().items():
+                    rows.append(((link.peer, label), float(cell[index])))
+            return rows
+
+        return collect
+
+    def per_topic(read: str) -> Callable[[], list[tuple[Labels, float]]]:
+        def collect() -> list[tuple[Labels, float]]:
+            return [
+                ((link.peer, counters.topic, CLASS_LABELS[counters.priority]), float(getattr(counters, read)))
+                for link in links()
+                for counters in link.ledger.topics.values()
+            ]
+
+        return collect
+
+    def drops() -> list[tuple[Labels, float]]:
+        return [
+            ((link.peer, counters.topic, CLASS_LABELS[counters.priority], str(reason)), float(count))
+            for link in links()
+            for counters in link.ledger.topics.values()
+            for reason, count in counters.by_reason.items()
+        ]
+
+    gauge, counter = metrics.gauge, metrics.counter
+    peer = ("peer",)
+    gauge("sern_link_up", "1 while a session exists and the path answers.", peer,
+          per_link(lambda link: float(link.established and not link.lane.stalled)))  # fmt: skip
+    gauge("sern_link_capacity_bits_per_second", "Estimated capacity of the link, bit/s.", peer,
+          per_link(lambda link: link.lane.estimator.rate_bps))  # fmt: skip
+    gauge("sern_link_window_bytes", "Bytes that may be in flight.", peer,
+          per_link(lambda link: link.lane.estimator.window_bytes))  # fmt: skip
+    gauge("sern_link_inflight_bytes", "Bytes sent and not yet acknowledged.", peer,
+          per_link(lambda link: float(link.lane.flight.inflight_bytes)))  # fmt: skip
+    gauge("sern_link_rtt_seconds", "Smoothed round-trip time.", peer,
+          per_link(lambda link: link.lane.flight.rtt.srtt_s))  # fmt: skip
+    gauge("sern_link_rtprop_seconds", "Round-trip time of the empty path.", peer,
+          per_link(lambda link: link.lane.estimator.rtprop_s))  # fmt: skip
+    gauge("sern_link_clock_offset_seconds", "Peer's monotonic clock minus ours.", peer,
+          per_link(lambda link: link.clock.offset_s))  # fmt: skip
+    gauge("sern_link_clock_error_seconds", "Bound of the error of the clock offset.", peer,
+          per_link(lambda link: link.clock.error_s))  # fmt: skip
+    gauge("sern_link_queue_messages", "Messages waiting for the link, by class.", ("peer", "class"), per_class(0))
+    gauge("sern_link_queue_bytes", "Bytes waiting for the link, by class.", ("peer", "class"), per_class(1))
+    topic = ("peer", "topic", "class")
+    counter("sern_messages_offered_total", "Messages offered to a link.", topic, per_topic("offered"))
+    counter("sern_messages_delivered_total", "Messages that the peer has (reliable: delivered to the far end).",
+            topic, per_topic("delivered"))  # fmt: skip
+    counter("sern_messages_refused_total", "Messages refused to their source: a reliable queue was full.",
+            topic, per_topic("refused"))  # fmt: skip
+    counter("sern_bytes_offered_total", "Bytes offered to a link.", topic, per_topic("offered_bytes"))
+    counter("sern_bytes_delivered_total", "Bytes that the peer has.", topic, per_topic("delivered_bytes"))
+    counter("sern_messages_dropped_total", "Messages dropped, by reason.", (*topic, "reason"), drops)
+    counter("sern_stray_fragments_total", "Fragments of streams that were not announced.", peer,
+            per_link(lambda link: float(link.strays)))  # fmt: skip
+
+
+def register_received(metrics: Metrics, received: ReceiveLedger, ages: AgeHistograms) -> None:
+    """What arrives, how old it is, and what was dropped on arrival."""
+
+    def delivered(read: str) -> Callable[[], list[tuple[Labels, float]]]:
+        def collect() -> list[tuple[Labels, float]]:
+            return [
+                ((c.topic, CLASS_LABELS[c.priority]), float(getattr(c, read))) for c in received.topics.values()
+            ]
+
+        return collect
+
+    def information_age() -> list[tuple[Labels, float]]:
+        now = time.monotonic()
+        rows: list[tuple[Labels, float]] = []
+        for counters in received.topics.values():
+            age_s = counters.age_of_information_s(now)
+            if age_s is not None:
+                rows.append(((counters.topic, CLASS_LABELS[counters.priority]), age_s))
+        return rows
+
+    def drops() -> list[tuple[Labels, float]]:
+        return [
+            ((c.topic, CLASS_LABELS[c.priority], str(reason)), float(count))
+            for c in received.topics.values()
+            for reason, count in c.by_reason.items()
+        ]
+
+    topic = ("topic", "class")
+    counter = metrics.counter
+    counter("sern_received_messages_total", "Messages that arrived and had their turn.", topic, delivered("delivered"))
+    counter("sern_received_bytes_total", "Bytes that arrived.", topic, delivered("delivered_bytes"))
+    counter("sern_received_dropped_total", "Messages dropped on arrival, by reason.", (*topic, "reason"), drops)
+    metrics.gauge("sern_topic_age_seconds", "Age of information: how old the freshest sample is now.", topic,
+                  information_age)  # fmt: skip
+    metrics.histogram("sern_message_age_seconds", "Age of messages when delivered, by class.", LATENCY_EDGES_S,
+                      ("class",), ages.read, known=lambda: [(label,) for label in CLASS_LABELS])  # fmt: skip
+
+

@@ -1,0 +1,98 @@
+"""Moves datagrams between a port of the core (a link, or the relay's side of one) and a lane's socket."""
+
+import asyncio
+import time
+from collections.abc import Callable
+from typing import Final, Protocol
+
+from sern_runtime.loop import Timer
+from sern_runtime.zmq_socket import SendResult
+
+BURST: Final = 64
+"""Datagrams sent in one go before others in the loop get their turn; about 1 ms of work."""
+
+
+class Port(Protocol):
+    """What the core gives for one side of a hop."""
+
+    def next_datagram(self, *, now: float) -> bytes | None: ...
+
+    def next_deadline(self) -> float | None: ...
+
+    def handle_timeout(self, *, now: float) -> None: ...
+
+
+class Pump:
+    """Sends what `port` has, when it has it, and wakes it at its deadline.
+
+    Call `kick` after anything that may have given the port something to send: it costs one flag, and everything that
+    happens before the loop comes round is sent together. `send` answers FULL when the socket cannot take more; `kick`
+    again when it can. `on_gone` is called when the peer's connection is over.
+    """
+
+    def __init__(self, port: Port, send: Callable[[bytes], SendResult], *, on_gone: Callable[[], None]) -> None:
+        self._port = port
+        self._send = send
+        self._on_gone = on_gone
+        self._loop = asyncio.get_running_loop()
+        self._timer = Timer(self._due)
+        self._scheduled: asyncio.Handle | None = None
+        self._held: bytes | None = None
+        self._closed = False
+        self.datagrams = 0
+        self.bytes = 0
+
+    def kick(self) -> None:
+        if self._scheduled is None and not self._closed:
+            self._scheduled = self._loop.call_soon(self._run)
+
+    def run(self) -> None:
+        """Send now instead of when the loop comes round."""
+        if not self._closed:
+            self._run()
+
+    def reset(self) -> None:
+        """The transport is another one: forget what waited for the old one."""
+        self._held = None
+
+    def close(self) -> None:
+        self._closed = True
+        self._timer.cancel()
+        if self._scheduled is not None:
+            self._scheduled.cancel()
+            self._scheduled = None
+
+    def _due(self) -> None:
+        self._port.handle_timeout(now=time.monotonic())
+        self._run()
+
+    def _run(self) -> None:
+        if self._scheduled is not None:
+            self._scheduled.cancel()
+            self._scheduled = None
+        if self._closed:
+            return
+        port = self._port
+        now = time.monotonic()
+        for _ in range(BURST):
+            datagram = self._held
+            if datagram is None:
+                datagram = port.next_datagram(now=now)
+                if datagram is None:
+                    break
+            result = self._send(datagram)
+            if result is SendResult.OK:
+                self._held = None
+                self.datagrams += 1
+                self.bytes += len(datagram)
+            elif result is SendResult.FULL:
+                self._held = datagram  # the socket says when it can take more
+                break
+            else:
+                self._held = None
+                self._on_gone()
+                return
+        else:
+            self.kick()
+        deadline_s = port.next_deadline()
+        self._timer.arm(deadline_s if deadline_s is None else max(deadline_s, now))
