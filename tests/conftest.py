@@ -1,0 +1,132 @@
+"""Shared fixtures, and the detectors: what a test starts, it stops.
+
+Tasks are checked after every asynchronous test, contexts are terminated under a timeout, and threads, child processes
+and sockets are checked once, at the end of the session.
+"""
+
+import asyncio
+import gc
+import threading
+import time
+from collections.abc import AsyncIterator, Callable, Iterator, Mapping
+from pathlib import Path
+
+import pytest
+import uvloop
+import zmq
+
+from sern_core.types import ClientName
+from sern_runtime.keys import SecretKey, generate
+from tests.support import DEADLINE_S
+
+Context = zmq.Context[zmq.Socket[bytes]]
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_asyncio_loop_factories(
+    config: pytest.Config, item: pytest.Item
+) -> Mapping[str, Callable[[], asyncio.AbstractEventLoop]]:
+    """Asynchronous tests run on the loop that the daemons run on."""
+    return {"uvloop": uvloop.new_event_loop}
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Ask for `no_leftover_tasks` ahead of all other fixtures, so that it is torn down after them."""
+    for item in items:
+        if isinstance(item, pytest.Function) and asyncio.iscoroutinefunction(item.function):
+            item.fixturenames.insert(0, "no_leftover_tasks")
+
+
+@pytest.fixture
+async def no_leftover_tasks() -> AsyncIterator[None]:
+    """Fails a test whose tasks outlive its fixtures."""
+    before = asyncio.all_tasks()
+    yield
+    # Transports and cancelled tasks end in the loop's next rounds; what still runs after many will not end by itself.
+    for _ in range(100):
+        left = [task for task in asyncio.all_tasks() - before if task is not asyncio.current_task()]
+        if not left:
+            return
+        await asyncio.sleep(0.001)
+    for task in left:
+        task.cancel()
+    pytest.fail(f"tasks left running: {left}")
+
+
+@pytest.fixture
+def zmq_context() -> Iterator[Context]:
+    """A context of the test's own. The test closes its sockets; the context must then end within the deadline."""
+    context = Context()
+    yield context
+    left = [socket for socket in list(context._sockets) if not socket.closed]
+    terminator = threading.Thread(target=context.destroy, kwargs={"linger": 0}, daemon=True)
+    terminator.start()
+    terminator.join(DEADLINE_S)
+    assert not terminator.is_alive(), "the context did not end: a socket is used elsewhere, or lingers"
+    assert not left, f"sockets left open: {left}"
+
+
+@pytest.fixture(scope="session")
+def relay_keys() -> SecretKey:
+    return generate(ClientName("relay"))
+
+
+@pytest.fixture(scope="session")
+def robot_keys() -> SecretKey:
+    return generate(ClientName("robot1"))
+
+
+@pytest.fixture(scope="session")
+def site_keys() -> SecretKey:
+    return generate(ClientName("site1"))
+
+
+@pytest.fixture(scope="session")
+def stranger_keys() -> SecretKey:
+    """A pair that nobody knows."""
+    return generate(ClientName("stranger"))
+
+
+def _children() -> set[str]:
+    """The children of every thread of this process."""
+    found: set[str] = set()
+    for task in Path("/proc/self/task").iterdir():
+        try:
+            found.update(f"process {pid}" for pid in (task / "children").read_text().split())
+        except OSError:
+            continue  # the thread ended meanwhile
+    return found
+
+
+def _sockets() -> set[str]:
+    """The sockets and event descriptors that this process has open, as /proc names them."""
+    found = set()
+    for entry in Path("/proc/self/fd").iterdir():
+        try:
+            target = str(entry.readlink())
+        except OSError:
+            continue
+        if target.startswith("socket:"):
+            found.add(f"fd {entry.name} -> {target}")
+    return found
+
+
+def _threads() -> set[str]:
+    return {thread.name for thread in threading.enumerate() if not thread.daemon}
+
+
+@pytest.fixture(scope="session", autouse=True)
+def nothing_left_behind() -> Iterator[None]:
+    """At the end of the session: no threads, child processes or sockets more than at its start."""
+    probes = (_threads, _children, _sockets)
+    before = [probe() for probe in probes]
+    yield
+    give_up_s = time.monotonic() + DEADLINE_S
+    while True:
+        gc.collect()
+        left = [item for probe, old in zip(probes, before, strict=True) for item in probe() - old]
+        if not left:
+            return
+        if time.monotonic() > give_up_s:
+            pytest.fail(f"left behind by the session: {left}")
+        threading.Event().wait(0.05)
