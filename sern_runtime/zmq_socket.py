@@ -465,8 +465,8 @@ def _bind_problem(error: zmq.ZMQError) -> str:
 def serve_curve(socket: "zmq.Socket[bytes]", keys: CurvePair | None, zap_domain: str) -> None:
     """Make a socket a CURVE server whose every connection is put to the ZAP handler. Before bind.
 
-    Both halves matter: with an empty domain libzmq asks no handler and lets anyone in, and without
-    ZAP_ENFORCE_DOMAIN it also does so when the handler is missing (seen on 4.3.5).
+    Both halves matter: without a domain, or without ZAP_ENFORCE_DOMAIN, libzmq admits every key in silence when it
+    finds no handler to ask (seen on 4.3.5).
     """
     if keys is None:
         return

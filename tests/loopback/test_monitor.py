@@ -1,0 +1,277 @@
+"""What happens to connections: the watch of a client, the table of a server, and the TCP socket underneath."""
+
+import os
+import socket as socketlib
+
+import pytest
+import zmq
+
+from sern_runtime.keys import SecretKey
+from sern_runtime.monitor import ConnectionTable, TcpHandle, TransportWatch, port_of
+from sern_runtime.zap import ZapHandler
+from sern_runtime.zmq_socket import DealerSocket, RouterSocket, make_client, make_server
+from tests.support import until
+
+Context = zmq.Context[zmq.Socket[bytes]]
+
+
+class Server:
+    """A ROUTER that binds users to their connections, as a relay does at hello."""
+
+    def __init__(
+        self,
+        context: Context,
+        *,
+        max_half_open_per_source: int = 32,
+        max_half_open: int = 256,
+        max_connections: int = 1024,
+    ) -> None:
+        socket = make_server(context, ["tcp://127.0.0.1:*"], None)
+        self.endpoint = socket.getsockopt_string(zmq.LAST_ENDPOINT)
+        self.now_s = 0.0
+        self.table = ConnectionTable(
+            socket,
+            max_half_open_per_source=max_half_open_per_source,
+            max_half_open=max_half_open,
+            max_connections=max_connections,
+            clock=lambda: self.now_s,
+        )
+        self.router = RouterSocket(socket, self._on_message)
+        self.seen: list[bytes] = []
+
+    def _on_message(self, _routing_id: bytes, _user: str, body: bytes) -> None:
+        self.seen.append(body)
+        self.table.bind_user(self.router.peer_details().fd, body.decode())
+
+    @property
+    def address(self) -> tuple[str, int]:
+        port = port_of(self.endpoint)
+        assert port is not None
+        return "127.0.0.1", port
+
+    def close(self) -> None:
+        self.table.close()
+        self.router.close()
+
+
+class Client:
+    def __init__(self, context: Context, endpoint: str) -> None:
+        self.handles: list[TcpHandle | None] = []
+        self.reasons: list[str] = []
+        self.rebuilds: list[str] = []
+        self.dealer = DealerSocket(
+            make_client(context, endpoint, None, None, before_connect=self._watch), lambda _body: None
+        )
+
+    def _watch(self, socket: "zmq.Socket[bytes]") -> None:
+        self.watch = TransportWatch(socket, self.handles.append, self.reasons.append, self.rebuilds.append)
+
+    def close(self) -> None:
+        self.watch.close()
+        self.dealer.close()
+
+
+async def test_up_down_and_up_again(zmq_context: Context) -> None:
+    server = Server(zmq_context)
+    client = Client(zmq_context, server.endpoint)
+    await until(lambda: client.watch.up)
+    await until(lambda: client.dealer.send(b"robot1"))
+    await until(lambda: server.seen)
+    assert server.table.cut_user("nobody") == 0
+    assert server.table.cut_user("robot1") == 1
+    await until(lambda: client.reasons)
+    assert client.reasons == ["the connection to the relay was lost"]
+    await until(lambda: len(client.handles) == 2)
+    assert client.watch.up
+    assert client.watch.reason == ""
+    assert client.rebuilds == []
+    client.close()
+    server.close()
+
+
+async def test_nobody_listening_is_said_once(zmq_context: Context) -> None:
+    with socketlib.create_server(("127.0.0.1", 0)) as taken:
+        endpoint = f"tcp://127.0.0.1:{taken.getsockname()[1]}"
+    client = Client(zmq_context, endpoint)
+    await until(lambda: client.reasons)
+    server_socket = zmq_context.socket(zmq.ROUTER)
+    server_socket.bind(endpoint)
+    await until(lambda: client.watch.up)
+    assert client.reasons == ["the relay does not answer: connecting failed"]
+    client.close()
+    server_socket.close()
+
+
+async def test_connections_are_counted_until_they_end(zmq_context: Context) -> None:
+    server = Server(zmq_context)
+    clients = [Client(zmq_context, server.endpoint) for _ in range(3)]
+    await until(lambda: len(server.table) == 3)
+    assert server.table.half_open == 3
+    for number, client in enumerate(clients):
+        await until(lambda client=client, number=number: client.dealer.send(b"c%d" % number))  # type: ignore[misc]
+    await until(lambda: server.table.half_open == 0)
+    assert [len(server.table.handles_of(f"c{number}")) for number in range(3)] == [1, 1, 1]
+    for client in clients:
+        client.close()
+    await until(lambda: len(server.table) == 0)
+    assert server.table.accepted == 3
+    server.close()
+
+
+async def test_half_open_connections_are_capped_and_age_out(zmq_context: Context) -> None:
+    server = Server(zmq_context, max_half_open_per_source=4)
+    silent = [socketlib.create_connection(server.address) for _ in range(10)]
+    await until(lambda: server.table.accepted == 10)
+    assert server.table.capped == 6
+    await until(lambda: len(server.table) == 4)
+    assert server.table.half_open == 4
+    server.now_s = 10.1  # libzmq would have ended those that did not finish their handshake
+    assert server.table.half_open == 0
+    client = Client(zmq_context, server.endpoint)
+    await until(lambda: client.dealer.send(b"robot1"))
+    await until(lambda: server.seen == [b"robot1"])
+    for connection in silent:
+        connection.close()
+    client.close()
+    await until(lambda: len(server.table) == 0)
+    server.close()
+
+
+async def test_all_connections_are_capped(zmq_context: Context) -> None:
+    server = Server(zmq_context, max_connections=2, max_half_open_per_source=0, max_half_open=0)
+    first = [Client(zmq_context, server.endpoint) for _ in range(2)]
+    await until(lambda: len(server.table) == 2)
+    late = Client(zmq_context, server.endpoint)
+    await until(lambda: server.table.capped)
+    assert all(client.watch.up for client in first)
+    for client in (*first, late):
+        client.close()
+    server.close()
+
+
+async def test_hundreds_of_half_open_connections_do_not_keep_a_client_out(zmq_context: Context) -> None:
+    server = Server(zmq_context, max_half_open_per_source=64, max_half_open=0)
+    crowd = []
+    for _ in range(500):
+        connection = socketlib.socket()
+        connection.setblocking(False)
+        connection.connect_ex(server.address)
+        crowd.append(connection)
+    await until(lambda: server.table.accepted >= 400)
+    server.table.max_half_open_per_source = 10_000  # the honest client comes from another address in life
+    client = Client(zmq_context, server.endpoint)
+    await until(lambda: client.dealer.send(b"robot1"))
+    await until(lambda: b"robot1" in server.seen)
+    assert server.table.capped > 300
+    for connection in crowd:
+        connection.close()
+    client.close()
+    await until(lambda: len(server.table) == 0)
+    server.close()
+
+
+async def test_the_tcp_socket_underneath(zmq_context: Context) -> None:
+    server = Server(zmq_context)
+    client = Client(zmq_context, server.endpoint)
+    await until(lambda: client.handles)
+    handle = client.handles[0]
+    assert handle is not None
+    assert handle.peer == server.address
+    info = handle.info()
+    assert info is not None
+    assert 0 < info.rtt_s < 5
+    assert info.sent_segments >= 1
+    assert info.congestion_window_segments >= 1
+    name = handle.congestion()
+    assert name
+    assert handle.set_congestion(name)
+    assert not handle.set_congestion("no_such_thing")
+    assert handle.set_user_timeout(12.5)
+    assert handle.set_rto_max() in (True, False)  # kernels before 6.15 do not know it
+    with socketlib.socket(fileno=os.dup(handle.fd)) as connection:
+        assert connection.getsockopt(socketlib.IPPROTO_TCP, socketlib.TCP_USER_TIMEOUT) == 12500
+    assert handle.cut()
+    await until(lambda: client.reasons)
+    client.close()
+    server.close()
+
+
+def test_a_handle_never_touches_another_socket_under_its_number() -> None:
+    with socketlib.create_server(("127.0.0.1", 0)) as listener:
+        first = socketlib.create_connection(listener.getsockname())
+        handle = TcpHandle.of(first.fileno())
+        assert handle is not None
+        number = first.fileno()
+        first.close()
+        assert handle.info() is None
+        with socketlib.create_connection(listener.getsockname()) as other:
+            assert other.fileno() == number  # the lowest free number is taken first
+            assert handle.info() is None
+            assert handle.congestion() is None
+            assert not handle.set_user_timeout(1.0)
+            assert not handle.cut()
+            other.sendall(b"alive")
+
+
+def test_what_is_no_tcp_connection_gives_no_handle() -> None:
+    left, right = socketlib.socketpair()
+    with left, right, socketlib.create_server(("127.0.0.1", 0)) as listener:
+        assert TcpHandle.of(left.fileno()) is None
+        assert TcpHandle.of(listener.fileno()) is None
+        assert TcpHandle.of(10_000) is None
+        with socketlib.create_connection(listener.getsockname()) as connection:
+            port = listener.getsockname()[1]
+            assert TcpHandle.of(connection.fileno(), peer_port=port) is not None
+            assert TcpHandle.of(connection.fileno(), peer_port=port + 1) is None
+            assert TcpHandle.of(connection.fileno(), local_port=port) is None
+
+
+async def test_a_revoked_user_loses_the_connection_and_is_refused(
+    zmq_context: Context, relay_keys: SecretKey, robot_keys: SecretKey
+) -> None:
+    names = {robot_keys.public_key: "robot1"}
+    handler = ZapHandler(zmq_context)
+    handler.add_domain("sern", lambda key, _address: names.get(key))
+    socket = make_server(zmq_context, ["tcp://127.0.0.1:*"], relay_keys)
+    table = ConnectionTable(socket)
+    seen: list[str] = []
+
+    def on_message(_routing_id: bytes, user: str, _body: bytes) -> None:
+        seen.append(user)
+        table.bind_user(router.peer_details().fd, user)
+
+    router = RouterSocket(socket, on_message)
+    rebuilds: list[str] = []
+    reasons: list[str] = []
+    watches: list[TransportWatch] = []
+    dealer = DealerSocket(
+        make_client(
+            zmq_context,
+            socket.getsockopt_string(zmq.LAST_ENDPOINT),
+            robot_keys,
+            relay_keys.public_key,
+            before_connect=lambda s: watches.append(
+                TransportWatch(s, lambda _handle: None, reasons.append, rebuilds.append)
+            ),
+        ),
+        lambda _body: None,
+    )
+    await until(lambda: dealer.send(b"hello"))
+    await until(lambda: seen == ["robot1"])
+    names.clear()
+    assert table.cut_user("robot1") == 1
+    await until(lambda: rebuilds)
+    assert reasons[0] == "the connection to the relay was lost"
+    assert reasons[-1].startswith("relay refused our key")
+    watches[0].close()
+    dealer.close()
+    table.close()
+    router.close()
+    handler.close()
+
+
+@pytest.mark.parametrize(
+    ("endpoint", "port"), [("tcp://127.0.0.1:5555", 5555), ("tcp://[::1]:80", 80), ("ipc:///x:1", None), ("", None)]
+)
+def test_port_of(endpoint: str, port: int | None) -> None:
+    assert port_of(endpoint) == port
