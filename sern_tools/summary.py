@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sern_core.types import CLASS_LABELS
+from sern_tools.counters import Counters
 from sern_tools.message_log import TopicLog
 
 FRESH_S: Final = 0.5
@@ -37,20 +38,6 @@ class RunFacts:
     reliable_topics: frozenset[str] = frozenset()
     command_lifespans_s: Mapping[str, float] = field(default_factory=dict)
     pose_topic: str = ""
-
-
-@dataclass(frozen=True, slots=True)
-class Counters:
-    """The counters of one topic at one daemon at its exit. `direction`: send, receive, or relay."""
-
-    daemon: str
-    direction: str
-    offered: int = 0
-    delivered: int = 0
-    refused: int = 0
-    dropped: Mapping[str, int] = field(default_factory=dict)
-    in_queue: int = 0
-    in_flight: int = 0
 
 
 @dataclass(slots=True)

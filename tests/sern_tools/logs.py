@@ -2,8 +2,9 @@
 
 from dataclasses import dataclass, field, replace
 
+from sern_tools.counters import Counters
 from sern_tools.message_log import Delivery, Offer, TopicLog
-from sern_tools.summary import Counters, Result, RunFacts, analyse
+from sern_tools.summary import Result, RunFacts, analyse
 
 ORIGIN_NS = 1_700_000_000_000_000_000
 MS = 1_000_000

@@ -7,8 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from sern_tools.counters import Counters
 from sern_tools.message_log import Offer
-from sern_tools.summary import Counters, Verdict, judge
+from sern_tools.summary import Verdict, judge
 from tests.sern_tools.logs import CLOUD, COMMAND, FACTS, FLOOR_S, MAP, MS, ORIGIN_NS, POSE, Run, good_run, with_counter
 
 LIMITS = {"control": 0.01, "state": 0.10}

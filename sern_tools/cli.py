@@ -1,0 +1,25 @@
+"""The `sern` command. Every subcommand is registered here, in one place."""
+
+import typer
+
+from sern_tools import check, keygen
+from sern_tools.demo import demo
+
+app = typer.Typer(
+    name="sern",
+    help="Keep a robot's virtual twin and its operator useful over thin, lossy, broken links.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+app.command()(demo)
+app.add_typer(keygen.app, name="keygen")
+app.command("check")(check.check_command)
+
+
+def main() -> None:
+    app()
+
+
+if __name__ == "__main__":
+    main()

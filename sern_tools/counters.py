@@ -1,0 +1,52 @@
+"""Reading the counters that daemons leave behind at exit, and that they tell over HTTP while they run."""
+
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from sern_core.errors import ConfigError
+
+
+@dataclass(frozen=True, slots=True)
+class Counters:
+    """The counters of one topic at one daemon. `direction`: send, receive, or relay."""
+
+    daemon: str
+    direction: str
+    offered: int = 0
+    delivered: int = 0
+    refused: int = 0
+    dropped: Mapping[str, int] = field(default_factory=dict)
+    in_queue: int = 0
+    in_flight: int = 0
+
+
+def read_counters(files: Iterable[Path]) -> dict[str, list[Counters]]:
+    """The summaries of several daemons, by global topic. ConfigError, naming the file, for anything else."""
+    found: dict[str, list[Counters]] = {}
+    for path in files:
+        try:
+            document = json.loads(path.read_text())
+            daemon = str(document.get("client") or document.get("relay"))
+            for topic, counters in document["topics"].items():
+                found.setdefault(topic, []).append(_counters(daemon, counters))
+        except OSError as error:
+            raise ConfigError(f"cannot read the summary: {error.strerror}", file=str(path)) from error
+        except (ValueError, KeyError, AttributeError, TypeError) as error:
+            raise ConfigError(f"not a summary of a daemon ({type(error).__name__}: {error})", file=str(path)) from error
+    return found
+
+
+def _counters(daemon: str, values: Mapping[str, Any]) -> Counters:
+    return Counters(
+        daemon,
+        values["direction"],
+        offered=int(values["offered"]),
+        delivered=int(values["delivered"]),
+        refused=int(values["refused"]),
+        dropped={str(reason): int(count) for reason, count in values["dropped"].items()},
+        in_queue=int(values["in_queue"]),
+        in_flight=int(values["in_flight"]),
+    )

@@ -1,0 +1,75 @@
+"""The demo's hand on its proxy: start the script, read what was carried."""
+
+import asyncio
+import json
+import socket
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from sern_core.errors import SernError
+from sern_tools.demo_report import Carried
+from sern_tools.processes import Child, Children
+from sern_tools.proxy import address
+
+HOST: Final = "127.0.0.1"
+
+
+def free_ports(count: int) -> list[int]:
+    """Ports on loopback that nobody listens on now."""
+    sockets = [socket.socket() for _ in range(count)]
+    try:
+        for sock in sockets:
+            sock.bind((HOST, 0))
+        return [sock.getsockname()[1] for sock in sockets]
+    finally:
+        for sock in sockets:
+            sock.close()
+
+
+@dataclass
+class LinkProcess:
+    """A shaping proxy in a process of its own; `ports` are where it listens, one for each target."""
+
+    child: Child
+    ports: list[int]
+    reader: asyncio.StreamReader
+    writer: asyncio.StreamWriter
+
+    @classmethod
+    async def start(
+        cls, children: Children, name: str, targets: list[int], *, profile: str, profiles: Path | None, seed: int
+    ) -> "LinkProcess":
+        command = [sys.executable, "-m", "sern_tools.proxy", "--profile", profile, "--seed", str(seed)]
+        for port in targets:
+            command += ["--listen", f"{HOST}:0", "--target", f"{HOST}:{port}"]
+        if profiles is not None:
+            command += ["--profiles", str(profiles)]
+        child = await children.start(name, command, talks=True)
+        ready = await child.read_object()
+        reader, writer = await asyncio.open_connection(HOST, ready["control"], limit=2**24)
+        return cls(child, [address(text)[1] for text in ready["listening"]], reader, writer)
+
+    async def ask(self, **request: object) -> dict[str, Any]:
+        """SernError when the proxy is gone or refuses."""
+        try:
+            self.writer.write(json.dumps(request).encode() + b"\n")
+            await self.writer.drain()
+            line = await self.reader.readline()
+        except ConnectionError:
+            line = b""
+        if not line:
+            raise self.child.failure()
+        answer: dict[str, Any] = json.loads(line)
+        if "error" in answer:
+            raise SernError(f"the proxy refused {request}: {answer['error']}")
+        return answer
+
+    async def carried(self) -> Carried:
+        """What went from robot to site so far."""
+        statistics = await self.ask(do="stats")
+        return Carried(statistics["bucket_s"], statistics["up"]["bytes_per_bucket"])
+
+    def close(self) -> None:
+        self.writer.close()

@@ -1,0 +1,157 @@
+"""Child processes that never outlive their parent's work: started together, watched, stopped in order.
+
+Each child is a session of its own, so that Ctrl-C in the terminal reaches only the parent, which then stops the
+children the way a supervisor does: SIGTERM, time to drain, SIGKILL.
+"""
+
+import asyncio
+import contextlib
+import json
+import os
+import signal
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final, Self
+
+from sern_core.errors import SernError
+
+DRAIN_S: Final = 45.0
+"""How long a child may take to end after SIGTERM when all is well: a daemon drains first."""
+ABORT_S: Final = 5.0
+"""The same when the whole is being given up."""
+TAIL_LINES: Final = 3
+LINE_BYTES: Final = 2**20
+
+
+@dataclass(eq=False)
+class Child:
+    """One process. Its standard error goes to `log`; its standard output, unless `lines`, too."""
+
+    name: str
+    process: asyncio.subprocess.Process
+    log: Path
+    stopping: bool = False
+
+    @property
+    def running(self) -> bool:
+        return self.process.returncode is None
+
+    async def read_object(self) -> dict[str, Any]:
+        """The next line of its output as JSON. SernError when it ended instead."""
+        assert self.process.stdout is not None
+        line = await self.process.stdout.readline()
+        if not line:
+            await self.process.wait()
+            raise self.failure()
+        answer: dict[str, Any] = json.loads(line)
+        return answer
+
+    async def ask(self, word: str) -> dict[str, Any]:
+        """Send one line to its input and return the line it answers."""
+        assert self.process.stdin is not None
+        with contextlib.suppress(ConnectionError):  # it has ended; the missing answer says so
+            self.process.stdin.write(word.encode() + b"\n")
+            await self.process.stdin.drain()
+        return await self.read_object()
+
+    def signal(self, number: int) -> None:
+        if self.running:
+            with contextlib.suppress(ProcessLookupError):
+                self.process.send_signal(number)
+
+    def failure(self) -> SernError:
+        """One line: who ended, how, and its last words."""
+        with contextlib.suppress(OSError):
+            tail = [line for line in self.log.read_text(errors="replace").splitlines() if line.strip()][-TAIL_LINES:]
+            if tail:
+                return SernError(f"{self.name} ended ({self._outcome()}): {' | '.join(tail)}")
+        return SernError(f"{self.name} ended ({self._outcome()}) and said nothing; its log is {self.log}")
+
+    def _outcome(self) -> str:
+        code = self.process.returncode
+        if code is None:
+            return "output closed"
+        return f"exit status {code}" if code >= 0 else f"signal {signal.Signals(-code).name}"
+
+
+@dataclass
+class Children:
+    """`async with Children(directory) as children:` every child that is left at the end is stopped."""
+
+    directory: Path
+    children: list[Child] = field(default_factory=list)
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        # Whoever cancels must not be able to leave a child behind: the stop runs to its end in a task of its own.
+        stop = asyncio.ensure_future(self.stop(self.children, within_s=ABORT_S))
+        cancelled = False
+        while not stop.done():
+            try:
+                await asyncio.shield(stop)
+            except asyncio.CancelledError:
+                cancelled = True
+                self.kill()
+        stop.result()
+        if cancelled:
+            raise asyncio.CancelledError
+
+    async def start(
+        self, name: str, command: Sequence[str], *, talks: bool = False, environment: Mapping[str, str] | None = None
+    ) -> Child:
+        """`talks`: its input and output are pipes for `ask` and `read_object`. SernError when it cannot be run."""
+        log = self.directory / f"{name}.log"
+        pipe = asyncio.subprocess.PIPE if talks else None
+        try:
+            with log.open("wb") as stream:
+                process = await asyncio.create_subprocess_exec(
+                    *command,
+                    stdin=pipe or asyncio.subprocess.DEVNULL,
+                    stdout=pipe or stream,
+                    stderr=stream,
+                    start_new_session=True,
+                    env={**os.environ, **(environment or {})},
+                    limit=LINE_BYTES,
+                )
+        except OSError as error:
+            raise SernError(f"cannot start {name}: {command[0]}: {error.strerror}") from error
+        child = Child(name, process, log)
+        self.children.append(child)
+        return child
+
+    def check(self) -> None:
+        """Raises SernError when a child ended that nobody told to."""
+        for child in self.children:
+            if not child.running and not child.stopping:
+                raise child.failure()
+
+    async def stop(self, children: Iterable[Child], *, within_s: float = DRAIN_S) -> None:
+        """SIGTERM to all of them and the end of their input; SIGKILL for who is still there after `within_s`."""
+        leaving = list(children)
+        for child in leaving:
+            child.stopping = True
+            if child.process.stdin is not None:
+                child.process.stdin.close()
+            child.signal(signal.SIGTERM)
+        waits = [asyncio.ensure_future(child.process.wait()) for child in leaving]
+        if waits:
+            _, late = await asyncio.wait(waits, timeout=within_s)
+            if late:
+                self.kill()
+                await asyncio.wait(waits)
+
+    def kill(self) -> None:
+        for child in self.children:
+            child.signal(signal.SIGKILL)
+
+
+def program(name: str) -> list[str]:
+    """The command of an installed SERN program. SernError when it is not installed beside this Python."""
+    path = Path(sys.executable).with_name(name)
+    if not path.exists():
+        raise SernError(f"{name} is not installed beside {sys.executable}; install SERN there: pip install .")
+    return [str(path)]
