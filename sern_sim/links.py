@@ -50,7 +50,7 @@ class LinkStats(NamedTuple):
     duplicate_packets: int
     duplicate_bytes: int
     reordered_packets: int
-    stalls: int  # losses as a stream sees them
+    stalls: int  # losses as a stream sees them, retransmissions included
     capacity_bits: float  # what the link could have carried outside blackouts; inf when unlimited
 
     def minus(self, earlier: "LinkStats") -> "LinkStats":
@@ -88,6 +88,7 @@ class Link:
         "_jitter_ns",
         "_last_arrival_ns",
         "_loss",
+        "_mean_loss",
         "_normal",
         "_plain",
         "_queue_packets",
@@ -130,6 +131,7 @@ class Link:
         self._reorder_ns = to_ns(model.reorder_delay_s)
         self._stall_ns = 2 * self._delay_ns + to_ns(model.stall_s)
         self._loss = model.loss
+        self._mean_loss = model.mean_loss
         self._burst = model.burst_loss
         self._burst_bad = False
         self._queue_packets = model.queue_packets
@@ -231,11 +233,8 @@ class Link:
             if self._jitter_ns:
                 path_ns = max(0, path_ns + self._jitter())
             for _ in range(segments):
-                stall_ns = self._stall_ns
-                while self._lose():
-                    self.stalls += 1
-                    path_ns += stall_ns
-                    stall_ns = min(2 * stall_ns, LONGEST_STALL_NS)
+                if self._lose():
+                    path_ns += self._stall()
         arrival_ns = departure_ns + path_ns
         down_start_ns, down_end_ns = self.blackout_after(departure_ns)
         while down_start_ns < arrival_ns:
@@ -301,6 +300,18 @@ class Link:
         if self._loss and self._draw() < self._loss:
             lost = True
         return lost
+
+    def _stall(self) -> int:
+        """How long a lost segment holds the stream up. Retransmissions are so late that a burst is over by then, so
+        they meet the mean loss."""
+        again = self._mean_loss
+        stall_ns, step_ns = 0, self._stall_ns
+        while True:
+            self.stalls += 1
+            stall_ns += step_ns
+            if self._draw() >= again:
+                return stall_ns
+            step_ns = min(2 * step_ns, LONGEST_STALL_NS)
 
     def _jitter(self) -> int:
         """A deviation of the delay, never making it negative."""

@@ -309,8 +309,10 @@ class Network:
         """
         begin_ns = self.elapsed_ns
         end_ns = begin_ns + to_ns(within_s)
-        if not condition() and not self._run(end_ns, condition):
-            self._set_time(end_ns)
+        if condition() or self._run(end_ns, condition):
+            return (self.elapsed_ns - begin_ns) / NS
+        self._set_time(end_ns)
+        if not condition():
             raise SimulationTimeoutError(f"{what}: not within {within_s} s, by {self.elapsed_s:.3f} s of the run")
         return (self.elapsed_ns - begin_ns) / NS
 
@@ -325,26 +327,13 @@ class Network:
 
     def _run_events(self, end_ns: int, condition: Callable[[], object] | None) -> bool:
         heap = self._heap
-        log = self._log
         while heap and heap[0][0] <= end_ns:
             at_ns, _, kind, subject, data, epoch = heappop(heap)
             if at_ns != self.elapsed_ns:
                 self._set_time(at_ns)
             self._count(kind, subject)
             if kind == _DELIVER:
-                link = subject.link
-                if epoch != subject.epoch:
-                    link.broken_packets += 1
-                    if log is not None:
-                        log.add(at_ns, "broken", subject.name, data)
-                    continue
-                link.delivered_packets += 1
-                link.delivered_bytes += len(data)
-                slot = subject._target
-                if log is not None:
-                    log.add(at_ns, "receive", slot.name, data)
-                slot.receive(data, now=self.now)
-                self._settle(slot.node, slot)
+                self._on_arrival(subject, data, epoch)
             elif kind == _TIMER:
                 self._on_timer(subject)
             elif kind == _CALL:
@@ -458,6 +447,21 @@ class Network:
             pending.append(due_ns)
             self._sequence += 1
             heappush(self._heap, (due_ns, self._sequence, _TIMER, slot, b"", 0))
+
+    def _on_arrival(self, direction: Direction, data: bytes, epoch: int) -> None:
+        link = direction.link
+        if epoch != direction.epoch:
+            link.broken_packets += 1
+            if self._log is not None:
+                self._log.add(self.elapsed_ns, "broken", direction.name, data)
+            return
+        link.delivered_packets += 1
+        link.delivered_bytes += len(data)
+        slot = direction._target
+        if self._log is not None:
+            self._log.add(self.elapsed_ns, "receive", slot.name, data)
+        slot.receive(data, now=self.now)
+        self._settle(slot.node, slot)
 
     def _on_timer(self, slot: Slot) -> None:
         if not slot.node.alive or not slot.pending or slot.pending[-1] != self.elapsed_ns:

@@ -48,7 +48,7 @@ def link_models(
         burst_loss=draw(
             st.one_of(
                 st.none(),
-                st.builds(BurstLoss, st.floats(0, 0.1), st.floats(0.05, 1), st.floats(0, 0.9), st.floats(0, 0.05)),
+                st.builds(BurstLoss, st.floats(0, 0.1), st.floats(0.2, 1), st.floats(0, 0.9), st.floats(0, 0.05)),
             )
         ),
         reorder=draw(_probabilities(0.2)),

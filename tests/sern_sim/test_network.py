@@ -181,6 +181,15 @@ def test_run_until_true_tells_how_long_it_took_or_what_did_not_happen() -> None:
         network.run_until_true(lambda: len(b.inbox) > 1, within_s=2.0, what="a second one")
 
 
+def test_a_condition_is_checked_after_events_of_every_kind_and_at_the_end() -> None:
+    a, b = Wire(), Wire()
+    network, hop = joined(LinkModel(delay_s=0.125).as_stream(), a, b)
+    send_at(network, a, 1.0, b"x")
+    network.at(1.1, lambda now: hop.break_connection(reconnect_s=100.0))
+    assert network.run_until_true(lambda: hop.forward.stats.broken_packets, within_s=50.0) == 1.125
+    assert network.run_until_true(lambda: network.elapsed_s > 20.0, within_s=30.0) == 30.0
+
+
 def test_misuse_is_named() -> None:
     network = Network(1)
     a, b = Wire(), Wire()
