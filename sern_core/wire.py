@@ -25,13 +25,14 @@ Frames of a kind-16 datagram, each starting with its type:
    | stamp_ns i64 | age u32 (100 us) | codec u8 | reserved u8     |   only when offset is 0
    +--------------+------------------+----------+-----------------+
 
-   type 2 ACK (38 bytes): lane u8, highest u32, sack u64, echo stamp u64, receive stamp u64, cumulative bytes u64
+   type 2 ACK (38 bytes, at most 4 a datagram): lane u8, highest u32, sack u64, echo stamp u64, receive stamp u64, cumulative bytes u64
        bit i of sack: packet highest-1-i has arrived; the stamps belong to packet `highest`, in microseconds
    type 3 WATERMARK (7 bytes): channel u16, delivered u32: every seq up to it is delivered, expired or refused
    type 4 PING (1 byte): asks for an acknowledgement
 
 `seq` is the low 32 bits of a 64-bit count; the receiver widens it next to what it expects (RFC 1982 style).
-Decoding accepts or raises WireError, nothing else.
+Decoding accepts or raises WireError (VersionError for a version that is not spoken here), nothing else. Everything
+that another program needs to know to speak it is in schemas/wire.md.
 """
 
 import struct
@@ -48,6 +49,8 @@ MAGIC: Final = 0x53
 VERSION_MIN: Final = 1
 VERSION_MAX: Final = 1
 """The wire versions this code speaks; peers agree on the highest common one at hello."""
+HANDSHAKE_VERSION: Final = 1
+"""Version byte of every handshake datagram, for ever: a peer must be able to read the HELLO that offers its version."""
 
 HEADER: Final = struct.Struct("!BBBBIQ")
 DATA_FIXED: Final = struct.Struct("!BBHIIIH")
@@ -65,8 +68,16 @@ MAX_DATAGRAM_BYTES: Final = 65_536
 MAX_ENVELOPE_BYTES: Final = 4096
 MAX_ENVELOPE_ITEMS: Final = 64
 """Arrays and maps of an envelope; without it one megabyte of empty maps costs 78 MB of memory."""
+MAX_ENVELOPE_DEPTH: Final = 3
+"""Maps and arrays inside each other: what the control messages use and one more."""
 MAX_ATTACHMENT_BYTES: Final = 1 << 20
 """Unpacked size of a control message's attachment (a message definition or an object's value)."""
+MAX_ACK_FRAMES: Final = 4
+"""ACK frames of one datagram (one a lane); each costs the receiver a walk over what it has in flight."""
+MAX_PACKET_NUMBER: Final = 0xFFFFFFFF
+"""Packet numbers do not wrap: a session ends before they are used up, and the next one starts at 1."""
+MAX_SEQ: Final = 2**62
+"""Where a stream may begin to count: far enough below 2^63 that no sender ever counts past what msgpack holds."""
 AGE_UNIT_S: Final = 1e-4
 MAX_AGE_S: Final = AGE_UNIT_S * 0xFFFFFFFF
 
@@ -126,7 +137,7 @@ class FrameSink(Protocol):
 
 
 def encode_header(kind: int, tag: int, number: int, stamp_us: int, *, version: int = VERSION_MAX) -> bytes:
-    """The 16-byte datagram header. `stamp_us` is taken modulo 2^64."""
+    """The 16-byte datagram header. `stamp_us` is taken modulo 2^64; `version` is the one that was agreed."""
     return HEADER.pack(MAGIC, version, kind, tag, number, stamp_us & 0xFFFFFFFFFFFFFFFF)
 
 
@@ -139,17 +150,24 @@ def decode_header(data: bytes) -> Header:
     magic, version, kind, tag, number, stamp_us = HEADER.unpack_from(data)
     if magic != MAGIC:
         raise WireError(f"first byte 0x{magic:02x} is not a SERN datagram (0x{MAGIC:02x})")
-    if not VERSION_MIN <= version <= VERSION_MAX:
+    if kind in _HANDSHAKE_KINDS:
+        if version != HANDSHAKE_VERSION:
+            raise VersionError(f"handshake with version byte {version}; it is {HANDSHAKE_VERSION} in every version")
+    elif not VERSION_MIN <= version <= VERSION_MAX:
         raise VersionError(f"wire version {version} is unknown here; this side speaks {VERSION_MIN} to {VERSION_MAX}")
-    if kind != Kind.DATA and kind not in _HANDSHAKE_KINDS:
+    elif kind != Kind.DATA:
         raise WireError(f"unknown datagram kind {kind}")
     return Header(version, kind, tag, number, stamp_us)
 
 
 def decode_frames(data: bytes, sink: FrameSink) -> None:
-    """Walk the frames of a kind-16 datagram whose header was checked. Raises WireError at the first bad byte."""
+    """Walk the frames of a kind-16 datagram whose header was checked.
+
+    Raises WireError at the first bad byte; the frames before it have been reported.
+    """
     position = HEADER_BYTES
     end = len(data)
+    acks = 0
     unpack_data = DATA_FIXED.unpack_from
     while position < end:
         kind = data[position]
@@ -166,10 +184,12 @@ def decode_frames(data: bytes, sink: FrameSink) -> None:
                 position += FIRST_EXTRA.size
                 if reserved:
                     raise WireError("reserved byte of a DATA frame is not zero")
-            elif length == 0:
-                raise WireError("empty fragment")
             if flags & ~KNOWN_FLAGS:
                 raise WireError(f"unknown DATA flags 0x{flags:02x}")
+            if length == 0 and (offset or total):
+                raise WireError("empty fragment")
+            if length > MAX_FRAGMENT_BYTES:
+                raise WireError(f"fragment of {length} bytes exceeds {MAX_FRAGMENT_BYTES}")
             if offset + length > total:
                 raise WireError(f"fragment {offset}+{length} lies outside its message of {total} bytes")
             body = data[position : position + length]
@@ -182,6 +202,9 @@ def decode_frames(data: bytes, sink: FrameSink) -> None:
         elif kind == FRAME_ACK:
             if position + ACK.size > end:
                 raise WireError("truncated ACK frame")
+            acks += 1
+            if acks > MAX_ACK_FRAMES:
+                raise WireError(f"more than {MAX_ACK_FRAMES} ACK frames in one datagram")
             _, lane, highest, sack, echo_us, received_us, cum_bytes = ACK.unpack_from(data, position)
             position += ACK.size
             sink.on_ack(lane, highest, sack, echo_us, received_us, cum_bytes)
@@ -201,9 +224,8 @@ def decode_frames(data: bytes, sink: FrameSink) -> None:
 def encode_data_first(
     flags: int, channel: int, seq: int, total: int, length: int, stamp_ns: int, age_s: float, codec: int
 ) -> bytes:
-    """Header of the fragment at offset 0 (32 bytes); the body follows it."""
-    age = int(age_s / AGE_UNIT_S)
-    age = 0 if age < 0 else min(age, 0xFFFFFFFF)
+    """Header of the fragment at offset 0 (32 bytes); the body follows it. The age is cut to 0 and MAX_AGE_S."""
+    age = 0xFFFFFFFF if age_s >= MAX_AGE_S else int(age_s / AGE_UNIT_S) if age_s > 0.0 else 0
     return DATA_FIRST.pack(FRAME_DATA, flags, channel, seq & 0xFFFFFFFF, 0, total, length, stamp_ns, age, codec, 0)
 
 
@@ -240,11 +262,25 @@ def widen_seq(low: int, near: int) -> int:
 Envelope = dict[str, Any]
 
 
+def _pack(envelope: Envelope) -> bytes:
+    return cast(bytes, msgpack.packb(envelope, use_bin_type=True))
+
+
+def envelope_bytes(envelope: Envelope) -> int:
+    """Size of an envelope on the wire, also of one that is too long for it."""
+    return len(_pack(envelope))
+
+
 def encode_envelope(envelope: Envelope) -> bytes:
-    packed = cast(bytes, msgpack.packb(envelope, use_bin_type=True))
+    """A map of plain values. Raises WireError above MAX_ENVELOPE_BYTES."""
+    packed = _pack(envelope)
     if len(packed) > MAX_ENVELOPE_BYTES:
         raise WireError(f"envelope of {len(packed)} bytes exceeds {MAX_ENVELOPE_BYTES}")
     return packed
+
+
+class _Map(list[tuple[bytes, object]]):
+    """A map as it is on the wire, in order and with whatever keys it repeats."""
 
 
 def decode_envelope(data: bytes) -> Envelope:
@@ -252,19 +288,44 @@ def decode_envelope(data: bytes) -> Envelope:
     if len(data) > MAX_ENVELOPE_BYTES:
         raise WireError(f"envelope of {len(data)} bytes exceeds {MAX_ENVELOPE_BYTES}")
     try:
+        # `raw`: msgpack interns text keys, and interned text is never freed on Python 3.12: a peer's keys stay bytes
+        # until they are known to be few and short-lived. Without bin and ext, every bytes object here is text.
         value = msgpack.unpackb(
             data,
-            raw=False,
+            raw=True,
             strict_map_key=True,
+            object_pairs_hook=_Map,
             max_array_len=MAX_ENVELOPE_ITEMS,
             max_map_len=MAX_ENVELOPE_ITEMS,
+            max_bin_len=0,
             max_ext_len=0,
         )
     except (ValueError, RecursionError, msgpack.exceptions.UnpackException) as error:
-        raise WireError(f"bad msgpack envelope: {type(error).__name__}") from error
-    if not isinstance(value, dict) or not all(isinstance(key, str) for key in value):
-        raise WireError("an envelope must be a map with string keys")
-    return value
+        raise WireError("envelope is not one msgpack map within the limits") from error
+    if not isinstance(value, _Map):
+        raise WireError("envelope is not a map")
+    return cast(Envelope, _plain(value, MAX_ENVELOPE_DEPTH))
+
+
+def _plain(value: object, depth: int) -> object:
+    """Bytes become text, maps become dicts. Raises WireError for what an envelope may not hold."""
+    if isinstance(value, bytes):
+        try:
+            return value.decode()
+        except UnicodeDecodeError:
+            raise WireError("text in an envelope is not UTF-8") from None
+    if value is None or isinstance(value, (bool, int, float)):
+        return value
+    if depth == 0:
+        raise WireError(f"envelope is nested deeper than {MAX_ENVELOPE_DEPTH}")
+    if isinstance(value, _Map):
+        result = {_plain(key, 0): _plain(item, depth - 1) for key, item in value}
+        if len(result) != len(value):
+            raise WireError("an envelope repeats a key")
+        return result
+    if isinstance(value, list):
+        return [_plain(item, depth - 1) for item in value]
+    raise WireError("an envelope holds an extension type")
 
 
 def encode_control(envelope: Envelope, attachment: bytes = b"") -> bytes:
@@ -287,11 +348,16 @@ def decode_control(body: bytes) -> tuple[Envelope, bytes]:
         return envelope, b""
     unpacker = zlib.decompressobj()
     try:
-        attachment = unpacker.decompress(packed, MAX_ATTACHMENT_BYTES)
+        # One byte more than is allowed: the end of a stream that fills the limit exactly is read as well.
+        attachment = unpacker.decompress(packed, MAX_ATTACHMENT_BYTES + 1)
     except zlib.error as error:
         raise WireError("bad zlib data in a control attachment") from error
-    if not unpacker.eof or unpacker.unused_data:
-        raise WireError(f"control attachment is truncated or unpacks to more than {MAX_ATTACHMENT_BYTES} bytes")
+    if len(attachment) > MAX_ATTACHMENT_BYTES:
+        raise WireError(f"control attachment unpacks to more than {MAX_ATTACHMENT_BYTES} bytes")
+    if not unpacker.eof:
+        raise WireError("truncated control attachment")
+    if unpacker.unused_data:
+        raise WireError("bytes follow a control attachment")
     return envelope, attachment
 
 
@@ -312,18 +378,42 @@ def take_float(envelope: Envelope, key: str, *, low: float, high: float, default
     return float(value)
 
 
+def _is_text(value: object, max_length: int) -> bool:
+    """Text of a peer ends up in logs and on terminals: no control characters."""
+    return isinstance(value, str) and len(value) <= max_length and value.isprintable()
+
+
 def take_str(envelope: Envelope, key: str, *, max_length: int = 512, default: str | None = None) -> str:
     value = envelope.get(key, default)
-    if not isinstance(value, str) or len(value) > max_length:
-        raise WireError(f"envelope key {key!r} must be a string of at most {max_length} characters")
-    return value
+    if not _is_text(value, max_length):
+        raise WireError(f"envelope key {key!r} must be a printable string of at most {max_length} characters")
+    return cast(str, value)
 
 
 def take_strings(envelope: Envelope, key: str, *, max_length: int = 512) -> list[str]:
     value = envelope.get(key, [])
-    if not isinstance(value, list) or not all(isinstance(item, str) and len(item) <= max_length for item in value):
-        raise WireError(f"envelope key {key!r} must be a list of strings")
+    if not isinstance(value, list) or not all(_is_text(item, max_length) for item in value):
+        raise WireError(f"envelope key {key!r} must be a list of printable strings of at most {max_length} characters")
     return list(value)
+
+
+def take_texts(
+    envelope: Envelope, key: str, *, max_items: int = MAX_ENVELOPE_ITEMS, max_length: int = 512, max_bytes: int = 4096
+) -> dict[str, str]:
+    """A map of printable strings, at most `max_bytes` of UTF-8 in all; empty when the key is absent."""
+    value = envelope.get(key, {})
+    if not isinstance(value, dict) or not all(
+        _is_text(name, max_length) and _is_text(text, max_length) for name, text in value.items()
+    ):
+        raise WireError(
+            f"envelope key {key!r} must map strings to strings, printable, of at most {max_length} characters"
+        )
+    if (
+        len(value) > max_items
+        or sum(len(name.encode()) + len(text.encode()) for name, text in value.items()) > max_bytes
+    ):
+        raise WireError(f"envelope key {key!r} holds more than {max_items} items or {max_bytes} bytes")
+    return dict(value)
 
 
 def take_bool(envelope: Envelope, key: str, *, default: bool = False) -> bool:
@@ -334,7 +424,7 @@ def take_bool(envelope: Envelope, key: str, *, default: bool = False) -> bool:
 
 
 def encode_handshake(kind: Kind, tag: int, stamp_us: int, envelope: Envelope) -> bytes:
-    return encode_header(kind, tag, 0, stamp_us) + encode_envelope(envelope)
+    return encode_header(kind, tag, 0, stamp_us, version=HANDSHAKE_VERSION) + encode_envelope(envelope)
 
 
 def decode_handshake(data: bytes) -> Envelope:
