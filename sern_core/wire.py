@@ -25,8 +25,9 @@ Frames of a kind-16 datagram, each starting with its type:
    | stamp_ns i64 | age u32 (100 us) | codec u8 | reserved u8     |   only when offset is 0
    +--------------+------------------+----------+-----------------+
 
-   type 2 ACK (38 bytes, at most 4 a datagram): lane u8, highest u32, sack u64, echo stamp u64, receive stamp u64, cumulative bytes u64
-       bit i of sack: packet highest-1-i has arrived; the stamps belong to packet `highest`, in microseconds
+   type 2 ACK (38 bytes): lane u8, highest u32, sack u64, echo stamp u64, receive stamp u64, cumulative bytes u64
+       bit i of sack: packet highest-1-i has arrived; the stamps belong to packet `highest`, in microseconds;
+       at most 4 ACK frames a datagram
    type 3 WATERMARK (7 bytes): channel u16, delivered u32: every seq up to it is delivered, expired or refused
    type 4 PING (1 byte): asks for an acknowledgement
 
