@@ -31,12 +31,12 @@ import zmq
 import zmq.asyncio
 
 from sern_client.endpoints.base import Endpoint, Subscription
+from sern_client.factory import make_endpoint
 from sern_core.errors import ConfigError, SernError
 from sern_core.message import TopicInfo
 from sern_core.rules import ResolvedTopic, to_global
 from sern_core.types import CLASS_LABELS, TopicName
 from sern_runtime.config.client import ClientFile, load_client
-from sern_tools.demo_endpoints import make_endpoint
 from sern_tools.message_log import Delivery, MessageLog, Offer
 
 KERNEL_BUFFER_BYTES: Final = 32 * 1024

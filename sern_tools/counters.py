@@ -40,13 +40,14 @@ def read_counters(files: Iterable[Path]) -> dict[str, list[Counters]]:
 
 
 def _counters(daemon: str, values: Mapping[str, Any]) -> Counters:
+    """A receiver's entry has only what a receiver knows; the rest is 0."""
     return Counters(
         daemon,
         values["direction"],
-        offered=int(values["offered"]),
+        offered=int(values.get("offered", 0)),
         delivered=int(values["delivered"]),
-        refused=int(values["refused"]),
+        refused=int(values.get("refused", 0)),
         dropped={str(reason): int(count) for reason, count in values["dropped"].items()},
-        in_queue=int(values["in_queue"]),
-        in_flight=int(values["in_flight"]),
+        in_queue=int(values.get("in_queue", 0)),
+        in_flight=int(values.get("in_flight", 0)),
     )

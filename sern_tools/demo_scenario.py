@@ -217,6 +217,7 @@ def _site(scenario: Scenario, ports: Ports) -> dict[str, Any]:
         "seed": scenario.seed,
         "command_topic": COMMAND_TOPIC,
         "command_rate_hz": 10.0,
+        "goal_rate_hz": 0.0,
     }
     commands = {"match": COMMAND_TOPIC, "class": "control", "direction": "send", "reliability": "best_effort"}
     rules = [{**commands, "depth": 1, "lifespan_s": COMMAND_LIFESPAN_S}]
