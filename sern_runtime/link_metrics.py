@@ -100,9 +100,7 @@ def register_received(metrics: Metrics, received: ReceiveLedger, ages: AgeHistog
 
     def delivered(read: str) -> Callable[[], list[tuple[Labels, float]]]:
         def collect() -> list[tuple[Labels, float]]:
-            return [
-                ((c.topic, CLASS_LABELS[c.priority]), float(getattr(c, read))) for c in received.topics.values()
-            ]
+            return [((c.topic, CLASS_LABELS[c.priority]), float(getattr(c, read))) for c in received.topics.values()]
 
         return collect
 
@@ -131,5 +129,3 @@ def register_received(metrics: Metrics, received: ReceiveLedger, ages: AgeHistog
                   information_age)  # fmt: skip
     metrics.histogram("sern_message_age_seconds", "Age of messages when delivered, by class.", LATENCY_EDGES_S,
                       ("class",), ages.read, known=lambda: [(label,) for label in CLASS_LABELS])  # fmt: skip
-
-

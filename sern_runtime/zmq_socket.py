@@ -25,7 +25,7 @@ import ipaddress
 import logging
 from collections.abc import Callable, Sequence
 from enum import Enum
-from typing import Final, NamedTuple, Protocol
+from typing import Final, NamedTuple, Protocol, cast
 
 import zmq
 
@@ -66,6 +66,9 @@ _log = logging.getLogger(__name__)
 _NOBLOCK: Final = int(zmq.NOBLOCK)
 _SNDMORE: Final = int(zmq.SNDMORE)
 _NOBLOCK_MORE: Final = _NOBLOCK | _SNDMORE
+
+
+RawSend = Callable[["bytes | zmq.Frame", int, bool], object]
 
 
 class SendResult(Enum):
@@ -122,6 +125,9 @@ class DrainedSocket:
         if batch < 1:
             raise UsageError(f"batch is {batch}, it must be at least 1")
         self.socket = socket
+        self.raw_send = cast("RawSend", super(zmq.Socket, socket).send)
+        """`send` of the extension type, (data, flags, copy): without the checks of options that SERN does not use.
+        May raise zmq.Again; `kick` is the caller's duty."""
         self.on_writable = on_writable
         self.malformed = 0
         """Messages dropped whole because their frames were not what this socket takes."""
@@ -148,10 +154,7 @@ class DrainedSocket:
     def send(self, body: bytes) -> SendResult:
         """Send one frame without waiting."""
         try:
-            if len(body) < ZERO_COPY_BYTES:
-                self.socket.send(body, _NOBLOCK)
-            else:
-                self.socket.send(body, _NOBLOCK, copy=False)
+            self.raw_send(body, _NOBLOCK, len(body) < ZERO_COPY_BYTES)
         except zmq.ZMQError as error:
             return self._unsent(error)
         if self._scheduled is None:
@@ -271,11 +274,8 @@ class RouterSocket(DrainedSocket):
     def send_to(self, routing_id: bytes, body: bytes) -> SendResult:
         """Send to one peer without waiting. GONE when its connection is over (ROUTER_MANDATORY)."""
         try:
-            self.socket.send(routing_id, _NOBLOCK_MORE)
-            if len(body) < ZERO_COPY_BYTES:
-                self.socket.send(body, _NOBLOCK)
-            else:
-                self.socket.send(body, _NOBLOCK, copy=False)
+            self.raw_send(routing_id, _NOBLOCK_MORE)
+            self.raw_send(body, _NOBLOCK, len(body) < ZERO_COPY_BYTES)
         except zmq.ZMQError as error:
             return self._unsent(error)
         if self._scheduled is None:
@@ -399,6 +399,7 @@ def apply_common_options(
     max_message_bytes: int = MAX_MESSAGE_BYTES,
     sndhwm: int = SNDHWM,
     rcvhwm: int = RCVHWM,
+    handshake_ivl_ms: int = HANDSHAKE_IVL_MS,
     tos: int = 0,
 ) -> None:
     """The options that every SERN socket over TCP has; see the constants for the reasons."""
@@ -408,7 +409,7 @@ def apply_common_options(
     socket.setsockopt(zmq.HEARTBEAT_TIMEOUT, heartbeat_timeout_ms)
     socket.setsockopt(zmq.HEARTBEAT_TTL, heartbeat_timeout_ms)
     socket.setsockopt(zmq.CONNECT_TIMEOUT, CONNECT_TIMEOUT_MS)
-    socket.setsockopt(zmq.HANDSHAKE_IVL, HANDSHAKE_IVL_MS)
+    socket.setsockopt(zmq.HANDSHAKE_IVL, handshake_ivl_ms)
     socket.setsockopt(zmq.RECONNECT_IVL, RECONNECT_IVL_MS)
     socket.setsockopt(zmq.RECONNECT_IVL_MAX, RECONNECT_IVL_MAX_MS)
     socket.setsockopt(zmq.SNDHWM, sndhwm)
@@ -496,6 +497,7 @@ def make_server(
     heartbeat_timeout_ms: int = HEARTBEAT_TIMEOUT_MS,
     max_message_bytes: int = MAX_MESSAGE_BYTES,
     sndhwm: int = SNDHWM,
+    handshake_ivl_ms: int = HANDSHAKE_IVL_MS,
 ) -> "zmq.Socket[bytes]":
     """A ROUTER bound to all `endpoints`. Start the ZAP handler of the same context first.
 
@@ -505,7 +507,11 @@ def make_server(
     socket = ctx.socket(zmq.ROUTER)
     try:
         apply_common_options(
-            socket, heartbeat_timeout_ms=heartbeat_timeout_ms, max_message_bytes=max_message_bytes, sndhwm=sndhwm
+            socket,
+            heartbeat_timeout_ms=heartbeat_timeout_ms,
+            max_message_bytes=max_message_bytes,
+            sndhwm=sndhwm,
+            handshake_ivl_ms=handshake_ivl_ms,
         )
         socket.setsockopt(zmq.BACKLOG, BACKLOG)
         socket.setsockopt(zmq.ROUTER_MANDATORY, 1)  # without it a full or lost peer is dropped silently

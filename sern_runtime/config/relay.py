@@ -29,7 +29,13 @@ from sern_runtime.config.base import (
     resolve,
 )
 from sern_runtime.config.load import Loaded, load
-from sern_runtime.config.shared import LinkSection, LogSection, SchedulerSection, secret_key_problems
+from sern_runtime.config.shared import (
+    LinkSection,
+    LogSection,
+    SchedulerSection,
+    output_problems,
+    secret_key_problems,
+)
 from sern_runtime.keys import KeyDirectory
 
 DEFAULT_HTTP_LISTEN = "127.0.0.1:5580"
@@ -189,6 +195,8 @@ class RelayFile(FileModel):
     """Metrics and health over HTTP."""
     log: LogSection = LogSection()
     """The log."""
+    summary: PathText | None = None
+    """JSON file with the counters, written at exit; null: none."""
 
     @model_validator(mode="after")
     def _addresses(self) -> "RelayFile":
@@ -218,6 +226,7 @@ class RelayFile(FileModel):
         return tuple(section.role() for section in self.feed.roles)
 
     def file_problems(self, base_dir: Path) -> Iterator[FileProblem]:
+        yield from output_problems(base_dir, self.summary, ("summary",))
         if self.relay.secret_key_file is not None:
             loc = ("relay", "secret_key_file")
             yield from secret_key_problems(base_dir, self.relay.secret_key_file, loc, owner=self.name)
