@@ -12,6 +12,7 @@ from typing import Final
 from sern_core import wire
 from sern_core.errors import UsageError, WireError
 from sern_core.message import StreamId, StreamInfo, TopicInfo, TopicSpec
+from sern_core.rules import NAME_MAX_CHARS
 from sern_core.types import ClientName, Durability, Encoding, PriorityClass, Reliability, TopicName
 
 DEFINITION_HASH_CHARS: Final = 32
@@ -19,16 +20,12 @@ MAX_DEPTH: Final = 100_000
 MAX_TIME_S: Final = 1e9
 MAX_STRINGS: Final = 48
 """Items of one list in an envelope (below wire.MAX_ENVELOPE_ITEMS); longer lists are sent in parts."""
-MAX_NAME_CHARS: Final = 255
-"""Topic and type names, as in DDS."""
 MAX_HASH_CHARS: Final = 128
 MAX_ATTRIBUTES: Final = 16
 MAX_ATTRIBUTE_CHARS: Final = 256
 MAX_ATTRIBUTE_BYTES: Final = 1024
 """All attributes of a stream. With the bounds on the names it leaves room for what a relay adds when it announces the
-stream further: an announcement that was accepted can always be passed on."""
-_CLIENT_NAME: Final = re.compile(r"[a-z][a-z0-9_]{0,62}")
-_TOPIC: Final = re.compile(rf"/[!-~]{{0,{MAX_NAME_CHARS - 1}}}")
+stream further: an announcement of a valid name that was accepted can always be passed on."""
 _DIGEST: Final = re.compile(rf"(?:[0-9a-f]{{{DEFINITION_HASH_CHARS}}})?")
 
 
@@ -90,13 +87,6 @@ def check_stream(stream: StreamInfo) -> None:
         raise UsageError(f"{stream.id.topic} cannot be announced: {error}") from error
 
 
-def _take_name(envelope: wire.Envelope, key: str, pattern: re.Pattern[str], what: str) -> str:
-    value = wire.take_str(envelope, key, max_length=MAX_NAME_CHARS)
-    if pattern.fullmatch(value) is None:
-        raise WireError(f"{value!r} is not {what}")
-    return value
-
-
 def decode_announcement(envelope: wire.Envelope) -> Announcement:
     """Raises WireError for anything that is not a complete, sane announcement. The definition is not in it."""
     attributes = wire.take_texts(
@@ -109,7 +99,13 @@ def decode_announcement(envelope: wire.Envelope) -> Announcement:
     encoding = wire.take_str(envelope, "enc", max_length=8)
     if encoding not in set(Encoding):
         raise WireError(f"unknown encoding {encoding!r}")
-    topic = TopicName(_take_name(envelope, "topic", _TOPIC, "an absolute topic name"))
+    # Whether it is a ROS name is for the routing table to say: it refuses the stream, not the connection.
+    topic = TopicName(wire.take_str(envelope, "topic"))
+    if not topic.startswith("/"):
+        raise WireError(f"topic {topic!r} is not absolute")
+    digest = wire.take_str(envelope, "dh", max_length=DEFINITION_HASH_CHARS)
+    if _DIGEST.fullmatch(digest) is None:
+        raise WireError(f"{digest!r} is not the hash of a definition")
     weight = wire.take_float(envelope, "w", low=1e-9, high=1e9)
     retention_s = wire.take_float(envelope, "ret", low=0.0, high=MAX_TIME_S)
     if weight is None or retention_s is None:
@@ -128,17 +124,17 @@ def decode_announcement(envelope: wire.Envelope) -> Announcement:
     )
     info = TopicInfo(
         name=topic,
-        type_name=wire.take_str(envelope, "type", max_length=MAX_NAME_CHARS),
+        type_name=wire.take_str(envelope, "type", max_length=NAME_MAX_CHARS),
         encoding=Encoding(encoding),
         type_hash=wire.take_str(envelope, "hash", max_length=MAX_HASH_CHARS),
         latched=latched,
         reliable=spec.reliable,
     )
-    origin = ClientName(_take_name(envelope, "or", _CLIENT_NAME, "a client's name"))
+    origin = ClientName(wire.take_str(envelope, "or", max_length=64))
     return Announcement(
         channel=wire.take_int(envelope, "ch", low=1, high=0xFFFF),
         stream=StreamInfo(StreamId(origin, wire.take_int(envelope, "boot"), topic), info, spec, attributes),
-        definition_hash=_take_name(envelope, "dh", _DIGEST, "the hash of a definition"),
+        definition_hash=digest,
         first=wire.take_int(envelope, "first", low=1, high=wire.MAX_SEQ),
         owed=tuple(wire.take_strings(envelope, "owed", max_length=64)),
     )
