@@ -24,14 +24,25 @@ class Counters:
 
 
 def read_counters(files: Iterable[Path]) -> dict[str, list[Counters]]:
-    """The summaries of several daemons, by global topic. ConfigError, naming the file, for anything else."""
+    """The summaries of several daemons, by global topic. ConfigError, naming the file, for anything else.
+
+    A client has one entry a topic, of direction `send` or `receive`. The relay has one for each client it sends the
+    topic to and one for what it received; both are of direction `relay`.
+    """
     found: dict[str, list[Counters]] = {}
     for path in files:
         try:
             document = json.loads(path.read_text())
-            daemon = str(document.get("client") or document.get("relay"))
-            for topic, counters in document["topics"].items():
-                found.setdefault(topic, []).append(_counters(daemon, counters))
+            if "relay" in document:
+                parts = [*document["links"].values(), document["received"]]
+                entries = [
+                    (topic, document["relay"], "relay", values) for part in parts for topic, values in part.items()
+                ]
+            else:
+                topics = document["topics"].items()
+                entries = [(topic, document["client"], values["direction"], values) for topic, values in topics]
+            for topic, daemon, direction, values in entries:
+                found.setdefault(topic, []).append(_counters(daemon, direction, values))
         except OSError as error:
             raise ConfigError(f"cannot read the summary: {error.strerror}", file=str(path)) from error
         except (ValueError, KeyError, AttributeError, TypeError) as error:
@@ -39,11 +50,11 @@ def read_counters(files: Iterable[Path]) -> dict[str, list[Counters]]:
     return found
 
 
-def _counters(daemon: str, values: Mapping[str, Any]) -> Counters:
+def _counters(daemon: str, direction: str, values: Mapping[str, Any]) -> Counters:
     """A receiver's entry has only what a receiver knows; the rest is 0."""
     return Counters(
         daemon,
-        values["direction"],
+        direction,
         offered=int(values.get("offered", 0)),
         delivered=int(values["delivered"]),
         refused=int(values.get("refused", 0)),

@@ -15,7 +15,6 @@ from sern_core.errors import ConfigError
 from sern_core.params import SchedulerParams
 from sern_core.rules import client_name
 from sern_runtime import keys
-from sern_runtime.config.relay import RelayFile
 from sern_runtime.keys import PublicKey, PublicKeys
 from sern_sim.profiles import LinkProfile
 from sern_tools.shaping import RateSchedule
@@ -170,7 +169,7 @@ def write_files(directory: Path, scenario: Scenario, ports: Ports) -> dict[str, 
 
 
 def _relay(ports: Ports) -> dict[str, Any]:
-    content: dict[str, Any] = {
+    return {
         "relay": {
             "name": RELAY,
             "listen": [f"tcp://{HOST}:{ports.relay}"],
@@ -182,10 +181,8 @@ def _relay(ports: Ports) -> dict[str, Any]:
             {"client": SITE, "publish": [COMMAND_TOPIC], "subscribe": [f"/{ROBOT}/.*"]},
         ],
         "http": {"listen": f"{HOST}:{ports.relay_http}"},
+        "summary": "relay.summary.json",
     }
-    if "summary" in RelayFile.model_fields:
-        content["summary"] = "relay.summary.json"
-    return content
 
 
 def _client(

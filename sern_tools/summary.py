@@ -228,27 +228,40 @@ def _first_fresh_pose(logs: Mapping[str, TopicLog], facts: RunFacts) -> list[flo
     return found
 
 
+UNCERTAIN: Final = frozenset({"lost", "disconnected", "shutdown", "retention"})
+"""A sender that gives a message up for one of these may not know that it did arrive: the acknowledgement is missing."""
+
+
 def _account(result: Result, counters: Mapping[str, Sequence[Counters]]) -> None:
-    """offered = delivered + refused + dropped + still queued or in flight, per topic; and the logs say the same."""
+    """offered = delivered + refused + dropped + still queued or in flight, per topic; and the logs say the same.
+
+    A message in flight at the end, or given up without an answer, may have arrived all the same. So many may be
+    counted twice; none may be counted not at all.
+    """
     result.accounting_gap = 0
     for name, log in sorted(result.logs.items()):
         entries = counters.get(name, ())
         senders = [c for c in entries if c.direction == "send"]
-        receivers = [c for c in entries if c.direction == "receive"]
         offered = sum(c.offered for c in senders)
-        delivered = sum(c.delivered for c in receivers)
-        dropped = sum(n for c in entries for reason, n in c.dropped.items() if reason not in ("duplicate", "refused"))
-        held = sum(c.in_queue + c.in_flight for c in entries)
-        refused = sum(c.refused for c in senders)
+        delivered = sum(c.delivered for c in entries if c.direction == "receive")
+        drops = [
+            (reason, n) for c in entries for reason, n in c.dropped.items() if reason not in ("duplicate", "refused")
+        ]
+        in_flight = sum(c.in_flight for c in entries)
+        known = (
+            delivered + sum(c.refused for c in senders) + sum(c.in_queue for c in entries) + sum(n for _, n in drops)
+        )
+        uncertain = in_flight + sum(n for reason, n in drops if reason in UNCERTAIN)
         gaps = {
-            "offered but not accounted for": offered - delivered - refused - dropped - held,
+            "offered and not accounted for": max(0, offered - known - in_flight),
+            "accounted for more than once": max(0, known + in_flight - offered - uncertain),
             "offered in the log but not in the counters": log.offered - offered,
             "delivered in the log but not in the counters": len(log.deliveries) - delivered,
         }
         for what, gap in gaps.items():
             if gap:
                 result.accounting_gap += abs(gap)
-                result.accounting_notes.append(f"{name}: {gap:+d} {what}")
+                result.accounting_notes.append(f"{name}: {gap} {what}")
 
 
 def judge(

@@ -25,7 +25,19 @@ def test_summaries_are_joined_by_topic(tmp_path: Path) -> None:
     assert found == {"/r/pose": [sent, received], "/r/map": [received]}
 
 
-@pytest.mark.parametrize("text", ["", "[]", "{}", '{"client": "x", "topics": {"/a": {}}}', '{"topics": []}'])
+def test_the_relay_counts_per_client_and_what_it_received(tmp_path: Path) -> None:
+    path = tmp_path / "relay.json"
+    links = {"site": {"/r/pose": SENT}, "other": {"/r/pose": SENT}}
+    path.write_text(json.dumps({"relay": "hub", "links": links, "received": {"/r/pose": RECEIVED}}))
+    entries = read_counters([path])["/r/pose"]
+    assert [entry.direction for entry in entries] == ["relay"] * 3
+    assert [entry.offered for entry in entries] == [9, 9, 0]
+    assert {entry.daemon for entry in entries} == {"hub"}
+
+
+@pytest.mark.parametrize(
+    "text", ["", "[]", "{}", '{"relay": "hub"}', '{"client": "x", "topics": {"/a": {}}}', '{"topics": []}']
+)
 def test_something_else_is_refused_by_name(tmp_path: Path, text: str) -> None:
     path = tmp_path / "summary.json"
     path.write_text(text)

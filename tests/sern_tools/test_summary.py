@@ -219,6 +219,17 @@ def test_counters_that_are_missing_leave_a_gap() -> None:
     assert "497" in result.accounting_notes[0]
 
 
+def test_what_was_in_flight_at_the_end_may_have_arrived() -> None:
+    run = good_run()
+    sender = run.counters[POSE][0]
+    run.counters[POSE][0] = replace(sender, in_flight=3)
+    assert run.analyse().accounting_gap == 0
+    run.counters[POSE][0] = replace(sender, dropped={"lifespan": 100, "lost": 5})
+    assert run.analyse().accounting_gap == 0
+    run.counters[POSE][0] = replace(sender, dropped={"lifespan": 103}, in_flight=2)
+    assert run.analyse().accounting_gap == 3
+
+
 def test_drop_reasons_of_the_log_serve_when_there_are_no_counters() -> None:
     run = good_run()
     run.counters.clear()
