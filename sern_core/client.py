@@ -48,6 +48,9 @@ class ClientEvents(Protocol):
     def send_dropped(self, stream: StreamInfo, seq: int, reason: DropReason) -> None:
         """A message of ours was dropped, here or at a later hop."""
 
+    def wanted(self, stream: StreamInfo, wanted: bool) -> None:
+        """Whether anybody at the far side wants a stream of ours; said again after every change."""
+
     def publication_refused(self, stream: StreamInfo, code: str, text: str) -> None: ...
 
 
@@ -229,6 +232,9 @@ class ClientCore:
 
     def on_delivered(self, link: Link, channel: OutChannel, *, now: float) -> None:
         """The ledger has counted it."""
+
+    def on_wanted(self, link: Link, channel: OutChannel, *, now: float) -> None:
+        self.events.wanted(channel.stream, bool(channel.wanted))
 
     def on_refused(self, link: Link, channel: OutChannel, code: str, text: str, *, now: float) -> None:
         self.events.publication_refused(channel.stream, code, text)

@@ -177,7 +177,8 @@ class Hub:
         self._heard: set[ClientName] = set()  # said what they want, to this run of the relay
         self._absent_since: dict[ClientName, float] = {}
         self._draining: list[tuple[Link, OutChannel]] = []  # streams that ended with reliable messages still owed
-        self._sweep_due_s = now
+        self.tap: Callable[[StreamInfo], bool] = lambda _stream: False
+        """Whether the relay itself wants a stream (a subscriber of the feed); set by the shell."""
 
     # --- connections ----------------------------------------------------------------------------------------------
 
@@ -278,10 +279,6 @@ class Hub:
     def _wanted(self, relayed: Relayed) -> bool:
         assert relayed.stream is not None
         return bool(relayed.outs) or relayed.cache is not None or self.tap(relayed.stream.stream)
-
-    def tap(self, stream: StreamInfo) -> bool:
-        """Whether the relay itself wants the stream (a feed subscriber). Replaced by the shell."""
-        return False
 
     def refresh_interest(self, *, now: float) -> None:
         """The answer of `tap` may have changed: tell the origins."""
@@ -454,10 +451,10 @@ class Hub:
         if relayed is None or not stream.reliable:
             return
         for out_link, channel in relayed.outs.values():
-            while channel.next_seq <= stream.delivered:
-                gap = Message(stream.stream.id, channel.next_seq, b"", 0, now)
-                channel.reject(gap, DropReason.RETENTION)
-            out_link.handle_timeout(now=now)
+            out_link.skip(channel, stream.delivered + 1, now=now)
+
+    def on_wanted(self, link: Link, channel: OutChannel, *, now: float) -> None:
+        """Nothing depends on it here: what a client subscribed to it gets."""
 
     def on_definition(self, link: Link, digest: str, *, now: float) -> None:
         for other in self.links.values():

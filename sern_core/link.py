@@ -62,6 +62,9 @@ class LinkHandler(Protocol):
     def on_delivered(self, link: "Link", channel: OutChannel, *, now: float) -> None:
         """The peer's watermark of a reliable channel moved to `channel.watermark`."""
 
+    def on_wanted(self, link: "Link", channel: OutChannel, *, now: float) -> None:
+        """The peer has said whether it wants the stream: `channel.wanted`. Said again after every change."""
+
     def on_refused(self, link: "Link", channel: OutChannel, code: str, text: str, *, now: float) -> None: ...
 
     def on_skipped(self, link: "Link", stream: InStream, count: int, *, now: float) -> None:
@@ -413,7 +416,19 @@ class Link(Hop):
     def _in_drop(self, stream: InStream, reason: DropReason, nbytes: int) -> None:
         self.handler.on_in_drop(self, stream, reason, nbytes)
 
+    def skip(self, channel: OutChannel, first: int, *, now: float) -> None:
+        """The stream goes on at seq `first`: what lies between will not come, and the peer must not wait for it."""
+        channel.skip_to(first)
+        self._tell_gap(channel, now)
+
+    def _tell_gap(self, channel: OutChannel, now: float) -> None:
+        first = channel.next_gap()
+        if first is not None and self.established:
+            self.send_control({"t": "first", "ch": channel.slot, "seq": first}, now=now)
+
     def _watermark_moved(self, channel: OutChannel) -> None:
+        if channel.gaps:
+            self._tell_gap(channel, self._now)
         self.handler.on_delivered(self, channel, now=self._now)
 
     def _synced(self, now: float) -> None:
@@ -480,6 +495,7 @@ class Link(Hop):
             channel.set_wanted(wanted)
             channel.ready = True
             self._refresh(channel, now)
+            self.handler.on_wanted(self, channel, now=now)
         elif kind == "dropped":
             reason = DROP_REASONS.get(wire.take_int(envelope, "code"), DropReason.LOST)
             channel.reported(wire.take_int(envelope, "seq"), reason)

@@ -100,6 +100,7 @@ class OutChannel:
         self._next_allowed_s: float | None = None
         self.wanted: bool | None = None  # None until the peer has answered
         self.ready = False  # announced in this session
+        self.gaps: deque[tuple[int, int]] = deque()  # reliable: after this seq, the next that will come
         self.offered = False  # the scheduler knows of a pending message
         self.owed: tuple[str, ...] = ()  # reliable subscribers behind the peer, as it told us
 
@@ -338,6 +339,20 @@ class OutChannel:
         """Let go of reliable messages that the peer has whole, in order: for a stream without a watermark."""
         while self.retained and self.retained[0].started and self.retained[0].seq not in self.flying:
             self.delivered_to(self.retained[0].seq)
+
+    def skip_to(self, first: int) -> None:
+        """Nothing from `next_seq` up to `first` will come; the peer is told in its turn (`next_gap`)."""
+        if first > self.next_seq:
+            self.gaps.append((self.next_seq - 1, first))
+            self.next_seq = first
+
+    def next_gap(self) -> int | None:
+        """The seq to go on at, once everything before the gap is delivered; each gap is given out once."""
+        first = None
+        while self.gaps and self.watermark >= self.gaps[0][0]:
+            first = self.gaps.popleft()[1]
+            self.watermark = max(self.watermark, first - 1)
+        return first
 
     def _forget(self, out: OutMessage) -> None:
         """Take a reliable message out of wherever it still is."""

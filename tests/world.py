@@ -78,6 +78,7 @@ class SimClient:
     rejections: list[tuple[str, str]] = field(default_factory=list)
     opened: list[StreamInfo] = field(default_factory=list)
     closed: list[StreamInfo] = field(default_factory=list)
+    wants: dict[str, bool] = field(default_factory=dict)
     ups: int = 0
 
     def start(
@@ -117,6 +118,9 @@ class SimClient:
 
     def send_dropped(self, stream: StreamInfo, seq: int, reason: DropReason) -> None:
         self.dropped_out.append((stream.id.topic, seq, reason))
+
+    def wanted(self, stream: StreamInfo, wanted: bool) -> None:
+        self.wants[stream.id.topic] = wanted
 
     def publication_refused(self, stream: StreamInfo, code: str, text: str) -> None:
         self.refusals.append((code, text))

@@ -55,7 +55,7 @@ class BagOptions:
 
     `rate` scales time; 0 plays as fast as messages are accepted. `namespaces` replays the bag once per name, under
     `/name`. `topics` are full-match regular expressions on the bag's own topic names; None means all. Play starts
-    when every topic of `wait_for` (names as announced) is subscribed, and then `start_delay_s` later.
+    when every topic of `wait_for` (names as announced) is wanted at the far side, and then `start_delay_s` later.
     """
 
     path: Path
@@ -135,7 +135,8 @@ class BagEndpoint:
         self._messages: Iterator[tuple[Connection, int, bytes]] | None = None
         self._worker: ThreadPoolExecutor | None = None
         self._task: asyncio.Task[None] | None = None
-        self._subscribed = asyncio.Event()
+        self._audience = asyncio.Event()
+        self._wanted: set[str] = set()  # at the far side
         self._finished = False
         self._base_s = 0.0
         self._yielded_s = 0.0
@@ -179,11 +180,14 @@ class BagEndpoint:
         topic.subscriptions.append(subscription)
         if subscription.backlog:
             asyncio.get_running_loop().call_soon(self._drain_backlog, subscription)
-        self._subscribed.set()
         return subscription
 
     def advertise(self, info: TopicInfo) -> Publisher:
         raise ConfigError(f"{info.name}: a bag being played takes no messages", file=str(self.options.path))
+
+    def interest(self, name: TopicName, wanted: bool) -> None:
+        (self._wanted.add if wanted else self._wanted.discard)(name)
+        self._audience.set()
 
     @property
     def exhausted(self) -> bool:
@@ -295,7 +299,7 @@ class BagEndpoint:
     # Playing
 
     async def _play(self) -> None:
-        await self._wait_for_subscribers()
+        await self._wait_for_audience()
         if self.options.start_delay_s > 0:
             await self._clock.sleep(self.options.start_delay_s)
         assert self._reader is not None
@@ -386,10 +390,10 @@ class BagEndpoint:
             await self._clock.sleep(max(delay_s, 0.0))
             self._yielded_s = self._clock.monotonic_s()
 
-    async def _wait_for_subscribers(self) -> None:
-        while not all(self._topics[TopicName(name)].subscriptions for name in self.options.wait_for):
-            self._subscribed.clear()
-            await self._subscribed.wait()
+    async def _wait_for_audience(self) -> None:
+        while not self._wanted.issuperset(self.options.wait_for):
+            self._audience.clear()
+            await self._audience.wait()
 
     def _on_worker(self, job: Callable[[], _R]) -> asyncio.Future[_R]:
         return asyncio.get_running_loop().run_in_executor(self._worker, job)

@@ -51,6 +51,12 @@ class Endpoint(Protocol):
 
     def advertise(self, info: TopicInfo) -> Publisher: ...
 
+    def interest(self, name: TopicName, wanted: bool) -> None:
+        """Whether anybody at the far side wants a topic announced from here; told on every change.
+
+        A recording can wait for its audience; an endpoint that need not know does nothing.
+        """
+
     @property
     def exhausted(self) -> bool:
         """True when a finite source (a bag without loop) has offered all it has and all of it was accepted."""

@@ -117,6 +117,10 @@ class CompositeEndpoint:
             raise refusals[0]
         raise ConfigError("; ".join(dict.fromkeys(str(error) for error in refusals)))
 
+    def interest(self, name: TopicName, wanted: bool) -> None:
+        for index in self._givers.get(name, ()):
+            self._members[index].interest(name, wanted)
+
     @property
     def exhausted(self) -> bool:
         return all(member.exhausted for member in self._members)

@@ -135,6 +135,9 @@ class RecordEndpoint:
         self._jobs.put(info)
         return _Publisher(self, info)
 
+    def interest(self, name: TopicName, wanted: bool) -> None:
+        """Makes no difference here."""
+
     @property
     def exhausted(self) -> bool:
         """Always true: a recorder offers nothing."""

@@ -208,6 +208,9 @@ class SyntheticEndpoint:
 
         return _Publisher(receive)
 
+    def interest(self, name: TopicName, wanted: bool) -> None:
+        """Makes no difference here."""
+
     @property
     def exhausted(self) -> bool:
         """Never: the simulation goes on."""

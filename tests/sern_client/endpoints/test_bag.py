@@ -150,15 +150,17 @@ async def test_refused_is_dropped_and_counted(make_bag: Make, events: Any, until
     assert endpoint.counters.accepted == endpoint.counters.dropped == 5
 
 
-async def test_waits_for_its_subscribers(make_bag: Make, events: Any, until: Until) -> None:
+async def test_waits_for_its_audience(make_bag: Make, events: Any, until: Until) -> None:
     endpoint = BagEndpoint(BagOptions(make_bag("bag"), rate=0, wait_for=("/chat", "/scan_text")))
     await endpoint.start(events)
     chat: list[bytes] = []
     endpoint.subscribe(CHAT, appender(chat))
+    endpoint.subscribe(SCAN, lambda body, stamp_ns: True)
+    endpoint.interest(CHAT, True)
     for _ in range(20):
         await asyncio.sleep(0)
-    assert not chat
-    endpoint.subscribe(SCAN, lambda body, stamp_ns: True)
+    assert not chat  # the other one is not wanted yet
+    endpoint.interest(SCAN, True)
     await until(lambda: endpoint.exhausted)
     await endpoint.stop()
     assert len(chat) == 10

@@ -1,0 +1,250 @@
+"""Joins an endpoint to the client core: discovery, names, rules, leases; what comes in goes out on the other side."""
+
+import logging
+import time
+from collections.abc import Callable
+from dataclasses import replace
+
+from sern_client.endpoints import ros_types
+from sern_client.endpoints.base import Endpoint, Publisher, Subscription
+from sern_client.message_log import MessageLog
+from sern_core.client import ClientCore
+from sern_core.errors import ConfigError, UsageError
+from sern_core.lease import CommandLease
+from sern_core.message import Message, StreamId, StreamInfo, TopicInfo
+from sern_core.queues import OutChannel
+from sern_core.rules import Discovery, RuleSet, to_global
+from sern_core.types import DropReason, TopicName
+from sern_runtime.link_metrics import AgeHistograms
+from sern_runtime.loop import Timer
+
+_log = logging.getLogger(__name__)
+
+
+class Outgoing:
+    """A local topic that is offered to the link."""
+
+    __slots__ = ("channel", "subscription")
+
+    def __init__(self, channel: OutChannel, subscription: Subscription) -> None:
+        self.channel = channel
+        self.subscription = subscription
+
+
+class Incoming:
+    """A stream from elsewhere that is published here. `stop` is the body that a lost link makes us publish."""
+
+    __slots__ = ("lease", "local", "publisher", "stop")
+
+    def __init__(self, local: TopicName, publisher: Publisher, lease: CommandLease | None, stop: bytes | None) -> None:
+        self.local = local
+        self.publisher = publisher
+        self.lease = lease
+        self.stop = stop
+
+
+class Bridge:
+    """`ClientEvents` on one side, `TopicEvents` on the other. `attach` the core before anything is called."""
+
+    def __init__(
+        self,
+        endpoint: Endpoint,
+        rules: RuleSet,
+        discovery: Discovery,
+        namespace: str,
+        *,
+        log: MessageLog | None,
+        kick: Callable[[], None],
+    ) -> None:
+        self.endpoint = endpoint
+        self.rules = rules
+        self.discovery = discovery
+        self.namespace = namespace
+        self.ages = AgeHistograms()
+        self.rejected_reason: str | None = None
+        self.refusals = 0
+        self.deadlines_missed: dict[TopicName, int] = {}
+        self.leases_fired = 0
+        self._log = log
+        self._kick = kick
+        self._core: ClientCore | None = None
+        self._outgoing: dict[TopicName, Outgoing] = {}
+        self._incoming: dict[StreamId, Incoming] = {}
+        self._last_arrival_s: dict[StreamId, float] = {}
+        self._timer = Timer(self._leases_due)
+
+    def attach(self, core: ClientCore) -> None:
+        self._core = core
+
+    @property
+    def core(self) -> ClientCore:
+        if self._core is None:
+            raise UsageError("the bridge has no core yet")
+        return self._core
+
+    def close(self) -> None:
+        self._timer.cancel()
+        for outgoing in self._outgoing.values():
+            outgoing.subscription.close()
+        self._outgoing.clear()
+        for incoming in self._incoming.values():
+            incoming.publisher.close()
+        self._incoming.clear()
+
+    # --- TopicEvents: from the endpoint -----------------------------------------------------------------------------
+
+    def topic_added(self, info: TopicInfo) -> None:
+        if info.name in self._outgoing:
+            return
+        listed = self.rules.find(info.type_name, info.name) is not None
+        if not self.discovery.wants(info.name, listed=listed):
+            return
+        try:
+            resolved = self.rules.resolve(info, local_name=info.name)
+        except ConfigError as error:
+            _log.error("%s", error)
+            return
+        if not resolved.direction.sends:
+            return
+        name = to_global(resolved.name, self.namespace)
+        try:
+            channel = self.core.publish(replace(info, name=name), resolved.spec, now=time.monotonic())
+        except UsageError as error:
+            _log.error("%s cannot be offered as %s: %s", info.name, name, error)
+            return
+        subscription = self.endpoint.subscribe(info.name, self._sink(channel))
+        self._outgoing[info.name] = Outgoing(channel, subscription)
+        self._kick()
+
+    def topic_removed(self, name: TopicName) -> None:
+        outgoing = self._outgoing.pop(name, None)
+        if outgoing is not None:
+            outgoing.subscription.close()
+            self.core.unpublish(outgoing.channel, now=time.monotonic())
+            self._kick()
+
+    def _sink(self, channel: OutChannel) -> Callable[[bytes, int], bool]:
+        core, kick, log, stream = self.core, self._kick, self._log, channel.stream
+
+        def sink(body: bytes, stamp_ns: int) -> bool:
+            seq = channel.next_seq
+            accepted = core.send(channel, body, stamp_ns, now=time.monotonic())
+            if log is not None:
+                log.offered(stream, seq, body, stamp_ns, accepted=accepted)
+            kick()
+            return accepted
+
+        return sink
+
+    # --- ClientEvents: from the link --------------------------------------------------------------------------------
+
+    def link_up(self, *, resumed: bool) -> None:
+        self.rejected_reason = None
+        _log.info("connected to %s%s", self.core.link.peer, " again" if resumed else "")
+
+    def link_down(self, reason: str) -> None:
+        _log.warning("link down: %s", reason)
+
+    def rejected(self, code: str, text: str) -> None:
+        self.rejected_reason = text
+        _log.error("the relay refuses us (%s): %s", code, text)
+
+    def stream_opened(self, stream: StreamInfo) -> None:
+        local = self.rules.inward(stream.id.topic, namespace=self.namespace)
+        info = replace(stream.info, name=local)
+        try:
+            resolved = self.rules.resolve(info, local_name=local)
+            if not resolved.direction.receives:
+                raise ConfigError(f"{local} is only sent from here (direction: send); not received")
+            publisher = self.endpoint.advertise(info)
+        except ConfigError as error:
+            _log.error("%s from %s is not received: %s", stream.id.topic, stream.id.origin, error)
+            raise
+        lease = stop = None
+        if resolved.lease is not None:
+            stop = ros_types.zero_message(info.type_name, info.encoding)
+            if stop is None:
+                _log.error("%s is %s: on_link_loss cannot stop it; no lease", local, info.type_name)
+            else:
+                lease = CommandLease(resolved.lease.after_s)
+        self._incoming[stream.id] = Incoming(local, publisher, lease, stop)
+        _log.info("receiving %s from %s as %s", stream.id.topic, stream.id.origin, local)
+
+    def stream_closed(self, stream: StreamInfo) -> None:
+        incoming = self._incoming.pop(stream.id, None)
+        self._last_arrival_s.pop(stream.id, None)
+        if incoming is not None:
+            if incoming.lease is not None and incoming.stop is not None and incoming.lease.deadline() is not None:
+                incoming.publisher.publish(incoming.stop, time.time_ns())  # whoever commanded is gone
+            incoming.publisher.close()
+            _log.info("%s from %s has ended", stream.id.topic, stream.id.origin)
+
+    def message(self, stream: StreamInfo, message: Message, *, now: float) -> None:
+        incoming = self._incoming.get(stream.id)
+        if incoming is None:
+            return
+        age_s = now - message.born_s
+        incoming.publisher.publish(message.body, message.stamp_ns)
+        self.ages.observe(stream.spec.priority, age_s)
+        if stream.spec.deadline_s is not None:
+            self._check_deadline(stream, now)
+        if incoming.lease is not None:
+            incoming.lease.renew(born_s=message.born_s)
+            self._arm()
+        if self._log is not None:
+            self._log.delivered(stream, message, age_s)
+
+    def _check_deadline(self, stream: StreamInfo, now: float) -> None:
+        last_s = self._last_arrival_s.get(stream.id)
+        self._last_arrival_s[stream.id] = now
+        deadline_s = stream.spec.deadline_s
+        if last_s is not None and deadline_s is not None and now - last_s > deadline_s:
+            topic = stream.id.topic
+            self.deadlines_missed[topic] = self.deadlines_missed.get(topic, 0) + 1
+            _log.warning("%s: %.3f s between messages, deadline %.3f s", topic, now - last_s, deadline_s)
+
+    def expired(self, stream: StreamInfo, seq: int, reason: DropReason) -> None:
+        if self._log is not None:
+            self._log.expired(stream, seq, reason)
+        _log.warning("%s: reliable message %d was dropped on its way: %s", stream.id.topic, seq, reason)
+
+    def skipped(self, stream: StreamInfo, count: int) -> None:
+        _log.warning("%s: %d reliable messages were given up while we were away", stream.id.topic, count)
+
+    def wanted(self, stream: StreamInfo, wanted: bool) -> None:
+        for local, outgoing in self._outgoing.items():
+            if outgoing.channel.stream.id == stream.id:
+                self.endpoint.interest(local, wanted)
+                break
+
+    def send_dropped(self, stream: StreamInfo, seq: int, reason: DropReason) -> None:
+        if stream.spec.reliable:
+            _log.warning("%s: our reliable message %d was dropped: %s", stream.id.topic, seq, reason)
+
+    def publication_refused(self, stream: StreamInfo, code: str, text: str) -> None:
+        self.refusals += 1
+        _log.error("the relay refuses %s (%s): %s", stream.id.topic, code, text)
+
+    # --- leases -----------------------------------------------------------------------------------------------------
+
+    def _arm(self) -> None:
+        deadlines = [
+            deadline_s
+            for incoming in self._incoming.values()
+            if incoming.lease is not None and (deadline_s := incoming.lease.deadline()) is not None
+        ]
+        self._timer.arm(min(deadlines) if deadlines else None)
+
+    def _leases_due(self) -> None:
+        now = time.monotonic()
+        for incoming in self._incoming.values():
+            lease = incoming.lease
+            if lease is None or incoming.stop is None:
+                continue
+            first = not lease.expired
+            if lease.due(now=now):
+                incoming.publisher.publish(incoming.stop, time.time_ns())
+                if first:
+                    self.leases_fired += 1
+                    _log.warning("%s: no fresh command; publishing the stop command", incoming.local)
+        self._arm()

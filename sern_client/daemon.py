@@ -1,0 +1,259 @@
+"""The client daemon: composition root of endpoint, core, transport, HTTP and logs."""
+
+import asyncio
+import json
+import logging
+import secrets
+import time
+from pathlib import Path
+from random import Random
+from typing import Final
+
+import zmq
+from prometheus_client import CollectorRegistry
+
+from sern_client.bridge import Bridge
+from sern_client.factory import make_endpoint
+from sern_client.message_log import MessageLog
+from sern_client.transport import RelayTransport
+from sern_core.client import ClientCore
+from sern_core.errors import ConfigError
+from sern_core.trace import DecisionTrace
+from sern_core.types import CLASS_LABELS, ObjectKind
+from sern_runtime.config.client import ClientFile, load_client
+from sern_runtime.config.load import Loaded
+from sern_runtime.http import Health, HttpServer
+from sern_runtime.keys import load_public, load_secret
+from sern_runtime.link_metrics import register_links, register_received
+from sern_runtime.loop import Shutdown
+from sern_runtime.metrics import Metrics
+from sern_runtime.sdnotify import Notifier, Watchdog
+from sern_runtime.topics_view import link_summary, received_summary
+
+DRAIN_S: Final = 5.0
+"""How long a stopping client goes on sending what reliable topics still owe."""
+TICK_S: Final = 0.5
+
+_log = logging.getLogger(__name__)
+
+
+async def run_client(path: Path, shutdown: Shutdown) -> int:
+    """Run until asked to stop. Raises ConfigError for what is wrong with the file or the machine."""
+    loaded = load_client(path)
+    for warning in loaded.warnings:
+        _log.warning("%s", warning)
+    daemon = ClientDaemon(loaded)
+    try:
+        await daemon.start()
+        await shutdown.wait()
+        daemon.notifier.stopping("draining")
+        await daemon.drain()
+    finally:
+        await daemon.stop()
+    return 0
+
+
+class ClientDaemon:
+    """`start`, then any time, then `drain` and `stop`; `stop` alone is safe at any point."""
+
+    def __init__(self, loaded: Loaded[ClientFile]) -> None:
+        self.loaded = loaded
+        model = loaded.model
+        self.notifier = Notifier.from_environment()
+        self.message_log = MessageLog(loaded.resolve(model.message_log)) if model.message_log else None
+        self.bridge = Bridge(
+            make_endpoint(loaded),
+            model.rules(),
+            model.discovery.filter(),
+            model.namespace,
+            log=self.message_log,
+            kick=self._kick,
+        )
+        now = time.monotonic()
+        self.core = ClientCore(
+            name=model.name,
+            boot=secrets.randbits(63),
+            events=self.bridge,
+            link=model.link.params(),
+            scheduler=model.scheduler.params(),
+            trace=DecisionTrace(),
+            now=now,
+        )
+        self.bridge.attach(self.core)
+        self.core.subscribe(model.subscribe_patterns(), now=now)
+        self.reason = "not connected yet"
+        self._ctx: zmq.Context[zmq.Socket[bytes]] | None = None
+        self._transport: RelayTransport | None = None
+        self._http: HttpServer | None = None
+        self._tasks: list[asyncio.Task[None]] = []
+        self._endpoint_started = False
+
+    async def start(self) -> None:
+        model = self.loaded.model
+        relay = model.relay
+        keys = load_secret(self.loaded.resolve(relay.secret_key_file)) if relay.secret_key_file else None
+        server_keys: tuple[str, ...] = ()
+        if relay.server_key_file:
+            public = load_public(self.loaded.resolve(relay.server_key_file))
+            server_keys = tuple(key.key for key in public.valid_at(time.time()))
+            if not server_keys:
+                raise ConfigError(
+                    "holds no key that is valid now; ask for the relay's new public key",
+                    file=str(self.loaded.resolve(relay.server_key_file)),
+                )
+        if model.http.listen is not None:
+            self._http = self._make_http(model.http.listen)
+            await self._http.start()
+        self._ctx = zmq.Context()
+        self._transport = RelayTransport(
+            self._ctx,
+            self.core.link,
+            relay.endpoint,
+            keys,
+            server_keys,
+            heartbeat_timeout_s=model.link.heartbeat_timeout_s,
+            random=Random(secrets.randbits(64)),
+            on_reason=self._note_reason,
+        )
+        await self.bridge.endpoint.start(self.bridge)
+        self._endpoint_started = True
+        self._tasks.append(asyncio.create_task(self._tick(), name="client-tick"))
+        self.notifier.ready(f"{model.name} -> {relay.endpoint}")
+        _log.info("client %s started, relay %s", model.name, relay.endpoint)
+
+    def _kick(self) -> None:
+        if self._transport is not None:
+            self._transport.pump.kick()
+
+    def _note_reason(self, reason: str) -> None:
+        self.reason = reason
+        _log.warning("%s: %s", self.loaded.model.relay.endpoint, reason)
+
+    async def _tick(self) -> None:
+        watchdog = Watchdog(self.notifier, {"loop": lambda: int(time.monotonic() * 1e3)})
+        announced = False
+        while True:
+            await asyncio.sleep(TICK_S)
+            if self.message_log is not None:
+                self.message_log.flush()
+            link = self.core.link
+            if link.established and not announced:
+                self._put_node()
+            announced = link.established
+            if watchdog.interval_s is not None:
+                watchdog.check()
+            state = "up" if link.established and not link.lane.stalled else f"down: {self.reason}"
+            self.notifier.status(f"link {state}")
+
+    def _put_node(self) -> None:
+        """Tell the relay's registry who we are."""
+        model = self.loaded.model
+        self.core.put_object(
+            f"node:{model.name}",
+            ObjectKind.NODE,
+            "sern/client",
+            attributes={
+                "namespace": model.namespace,
+                "endpoints": ",".join(section.kind for section in model.endpoints),
+                "topics": str(len(self.core.link.channels)),
+            },
+            wall_ns=time.time_ns(),
+            now=time.monotonic(),
+        )
+        self._kick()
+
+    def _make_http(self, listen: str) -> HttpServer:
+        registry = CollectorRegistry()
+        metrics = Metrics(registry)
+        link = self.core.link
+        register_links(metrics, lambda: [link])
+        register_received(metrics, self.core.received, self.bridge.ages)
+        metrics.counter(
+            "sern_command_lease_expired_total",
+            "Times a command topic went quiet and the stop command was published.",
+            read=lambda: [((), float(self.bridge.leases_fired))],
+        )
+        metrics.counter(
+            "sern_deadline_missed_total",
+            "Gaps between messages longer than the topic's deadline_s.",
+            ("topic",),
+            lambda: [((topic,), float(count)) for topic, count in self.bridge.deadlines_missed.items()],
+        )
+        metrics.counter(
+            "sern_bad_frames_total",
+            "Frames from the relay that were not valid.",
+            read=lambda: [((), float(self._transport.bad_frames if self._transport else 0))],
+        )
+        return HttpServer(
+            listen,
+            registry,
+            health=lambda: Health(ok=True, reason="running"),
+            ready=self._ready,
+            json_routes={
+                "/api/link": lambda: [link.snapshot()],
+                "/api/topics": self.topics,
+                "/api/trace": self.core.trace.to_json,
+            },
+        )
+
+    def _ready(self) -> Health:
+        if self.core.link.established:
+            return Health(ok=True, reason=f"connected to {self.core.link.peer}")
+        return Health(ok=False, reason=self.bridge.rejected_reason or self.reason)
+
+    def topics(self) -> dict[str, object]:
+        """Counters of every topic by global name, sent and received."""
+        now = time.monotonic()
+        return {
+            **link_summary(self.core.link, direction="send"),
+            **received_summary(self.core.received, now=now),
+        }
+
+    async def drain(self) -> None:
+        """Stop the sources, then go on sending for a while what is still owed."""
+        if self._endpoint_started:
+            self._endpoint_started = False
+            await self.bridge.endpoint.stop()
+        deadline_s = time.monotonic() + DRAIN_S
+        link = self.core.link
+        while link.established and not link.lane.stalled and time.monotonic() < deadline_s:
+            waiting = [c for c in link.channels.values() if c.retained or (c.queue and c.wanted)]
+            if not waiting:
+                break
+            self._kick()
+            await asyncio.sleep(0.02)
+        link.close("client stops", now=time.monotonic())
+        if self._transport is not None:
+            self._transport.pump.run()
+            await asyncio.sleep(0.05)  # libzmq's thread takes it from here
+
+    async def stop(self) -> None:
+        for task in self._tasks:
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+        if self._endpoint_started:
+            await self.bridge.endpoint.stop()
+        self.bridge.close()
+        if self._transport is not None:
+            self._transport.close()
+        if self._http is not None:
+            await self._http.stop()
+        if self._ctx is not None:
+            self._ctx.term()
+        if self.message_log is not None:
+            self.message_log.close()
+            if self.message_log.problem:
+                _log.error("%s", self.message_log.problem)
+        self._write_summary()
+        self.notifier.close()
+
+    def _write_summary(self) -> None:
+        name = self.loaded.model.summary
+        if name is None:
+            return
+        content = {"client": self.loaded.model.name, "classes": list(CLASS_LABELS), "topics": self.topics()}
+        path = self.loaded.resolve(name)
+        try:
+            path.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+        except OSError as error:
+            _log.error("%s: the summary could not be written: %s", path, error.strerror)

@@ -1,0 +1,59 @@
+"""Makes endpoints from the sections of a client file."""
+
+from collections.abc import Callable
+from dataclasses import fields
+from pathlib import Path
+
+from sern_client.endpoints.bag import BagEndpoint, BagOptions
+from sern_client.endpoints.base import Endpoint
+from sern_client.endpoints.composite import CompositeEndpoint
+from sern_client.endpoints.record import RecordEndpoint, RecordOptions
+from sern_client.endpoints.synthetic import SyntheticEndpoint, SyntheticOptions
+from sern_core.errors import UsageError
+from sern_runtime.config import endpoints as sections
+from sern_runtime.config.client import ClientFile
+from sern_runtime.config.load import Loaded
+
+Resolve = Callable[[str], Path]
+
+
+def make_endpoint(loaded: Loaded[ClientFile]) -> Endpoint:
+    """The endpoint of a client: the one its file names, or several as one. Raises ConfigError."""
+    made = [_make(section, loaded.resolve) for section in loaded.model.endpoints]
+    return made[0] if len(made) == 1 else CompositeEndpoint(made)
+
+
+def _make(section: sections.EndpointSection, resolve: Resolve) -> Endpoint:
+    match section:
+        case sections.BagEndpoint():
+            return BagEndpoint(
+                BagOptions(
+                    path=resolve(section.path),
+                    rate=section.rate,
+                    loop=section.loop,
+                    namespaces=section.namespaces,
+                    topics=section.topics,
+                    start_delay_s=section.start_delay_s,
+                    wait_for=section.wait_for,
+                    on_refused=section.on_refused,
+                    stamps=section.stamps,
+                )
+            )
+        case sections.RecordEndpoint():
+            return RecordEndpoint(
+                RecordOptions(
+                    path=resolve(section.path),
+                    overwrite=section.overwrite,
+                    max_buffer_bytes=section.max_buffer_bytes,
+                )
+            )
+        case sections.SyntheticEndpoint():
+            return SyntheticEndpoint(_synthetic(section, resolve))
+    raise UsageError(f"no endpoint for a section of type {type(section).__name__}")
+
+
+def _synthetic(section: sections.SyntheticEndpoint, resolve: Resolve) -> SyntheticOptions:
+    # Section and options have the same fields on purpose; a test keeps them so.
+    names = [item.name for item in fields(SyntheticOptions) if item.name != "cloud_files"]
+    values = {name: getattr(section, name) for name in names}
+    return SyntheticOptions(cloud_files=tuple(resolve(path) for path in section.cloud_files), **values)

@@ -1,0 +1,299 @@
+"""The relay daemon: composition root of hub, lane, access control, feed, HTTP and logs."""
+
+import asyncio
+import json
+import logging
+import secrets
+import time
+from pathlib import Path
+from typing import Final
+
+import zmq
+from prometheus_client import CollectorRegistry
+
+from sern_core.access import AccessTable
+from sern_core.errors import ConfigError
+from sern_core.hub import Hub, HubParams
+from sern_core.message import Message, StreamInfo
+from sern_core.types import ClientName
+from sern_relay.feed import RelayFeed
+from sern_relay.server import RelayServer
+from sern_runtime.config.load import Loaded
+from sern_runtime.config.relay import RelayFile, load_relay
+from sern_runtime.http import Health, HttpServer
+from sern_runtime.keys import KeyDirectory, KeyStatus, load_secret
+from sern_runtime.link_metrics import AgeHistograms, register_links, register_received
+from sern_runtime.loop import Shutdown
+from sern_runtime.metrics import Metrics
+from sern_runtime.sdnotify import Notifier, Watchdog
+from sern_runtime.topics_view import link_summary, received_summary
+from sern_runtime.zap import TemporaryRefusal, ZapHandler, self_test
+
+ZAP_DOMAIN: Final = "sern"
+DRAIN_S: Final = 10.0
+"""How long a stopping relay goes on sending what it holds for clients that are connected."""
+SWEEP_S: Final = 1.0
+
+_log = logging.getLogger(__name__)
+
+
+async def run_relay(path: Path, shutdown: Shutdown) -> int:
+    """Run until asked to stop. Raises ConfigError for what is wrong with the file or the machine."""
+    loaded = load_relay(path)
+    for warning in loaded.warnings:
+        _log.warning("%s", warning)
+    daemon = RelayDaemon(loaded)
+    shutdown.on_reload = daemon.reload
+    try:
+        await daemon.start()
+        await shutdown.wait()
+        daemon.notifier.stopping("draining")
+        await daemon.drain()
+    finally:
+        await daemon.stop()
+    return 0
+
+
+class RelayDaemon:
+    """`start`, then any time, then `drain` and `stop`; `stop` alone is safe at any point. It is the hub's shell."""
+
+    def __init__(self, loaded: Loaded[RelayFile]) -> None:
+        self.loaded = loaded
+        model = loaded.model
+        self.notifier = Notifier.from_environment()
+        self.directory = self._directory(loaded)
+        self.ages = AgeHistograms()
+        self.refusals: dict[str, int] = {}
+        self.reloads_failed = 0
+        self.hub = Hub(
+            name=model.name,
+            boot=secrets.randbits(63),
+            access=AccessTable(model.access_rules()),
+            known=self._known,
+            events=self,
+            link=model.link.params(),
+            scheduler=model.scheduler.params(),
+            params=HubParams(cache_bytes=model.replay.cache_bytes, resume_s=model.replay.resume_s),
+            wall_ns=lambda _now: time.time_ns(),
+            now=time.monotonic(),
+        )
+        self.zap: ZapHandler | None = None
+        self.server: RelayServer | None = None
+        self.feed: RelayFeed | None = None
+        self._ctx: zmq.Context[zmq.Socket[bytes]] | None = None
+        self._http: HttpServer | None = None
+        self._tasks: list[asyncio.Task[None]] = []
+        self._ready = False
+        self._flush_due: asyncio.Handle | None = None
+
+    @staticmethod
+    def _directory(loaded: Loaded[RelayFile]) -> KeyDirectory | None:
+        clients_dir = loaded.model.relay.clients_dir
+        return None if clients_dir is None else KeyDirectory(loaded.resolve(clients_dir))
+
+    def _known(self, client: ClientName) -> bool:
+        return self.directory is None or client in self.directory.names
+
+    async def start(self) -> None:
+        model = self.loaded.model
+        relay = model.relay
+        keys = load_secret(self.loaded.resolve(relay.secret_key_file)) if relay.secret_key_file else None
+        if model.http.listen is not None:
+            self._http = self._make_http(model.http.listen)
+            await self._http.start()
+        self._ctx = zmq.Context()
+        if keys is not None:
+            self.zap = ZapHandler(self._ctx)
+            self.zap.add_domain(ZAP_DOMAIN, self._lookup)
+        self.server = RelayServer(
+            self._ctx,
+            self.hub,
+            relay.listen,
+            keys,
+            ZAP_DOMAIN,
+            heartbeat_timeout_s=model.link.heartbeat_timeout_s,
+            handshake_interval_s=relay.handshake_interval_s,
+            max_connections=relay.max_connections,
+            after=self._after,
+        )
+        if keys is not None and self.zap is not None:
+            await self_test(self._ctx, self.zap, relay.listen, keys.public_key)
+            _log.info("self-test passed: a stranger's key is refused on %s", ", ".join(relay.listen))
+        else:
+            _log.warning("insecure: true: clients are not authenticated and nothing is encrypted")
+        if model.feed.roles:
+            self.feed = RelayFeed(self._ctx, self.hub, model.feed_roles(), after=self._after)
+        self._tasks.append(asyncio.create_task(self._tick(), name="relay-tick"))
+        self._ready = True
+        self.notifier.ready(f"{model.name} on {', '.join(relay.listen)}")
+        _log.info("relay %s listens on %s", model.name, ", ".join(relay.listen))
+
+    def _lookup(self, public_key: str, address: str) -> str | TemporaryRefusal | None:
+        assert self.directory is not None
+        match = self.directory.lookup(public_key, at_s=time.time())
+        if match.status is KeyStatus.VALID:
+            return match.name
+        if match.status is KeyStatus.NOT_YET:
+            return TemporaryRefusal(f"the key of {match.name} is not valid yet")
+        _log.warning(
+            "%s refused: %s", address, "unknown key" if match.name is None else f"the key of {match.name} has expired"
+        )
+        return None
+
+    def _after(self) -> None:
+        """Something came in: before the loop comes round again, whoever has something to send sends it."""
+        if self._flush_due is None:
+            self._flush_due = asyncio.get_running_loop().call_soon(self._flush)
+
+    def _flush(self) -> None:
+        self._flush_due = None
+        if self.server is not None:
+            self.server.flush()
+
+    async def _tick(self) -> None:
+        progress = {"socket": lambda: self.server.socket.drains if self.server else 0}
+        if self.zap is not None:
+            progress["zap"] = lambda: self.zap.counters.pings if self.zap else 0
+        watchdog = Watchdog(self.notifier, progress)
+        while True:
+            await asyncio.sleep(SWEEP_S)
+            self.hub.sweep(now=time.monotonic())
+            self._flush()
+            if self.zap is not None:
+                self.zap.ping()
+            if watchdog.interval_s is not None:
+                watchdog.check()
+            up = sum(link.established for link in self.hub.links.values())
+            self.notifier.status(f"{up} clients, {len(self.hub.relayed)} streams")
+
+    def reload(self) -> None:
+        """SIGHUP: read keys and access rules anew; all or nothing. What was revoked ends now."""
+        self.notifier.reloading()
+        try:
+            loaded = load_relay(self.loaded.path)
+            directory = self._directory(loaded)
+            access = AccessTable(loaded.model.access_rules())
+        except ConfigError as error:
+            self.reloads_failed += 1
+            _log.error("reload failed, the old configuration stays: %s", error)
+            self.notifier.ready(f"reload failed: {error}")
+            return
+        before = set(self.directory.names) if self.directory is not None else set()
+        self.directory = directory
+        now = time.monotonic()
+        self.hub.revoke(access, now=now)
+        for client in sorted(before - set(directory.names if directory is not None else ())):
+            if self.server is not None:
+                _log.warning("%s is revoked; %d connections cut", client, self.server.cut_client(client))
+        self._after()
+        self.notifier.ready("reloaded")
+        _log.info("reloaded keys and access rules; other changes need a restart")
+
+    def _make_http(self, listen: str) -> HttpServer:
+        registry = CollectorRegistry()
+        metrics = Metrics(registry)
+        register_links(metrics, lambda: list(self.hub.links.values()))
+        register_received(metrics, self.hub.received, self.ages)
+        metrics.gauge("sern_relay_clients", "Clients with a session.",
+                      read=lambda: [((), float(sum(link.established for link in self.hub.links.values())))])  # fmt: skip
+        metrics.gauge("sern_relay_streams", "Streams announced by clients.",
+                      read=lambda: [((), float(len(self.hub.relayed)))])  # fmt: skip
+        metrics.gauge("sern_relay_objects", "Cross-reality objects in the registry.",
+                      read=lambda: [((), float(len(self.hub.objects)))])  # fmt: skip
+        metrics.counter("sern_relay_refusals_total", "Announcements, subscriptions and objects refused, by code.",
+                        ("code",), lambda: [((code,), float(n)) for code, n in self.refusals.items()])  # fmt: skip
+        metrics.counter("sern_bad_frames_total", "Frames that were not valid; their connections were closed.",
+                        read=lambda: [((), float(self.server.bad_frames if self.server else 0))])  # fmt: skip
+        metrics.counter("sern_relay_auth_total", "Answers of the ZAP handler.", ("result",), self._auth)
+        metrics.counter("sern_relay_reload_failures_total", "Reloads that kept the old configuration.",
+                        read=lambda: [((), float(self.reloads_failed))])  # fmt: skip
+        return HttpServer(
+            listen,
+            registry,
+            health=lambda: Health(ok=True, reason="running"),
+            ready=lambda: Health(ok=self._ready, reason="listening" if self._ready else "starting"),
+            json_routes={
+                "/api/link": lambda: [link.snapshot() for link in self.hub.links.values()],
+                "/api/objects": self.hub.objects.to_json,
+                "/api/topics": self.topics,
+            },
+        )
+
+    def _auth(self) -> list[tuple[tuple[str, ...], float]]:
+        names = ("admitted", "unknown_key", "not_now", "capped", "failed", "malformed")
+        return [((name,), float(getattr(self.zap.counters, name)) if self.zap else 0.0) for name in names]
+
+    def topics(self) -> dict[str, object]:
+        """Counters by client link and topic, and of what arrived."""
+        now = time.monotonic()
+        return {
+            "links": {name: link_summary(link, direction="send") for name, link in self.hub.links.items()},
+            "received": received_summary(self.hub.received, now=now),
+        }
+
+    async def drain(self) -> None:
+        """Go on for a while with what connected clients are owed, then end their sessions."""
+        deadline_s = time.monotonic() + DRAIN_S
+        while time.monotonic() < deadline_s:
+            links = [link for link in self.hub.links.values() if link.established and not link.lane.stalled]
+            if not any(channel.retained for link in links for channel in link.channels.values()):
+                break
+            await asyncio.sleep(0.02)
+        for link in self.hub.links.values():
+            link.close("relay stops", now=time.monotonic())
+        if self.server is not None:
+            self.server.run_all()
+            await asyncio.sleep(0.05)  # libzmq's thread takes it from here
+
+    async def stop(self) -> None:
+        self._ready = False
+        for task in self._tasks:
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+        if self._flush_due is not None:
+            self._flush_due.cancel()
+        if self._http is not None:
+            await self._http.stop()
+        if self.feed is not None:
+            self.feed.close()
+        if self.server is not None:
+            self.server.close()
+        if self.zap is not None:
+            self.zap.close()
+        if self._ctx is not None:
+            self._ctx.term()
+        self._write_summary()
+        self.notifier.close()
+
+    def _write_summary(self) -> None:
+        name = self.loaded.model.summary
+        if name is None:
+            return
+        path = self.loaded.resolve(name)
+        try:
+            path.write_text(json.dumps({"relay": self.loaded.model.name, **self.topics()}, indent=1) + "\n")
+        except OSError as error:
+            _log.error("%s: the summary could not be written: %s", path, error.strerror)
+
+    # --- HubEvents ----------------------------------------------------------------------------------------------------
+
+    def client_up(self, client: ClientName, *, resumed: bool) -> None:
+        _log.info("%s connected%s", client, " again" if resumed else "")
+
+    def client_down(self, client: ClientName, reason: str) -> None:
+        _log.info("%s is away: %s", client, reason)
+
+    def stream_added(self, stream: StreamInfo) -> None:
+        _log.info("%s announces %s (%s)", stream.id.origin, stream.id.topic, stream.info.type_name)
+
+    def stream_removed(self, stream: StreamInfo) -> None:
+        _log.info("%s of %s has ended", stream.id.topic, stream.id.origin)
+
+    def message(self, stream: StreamInfo, message: Message, *, now: float) -> None:
+        self.ages.observe(stream.spec.priority, now - message.born_s)
+        if self.feed is not None:
+            self.feed.publish(stream, message, now=now)
+
+    def refused(self, client: ClientName, code: str, text: str) -> None:
+        self.refusals[code] = self.refusals.get(code, 0) + 1
+        _log.warning("%s: %s", client, text)

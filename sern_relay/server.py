@@ -1,0 +1,167 @@
+"""The relay's lane: one ROUTER for all clients, one port of the hub for each connection."""
+
+import logging
+import time
+from collections.abc import Callable
+from typing import Final
+
+import zmq
+
+from sern_core import wire
+from sern_core.errors import WireError
+from sern_core.hub import Hub, HubPort
+from sern_core.rules import client_name
+from sern_runtime.monitor import ConnectionTable
+from sern_runtime.pump import Pump
+from sern_runtime.zmq_socket import CurvePair, RouterSocket, SendResult, make_server
+
+CONGESTION_CONTROL: Final = "cubic"
+"""See sern_client.transport: BBR's probing shows in class 0."""
+
+_log = logging.getLogger(__name__)
+
+
+class Session:
+    """One connection: its port of the hub and the pump that serves it."""
+
+    __slots__ = ("connection", "fd", "port", "pump")
+
+    def __init__(self, port: HubPort, pump: Pump, fd: int, connection: object) -> None:
+        self.port = port
+        self.pump = pump
+        self.fd = fd
+        self.connection = connection
+
+
+class RelayServer:
+    """Binds the listeners and joins them to `hub`. `insecure`: clients are who their HELLO says they are."""
+
+    def __init__(
+        self,
+        ctx: "zmq.Context[zmq.Socket[bytes]]",
+        hub: Hub,
+        listen: tuple[str, ...],
+        keys: CurvePair | None,
+        zap_domain: str,
+        *,
+        heartbeat_timeout_s: float,
+        handshake_interval_s: float,
+        max_connections: int,
+        after: Callable[[], None],
+    ) -> None:
+        self.hub = hub
+        self.bad_frames = 0
+        self.strangers = 0
+        self._insecure = keys is None
+        self._after = after
+        self._sessions: dict[bytes, Session] = {}
+        raw = make_server(
+            ctx,
+            listen,
+            keys,
+            zap_domain,
+            heartbeat_timeout_ms=int(heartbeat_timeout_s * 1000),
+            handshake_ivl_ms=int(handshake_interval_s * 1000),
+        )
+        self.connections = ConnectionTable(raw, max_connections=max_connections, on_change=self._connections_changed)
+        self.socket = RouterSocket(raw, self._received, on_writable=self._writable)
+
+    def close(self) -> None:
+        for session in self._sessions.values():
+            session.pump.close()
+        self._sessions.clear()
+        self.connections.close()
+        self.socket.close()
+
+    def _received(self, routing_id: bytes, user: str, data: bytes) -> None:
+        session = self._sessions.get(routing_id)
+        if session is None:
+            session = self._accept(routing_id, user, data)
+            if session is None:
+                return
+        elif not self._insecure and user != session.port.client:
+            self._cut(routing_id, session, f"its identity changed to {user!r}")
+            return
+        try:
+            session.port.receive(data, now=time.monotonic())
+        except WireError as error:
+            self.bad_frames += 1
+            self._cut(routing_id, session, f"bad frame: {error}")
+            return
+        self._after()
+
+    def _accept(self, routing_id: bytes, user: str, data: bytes) -> Session | None:
+        """A connection speaks for the first time: find out whose it is."""
+        details = self.socket.peer_details()
+        try:
+            name = client_name(user or self._claimed(data))
+        except (WireError, ValueError) as error:
+            self.bad_frames += 1
+            _log.warning("%s: closed: %s", details.address, error)
+            self._cut_fd(details.fd)
+            return None
+        self.connections.bind_user(details.fd, name)
+        connection = self.connections.by_fd(details.fd)
+        handle = connection.handle if connection is not None else None
+        if handle is not None:
+            handle.set_congestion(CONGESTION_CONTROL)
+            handle.set_rto_max()
+        port = HubPort(self.hub, name)
+
+        def send(datagram: bytes) -> SendResult:
+            return self.socket.send_to(routing_id, datagram)
+
+        pump = Pump(port, send, on_gone=lambda: self._gone(routing_id))
+        session = self._sessions[routing_id] = Session(port, pump, details.fd, connection)
+        return session
+
+    @staticmethod
+    def _claimed(data: bytes) -> str:
+        """Without keys the first datagram must be a HELLO, and its name is believed."""
+        header = wire.decode_header(data)
+        if header.kind != wire.Kind.HELLO:
+            raise WireError("the first datagram of a connection must be HELLO")
+        return wire.take_str(wire.decode_handshake(data), "name", max_length=64)
+
+    def flush(self) -> None:
+        """Let every port that has something to say say it."""
+        for session in self._sessions.values():
+            if session.port.dirty:
+                session.pump.kick()
+
+    def run_all(self) -> None:
+        for session in list(self._sessions.values()):
+            session.pump.run()
+
+    def _writable(self) -> None:
+        for session in self._sessions.values():
+            session.pump.kick()
+
+    def cut_client(self, client: str) -> int:
+        """End every connection of a client at once; returns how many there were."""
+        for routing_id, session in list(self._sessions.items()):
+            if session.port.client == client:
+                self._gone(routing_id)
+        return self.connections.cut_user(client)
+
+    def _cut(self, routing_id: bytes, session: Session, why: str) -> None:
+        _log.warning("connection of %s closed: %s", session.port.client, why)
+        self._gone(routing_id)
+        self._cut_fd(session.fd)
+
+    def _cut_fd(self, fd: int) -> None:
+        connection = self.connections.by_fd(fd)
+        if connection is not None and connection.handle is not None:
+            connection.handle.cut()
+
+    def _gone(self, routing_id: bytes) -> None:
+        session = self._sessions.pop(routing_id, None)
+        if session is not None:
+            session.pump.close()
+            session.port.disconnected(now=time.monotonic())
+            self._after()
+
+    def _connections_changed(self) -> None:
+        for routing_id, session in list(self._sessions.items()):
+            if self.connections.by_fd(session.fd) is not session.connection:
+                self._gone(routing_id)

@@ -1,0 +1,51 @@
+"""Counters of topics as JSON: for /api/topics, the summaries written at exit, and the tools that read them."""
+
+from sern_core.ledger import ReceiveLedger
+from sern_core.link import Link
+from sern_core.types import CLASS_LABELS
+
+
+def link_summary(link: Link, *, direction: str) -> dict[str, dict[str, object]]:
+    """What was offered to a link and what became of it: offered = delivered + dropped + in_queue + in_flight."""
+    held: dict[str, list[int]] = {}
+    wanted: dict[str, bool] = {}
+    for channel in link.channels.values():
+        cell = held.setdefault(channel.stream.id.topic, [0, 0])
+        queued, _queued_bytes, flying, _flying_bytes = channel.held()
+        cell[0] += queued
+        cell[1] += flying
+        wanted[channel.stream.id.topic] = bool(channel.wanted)
+    result: dict[str, dict[str, object]] = {}
+    for topic, counters in link.ledger.topics.items():
+        in_queue, in_flight = held.get(topic, (0, 0))
+        result[topic] = {
+            "class": CLASS_LABELS[counters.priority],
+            "direction": direction,
+            "wanted": wanted.get(topic, False),
+            "offered": counters.offered,
+            "sent": counters.offered - counters.dropped - in_queue,
+            "delivered": counters.delivered,
+            "dropped": {str(reason): n for reason, n in counters.by_reason.items() if n and reason != "refused"},
+            "refused": counters.refused,
+            "in_queue": in_queue,
+            "in_flight": in_flight,
+            "bytes_offered": counters.offered_bytes,
+            "bytes_delivered": counters.delivered_bytes,
+        }
+    return result
+
+
+def received_summary(received: ReceiveLedger, *, now: float) -> dict[str, dict[str, object]]:
+    """What arrived, by topic, and how old the freshest sample of each is."""
+    return {
+        counters.topic: {
+            "class": CLASS_LABELS[counters.priority],
+            "direction": "receive",
+            "delivered": counters.delivered,
+            "bytes_delivered": counters.delivered_bytes,
+            "dropped": {str(reason): n for reason, n in counters.by_reason.items() if n},
+            "age_s": counters.age_of_information_s(now),
+            "last_age_s": counters.age_s,
+        }
+        for counters in received.topics.values()
+    }
