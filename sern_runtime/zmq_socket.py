@@ -68,7 +68,8 @@ _SNDMORE: Final = int(zmq.SNDMORE)
 _NOBLOCK_MORE: Final = _NOBLOCK | _SNDMORE
 
 
-RawSend = Callable[["bytes | zmq.Frame", int, bool], object]
+class RawSend(Protocol):
+    def __call__(self, data: "bytes | zmq.Frame", flags: int, copy: bool = True, /) -> object: ...
 
 
 class SendResult(Enum):

@@ -1,0 +1,447 @@
+"""The feed: plain XPUB/XSUB sockets for programs without SERN code, in any language that has ZeroMQ.
+
+A message is three frames:
+
+    +----------------------------+----------------------+----------------+
+    | topic name (UTF-8) and NUL | header, 24 bytes     | body, raw      |
+    +----------------------------+----------------------+----------------+
+
+     0       1       2               4                               8
+    +-------+-------+---------------+-------------------------------+
+    |version| class |   0 (zero)    |       sequence (low 32)       |
+    +-------+-------+---------------+-------------------------------+
+    |                  stamp, ns of Unix time, signed               |
+    +---------------------------------------------------------------+
+    |                  age when sent, µs, unsigned                  |
+    +---------------------------------------------------------------+    big endian
+
+The NUL ends the name: a subscription to `/r/odom` also matches `/r/odom_filtered`, one to `/r/odom\\0` does not. A
+publisher may leave the header frame empty: class bulk, sequence 0, stamped on arrival.
+
+There is one pair of sockets for each role, filtered before sending: on a shared XPUB a grant per topic could not be
+kept apart. A role is what its address gives; publishing is off unless the role has an ingest endpoint.
+"""
+
+import logging
+import struct
+import time
+from collections import deque
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+import zmq
+
+from sern_core.rules import FeedRole
+from sern_core.types import CLASSES, PriorityClass, TopicName
+from sern_runtime.zmq_socket import (
+    BACKLOG,
+    ZERO_COPY_BYTES,
+    CurvePair,
+    DrainedSocket,
+    FrameSocket,
+    apply_common_options,
+    bind_all,
+    serve_curve,
+)
+
+VERSION: Final = 1
+HEADER: Final = struct.Struct("!BBHIqQ")
+MAX_TOPIC_BYTES: Final = 512
+MAX_FRAMES: Final = 8
+MAX_MESSAGE_BYTES: Final = 16 * 2**20
+"""A frame above this closes its connection. The local network carries maps and images whole."""
+HIGH_WATER: Final = 1000
+"""Messages that may wait for a slow subscriber; libzmq drops what comes after them, for that subscriber alone."""
+MAX_PREFIXES: Final = 4096
+"""Distinct subscriptions of a role that are looked at; more are served, but no longer tracked one by one."""
+_MAX_VERDICTS: Final = 4096
+_NOBLOCK: Final = int(zmq.NOBLOCK)
+_NOBLOCK_MORE: Final = int(zmq.NOBLOCK | zmq.SNDMORE)
+_log = logging.getLogger(__name__)
+
+
+class FeedHeader(NamedTuple):
+    """The second frame. `seq` modulo 2³²; `stamp_ns` Unix time; `age_us` is the message's age when it was sent."""
+
+    priority: PriorityClass
+    seq: int
+    stamp_ns: int
+    age_us: int = 0
+
+    def pack(self) -> bytes:
+        return HEADER.pack(VERSION, self.priority, 0, self.seq & 0xFFFFFFFF, self.stamp_ns, self.age_us)
+
+    @classmethod
+    def parse(cls, raw: bytes) -> "FeedHeader | None":
+        """None for anything but a header of this version."""
+        if len(raw) != HEADER.size:
+            return None
+        version, priority, reserved, seq, stamp_ns, age_us = HEADER.unpack(raw)
+        if version != VERSION or reserved or priority >= len(CLASSES):
+            return None
+        return cls(PriorityClass(priority), seq, stamp_ns, age_us)
+
+
+def topic_frame(name: str) -> bytes:
+    """The first frame for a topic name."""
+    return name.encode() + b"\0"
+
+
+def parse_topic(frame: bytes) -> TopicName | None:
+    """The name in a first frame, None when it is none: NUL at its end alone, a slash first, printable UTF-8."""
+    if not 3 <= len(frame) <= MAX_TOPIC_BYTES or frame[0] != 0x2F or frame.find(b"\0") != len(frame) - 1:
+        return None
+    try:
+        name = frame[:-1].decode()
+    except UnicodeDecodeError:
+        return None
+    return TopicName(name) if name.isprintable() else None
+
+
+@dataclass(slots=True)
+class FeedCounters:
+    """What went through a role, from start on."""
+
+    sent: int = 0  # messages handed to the role's XPUB while somebody wanted them
+    received: int = 0  # messages that came in through the role and were accepted
+    received_bytes: int = 0
+    forbidden: int = 0  # the role may not publish that topic, or not in that class
+    malformed: int = 0
+
+
+Accept = Callable[[FeedRole, TopicName], bool]
+"""`accept(role, name)`: may this role own or write the name now? Asked once a topic; `Feed.refresh` forgets answers."""
+
+OnPublish = Callable[[FeedRole, TopicName, FeedHeader, bytes], None]
+"""`on_publish(role, name, header, body)`: a message came in. The feed's own subscribers have got it already."""
+
+
+class Feed:
+    """The feed of a relay: one XPUB, and where configured one XSUB, for each role.
+
+    `on_publish` None: what comes in goes to the feed's own subscribers only. `on_interest` is called after the set
+    of wanted prefixes has changed. `keys` makes the sockets CURVE servers in the ZAP domain `feed.NAME`; without
+    keys the role's addresses are the only guard, which the configuration has to allow. Raises ConfigError when an
+    endpoint cannot be had. `close()` once.
+    """
+
+    def __init__(
+        self,
+        ctx: "zmq.Context[zmq.Socket[bytes]]",
+        roles: Iterable[FeedRole],
+        *,
+        on_publish: OnPublish | None = None,
+        on_interest: Callable[[], None] | None = None,
+        accept: Accept | None = None,
+        keys: CurvePair | None = None,
+        max_message_bytes: int = MAX_MESSAGE_BYTES,
+        wall_ns: Callable[[], int] = time.time_ns,
+    ) -> None:
+        self.on_publish = on_publish
+        self.on_interest = on_interest
+        self.accept = accept
+        self.wall_ns = wall_ns
+        self._ctx = ctx
+        self._keys = keys
+        self._max_message_bytes = max_message_bytes
+        self._outlets: dict[str, _Outlet] = {}
+        self._inlets: dict[str, _Inlet] = {}
+        try:
+            self.update(roles)
+        except BaseException:
+            self.close()
+            raise
+
+    def update(self, roles: Iterable[FeedRole]) -> None:
+        """Make these the roles. Sockets whose address stays are kept with their subscriptions, and filter by the new
+        patterns from now on; others are closed, which cuts their connections. Raises ConfigError when an endpoint
+        cannot be had: the roles before it in order are in force then."""
+        wanted = {role.name: role for role in roles}
+        for name, outlet in list(self._outlets.items()):
+            new = wanted.get(name)
+            if new is None or new.publish_endpoint != outlet.role.publish_endpoint:
+                self._outlets.pop(name).close()
+        for name, inlet in list(self._inlets.items()):
+            new = wanted.get(name)
+            if new is None or new.ingest_endpoint != inlet.role.ingest_endpoint:
+                self._inlets.pop(name).close()
+        for name, role in wanted.items():
+            if name in self._outlets:
+                self._outlets[name].role = role
+            else:
+                self._outlets[name] = _Outlet(self, role, self._bound(zmq.XPUB, role, role.publish_endpoint))
+            if name in self._inlets:
+                self._inlets[name].role = role
+            elif role.ingest_endpoint is not None:
+                self._inlets[name] = _Inlet(self, role, self._bound(zmq.XSUB, role, role.ingest_endpoint))
+        for outlet in self._outlets.values():
+            outlet.forget()
+
+    def close(self) -> None:
+        for inlet in self._inlets.values():
+            inlet.close()
+        for outlet in self._outlets.values():
+            outlet.close()
+
+    def publish(self, name: TopicName, header: FeedHeader, body: bytes) -> int:
+        """Send a message to the subscribers of every role that may see it; returns how many roles wanted it."""
+        frame = topic_frame(name)
+        packed = b""
+        count = 0
+        for outlet in self._outlets.values():
+            if outlet.wants(frame, name):
+                packed = packed or header.pack()
+                outlet.send_message(frame, packed, body)
+                count += 1
+        return count
+
+    def wants(self, name: TopicName) -> bool:
+        """Is there a subscriber for this topic in a role that may see it?"""
+        frame = topic_frame(name)
+        return any(outlet.wants(frame, name) for outlet in self._outlets.values())
+
+    def prefixes(self) -> dict[str, tuple[bytes, ...]]:
+        """The subscriptions by role, as they came in: prefixes of the topic frame, the empty one meaning all."""
+        return {name: tuple(sorted(outlet.prefixes)) for name, outlet in self._outlets.items()}
+
+    def counters(self) -> dict[str, FeedCounters]:
+        """By role name."""
+        return {name: outlet.counters for name, outlet in self._outlets.items()}
+
+    def endpoints(self) -> dict[str, tuple[str, str | None]]:
+        """By role name: where subscribers and publishers connect, as bound."""
+        return {
+            name: (outlet.endpoint, self._inlets[name].endpoint if name in self._inlets else None)
+            for name, outlet in self._outlets.items()
+        }
+
+    @property
+    def outlets(self) -> "Iterable[_Outlet]":
+        return self._outlets.values()
+
+    def refresh(self) -> None:
+        """Ask `accept` again for every topic: ownership of names has changed."""
+        for inlet in self._inlets.values():
+            inlet.verdicts.clear()
+
+    def _bound(self, kind: int, role: FeedRole, endpoint: str) -> "zmq.Socket[bytes]":
+        socket = self._ctx.socket(kind)
+        try:
+            apply_common_options(
+                socket, max_message_bytes=self._max_message_bytes, sndhwm=HIGH_WATER, rcvhwm=HIGH_WATER
+            )
+            socket.setsockopt(zmq.HEARTBEAT_IVL, 0)  # not every implementation answers ZMTP pings; TCP looks instead
+            socket.setsockopt(zmq.TCP_KEEPALIVE, 1)
+            socket.setsockopt(zmq.BACKLOG, BACKLOG)
+            serve_curve(socket, self._keys, f"feed.{role.name}")
+            bind_all(socket, [endpoint])
+        except BaseException:
+            socket.close(linger=0)
+            raise
+        return socket
+
+    def interest_changed(self) -> None:
+        """A subscription came or went."""
+        self.refresh()
+        if self.on_interest is not None:
+            self.on_interest()
+
+
+class _Outlet(FrameSocket):
+    """The XPUB of a role: takes subscriptions, sends what the role may see."""
+
+    def __init__(self, feed: Feed, role: FeedRole, socket: "zmq.Socket[bytes]") -> None:
+        super().__init__(socket, self._on_subscription)
+        self.role = role
+        self.endpoint = socket.getsockopt_string(zmq.LAST_ENDPOINT)
+        self.counters = FeedCounters()
+        self.prefixes: set[bytes] = set()
+        self._feed = feed
+        self._untracked = 0
+        self._wanted: dict[bytes, bool] = {}
+
+    def wants(self, frame: bytes, name: TopicName) -> bool:
+        wanted = self._wanted.get(frame)
+        if wanted is None:
+            matched = self._untracked > 0 or any(frame.startswith(prefix) for prefix in self.prefixes)
+            wanted = matched and self.role.may_see(name)
+            if len(self._wanted) >= _MAX_VERDICTS:
+                self._wanted.clear()
+            self._wanted[frame] = wanted
+        return wanted
+
+    def send_message(self, frame: bytes, header: bytes, body: bytes) -> None:
+        """XPUB never blocks: what a slow subscriber cannot take is dropped for it alone."""
+        send = self.raw_send
+        send(frame, _NOBLOCK_MORE)
+        send(header, _NOBLOCK_MORE)
+        send(body, _NOBLOCK, len(body) < ZERO_COPY_BYTES)
+        self.counters.sent += 1
+        self.kick()
+
+    def _on_subscription(self, frames: list[zmq.Frame]) -> None:
+        if len(frames) != 1:
+            return
+        message = frames[0].bytes
+        if message[:1] == b"\1":
+            self._subscribed(message[1:])
+        elif message[:1] == b"\0":
+            self._unsubscribed(message[1:])
+
+    def _subscribed(self, prefix: bytes) -> None:
+        if len(self.prefixes) < MAX_PREFIXES:
+            self.prefixes.add(prefix)  # XPUB reports the first subscriber of a prefix and the end of the last
+        else:
+            self._untracked += 1
+        self._changed()
+
+    def _unsubscribed(self, prefix: bytes) -> None:
+        if prefix in self.prefixes:
+            self.prefixes.remove(prefix)
+        else:
+            self._untracked -= 1
+        self._changed()
+
+    def _changed(self) -> None:
+        self._wanted.clear()
+        self._feed.interest_changed()
+
+    def forget(self) -> None:
+        """Judge every topic anew: the role has changed."""
+        self._wanted.clear()
+        self._feed.refresh()
+
+
+class _Inlet(DrainedSocket):
+    """The XSUB of a role: takes messages in, hands them to the role outlets and to the relay.
+
+    Framing: `more` is read from the last frame of three alone, as it costs a third of the whole (a Frame object for
+    each). Short messages therefore run together, until a frame at a third place has more behind it: then the last
+    three frames up to the boundary are the message. So a well-formed message is never lost to a malformed one before
+    it, and what malformed ones make together is checked like any other: their senders could have sent just that.
+    """
+
+    def __init__(self, feed: Feed, role: FeedRole, socket: "zmq.Socket[bytes]") -> None:
+        super().__init__(socket)
+        self.role = role
+        self.endpoint = socket.getsockopt_string(zmq.LAST_ENDPOINT)
+        self.verdicts: dict[bytes, _Verdict] = {}
+        self.counters = feed.counters()[role.name]
+        self._feed = feed
+        socket.send(b"\1")  # everything: what the role may publish is decided here, by pattern and not by prefix
+
+    def _received(self) -> int:
+        return self.counters.received
+
+    def _take(self, count: int) -> bool:
+        recv = self.socket.recv
+        verdicts = self.verdicts
+        counters = self.counters
+        on_publish = self._feed.on_publish
+        received = received_bytes = 0
+        topic = b""
+        used: set[_Outlet] = set()
+        try:
+            for _ in range(count):
+                topic = b""
+                topic = recv(_NOBLOCK)
+                header = recv(_NOBLOCK)
+                body = recv(_NOBLOCK, copy=False)
+                if body.more:
+                    aligned = self._realign(topic, header, body)
+                    if aligned is None:
+                        continue
+                    topic, header, body = aligned
+                verdict = verdicts.get(topic) or self._judge(topic)
+                if len(header) != HEADER.size or header[:4] not in verdict.openings:
+                    header = self._second_look(verdict, header)
+                    if not header:
+                        continue
+                received += 1
+                received_bytes += len(body)
+                for outlet in verdict.outlets:
+                    send = outlet.raw_send
+                    send(topic, _NOBLOCK_MORE)
+                    send(header, _NOBLOCK_MORE)
+                    send(body, _NOBLOCK, False)
+                    outlet.counters.sent += 1
+                    used.add(outlet)
+                if on_publish is not None and verdict.name is not None:
+                    parsed = FeedHeader.parse(header)
+                    if parsed is not None:
+                        on_publish(self.role, verdict.name, parsed, body.bytes)
+        except zmq.Again:
+            if topic:
+                counters.malformed += 1  # the frames ended before the third, and nothing came after them
+            raise
+        finally:
+            counters.received += received
+            counters.received_bytes += received_bytes
+            for outlet in used:
+                outlet.kick()
+        return True
+
+    def _realign(self, topic: bytes, header: bytes, body: zmq.Frame) -> tuple[bytes, bytes, zmq.Frame] | None:
+        """Read up to the boundary; the last three frames are the message, if it was not too long for one."""
+        self.counters.malformed += 1
+        tail: deque[bytes | zmq.Frame] = deque((topic, header, body), maxlen=3)
+        frame = body
+        extra = 0
+        while frame.more:
+            frame = self.socket.recv(_NOBLOCK, copy=False)
+            tail.append(frame)
+            extra += 1
+        if extra > MAX_FRAMES:
+            return None
+        first, second, _ = tail
+        return _bytes_of(first), _bytes_of(second), frame
+
+    def _judge(self, topic: bytes) -> "_Verdict":
+        """What holds for this topic frame; remembered until interest, roles or ownership change."""
+        name = parse_topic(topic)
+        if name is None:
+            return _MALFORMED
+        feed = self._feed
+        openings: frozenset[bytes] = frozenset()
+        outlets: tuple[_Outlet, ...] = ()
+        if feed.accept is None or feed.accept(self.role, name):
+            openings = frozenset(_opening(priority) for priority in CLASSES if self.role.may_publish(name, priority))
+        if openings:
+            outlets = tuple(outlet for outlet in feed.outlets if outlet.wants(topic, name))
+        verdict = _Verdict(name, openings, outlets)
+        if len(self.verdicts) >= _MAX_VERDICTS:
+            self.verdicts.clear()
+        self.verdicts[topic] = verdict
+        return verdict
+
+    def _second_look(self, verdict: "_Verdict", header: bytes) -> bytes:
+        """A header to go on with for a message that is not plainly fine, empty when it is refused (and counted)."""
+        if verdict.name is None or (header and FeedHeader.parse(header) is None):
+            self.counters.malformed += 1
+            return b""
+        parsed = FeedHeader.parse(header) if header else FeedHeader(PriorityClass.BULK, 0, self._feed.wall_ns())
+        if parsed is None or _opening(parsed.priority) not in verdict.openings:
+            self.counters.forbidden += 1
+            return b""
+        return parsed.pack()
+
+
+class _Verdict(NamedTuple):
+    """What holds for one topic frame that came in through one role."""
+
+    name: TopicName | None  # None: malformed
+    openings: frozenset[bytes]  # how a header may begin: the classes it may be published in; none: forbidden
+    outlets: tuple[_Outlet, ...]  # whose subscribers want it and may see it
+
+
+_MALFORMED: Final = _Verdict(None, frozenset(), ())
+
+
+def _opening(priority: PriorityClass) -> bytes:
+    """The first four bytes of every header of a class."""
+    return bytes((VERSION, priority, 0, 0))
+
+
+def _bytes_of(frame: "bytes | zmq.Frame") -> bytes:
+    return frame if isinstance(frame, bytes) else frame.bytes
