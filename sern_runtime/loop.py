@@ -11,7 +11,7 @@ import time
 import traceback
 from collections.abc import Callable, Coroutine
 from types import TracebackType
-from typing import Any, Final, Self
+from typing import Any, Final, Protocol, Self
 
 import uvloop
 
@@ -79,6 +79,18 @@ def run(main: Callable[[Shutdown], Coroutine[Any, Any, int | None]]) -> int:
         return runner.run(with_signals())
 
 
+class Cancellable(Protocol):
+    def cancel(self) -> object: ...
+
+
+class Wakeups(Protocol):
+    """What a timer needs of an event loop."""
+
+    def call_soon(self, callback: Callable[[], object], /) -> Cancellable: ...
+
+    def call_later(self, delay: float, callback: Callable[[], object], /) -> Cancellable: ...
+
+
 class Timer:
     """One callback at an absolute deadline, on `clock` (monotonic seconds).
 
@@ -93,15 +105,15 @@ class Timer:
         self,
         callback: Callable[[], None],
         *,
-        loop: asyncio.AbstractEventLoop | None = None,
+        loop: Wakeups | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.deadline_s: float | None = None
         """When the callback is due; None while unarmed."""
         self._callback = callback
         self._clock = clock
-        self._loop = loop or asyncio.get_running_loop()
-        self._handle: asyncio.Handle | None = None
+        self._loop: Wakeups = loop or asyncio.get_running_loop()
+        self._handle: Cancellable | None = None
         self._wake_s = math.inf  # when the loop will wake us, at the latest
 
     def arm(self, deadline_s: float | None) -> None:

@@ -1,0 +1,135 @@
+"""The HTTP server as a scraper and a supervisor see it."""
+
+import asyncio
+import json
+import socket as socketlib
+
+import aiohttp
+import pytest
+from prometheus_client import CollectorRegistry
+from prometheus_client.parser import text_string_to_metric_families
+
+from sern_core.errors import ConfigError, UsageError
+from sern_runtime.http import Health, HttpServer, parse_listen
+from sern_runtime.metrics import Metrics
+
+
+class Daemon:
+    """A server and what it is asked about."""
+
+    def __init__(self, listen: str = "127.0.0.1:0") -> None:
+        self.registry = CollectorRegistry()
+        self.metrics = Metrics(self.registry, process=False)
+        self.health = Health(ok=True, reason="ok")
+        self.readiness = Health(ok=False, reason="link down: relay refused our key")
+        self.server = HttpServer(
+            listen,
+            self.registry,
+            health=lambda: self.health,
+            ready=lambda: self.readiness,
+            json_routes={
+                "/api/link": lambda: {"up": True, "rtt_s": 0.025},
+                "/api/broken": lambda: dict[str, int]()["no such key"],
+            },
+        )
+
+    async def get(self, path: str, **headers: str) -> tuple[int, str, str]:
+        async with (
+            aiohttp.ClientSession() as session,
+            session.get(f"http://127.0.0.1:{self.server.port}{path}", headers=headers) as answer,
+        ):
+            return answer.status, answer.content_type, await answer.text()
+
+
+async def test_health_and_readiness_are_told_apart() -> None:
+    daemon = Daemon()
+    await daemon.server.start()
+    assert await daemon.get("/healthz") == (200, "text/plain", "ok\n")
+    assert await daemon.get("/readyz") == (503, "text/plain", "link down: relay refused our key\n")
+    daemon.readiness = Health(ok=True, reason="link up")
+    assert await daemon.get("/readyz") == (200, "text/plain", "link up\n")
+    await daemon.server.stop()
+
+
+async def test_metrics_are_read_when_scraped_in_either_format() -> None:
+    daemon = Daemon()
+    count = 0
+    daemon.metrics.counter("sern_things_total", "Things.", (), lambda: [((), count)])
+    await daemon.server.start()
+    count = 3
+    status, content_type, text = await daemon.get("/metrics")
+    assert (status, content_type) == (200, "text/plain")
+    families = {family.name: family for family in text_string_to_metric_families(text)}
+    assert families["sern_things"].samples[0].value == 3
+    _, content_type, text = await daemon.get("/metrics", Accept="application/openmetrics-text; version=1.0.0")
+    assert content_type == "application/openmetrics-text"
+    assert text.endswith("# EOF\n")
+    await daemon.server.stop()
+
+
+async def test_json_and_a_view_that_fails(caplog: pytest.LogCaptureFixture) -> None:
+    daemon = Daemon()
+    daemon.server.add_json("/api/more", lambda: [1, 2])
+    await daemon.server.start()
+    status, content_type, text = await daemon.get("/api/link")
+    assert (status, content_type, json.loads(text)) == (200, "application/json", {"up": True, "rtt_s": 0.025})
+    assert (await daemon.get("/api/more"))[2] == "[1, 2]"
+    status, _, text = await daemon.get("/api/broken")
+    assert (status, json.loads(text)) == (500, {"error": "internal error, see the log"})
+    assert "no such key" in caplog.text
+    assert (await daemon.get("/healthz"))[0] == 200
+    assert (await daemon.get("/nothing"))[0] == 404
+    with pytest.raises(UsageError, match="before the server is started"):
+        daemon.server.add_json("/late", dict)
+    await daemon.server.stop()
+    await daemon.server.stop()
+
+
+async def test_a_port_in_use_is_one_line() -> None:
+    with socketlib.create_server(("127.0.0.1", 0)) as taken:
+        daemon = Daemon(f"127.0.0.1:{taken.getsockname()[1]}")
+        with pytest.raises(ConfigError) as caught:
+            await daemon.server.start()
+    assert str(caught.value) == (
+        f"cannot listen on http://{daemon.server.listen}: "
+        "the port is in use; stop the other process or choose another port"
+    )
+
+
+async def test_an_address_of_another_machine() -> None:
+    with pytest.raises(ConfigError, match="no such address"):
+        await Daemon("192.0.2.1:9464").server.start()
+
+
+async def test_stopping_does_not_wait_for_a_client_that_keeps_its_connection() -> None:
+    daemon = Daemon()
+    await daemon.server.start()
+    reader, writer = await asyncio.open_connection("127.0.0.1", daemon.server.port)
+    writer.write(b"GET /healthz HTTP/1.1\r\nHost: x\r\n\r\n")
+    assert b"200 OK" in await reader.readuntil(b"\r\n\r\n")
+    await daemon.server.stop()
+    writer.close()
+    await writer.wait_closed()
+    with pytest.raises(UsageError, match="not started"):
+        _ = daemon.server.port
+
+
+@pytest.mark.parametrize(
+    ("listen", "expected"),
+    [
+        ("127.0.0.1:9464", ("127.0.0.1", 9464)),
+        ("[::1]:80", ("::1", 80)),
+        ("localhost:0", ("localhost", 0)),
+        ("9464", None),
+        (":9464", None),
+        ("127.0.0.1:", None),
+        ("127.0.0.1:70000", None),
+        ("127.0.0.1:http", None),
+    ],
+)
+def test_listen(listen: str, expected: tuple[str, int] | None) -> None:
+    if expected is None:
+        with pytest.raises(ConfigError, match="is not HOST:PORT"):
+            parse_listen(listen)
+    else:
+        assert parse_listen(listen) == expected
