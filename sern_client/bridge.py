@@ -5,7 +5,6 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 
-from sern_client.endpoints import ros_types
 from sern_client.endpoints.base import Endpoint, Publisher, Subscription
 from sern_client.message_log import MessageLog
 from sern_core.client import ClientCore
@@ -15,6 +14,7 @@ from sern_core.message import Message, StreamId, StreamInfo, TopicInfo
 from sern_core.queues import OutChannel
 from sern_core.rules import Discovery, RuleSet, to_global
 from sern_core.types import DropReason, TopicName
+from sern_runtime import ros_types
 from sern_runtime.link_metrics import AgeHistograms
 from sern_runtime.loop import Timer
 

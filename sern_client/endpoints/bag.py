@@ -28,13 +28,13 @@ from rosbags.interfaces import (
 from rosbags.rosbag1 import Reader as Reader1
 from rosbags.rosbag2 import Reader as Reader2
 
-from sern_client.endpoints import ros_types
 from sern_client.endpoints.base import Publisher, Sink, TopicEvents
 from sern_client.endpoints.clock import Clock, SystemClock
-from sern_client.endpoints.ros_types import one_line
 from sern_core.errors import ConfigError, UsageError
 from sern_core.message import TopicInfo
 from sern_core.types import Encoding, TopicName
+from sern_runtime import ros_types
+from sern_runtime.ros_types import one_line
 
 BATCH_MESSAGES: Final = 512
 BATCH_BYTES: Final = 4 * 2**20

@@ -7,9 +7,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from sern_client.endpoints import ros_types
 from sern_core.errors import ConfigError
 from sern_core.types import Encoding
+from sern_runtime import ros_types
 
 CLOUD_TYPE: Final = "sensor_msgs/msg/PointCloud2"
 _FLOAT32: Final = 7  # sensor_msgs/PointField.FLOAT32

@@ -15,13 +15,13 @@ from pathlib import Path
 from queue import SimpleQueue
 from typing import Final, NamedTuple
 
-from sern_client.endpoints import ros_types
 from sern_client.endpoints.bag_files import BagFile, McapFile, RecordFile, active_path
 from sern_client.endpoints.base import Sink, Subscription, TopicEvents
-from sern_client.endpoints.ros_types import one_line
 from sern_core.errors import ConfigError, UsageError
 from sern_core.message import TopicInfo
 from sern_core.types import Encoding, TopicName
+from sern_runtime import ros_types
+from sern_runtime.ros_types import one_line
 
 MAX_STAMP_NS: Final = 2**32 * 10**9 - 1
 """The latest time a ROS 1 bag can hold (32-bit seconds)."""

@@ -14,13 +14,13 @@ from pathlib import Path
 from random import Random
 from typing import Any, Final, Literal
 
-from sern_client.endpoints import ros_types
 from sern_client.endpoints.base import Sink, TopicEvents
 from sern_client.endpoints.clock import Clock, SystemClock
 from sern_client.endpoints.jackal import JACKAL, JackalSource, OperatorSource, Plan, Sizes
 from sern_core.errors import ConfigError, UsageError
 from sern_core.message import TopicInfo
 from sern_core.types import Encoding, TopicName
+from sern_runtime import ros_types
 from sern_sim.robot import STEP_S, RobotState
 
 COUNTER_RATE_HZ: Final = 5.0

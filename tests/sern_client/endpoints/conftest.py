@@ -10,9 +10,9 @@ from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 
-from sern_client.endpoints import ros_types
 from sern_core.message import TopicInfo
 from sern_core.types import Encoding, TopicName
+from sern_runtime import ros_types
 
 START_NS = 1_700_000_000_000_000_000
 STEP_NS = 10_000_000

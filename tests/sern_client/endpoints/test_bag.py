@@ -10,9 +10,9 @@ from typing import Any
 import pytest
 
 from sern_client.endpoints.bag import BagEndpoint, BagOptions
-from sern_client.endpoints.ros_types import hash_of, topic_info
 from sern_core.errors import ConfigError, UsageError
 from sern_core.types import Encoding, TopicName
+from sern_runtime.ros_types import hash_of, topic_info
 
 Make = Callable[..., Path]
 Until = Callable[[Callable[[], bool]], Awaitable[None]]

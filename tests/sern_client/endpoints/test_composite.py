@@ -12,11 +12,11 @@ from sern_client.endpoints.bag import BagEndpoint, BagOptions
 from sern_client.endpoints.base import Endpoint, Publisher, Sink, Subscription, TopicEvents
 from sern_client.endpoints.composite import CompositeEndpoint
 from sern_client.endpoints.record import RecordEndpoint, RecordOptions
-from sern_client.endpoints.ros_types import topic_info
 from sern_client.endpoints.synthetic import SyntheticEndpoint, SyntheticOptions
 from sern_core.errors import ConfigError, UsageError
 from sern_core.message import TopicInfo
 from sern_core.types import Encoding, TopicName
+from sern_runtime.ros_types import topic_info
 
 Make = Callable[..., Path]
 Until = Callable[[Callable[[], bool]], Awaitable[None]]

@@ -12,13 +12,13 @@ import pytest
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import ConnectionExtRosbag1, ConnectionExtRosbag2, QosDurability
 
-from sern_client.endpoints import ros_types
 from sern_client.endpoints.bag import BagEndpoint, BagOptions
 from sern_client.endpoints.record import RecordEndpoint, RecordOptions
-from sern_client.endpoints.ros_types import topic_info
 from sern_core.errors import ConfigError, UsageError
 from sern_core.message import TopicInfo
 from sern_core.types import Encoding, TopicName
+from sern_runtime import ros_types
+from sern_runtime.ros_types import topic_info
 
 Make = Callable[..., Path]
 Until = Callable[[Callable[[], bool]], Awaitable[None]]
@@ -287,7 +287,7 @@ INTERRUPTED = """
 import asyncio, os, signal, sys
 from pathlib import Path
 from sern_client.endpoints.record import RecordEndpoint, RecordOptions
-from sern_client.endpoints.ros_types import topic_info
+from sern_runtime.ros_types import topic_info
 from sern_core.types import Encoding
 
 async def main(stop):

@@ -8,13 +8,13 @@ from typing import Any
 
 import pytest
 
-from sern_client.endpoints import ros_types
 from sern_client.endpoints.jackal import JACKAL
-from sern_client.endpoints.ros_types import topic_info
 from sern_client.endpoints.synthetic import SyntheticEndpoint, SyntheticOptions
 from sern_core.errors import ConfigError, UsageError
 from sern_core.message import TopicInfo
 from sern_core.types import Encoding, TopicName
+from sern_runtime import ros_types
+from sern_runtime.ros_types import topic_info
 
 Until = Callable[[Callable[[], bool]], Awaitable[None]]
 Rows = dict[str, list[tuple[bytes, int]]]

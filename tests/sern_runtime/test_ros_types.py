@@ -2,9 +2,9 @@
 
 import pytest
 
-from sern_client.endpoints import ros_types
 from sern_core.errors import ConfigError, UsageError
 from sern_core.types import Encoding
+from sern_runtime import ros_types
 
 ROS1, CDR = Encoding.ROS1, Encoding.CDR
 
