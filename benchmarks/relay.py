@@ -1,0 +1,361 @@
+"""One publisher, one relay, one subscriber, each a process of its own, over TCP on this machine.
+
+Every system carries the same messages in closed loop: the publisher keeps a bounded number in flight, by a counter in
+shared memory, so that nothing is dropped and the figure is what the relay carries, not what it loses. Systems are
+measured in interleaved rounds; ratios are taken within a round and their median is reported.
+
+    proxy   zmq.proxy between XSUB and XPUB, in C: the least a relay can cost
+    feed    sern_runtime.feed: the same sockets and frames, with access rules
+    zenoh   a zenoh router and two clients, shared memory off
+
+A further system is one more subclass of `System` in `SYSTEMS`, and its limits in `CPU_LIMITS` and `RATE_LIMITS`.
+"""
+
+import argparse
+import importlib.util
+import json
+import multiprocessing
+import re
+import signal
+import socket
+import statistics
+import sys
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from ctypes import c_bool, c_uint64
+from dataclasses import dataclass, field
+from functools import partial
+from multiprocessing.process import BaseProcess
+from multiprocessing.sharedctypes import RawValue
+from typing import Any, Final, NamedTuple
+
+import psutil
+import zmq
+
+from benchmarks import common
+from sern_core.errors import SernError
+from sern_core.rules import FeedRole
+from sern_core.types import PriorityClass
+from sern_runtime.feed import Feed, FeedHeader, topic_frame
+from sern_runtime.loop import Shutdown, run
+
+SIZES: Final = {"100 B": 100, "1 kB": 1000, "64 kB": 64_000, "1 MB": 1_000_000}
+IN_FLIGHT_MESSAGES: Final = 500
+IN_FLIGHT_BYTES: Final = 8_000_000
+BURST: Final = 16
+START_S: Final = 20.0
+"""How long processes may take to start and find each other."""
+STALL_S: Final = 1.0
+"""Without progress for this long, what is in flight counts as lost."""
+HIGH_WATER: Final = 10_000  # above what is in flight: the closed loop alone decides
+
+TOPIC: Final = "/bench/odom"
+CPU_LIMITS: Final = {("feed", "1 kB"): 3.0}
+"""(system, case): relay CPU a message, at most this many times that of zmq.proxy."""
+RATE_LIMITS: Final = {("feed", "64 kB"): 0.8}
+"""(system, case): MB/s, at least this share of zenoh's."""
+
+
+class Ports(NamedTuple):
+    ingest: int
+    publish: int
+
+
+@dataclass
+class Flow:
+    """What the three processes share: how much arrived, and when to end."""
+
+    size_bytes: int
+    received: Any = field(default_factory=lambda: RawValue(c_uint64, 0))
+    stopped: Any = field(default_factory=lambda: RawValue(c_bool, False))
+
+    @property
+    def window(self) -> int:
+        return max(4, min(IN_FLIGHT_MESSAGES, IN_FLIGHT_BYTES // self.size_bytes))
+
+    def drive(self, send: Callable[[], object]) -> None:
+        """The publisher's loop: first until it is heard, then with a full window, until stopped."""
+        received, stopped = self.received, self.stopped
+        sent = 0
+        while not received.value and not stopped.value:
+            send()
+            sent += 1
+            time.sleep(0.02)
+        sent = received.value
+        burst = min(BURST, self.window)
+        while not stopped.value:
+            for _ in range(burst):
+                send()
+            sent += burst
+            moved_s, seen = time.monotonic(), received.value
+            while sent - received.value > self.window - burst and not stopped.value:
+                time.sleep(0.0001)
+                if received.value != seen:
+                    moved_s, seen = time.monotonic(), received.value
+                elif time.monotonic() - moved_s > STALL_S:
+                    sent = seen
+
+    def arrived(self) -> None:
+        self.received.value += 1
+
+
+class System(ABC):
+    """A way to get messages from one process to another through a third. Instances have no state: each method runs
+    in a process of its own. The publisher and the subscriber return when the flow is stopped."""
+
+    name: str
+
+    @abstractmethod
+    def relay(self, ports: Ports, ready: Callable[[], None]) -> None:
+        """Call `ready` once listening; runs until the process is terminated."""
+
+    @abstractmethod
+    def publisher(self, ports: Ports, flow: Flow) -> None: ...
+
+    @abstractmethod
+    def subscriber(self, ports: Ports, flow: Flow) -> None: ...
+
+
+class ZmqSystem(System):
+    """The two ends of the plain sockets: three frames, the feed's layout."""
+
+    def publisher(self, ports: Ports, flow: Flow) -> None:
+        with zmq.Context() as context, context.socket(zmq.PUB) as out:
+            out.setsockopt(zmq.LINGER, 0)
+            out.setsockopt(zmq.SNDHWM, HIGH_WATER)
+            out.connect(f"tcp://127.0.0.1:{ports.ingest}")
+            frames = (topic_frame(TOPIC), FeedHeader(PriorityClass.BULK, 1, 1).pack(), bytes(flow.size_bytes))
+            flow.drive(partial(out.send_multipart, frames, copy=flow.size_bytes < 32_000))
+
+    def subscriber(self, ports: Ports, flow: Flow) -> None:
+        with zmq.Context() as context, context.socket(zmq.SUB) as inlet:
+            inlet.setsockopt(zmq.LINGER, 0)
+            inlet.setsockopt(zmq.RCVHWM, HIGH_WATER)
+            inlet.setsockopt(zmq.RCVTIMEO, 100)
+            inlet.subscribe(topic_frame(TOPIC))
+            inlet.connect(f"tcp://127.0.0.1:{ports.publish}")
+            while not flow.stopped.value:
+                try:
+                    inlet.recv()
+                except zmq.Again:
+                    continue
+                inlet.recv()
+                body = inlet.recv(copy=False)
+                if len(body) == flow.size_bytes:
+                    flow.arrived()
+
+
+class Proxy(ZmqSystem):
+    name = "proxy"
+
+    def relay(self, ports: Ports, ready: Callable[[], None]) -> None:
+        context = zmq.Context()
+        ingest, publish = context.socket(zmq.XSUB), context.socket(zmq.XPUB)
+        ingest.setsockopt(zmq.RCVHWM, HIGH_WATER)
+        publish.setsockopt(zmq.SNDHWM, HIGH_WATER)
+        ingest.bind(f"tcp://127.0.0.1:{ports.ingest}")
+        publish.bind(f"tcp://127.0.0.1:{ports.publish}")
+        ready()
+        zmq.proxy(ingest, publish)
+
+
+class FeedRelay(ZmqSystem):
+    name = "feed"
+
+    def relay(self, ports: Ports, ready: Callable[[], None]) -> None:
+        everything = (re.compile("/bench/.*"),)
+        role = FeedRole(
+            "bench",
+            f"tcp://127.0.0.1:{ports.publish}",
+            f"tcp://127.0.0.1:{ports.ingest}",
+            subscribe=everything,
+            publish=everything,
+        )
+
+        async def main(shutdown: Shutdown) -> None:
+            context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+            feed = Feed(context, [role])
+            ready()
+            await shutdown.wait()
+            feed.close()
+            context.term()
+
+        run(main)
+
+
+class Zenoh(System):
+    name = "zenoh"
+
+    @staticmethod
+    def _session(**settings: object) -> Any:
+        import zenoh
+
+        config = zenoh.Config()
+        settings = {
+            "scouting/multicast/enabled": False,
+            "scouting/gossip/enabled": False,
+            "transport/shared_memory/enabled": False,
+            **settings,
+        }
+        for key, value in settings.items():
+            config.insert_json5(key, json.dumps(value))
+        return zenoh.open(config)
+
+    def relay(self, ports: Ports, ready: Callable[[], None]) -> None:
+        with self._session(**{"mode": "router", "listen/endpoints": [f"tcp/127.0.0.1:{ports.ingest}"]}):
+            ready()
+            signal.pause()
+
+    def _client(self, ports: Ports) -> Any:
+        return self._session(**{"mode": "client", "connect/endpoints": [f"tcp/127.0.0.1:{ports.ingest}"]})
+
+    def publisher(self, ports: Ports, flow: Flow) -> None:
+        import zenoh
+
+        with self._client(ports) as session:
+            publisher = session.declare_publisher("bench/odom", congestion_control=zenoh.CongestionControl.BLOCK)
+            flow.drive(partial(publisher.put, bytes(flow.size_bytes)))
+
+    def subscriber(self, ports: Ports, flow: Flow) -> None:
+        def count(sample: Any) -> None:
+            if len(sample.payload) == flow.size_bytes:
+                flow.arrived()
+
+        with self._client(ports) as session:
+            session.declare_subscriber("bench/odom", count)
+            while not flow.stopped.value:
+                time.sleep(0.02)
+
+
+SYSTEMS: Final[tuple[System, ...]] = (Proxy(), FeedRelay(), Zenoh())
+
+
+class Sample(NamedTuple):
+    """One measured run."""
+
+    messages_hz: float
+    throughput_mbytes_per_s: float
+    relay_cpu_us: float  # of the relay process, a message
+
+
+def free_ports() -> Ports:
+    with socket.create_server(("127.0.0.1", 0)) as first, socket.create_server(("127.0.0.1", 0)) as second:
+        return Ports(first.getsockname()[1], second.getsockname()[1])
+
+
+def _relay_main(system: System, ports: Ports, ready: Any) -> None:
+    system.relay(ports, ready.set)
+
+
+def measure(system: System, size_bytes: int, duration_s: float) -> Sample:
+    """Start the three processes, wait until messages flow, and look at both ends of `duration_s`."""
+    processes = multiprocessing.get_context("spawn")
+    ports, flow, ready = free_ports(), Flow(size_bytes), processes.Event()
+    relay = processes.Process(target=_relay_main, args=(system, ports, ready), daemon=True)
+    ends = [
+        processes.Process(target=end, args=(ports, flow), daemon=True) for end in (system.subscriber, system.publisher)
+    ]
+    try:
+        relay.start()
+        if not ready.wait(START_S):
+            raise SernError(f"the relay of {system.name} did not start")
+        for process in ends:
+            process.start()
+        _wait_for_messages(system, flow, (relay, *ends))
+        time.sleep(duration_s / 4)
+        watched = psutil.Process(relay.pid)
+        start_s, start, start_cpu_s = time.monotonic(), flow.received.value, _cpu_s(watched)
+        time.sleep(duration_s)
+        end_s, end, end_cpu_s = time.monotonic(), flow.received.value, _cpu_s(watched)
+    finally:
+        flow.stopped.value = True
+        for process in ends:
+            _end(process, patient=True)
+        _end(relay, patient=False)
+    messages = end - start
+    if not messages:
+        raise SernError(f"{system.name} carried nothing at {size_bytes} bytes")
+    rate_hz = messages / (end_s - start_s)
+    return Sample(rate_hz, rate_hz * size_bytes / 1e6, (end_cpu_s - start_cpu_s) / messages * 1e6)
+
+
+def _cpu_s(process: psutil.Process) -> float:
+    times = process.cpu_times()
+    return float(times.user + times.system)
+
+
+def _wait_for_messages(system: System, flow: Flow, processes: tuple[BaseProcess, ...]) -> None:
+    give_up_s = time.monotonic() + START_S
+    while flow.received.value < 2 * BURST:
+        if time.monotonic() > give_up_s or not all(process.is_alive() for process in processes):
+            raise SernError(f"no messages through {system.name}")
+        time.sleep(0.01)
+
+
+def _end(process: BaseProcess, *, patient: bool) -> None:
+    """End one of our processes, started or not."""
+    if process.pid is None:
+        return
+    if patient:
+        process.join(2.0)
+    if process.is_alive():
+        process.terminate()
+        process.join(2.0)
+    if process.is_alive():
+        process.kill()
+    process.join()
+    process.close()
+
+
+def bench(options: argparse.Namespace, report: common.Report) -> None:
+    rounds, duration_s = (2, 0.8) if options.quick else (5, 3.0)
+    systems = [s for s in SYSTEMS if s.name != "zenoh" or importlib.util.find_spec("zenoh") is not None]
+    if options.systems:
+        systems = [s for s in systems if s.name in options.systems]
+    if len(systems) < len(SYSTEMS):
+        report.note("measured without: " + ", ".join(s.name for s in SYSTEMS if s not in systems))
+    for case, size_bytes in SIZES.items():
+        runs = {s.name: partial(measure, s, size_bytes, duration_s) for s in systems}
+        samples = common.interleaved(runs, rounds)
+        for name, found in samples.items():
+            report.row(
+                case,
+                name,
+                messages_hz=statistics.median(s.messages_hz for s in found),
+                throughput_MBps=statistics.median(s.throughput_mbytes_per_s for s in found),
+                relay_cpu_us=statistics.median(s.relay_cpu_us for s in found),
+            )
+        _reaches(report, case, samples)
+    report.note(f"medians of {rounds} interleaved rounds of {duration_s:g} s; ratios within a round")
+
+
+def _reaches(report: common.Report, case: str, samples: dict[str, list[Sample]]) -> None:
+    for (name, at), limit in CPU_LIMITS.items():
+        if at == case and name in samples and "proxy" in samples:
+            pairs = zip(samples[name], samples["proxy"], strict=True)
+            ratio = statistics.median(ours.relay_cpu_us / max(theirs.relay_cpu_us, 1e-3) for ours, theirs in pairs)
+            report.reach(f"{name}: relay CPU a message, times zmq.proxy, {case}", ratio, limit)
+    for (name, at), limit in RATE_LIMITS.items():
+        if at == case and name in samples and "zenoh" in samples:
+            pairs = zip(samples[name], samples["zenoh"], strict=True)
+            ratio = statistics.median(
+                ours.throughput_mbytes_per_s / theirs.throughput_mbytes_per_s for ours, theirs in pairs
+            )
+            report.reach(f"{name}: MB/s, share of zenoh, {case}", ratio, limit, at_least=True)
+
+
+def _arguments(parser: argparse.ArgumentParser) -> None:
+    names = [system.name for system in SYSTEMS]
+    parser.add_argument("--systems", nargs="+", choices=names, help="measure these alone")
+
+
+def main() -> int:
+    return common.main("relay", bench, description=__doc__, arguments=_arguments)
+
+
+if __name__ == "__main__":
+    # Spawned processes import this file by its name, not as __main__.
+    from benchmarks.relay import main as imported_main
+
+    sys.exit(imported_main())
