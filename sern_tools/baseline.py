@@ -145,6 +145,7 @@ class Baseline:
         self._subscriptions[info.name] = self._endpoint.subscribe(
             info.name, lambda body, _stamp_ns: self._offer(name, resolved, body)
         )
+        self._endpoint.interest(info.name, wanted=True)  # the far side subscribes to everything
 
     def topic_removed(self, name: TopicName) -> None:
         subscription = self._subscriptions.pop(name, None)

@@ -104,9 +104,7 @@ def fates(result: Result, label: str) -> dict[str, float]:
     """What became of the messages of a class, as shares that add up to 1."""
     statistics = result.classes[label]
     counts: dict[str, float] = {"delivered": statistics.delivered, "refused": statistics.refused, **statistics.dropped}
-    rest = statistics.offered - sum(counts.values())
-    if rest > 0:
-        counts["never seen again"] = rest
+    counts |= {"under way at the end": statistics.under_way, "never seen again": statistics.unseen}
     total = sum(counts.values())
     return {name: count / total for name, count in counts.items() if count}
 

@@ -8,7 +8,7 @@ import os
 import platform
 import subprocess
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final
 
@@ -154,6 +154,10 @@ def measured(verdict: Verdict) -> str:
     return f"{text}; {verdict.detail}" if verdict.detail else text
 
 
+def _without_limit(verdict: Verdict) -> str:
+    return measured(replace(verdict, limit=0.0))
+
+
 def _unit(verdict: Verdict) -> Callable[[float], str]:
     if verdict.name.endswith("_s"):
         return seconds
@@ -165,9 +169,10 @@ def drop_words(statistics: Statistics) -> str:
     words = [f"{count} {reason}" for reason, count in statistics.dropped.most_common()]
     if statistics.refused:
         words.append(f"{statistics.refused} refused")
-    rest = statistics.offered - statistics.delivered - statistics.refused - sum(statistics.dropped.values())
-    if rest > 0:
-        words.append(f"{rest} never seen again")
+    if statistics.under_way:
+        words.append(f"{statistics.under_way} under way at the end")
+    if statistics.unseen:
+        words.append(f"{statistics.unseen} never seen again")
     return ", ".join(words)
 
 
@@ -205,7 +210,7 @@ h1 { font-size: 26px; margin: 0 0 4px; } h2 { font-size: 19px; margin: 36px 0 8p
 p { margin: 8px 0; } .lead { color: #59636e; }
 table { border-collapse: collapse; width: 100%; font-variant-numeric: tabular-nums; }
 th, td { text-align: left; padding: 5px 10px 5px 0; border-bottom: 1px solid #d1d9e0; vertical-align: top; }
-th { font-weight: 600; } td.n, th.n { text-align: right; white-space: nowrap; }
+th { font-weight: 600; } th.wide { width: 38%; } td.n, th.n { text-align: right; white-space: nowrap; }
 tr.first td { border-top: 2px solid #afb8c1; }
 .kept { color: #1a7f37; font-weight: 600; } .broken { color: #cf222e; font-weight: 600; }
 .banner { padding: 10px 14px; border-radius: 6px; font-weight: 600; margin: 16px 0; }
@@ -252,14 +257,14 @@ def as_html(report: Report) -> str:
 
 
 def _verdict_table(report: Report) -> str:
-    head = "<tr><th></th><th>promise</th><th>measured</th>"
-    head += "<th>plain ZMQ, which does not promise it</th></tr>" if report.comparison else "</tr>"
+    head = '<tr><th></th><th class="wide">promise</th><th>measured</th>'
+    head += "<th>plain ZMQ, which promises none of it</th></tr>" if report.comparison else "</tr>"
     rows = []
     for verdict in report.verdicts:
         other = report.comparison.get(verdict.name)
         cells = [html.escape(verdict.promise), html.escape(measured(verdict))]
         if report.comparison:
-            cells.append(html.escape(_unit(other)(other.value)) if other else "")
+            cells.append(html.escape(_without_limit(other)) if other else "")
         word, style = ("kept", "kept") if verdict.ok else ("BROKEN", "broken")
         rows.append(f'<tr><td class="{style}">{word}</td>' + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>")
     return "<table>" + head + "".join(rows) + "</table>"

@@ -56,12 +56,19 @@ class Statistics:
     offered_bytes: int = 0
     delivered_bytes: int = 0
     latency_s: list[float] = field(default_factory=list)
+    under_way: int = 0  # still queued or in flight at the end, where there are counters
     overtaken: int = 0  # delivered after a less urgent message that was offered later
     above_floor_s: list[float] = field(default_factory=list)
 
     def quantile_s(self, q: float) -> float:
         """NaN when nothing was delivered."""
         return float(np.quantile(self.latency_s, q)) if self.latency_s else math.nan
+
+    @property
+    def unseen(self) -> int:
+        """Messages that went into the system and of which nothing more is known."""
+        known = self.delivered + self.refused + self.under_way + sum(self.dropped.values())
+        return max(0, self.offered - known)
 
     @property
     def delivered_share(self) -> float:
@@ -73,6 +80,7 @@ class Statistics:
             "delivered",
             "refused",
             "undelivered",
+            "under_way",
             "duplicates",
             "out_of_order",
             "corrupted",
@@ -151,11 +159,11 @@ def analyse(
     for name, overtaken in _overtaken(logs).items():
         topics[name].overtaken = overtaken
     classes = {label: Statistics(label) for label in CLASS_LABELS}
-    for name, statistics in topics.items():
-        classes[logs[name].priority].add(statistics)
     result = Result(system, facts, topics, classes, logs, _first_fresh_pose(logs, facts))
     if counters is not None:
         _account(result, counters)
+    for name, statistics in topics.items():
+        classes[logs[name].priority].add(statistics)
     return result
 
 
@@ -230,13 +238,15 @@ def _first_fresh_pose(logs: Mapping[str, TopicLog], facts: RunFacts) -> list[flo
 
 UNCERTAIN: Final = frozenset({"lost", "disconnected", "shutdown", "retention"})
 """A sender that gives a message up for one of these may not know that it did arrive: the acknowledgement is missing."""
+UNCERTAIN_PER_BREAK: Final = 64
+"""When the link breaks, so many messages of a topic may be in flight whose acknowledgement is lost with it. They wait
+again, may be dropped for any reason, and may have arrived all the same: counted twice, which is no loss."""
 
 
 def _account(result: Result, counters: Mapping[str, Sequence[Counters]]) -> None:
     """offered = delivered + refused + dropped + still queued or in flight, per topic; and the logs say the same.
 
-    A message in flight at the end, or given up without an answer, may have arrived all the same. So many may be
-    counted twice; none may be counted not at all.
+    None may be missing. Messages whose fate the sender could not know may be counted twice.
     """
     result.accounting_gap = 0
     for name, log in sorted(result.logs.items()):
@@ -248,10 +258,11 @@ def _account(result: Result, counters: Mapping[str, Sequence[Counters]]) -> None
             (reason, n) for c in entries for reason, n in c.dropped.items() if reason not in ("duplicate", "refused")
         ]
         in_flight = sum(c.in_flight for c in entries)
-        known = (
-            delivered + sum(c.refused for c in senders) + sum(c.in_queue for c in entries) + sum(n for _, n in drops)
-        )
+        known = delivered + sum(c.refused for c in senders) + sum(c.in_queue for c in entries)
+        known += sum(n for _, n in drops)
+        result.topics[name].under_way = max(0, min(in_flight, offered - known)) + sum(c.in_queue for c in entries)
         uncertain = in_flight + sum(n for reason, n in drops if reason in UNCERTAIN)
+        uncertain += UNCERTAIN_PER_BREAK * len(result.facts.blackouts)
         gaps = {
             "offered and not accounted for": max(0, offered - known - in_flight),
             "accounted for more than once": max(0, known + in_flight - offered - uncertain),

@@ -1,0 +1,118 @@
+"""Children are started, asked, stopped in order, and never left behind."""
+
+import asyncio
+import os
+import signal
+import sys
+from pathlib import Path
+
+import pytest
+
+from sern_core.errors import SernError
+from sern_tools import processes
+from sern_tools.processes import Child, Children, program
+from tests.support import until
+
+ECHO = 'import sys\nfor line in sys.stdin: print(\'{"word": "%s"}\' % line.strip(), flush=True)'
+STUBBORN = (
+    "import signal, sys\nsignal.signal(signal.SIGTERM, signal.SIG_IGN)\n"
+    "print('{}', flush=True)\nwhile True: signal.pause()"
+)
+PATIENT = "import signal\nprint('{}', flush=True)\nsignal.pause()"
+
+
+def python(code: str) -> list[str]:
+    return [sys.executable, "-c", code]
+
+
+def gone(child: Child) -> bool:
+    try:
+        os.kill(child.process.pid, 0)
+    except ProcessLookupError:
+        return True
+    return False
+
+
+async def test_a_child_answers_and_ends_with_its_input(tmp_path: Path) -> None:
+    async with Children(tmp_path) as children:
+        child = await children.start("echo", python(ECHO), talks=True)
+        assert await child.ask("floor") == {"word": "floor"}
+        assert await child.ask("go") == {"word": "go"}
+        children.check()
+        await children.stop([child])
+        assert child.process.returncode in (0, -signal.SIGTERM)
+        children.check()  # it was told to
+    assert gone(child)
+
+
+async def test_children_are_sessions_of_their_own(tmp_path: Path) -> None:
+    async with Children(tmp_path) as children:
+        child = await children.start("patient", python(PATIENT), talks=True)
+        assert os.getsid(child.process.pid) == child.process.pid != os.getsid(0)
+
+
+async def test_a_child_that_ignores_sigterm_is_killed(tmp_path: Path) -> None:
+    async with Children(tmp_path) as children:
+        child = await children.start("stubborn", python(STUBBORN), talks=True)
+        await child.read_object()
+        await children.stop([child], within_s=0.2)
+        assert child.process.returncode == -signal.SIGKILL
+
+
+async def test_whoever_is_left_at_the_end_is_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(processes, "ABORT_S", 0.2)
+    async with Children(tmp_path) as children:
+        left = [await children.start(name, python(PATIENT), talks=True) for name in ("a", "b")]
+        left.append(await children.start("stubborn", python(STUBBORN), talks=True))
+        for child in left:
+            await child.read_object()
+    assert all(gone(child) for child in left)
+
+
+async def test_cancelling_twice_kills_and_leaves_nothing(tmp_path: Path) -> None:
+    started: list[Child] = []
+
+    async def work() -> None:
+        async with Children(tmp_path) as children:
+            started.append(await children.start("stubborn", python(STUBBORN), talks=True))
+            await started[0].read_object()
+            await asyncio.Event().wait()
+
+    task = asyncio.create_task(work())
+    await until(lambda: started and started[0].process.stdout is not None and not task.done())
+    await until(lambda: Path(f"/proc/{started[0].process.pid}").exists())
+    await asyncio.sleep(0)
+    task.cancel()  # SIGTERM, which the child ignores
+    await until(lambda: started[0].stopping)
+    task.cancel()  # SIGKILL
+    with pytest.raises(asyncio.CancelledError):
+        await task
+    assert gone(started[0])
+
+
+async def test_a_child_that_ends_by_itself_is_an_error_with_its_last_words(tmp_path: Path) -> None:
+    async with Children(tmp_path) as children:
+        code = "import sys; print('one', file=sys.stderr); print('no such link', file=sys.stderr); sys.exit(3)"
+        child = await children.start("relay", python(code))
+        await child.process.wait()
+        with pytest.raises(SernError, match=r"relay ended \(exit status 3\): one \| no such link"):
+            children.check()
+        talker = await children.start("talker", python("import sys; sys.exit(3)"), talks=True)
+        with pytest.raises(SernError, match="exit status 3"):
+            await talker.ask("go")
+
+
+async def test_a_child_that_dies_silently(tmp_path: Path) -> None:
+    async with Children(tmp_path) as children:
+        child = await children.start("relay", python("import os; os.kill(os.getpid(), 9)"))
+        await child.process.wait()
+        with pytest.raises(SernError, match=r"signal SIGKILL\) and said nothing"):
+            children.check()
+
+
+async def test_a_program_that_is_not_there(tmp_path: Path) -> None:
+    async with Children(tmp_path) as children:
+        with pytest.raises(SernError, match="cannot start relay: /nowhere/relay"):
+            await children.start("relay", ["/nowhere/relay"])
+    with pytest.raises(SernError, match="sern-nothing is not installed"):
+        program("sern-nothing")
