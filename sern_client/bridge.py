@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from sern_client.endpoints.base import Endpoint, Publisher, Subscription
+from sern_client.frames import FramePrefixer, Rewrite
 from sern_client.message_log import MessageLog
 from sern_core.client import ClientCore
 from sern_core.errors import ConfigError, UsageError
@@ -34,13 +35,21 @@ class Outgoing:
 class Incoming:
     """A stream from elsewhere that is published here. `stop` is the body that a lost link makes us publish."""
 
-    __slots__ = ("lease", "local", "publisher", "stop")
+    __slots__ = ("lease", "local", "publisher", "rewrite", "stop")
 
-    def __init__(self, local: TopicName, publisher: Publisher, lease: CommandLease | None, stop: bytes | None) -> None:
+    def __init__(
+        self,
+        local: TopicName,
+        publisher: Publisher,
+        lease: CommandLease | None,
+        stop: bytes | None,
+        rewrite: Rewrite | None,
+    ) -> None:
         self.local = local
         self.publisher = publisher
         self.lease = lease
         self.stop = stop
+        self.rewrite = rewrite
 
 
 class Bridge:
@@ -53,6 +62,7 @@ class Bridge:
         discovery: Discovery,
         namespace: str,
         *,
+        frame_prefix: str | None = None,
         log: MessageLog | None,
         kick: Callable[[], None],
     ) -> None:
@@ -60,6 +70,7 @@ class Bridge:
         self.rules = rules
         self.discovery = discovery
         self.namespace = namespace
+        self.frames = FramePrefixer(frame_prefix)
         self.ages = AgeHistograms()
         self.rejected_reason: str | None = None
         self.refusals = 0
@@ -112,7 +123,7 @@ class Bridge:
         except UsageError as error:
             _log.error("%s cannot be offered as %s: %s", info.name, name, error)
             return
-        subscription = self.endpoint.subscribe(info.name, self._sink(channel))
+        subscription = self.endpoint.subscribe(info.name, self._sink(channel, self.frames.outgoing(info)))
         self._outgoing[info.name] = Outgoing(channel, subscription)
         self._kick()
 
@@ -123,11 +134,13 @@ class Bridge:
             self.core.unpublish(outgoing.channel, now=time.monotonic())
             self._kick()
 
-    def _sink(self, channel: OutChannel) -> Callable[[bytes, int], bool]:
+    def _sink(self, channel: OutChannel, rewrite: Rewrite | None) -> Callable[[bytes, int], bool]:
         core, kick, log, stream = self.core, self._kick, self._log, channel.stream
 
         def sink(body: bytes, stamp_ns: int) -> bool:
             seq = channel.next_seq
+            if rewrite is not None:
+                body = rewrite(body)
             accepted = core.send(channel, body, stamp_ns, now=time.monotonic())
             if log is not None:
                 log.offered(stream, seq, body, stamp_ns, accepted=accepted)
@@ -167,7 +180,7 @@ class Bridge:
                 _log.error("%s is %s: on_link_loss cannot stop it; no lease", local, info.type_name)
             else:
                 lease = CommandLease(resolved.lease.after_s)
-        self._incoming[stream.id] = Incoming(local, publisher, lease, stop)
+        self._incoming[stream.id] = Incoming(local, publisher, lease, stop, self.frames.incoming(info))
         _log.info("receiving %s from %s as %s", stream.id.topic, stream.id.origin, local)
 
     def stream_closed(self, stream: StreamInfo) -> None:
@@ -184,7 +197,8 @@ class Bridge:
         if incoming is None:
             return
         age_s = now - message.born_s
-        incoming.publisher.publish(message.body, message.stamp_ns)
+        body = message.body if incoming.rewrite is None else incoming.rewrite(message.body)
+        incoming.publisher.publish(body, message.stamp_ns)
         self.ages.observe(stream.spec.priority, age_s)
         if stream.spec.deadline_s is not None:
             self._check_deadline(stream, now)

@@ -66,6 +66,7 @@ class ClientDaemon:
             model.rules(),
             model.discovery.filter(),
             model.namespace,
+            frame_prefix=model.client.frame_prefix,
             log=self.message_log,
             kick=self._kick,
         )
@@ -178,6 +179,11 @@ class ClientDaemon:
             "Gaps between messages longer than the topic's deadline_s.",
             ("topic",),
             lambda: [((topic,), float(count)) for topic, count in self.bridge.deadlines_missed.items()],
+        )
+        metrics.counter(
+            "sern_frame_ids_unread_total",
+            "Messages whose frame ids stayed without frame_prefix because their type or bytes could not be read.",
+            read=lambda: [((), float(self.bridge.frames.unreadable))],
         )
         metrics.counter(
             "sern_bad_frames_total",

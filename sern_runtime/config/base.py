@@ -106,8 +106,8 @@ def _check_phrase(text: str) -> None:
 
 
 def _check_frame_prefix(text: str) -> None:
-    if not re.fullmatch(r"[A-Za-z0-9_/]{1,64}", text):
-        raise UsageError("must be 1 to 64 letters, digits, '_' or '/', such as jackal1/")
+    if not re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_/]{0,63}", text):
+        raise UsageError("must be 1 to 64 letters, digits, '_' or '/', not '/' first, such as jackal1/")
 
 
 def split_tcp(endpoint: str) -> tuple[str, int] | None:

@@ -67,7 +67,8 @@ class ClientSection(Section):
     """Put before the names of its topics for everyone else: /odom of jackal1 is /jackal1/odom. null: the client's
     name; "/": names are global as they are."""
     frame_prefix: FramePrefix | None = None
-    """Put before the frame ids in messages that leave this site, such as "jackal1/"; null: unchanged."""
+    """Put before the frame ids (`frame_id` of headers, `child_frame_id`) in messages that leave this site, and taken
+    off those that come in, such as "jackal1/". Ids that are empty or begin with it stay; null: all stay."""
 
     @property
     def normal_namespace(self) -> str:
