@@ -1,0 +1,146 @@
+"""`sern demo` as a person starts it: real processes, a short script, and Ctrl-C at every stage.
+
+Figures are not judged here (the machine may be busy); what does not depend on speed is.
+"""
+
+import asyncio
+import json
+import os
+import signal
+import sys
+import uuid
+from pathlib import Path
+
+import pytest
+
+from sern_tools.demo import EXIT_BROKEN, EXIT_ERROR, EXIT_INTERRUPTED, EXIT_OK
+from tests.support import until
+
+PROFILES = """
+profiles:
+  quick:
+    description: A short run with a short interruption
+    link: {rate_bps: 2000000, delay_s: 0.01, queue_packets: 50, overhead_bytes: 28}
+    schedule: [{at_s: 1.0, blackout_s: 0.5}]
+    duration_s: 3
+"""
+RUN_S = 90.0
+INDEPENDENT_OF_SPEED = {"reliable_faults", "corrupted_messages", "expired_commands", "uncounted_messages"}
+
+
+class Started:
+    """A demo in a process, everything it prints, and whatever it left."""
+
+    def __init__(self, directory: Path) -> None:
+        self.directory = directory
+        self.mark = uuid.uuid4().hex
+        self.temporary = directory / "tmp"
+        self.output = ""
+        self.process: asyncio.subprocess.Process | None = None
+        self._reading: asyncio.Task[None] | None = None
+
+    async def start(self, *arguments: str) -> None:
+        self.temporary.mkdir()
+        profiles = self.directory / "profiles.yaml"
+        profiles.write_text(PROFILES)
+        environment = {**os.environ, "TMPDIR": str(self.temporary), "SERN_TEST_MARK": self.mark, "COLUMNS": "80"}
+        command = [sys.executable, "-m", "sern_tools.cli", "demo", "--profiles", str(profiles), *arguments]
+        self.process = await asyncio.create_subprocess_exec(
+            *command,
+            cwd=self.directory,
+            env=environment,
+            stdout=asyncio.subprocess.PIPE,
+            stderr=asyncio.subprocess.STDOUT,
+            start_new_session=True,
+        )
+        self._reading = asyncio.create_task(self._read())
+
+    async def _read(self) -> None:
+        assert self.process is not None and self.process.stdout is not None
+        while data := await self.process.stdout.read(4096):
+            self.output += data.decode()
+
+    async def ended(self) -> int:
+        """The exit status, once it has ended; RUN_S is for a very slow machine."""
+        assert self.process is not None and self._reading is not None
+        async with asyncio.timeout(RUN_S):
+            await self._reading
+            return await self.process.wait()
+
+    def processes(self) -> list[str]:
+        """The command lines of everything that carries this demo's mark."""
+        found = []
+        for entry in Path("/proc").iterdir():
+            try:
+                if entry.name.isdigit() and self.mark.encode() in (entry / "environ").read_bytes():
+                    found.append((entry / "cmdline").read_bytes().replace(b"\0", b" ").decode())
+            except OSError:
+                continue  # it ended while we looked
+        return found
+
+    async def clean_up(self) -> None:
+        if self.process is not None and self.process.returncode is None:
+            self.process.send_signal(signal.SIGINT)
+            await self.ended()
+
+    def assert_nothing_left(self) -> None:
+        assert self.processes() == []
+        assert list(self.temporary.iterdir()) == []
+
+
+async def test_a_whole_run_leaves_its_report_and_nothing_else(tmp_path: Path) -> None:
+    demo = Started(tmp_path)
+    try:
+        await demo.start("--profile", "quick", "--out", "result", "--json", "figures.json")
+        status = await demo.ended()
+        assert status in (EXIT_OK, EXIT_BROKEN), demo.output
+        demo.assert_nothing_left()
+    finally:
+        await demo.clean_up()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["figures.json", "profiles.yaml", "result", "tmp"]
+    assert [path.name for path in (tmp_path / "result").iterdir()] == ["report.html"]
+    figures = json.loads((tmp_path / "figures.json").read_text())
+    reach = {entry["name"]: entry["ok"] for entry in figures["reach"]}
+    assert {name: ok for name, ok in reach.items() if name in INDEPENDENT_OF_SPEED} == dict.fromkeys(
+        INDEPENDENT_OF_SPEED, True
+    ), demo.output
+    assert {"control_p99_s", "first_fresh_pose_s", "control_overtaken_share"} < reach.keys()
+    assert status == (EXIT_OK if all(reach.values()) else EXIT_BROKEN)
+    assert {row["system"] for row in figures["rows"]} == {"SERN", "plain ZMQ"}
+    for words in ("1/3  measuring", "2/3  SERN, 3 s", "3/3  the same load", "What became of the messages"):
+        assert words in demo.output
+
+
+@pytest.mark.parametrize(
+    ("stage", "number"),
+    [("1/3", signal.SIGINT), ("2/3", signal.SIGTERM), ("  0.0 s", signal.SIGINT), ("3/3", signal.SIGHUP)],
+)
+async def test_ctrl_c_stops_everything_at_any_stage(tmp_path: Path, stage: str, number: signal.Signals) -> None:
+    demo = Started(tmp_path)
+    try:
+        await demo.start("--profile", "quick", "--duration", "2")
+        await until(lambda: stage in demo.output or demo.process is None, stage, deadline_s=RUN_S)
+        assert demo.process is not None
+        demo.process.send_signal(number)
+        assert await demo.ended() == EXIT_INTERRUPTED, demo.output
+        demo.assert_nothing_left()
+    finally:
+        await demo.clean_up()
+    assert not (tmp_path / "demo-out").exists()
+    assert "Traceback" not in demo.output
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--profile", "quik"], "no link profile quik (did you mean quick?)"),
+        (["--profile", "quick", "--bag", "none.bag"], "none.bag: no such file or directory"),
+    ],
+)
+async def test_what_is_wrong_is_one_line(tmp_path: Path, arguments: list[str], words: str) -> None:
+    demo = Started(tmp_path)
+    await demo.start(*arguments)
+    assert await demo.ended() == EXIT_ERROR
+    assert words in demo.output
+    assert len(demo.output.splitlines()) == 1
+    demo.assert_nothing_left()
