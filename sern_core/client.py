@@ -7,7 +7,7 @@ appear and which messages have their turn. Everything about bandwidth, order, re
 from typing import Protocol
 
 from sern_core import wire
-from sern_core.announce import MAX_STRINGS, Announcement
+from sern_core.announce import MAX_STRINGS, Announcement, check_stream
 from sern_core.errors import ConfigError, WireError
 from sern_core.fragments import InStream
 from sern_core.ledger import ReceiveLedger
@@ -15,6 +15,7 @@ from sern_core.link import Link
 from sern_core.message import Message, StreamId, StreamInfo, TopicInfo, TopicSpec
 from sern_core.params import LinkParams, SchedulerParams
 from sern_core.queues import OutChannel, OutMessage
+from sern_core.replay import LatchedCache
 from sern_core.trace import DecisionTrace, TraceEvent
 from sern_core.types import ClientName, DropReason, ObjectKind
 
@@ -80,6 +81,7 @@ class ClientCore:
         self.attributes: dict[str, str] = {}
         """Metadata of this node, for the object registry."""
         self._generations: dict[StreamId, int] = {}
+        self._latched: dict[StreamId, LatchedCache] = {}  # for a relay that comes back with nothing
         self._open: set[StreamId] = set()
         self.link = Link(
             name=name,
@@ -98,19 +100,31 @@ class ClientCore:
     # --- publishing -----------------------------------------------------------------------------------------------
 
     def publish(self, info: TopicInfo, spec: TopicSpec, *, now: float) -> OutChannel:
-        """Offer a topic under its global name. Offering it again after `unpublish` goes on counting where it ended."""
+        """Offer a topic under its global name. Offering it again after `unpublish` goes on counting where it ended.
+
+        Raises UsageError if it is offered already, or no relay would accept it.
+        """
         identity = StreamId(self.name, self.boot, info.name)
         first = self._generations.get(identity, 0) + 1
-        return self.link.open_channel(StreamInfo(identity, info, spec), first=first, now=now)
+        stream = StreamInfo(identity, info, spec)
+        check_stream(stream)
+        channel = self.link.open_channel(stream, first=first, now=now)
+        if spec.latched:
+            self._latched[identity] = LatchedCache(spec.depth, spec.max_queue_bytes)
+        return channel
 
     def unpublish(self, channel: OutChannel, *, now: float) -> None:
         self._generations[channel.stream.id] = channel.next_seq - 1
+        self._latched.pop(channel.stream.id, None)
         self.link.close_channel(channel, DropReason.SHUTDOWN, now=now)
 
     def send(self, channel: OutChannel, body: bytes, stamp_ns: int, *, now: float) -> bool:
         """Offer one message. False: refused, the reliable queue is full; offer it again later or count it lost."""
         message = Message(channel.stream.id, channel.next_seq, body, stamp_ns, now)
-        return self.link.submit(channel, message, now=now)
+        accepted = self.link.submit(channel, message, now=now)
+        if accepted and channel.spec.latched:
+            self._latched[channel.stream.id].add(message)
+        return accepted
 
     # --- receiving ------------------------------------------------------------------------------------------------
 
@@ -164,6 +178,9 @@ class ClientCore:
     # --- LinkHandler ----------------------------------------------------------------------------------------------
 
     def on_up(self, link: Link, *, resumed: bool, now: float) -> None:
+        if not resumed:
+            for identity, cache in self._latched.items():
+                link.by_stream[identity].prime(cache.replay(), now=now)
         self._send_subscription(now)
         self.events.link_up(resumed=resumed)
 
@@ -240,7 +257,7 @@ class ClientCore:
         self.events.publication_refused(channel.stream, code, text)
 
     def on_skipped(self, link: Link, stream: InStream, count: int, *, now: float) -> None:
-        if stream.reliable and stream.stream.id in self._open:
+        if stream.begun and stream.stream.id in self._open:
             self.events.skipped(stream.stream, count)
 
     def on_control(self, link: Link, envelope: wire.Envelope, attachment: bytes, *, now: float) -> None:

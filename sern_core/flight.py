@@ -1,9 +1,11 @@
 """Sent and not yet acknowledged: the accounting of one lane in one direction.
 
 The sender numbers every acknowledgement-eliciting datagram from 1. A packet is lost when three later ones have been
-acknowledged, or when it is older than max(100 ms, 2 srtt + 30 ms); on a stream lane (TCP) nothing is lost while the
-connection lasts. The receiver's half says what to acknowledge and when: every second datagram, at once on a gap or
-on class control, else within `ACK_DELAY_S`.
+acknowledged, or when it is older than max(100 ms, 2 srtt + 30 ms, RTO); on a stream lane (TCP) nothing is lost while
+the connection lasts. A round trip is measured from every acknowledgement that names a newer packet, whether or not
+that packet was given up meanwhile: else a path slower than the first guess would never be measured.
+The receiver's half says what to acknowledge and when: every second datagram, at once on a gap or on class control,
+else within `ACK_DELAY_S`.
 """
 
 from collections.abc import Callable
@@ -13,8 +15,15 @@ from sern_core.clocksync import RttEstimator
 
 REORDER_THRESHOLD: Final = 3
 MIN_LOSS_TIMEOUT_S: Final = 0.100
+FIRST_LOSS_TIMEOUT_S: Final = 1.0
+"""Before any round trip was measured (RFC 6298, 2.1)."""
+STALL_MIN_S: Final = 0.5
+STALL_RTTS: Final = 4.0
+FIRST_STALL_S: Final = 3.0
+"""No acknowledgement for so long: the path is gone; the last one before any round trip was measured."""
 ACK_DELAY_S: Final = 0.010
 SACK_BITS: Final = 64
+SACK_MASK: Final = (1 << SACK_BITS) - 1
 
 Items = list[Any]
 """What a packet carried, opaque here: handed back when the packet is acknowledged or lost."""
@@ -41,58 +50,65 @@ class Flight:
         self.inflight_bytes = 0
         self.packets: dict[int, Packet] = {}  # in order of number, which dicts keep
         self.next_number = 1
+        self.highest_acked = 0
         self.rtt = RttEstimator()
-        self.last_progress_s: float | None = None  # last acknowledgement, or first send after idle
+        self.waiting_since_s: float | None = None  # last acknowledgement, or the first packet since nothing is owed
 
     def sent(self, *, now: float, nbytes: int, items: Items, app_limited: bool) -> None:
         number = self.next_number
-        if not self.packets:
-            self.last_progress_s = now
+        if self.waiting_since_s is None:
+            self.waiting_since_s = now
         self.packets[number] = Packet(number, now, nbytes, items, app_limited)
         self.inflight_bytes += nbytes
         self.next_number = number + 1
 
     def acked(self, highest: int, sack: int, *, now: float) -> list[Packet]:
         """Packets that this acknowledgement newly covers, oldest first. Unknown numbers are old news."""
+        if highest > self.highest_acked:
+            self.highest_acked = highest
+            self.waiting_since_s = now
         packets = self.packets
-        if not packets:
-            return []
+        result: list[Packet] = []
         if self.lossless:
             # A stream delivers in order: everything up to `highest` has arrived.
-            done = []
-            for number in packets:
+            for number, packet in packets.items():
                 if number > highest:
                     break
-                done.append(number)
+                result.append(packet)
         else:
-            done = [
-                number
-                for number in packets
-                if number == highest or (0 <= highest - number - 1 < SACK_BITS and sack >> (highest - number - 1) & 1)
-            ]
-        result = []
-        for number in done:
-            packet = packets.pop(number)
+            for number, packet in packets.items():
+                if number >= highest:
+                    if number == highest:
+                        result.append(packet)
+                    break
+                behind = highest - number - 1
+                if behind < SACK_BITS and sack >> behind & 1:
+                    result.append(packet)
+        for packet in result:
+            del packets[packet.number]
             self.inflight_bytes -= packet.nbytes
-            result.append(packet)
-        if result:
-            self.last_progress_s = now
+        if not packets:
+            self.waiting_since_s = None
         return result
 
     def loss_timeout_s(self) -> float:
-        srtt_s = self.rtt.srtt_s
-        return max(MIN_LOSS_TIMEOUT_S, 2 * srtt_s + 0.030) if srtt_s is not None else 1.0
+        if not self.rtt.samples:
+            return FIRST_LOSS_TIMEOUT_S
+        return max(MIN_LOSS_TIMEOUT_S, 2 * self.rtt.srtt_s + 0.030, self.rtt.rto_s)
 
-    def lost(self, highest_acked: int, *, now: float) -> list[Packet]:
+    def stall_timeout_s(self) -> float:
+        return max(STALL_MIN_S, STALL_RTTS * self.rtt.srtt_s) if self.rtt.samples else FIRST_STALL_S
+
+    def lost(self, *, now: float) -> list[Packet]:
         """Packets to give up, oldest first; they leave the flight."""
         if self.lossless or not self.packets:
             return []
-        timeout_s = self.loss_timeout_s()
+        sent_before_s = now - self.loss_timeout_s()
         gone = []
         for packet in self.packets.values():
-            if packet.number <= highest_acked - REORDER_THRESHOLD or packet.sent_s + timeout_s <= now:
+            if packet.number <= self.highest_acked - REORDER_THRESHOLD or packet.sent_s <= sent_before_s:
                 gone.append(packet)
-            elif packet.number > highest_acked:
+            else:
                 break
         for packet in gone:
             del self.packets[packet.number]
@@ -100,20 +116,24 @@ class Flight:
         return gone
 
     def loss_deadline(self) -> float | None:
+        """When the oldest packet is lost by time alone; a hair late, so that `lost` agrees whatever the rounding."""
         if self.lossless or not self.packets:
             return None
-        return next(iter(self.packets.values())).sent_s + self.loss_timeout_s()
+        return next(iter(self.packets.values())).sent_s + self.loss_timeout_s() + 1e-6
 
     def abandon(self) -> list[Packet]:
         """The transport is gone: everything in flight comes back, oldest first. Numbers go on."""
         result = list(self.packets.values())
         self.packets.clear()
         self.inflight_bytes = 0
+        self.waiting_since_s = None
         return result
 
     def validate(self, check: Callable[[bool, str], None]) -> None:
         check(self.inflight_bytes == sum(p.nbytes for p in self.packets.values()), "in-flight bytes do not add up")
-        check(self.inflight_bytes >= 0, "negative bytes in flight")
+        numbers = list(self.packets)
+        check(numbers == sorted(numbers), "packets in flight are out of order")
+        check(not self.packets or self.waiting_since_s is not None, "nobody waits for what is in flight")
 
 
 class Arrivals:
@@ -132,23 +152,26 @@ class Arrivals:
         self.since_s = 0.0
 
     def arrived(self, number: int, stamp_us: int, nbytes: int, *, now: float) -> bool:
-        """Note one numbered datagram. False: seen before (a duplicate on the network)."""
+        """Note one numbered datagram. False: seen before, a duplicate made by the network."""
         ahead = number - self.highest
-        if ahead > 0:
-            self.mask = ((self.mask << ahead) | (1 << (ahead - 1) if self.highest else 0)) & 0xFFFFFFFFFFFFFFFF
-            if ahead > 1:
-                self.due = True  # a gap
-            self.highest = number
-            self.echo_us = stamp_us
-            self.received_us = int(now * 1e6)
+        if ahead == 1:
+            self.mask = (self.mask << 1 | (1 if self.highest else 0)) & SACK_MASK
+        elif ahead > 0:
+            self.mask = (
+                (self.mask << ahead | 1 << (ahead - 1)) & SACK_MASK if self.highest and ahead <= SACK_BITS else 0
+            )
+            self.due = True  # a gap
         else:
             bit = -ahead - 1
             if bit < 0 or (bit < SACK_BITS and self.mask >> bit & 1):
-                self.due = True  # our acknowledgement was lost: say it again
                 return False
             if bit < SACK_BITS:
                 self.mask |= 1 << bit
             self.due = True  # it fills a gap
+        if ahead > 0:
+            self.highest = number
+            self.echo_us = stamp_us
+            self.received_us = int(now * 1e6)
         self.cum_bytes += nbytes
         if not self.unacked:
             self.since_s = now
@@ -156,12 +179,6 @@ class Arrivals:
         if self.unacked >= 2:
             self.due = True
         return True
-
-    def deadline(self) -> float | None:
-        """When an acknowledgement must leave; None if nothing is owed."""
-        if self.due:
-            return self.since_s
-        return self.since_s + ACK_DELAY_S if self.unacked else None
 
     def flushed(self) -> None:
         self.unacked = 0

@@ -1,8 +1,10 @@
 """The receiving side of a stream on one hop: reassembly, duplicates, order, tombstones.
 
 Best effort is delivered in increasing seq (a late older sample is dropped as superseded); reliable is delivered
-once and in order, a tombstone taking its message's turn. State is kept per `StreamId`, across sessions and peers:
-that is what makes "once" hold when a relay comes back as a new process and everything is sent again.
+once and in order, a tombstone taking its message's turn. A reliable message that cannot be kept here (too late, too
+large, no room) becomes a tombstone as well, and the sender is told: nothing waits for it for ever.
+State is kept per `StreamId`, across sessions and peers: that is what makes "once" hold when a relay comes back as a
+new process and everything is sent again.
 """
 
 from collections.abc import Callable
@@ -15,17 +17,19 @@ from sern_core.wire import FLAG_REPLAY, FLAG_TOMBSTONE
 PARTIAL_IDLE_S: Final = 10.0
 """A half-received best-effort message that gets no fragment for so long will not be completed."""
 SEEN_BITS: Final = 64
+SEEN_MASK: Final = (1 << SEEN_BITS) - 1
 
 
 class Partial:
     """One message of which some fragments have arrived."""
 
-    __slots__ = ("body", "born_s", "spans", "stamp_ns", "touched_s")
+    __slots__ = ("body", "born_s", "error_s", "spans", "stamp_ns", "touched_s")
 
     def __init__(self, total: int) -> None:
         self.body = bytearray(total)
         self.spans: list[tuple[int, int]] = []  # merged [start, end) that have arrived
         self.born_s: float | None = None  # known with the first fragment
+        self.error_s = 0.0
         self.stamp_ns = 0
         self.touched_s = 0.0
 
@@ -53,7 +57,7 @@ class Partial:
 
 
 class Reassembly:
-    """Memory that half-received messages of one link may hold in all."""
+    """Memory that half-received and waiting messages of one link may hold in all."""
 
     __slots__ = ("held_bytes", "limit_bytes")
 
@@ -62,8 +66,21 @@ class Reassembly:
         self.held_bytes = 0
 
 
+class DropReport:
+    """A reliable message dropped here or further on, of which the peer must know before its watermark passes it."""
+
+    __slots__ = ("control_seq", "reason", "seq", "where")
+
+    def __init__(self, seq: int, reason: DropReason, where: str) -> None:
+        self.seq = seq
+        self.reason = reason
+        self.where = where
+        self.control_seq = 0  # the control message of this session that carries it; 0: none yet
+
+
 Deliver = Callable[["InStream", Message], None]
-OnInDrop = Callable[["InStream", DropReason, int], None]
+OnInDrop = Callable[["InStream", DropReason, int, int], None]
+"""Stream, reason, bytes, and the seq of a reliable message that was given up here (its tombstone follows) or 0."""
 
 
 class InStream:
@@ -78,32 +95,29 @@ class InStream:
         self.delivered = first - 1
         self.confirmed = first - 1  # what the peer was told (`Hop.confirm`)
         self.channel_id: int | None = None  # in this session
-        self.error_s = 0.0  # uncertainty of the one-way delay, set by the hop
-        self.skipped = 0  # messages that an announcement said will not come
+        self.begun = False  # something has had its turn
+        self.reports: list[DropReport] = []  # drops that the peer may not know of yet
         self._seen = 0  # best effort: bit i set when seq delivered-1-i arrived
         self._partials: dict[int, Partial] = {}
         self._waiting: dict[int, Message] = {}
         self._reassembly = reassembly
         self._deliver = deliver
         self._on_drop = on_drop
-        self.last_message: Message | None = None
         self._now = 0.0
 
-    def skip_to(self, first: int) -> int:
+    def skip_to(self, first: int, now: float) -> int:
         """The sender says that nothing below `first` will come. Returns how many messages that leaves out."""
         left_out = first - 1 - self.delivered
-        if left_out <= 0:
+        if left_out <= 0 or not self.reliable:
             return 0
-        if self.reliable:
-            while self.delivered < first - 1:
-                self.delivered += 1
-                message = self._waiting.pop(self.delivered, None)
-                self._discard_partial(self.delivered)
-                if message is not None:
-                    left_out -= 1
-                    self._turn(message)
-            self._advance()
-        self.skipped += left_out
+        self._now = now
+        for seq in [seq for seq in self._partials if seq < first]:
+            self._discard_partial(seq)
+        for seq in sorted(seq for seq in self._waiting if seq < first):
+            left_out -= 1
+            self._take_turn(seq)
+        self.delivered = first - 1
+        self._advance()
         return left_out
 
     def fragment(
@@ -115,54 +129,66 @@ class InStream:
         body: bytes,
         stamp_ns: int,
         born_s: float,
+        error_s: float,
         now: float,
     ) -> None:
-        """One fragment arrived; `seq` is widened already and `born_s` holds for offset 0 only."""
+        """One fragment arrived; `seq` is widened already, `born_s` and `error_s` hold for offset 0 only."""
         self._now = now
         if seq <= self.delivered:
             self._late(seq, len(body))
             return
-        if flags & FLAG_TOMBSTONE:
+        if self._partials and (flags & FLAG_TOMBSTONE or len(body) == total):
             self._discard_partial(seq)
-            if seq not in self._waiting:
-                code = body[0] if body[0] in DROP_REASONS else 1
-                self._arrived(Message(self.stream.id, seq, body, stamp_ns, born_s, tombstone=code))
+        if self._waiting and seq in self._waiting:
+            self._on_drop(self, DropReason.DUPLICATE, len(body), 0)
+            return
+        if flags & FLAG_TOMBSTONE:
+            code = body[0] if body[0] in DROP_REASONS else DROP_CODES[DropReason.LOST]
+            self._arrived(Message(self.stream.id, seq, body, stamp_ns, born_s, code))
             return
         replay = bool(flags & FLAG_REPLAY)
         if len(body) == total:
-            self._discard_partial(seq)
-            if seq in self._waiting:
-                self._on_drop(self, DropReason.DUPLICATE, total)
-                return
-            self._arrived(Message(self.stream.id, seq, body, stamp_ns, born_s, 0, replay))
-            return
-        if seq in self._waiting:
-            self._on_drop(self, DropReason.DUPLICATE, len(body))
+            self._arrived(Message(self.stream.id, seq, body, stamp_ns, born_s, 0, replay, error_s))
             return
         partial = self._partials.get(seq)
         if partial is None or len(partial.body) != total:
             self._discard_partial(seq)
             if not self._make_room(total):
-                self._on_drop(self, DropReason.REASSEMBLY, len(body))
+                self.give_up(seq, DropReason.REASSEMBLY, len(body), now)
                 return
             partial = self._partials[seq] = Partial(total)
         partial.touched_s = now
         partial.add(offset, body)
         if offset == 0:
-            partial.born_s, partial.stamp_ns = born_s, stamp_ns
+            partial.born_s, partial.error_s, partial.stamp_ns = born_s, error_s, stamp_ns
         if partial.complete:
             assert partial.born_s is not None
-            del self._partials[seq]
-            self._reassembly.held_bytes -= total
+            self._discard_partial(seq)
+            whole = bytes(partial.body)
             self._arrived(
-                Message(self.stream.id, seq, bytes(partial.body), partial.stamp_ns, partial.born_s, 0, replay)
+                Message(self.stream.id, seq, whole, partial.stamp_ns, partial.born_s, 0, replay, partial.error_s)
             )
+
+    def give_up(self, seq: int, reason: DropReason, nbytes: int, now: float) -> None:
+        """Message `seq` cannot be taken here: best effort loses it, of a reliable stream a tombstone takes its turn."""
+        self._now = now
+        if seq <= self.delivered or seq in self._waiting:
+            return
+        if not self.reliable:
+            self._on_drop(self, reason, nbytes, 0)
+            return
+        self._on_drop(self, reason, nbytes, seq)
+        self._arrived(self._tombstone(seq, reason, 0, now))
+
+    def _tombstone(self, seq: int, reason: DropReason, stamp_ns: int, born_s: float) -> Message:
+        code = DROP_CODES[reason]
+        return Message(self.stream.id, seq, bytes([code]), stamp_ns, born_s, code)
 
     def _make_room(self, total: int) -> bool:
         reassembly = self._reassembly
         while self._partials and not self.reliable and reassembly.held_bytes + total > reassembly.limit_bytes:
             oldest = min(self._partials)
-            self._on_drop(self, DropReason.REASSEMBLY, len(self._partials[oldest].body))
+            self._on_drop(self, DropReason.REASSEMBLY, len(self._partials[oldest].body), 0)
             self._discard_partial(oldest)
         if reassembly.held_bytes + total > reassembly.limit_bytes:
             return False
@@ -176,25 +202,29 @@ class InStream:
 
     def _late(self, seq: int, size: int) -> None:
         if self.reliable:
-            self._on_drop(self, DropReason.DUPLICATE, size)
+            self._on_drop(self, DropReason.DUPLICATE, size, 0)
             return
         bit = self.delivered - 1 - seq
         if seq == self.delivered or (0 <= bit < SEEN_BITS and self._seen >> bit & 1):
-            self._on_drop(self, DropReason.DUPLICATE, size)
+            self._on_drop(self, DropReason.DUPLICATE, size, 0)
         else:
             if 0 <= bit < SEEN_BITS:
                 self._seen |= 1 << bit
-            self._on_drop(self, DropReason.SUPERSEDED, size)
+            self._on_drop(self, DropReason.SUPERSEDED, size, 0)
 
     def _arrived(self, message: Message) -> None:
         seq = message.seq
         if not self.reliable:
             ahead = seq - self.delivered
-            self._seen = ((self._seen << ahead) | 1 << (ahead - 1)) & (1 << SEEN_BITS) - 1
+            if ahead == 1:
+                self._seen = (self._seen << 1 | 1) & SEEN_MASK
+            else:
+                self._seen = (self._seen << ahead | 1 << (ahead - 1)) & SEEN_MASK if ahead <= SEEN_BITS else 0
             self.delivered = seq
-            for stale in [s for s in self._partials if s <= seq] if self._partials else ():
-                self._on_drop(self, DropReason.SUPERSEDED, len(self._partials[stale].body))
-                self._discard_partial(stale)
+            if self._partials:
+                for stale in [s for s in self._partials if s <= seq]:
+                    self._on_drop(self, DropReason.SUPERSEDED, len(self._partials[stale].body), 0)
+                    self._discard_partial(stale)
             self._turn(message)
             return
         if seq == self.delivered + 1:
@@ -202,41 +232,73 @@ class InStream:
             self._turn(message)
             if self._waiting:
                 self._advance()
-        else:
-            self._waiting[seq] = message
+            return
+        size = len(message.body)
+        if not message.tombstone and not self._make_room(size):
+            # Without the message before it this one cannot be kept; its tombstone can.
+            self._on_drop(self, DropReason.REASSEMBLY, size, seq)
+            message = self._tombstone(seq, DropReason.REASSEMBLY, message.stamp_ns, message.born_s)
+        self._waiting[seq] = message
 
     def _advance(self) -> None:
-        while (message := self._waiting.pop(self.delivered + 1, None)) is not None:
-            self.delivered = message.seq
-            self._turn(message)
+        while self.delivered + 1 in self._waiting:
+            self._take_turn(self.delivered + 1)
+
+    def _take_turn(self, seq: int) -> None:
+        """A message that waited for those before it."""
+        message = self._waiting.pop(seq)
+        if not message.tombstone:
+            self._reassembly.held_bytes -= len(message.body)
+        self.delivered = seq
+        self._turn(message)
 
     def _turn(self, message: Message) -> None:
         lifespan_s = self.lifespan_s
-        if lifespan_s is not None and not message.tombstone and self._now - message.born_s + self.error_s > lifespan_s:
-            self._on_drop(self, DropReason.LIFESPAN, len(message.body))
+        if (
+            lifespan_s is not None
+            and not message.tombstone
+            and self._now - message.born_s + message.error_s > lifespan_s
+        ):
+            # Late as far as can be known: where the clocks' offset is uncertain, the worst of it counts.
+            size = len(message.body)
             if not self.reliable:
+                self._on_drop(self, DropReason.LIFESPAN, size, 0)
                 return
-            code = DROP_CODES[DropReason.LIFESPAN]
-            message = Message(message.stream, message.seq, bytes([code]), message.stamp_ns, message.born_s, code)
-        self.last_message = message
+            self._on_drop(self, DropReason.LIFESPAN, size, message.seq)
+            message = self._tombstone(message.seq, DropReason.LIFESPAN, message.stamp_ns, message.born_s)
+        self.begun = True
         self._deliver(self, message)
 
-    def sweep(self, now: float) -> None:
-        """Give up half-received best-effort messages that nobody completes."""
+    def sweep(self, now: float, up_since_s: float) -> None:
+        """Give up half-received best-effort messages that nobody completes, though the link has been there."""
         if self.reliable or not self._partials:
             return
-        for seq in [seq for seq, partial in self._partials.items() if now - partial.touched_s > PARTIAL_IDLE_S]:
-            self._on_drop(self, DropReason.LOST, len(self._partials[seq].body))
-            self._discard_partial(seq)
+        for seq, partial in list(self._partials.items()):
+            if now - max(partial.touched_s, up_since_s) > PARTIAL_IDLE_S:
+                self._on_drop(self, DropReason.LOST, len(partial.body), 0)
+                self._discard_partial(seq)
 
     def close(self) -> None:
         """The stream ends; half-received messages are let go."""
         for seq in list(self._partials):
-            self._on_drop(self, DropReason.DISCONNECTED, len(self._partials[seq].body))
+            self._on_drop(self, DropReason.DISCONNECTED, len(self._partials[seq].body), 0)
             self._discard_partial(seq)
+        self._reassembly.held_bytes -= self._waiting_bytes()
         self._waiting.clear()
+        self.reports.clear()
+
+    def _waiting_bytes(self) -> int:
+        return sum(len(message.body) for message in self._waiting.values() if not message.tombstone)
+
+    @property
+    def held_bytes(self) -> int:
+        """Memory of half-received and waiting messages."""
+        return sum(len(partial.body) for partial in self._partials.values()) + self._waiting_bytes()
 
     def validate(self, check: Callable[[bool, str], None]) -> None:
         name = self.stream.id.topic
         check(all(seq > self.delivered for seq in self._waiting), f"{name}: a delivered message still waits")
         check(all(seq > self.delivered for seq in self._partials), f"{name}: a stale partial message is kept")
+        check(self.delivered + 1 not in self._waiting, f"{name}: a message waits for nothing")
+        check(not self._partials.keys() & self._waiting.keys(), f"{name}: a whole message is half-received as well")
+        check(self.confirmed <= self.delivered, f"{name}: more was confirmed than had its turn")

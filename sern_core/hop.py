@@ -20,7 +20,16 @@ from sern_core.params import LinkParams, SchedulerParams
 from sern_core.queues import OutChannel, OutMessage
 from sern_core.scheduler import Scheduler
 from sern_core.trace import LINK, DecisionTrace, TraceEvent
-from sern_core.types import ClientName, DropReason, Encoding, Ordering, PriorityClass, Reliability, TopicName
+from sern_core.types import (
+    CLASSES,
+    ClientName,
+    DropReason,
+    Encoding,
+    Ordering,
+    PriorityClass,
+    Reliability,
+    TopicName,
+)
 
 CONTROL_CHANNEL: Final = 0
 CONTROL_TOPIC: Final = TopicName("/_sern/control")
@@ -30,6 +39,8 @@ RATE_INTERVAL_S: Final = 0.05
 MIN_SHARE_BYTES: Final = 64
 """A fragment smaller than this is not worth its header: the datagram ends instead."""
 MAX_WATERMARKS: Final = 64
+MAX_CONTROL_BYTES: Final = 2 + wire.MAX_ENVELOPE_BYTES + wire.MAX_ATTACHMENT_BYTES + 1024
+"""A control message: envelope and packed attachment (what cannot be packed grows a little)."""
 
 
 class SentData(NamedTuple):
@@ -88,15 +99,18 @@ class Hop(ABC):
         """Streams of this session by the peer's channel number."""
         self.reassembly = Reassembly(max(64 * 2**20, 2 * link.max_message_bytes))
         self.established = False
-        self.tag = 0
+        self.version = wire.VERSION_MAX
+        self.tag = boot % 255  # so that a late datagram of an earlier process is not taken for one of ours
         self.dirty = False
         """Something may be sendable: the owner should poll `next_datagram`."""
         self._ping = False
         self._ping_due_s = now
         self._sweep_due_s = now + SWEEP_INTERVAL_S
         self._rate_due_s = now
+        self._up_since_s = now
         self._watermarks: dict[int, int] = {}  # channel -> delivered, not yet on the wire
         self._rx_stamp_us = 0
+        self._rx_delay: tuple[float, float] | None = None  # of the datagram at hand, and its uncertainty
         self._now = now
         self._begin_control()
 
@@ -106,7 +120,11 @@ class Hop(ABC):
     def _control_message(self, stream: InStream, message: Message) -> None: ...
 
     @abstractmethod
-    def _in_drop(self, stream: InStream, reason: DropReason, nbytes: int) -> None: ...
+    def _in_drop(self, stream: InStream, reason: DropReason, nbytes: int, seq: int) -> None: ...
+
+    @abstractmethod
+    def _control_sent(self, seq: int) -> None:
+        """Control message `seq` is on the wire."""
 
     @abstractmethod
     def _watermark_moved(self, channel: OutChannel) -> None: ...
@@ -168,8 +186,7 @@ class Hop(ABC):
         self.dirty = True
         self.scheduler.offer(
             channel.slot,
-            # A replay for a late joiner competes with deferrable traffic only, never with live state.
-            priority=PriorityClass.BULK if out.message.replay else spec.priority,
+            priority=_class_of(channel, out),
             weight=spec.weight,
             size_bytes=out.unsent_bytes,
             since_s=since_s,
@@ -201,52 +218,65 @@ class Hop(ABC):
             arrivals.flushed()
         if not frames:
             return None
+        self.dirty = True
         if not items:
-            return b"".join((wire.encode_header(wire.Kind.DATA, self.tag, 0, microseconds(now)), *frames))
+            return b"".join((self._header(0, now), *frames))
         flight = lane.flight
-        header = wire.encode_header(wire.Kind.DATA, self.tag, flight.next_number, microseconds(now))
-        datagram = b"".join((header, *frames))
+        datagram = b"".join((self._header(flight.next_number, now), *frames))
         nbytes = len(datagram) + OVERHEAD_BYTES
         estimator = lane.estimator
-        app_limited = not self.dirty and flight.inflight_bytes + nbytes < estimator.window_bytes
+        inflight_bytes = flight.inflight_bytes + nbytes
+        app_limited = inflight_bytes < estimator.window_bytes and not self._backlog
         flight.sent(now=now, nbytes=nbytes, items=items, app_limited=app_limited)
-        estimator.on_sent(now=now, nbytes=nbytes, inflight_bytes=flight.inflight_bytes)
+        estimator.on_sent(now=now, nbytes=nbytes, inflight_bytes=inflight_bytes)
         self._ping_due_s = now + PING_INTERVAL_S
         return datagram
 
+    def _header(self, number: int, now: float) -> bytes:
+        return wire.encode_header(wire.Kind.DATA, self.tag, number, microseconds(now), version=self.version)
+
+    @property
+    def _backlog(self) -> bool:
+        """Whether more could be sent if the window allowed it."""
+        control = self._control
+        scheduler = self.scheduler
+        return bool(control.queue or control.active) or any(scheduler.pending(priority) for priority in CLASSES)
+
     def _compose(self, frames: list[bytes], items: list[SentData | SentWatermark | SentPing], now: float) -> None:
-        """Fill one datagram: watermarks, control, then what the scheduler picks, of one class."""
+        """Fill one datagram: watermarks, then what the scheduler picks, of one class; control ahead of all but class 0.
+
+        Control keeps to the window like everything below class 0: a thousand announcements must not fill the path.
+        """
         lane = self.lane
         limit = lane.fragment_bytes - (wire.ACK.size if lane.arrivals.unacked else 0)
         scheduler = self.scheduler
         window_open = lane.window_open and not lane.stalled
         size = wire.HEADER_BYTES
         if self._watermarks:
-            for slot in list(self._watermarks)[:MAX_WATERMARKS]:
-                frames.append(wire.encode_watermark(slot, self._watermarks.pop(slot)))
-                items.append(SentWatermark(slot))
-                size += wire.WATERMARK.size
+            size = self._put_watermarks(frames, items, size)
         control = self._control
-        while size < limit - MIN_SHARE_BYTES and (order := control.head(now)) is not None:
-            before = size
-            size = self._put(control, order, frames, items, size, limit, now)
-            scheduler.charge(PriorityClass.CONTROL, size - before, now=now)
         served: PriorityClass | None = None
-        while size < limit:
+        while size < limit - MIN_SHARE_BYTES:
             chosen = self._pick(now, window_open=window_open)
-            if chosen is None:
+            channel = self.channels[chosen] if chosen is not None else None
+            if window_open and (channel is None or channel.spec.priority is not PriorityClass.CONTROL):
+                order = control.head(now)
+                if order is not None:
+                    size = self._put(control, order, frames, items, size, limit, now)
+                    if not order.has_unsent:
+                        self._control_sent(order.seq)
+                    continue
+            if channel is None:
                 break
-            channel = self.channels[chosen]
             out = channel.head(now)
             if out is None:
                 self._refresh(channel, now)
                 continue
-            priority = channel.spec.priority
+            priority = _class_of(channel, out)
             if frames and (
                 (served is not None and priority is not served)
                 or out.unsent_bytes > limit - size - wire.DATA_FIRST_BYTES
             ):
-                self.dirty = True
                 break
             served = priority
             before = size
@@ -259,8 +289,19 @@ class Hop(ABC):
             frames.append(wire.PING_FRAME)
             items.append(SentPing())
         self._ping = False
-        if items:
-            self.dirty = True
+
+    def _put_watermarks(self, frames: list[bytes], items: list[SentData | SentWatermark | SentPing], size: int) -> int:
+        acked = self._control.watermark
+        for slot in list(self._watermarks)[:MAX_WATERMARKS]:
+            reports = self.incoming[slot].reports
+            while reports and 0 < reports[0].control_seq <= acked:
+                del reports[0]
+            if reports:
+                continue  # the peer must hear of drops first: behind the watermark it would take them for delivered
+            frames.append(wire.encode_watermark(slot, self._watermarks.pop(slot)))
+            items.append(SentWatermark(slot))
+            size += wire.WATERMARK.size
+        return size
 
     def _pick(self, now: float, *, window_open: bool) -> int | None:
         """The scheduler's choice; under `ordering: paper` what it found stale is dropped first."""
@@ -294,7 +335,10 @@ class Hop(ABC):
             flags |= wire.FLAG_URGENT
         if start == 0:
             age_s = now - message.born_s
-            head = wire.encode_data_first(flags, channel.slot, out.seq, out.size, end, message.stamp_ns, age_s, 0)
+            error_s = message.error_s + wire.AGE_UNIT_S  # the age itself is cut to its unit
+            head = wire.encode_data_first(
+                flags, channel.slot, out.seq, out.size, end, message.stamp_ns, age_s, 0, error_s
+            )
         else:
             head = wire.encode_data_next(flags, channel.slot, out.seq, start, out.size, end - start)
         frames.append(head)
@@ -307,12 +351,13 @@ class Hop(ABC):
     def _receive_data(self, header: wire.Header, data: bytes, now: float) -> None:
         """A kind-16 datagram of this session."""
         self._rx_stamp_us = header.stamp_us
+        self._rx_delay = None
         self._now = now
         if header.number:
             arrivals = self.lane.arrivals
-            arrivals.arrived(header.number, header.stamp_us, len(data) + OVERHEAD_BYTES, now=now)
-            if arrivals.due:
-                self.dirty = True
+            if not arrivals.arrived(header.number, header.stamp_us, len(data) + OVERHEAD_BYTES, now=now):
+                return
+            self.dirty = True  # an acknowledgement is owed
         wire.decode_frames(data, self)
 
     def on_data(
@@ -326,6 +371,7 @@ class Hop(ABC):
         stamp_ns: int,
         age_s: float,
         codec: int,
+        error_s: float,
     ) -> None:
         """FrameSink: one fragment."""
         now = self._now
@@ -333,26 +379,29 @@ class Hop(ABC):
             raise WireError(f"codec {codec} was not agreed")
         if flags & wire.FLAG_URGENT:
             self.lane.arrivals.due = True
-            self.dirty = True
         if channel == CONTROL_CHANNEL:
             stream = self._control_in
+            if total > MAX_CONTROL_BYTES:
+                raise WireError(f"control message of {total} bytes exceeds {MAX_CONTROL_BYTES}")
         else:
             known = self.incoming.get(channel)
             if known is None:
                 self.strays += 1
                 return
             stream = known
-        if total > self.params.max_message_bytes:
-            raise WireError(f"message of {total} bytes exceeds max_message_bytes {self.params.max_message_bytes}")
         wide = wire.widen_seq(seq, stream.delivered)
+        if total > self.params.max_message_bytes:
+            if offset == 0:
+                stream.give_up(wide, DropReason.TOO_LARGE, total, now)
+            return
         born_s = now
         if offset == 0:
-            delay_s, error_s = self.clock.one_way_delay_s(self._rx_stamp_us * 1e-6, now)
+            if self._rx_delay is None:
+                self._rx_delay = self.clock.one_way_delay_s(self._rx_stamp_us * 1e-6, now)
+            delay_s, uncertainty_s = self._rx_delay
             born_s = now - age_s - delay_s
-            # With no idea of the delay a command counts as late; other messages are given the benefit of the doubt.
-            strict = self.clock.ready or stream.stream.spec.priority is PriorityClass.CONTROL
-            stream.error_s = error_s if strict else 0.0
-        stream.fragment(flags, wide, offset, total, body, stamp_ns, born_s, now)
+            error_s += uncertainty_s  # infinite before the first round trip
+        stream.fragment(flags, wide, offset, total, body, stamp_ns, born_s, error_s, now)
 
     def on_ack(self, lane: int, highest: int, sack: int, echo_us: int, received_us: int, cum_bytes: int) -> None:
         """FrameSink: an acknowledgement of what we sent."""
@@ -363,29 +412,30 @@ class Hop(ABC):
         if highest >= flight.next_number:
             raise WireError(f"acknowledgement of packet {highest}, which was never sent")
         now = self._now
+        newer = highest > flight.highest_acked
         packets = flight.acked(highest, sack, now=now)
-        if packets:
+        if newer:
+            sent_s, stamp_s, received_s = echo_us * 1e-6, self._rx_stamp_us * 1e-6, received_us * 1e-6
+            rtt_s = max(1e-6, now - sent_s - (stamp_s - received_s))
+            flight.rtt.sample(rtt_s, now=now)
+            self.clock.sample(sent_s, received_s, stamp_s, now)
+            acked_bytes = sum([packet.nbytes for packet in packets])
+            app_limited = bool(packets) and packets[-1].app_limited
+            state.estimator.on_ack(
+                AckSample(now, rtt_s, acked_bytes, flight.inflight_bytes, received_s, cum_bytes, app_limited)
+            )
+            if now >= self._rate_due_s:
+                self._rate_known(now)
+        if newer or packets:
             state.stalled = False
-            newest = packets[-1]
-            if newest.number == highest:
-                sent_s, stamp_s, received_s = echo_us * 1e-6, self._rx_stamp_us * 1e-6, received_us * 1e-6
-                rtt_s = max(1e-6, now - sent_s - (stamp_s - received_s))
-                flight.rtt.sample(rtt_s, now=now)
-                self.clock.sample(sent_s, received_s, stamp_s, now)
-                acked_bytes = sum(packet.nbytes for packet in packets)
-                state.estimator.on_ack(
-                    AckSample(now, rtt_s, acked_bytes, flight.inflight_bytes, received_s, cum_bytes, newest.app_limited)
-                )
-                if now >= self._rate_due_s:
-                    self._rate_known(now)
-            for packet in packets:
-                for item in packet.items:
-                    if type(item) is SentData:
-                        item.channel.fragment_acked(item.out, item.generation)
-            self._control.settle()
             self.dirty = True
-        if highest > state.highest_acked:
-            state.highest_acked = highest
+        for packet in packets:
+            for item in packet.items:
+                if type(item) is SentData:
+                    item.channel.fragment_acked(item.out, item.generation)
+        control = self._control
+        if control.retained:
+            control.settle()
         if not flight.lossless:
             self._find_losses(now)
 
@@ -395,7 +445,7 @@ class Hop(ABC):
 
     def _find_losses(self, now: float) -> None:
         lane = self.lane
-        for packet in lane.flight.lost(lane.highest_acked, now=now):
+        for packet in lane.flight.lost(now=now):
             lane.estimator.on_loss(now=now, nbytes=packet.nbytes)
             self._give_back(packet.items, now)
             self.dirty = True
@@ -412,9 +462,11 @@ class Hop(ABC):
                     )
                 if self.channels.get(channel.slot) is channel:
                     self._refresh(channel, now)
-            elif type(item) is SentWatermark and item.channel in self.incoming:
-                stream = self.incoming[item.channel]
-                self._watermarks.setdefault(item.channel, stream.confirmed)
+            elif type(item) is SentWatermark:
+                if item.channel in self.incoming:
+                    self._watermarks[item.channel] = self.incoming[item.channel].confirmed
+            else:
+                self._ping = True
 
     def on_watermark(self, channel: int, delivered: int) -> None:
         """FrameSink: everything of a reliable channel up to `delivered` has had its turn at the far side."""
@@ -483,7 +535,17 @@ class Hop(ABC):
         """Expire what nobody will send, also while the link is down."""
         self._sweep_due_s = now + SWEEP_INTERVAL_S
         for channel in list(self.channels.values()):
+            watermark = channel.watermark
             channel.sweep(now, up=self.established)
-            self._refresh(channel, now)
-        for stream in self.incoming.values():
-            stream.sweep(now)
+            if channel.offered:
+                self._refresh(channel, now)
+            if channel.watermark > watermark:
+                self._watermark_moved(channel)
+        if self.established:
+            for stream in self.incoming.values():
+                stream.sweep(now, self._up_since_s)
+
+
+def _class_of(channel: OutChannel, out: OutMessage) -> PriorityClass:
+    """A replay for a late joiner competes with deferrable traffic only, never with live state."""
+    return PriorityClass.BULK if out.message.replay else channel.spec.priority

@@ -185,7 +185,8 @@ class Hub:
     def greet(self, port: HubPort, hello: wire.Envelope, header: wire.Header, *, now: float) -> None:
         """A client says hello on a connection. A newer connection of the same client retires the older one."""
         link = self._link(port.client, now)
-        link.accept(hello, header.tag, header.stamp_us, now=now)
+        if not link.accept(hello, header.tag, header.stamp_us, now=now):
+            return
         older = self.port_of.get(port.client)
         if older is not None and older is not port:
             older.link = None
@@ -234,7 +235,7 @@ class Hub:
 
     def _forget(self, client: ClientName, now: float) -> None:
         link = self.links[client]
-        self._apply(self.routing.drop_client(client), now)
+        self._apply(self.routing.drop_client(client), now, reason=DropReason.DISCONNECTED)
         for channel in list(link.channels.values()):
             link.close_channel(channel, DropReason.DISCONNECTED, now=now)
         self._draining = [(other, channel) for other, channel in self._draining if other is not link]
@@ -250,20 +251,30 @@ class Hub:
         self.access = access
         for client in self.links:
             self._guards[client] = RateGuard.of(access.limits(client), now=now)
-        self._apply(self.routing.set_access(access), now)
+        change = self.routing.set_access(access)
+        for identity in change.removed:
+            relayed = self.relayed[identity]
+            if relayed.source is not None and relayed.stream is not None:
+                text = f"{identity.origin} may no longer publish {identity.topic}: the access rules have changed"
+                relayed.source.refuse(relayed.stream, "forbidden", text, now=now)
+                self.events.refused(identity.origin, "forbidden", text)
+        self._apply(change, now)
 
     # --- routes -----------------------------------------------------------------------------------------------------
 
-    def _apply(self, change: RouteChange, now: float) -> None:
+    def _apply(self, change: RouteChange, now: float, *, reason: DropReason = DropReason.UNWANTED) -> None:
+        """Open and close channels as the routes have changed; `reason`: of dropping what no longer has a taker."""
         touched: set[StreamId] = set(change.wanted) | set(change.unwanted)
         for identity in change.removed:
             self._remove(identity, now)
         for client, identity in change.unmatched:
-            relayed = self.relayed.get(identity)
-            pair = relayed.outs.pop(client, None) if relayed is not None else None
-            if pair is not None:
-                pair[0].close_channel(pair[1], DropReason.UNWANTED, now=now)
-                touched.add(identity)
+            self._close(client, identity, reason, now)
+            touched.add(identity)
+        for identity in change.updated:  # the origin offers it anew, with other properties: so is it offered onwards
+            for client in tuple(self.relayed[identity].outs):
+                self._close(client, identity, DropReason.DISCONNECTED, now)
+                self._open(client, identity, now)
+            touched.add(identity)
         for client, identity in change.matched:
             self._open(client, identity, now)
             touched.add(identity)
@@ -275,6 +286,12 @@ class Hub:
         for denied in change.denied:
             if denied.by_name:
                 self.events.refused(denied.client, "forbidden", f"{denied.client} may not subscribe to {denied.topic}")
+
+    def _close(self, client: ClientName, identity: StreamId, reason: DropReason, now: float) -> None:
+        relayed = self.relayed.get(identity)
+        pair = relayed.outs.pop(client, None) if relayed is not None else None
+        if pair is not None:
+            pair[0].close_channel(pair[1], reason, now=now)
 
     def _wanted(self, relayed: Relayed) -> bool:
         assert relayed.stream is not None
@@ -295,26 +312,21 @@ class Hub:
                 self._draining.remove((ended, channel))
                 relayed.outs[client] = (link, channel)
                 return
-        cached = relayed.cache.replay() if relayed.cache is not None else []
-        if cached and not self.access.may_replay(client, identity.topic):
-            cached = []
-        following = relayed.stream.delivered + 1
-        first = cached[0].seq if cached else following
-        channel = link.open_channel(relayed.stream.stream, first=first, now=now)
+        channel = link.open_channel(
+            relayed.stream.stream,
+            first=relayed.stream.delivered + 1,
+            now=now,
+            replays=self._replays(client, relayed),
+        )
         relayed.outs[client] = (link, channel)
-        expected = first
-        for message in cached:
-            if channel.reliable:
-                # Only what is contiguous can be in order; an older gap was reported when it arose.
-                while expected < message.seq:
-                    channel.reject(_gap(message, expected), DropReason.RETENTION)
-                    expected += 1
-                expected = message.seq + 1
-            link.submit(channel, message, now=now, forced=True)
-        if channel.reliable:
-            while expected < following:
-                channel.reject(_gap(cached[-1], expected), DropReason.RETENTION)
-                expected += 1
+
+    def _replays(self, client: ClientName, relayed: Relayed) -> list[Message]:
+        """The latched messages that a late joiner may have."""
+        if relayed.cache is None or relayed.stream is None:
+            return []
+        if not self.access.may_replay(client, relayed.stream.stream.id.topic):
+            return []
+        return relayed.cache.replay()
 
     def _remove(self, identity: StreamId, now: float) -> None:
         relayed = self.relayed.pop(identity, None)
@@ -343,6 +355,10 @@ class Hub:
 
     def on_up(self, link: Link, *, resumed: bool, now: float) -> None:
         self._absent_since.pop(link.peer, None)
+        if not resumed:
+            for relayed in self.relayed.values():
+                if link.peer in relayed.outs:
+                    relayed.outs[link.peer][1].prime(self._replays(link.peer, relayed), now=now)
         self.events.client_up(link.peer, resumed=resumed)
 
     def on_down(self, link: Link, reason: str, *, now: float) -> None:
@@ -365,6 +381,7 @@ class Hub:
         try:
             change = self.routing.announce(stream.stream)
         except RefusedError as refusal:
+            self._apply(self.routing.withdraw(identity), now)
             self.relayed.pop(identity, None)
             self.events.refused(link.peer, refusal.code, str(refusal))
             raise
@@ -417,14 +434,18 @@ class Hub:
             self.received.of(stream.stream).drop_arrived(message.drop_reason)
         else:
             self.received.of(stream.stream).arrived(nbytes, now - message.born_s, now)
+        behind = not relayed.outs
         for out_link, channel in relayed.outs.values():
+            if stream.reliable and channel.next_seq < message.seq:
+                out_link.skip(channel, message.seq, now=now)  # what lies between was given up before it came here
             out_link.submit(channel, message, now=now, forced=True)
+            behind = behind or channel.watermark >= message.seq
         if not message.tombstone:
             if relayed.cache is not None:
                 relayed.cache.add(message)
             self.objects.observe(stream.stream.id, message.seq, message.body, wall_ns=message.stamp_ns, now=now)
             self.events.message(stream.stream, message, now=now)
-        if stream.reliable and not relayed.outs:
+        if behind and stream.reliable:
             self._confirm(relayed)
 
     def on_in_drop(self, link: Link, stream: InStream, reason: DropReason, nbytes: int) -> None:
@@ -518,7 +539,3 @@ class Hub:
         for identity, relayed in self.relayed.items():
             outs = set(self.routing.subscribers(identity))
             assert set(relayed.outs) == outs, f"{identity.topic}: channels {set(relayed.outs)} but routes {outs}"
-
-
-def _gap(near: Message, seq: int) -> Message:
-    return Message(near.stream, seq, b"", near.stamp_ns, near.born_s)

@@ -17,8 +17,6 @@ FRAGMENT_TIME_S: Final = 0.003
 UNKNOWN_RATE_FRAGMENT_BYTES: Final = 1400
 OVERHEAD_BYTES: Final = 60
 """What one datagram costs beside its own bytes: ZMTP, CURVE, TCP/IP or UDP/IP and AEAD."""
-STALL_MIN_S: Final = 0.5
-STALL_RTTS: Final = 4.0
 PROBE_INTERVAL_S: Final = 0.2
 """While stalled, one fresh class-0 message goes out this often and finds out whether the path is back."""
 
@@ -39,7 +37,6 @@ class Lane:
         self.arrivals = Arrivals()
         self.stalled = False
         self.probe_due_s = 0.0
-        self.highest_acked = 0
         self.fragment_bytes = self._fragment_bytes(None)
 
     def _fragment_bytes(self, rate_bps: float | None) -> int:
@@ -61,13 +58,12 @@ class Lane:
 
     def stall_deadline(self) -> float | None:
         flight = self.flight
-        if self.stalled or not flight.packets or flight.last_progress_s is None:
+        if self.stalled or flight.waiting_since_s is None:
             return None
-        return flight.last_progress_s + max(STALL_MIN_S, STALL_RTTS * (flight.rtt.srtt_s or 0.0))
+        return flight.waiting_since_s + flight.stall_timeout_s()
 
     def new_session(self) -> None:
         """Numbers start again; the flight was abandoned before."""
         self.flight = Flight(lossless=self.lossless)
         self.arrivals = Arrivals()
         self.stalled = False
-        self.highest_acked = 0

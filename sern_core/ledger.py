@@ -4,6 +4,7 @@ Plain integers bumped by the hot path; metrics are collected from them at scrape
 from the moment its stream does, so that a rate over them never misses the first event.
 """
 
+from collections.abc import Callable, Iterable
 from typing import Final
 
 from sern_core.message import StreamInfo
@@ -100,6 +101,31 @@ class SendLedger:
         if counters is None:
             counters = self.topics[name] = SendCounters(name, priority)
         return counters
+
+    def validate(
+        self, held: Iterable[tuple[SendCounters, int, int, int, int]], check: Callable[[bool, str], None]
+    ) -> None:
+        """offered = delivered + dropped + queued + in flight, by topic, in messages and bytes. `held`, of each open
+        channel: its counters, messages and bytes queued, messages and bytes in flight."""
+        messages: dict[TopicName, int] = dict.fromkeys(self.topics, 0)
+        nbytes: dict[TopicName, int] = dict.fromkeys(self.topics, 0)
+        for counters, queued, queued_bytes, flying, flying_bytes in held:
+            messages[counters.topic] += queued + flying
+            nbytes[counters.topic] += queued_bytes + flying_bytes
+        for topic, c in self.topics.items():
+            check(
+                c.offered == c.delivered + c.dropped + messages[topic],
+                f"{topic}: {c.offered} offered is not {c.delivered} delivered + {c.dropped} dropped"
+                f" + {messages[topic]} held",
+            )
+            check(
+                c.offered_bytes == c.delivered_bytes + c.dropped_bytes + nbytes[topic],
+                f"{topic}: {c.offered_bytes} bytes offered is not {c.delivered_bytes} delivered + {c.dropped_bytes}"
+                f" dropped + {nbytes[topic]} held",
+            )
+            dropped = sum(count for reason, count in c.by_reason.items() if reason is not DropReason.REFUSED)
+            check(c.dropped == dropped, f"{topic}: {c.dropped} dropped, but {dropped} by reason")
+            check(c.refused == c.by_reason[DropReason.REFUSED], f"{topic}: refusals do not add up")
 
 
 class ReceiveLedger:

@@ -1,11 +1,7 @@
-"""One end of a hop: data plane (`Hop`) plus handshake, announcements and interest; no I/O, clock or randomness.
+"""One end of a hop: handshake (`Session`), data (`Hop`), announcements and interest; no I/O, clock or randomness.
 
-A hop is a pair of links. The client's end says HELLO; the relay's end answers WELCOME. After that both are alike:
-each announces the streams it has, is told which of them are wanted, and sends those as scheduler and window allow.
-
-    initiator:  idle --connected--> greeting --WELCOME--> up --disconnected--> idle
-                                    greeting --REFUSE--> greeting (later)    up --RESET, CLOSE--> greeting
-    acceptor:   idle --HELLO--> up --HELLO (another)--> up    up --disconnected, CLOSE--> idle
+A hop is a pair of links. Each end announces the streams it has, is told which of them are wanted, and sends those as
+scheduler and window allow.
 
 A link lives as long as its owner remembers the peer's name; sessions come and go inside it. What survives a session:
 queues, retained reliable messages, delivered counts. What does not: channel numbers and control messages, so every
@@ -16,23 +12,20 @@ told what happens through its `LinkHandler`.
 """
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Final, Protocol
 
 from sern_core import wire
 from sern_core.announce import MAX_STRINGS, Announcement, decode_announcement, definition_hash, encode_announcement
-from sern_core.clocksync import ClockSync
 from sern_core.errors import RefusedError, UsageError, WireError
-from sern_core.fragments import InStream
-from sern_core.hop import PING_INTERVAL_S, Hop, microseconds
+from sern_core.fragments import DropReport, InStream
 from sern_core.message import Message, StreamId, StreamInfo
 from sern_core.params import LinkParams, SchedulerParams
 from sern_core.queues import OutChannel, OutMessage
-from sern_core.trace import LINK, DecisionTrace, TraceEvent
+from sern_core.session import Session
+from sern_core.trace import DecisionTrace, TraceEvent
 from sern_core.types import CLASS_LABELS, DROP_CODES, DROP_REASONS, ClientName, DropReason
 
-HELLO_INTERVAL_S: Final = 1.0
-REFUSED_INTERVAL_S: Final = 5.0
 MAX_DEFINITIONS: Final = 4096
 
 
@@ -77,7 +70,7 @@ class LinkHandler(Protocol):
         """A control message that is not the link's own business. Raises WireError if it is nobody's."""
 
 
-class Link(Hop):
+class Link(Session):
     """One end of one hop towards `peer`.
 
     `definitions` maps digest to text and is shared by all links of a process. `auto_confirm`: what had its turn here
@@ -100,197 +93,62 @@ class Link(Hop):
         lossless: bool = True,
         auto_confirm: bool = True,
     ) -> None:
-        self.initiator = initiator
         self.handler = handler
         self.definitions = definitions
         self.auto_confirm = auto_confirm
-        self.peer_boot: int | None = None
-        self.transport_up = False
-        self.version = wire.VERSION_MAX
         self.by_stream: dict[StreamId, OutChannel] = {}
         self.streams: dict[StreamId, InStream] = {}
         """Incoming streams across sessions."""
-        self._handshake_out: deque[bytes] = deque()
-        self._hello_due_s: float | None = None
         self._next_channel = 1
         self._asked: set[str] = set()  # definitions the peer asked for before we had them
-        self._resumed = False
+        self._announcing: deque[tuple[int, OutChannel]] = deque()  # may send once that control message is on its way
         self._missing: dict[StreamId, float] = {}  # not announced by a new peer, and since when
         super().__init__(
-            name=name, boot=boot, peer=peer, link=link, scheduler=scheduler, trace=trace, now=now, lossless=lossless
+            name=name,
+            boot=boot,
+            peer=peer,
+            initiator=initiator,
+            link=link,
+            scheduler=scheduler,
+            trace=trace,
+            now=now,
+            lossless=lossless,
         )
 
-    # --- transport and handshake --------------------------------------------------------------------------------
-
-    def connected(self, *, now: float) -> None:
-        """The lane's transport is there. The initiator says hello; the other side waits for it."""
-        self.transport_up = True
-        if self.initiator:
-            self._greet(now, now)
-
-    def disconnected(self, *, now: float, reason: str = "connection lost") -> None:
-        """The lane's transport is gone, and with it whatever was in flight."""
-        self.transport_up = False
-        self._hello_due_s = None
-        self._handshake_out.clear()
-        self._end_session(reason, now)
-
-    def _greet(self, due_s: float, now: float) -> None:
-        self._end_session("new session", now)
-        self.tag = self.tag % 255 + 1
-        self._hello_due_s = due_s
-        self.dirty = True
-
-    def _hello(self, now: float) -> bytes:
-        self._hello_due_s = now + HELLO_INTERVAL_S
-        hello = {"name": self.name, "boot": self.boot, "vmin": wire.VERSION_MIN, "vmax": wire.VERSION_MAX}
-        return wire.encode_handshake(wire.Kind.HELLO, self.tag, microseconds(now), hello)
-
-    def accept(self, hello: wire.Envelope, tag: int, stamp_us: int, *, now: float) -> None:
-        """The relay's end: a peer whose name and key were checked says hello; WELCOME is queued.
-
-        Raises WireError, or VersionError when no wire version is common; the caller refuses then.
-        """
-        boot = wire.take_int(hello, "boot")
-        version = wire.agree_version(wire.take_int(hello, "vmin"), wire.take_int(hello, "vmax"))
-        self.transport_up = True
-        again = self.established and tag == self.tag and boot == self.peer_boot  # our WELCOME was lost
-        if not again:
-            self._end_session("new session", now)
-            self.tag = tag
-            self.version = version
-        at_us = microseconds(now)
-        welcome = {"name": self.name, "boot": self.boot, "version": version, "echo": stamp_us, "at": at_us}
-        self._handshake_out.append(wire.encode_handshake(wire.Kind.WELCOME, tag, at_us, welcome))
-        self.dirty = True
-        if not again:
-            self._establish(boot, now)
-
-    def close(self, reason: str, *, now: float) -> None:
-        """End the session on purpose and tell the peer. The transport stays."""
-        if self.established:
-            why = {"why": reason[:200]}
-            self._handshake_out.append(wire.encode_handshake(wire.Kind.CLOSE, self.tag, microseconds(now), why))
-            self.dirty = True
-        self._end_session(reason, now)
-
-    def _establish(self, peer_boot: int, now: float) -> None:
-        resumed = self._resumed = self.peer_boot == peer_boot
-        if not resumed:
-            for channel in self.channels.values():
-                channel.peer_restarted()
-            self.clock = ClockSync()
-        self.peer_boot = peer_boot
-        self.established = True
-        self._hello_due_s = None
-        self.lane.new_session()
-        self.lane.estimator.on_reset(now=now)
-        self._rate_known(now)
-        self._ping_due_s = now
-        self._watermarks.clear()
+    def _session_began(self, resumed: bool, now: float) -> None:
         self._asked.clear()
-        self._begin_control()
-        self.trace.record(now, LINK, TraceEvent.LINK_UP, peer=self.peer)
+        self._announcing.clear()
         self.handler.on_up(self, resumed=resumed, now=now)
         for channel in list(self.channels.values()):
             self._announce(channel, now)
         self.send_control({"t": "synced"}, now=now)
 
-    def _end_session(self, reason: str, now: float) -> None:
-        for packet in self.lane.flight.abandon():
-            self._give_back(packet.items, now)
-        for stream in self.incoming.values():
-            stream.channel_id = None
-        self.incoming.clear()
-        if not self.established:
-            return
-        self.established = False
-        for channel in self.channels.values():
-            channel.ready = False
-            self._refresh(channel, now)
-        self.trace.record(now, LINK, TraceEvent.LINK_DOWN, peer=self.peer, reason=reason)
+    def _session_ended(self, reason: str, now: float) -> None:
         self.handler.on_down(self, reason, now=now)
 
-    # --- bytes and time -------------------------------------------------------------------------------------------
-
-    def next_datagram(self, *, now: float) -> bytes | None:
-        """The next bytes for the lane, or None if nothing may or need be sent now."""
-        if self._handshake_out:
-            return self._handshake_out.popleft()
-        if self._hello_due_s is not None and self.transport_up:
-            if now >= self._hello_due_s:
-                return self._hello(now)
-            self.dirty = False
-            return None
-        if not self.established:
-            self.dirty = False
-            return None
-        return self._next_data(now)
-
-    def receive(self, data: bytes, *, now: float) -> None:
-        """One datagram from the lane. Raises WireError or VersionError for bytes no honest peer sends."""
-        header = wire.decode_header(data)
-        if header.kind != wire.Kind.DATA:
-            self._now = now
-            self._handshake(header, data, now)
-        elif header.tag == self.tag and self.established:
-            self._receive_data(header, data, now)
-        # else: of another session; whatever it carried is sent again in this one
-
-    def next_deadline(self) -> float | None:
-        """When to call `handle_timeout` and `next_datagram` at the latest, if nothing else happens."""
-        if self.established:
-            return self._data_deadline()
-        if self._hello_due_s is not None:
-            return min(self._hello_due_s, self._sweep_due_s)
-        return self._sweep_due_s
-
-    def handle_timeout(self, *, now: float) -> None:
-        if self.established:
-            self._data_timeout(now)
-        elif now >= self._sweep_due_s:
-            self._now = now
-            self._sweep(now)
-        self.dirty = True
-
-    def _handshake(self, header: wire.Header, data: bytes, now: float) -> None:
-        envelope = wire.decode_handshake(data)
-        kind = wire.Kind(header.kind)
-        if kind is wire.Kind.CLOSE:
-            if header.tag == self.tag and self.established:
-                why = f"{self.peer} closed the session: {wire.take_str(envelope, 'why')}"
-                if self.initiator:
-                    self._end_session(why, now)
-                    self._greet(now + HELLO_INTERVAL_S, now)
-                else:
-                    self._end_session(why, now)
-            return
-        if not self.initiator or kind is wire.Kind.HELLO:
-            raise WireError(f"{kind.name} is not for this side")
-        if header.tag != self.tag:
-            return
-        if kind is wire.Kind.WELCOME and self._hello_due_s is not None:
-            self.version = wire.take_int(envelope, "version", low=wire.VERSION_MIN, high=wire.VERSION_MAX)
-            self.peer = ClientName(wire.take_str(envelope, "name", max_length=64))
-            echo_us = wire.take_int(envelope, "echo", high=2**64 - 1)
-            at_us = wire.take_int(envelope, "at", high=2**64 - 1)
-            self._establish(wire.take_int(envelope, "boot"), now)
-            self.clock.sample(echo_us * 1e-6, at_us * 1e-6, header.stamp_us * 1e-6, now)
-        elif kind is wire.Kind.REFUSE:
-            code, text = wire.take_str(envelope, "code", max_length=64), wire.take_str(envelope, "why")
-            self._greet(now + REFUSED_INTERVAL_S, now)
-            self.handler.on_rejected(self, code, text, now=now)
-        elif kind is wire.Kind.RESET and self.established:
-            self._greet(now, now)
+    def _session_refused(self, code: str, text: str, now: float) -> None:
+        self.handler.on_rejected(self, code, text, now=now)
 
     # --- streams out ----------------------------------------------------------------------------------------------
 
     def open_channel(
-        self, stream: StreamInfo, *, first: int, now: float, owed: tuple[str, ...] = (), wanted: bool | None = None
+        self,
+        stream: StreamInfo,
+        *,
+        first: int,
+        now: float,
+        owed: tuple[str, ...] = (),
+        wanted: bool | None = None,
+        replays: Sequence[Message] = (),
     ) -> OutChannel:
-        """Announce a stream to the peer; its messages start at seq `first`. UsageError if it is open already."""
+        """Announce a stream to the peer; its messages start at seq `first`, after the latched `replays`, oldest first.
+
+        Raises UsageError if it is open already, or cannot be announced at all.
+        """
         if stream.id in self.by_stream:
             raise UsageError(f"stream {stream.id.topic} of {stream.id.origin} is already open towards {self.peer}")
+        if len(stream.info.definition.encode()) > wire.MAX_ATTACHMENT_BYTES:
+            raise UsageError(f"the definition of {stream.id.topic} exceeds {wire.MAX_ATTACHMENT_BYTES} bytes")
         if len(self.channels) >= 0xFFFF:
             raise UsageError(f"all 65535 channels towards {self.peer} are in use")
         slot = self._next_channel
@@ -301,6 +159,7 @@ class Link(Hop):
         channel = OutChannel(slot, stream, counters, self._reporter(slot), first=first)
         channel.owed = owed
         channel.wanted = wanted
+        channel.prime(replays, now=now)
         self.channels[slot] = channel
         self.by_stream[stream.id] = channel
         self._define(stream.info.definition)
@@ -332,24 +191,46 @@ class Link(Hop):
     def _announce(self, channel: OutChannel, now: float) -> None:
         stream = channel.stream
         digest = stream.attributes.get("definition") or definition_hash(stream.info.definition)
-        announcement = Announcement(channel.slot, stream, digest, channel.first_seq, channel.owed)
-        self.send_control(encode_announcement(announcement), now=now)
-        # On a stream lane data may follow its announcement at once, if the stream was wanted before.
-        channel.ready = self.lane.lossless and channel.wanted is True
+        owed = channel.owed if channel.reliable else ()
+        announcement = Announcement(channel.slot, stream, digest, channel.first_seq, owed)
+        channel.ready = False
+        seq = self.send_control(encode_announcement(announcement), now=now)
+        if self.lane.lossless and self._resumed and channel.wanted:
+            # On a stream lane data may follow its announcement at once, if the same peer wanted it before.
+            self._announcing.append((seq, channel))
         self._refresh(channel, now)
 
-    def send_control(self, envelope: wire.Envelope, attachment: bytes = b"", *, now: float) -> None:
-        """Queue a control message: reliable and in order within the session, ahead of everything else."""
+    def _control_sent(self, seq: int) -> None:
+        while self._announcing and self._announcing[0][0] <= seq:
+            channel = self._announcing.popleft()[1]
+            if self.channels.get(channel.slot) is channel:
+                channel.ready = True
+                self._refresh(channel, self._now)
+
+    def send_control(self, envelope: wire.Envelope, attachment: bytes = b"", *, now: float) -> int:
+        """Queue a control message: reliable and in order within the session. Returns its number, 0 without a session:
+        then it is not sent; every session tells everything anew."""
+        if not self.established:
+            return 0
         control = self._control
         body = wire.encode_control(envelope, attachment)
-        control.submit(Message(control.stream.id, control.next_seq, body, 0, now), now=now, forced=True)
+        seq = control.next_seq
+        control.submit(Message(control.stream.id, seq, body, 0, now), now=now, forced=True)
         self.dirty = True
+        return seq
 
     def report_drop(self, stream: InStream, seq: int, reason: DropReason, where: str, *, now: float) -> None:
-        """Tell the origin's side that a later hop dropped a reliable message."""
-        if self.established and stream.channel_id is not None:
-            envelope = {"t": "dropped", "ch": stream.channel_id, "seq": seq, "code": DROP_CODES[reason], "to": where}
-            self.send_control(envelope, now=now)
+        """Tell the origin's side that a reliable message was dropped here or further on: before the watermark passes
+        it, and again in the next session until it is known there."""
+        report = DropReport(seq, reason, where)
+        stream.reports.append(report)
+        self._send_report(stream, report, now)
+
+    def _send_report(self, stream: InStream, report: DropReport, now: float) -> None:
+        if stream.channel_id is not None:
+            code = DROP_CODES[report.reason]
+            envelope = {"t": "dropped", "ch": stream.channel_id, "seq": report.seq, "code": code, "to": report.where}
+            report.control_seq = self.send_control(envelope, now=now)
 
     # --- streams in -----------------------------------------------------------------------------------------------
 
@@ -380,6 +261,8 @@ class Link(Hop):
         self._missing.pop(identity, None)
         stream.channel_id = slot
         self.incoming[slot] = stream
+        for report in stream.reports:
+            self._send_report(stream, report, now)
         definition = self.definitions.get(announcement.definition_hash, "")
         if announcement.definition_hash:
             stream.stream.attributes["definition"] = announcement.definition_hash
@@ -399,7 +282,7 @@ class Link(Hop):
             self.answer(stream, wanted, now=now)
 
     def _skip(self, stream: InStream, first: int, now: float) -> None:
-        left_out = stream.skip_to(first)
+        left_out = stream.skip_to(first, now)
         if left_out:
             self.handler.on_skipped(self, stream, left_out, now=now)
             self._confirm_own(stream)
@@ -413,8 +296,13 @@ class Link(Hop):
         if stream.reliable:
             self._confirm_own(stream)
 
-    def _in_drop(self, stream: InStream, reason: DropReason, nbytes: int) -> None:
-        self.handler.on_in_drop(self, stream, reason, nbytes)
+    def _in_drop(self, stream: InStream, reason: DropReason, nbytes: int, seq: int) -> None:
+        if stream is self._control_in:
+            return
+        if seq:
+            self.report_drop(stream, seq, reason, self.name, now=self._now)  # its tombstone tells the handler
+        else:
+            self.handler.on_in_drop(self, stream, reason, nbytes)
 
     def skip(self, channel: OutChannel, first: int, *, now: float) -> None:
         """The stream goes on at seq `first`: what lies between will not come, and the peer must not wait for it."""
@@ -492,7 +380,7 @@ class Link(Hop):
             channel.owed = tuple(wire.take_strings(envelope, "owed", max_length=64))
             if wanted and channel.wanted is False and channel.reliable:
                 self.send_control({"t": "first", "ch": channel.slot, "seq": channel.first_seq}, now=now)
-            channel.set_wanted(wanted)
+            self._set_wanted(channel, wanted, now)
             channel.ready = True
             self._refresh(channel, now)
             self.handler.on_wanted(self, channel, now=now)
@@ -501,10 +389,19 @@ class Link(Hop):
             channel.reported(wire.take_int(envelope, "seq"), reason)
         else:
             code, why = wire.take_str(envelope, "code", max_length=64), wire.take_str(envelope, "why")
-            channel.wanted = False
-            channel.clear(DropReason.FORBIDDEN if code == "forbidden" else DropReason.UNWANTED)
+            self._set_wanted(
+                channel, False, now, reason=DropReason.FORBIDDEN if code == "forbidden" else DropReason.UNWANTED
+            )
             self._refresh(channel, now)
             self.handler.on_refused(self, channel, code, why, now=now)
+
+    def _set_wanted(
+        self, channel: OutChannel, wanted: bool, now: float, *, reason: DropReason = DropReason.UNWANTED
+    ) -> None:
+        watermark = channel.watermark
+        channel.set_wanted(wanted, reason)
+        if channel.watermark > watermark:
+            self._watermark_moved(channel)
 
     def _define(self, definition: str) -> None:
         digest = definition_hash(definition)
@@ -578,9 +475,14 @@ class Link(Hop):
 
         for channel in self.channels.values():
             channel.validate(check)
+            waits = bool(channel.ready and channel.wanted and (channel.active or channel.queue))
+            check(waits == channel.offered, f"{channel.stream.id.topic}: the scheduler does not know what waits")
+        self.ledger.validate([(channel.counters, *channel.held()) for channel in self.channels.values()], check)
+        held_bytes = sum(stream.held_bytes for stream in self.streams.values()) + self._control_in.held_bytes
+        check(self.reassembly.held_bytes == held_bytes, "reassembly bytes do not add up")
         for stream in self.streams.values():
             stream.validate(check)
         self.lane.flight.validate(check)
         self.scheduler.validate()
-        check(self.reassembly.held_bytes >= 0, "negative reassembly bytes")
-        check(PING_INTERVAL_S > 0 and len(self.by_stream) == len(self.channels), "channel tables differ")
+        check(len(self.by_stream) == len(self.channels), "channel tables differ")
+        check(self._watermarks.keys() <= self.incoming.keys(), "watermarks of streams that are gone")

@@ -99,6 +99,7 @@ class Message:
     born_s: float
     tombstone: int = 0  # 0, or a DROP_CODES value
     replay: bool = False  # a transient_local message sent again to a late joiner
+    error_s: float = 0.0  # the message may be older than `born_s` says by as much: clock offsets of the hops so far
 
     def age_s(self, now: float) -> float:
         return now - self.born_s

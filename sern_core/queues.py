@@ -10,7 +10,7 @@ reason. `OutChannel.validate` checks that the counters agree.
 """
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Final
 
 from sern_core.ledger import SendCounters
@@ -32,6 +32,7 @@ class OutMessage:
         "generation",
         "message",
         "ranges",
+        "retain_from_s",
         "seq",
         "size",
         "some_acked",
@@ -48,6 +49,7 @@ class OutMessage:
         self.fragments_inflight = 0
         self.started = False
         self.counted = False  # already accounted as dropped (a tombstone now)
+        self.retain_from_s = message.born_s  # retention counts from here
 
     @property
     def unsent_bytes(self) -> int:
@@ -95,6 +97,8 @@ class OutChannel:
         self.retained_bytes = 0
         self.queued_bytes = 0
         self.watermark = first - 1
+        self.acked_seq = 0  # best effort: the newest message that the peer has whole
+        self.begun_seq = 0
         self.next_seq = first  # the next seq expected from `submit`
         self.last_sent_s: float | None = None
         self._next_allowed_s: float | None = None
@@ -123,7 +127,7 @@ class OutChannel:
                 counters.deliver(size)  # the peer has it already, from an earlier run of this relay
                 return True
             if self.wanted is False and not self.retained:
-                counters.drop(DropReason.UNWANTED, size)
+                counters.drop(DROP_REASONS[message.tombstone] if message.tombstone else DropReason.UNWANTED, size)
                 self.watermark = message.seq
                 return True
             out = OutMessage(message)
@@ -146,15 +150,43 @@ class OutChannel:
         return True
 
     def reject(self, message: Message, reason: DropReason) -> None:
-        """Count a message that cannot travel at all; a reliable stream goes on over its tombstone."""
+        """Drop a message that cannot travel at all; a reliable stream goes on over its tombstone."""
         size = len(message.body)
         self.counters.offer(size)
-        self.counters.drop(reason, size)
         self.next_seq = message.seq + 1
+        out = OutMessage(message)
+        if not self.reliable or message.seq <= self.watermark:
+            self._drop(out, reason)
+            return
+        self.counters.drop(reason, size)
+        out.entomb(reason)
+        self._keep(out)
+        self.on_drop(out, reason)
+
+    def prime(self, replays: Sequence[Message], *, now: float) -> None:
+        """Put latched messages (oldest first, marked as replays) ahead of everything; nothing has been sent yet."""
+        limit = self.retained[0].seq if self.retained else self.next_seq
+        if not self.reliable:
+            limit = self.queue[0].seq if self.queue else self.next_seq
+        fresh = [OutMessage(message) for message in replays if message.seq < limit]
+        fresh = [out for out in fresh if not self._expired(out, now)]
+        if not self.reliable:
+            fresh = fresh[max(0, len(fresh) + len(self.queue) - self.spec.depth) :]
+        if not fresh:
+            return
+        for out in fresh:
+            out.retain_from_s = now
+            self.counters.offer(out.size)
+            self.queued_bytes += out.size
+        self.queue.extendleft(reversed(fresh))
         if self.reliable:
-            out = OutMessage(message)
-            out.entomb(reason)
-            self._keep(out)
+            self.retained.extendleft(reversed(fresh))
+            self.retained_bytes += sum(out.size for out in fresh)
+            self.watermark = fresh[0].seq - 1
+            after = [*(out.seq for out in fresh[1:]), limit]
+            self.gaps.extendleft(
+                (out.seq, seq) for out, seq in reversed([*zip(fresh, after, strict=True)]) if seq > out.seq + 1
+            )
 
     def _keep(self, out: OutMessage) -> None:
         if self.reliable:
@@ -187,10 +219,10 @@ class OutChannel:
         """The message to serve next: begun ones first, then the queue; what has expired is dropped on the way."""
         while self.active:
             out = self.active[0]
-            if not out.has_unsent:
-                self.active.popleft()
-            elif self._expired(out, now):
-                self._expire_begun(out)
+            if self._expired(out, now):
+                self._give_up_begun(out, DropReason.LIFESPAN)
+            elif out.seq < self.acked_seq:
+                self._give_up_begun(out, DropReason.SUPERSEDED)
             else:
                 return out
         while self.queue:
@@ -206,42 +238,45 @@ class OutChannel:
 
     def _expired(self, out: OutMessage, now: float) -> bool:
         lifespan_s = self.spec.lifespan_s
-        return lifespan_s is not None and not out.message.tombstone and now - out.message.born_s > lifespan_s
+        message = out.message
+        return lifespan_s is not None and not message.tombstone and now - message.born_s + message.error_s > lifespan_s
 
-    def _expire_begun(self, out: OutMessage) -> None:
+    def _give_up_begun(self, out: OutMessage, reason: DropReason) -> None:
+        """Give up a message of which something was sent already."""
         if self.reliable:
             # What is in flight of the old body is harmless: the receiver takes the tombstone in its place.
-            self._entomb(out, DropReason.LIFESPAN)
+            self._entomb(out, reason)
+            self._activate(out)
             return
-        self.active.popleft()
-        self.flying.pop(out.seq, None)
-        self._drop(out, DropReason.LIFESPAN)
+        del self.flying[out.seq]
+        if out in self.active:
+            self.active.remove(out)
+        self._drop(out, reason)
 
     def _entomb(self, out: OutMessage, reason: DropReason) -> None:
+        """A tombstone takes the place of a reliable message; it is reported unless that was done before."""
         size = out.size
         if not out.started:
             self.queued_bytes -= size - 1
         self.retained_bytes -= size - 1
-        self.counters.drop(reason, size)
+        reported = out.counted
+        if not reported:
+            self.counters.drop(reason, size)
         out.entomb(reason)
-        self.on_drop(out, reason)
+        if not reported:
+            self.on_drop(out, reason)
 
     def drop_head(self, reason: DropReason, now: float) -> None:
         """Give up the message that would go next (best effort); a reliable one becomes a tombstone."""
         out = self.head(now)
-        if out is None or out.counted:
-            return
-        if self.reliable:
-            self._entomb(out, reason)
-            if out.started:
-                self._activate(out)
+        if out is None or out.message.tombstone:
             return
         if out.started:
-            self.active.popleft()
-            self.flying.pop(out.seq, None)
+            self._give_up_begun(out, reason)
+        elif self.reliable:
+            self._entomb(out, reason)
         else:
-            self._pop_queue()
-        self._drop(out, reason)
+            self._drop(self._pop_queue(), reason)
 
     def _begin(self, out: OutMessage, now: float) -> None:
         """`out` was the head of the queue and its first bytes leave now."""
@@ -251,6 +286,7 @@ class OutChannel:
         self.flying[out.seq] = out
         if out.has_unsent:
             self.active.append(out)
+        self.begun_seq = out.seq
         self.last_sent_s = now
 
     def take(self, out: OutMessage, room: int, now: float) -> tuple[int, int]:
@@ -271,6 +307,8 @@ class OutChannel:
                 del out.ranges[0]
         if not out.started:
             self._begin(out, now)
+        elif not out.ranges:
+            self.active.remove(out)
         out.fragments_inflight += 1
         return start, end
 
@@ -285,6 +323,8 @@ class OutChannel:
             del self.flying[out.seq]
             if not self.reliable:
                 self.counters.deliver(out.size)
+                if out.seq > self.acked_seq:
+                    self.acked_seq = out.seq
 
     def fragment_lost(self, out: OutMessage, generation: int, start: int, end: int, *, now: float) -> bool:
         """A fragment did not arrive. True: it will be sent again; False: the message is no longer wanted."""
@@ -293,17 +333,9 @@ class OutChannel:
         out.fragments_inflight -= 1
         if self.flying.get(out.seq) is not out:
             return False  # finished or dropped meanwhile
-        if not self.reliable and self._expired(out, now):
-            reason: DropReason | None = DropReason.LIFESPAN
-        elif self.coalesced and self.queue and not out.ranges and not out.some_acked:
-            reason = DropReason.SUPERSEDED  # nothing of it has arrived and a fresher sample waits
-        else:
-            reason = None
+        reason = None if self.reliable else self._unwanted_again(out, now)
         if reason is not None:
-            del self.flying[out.seq]
-            if out in self.active:
-                self.active.remove(out)
-            self._drop(out, reason)
+            self._give_up_begun(out, reason)
             return False
         if out.ranges is None:
             out.ranges = []
@@ -311,6 +343,17 @@ class OutChannel:
         out.ranges.sort()
         self._activate(out)
         return True
+
+    def _unwanted_again(self, out: OutMessage, now: float) -> DropReason | None:
+        """Why a best-effort message that lost a fragment is not sent again; None if it is."""
+        if self._expired(out, now):
+            return DropReason.LIFESPAN
+        fresher = bool(self.queue) or self.begun_seq > out.seq
+        # Behind a newer one it would be dropped on arrival; of a coalesced topic only the newest counts, unless most
+        # of a large one may have arrived.
+        if out.seq < self.acked_seq or (self.coalesced and fresher and not out.ranges and not out.some_acked):
+            return DropReason.SUPERSEDED
+        return None
 
     def _activate(self, out: OutMessage) -> None:
         """A begun message has bytes to send (again): put it back in its place."""
@@ -362,11 +405,11 @@ class OutChannel:
         else:
             if self.flying.get(out.seq) is out:
                 del self.flying[out.seq]
-            if out.has_unsent and out in self.active:
+            if out in self.active:
                 self.active.remove(out)
 
     def reported(self, seq: int, reason: DropReason) -> None:
-        """A later hop dropped `seq` and said so."""
+        """A later hop dropped `seq` and said so, before its watermark passed it."""
         for out in self.retained:
             if out.seq == seq:
                 if not out.counted:
@@ -378,29 +421,30 @@ class OutChannel:
     def sweep(self, now: float, *, up: bool) -> None:
         """Expire what nobody will send: lifespan and retention, also while the link is down."""
         if not self.reliable:
-            lifespan_s = self.spec.lifespan_s
-            if lifespan_s is not None:
-                while self.queue and now - self.queue[0].message.born_s > lifespan_s:
+            if self.spec.lifespan_s is not None:
+                while self.queue and self._expired(self.queue[0], now):
                     self._drop(self._pop_queue(), DropReason.LIFESPAN)
-                while self.active and now - self.active[0].message.born_s > lifespan_s:
-                    self._expire_begun(self.active[0])
+                while self.active and self._expired(self.active[0], now):
+                    self._give_up_begun(self.active[0], DropReason.LIFESPAN)
             return
-        lifespan_s, retention_s = self.spec.lifespan_s, self.spec.retention_s
+        retention_s = self.spec.retention_s
+        patience_s = retention_s if self.spec.lifespan_s is None else min(retention_s, self.spec.lifespan_s)
         for out in self.retained:
-            if out.counted:
+            if out.message.tombstone:
                 continue
-            age_s = now - out.message.born_s
-            lapsed = age_s > retention_s
+            lapsed = now - out.retain_from_s > retention_s
+            if now - out.message.born_s + out.message.error_s <= patience_s:
+                break  # they are in the order of their birth
             # Lifespan stops a message from being sent; once the peer has it whole, the peer watches it.
-            stale = lifespan_s is not None and age_s > lifespan_s and (out.has_unsent or out.fragments_inflight > 0)
-            if not lapsed and not stale:
-                break
-            self._entomb(out, DropReason.RETENTION if lapsed else DropReason.LIFESPAN)
-            if out.started:
-                self._activate(out)
+            if lapsed or (self._expired(out, now) and (out.has_unsent or out.fragments_inflight > 0)):
+                reason = DropReason.RETENTION if lapsed else DropReason.LIFESPAN
+                if out.started:
+                    self._give_up_begun(out, reason)
+                else:
+                    self._entomb(out, reason)
         if not up:
             # Nobody to tell in this session: the announcement of the next one starts behind them.
-            while self.retained and self.retained[0].message.tombstone and self.retained[0].counted:
+            while self.retained and self.retained[0].message.tombstone:
                 out = self.retained.popleft()
                 self.retained_bytes -= out.size
                 self._forget(out)
@@ -414,35 +458,33 @@ class OutChannel:
         candidates = [out.seq for out in (*self.flying.values(), *self.queue)]
         return min(candidates) if candidates else self.next_seq
 
-    def set_wanted(self, wanted: bool) -> None:
-        """The peer's answer: does anybody behind it want this stream?"""
+    def set_wanted(self, wanted: bool, reason: DropReason = DropReason.UNWANTED) -> None:
+        """The peer's answer: does anybody behind it want this stream? What is left is dropped for `reason` if not."""
         self.wanted = wanted
         if not wanted:
-            self.clear(DropReason.UNWANTED)
-            self.watermark = self.next_seq - 1
-
-    def session_lost(self) -> None:
-        """Fragments in flight were handed back one by one before; nothing is announced any more."""
-        self.ready = False
+            self.clear(reason)
 
     def peer_restarted(self) -> None:
-        """A new process at the other end has nothing of what we sent."""
-        for out in list(self.flying.values()):
-            if out.some_acked and not self.reliable:
-                del self.flying[out.seq]
-                if out in self.active:
-                    self.active.remove(out)
-                self._drop(out, DropReason.DISCONNECTED)
-            else:
-                out.restart()
-        if self.reliable:
-            again = [out for out in self.retained if out.started]
-            for out in again:
-                out.restart()
-                self.flying[out.seq] = out
-            self.active = deque(again)
-        else:
-            self.active = deque(sorted(self.flying.values(), key=lambda out: out.seq))
+        """A new process at the other end has nothing of what we sent: everything waits to be sent again."""
+        again = list(self.retained) if self.reliable else sorted(self.flying.values(), key=lambda out: out.seq)
+        if self.reliable and len(self.owed) < 2:
+            for out in again:  # reported as dropped to the only one who was to get it: then it shall not get it now
+                if out.counted and not out.message.tombstone:
+                    self.retained_bytes -= out.size - 1
+                    out.entomb(DropReason.LOST)
+        if not self.reliable:
+            again += self.queue
+            for out in again[: max(0, len(again) - self.spec.depth)]:
+                self._drop(out, DropReason.SUPERSEDED)
+            again = again[-self.spec.depth :]
+        for out in again:
+            out.restart()
+            out.started = False
+        self.queue = deque(again)
+        self.queued_bytes = sum(out.size for out in again)
+        self.flying.clear()
+        self.active.clear()
+        self.acked_seq = self.begun_seq = 0
 
     def clear(self, reason: DropReason) -> None:
         """The stream ends: whatever is left is dropped for `reason`."""
@@ -452,6 +494,8 @@ class OutChannel:
                     self._drop(out, reason)
             self.retained.clear()
             self.retained_bytes = 0
+            self.gaps.clear()
+            self.watermark = max(self.watermark, self.next_seq - 1)
         else:
             for out in (*self.flying.values(), *self.queue):
                 self._drop(out, reason)
@@ -472,24 +516,31 @@ class OutChannel:
         return len(queued), sum(o.size for o in queued), len(flying), sum(o.size for o in flying)
 
     def validate(self, check: Callable[[bool, str], None]) -> None:
+        """Internal consistency; that the counters add up is checked by the link, as streams of one topic share them."""
         name = self.stream.id.topic
-        queued, queued_bytes, flying, flying_bytes = self.held()
-        counters = self.counters
-        check(
-            counters.offered == counters.delivered + counters.dropped + queued + flying,
-            f"{name}: {counters.offered} offered is not {counters.delivered} delivered + {counters.dropped} dropped"
-            f" + {queued} queued + {flying} in flight",
-        )
-        check(
-            counters.offered_bytes == counters.delivered_bytes + counters.dropped_bytes + queued_bytes + flying_bytes,
-            f"{name}: offered bytes do not add up",
-        )
         check(self.queued_bytes == sum(out.size for out in self.queue), f"{name}: queued bytes do not add up")
         check(all(not out.started for out in self.queue), f"{name}: a begun message is in the queue")
-        check(self.reliable or len(self.queue) <= self.spec.depth, f"{name}: queue deeper than its depth")
-        if self.reliable:
+        check(
+            all(out.started and out.has_unsent and self.flying.get(out.seq) is out for out in self.active),
+            f"{name}: an active message was not begun, has nothing to send, or is not in flight",
+        )
+        if not self.reliable:
+            check(len(self.queue) <= self.spec.depth, f"{name}: queue deeper than its depth")
+            unsent = [out for out in self.flying.values() if out.has_unsent]
+            check(all(out in self.active for out in unsent), f"{name}: bytes to send are forgotten")
             check(
-                self.retained_bytes == sum(out.size for out in self.retained), f"{name}: retained bytes do not add up"
+                all(out.has_unsent or out.fragments_inflight > 0 for out in self.flying.values()),
+                f"{name}: a message waits for nothing",
             )
-            seqs = [out.seq for out in self.retained]
-            check(seqs == sorted(set(seqs)), f"{name}: retained messages are out of order")
+            return
+        check(self.retained_bytes == sum(out.size for out in self.retained), f"{name}: retained bytes do not add up")
+        seqs = [out.seq for out in self.retained]
+        check(seqs == sorted(set(seqs)), f"{name}: retained messages are out of order")
+        check(not seqs or seqs[0] > self.watermark, f"{name}: a delivered message is retained")
+        check(not seqs or seqs[-1] < self.next_seq, f"{name}: retained beyond what was submitted")
+        check(
+            [out for out in self.retained if not out.started] == list(self.queue),
+            f"{name}: queued and retained messages differ",
+        )
+        unsent = [out for out in self.retained if out.started and out.has_unsent]
+        check(all(out in self.active for out in unsent), f"{name}: bytes to send are forgotten")

@@ -34,6 +34,8 @@ class LatchedCache:
     def replay(self) -> list[Message]:
         """Copies marked as replay, oldest first."""
         return [
-            Message(message.stream, message.seq, message.body, message.stamp_ns, message.born_s, 0, True)
+            Message(
+                message.stream, message.seq, message.body, message.stamp_ns, message.born_s, 0, True, message.error_s
+            )
             for message in self._messages
         ]

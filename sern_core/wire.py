@@ -22,8 +22,9 @@ Frames of a kind-16 datagram, each starting with its type:
    | type | flags | channel | seq   | offset   | total   | length |
    |  u8  |  u8   |  u16    |  u32  |  u32     |  u32    |  u16   |
    +------+-------+---------+-------+----------+---------+--------+
-   | stamp_ns i64 | age u32 (100 us) | codec u8 | reserved u8     |   only when offset is 0
+   | stamp_ns i64 | age u32 (100 us) | codec u8 | age error u8    |   only when offset is 0
    +--------------+------------------+----------+-----------------+
+       the true age is at most `age` + AGE_ERRORS_S[age error]: 0 for none, n for 100 us * 2^((n-1)/8), 255 unknown
 
    type 2 ACK (38 bytes): lane u8, highest u32, sack u64, echo stamp u64, receive stamp u64, cumulative bytes u64
        bit i of sack: packet highest-1-i has arrived; the stamps belong to packet `highest`, in microseconds;
@@ -38,6 +39,7 @@ that another program needs to know to speak it is in schemas/wire.md.
 
 import struct
 import zlib
+from bisect import bisect_left
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any, Final, Protocol, cast
@@ -81,6 +83,8 @@ MAX_SEQ: Final = 2**62
 """Where a stream may begin to count: far enough below 2^63 that no sender ever counts past what msgpack holds."""
 AGE_UNIT_S: Final = 1e-4
 MAX_AGE_S: Final = AGE_UNIT_S * 0xFFFFFFFF
+AGE_ERRORS_S: Final = (0.0, *(AGE_UNIT_S * 2.0 ** (code / 8) for code in range(254)), float("inf"))
+"""By how much an age may be too young, by its code: every hop adds the uncertainty of its own clock offset."""
 
 FLAG_TOMBSTONE: Final = 0x01  # the message was dropped upstream; the body is one byte, its DROP_CODES value
 FLAG_REPLAY: Final = 0x02  # a transient_local sample for a late joiner
@@ -128,6 +132,7 @@ class FrameSink(Protocol):
         stamp_ns: int,
         age_s: float,
         codec: int,
+        error_s: float,
     ) -> None: ...
 
     def on_ack(self, lane: int, highest: int, sack: int, echo_us: int, received_us: int, cum_bytes: int) -> None: ...
@@ -177,14 +182,12 @@ def decode_frames(data: bytes, sink: FrameSink) -> None:
                 raise WireError("truncated DATA frame")
             _, flags, channel, seq, offset, total, length = unpack_data(data, position)
             position += DATA_BYTES
-            stamp_ns, age, codec = 0, 0, 0
+            stamp_ns, age, codec, error = 0, 0, 0, 0
             if offset == 0:
                 if position + FIRST_EXTRA.size > end:
                     raise WireError("truncated DATA frame")
-                stamp_ns, age, codec, reserved = FIRST_EXTRA.unpack_from(data, position)
+                stamp_ns, age, codec, error = FIRST_EXTRA.unpack_from(data, position)
                 position += FIRST_EXTRA.size
-                if reserved:
-                    raise WireError("reserved byte of a DATA frame is not zero")
             if flags & ~KNOWN_FLAGS:
                 raise WireError(f"unknown DATA flags 0x{flags:02x}")
             if length == 0 and (offset or total):
@@ -199,7 +202,9 @@ def decode_frames(data: bytes, sink: FrameSink) -> None:
             if flags & FLAG_TOMBSTONE and total != 1:
                 raise WireError("a tombstone carries exactly one byte")
             position += length
-            sink.on_data(flags, channel, seq, offset, total, body, stamp_ns, age * AGE_UNIT_S, codec)
+            sink.on_data(
+                flags, channel, seq, offset, total, body, stamp_ns, age * AGE_UNIT_S, codec, AGE_ERRORS_S[error]
+            )
         elif kind == FRAME_ACK:
             if position + ACK.size > end:
                 raise WireError("truncated ACK frame")
@@ -223,11 +228,23 @@ def decode_frames(data: bytes, sink: FrameSink) -> None:
 
 
 def encode_data_first(
-    flags: int, channel: int, seq: int, total: int, length: int, stamp_ns: int, age_s: float, codec: int
+    flags: int,
+    channel: int,
+    seq: int,
+    total: int,
+    length: int,
+    stamp_ns: int,
+    age_s: float,
+    codec: int,
+    error_s: float = 0.0,
 ) -> bytes:
-    """Header of the fragment at offset 0 (32 bytes); the body follows it. The age is cut to 0 and MAX_AGE_S."""
+    """Header of the fragment at offset 0 (32 bytes); the body follows it.
+
+    The age is cut to 0 and MAX_AGE_S; its error is rounded up to the next of AGE_ERRORS_S.
+    """
     age = 0xFFFFFFFF if age_s >= MAX_AGE_S else int(age_s / AGE_UNIT_S) if age_s > 0.0 else 0
-    return DATA_FIRST.pack(FRAME_DATA, flags, channel, seq & 0xFFFFFFFF, 0, total, length, stamp_ns, age, codec, 0)
+    error = bisect_left(AGE_ERRORS_S, error_s) if error_s else 0
+    return DATA_FIRST.pack(FRAME_DATA, flags, channel, seq & 0xFFFFFFFF, 0, total, length, stamp_ns, age, codec, error)
 
 
 def encode_data_next(flags: int, channel: int, seq: int, offset: int, total: int, length: int) -> bytes:

@@ -1,0 +1,251 @@
+"""The sessions of one end of a hop: hello and welcome, and one session after another.
+
+The client's end is the initiator and says HELLO; the relay's end answers WELCOME. After that both are alike.
+
+    initiator:  idle --connected--> greeting --WELCOME--> up --disconnected--> idle
+                                    greeting --REFUSE--> greeting (later)    up --RESET, CLOSE--> greeting
+    acceptor:   idle --HELLO--> up --HELLO (another)--> up    up --disconnected, CLOSE--> idle
+
+Every session has a tag; datagrams of another one are ignored. The acceptor answers them with RESET: the initiator may
+not know yet that its session is over.
+"""
+
+from abc import abstractmethod
+from collections import deque
+from typing import Final
+
+from sern_core import wire
+from sern_core.clocksync import ClockSync
+from sern_core.errors import WireError
+from sern_core.hop import Hop, microseconds
+from sern_core.params import LinkParams, SchedulerParams
+from sern_core.trace import LINK, DecisionTrace, TraceEvent
+from sern_core.types import ClientName
+
+HELLO_INTERVAL_S: Final = 1.0
+RESET_INTERVAL_S: Final = 0.5
+REFUSED_INTERVAL_S: Final = 5.0
+
+
+class Session(Hop):
+    """Handshake and session of one end. `Link` adds what a session is for."""
+
+    def __init__(
+        self,
+        *,
+        name: ClientName,
+        boot: int,
+        peer: ClientName,
+        initiator: bool,
+        link: LinkParams,
+        scheduler: SchedulerParams,
+        trace: DecisionTrace,
+        now: float,
+        lossless: bool,
+    ) -> None:
+        self.initiator = initiator
+        self.peer_boot: int | None = None
+        self.transport_up = False
+        self._handshake_out: deque[bytes] = deque()
+        self._hello_due_s: float | None = None
+        self._hello_stamp_us = -1
+        self._reset_due_s = -float("inf")
+        self._resumed = False
+        super().__init__(
+            name=name, boot=boot, peer=peer, link=link, scheduler=scheduler, trace=trace, now=now, lossless=lossless
+        )
+
+    @abstractmethod
+    def _session_began(self, resumed: bool, now: float) -> None: ...
+
+    @abstractmethod
+    def _session_ended(self, reason: str, now: float) -> None: ...
+
+    @abstractmethod
+    def _session_refused(self, code: str, text: str, now: float) -> None: ...
+
+    # --- transport ------------------------------------------------------------------------------------------------
+
+    def connected(self, *, now: float) -> None:
+        """The lane's transport is there. The initiator says hello; the other side waits for it."""
+        self.transport_up = True
+        if self.initiator:
+            self._greet(now, now)
+
+    def disconnected(self, *, now: float, reason: str = "connection lost") -> None:
+        """The lane's transport is gone, and with it whatever was in flight."""
+        self.transport_up = False
+        self._hello_due_s = None
+        self._handshake_out.clear()
+        self._end_session(reason, now)
+
+    def _greet(self, due_s: float, now: float) -> None:
+        self._end_session("new session", now)
+        self.tag = self.tag % 255 + 1
+        self._hello_due_s = due_s
+        self.dirty = True
+
+    def _hello(self, now: float) -> bytes:
+        self._hello_due_s = now + HELLO_INTERVAL_S
+        hello = {"name": self.name, "boot": self.boot, "vmin": wire.VERSION_MIN, "vmax": wire.VERSION_MAX}
+        return wire.encode_handshake(wire.Kind.HELLO, self.tag, microseconds(now), hello)
+
+    def accept(self, hello: wire.Envelope, tag: int, stamp_us: int, *, now: float) -> bool:
+        """The relay's end: a peer whose name and key were checked says hello; WELCOME is queued.
+
+        False: an old HELLO that the network delivered late. Raises WireError, or VersionError when no wire version is
+        common; the caller refuses then.
+        """
+        boot = wire.take_int(hello, "boot")
+        version = wire.agree_version(wire.take_int(hello, "vmin"), wire.take_int(hello, "vmax"))
+        if boot == self.peer_boot and stamp_us < self._hello_stamp_us:
+            return False
+        self._hello_stamp_us = stamp_us
+        self.transport_up = True
+        again = self.established and tag == self.tag and boot == self.peer_boot  # our WELCOME was lost
+        if not again:
+            self._end_session("new session", now)
+            self.tag = tag
+            self.version = version
+        at_us = microseconds(now)
+        welcome = {"name": self.name, "boot": self.boot, "version": version, "echo": stamp_us, "at": at_us}
+        self._handshake_out.append(wire.encode_handshake(wire.Kind.WELCOME, tag, at_us, welcome))
+        self.dirty = True
+        if not again:
+            self._establish(boot, now)
+        return True
+
+    def close(self, reason: str, *, now: float) -> None:
+        """End the session on purpose and tell the peer. The transport stays."""
+        if self.established:
+            why = {"why": reason[:200]}
+            self._handshake_out.append(wire.encode_handshake(wire.Kind.CLOSE, self.tag, microseconds(now), why))
+            self.dirty = True
+        self._end_session(reason, now)
+
+    def _establish(self, peer_boot: int, now: float) -> None:
+        resumed = self._resumed = self.peer_boot == peer_boot
+        if not resumed:
+            for channel in self.channels.values():
+                channel.peer_restarted()
+            self.clock = ClockSync()
+        self.peer_boot = peer_boot
+        self.established = True
+        self._hello_due_s = None
+        self.lane.new_session()
+        self.lane.estimator.on_reset(now=now)
+        self._rate_known(now)
+        self._ping_due_s = now
+        self._up_since_s = now
+        self._watermarks.clear()
+        self._begin_control()
+        self.trace.record(now, LINK, TraceEvent.LINK_UP, peer=self.peer)
+        self._session_began(resumed, now)
+
+    def _end_session(self, reason: str, now: float) -> None:
+        self._now = now
+        for packet in self.lane.flight.abandon():
+            self._give_back(packet.items, now)
+        for stream in self.incoming.values():
+            stream.channel_id = None
+        self.incoming.clear()
+        self._watermarks.clear()
+        if not self.established:
+            return
+        self.established = False
+        for channel in self.channels.values():
+            channel.ready = False
+            self._refresh(channel, now)
+        self.trace.record(now, LINK, TraceEvent.LINK_DOWN, peer=self.peer, reason=reason)
+        self._session_ended(reason, now)
+
+    # --- bytes and time -------------------------------------------------------------------------------------------
+
+    def next_datagram(self, *, now: float) -> bytes | None:
+        """The next bytes for the lane, or None if nothing may or need be sent now."""
+        if self._handshake_out:
+            return self._handshake_out.popleft()
+        if self._hello_due_s is not None and self.transport_up:
+            if now >= self._hello_due_s:
+                return self._hello(now)
+            self.dirty = False
+            return None
+        if not self.established:
+            self.dirty = False
+            return None
+        if self.lane.flight.next_number >= wire.MAX_PACKET_NUMBER:
+            self._renew(now)
+            return self.next_datagram(now=now)
+        return self._next_data(now)
+
+    def _renew(self, now: float) -> None:
+        """Packet numbers are used up: go on in another session."""
+        if self.initiator:
+            self._greet(now, now)
+        else:
+            self._end_session("packet numbers used up", now)
+            self._send_reset(self.tag, now)
+
+    def _send_reset(self, tag: int, now: float) -> None:
+        if now >= self._reset_due_s:
+            self._reset_due_s = now + RESET_INTERVAL_S
+            self._handshake_out.append(wire.encode_handshake(wire.Kind.RESET, tag, microseconds(now), {}))
+            self.dirty = True
+
+    def receive(self, data: bytes, *, now: float) -> None:
+        """One datagram from the lane. Raises WireError or VersionError for bytes no honest peer sends."""
+        header = wire.decode_header(data)
+        if header.kind != wire.Kind.DATA:
+            self._now = now
+            self._handshake(header, data, now)
+        elif header.tag == self.tag and self.established:
+            self._receive_data(header, data, now)
+        elif not self.initiator:
+            # Of another session; if that one is the peer's latest, it does not know yet that it is over.
+            self._send_reset(header.tag, now)
+
+    def next_deadline(self) -> float | None:
+        """When to call `handle_timeout` and `next_datagram` at the latest, if nothing else happens."""
+        if self.established:
+            return self._data_deadline()
+        if self._hello_due_s is not None:
+            return min(self._hello_due_s, self._sweep_due_s)
+        return self._sweep_due_s
+
+    def handle_timeout(self, *, now: float) -> None:
+        if self.established:
+            self._data_timeout(now)
+        elif now >= self._sweep_due_s:
+            self._now = now
+            self._sweep(now)
+        self.dirty = True
+
+    def _handshake(self, header: wire.Header, data: bytes, now: float) -> None:
+        envelope = wire.decode_handshake(data)
+        kind = wire.Kind(header.kind)
+        if kind is wire.Kind.CLOSE:
+            if header.tag == self.tag and self.established:
+                why = f"{self.peer} closed the session: {wire.take_str(envelope, 'why')}"
+                if self.initiator:
+                    self._end_session(why, now)
+                    self._greet(now + HELLO_INTERVAL_S, now)
+                else:
+                    self._end_session(why, now)
+            return
+        if not self.initiator or kind is wire.Kind.HELLO:
+            raise WireError(f"{kind.name} is not for this side")
+        if header.tag != self.tag:
+            return
+        if kind is wire.Kind.WELCOME and self._hello_due_s is not None:
+            self.version = wire.take_int(envelope, "version", low=wire.VERSION_MIN, high=wire.VERSION_MAX)
+            self.peer = ClientName(wire.take_str(envelope, "name", max_length=64))
+            echo_us = wire.take_int(envelope, "echo", high=2**64 - 1)
+            at_us = wire.take_int(envelope, "at", high=2**64 - 1)
+            self._establish(wire.take_int(envelope, "boot"), now)
+            self.clock.sample(echo_us * 1e-6, at_us * 1e-6, header.stamp_us * 1e-6, now)
+        elif kind is wire.Kind.REFUSE:
+            code, text = wire.take_str(envelope, "code", max_length=64), wire.take_str(envelope, "why")
+            self._greet(now + REFUSED_INTERVAL_S, now)
+            self._session_refused(code, text, now)
+        elif kind is wire.Kind.RESET and self.established:
+            self._greet(now, now)
