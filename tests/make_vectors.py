@@ -352,7 +352,8 @@ def _bad_bytes() -> Iterator[tuple[str, str, bytes]]:
     yield "fragment-wraps", "datagram", changed(by_name["data-next"], first + 8, 0xFFFF_FFFF, 4)
     yield "empty-fragment", "datagram", header + wire.encode_data_next(0, 3, 41, 5, 10, 0)
     yield "empty-first-fragment", "datagram", header + wire.encode_data_first(0, 3, 41, 10, 0, 0, 0.0, 0)
-    yield "oversize-fragment", "datagram", header + wire.encode_data_first(0, 3, 41, 60_001, 60_001, 0, 0.0, 0)
+    size = wire.MAX_FRAGMENT_BYTES + 1
+    yield "oversize-fragment", "datagram", header + wire.encode_data_first(0, 3, 41, size, size, 0, 0.0, 0)
     tombstone = wire.FLAG_TOMBSTONE
     yield "tombstone-of-two", "datagram", header + wire.encode_data_first(tombstone, 3, 41, 2, 2, 0, 0.0, 0) + b"\1\1"
     yield "tombstone-of-none", "datagram", header + wire.encode_data_first(tombstone, 3, 41, 0, 0, 0, 0.0, 0)

@@ -222,14 +222,19 @@ def test_every_frame_type() -> None:
         (0, 1, 1, None),
         (0, 2**32 - 1, 1, None),
         (2**32 - 2, 2**32 - 1, 1, None),
-        (0, 60_000, 60_000, None),
+        (0, wire.MAX_FRAGMENT_BYTES, wire.MAX_FRAGMENT_BYTES, None),
         (0, 1, 0, "empty fragment"),
         (1, 1, 0, "empty fragment"),
         (1, 2, 0, "empty fragment"),
         (0, 0, 1, "fragment 0+1 lies outside its message of 0 bytes"),
         (1, 1, 1, "fragment 1+1 lies outside its message of 1 bytes"),
         (2**32 - 1, 2**32 - 1, 1, "fragment 4294967295+1 lies outside its message of 4294967295 bytes"),
-        (0, 60_001, 60_001, "fragment of 60001 bytes exceeds 60000"),
+        (
+            0,
+            wire.MAX_FRAGMENT_BYTES + 1,
+            wire.MAX_FRAGMENT_BYTES + 1,
+            f"fragment of {wire.MAX_FRAGMENT_BYTES + 1} bytes exceeds {wire.MAX_FRAGMENT_BYTES}",
+        ),
     ],
 )
 def test_where_a_fragment_may_lie(offset: int, total: int, length: int, problem: str | None) -> None:
