@@ -6,39 +6,53 @@ measured in interleaved rounds; ratios are taken within a round and their median
 
     proxy   zmq.proxy between XSUB and XPUB, in C: the least a relay can cost
     feed    sern_runtime.feed: the same sockets and frames, with access rules
+    sern    the scheduled link: sern-relay between two clients, acknowledged hop by hop
     zenoh   a zenoh router and two clients, shared memory off
 
 A further system is one more subclass of `System` in `SYSTEMS`, and its limits in `CPU_LIMITS` and `RATE_LIMITS`.
 """
 
 import argparse
+import asyncio
 import importlib.util
 import json
 import multiprocessing
+import random
 import re
 import signal
 import socket
 import statistics
 import sys
+import tempfile
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from ctypes import c_bool, c_uint64
 from dataclasses import dataclass, field
 from functools import partial
 from multiprocessing.process import BaseProcess
 from multiprocessing.sharedctypes import RawValue
+from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import psutil
+import uvloop
 import zmq
 
 from benchmarks import common
+from sern_client.transport import RelayTransport
+from sern_core.client import ClientCore
 from sern_core.errors import SernError
+from sern_core.message import Message, StreamInfo, TopicInfo, TopicSpec
+from sern_core.params import LinkParams, SchedulerParams
 from sern_core.rules import FeedRole
-from sern_core.types import PriorityClass
+from sern_core.types import ClientName, DropReason, Encoding, PriorityClass, TopicName
+from sern_relay.daemon import RelayDaemon
+from sern_runtime import logs
+from sern_runtime.config.relay import load_relay
 from sern_runtime.feed import Feed, FeedHeader, topic_frame
 from sern_runtime.loop import Shutdown, run
+from sern_runtime.pump import Pump
 
 SIZES: Final = {"100 B": 100, "1 kB": 1000, "64 kB": 64_000, "1 MB": 1_000_000}
 IN_FLIGHT_MESSAGES: Final = 500
@@ -51,9 +65,9 @@ STALL_S: Final = 1.0
 HIGH_WATER: Final = 10_000  # above what is in flight: the closed loop alone decides
 
 TOPIC: Final = "/bench/odom"
-CPU_LIMITS: Final = {("feed", "1 kB"): 3.0}
+CPU_LIMITS: Final = {("feed", "1 kB"): 3.0, ("sern", "1 kB"): 8.0}
 """(system, case): relay CPU a message, at most this many times that of zmq.proxy."""
-RATE_LIMITS: Final = {("feed", "64 kB"): 0.8}
+RATE_LIMITS: Final = {("feed", "64 kB"): 0.8, ("sern", "64 kB"): 0.8}
 """(system, case): MB/s, at least this share of zenoh's."""
 
 
@@ -228,7 +242,135 @@ class Zenoh(System):
                 time.sleep(0.02)
 
 
-SYSTEMS: Final[tuple[System, ...]] = (Proxy(), FeedRelay(), Zenoh())
+class _Site:
+    """The shell of a client core in this benchmark: it counts what arrives and answers nothing."""
+
+    def __init__(self, flow: Flow) -> None:
+        self.flow = flow
+        self.wanted_now = False
+
+    def link_up(self, *, resumed: bool) -> None: ...
+
+    def link_down(self, reason: str) -> None: ...
+
+    def rejected(self, code: str, text: str) -> None: ...
+
+    def stream_opened(self, stream: StreamInfo) -> None: ...
+
+    def stream_closed(self, stream: StreamInfo) -> None: ...
+
+    def message(self, stream: StreamInfo, message: Message, *, now: float) -> None:
+        if len(message.body) == self.flow.size_bytes:
+            self.flow.arrived()
+
+    def expired(self, stream: StreamInfo, seq: int, reason: DropReason) -> None: ...
+
+    def skipped(self, stream: StreamInfo, count: int) -> None: ...
+
+    def send_dropped(self, stream: StreamInfo, seq: int, reason: DropReason) -> None: ...
+
+    def wanted(self, stream: StreamInfo, wanted: bool) -> None:
+        self.wanted_now = wanted
+
+    def publication_refused(self, stream: StreamInfo, code: str, text: str) -> None: ...
+
+
+Work = Callable[[ClientCore, Pump, _Site], Awaitable[None]]
+
+
+class ScheduledLink(System):
+    """A real relay daemon between two clients: schedulers, windows and acknowledgements on both hops, no CURVE."""
+
+    name = "sern"
+
+    def relay(self, ports: Ports, ready: Callable[[], None]) -> None:
+        text = (
+            f"relay: {{name: relay, listen: [tcp://127.0.0.1:{ports.ingest}], insecure: true}}\n"
+            "access: [{client: '.*', publish: ['.*'], subscribe: ['.*']}]\n"
+            "http: {listen: null}\nlog: {level: error}\n"
+        )
+
+        async def main(shutdown: Shutdown) -> None:
+            with tempfile.TemporaryDirectory() as folder:
+                path = Path(folder) / "relay.yaml"
+                path.write_text(text)
+                daemon = RelayDaemon(load_relay(path))
+                try:
+                    await daemon.start()
+                    ready()
+                    await shutdown.wait()
+                finally:
+                    await daemon.stop()
+
+        logs.configure(level="ERROR")
+        run(main)
+
+    async def _client(
+        self, ports: Ports, flow: Flow, name: str, work: Callable[[ClientCore, Pump, _Site], Any]
+    ) -> None:
+        site = _Site(flow)
+        core = ClientCore(
+            name=ClientName(name),
+            boot=random.getrandbits(63),
+            events=site,
+            link=LinkParams(),
+            scheduler=SchedulerParams(),
+            now=time.monotonic(),
+        )
+        with zmq.Context() as context:
+            transport = RelayTransport(
+                context,
+                core.link,
+                f"tcp://127.0.0.1:{ports.ingest}",
+                None,
+                (),
+                heartbeat_timeout_s=5.0,
+                random=random.Random(1),
+                on_reason=lambda _reason: None,
+            )
+            try:
+                await work(core, transport.pump, site)
+            finally:
+                transport.close()
+
+    def publisher(self, ports: Ports, flow: Flow) -> None:
+        async def work(core: ClientCore, pump: Pump, site: _Site) -> None:
+            info = TopicInfo(TopicName(TOPIC), "bench/Bytes", Encoding.RAW)
+            channel = core.publish(info, TopicSpec(depth=HIGH_WATER, lifespan_s=None), now=time.monotonic())
+            body, received, stopped = bytes(flow.size_bytes), flow.received, flow.stopped
+            sent = moved = 0
+            moved_s = time.monotonic()
+            while not stopped.value:
+                now = time.monotonic()
+                if site.wanted_now:
+                    if received.value != moved:
+                        moved_s, moved = now, received.value
+                    elif now - moved_s > STALL_S:
+                        sent = moved
+                    for _ in range(min(BURST * 4, self._room(flow, sent))):
+                        core.send(channel, body, 0, now=now)
+                        sent += 1
+                    pump.run()
+                await asyncio.sleep(0.0005 if self._room(flow, sent) <= 0 or not site.wanted_now else 0)
+
+        with asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:
+            runner.run(self._client(ports, flow, "publisher", work))
+
+    @staticmethod
+    def _room(flow: Flow, sent: int) -> int:
+        return int(flow.window - (sent - flow.received.value))
+
+    def subscriber(self, ports: Ports, flow: Flow) -> None:
+        async def work(core: ClientCore, pump: Pump, site: _Site) -> None:
+            core.subscribe((TOPIC,), now=time.monotonic())
+            while not flow.stopped.value:  # noqa: ASYNC110  (a flag in shared memory has no event)
+                await asyncio.sleep(0.02)
+
+        with asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:
+            runner.run(self._client(ports, flow, "subscriber", work))
+
+
+SYSTEMS: Final[tuple[System, ...]] = (Proxy(), FeedRelay(), ScheduledLink(), Zenoh())
 
 
 class Sample(NamedTuple):

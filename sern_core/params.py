@@ -73,7 +73,7 @@ class LinkParams:
     """What one hop needs besides the scheduler."""
 
     window: WindowParams = field(default_factory=WindowParams)
-    fragment_bytes_max: int = 8192
+    fragment_bytes_max: int = 65_000
     """Fragments on the ZMQ lane are clamp(3 ms · B, 1200, this)."""
     heartbeat_timeout_s: float = 5.0
     """A peer that says nothing for so long is gone; its connection is closed and rebuilt."""

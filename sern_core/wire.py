@@ -65,7 +65,7 @@ HEADER_BYTES: Final = HEADER.size
 DATA_BYTES: Final = DATA_FIXED.size
 DATA_FIRST_BYTES: Final = DATA_FIRST.size
 
-MAX_FRAGMENT_BYTES: Final = 60_000
+MAX_FRAGMENT_BYTES: Final = 65_000
 """Largest fragment body; `length` is 16 bits and a ZMQ message on the WAN stays below 64 KiB."""
 MAX_DATAGRAM_BYTES: Final = 65_536
 MAX_ENVELOPE_BYTES: Final = 4096

@@ -67,7 +67,7 @@ class LinkSection(Section):
 
     window: WindowSection = WindowSection()
     """The window of bytes in flight."""
-    fragment_bytes_max: Annotated[int, Field(ge=1200, le=65_536)] = _LINK.fragment_bytes_max
+    fragment_bytes_max: Annotated[int, Field(ge=1200, le=65_000)] = _LINK.fragment_bytes_max
     """Largest fragment; the size used is what the link carries in 3 ms, at least 1200."""
     heartbeat_timeout_s: Annotated[float, Field(ge=0.5, le=600)] = _LINK.heartbeat_timeout_s
     """A peer that is silent for so long is gone, and its connection is rebuilt. Satellite links need more than 2 s."""
