@@ -14,6 +14,7 @@ from typing import Final
 
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from sern_core.types import CLASS_LABELS
 from sern_sim.profiles import LinkProfile
@@ -138,9 +139,11 @@ def print_summary(report: Report, console: Console) -> None:
             if reasons:
                 console.print(f"{result.system}, {label}: {reasons}", highlight=False)
     console.print()
+    promises = Table.grid(padding=(0, 2, 0, 0))
     for verdict in report.verdicts:
-        word, style = ("kept  ", "green") if verdict.ok else ("BROKEN", "bold red")
-        console.print(f"[{style}]{word}[/]  {verdict.promise}: {measured(verdict)}", highlight=False)
+        word = Text("kept", "green") if verdict.ok else Text("BROKEN", "bold red")
+        promises.add_row(word, Text(f"{verdict.promise}: {measured(verdict)}"))
+    console.print(promises)
     for remark in report.remarks:
         console.print(remark, highlight=False, style="yellow", markup=False)
 
@@ -159,9 +162,9 @@ def _without_limit(verdict: Verdict) -> str:
 
 
 def _unit(verdict: Verdict) -> Callable[[float], str]:
-    if verdict.name.endswith("_s"):
-        return seconds
-    return _share if verdict.name.endswith("_share") else _count
+    if verdict.noun:
+        return lambda value: f"{value:.0f} {verdict.noun}" if value else f"none {verdict.noun}"
+    return seconds if verdict.name.endswith("_s") else _share
 
 
 def drop_words(statistics: Statistics) -> str:
@@ -197,10 +200,6 @@ def _share(value: float) -> str:
     return f"{100 * value:.2f} %"
 
 
-def _count(value: float) -> str:
-    return f"{value:.0f}" if value else "none"
-
-
 # HTML ----------------------------------------------------------------------------------------------------------------
 
 _STYLE: Final = """
@@ -211,7 +210,7 @@ p { margin: 8px 0; } .lead { color: #59636e; }
 table { border-collapse: collapse; width: 100%; font-variant-numeric: tabular-nums; }
 th, td { text-align: left; padding: 5px 10px 5px 0; border-bottom: 1px solid #d1d9e0; vertical-align: top; }
 th { font-weight: 600; } th.wide { width: 38%; } td.n, th.n { text-align: right; white-space: nowrap; }
-tr.first td { border-top: 2px solid #afb8c1; }
+td.system { white-space: nowrap; } tr.first td { border-top: 2px solid #afb8c1; }
 .kept { color: #1a7f37; font-weight: 600; } .broken { color: #cf222e; font-weight: 600; }
 .banner { padding: 10px 14px; border-radius: 6px; font-weight: 600; margin: 16px 0; }
 .banner.good { background: #dafbe1; } .banner.bad { background: #ffebe9; }
@@ -286,7 +285,7 @@ def _class_table(results: Sequence[Result]) -> str:
             )
             rows.append(
                 f'<tr class="{"first" if index == 0 else ""}"><td>{label if index == 0 else ""}</td>'
-                f"<td>{html.escape(result.system)}</td>"
+                f'<td class="system">{html.escape(result.system)}</td>'
                 + "".join(f'<td class="n">{cell}</td>' for cell in cells)
                 + f"<td>{html.escape(drop_words(statistics)) or 'none'}</td></tr>"
             )
@@ -366,6 +365,8 @@ def _notes(report: Report) -> list[str]:
             "again</i> counts what it dropped and what still waited in its queue three seconds after the end.",
         ]
     notes += [
+        "<i>Unwanted</i> are messages that were offered before anybody had subscribed to them; <i>superseded</i> ones "
+        "made way for a newer sample of the same topic.",
         "<i>Idle link</i> is the one-way latency of a 100-byte message over plain ZMQ through the same proxy before "
         "any load: nothing can be faster.",
         "A message is <i>overtaken</i> when a less urgent one from the same origin, offered at least 10 ms later, "

@@ -136,7 +136,10 @@ class Result:
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """A promise, what was measured, and whether it held. `limit` and `value` share the unit in `name`."""
+    """A promise, what was measured, and whether it held. `limit` and `value` share the unit in `name`.
+
+    `noun`: what is counted, where the value is a count that should be 0.
+    """
 
     name: str
     promise: str
@@ -144,6 +147,7 @@ class Verdict:
     limit: float
     ok: bool
     detail: str = ""
+    noun: str = ""
 
 
 def analyse(
@@ -294,6 +298,7 @@ def judge(
                 0,
                 sern.accounting_gap == 0,
                 "; ".join(sern.accounting_notes[:4]),
+                noun="uncounted",
             )
         )
     if baseline is not None:
@@ -344,13 +349,14 @@ def _reliable(result: Result) -> Verdict:
         0,
         broken == 0 and total > 0,
         "; ".join(notes) or f"{total} messages",
+        noun="missing or out of place",
     )
 
 
 def _intact(result: Result) -> Verdict:
     corrupted = sum(topic.corrupted for topic in result.topics.values())
     promise = "every message that arrives is one that was sent, byte for byte"
-    return Verdict("corrupted_messages", promise, corrupted, 0, corrupted == 0)
+    return Verdict("corrupted_messages", promise, corrupted, 0, corrupted == 0, noun="altered")
 
 
 def _order(result: Result, limits: Mapping[str, float]) -> list[Verdict]:
@@ -390,6 +396,7 @@ def _commands(result: Result) -> list[Verdict]:
             late,
             0,
             late == 0 and total > 0,
-            f"{total} commands delivered" + (f", the latest {worst_s:.3f} s too late" if late else ""),
+            f"{total} delivered" + (f", the latest {worst_s:.2f} s too late" if late else ""),
+            noun="late",
         )
     ]

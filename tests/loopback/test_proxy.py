@@ -6,15 +6,15 @@ import json
 import socket
 import sys
 import time
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 
 import pytest
 
 from sern_core.errors import SernError
 from sern_sim.models import LinkModel, RateStep, Window
 from sern_tools.proxy import EARLY_S, Route, ShapingProxy, address
+from tests.support import DEADLINE_S, until
 
-DEADLINE_S = 20.0
 HOST = "127.0.0.1"
 FAST = LinkModel(rate_bps=80e6, delay_s=0.002)
 
@@ -64,12 +64,6 @@ class Peer:
                     await writer.drain()
             self.ended += 1
             writer.close()
-
-
-async def until(condition: Callable[[], bool]) -> None:
-    async with asyncio.timeout(DEADLINE_S):
-        while not condition():  # noqa: ASYNC110 - any state of two parties, not one event
-            await asyncio.sleep(0.005)
 
 
 @contextlib.asynccontextmanager
