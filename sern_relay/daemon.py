@@ -14,12 +14,15 @@ from prometheus_client import CollectorRegistry
 from sern_core.access import AccessTable
 from sern_core.errors import ConfigError
 from sern_core.hub import Hub, HubParams
+from sern_core.link import Link
 from sern_core.message import Message, StreamInfo
+from sern_core.queues import OutChannel
 from sern_core.types import ClientName
 from sern_relay.feed import RelayFeed
 from sern_relay.server import RelayServer
 from sern_runtime.config.load import Loaded
 from sern_runtime.config.relay import RelayFile, load_relay
+from sern_runtime.entry import blamed_on, log_warnings, serve
 from sern_runtime.http import Health, HttpServer
 from sern_runtime.keys import KeyDirectory, KeyStatus, load_secret
 from sern_runtime.link_metrics import AgeHistograms, register_links, register_received
@@ -40,18 +43,24 @@ _log = logging.getLogger(__name__)
 async def run_relay(path: Path, shutdown: Shutdown) -> int:
     """Run until asked to stop. Raises ConfigError for what is wrong with the file or the machine."""
     loaded = load_relay(path)
-    for warning in loaded.warnings:
-        _log.warning("%s", warning)
+    log_warnings(_log, loaded.warnings)
     daemon = RelayDaemon(loaded)
-    shutdown.on_reload = daemon.reload
     try:
         await daemon.start()
-        await shutdown.wait()
+        shutdown.on_reload = daemon.reload
+        await serve(shutdown, daemon.tasks)
         daemon.notifier.stopping("draining")
         await daemon.drain()
     finally:
         await daemon.stop()
     return 0
+
+
+def _owes(link: Link, channel: OutChannel, last: int) -> bool:
+    """Whether a connected client has yet to confirm messages up to `last`."""
+    if not link.established or link.lane.stalled:
+        return False
+    return bool(channel.retained) and channel.retained[0].seq <= last
 
 
 class RelayDaemon:
@@ -82,7 +91,8 @@ class RelayDaemon:
         self.feed: RelayFeed | None = None
         self._ctx: zmq.Context[zmq.Socket[bytes]] | None = None
         self._http: HttpServer | None = None
-        self._tasks: list[asyncio.Task[None]] = []
+        self.tasks: list[asyncio.Task[None]] = []
+        self._valid = self._valid_keys()
         self._ready = False
         self._flush_due: asyncio.Handle | None = None
 
@@ -99,31 +109,35 @@ class RelayDaemon:
         relay = model.relay
         keys = load_secret(self.loaded.resolve(relay.secret_key_file)) if relay.secret_key_file else None
         if model.http.listen is not None:
-            self._http = self._make_http(model.http.listen)
-            await self._http.start()
+            with blamed_on(self.loaded.path, "http", "listen"):
+                self._http = self._make_http(model.http.listen)
+                await self._http.start()
         self._ctx = zmq.Context()
         if keys is not None:
             self.zap = ZapHandler(self._ctx)
             self.zap.add_domain(ZAP_DOMAIN, self._lookup)
-        self.server = RelayServer(
-            self._ctx,
-            self.hub,
-            relay.listen,
-            keys,
-            ZAP_DOMAIN,
-            heartbeat_timeout_s=model.link.heartbeat_timeout_s,
-            handshake_interval_s=relay.handshake_interval_s,
-            max_connections=relay.max_connections,
-            after=self._after,
-        )
+        with blamed_on(self.loaded.path, "relay", "listen"):
+            self.server = RelayServer(
+                self._ctx,
+                self.hub,
+                relay.listen,
+                keys,
+                ZAP_DOMAIN,
+                admits=self._known,
+                heartbeat_timeout_s=model.link.heartbeat_timeout_s,
+                handshake_interval_s=relay.handshake_interval_s,
+                max_connections=relay.max_connections,
+                after=self._after,
+            )
         if keys is not None and self.zap is not None:
             await self_test(self._ctx, self.zap, relay.listen, keys.public_key)
             _log.info("self-test passed: a stranger's key is refused on %s", ", ".join(relay.listen))
         else:
             _log.warning("insecure: true: clients are not authenticated and nothing is encrypted")
         if model.feed.roles:
-            self.feed = RelayFeed(self._ctx, self.hub, model.feed_roles(), after=self._after)
-        self._tasks.append(asyncio.create_task(self._tick(), name="relay-tick"))
+            with blamed_on(self.loaded.path, "feed", "roles"):
+                self.feed = RelayFeed(self._ctx, self.hub, model.feed_roles(), after=self._after)
+        self.tasks.append(asyncio.create_task(self._tick(), name="relay-tick"))
         self._ready = True
         self.notifier.ready(f"{model.name} on {', '.join(relay.listen)}")
         _log.info("relay %s listens on %s", model.name, ", ".join(relay.listen))
@@ -135,10 +149,27 @@ class RelayDaemon:
             return match.name
         if match.status is KeyStatus.NOT_YET:
             return TemporaryRefusal(f"the key of {match.name} is not valid yet")
-        _log.warning(
-            "%s refused: %s", address, "unknown key" if match.name is None else f"the key of {match.name} has expired"
-        )
+        if match.name is not None:  # an unknown key is reported by the handler
+            _log.warning("%s: the key of %s has expired", address, match.name)
         return None
+
+    def _valid_keys(self) -> dict[ClientName, frozenset[str]]:
+        """The keys that hold now, by client."""
+        if self.directory is None:
+            return {}
+        now_s = time.time()
+        return {
+            name: frozenset(key.key for key in self.directory.keys_of(name) if key.status(now_s) is KeyStatus.VALID)
+            for name in self.directory.names
+        }
+
+    def _end_lapsed(self) -> None:
+        """Cut the connections of every client of which a key was taken away or has expired. Which key a connection
+        was made with is not known here: one with a key that still holds is back at once."""
+        before, self._valid = self._valid, self._valid_keys()
+        for client, keys in before.items():
+            if keys - self._valid.get(client, frozenset()) and self.server is not None:
+                _log.warning("%s lost a key; %d connections cut", client, self.server.cut_client(client))
 
     def _after(self) -> None:
         """Something came in: before the loop comes round again, whoever has something to send sends it."""
@@ -157,14 +188,17 @@ class RelayDaemon:
         watchdog = Watchdog(self.notifier, progress)
         while True:
             await asyncio.sleep(SWEEP_S)
+            self._end_lapsed()
             self.hub.sweep(now=time.monotonic())
             self._flush()
             if self.zap is not None:
                 self.zap.ping()
             if watchdog.interval_s is not None:
                 watchdog.check()
-            up = sum(link.established for link in self.hub.links.values())
-            self.notifier.status(f"{up} clients, {len(self.hub.relayed)} streams")
+            self.notifier.status(f"{self._clients_up()} clients, {len(self.hub.relayed)} streams")
+
+    def _clients_up(self) -> int:
+        return sum(link.established for link in self.hub.links.values())
 
     def reload(self) -> None:
         """SIGHUP: read keys and access rules anew; all or nothing. What was revoked ends now."""
@@ -178,13 +212,12 @@ class RelayDaemon:
             _log.error("reload failed, the old configuration stays: %s", error)
             self.notifier.ready(f"reload failed: {error}")
             return
-        before = set(self.directory.names) if self.directory is not None else set()
+        log_warnings(_log, loaded.warnings)
         self.directory = directory
-        now = time.monotonic()
-        self.hub.revoke(access, now=now)
-        for client in sorted(before - set(directory.names if directory is not None else ())):
-            if self.server is not None:
-                _log.warning("%s is revoked; %d connections cut", client, self.server.cut_client(client))
+        self.hub.revoke(access, now=time.monotonic())
+        if self.server is not None:
+            self.server.cut_unbound()  # admitted by the old keys, and silent so far
+        self._end_lapsed()
         self._after()
         self.notifier.ready("reloaded")
         _log.info("reloaded keys and access rules; other changes need a restart")
@@ -195,7 +228,7 @@ class RelayDaemon:
         register_links(metrics, lambda: list(self.hub.links.values()))
         register_received(metrics, self.hub.received, self.ages)
         metrics.gauge("sern_relay_clients", "Clients with a session.",
-                      read=lambda: [((), float(sum(link.established for link in self.hub.links.values())))])  # fmt: skip
+                      read=lambda: [((), float(self._clients_up()))])  # fmt: skip
         metrics.gauge("sern_relay_streams", "Streams announced by clients.",
                       read=lambda: [((), float(len(self.hub.relayed)))])  # fmt: skip
         metrics.gauge("sern_relay_objects", "Cross-reality objects in the registry.",
@@ -205,6 +238,10 @@ class RelayDaemon:
         metrics.counter("sern_bad_frames_total", "Frames that were not valid; their connections were closed.",
                         read=lambda: [((), float(self.server.bad_frames if self.server else 0))])  # fmt: skip
         metrics.counter("sern_relay_auth_total", "Answers of the ZAP handler.", ("result",), self._auth)
+        metrics.gauge("sern_relay_connections", "Connections, those without a proven key included.",
+                      read=lambda: [((), float(len(self.server.connections) if self.server else 0))])  # fmt: skip
+        metrics.counter("sern_relay_connections_refused_total", "Connections or messages refused, by reason.",
+                        ("reason",), self._refused_connections)  # fmt: skip
         metrics.counter("sern_relay_reload_failures_total", "Reloads that kept the old configuration.",
                         read=lambda: [((), float(self.reloads_failed))])  # fmt: skip
         return HttpServer(
@@ -223,6 +260,21 @@ class RelayDaemon:
         names = ("admitted", "unknown_key", "not_now", "capped", "failed", "malformed")
         return [((name,), float(getattr(self.zap.counters, name)) if self.zap else 0.0) for name in names]
 
+    def _refused_connections(self) -> list[tuple[tuple[str, ...], float]]:
+        server = self.server
+        if server is None:
+            return []
+        table, socket = server.connections, server.socket
+        counts = {
+            "capped": table.capped,
+            "handshake": table.handshake_failed,
+            "accept": table.accept_failed,
+            "routing_id": socket.refused_routing_ids,
+            "multipart": socket.malformed,
+            "revoked": server.revoked,
+        }
+        return [((reason,), float(count)) for reason, count in counts.items()]
+
     def topics(self) -> dict[str, object]:
         """Counters by client link and topic, and of what arrived."""
         now = time.monotonic()
@@ -234,9 +286,16 @@ class RelayDaemon:
     async def drain(self) -> None:
         """Go on for a while with what connected clients are owed, then end their sessions."""
         deadline_s = time.monotonic() + DRAIN_S
+        # What comes in from now on its sources keep until the next relay confirms it.
+        owed = [
+            (link, channel, channel.next_seq - 1)
+            for link in self.hub.links.values()
+            for channel in link.channels.values()
+            if channel.retained
+        ]
         while time.monotonic() < deadline_s:
-            links = [link for link in self.hub.links.values() if link.established and not link.lane.stalled]
-            if not any(channel.retained for link in links for channel in link.channels.values()):
+            owed = [item for item in owed if _owes(*item)]
+            if not owed:
                 break
             await asyncio.sleep(0.02)
         for link in self.hub.links.values():
@@ -247,9 +306,9 @@ class RelayDaemon:
 
     async def stop(self) -> None:
         self._ready = False
-        for task in self._tasks:
+        for task in self.tasks:
             task.cancel()
-        await asyncio.gather(*self._tasks, return_exceptions=True)
+        await asyncio.gather(*self.tasks, return_exceptions=True)
         if self._flush_due is not None:
             self._flush_due.cancel()
         if self._http is not None:
@@ -261,7 +320,7 @@ class RelayDaemon:
         if self.zap is not None:
             self.zap.close()
         if self._ctx is not None:
-            self._ctx.term()
+            self._ctx.destroy(linger=0)
         self._write_summary()
         self.notifier.close()
 

@@ -8,11 +8,12 @@ from typing import Final
 import zmq
 
 from sern_core import wire
-from sern_core.errors import WireError
+from sern_core.errors import RemoteError, UsageError, WireError
 from sern_core.hub import Hub, HubPort
 from sern_core.rules import client_name
+from sern_core.types import ClientName
 from sern_runtime.monitor import ConnectionTable
-from sern_runtime.pump import Pump
+from sern_runtime.pump import LANE_MESSAGE_BYTES, Pump
 from sern_runtime.zmq_socket import CurvePair, RouterSocket, SendResult, make_server
 
 CONGESTION_CONTROL: Final = "cubic"
@@ -34,7 +35,11 @@ class Session:
 
 
 class RelayServer:
-    """Binds the listeners and joins them to `hub`. `insecure`: clients are who their HELLO says they are."""
+    """Binds the listeners and joins them to `hub`. Without `keys` clients are who their HELLO says they are.
+
+    `admits` is asked when a connection first speaks: its key may have been revoked since it was let in. `after` is
+    called whenever something came in.
+    """
 
     def __init__(
         self,
@@ -44,6 +49,7 @@ class RelayServer:
         keys: CurvePair | None,
         zap_domain: str,
         *,
+        admits: Callable[[ClientName], bool],
         heartbeat_timeout_s: float,
         handshake_interval_s: float,
         max_connections: int,
@@ -51,7 +57,9 @@ class RelayServer:
     ) -> None:
         self.hub = hub
         self.bad_frames = 0
-        self.strangers = 0
+        self.revoked = 0
+        """Connections that spoke first when their key was no longer known."""
+        self._admits = admits
         self._insecure = keys is None
         self._after = after
         self._sessions: dict[bytes, Session] = {}
@@ -62,6 +70,7 @@ class RelayServer:
             zap_domain,
             heartbeat_timeout_ms=int(heartbeat_timeout_s * 1000),
             handshake_ivl_ms=int(handshake_interval_s * 1000),
+            max_message_bytes=LANE_MESSAGE_BYTES,
         )
         self.connections = ConnectionTable(raw, max_connections=max_connections, on_change=self._connections_changed)
         self.socket = RouterSocket(raw, self._received, on_writable=self._writable)
@@ -84,7 +93,7 @@ class RelayServer:
             return
         try:
             session.port.receive(data, now=time.monotonic())
-        except WireError as error:
+        except RemoteError as error:
             self.bad_frames += 1
             self._cut(routing_id, session, f"bad frame: {error}")
             return
@@ -95,9 +104,14 @@ class RelayServer:
         details = self.socket.peer_details()
         try:
             name = client_name(user or self._claimed(data))
-        except (WireError, ValueError) as error:
+        except (WireError, UsageError) as error:
             self.bad_frames += 1
-            _log.warning("%s: closed: %s", details.address, error)
+            _log.warning("connection from %s closed: bad frame: %s", details.address, error)
+            self._cut_fd(details.fd)
+            return None
+        if not self._admits(name):
+            self.revoked += 1
+            _log.warning("connection from %s closed: the key of %s is revoked", details.address, name)
             self._cut_fd(details.fd)
             return None
         self.connections.bind_user(details.fd, name)
@@ -143,6 +157,10 @@ class RelayServer:
             if session.port.client == client:
                 self._gone(routing_id)
         return self.connections.cut_user(client)
+
+    def cut_unbound(self) -> int:
+        """End every connection that has not said anything yet; returns how many there were."""
+        return self.connections.cut_user("")
 
     def _cut(self, routing_id: bytes, session: Session, why: str) -> None:
         _log.warning("connection of %s closed: %s", session.port.client, why)

@@ -8,6 +8,8 @@ from typing import Final, Protocol
 from sern_runtime.loop import Timer
 from sern_runtime.zmq_socket import SendResult
 
+LANE_MESSAGE_BYTES: Final = 68 * 1024
+"""The largest message a lane takes: the largest `fragment_bytes_max`, and what frames and CURVE put around it."""
 BURST: Final = 64
 """Datagrams sent in one go before others in the loop get their turn; about 1 ms of work."""
 
