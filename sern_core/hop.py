@@ -155,10 +155,7 @@ class Hop(ABC):
         self._now = now
         nbytes = len(message.body)
         if nbytes > self.params.max_message_bytes:
-            channel.reject(message, DropReason.TOO_LARGE)
-            self.trace.record(
-                now, message.stream.topic, TraceEvent.DROPPED, seq=message.seq, reason=DropReason.TOO_LARGE
-            )
+            self.reject(channel, message, DropReason.TOO_LARGE, now=now)
             return True
         backlog = channel.offered
         accepted = channel.submit(message, now=now, forced=forced)
@@ -168,6 +165,20 @@ class Hop(ABC):
         if not backlog or channel.coalesced:
             self._refresh(channel, now)
         return accepted
+
+    def reject(self, channel: OutChannel, message: Message, reason: DropReason, *, now: float) -> None:
+        """Drop a message on its way in; of a reliable stream a tombstone goes on in its place."""
+        self._now = now
+        channel.reject(message, reason)
+        self.trace.record(now, message.stream.topic, TraceEvent.DROPPED, seq=message.seq, reason=reason)
+        self._refresh(channel, now)
+
+    def shed(self, channel: OutChannel, reason: DropReason, *, now: float) -> int:
+        """Give up one message that waits and has not been begun; returns the bytes that are free now, 0: none."""
+        self._now = now
+        freed_bytes = channel.shed(reason)
+        self._refresh(channel, now)
+        return freed_bytes
 
     def _refresh(self, channel: OutChannel, now: float) -> None:
         """Tell the scheduler what this channel would send next."""

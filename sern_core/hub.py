@@ -16,6 +16,7 @@ from typing import Final, Protocol
 from sern_core import wire
 from sern_core.access import AccessTable, RateGuard
 from sern_core.announce import Announcement
+from sern_core.bound import QueueBound
 from sern_core.errors import RefusedError, VersionError, WireError
 from sern_core.fragments import InStream
 from sern_core.hop import microseconds
@@ -25,7 +26,7 @@ from sern_core.message import Message, StreamId, StreamInfo
 from sern_core.objects import ObjectRegistry
 from sern_core.params import LinkParams, SchedulerParams
 from sern_core.queues import OutChannel, OutMessage
-from sern_core.replay import LatchedCache
+from sern_core.replay import ReplayStore
 from sern_core.routing import RouteChange, RoutingTable
 from sern_core.trace import DecisionTrace
 from sern_core.types import DROP_CODES, ClientName, DropReason, ObjectKind, TopicName
@@ -36,9 +37,9 @@ RESET_INTERVAL_S: Final = 0.5
 
 @dataclass(frozen=True, slots=True)
 class HubParams:
-    """`cache_bytes`: latched messages kept per stream. `resume_s`: how long an absent client is waited for."""
+    """`cache_bytes`: latched messages kept in all. `resume_s`: how long an absent client is waited for."""
 
-    cache_bytes: int = 8 * 2**20
+    cache_bytes: int = 64 * 2**20
     resume_s: float = 600.0
 
 
@@ -64,11 +65,12 @@ class Relayed:
 
     __slots__ = ("cache", "definition_known", "outs", "source", "stream")
 
-    def __init__(self, source: Link | None, stream: InStream | None, info: StreamInfo, cache_bytes: int) -> None:
+    def __init__(self, source: Link | None, stream: InStream, replays: ReplayStore) -> None:
         self.source = source
         self.stream = stream
         self.outs: dict[ClientName, tuple[Link, OutChannel]] = {}
-        self.cache = LatchedCache(info.spec.depth, cache_bytes) if info.spec.latched else None
+        spec = stream.stream.spec
+        self.cache = replays.open(spec.depth) if spec.latched else None
 
 
 class HubPort:
@@ -171,7 +173,9 @@ class Hub:
         self._scheduler_params = scheduler
         self._lossless = lossless
         self._wall_ns = wall_ns
+        self.replays = ReplayStore(self.params.cache_bytes)
         self._guards: dict[ClientName, RateGuard] = {}
+        self._bounds: dict[ClientName, QueueBound] = {}
         self._subscriptions: dict[ClientName, list[str]] = {}  # parts that have arrived
         self._awaited: dict[ClientName, set[TopicName]] = {}
         self._heard: set[ClientName] = set()  # said what they want, to this run of the relay
@@ -211,9 +215,18 @@ class Hub:
                 lossless=self._lossless,
                 auto_confirm=False,
             )
-            self._guards[client] = RateGuard.of(self.access.limits(client), now=now)
+            self._limit(client, now)
             self._absent_since[client] = now
         return link
+
+    def _limit(self, client: ClientName, now: float) -> None:
+        """Put the limits of the access rules in force."""
+        limits = self.access.limits(client)
+        self._guards[client] = RateGuard.of(limits, now=now)
+        if limits.max_queue_bytes is None:
+            self._bounds.pop(client, None)
+        else:
+            self._bounds[client] = QueueBound(limits.max_queue_bytes)
 
     def ports(self) -> list[HubPort]:
         return list(self.port_of.values())
@@ -244,13 +257,14 @@ class Hub:
         self._awaited.pop(client, None)
         self._heard.discard(client)
         self._guards.pop(client, None)
+        self._bounds.pop(client, None)
         self.objects.delete_owned(client)
 
     def revoke(self, access: AccessTable, *, now: float) -> None:
         """New access rules: what they no longer allow ends now."""
         self.access = access
         for client in self.links:
-            self._guards[client] = RateGuard.of(access.limits(client), now=now)
+            self._limit(client, now)
         change = self.routing.set_access(access)
         for identity in change.removed:
             relayed = self.relayed[identity]
@@ -322,16 +336,20 @@ class Hub:
 
     def _replays(self, client: ClientName, relayed: Relayed) -> list[Message]:
         """The latched messages that a late joiner may have."""
-        if relayed.cache is None or relayed.stream is None:
+        if relayed.cache is None:
             return []
         if not self.access.may_replay(client, relayed.stream.stream.id.topic):
             return []
-        return relayed.cache.replay()
+        if client in self._bounds:
+            self._bounds[client].recount()
+        return self.replays.replay(relayed.cache)
 
     def _remove(self, identity: StreamId, now: float) -> None:
         relayed = self.relayed.pop(identity, None)
         if relayed is None:
             return
+        if relayed.cache is not None:
+            self.replays.close(relayed.cache)
         for link, channel in relayed.outs.values():
             if channel.reliable and channel.retained:
                 self._draining.append((link, channel))
@@ -376,13 +394,15 @@ class Hub:
             raise RefusedError("origin", f"{link.peer} announced a stream of {identity.origin}")
         relayed = self.relayed.get(identity)
         if relayed is None:
-            relayed = self.relayed[identity] = Relayed(link, stream, stream.stream, self.params.cache_bytes)
+            relayed = self.relayed[identity] = Relayed(link, stream, self.replays)
         relayed.stream = stream
         try:
             change = self.routing.announce(stream.stream)
         except RefusedError as refusal:
             self._apply(self.routing.withdraw(identity), now)
-            self.relayed.pop(identity, None)
+            refused = self.relayed.pop(identity, None)
+            if refused is not None and refused.cache is not None:
+                self.replays.close(refused.cache)
             self.events.refused(link.peer, refusal.code, str(refusal))
             raise
         if change.added:
@@ -438,15 +458,22 @@ class Hub:
         for out_link, channel in relayed.outs.values():
             if stream.reliable and channel.next_seq < message.seq:
                 out_link.skip(channel, message.seq, now=now)  # what lies between was given up before it came here
-            out_link.submit(channel, message, now=now, forced=True)
+            self._submit(out_link, channel, message, now)
             behind = behind or channel.watermark >= message.seq
         if not message.tombstone:
             if relayed.cache is not None:
-                relayed.cache.add(message)
+                self.replays.add(relayed.cache, message)
             self.objects.observe(stream.stream.id, message.seq, message.body, wall_ns=message.stamp_ns, now=now)
             self.events.message(stream.stream, message, now=now)
         if behind and stream.reliable:
             self._confirm(relayed)
+
+    def _submit(self, link: Link, channel: OutChannel, message: Message, now: float) -> None:
+        bound = self._bounds.get(link.peer)
+        if bound is None or message.tombstone or bound.admit(link, channel, message, now=now):
+            link.submit(channel, message, now=now, forced=True)
+        else:
+            link.reject(channel, message, DropReason.QUEUE_FULL, now=now)
 
     def on_in_drop(self, link: Link, stream: InStream, reason: DropReason, nbytes: int) -> None:
         self.received.of(stream.stream).drop_arrived(reason)
@@ -536,6 +563,7 @@ class Hub:
             link.validate()
         self.routing.validate()
         self.objects.validate()
+        self.replays.validate()
         for identity, relayed in self.relayed.items():
             outs = set(self.routing.subscribers(identity))
             assert set(relayed.outs) == outs, f"{identity.topic}: channels {set(relayed.outs)} but routes {outs}"

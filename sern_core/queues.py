@@ -278,6 +278,27 @@ class OutChannel:
         else:
             self._drop(self._pop_queue(), reason)
 
+    def shed(self, reason: DropReason) -> int:
+        """Give up one message that has not been begun: the oldest, of a reliable stream the newest, whose tombstone
+        goes on. Returns the bytes that are free now, 0 when there is none."""
+        if not self.reliable:
+            if not self.queue:
+                return 0
+            out = self._pop_queue()
+            self._drop(out, reason)
+            return out.size
+        for out in reversed(self.queue):
+            size = out.size
+            if not out.message.tombstone:
+                self._entomb(out, reason)
+                return size - out.size
+        return 0
+
+    @property
+    def held_bytes(self) -> int:
+        """Bytes that wait here or are under way, and would have to be sent again to a peer that has lost them."""
+        return self.retained_bytes if self.reliable else self.queued_bytes + sum(o.size for o in self.flying.values())
+
     def _begin(self, out: OutMessage, now: float) -> None:
         """`out` was the head of the queue and its first bytes leave now."""
         out.started = True

@@ -80,6 +80,7 @@ class DropReason(StrEnum):
     LOOP = "loop"  # came back to its origin
     DISCONNECTED = "disconnected"  # the peer went away for good
     SHUTDOWN = "shutdown"  # the daemon stopped before it was sent
+    QUEUE_FULL = "queue_full"  # more waits for this client at the relay than its access rule allows
 
 
 DROP_CODES: Final[dict[DropReason, int]] = {reason: code for code, reason in enumerate(DropReason, start=1)}
