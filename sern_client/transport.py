@@ -9,10 +9,10 @@ from typing import Final
 
 import zmq
 
-from sern_core.errors import WireError
+from sern_core.errors import ConfigError, RemoteError
 from sern_core.link import Link
 from sern_runtime.monitor import TcpHandle, TransportWatch
-from sern_runtime.pump import Pump
+from sern_runtime.pump import LANE_MESSAGE_BYTES, Pump
 from sern_runtime.zmq_socket import CurvePair, DealerSocket, SendResult, make_client
 
 REBUILD_MIN_S: Final = 1.0
@@ -25,7 +25,10 @@ _log = logging.getLogger(__name__)
 
 
 class RelayTransport:
-    """Joins `link` to `endpoint`; with several `server_keys` (a rotation) they are tried in turn. `on_reason` is told why the transport is down."""
+    """Joins `link` to `endpoint`; with several `server_keys` (a rotation) they are tried in turn.
+
+    `on_reason` is told why the transport is down.
+    """
 
     def __init__(
         self,
@@ -59,8 +62,6 @@ class RelayTransport:
         self._open()
 
     def _open(self) -> None:
-        self._rebuild = None
-
         def attach(socket: "zmq.Socket[bytes]") -> None:
             self._watch = TransportWatch(socket, self._up, self._down, self._give_up)
 
@@ -70,9 +71,19 @@ class RelayTransport:
             self._keys,
             self._server_keys[self._attempt % len(self._server_keys)] if self._server_keys else None,
             heartbeat_timeout_ms=self._heartbeat_timeout_ms,
+            max_message_bytes=LANE_MESSAGE_BYTES,
             before_connect=attach,
         )
         self._socket = DealerSocket(raw, self._received, on_writable=self.pump.kick)
+
+    def _reopen(self) -> None:
+        self._rebuild = None
+        try:
+            self._open()
+        except (zmq.ZMQError, ConfigError) as error:  # out of file descriptors, for example: that passes
+            self._shut()
+            self._on_reason(f"no connection can be made: {error}")
+            self._give_up(str(error))
 
     def _shut(self) -> None:
         if self._watch is not None:
@@ -96,7 +107,7 @@ class RelayTransport:
     def _received(self, data: bytes) -> None:
         try:
             self.link.receive(data, now=time.monotonic())
-        except WireError as error:
+        except RemoteError as error:
             self.bad_frames += 1
             _log.warning("%s sent a bad frame (%s); reconnecting", self.endpoint, error)
             self._again(f"bad frame: {error}", REBUILD_MIN_S)
@@ -137,4 +148,4 @@ class RelayTransport:
         self.link.disconnected(now=time.monotonic(), reason=reason)
         loop = asyncio.get_running_loop()
         loop.call_soon(self._shut)
-        self._rebuild = loop.call_later(delay_s * (1 + 0.5 * self._random.random()), self._open)
+        self._rebuild = loop.call_later(delay_s * (1 + 0.5 * self._random.random()), self._reopen)

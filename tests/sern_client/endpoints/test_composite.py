@@ -32,6 +32,7 @@ class Fake:
         self.events: TopicEvents | None = None
         self.sinks: list[Sink] = []
         self.got: list[bytes] = []
+        self.interests: list[tuple[TopicName, bool]] = []
         self.stopped = 0
 
     async def start(self, events: TopicEvents) -> None:
@@ -53,6 +54,9 @@ class Fake:
                 fake.sinks.remove(sink)
 
         return Part()
+
+    def interest(self, name: TopicName, wanted: bool) -> None:
+        self.interests.append((name, wanted))
 
     def advertise(self, info: TopicInfo) -> Publisher:
         if self.problem == "advertise":
@@ -167,3 +171,16 @@ async def test_failures_leave_nothing_running(events: Any) -> None:
     with pytest.raises(UsageError):
         CompositeEndpoint([])
     assert len(asyncio.all_tasks()) == 1
+
+
+async def test_the_far_side_s_interest_reaches_those_that_give_the_topic(events: Any) -> None:
+    giver, other = Fake(), Fake()
+    endpoint = CompositeEndpoint([giver, other])
+    await endpoint.start(events)
+    assert giver.events is not None
+    giver.events.topic_added(STRING)
+    endpoint.interest(STRING.name, True)
+    endpoint.interest(TopicName("/unknown"), True)
+    assert giver.interests == [(STRING.name, True)]
+    assert other.interests == []
+    await endpoint.stop()
