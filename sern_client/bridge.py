@@ -65,6 +65,8 @@ class Bridge:
         frame_prefix: str | None = None,
         log: MessageLog | None,
         kick: Callable[[], None],
+        on_up: Callable[[], None],
+        on_down: Callable[[str], None],
     ) -> None:
         self.endpoint = endpoint
         self.rules = rules
@@ -76,8 +78,12 @@ class Bridge:
         self.refusals = 0
         self.deadlines_missed: dict[TopicName, int] = {}
         self.leases_fired = 0
+        self.publish_failures = 0
         self._log = log
         self._kick = kick
+        self._on_up = on_up
+        self._on_down = on_down
+        self._sources_stopped = False
         self._core: ClientCore | None = None
         self._outgoing: dict[TopicName, Outgoing] = {}
         self._incoming: dict[StreamId, Incoming] = {}
@@ -93,19 +99,38 @@ class Bridge:
             raise UsageError("the bridge has no core yet")
         return self._core
 
-    def close(self) -> None:
-        self._timer.cancel()
+    def stop_sources(self) -> None:
+        """Offer nothing more to the link; what arrives is still published here. Idempotent."""
+        self._sources_stopped = True
         for outgoing in self._outgoing.values():
             outgoing.subscription.close()
+
+    def close(self) -> None:
+        """Before the endpoint is stopped: a robot that is being commanded is told to stand still."""
+        self.stop_sources()
         self._outgoing.clear()
+        self._timer.cancel()
         for incoming in self._incoming.values():
-            incoming.publisher.close()
+            self._release(incoming)
         self._incoming.clear()
+
+    def _release(self, incoming: Incoming) -> None:
+        """No more commands will come from there: the last one must not stand."""
+        if incoming.lease is not None and incoming.stop is not None and incoming.lease.deadline() is not None:
+            self._publish(incoming, incoming.stop, time.time_ns())
+        incoming.publisher.close()
+
+    def _publish(self, incoming: Incoming, body: bytes, stamp_ns: int) -> None:
+        try:
+            incoming.publisher.publish(body, stamp_ns)
+        except Exception:  # noqa: BLE001  (a fault of one topic; the link below must finish what it was doing)
+            self.publish_failures += 1
+            _log.exception("%s could not be published here", incoming.local)
 
     # --- TopicEvents: from the endpoint -----------------------------------------------------------------------------
 
     def topic_added(self, info: TopicInfo) -> None:
-        if info.name in self._outgoing:
+        if info.name in self._outgoing or self._sources_stopped:
             return
         listed = self.rules.find(info.type_name, info.name) is not None
         if not self.discovery.wants(info.name, listed=listed):
@@ -154,13 +179,15 @@ class Bridge:
     def link_up(self, *, resumed: bool) -> None:
         self.rejected_reason = None
         _log.info("connected to %s%s", self.core.link.peer, " again" if resumed else "")
+        self._on_up()
 
     def link_down(self, reason: str) -> None:
-        _log.warning("link down: %s", reason)
+        self._on_down(reason)
 
     def rejected(self, code: str, text: str) -> None:
+        if text != self.rejected_reason:  # it is asked again every few seconds
+            _log.error("the relay refuses us (%s): %s", code, text)
         self.rejected_reason = text
-        _log.error("the relay refuses us (%s): %s", code, text)
 
     def stream_opened(self, stream: StreamInfo) -> None:
         local = self.rules.inward(stream.id.topic, namespace=self.namespace)
@@ -187,9 +214,7 @@ class Bridge:
         incoming = self._incoming.pop(stream.id, None)
         self._last_arrival_s.pop(stream.id, None)
         if incoming is not None:
-            if incoming.lease is not None and incoming.stop is not None and incoming.lease.deadline() is not None:
-                incoming.publisher.publish(incoming.stop, time.time_ns())  # whoever commanded is gone
-            incoming.publisher.close()
+            self._release(incoming)
             _log.info("%s from %s has ended", stream.id.topic, stream.id.origin)
 
     def message(self, stream: StreamInfo, message: Message, *, now: float) -> None:
@@ -198,7 +223,7 @@ class Bridge:
             return
         age_s = now - message.born_s
         body = message.body if incoming.rewrite is None else incoming.rewrite(message.body)
-        incoming.publisher.publish(body, message.stamp_ns)
+        self._publish(incoming, body, message.stamp_ns)
         self.ages.observe(stream.spec.priority, age_s)
         if stream.spec.deadline_s is not None:
             self._check_deadline(stream, now)
@@ -257,7 +282,7 @@ class Bridge:
                 continue
             first = not lease.expired
             if lease.due(now=now):
-                incoming.publisher.publish(incoming.stop, time.time_ns())
+                self._publish(incoming, incoming.stop, time.time_ns())
                 if first:
                     self.leases_fired += 1
                     _log.warning("%s: no fresh command; publishing the stop command", incoming.local)

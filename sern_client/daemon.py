@@ -5,6 +5,7 @@ import json
 import logging
 import secrets
 import time
+from contextlib import AsyncExitStack
 from pathlib import Path
 from random import Random
 from typing import Final
@@ -22,6 +23,7 @@ from sern_core.trace import DecisionTrace
 from sern_core.types import CLASS_LABELS, ObjectKind
 from sern_runtime.config.client import ClientFile, load_client
 from sern_runtime.config.load import Loaded
+from sern_runtime.entry import blamed_on, end_tasks, log_warnings, serve
 from sern_runtime.http import Health, HttpServer
 from sern_runtime.keys import load_public, load_secret
 from sern_runtime.link_metrics import register_links, register_received
@@ -40,12 +42,11 @@ _log = logging.getLogger(__name__)
 async def run_client(path: Path, shutdown: Shutdown) -> int:
     """Run until asked to stop. Raises ConfigError for what is wrong with the file or the machine."""
     loaded = load_client(path)
-    for warning in loaded.warnings:
-        _log.warning("%s", warning)
+    log_warnings(_log, loaded.warnings)
     daemon = ClientDaemon(loaded)
     try:
         await daemon.start()
-        await shutdown.wait()
+        await serve(shutdown, daemon.tasks)
         daemon.notifier.stopping("draining")
         await daemon.drain()
     finally:
@@ -60,15 +61,18 @@ class ClientDaemon:
         self.loaded = loaded
         model = loaded.model
         self.notifier = Notifier.from_environment()
+        endpoint = make_endpoint(loaded)
         self.message_log = MessageLog(loaded.resolve(model.message_log)) if model.message_log else None
         self.bridge = Bridge(
-            make_endpoint(loaded),
+            endpoint,
             model.rules(),
             model.discovery.filter(),
             model.namespace,
             frame_prefix=model.client.frame_prefix,
             log=self.message_log,
             kick=self._kick,
+            on_up=self._link_up,
+            on_down=self._link_down,
         )
         now = time.monotonic()
         self.core = ClientCore(
@@ -83,10 +87,11 @@ class ClientDaemon:
         self.bridge.attach(self.core)
         self.core.subscribe(model.subscribe_patterns(), now=now)
         self.reason = "not connected yet"
+        self._said: set[str] = set()  # since the last session: an attempt that fails as before is no news
         self._ctx: zmq.Context[zmq.Socket[bytes]] | None = None
         self._transport: RelayTransport | None = None
         self._http: HttpServer | None = None
-        self._tasks: list[asyncio.Task[None]] = []
+        self.tasks: list[asyncio.Task[None]] = []
         self._endpoint_started = False
 
     async def start(self) -> None:
@@ -103,22 +108,25 @@ class ClientDaemon:
                     file=str(self.loaded.resolve(relay.server_key_file)),
                 )
         if model.http.listen is not None:
-            self._http = self._make_http(model.http.listen)
-            await self._http.start()
-        self._ctx = zmq.Context()
-        self._transport = RelayTransport(
-            self._ctx,
-            self.core.link,
-            relay.endpoint,
-            keys,
-            server_keys,
-            heartbeat_timeout_s=model.link.heartbeat_timeout_s,
-            random=Random(secrets.randbits(64)),
-            on_reason=self._note_reason,
-        )
+            with blamed_on(self.loaded.path, "http", "listen"):
+                self._http = self._make_http(model.http.listen)
+                await self._http.start()
+        # Before the transport: streams from the relay are advertised at the endpoint as soon as there is a session.
         await self.bridge.endpoint.start(self.bridge)
         self._endpoint_started = True
-        self._tasks.append(asyncio.create_task(self._tick(), name="client-tick"))
+        self._ctx = zmq.Context()
+        with blamed_on(self.loaded.path, "relay", "endpoint"):
+            self._transport = RelayTransport(
+                self._ctx,
+                self.core.link,
+                relay.endpoint,
+                keys,
+                server_keys,
+                heartbeat_timeout_s=model.link.heartbeat_timeout_s,
+                random=Random(secrets.randbits(64)),
+                on_reason=self._link_down,
+            )
+        self.tasks.append(asyncio.create_task(self._tick(), name="client-tick"))
         self.notifier.ready(f"{model.name} -> {relay.endpoint}")
         _log.info("client %s started, relay %s", model.name, relay.endpoint)
 
@@ -126,21 +134,24 @@ class ClientDaemon:
         if self._transport is not None:
             self._transport.pump.kick()
 
-    def _note_reason(self, reason: str) -> None:
+    def _link_down(self, reason: str) -> None:
+        """Told by the transport and by the session on it, usually of the same thing."""
         self.reason = reason
-        _log.warning("%s: %s", self.loaded.model.relay.endpoint, reason)
+        if reason not in self._said:
+            self._said.add(reason)
+            _log.warning("%s: %s; trying again until it works", self.loaded.model.relay.endpoint, reason)
+
+    def _link_up(self) -> None:
+        self._said.clear()
+        self._put_node()
 
     async def _tick(self) -> None:
         watchdog = Watchdog(self.notifier, {"loop": lambda: int(time.monotonic() * 1e3)})
-        announced = False
         while True:
             await asyncio.sleep(TICK_S)
             if self.message_log is not None:
                 self.message_log.flush()
             link = self.core.link
-            if link.established and not announced:
-                self._put_node()
-            announced = link.established
             if watchdog.interval_s is not None:
                 watchdog.check()
             state = "up" if link.established and not link.lane.stalled else f"down: {self.reason}"
@@ -161,7 +172,6 @@ class ClientDaemon:
             wall_ns=time.time_ns(),
             now=time.monotonic(),
         )
-        self._kick()
 
     def _make_http(self, listen: str) -> HttpServer:
         registry = CollectorRegistry()
@@ -184,6 +194,11 @@ class ClientDaemon:
             "sern_frame_ids_unread_total",
             "Messages whose frame ids stayed without frame_prefix because their type or bytes could not be read.",
             read=lambda: [((), float(self.bridge.frames.unreadable))],
+        )
+        metrics.counter(
+            "sern_publish_failures_total",
+            "Messages that arrived and could not be published here.",
+            read=lambda: [((), float(self.bridge.publish_failures))],
         )
         metrics.counter(
             "sern_bad_frames_total",
@@ -216,10 +231,8 @@ class ClientDaemon:
         }
 
     async def drain(self) -> None:
-        """Stop the sources, then go on sending for a while what is still owed."""
-        if self._endpoint_started:
-            self._endpoint_started = False
-            await self.bridge.endpoint.stop()
+        """Stop the sources, then go on sending for a while what is still owed. What arrives meanwhile is taken."""
+        self.bridge.stop_sources()
         deadline_s = time.monotonic() + DRAIN_S
         link = self.core.link
         while link.established and not link.lane.stalled and time.monotonic() < deadline_s:
@@ -228,30 +241,32 @@ class ClientDaemon:
                 break
             self._kick()
             await asyncio.sleep(0.02)
-        link.close("client stops", now=time.monotonic())
+        unconfirmed = sum(len(channel.retained) for channel in link.channels.values())
+        if unconfirmed:
+            _log.warning("stopping with %d reliable messages that not everyone has confirmed", unconfirmed)
         if self._transport is not None:
+            self._transport.pump.run()  # what has arrived here is confirmed before we say goodbye
+            link.close("client stops", now=time.monotonic())
             self._transport.pump.run()
             await asyncio.sleep(0.05)  # libzmq's thread takes it from here
 
     async def stop(self) -> None:
-        for task in self._tasks:
-            task.cancel()
-        await asyncio.gather(*self._tasks, return_exceptions=True)
-        if self._endpoint_started:
-            await self.bridge.endpoint.stop()
-        self.bridge.close()
-        if self._transport is not None:
-            self._transport.close()
-        if self._http is not None:
-            await self._http.stop()
-        if self._ctx is not None:
-            self._ctx.term()
-        if self.message_log is not None:
-            self.message_log.close()
-            if self.message_log.problem:
-                _log.error("%s", self.message_log.problem)
-        self._write_summary()
-        self.notifier.close()
+        """Ends whatever was started, the last first, also when a part of it fails."""
+        async with AsyncExitStack() as stack:
+            stack.callback(self.notifier.close)
+            stack.callback(self._write_summary)
+            if self.message_log is not None:
+                stack.callback(self.message_log.close)
+            if self._ctx is not None:
+                stack.callback(self._ctx.destroy, linger=0)
+            if self._http is not None:
+                stack.push_async_callback(self._http.stop)
+            if self._endpoint_started:
+                stack.push_async_callback(self.bridge.endpoint.stop)
+            stack.callback(self.bridge.close)
+            if self._transport is not None:
+                stack.callback(self._transport.close)
+            stack.push_async_callback(end_tasks, self.tasks)
 
     def _write_summary(self) -> None:
         name = self.loaded.model.summary

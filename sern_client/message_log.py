@@ -4,8 +4,10 @@ For trials and audits; it grows without end. Lines are gathered and written ever
 the file never holds up the event loop for long.
 """
 
+import logging
 import time
 import zlib
+from contextlib import suppress
 from pathlib import Path
 from typing import Final, TextIO
 
@@ -15,6 +17,8 @@ from sern_core.types import CLASS_LABELS, DropReason
 
 HEADER: Final = ("event", "wall_ns", "topic", "class", "seq", "bytes", "stamp_ns", "crc32", "age_s", "reason")
 FLUSH_BYTES: Final = 64 * 1024
+
+_log = logging.getLogger(__name__)
 
 
 class MessageLog:
@@ -64,6 +68,9 @@ class MessageLog:
             self._file.flush()
         except OSError as error:
             self.problem = f"{self.path}: the message log ends here: {error.strerror}"
+            _log.error("%s", self.problem)
+            with suppress(OSError):
+                self._file.close()
             self._file = None
 
     def close(self) -> None:

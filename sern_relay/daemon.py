@@ -5,6 +5,7 @@ import json
 import logging
 import secrets
 import time
+from contextlib import AsyncExitStack
 from pathlib import Path
 from typing import Final
 
@@ -22,7 +23,7 @@ from sern_relay.feed import RelayFeed
 from sern_relay.server import RelayServer
 from sern_runtime.config.load import Loaded
 from sern_runtime.config.relay import RelayFile, load_relay
-from sern_runtime.entry import blamed_on, log_warnings, serve
+from sern_runtime.entry import blamed_on, end_tasks, log_warnings, serve
 from sern_runtime.http import Health, HttpServer
 from sern_runtime.keys import KeyDirectory, KeyStatus, load_secret
 from sern_runtime.link_metrics import AgeHistograms, register_links, register_received
@@ -305,24 +306,24 @@ class RelayDaemon:
             await asyncio.sleep(0.05)  # libzmq's thread takes it from here
 
     async def stop(self) -> None:
+        """Ends whatever was started, the last first, also when a part of it fails."""
         self._ready = False
-        for task in self.tasks:
-            task.cancel()
-        await asyncio.gather(*self.tasks, return_exceptions=True)
+        async with AsyncExitStack() as stack:
+            stack.callback(self.notifier.close)
+            stack.callback(self._write_summary)
+            if self._ctx is not None:
+                stack.callback(self._ctx.destroy, linger=0)
+            for part in (self.zap, self.server, self.feed):
+                if part is not None:
+                    stack.callback(part.close)
+            if self._http is not None:
+                stack.push_async_callback(self._http.stop)
+            stack.callback(self._cancel_flush)
+            stack.push_async_callback(end_tasks, self.tasks)
+
+    def _cancel_flush(self) -> None:
         if self._flush_due is not None:
             self._flush_due.cancel()
-        if self._http is not None:
-            await self._http.stop()
-        if self.feed is not None:
-            self.feed.close()
-        if self.server is not None:
-            self.server.close()
-        if self.zap is not None:
-            self.zap.close()
-        if self._ctx is not None:
-            self._ctx.destroy(linger=0)
-        self._write_summary()
-        self.notifier.close()
 
     def _write_summary(self) -> None:
         name = self.loaded.model.summary

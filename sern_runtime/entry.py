@@ -51,6 +51,13 @@ async def serve(shutdown: Shutdown, tasks: Sequence[asyncio.Task[None]]) -> None
             task.result()
 
 
+async def end_tasks(tasks: Sequence[asyncio.Task[None]]) -> None:
+    """Cancel what still runs, and wait for its end. How it ended is the business of `serve`."""
+    for task in tasks:
+        task.cancel()
+    await asyncio.gather(*tasks, return_exceptions=True)
+
+
 @contextmanager
 def blamed_on(path: Path, *loc: str | int) -> Iterator[None]:
     """A ConfigError that names no file comes from the setting at `loc` of the file at `path`: say so, with its line."""

@@ -15,7 +15,7 @@ from tests.support import until
 def written(site: Process, name: str, count: int) -> bool:
     """Whether a site has been delivered `count` messages."""
     topics = site.json("/api/topics")
-    return sum(topic["delivered"] for topic in topics.values() if topic["direction"] == "receive") >= count
+    return count <= sum(int(topic["delivered"]) for topic in topics.values() if topic["direction"] == "receive")
 
 
 async def carried(lab: Lab, players: dict[str, Path], site: Process) -> None:
