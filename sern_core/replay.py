@@ -82,7 +82,7 @@ class ReplayStore:
         self._by_use.move_to_end(cache)
         if len(message.body) > self.max_bytes:
             self.evicted += 1
-            self._shrink(cache, 0)  # replayed as the latest, what came before it would be wrong
+            self._shrink(cache, -1)  # replayed as the latest, what came before it would be wrong
             return
         before_bytes = cache.held_bytes
         cache.add(message)
