@@ -36,7 +36,6 @@ from sern_tools.demo_link import LinkProcess, free_ports
 from sern_tools.demo_live import LiveView, Sample, join
 from sern_tools.demo_report import Carried, Report
 from sern_tools.demo_scenario import (
-    COMMAND_LIFESPAN_S,
     COMMAND_TOPIC,
     CONTROL_OVERTAKEN_LIMIT,
     HOST,
@@ -323,7 +322,7 @@ class Demo:
             floor_s=floor_s,
             blackouts=tuple(RateSchedule.of(self.scenario.profile.up, until_s=duration_s).blackouts(duration_s)),
             reliable_topics=frozenset(name for name, log in logs.items() if log.priority == "state"),
-            command_lifespans_s={COMMAND_TOPIC: COMMAND_LIFESPAN_S},
+            command_lifespans_s={COMMAND_TOPIC: self.scenario.command_lifespan_s},
             pose_topic=POSE_TOPIC if POSE_TOPIC in poses else max(poses, key=poses.__getitem__, default=""),
         )
 

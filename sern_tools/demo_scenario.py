@@ -24,7 +24,7 @@ RELAY, ROBOT, SITE = "relay", "robot", "site"
 COMMAND_TOPIC: Final = "/robot/cmd_vel"
 POSE_TOPIC: Final = "/robot/odometry/filtered"
 COUNTER_TOPIC: Final = "/counter"
-COMMAND_LIFESPAN_S: Final = 0.3
+SHORT_COMMAND_LIFESPAN_S: Final = 0.3
 STATE_OVERTAKEN_LIMIT: Final = SchedulerParams().floor
 """Class bulk keeps this share of the link while class state is backlogged, so it may overtake as often."""
 CONTROL_OVERTAKEN_LIMIT: Final = 0.01
@@ -79,6 +79,12 @@ class Scenario:
         return min(1.0, self.lowest_bps / COMFORTABLE_BPS)
 
     @property
+    def command_lifespan_s(self) -> float:
+        """Long enough for the path: half its round trip on the way, half for what the receiver cannot know of the
+        other clock, and as much again for a queue. Below that no command would ever be young enough."""
+        return max(SHORT_COMMAND_LIFESPAN_S, round(0.15 + 2 * self.profile.rtt_s, 2))
+
+    @property
     def pose_rate_hz(self) -> float:
         return max(5.0, round(FULL_POSE_RATE_HZ * self.comfort))
 
@@ -125,8 +131,8 @@ class Scenario:
                 "match": "/cmd_vel",
                 "class": "control",
                 "direction": "receive",
-                "lifespan_s": COMMAND_LIFESPAN_S,
-                "on_link_loss": {"publish": "zero", "after_s": 0.5},
+                "lifespan_s": self.command_lifespan_s,
+                "on_link_loss": {"publish": "zero", "after_s": self.command_lifespan_s + 0.2},
             },
             {"match": "/points", **bulk, "lifespan_s": CLOUD_LIFESPAN_S},
             {"match": COUNTER_TOPIC, **state},
@@ -217,7 +223,7 @@ def _site(scenario: Scenario, ports: Ports) -> dict[str, Any]:
         "goal_rate_hz": 0.0,
     }
     commands = {"match": COMMAND_TOPIC, "class": "control", "direction": "send", "reliability": "best_effort"}
-    rules = [{**commands, "depth": 1, "lifespan_s": COMMAND_LIFESPAN_S}]
+    rules = [{**commands, "depth": 1, "lifespan_s": scenario.command_lifespan_s}]
     content = _client(SITE, ports.relay, ports.site_http, [operator], rules)
     content["client"]["namespace"] = "/"  # it commands the robot by the robot's own topic
     content["subscribe"] = [f"/{ROBOT}/.*"]

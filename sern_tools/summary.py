@@ -106,6 +106,7 @@ class Result:
     first_fresh_pose_s: list[float]  # per blackout that ended in the run; inf when none came
     accounting_gap: int | None = None  # messages that no counter accounts for; None without counters
     accounting_notes: list[str] = field(default_factory=list)
+    given_up_but_arrived: int = 0  # counted as dropped by the sender, which had no acknowledgement, and delivered
 
     def arrivals(self, priority: str) -> tuple[Floats, Floats]:
         """(time of delivery, latency) of every delivery of a class, by time; both in seconds."""
@@ -242,9 +243,11 @@ def _first_fresh_pose(logs: Mapping[str, TopicLog], facts: RunFacts) -> list[flo
 
 UNCERTAIN: Final = frozenset({"lost", "disconnected", "shutdown", "retention"})
 """A sender that gives a message up for one of these may not know that it did arrive: the acknowledgement is missing."""
+UNCERTAIN_SHARE: Final = 0.01
+"""So large a share of a topic may be taken for lost too early, be dropped for a newer one, and arrive all the same."""
 UNCERTAIN_PER_BREAK: Final = 64
 """When the link breaks, so many messages of a topic may be in flight whose acknowledgement is lost with it. They wait
-again, may be dropped for any reason, and may have arrived all the same: counted twice, which is no loss."""
+again, may be dropped for any reason, and may have arrived: counted twice, which is no loss."""
 
 
 def _account(result: Result, counters: Mapping[str, Sequence[Counters]]) -> None:
@@ -266,7 +269,8 @@ def _account(result: Result, counters: Mapping[str, Sequence[Counters]]) -> None
         known += sum(n for _, n in drops)
         result.topics[name].under_way = max(0, min(in_flight, offered - known)) + sum(c.in_queue for c in entries)
         uncertain = in_flight + sum(n for reason, n in drops if reason in UNCERTAIN)
-        uncertain += UNCERTAIN_PER_BREAK * len(result.facts.blackouts)
+        uncertain += UNCERTAIN_PER_BREAK * len(result.facts.blackouts) + int(UNCERTAIN_SHARE * offered)
+        result.given_up_but_arrived += max(0, known - offered)
         gaps = {
             "offered and not accounted for": max(0, offered - known - in_flight),
             "accounted for more than once": max(0, known + in_flight - offered - uncertain),
@@ -290,6 +294,9 @@ def judge(
     """The promises of a run. A promise that the run could not put to the test is not in the list."""
     verdicts = [_reliable(sern), _intact(sern), *_order(sern, overtaken_share_limits), *_commands(sern)]
     if sern.accounting_gap is not None:
+        notes = sern.accounting_notes[:4]
+        if sern.given_up_but_arrived:
+            notes.append(f"{sern.given_up_but_arrived} given up without an acknowledgement, and arrived all the same")
         verdicts.append(
             Verdict(
                 "uncounted_messages",
@@ -297,7 +304,7 @@ def judge(
                 sern.accounting_gap,
                 0,
                 sern.accounting_gap == 0,
-                "; ".join(sern.accounting_notes[:4]),
+                "; ".join(notes),
                 noun="uncounted",
             )
         )
