@@ -18,11 +18,11 @@ from sern_core.access import AccessTable, RateGuard
 from sern_core.announce import Announcement
 from sern_core.bound import QueueBound
 from sern_core.errors import RefusedError, VersionError, WireError
-from sern_core.fragments import InStream
+from sern_core.fragments import InStream, Reassembly
 from sern_core.hop import microseconds
 from sern_core.ledger import ReceiveLedger
 from sern_core.link import Link
-from sern_core.message import Message, StreamId, StreamInfo
+from sern_core.message import Message, StreamId, StreamInfo, TopicInfo, TopicSpec
 from sern_core.objects import ObjectRegistry
 from sern_core.params import LinkParams, SchedulerParams
 from sern_core.queues import OutChannel, OutMessage
@@ -33,6 +33,7 @@ from sern_core.types import DROP_CODES, ClientName, DropReason, ObjectKind, Topi
 
 MAX_SUBSCRIPTION_PARTS: Final = 64
 RESET_INTERVAL_S: Final = 0.5
+MAX_LOCAL_SEQS: Final = 4096
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +62,7 @@ class HubEvents(Protocol):
 
 
 class Relayed:
-    """One stream at the relay: where it comes from, where it goes, what is kept of it."""
+    """One stream at the relay: where it comes from (None: the relay itself), where it goes, what is kept of it."""
 
     __slots__ = ("cache", "definition_known", "outs", "source", "stream")
 
@@ -107,6 +108,9 @@ class HubPort:
             name = wire.take_str(hello, "name", max_length=64)
             if name != self.client:
                 self._refuse(header.tag, "name", f"your key belongs to {self.client}, not to {name}", now)
+                return
+            if name in self.hub.local_owners:
+                self._refuse(header.tag, "name", f"{name} is the relay's own name for its feed; take another", now)
                 return
             try:
                 self.hub.greet(self, hello, header, now=now)
@@ -181,6 +185,9 @@ class Hub:
         self._heard: set[ClientName] = set()  # said what they want, to this run of the relay
         self._absent_since: dict[ClientName, float] = {}
         self._draining: list[tuple[Link, OutChannel]] = []  # streams that ended with reliable messages still owed
+        self.local_owners: set[ClientName] = set()
+        """Names under which the relay itself publishes; no client may have one of them."""
+        self._local_seqs: dict[StreamId, int] = {}  # of local streams that were closed: the last seq
         self.tap: Callable[[StreamInfo], bool] = lambda _stream: False
         """Whether the relay itself wants a stream (a subscriber of the feed); set by the shell."""
 
@@ -268,7 +275,7 @@ class Hub:
         change = self.routing.set_access(access)
         for identity in change.removed:
             relayed = self.relayed[identity]
-            if relayed.source is not None and relayed.stream is not None:
+            if relayed.source is not None:
                 text = f"{identity.origin} may no longer publish {identity.topic}: the access rules have changed"
                 relayed.source.refuse(relayed.stream, "forbidden", text, now=now)
                 self.events.refused(identity.origin, "forbidden", text)
@@ -294,7 +301,7 @@ class Hub:
             touched.add(identity)
         for identity in sorted(touched):
             relayed = self.relayed.get(identity)
-            if relayed is not None and relayed.source is not None and relayed.stream is not None:
+            if relayed is not None and relayed.source is not None:
                 relayed.source.answer(relayed.stream, self._wanted(relayed), now=now, owed=tuple(relayed.outs))
                 self._confirm(relayed)
         for denied in change.denied:
@@ -308,18 +315,16 @@ class Hub:
             pair[0].close_channel(pair[1], reason, now=now)
 
     def _wanted(self, relayed: Relayed) -> bool:
-        assert relayed.stream is not None
         return bool(relayed.outs) or relayed.cache is not None or self.tap(relayed.stream.stream)
 
     def refresh_interest(self, *, now: float) -> None:
         """The answer of `tap` may have changed: tell the origins."""
         for relayed in self.relayed.values():
-            if relayed.source is not None and relayed.stream is not None:
+            if relayed.source is not None:
                 relayed.source.answer(relayed.stream, self._wanted(relayed), now=now, owed=tuple(relayed.outs))
 
     def _open(self, client: ClientName, identity: StreamId, now: float) -> None:
         relayed = self.relayed[identity]
-        assert relayed.stream is not None
         link = self._link(client, now)
         for ended, channel in list(self._draining):
             if ended is link and channel.stream.id == identity:  # it came back before it was gone
@@ -350,24 +355,81 @@ class Hub:
             return
         if relayed.cache is not None:
             self.replays.close(relayed.cache)
+        if relayed.source is None:
+            if len(self._local_seqs) >= MAX_LOCAL_SEQS:
+                self._local_seqs.clear()  # the far side has been told that they ended: they may begin anew
+            self._local_seqs[identity] = relayed.stream.delivered
         for link, channel in relayed.outs.values():
             if channel.reliable and channel.retained:
                 self._draining.append((link, channel))
             else:
                 link.close_channel(channel, DropReason.DISCONNECTED, now=now)
-        if relayed.stream is not None:
-            self.objects.delete_stream(identity)
-            self.events.stream_removed(relayed.stream.stream)
+        self.objects.delete_stream(identity)
+        self.events.stream_removed(relayed.stream.stream)
 
     def _confirm(self, relayed: Relayed) -> None:
         """Tell the origin how far everybody who is owed has got."""
         stream, source = relayed.stream, relayed.source
-        if stream is None or source is None or not stream.reliable:
+        if source is None or not stream.reliable:
             return
         delivered = stream.delivered
         for _link, channel in relayed.outs.values():
             delivered = min(delivered, channel.watermark)
         source.confirm(stream, delivered)
+
+    # --- streams of the relay itself ------------------------------------------------------------------------------
+
+    def open_local(self, info: TopicInfo, spec: TopicSpec, owner: ClientName, *, now: float) -> Relayed:
+        """Publish a topic from here, under the name of `owner`, who then owns the topic's name like any client.
+
+        The answer is the handle for `inject` and `close_local`; opening again gives the same. Raises RefusedError like
+        `RoutingTable.announce`: the access rules must let `owner` publish it.
+        """
+        if owner in self.links:
+            raise RefusedError("name_taken", f"{owner} is the name of a client; give the feed's role another name")
+        self.local_owners.add(owner)
+        identity = StreamId(owner, self.boot, info.name)
+        held = self.relayed.get(identity)
+        stream = InStream(
+            StreamInfo(identity, info, spec),
+            Reassembly(0),
+            lambda _stream, _message: None,
+            lambda _stream, _reason, _nbytes, _seq: None,
+            first=self._local_seqs.get(identity, 0) + 1,
+        )
+        if held is not None:
+            stream.delivered = held.stream.delivered
+        return self._take(None, stream, now)
+
+    def close_local(self, handle: Relayed, *, now: float) -> None:
+        """End a local stream; nothing happens when it has ended already."""
+        if self.is_open(handle):
+            self._apply(self.routing.withdraw(handle.stream.stream.id), now)
+
+    def is_open(self, handle: Relayed) -> bool:
+        """Whether a local stream still is; access rules may have ended it."""
+        return self.relayed.get(handle.stream.stream.id) is handle
+
+    def inject(self, handle: Relayed, body: bytes, stamp_ns: int, *, now: float, age_s: float = 0.0) -> bool:
+        """A message of a local stream, `age_s` old. False: too old, refused (a reliable queue is full), or ended."""
+        if not self.is_open(handle):
+            return False
+        stream = handle.stream
+        spec = stream.stream.spec
+        counters = self.received.of(stream.stream)
+        if spec.lifespan_s is not None and age_s > spec.lifespan_s:
+            counters.drop_arrived(DropReason.LIFESPAN)
+            return False
+        if spec.reliable and any(
+            channel.held_bytes + len(body) > spec.max_queue_bytes for _link, channel in handle.outs.values()
+        ):
+            counters.drop_arrived(DropReason.REFUSED)
+            return False
+        stream.delivered += 1
+        stream.confirmed = stream.delivered
+        counters.arrived(len(body), age_s, now)
+        self._forward(handle, Message(stream.stream.id, stream.delivered, body, stamp_ns, now - age_s), now)
+        return True
 
     # --- LinkHandler ----------------------------------------------------------------------------------------------
 
@@ -392,31 +454,40 @@ class Hub:
         identity = stream.stream.id
         if identity.origin != link.peer or identity.boot != link.peer_boot:
             raise RefusedError("origin", f"{link.peer} announced a stream of {identity.origin}")
+        try:
+            relayed = self._take(link, stream, now)
+        except RefusedError as refusal:
+            self.events.refused(link.peer, refusal.code, str(refusal))
+            raise
+        if stream.reliable:
+            self._await(announcement.owed, identity, now)
+        relayed.source = link
+        link.answer(stream, self._wanted(relayed), now=now, owed=tuple(relayed.outs))
+        return None
+
+    def _take(self, source: Link | None, stream: InStream, now: float) -> Relayed:
+        """Relay this stream from now on, or go on with it. Raises RefusedError; then it is not relayed any more."""
+        identity = stream.stream.id
         relayed = self.relayed.get(identity)
         if relayed is None:
-            relayed = self.relayed[identity] = Relayed(link, stream, self.replays)
+            relayed = self.relayed[identity] = Relayed(source, stream, self.replays)
         relayed.stream = stream
         try:
             change = self.routing.announce(stream.stream)
-        except RefusedError as refusal:
+        except RefusedError:
             self._apply(self.routing.withdraw(identity), now)
             refused = self.relayed.pop(identity, None)
             if refused is not None and refused.cache is not None:
                 self.replays.close(refused.cache)
-            self.events.refused(link.peer, refusal.code, str(refusal))
             raise
         if change.added:
             self.events.stream_added(stream.stream)
             try:
                 self.objects.put_stream(stream.stream, wall_ns=self._wall_ns(now), now=now)
             except RefusedError as refusal:
-                self.events.refused(link.peer, refusal.code, str(refusal))
+                self.events.refused(identity.origin, refusal.code, str(refusal))
         self._apply(change, now)
-        if stream.reliable:
-            self._await(announcement.owed, identity, now)
-        relayed.source = link
-        link.answer(stream, self._wanted(relayed), now=now, owed=tuple(relayed.outs))
-        return None
+        return relayed
 
     def _await(self, owed: Iterable[str], identity: StreamId, now: float) -> None:
         """Hold a reliable stream for clients that an earlier run of this relay owed it to."""
@@ -454,6 +525,12 @@ class Hub:
             self.received.of(stream.stream).drop_arrived(message.drop_reason)
         else:
             self.received.of(stream.stream).arrived(nbytes, now - message.born_s, now)
+        if self._forward(relayed, message, now) and stream.reliable:
+            self._confirm(relayed)
+
+    def _forward(self, relayed: Relayed, message: Message, now: float) -> bool:
+        """Offer a message to all who get it. True: with that, the stream may be delivered further than before."""
+        stream = relayed.stream
         behind = not relayed.outs
         for out_link, channel in relayed.outs.values():
             if stream.reliable and channel.next_seq < message.seq:
@@ -465,8 +542,7 @@ class Hub:
                 self.replays.add(relayed.cache, message)
             self.objects.observe(stream.stream.id, message.seq, message.body, wall_ns=message.stamp_ns, now=now)
             self.events.message(stream.stream, message, now=now)
-        if behind and stream.reliable:
-            self._confirm(relayed)
+        return behind
 
     def _submit(self, link: Link, channel: OutChannel, message: Message, now: float) -> None:
         bound = self._bounds.get(link.peer)
@@ -482,7 +558,7 @@ class Hub:
         if not channel.reliable:
             return
         relayed = self.relayed.get(channel.stream.id)
-        if relayed is not None and relayed.source is not None and relayed.stream is not None:
+        if relayed is not None and relayed.source is not None:
             relayed.source.report_drop(relayed.stream, out.seq, reason, link.peer, now=link.now)
 
     def on_delivered(self, link: Link, channel: OutChannel, *, now: float) -> None:
