@@ -1,5 +1,7 @@
 """Streams whose source is the relay itself (the feed): they are streams like any other."""
 
+from dataclasses import replace
+
 import pytest
 
 from sern_core.access import AccessRule, AccessTable
@@ -48,7 +50,7 @@ def test_a_subscriber_gets_it_with_type_definition_and_age() -> None:
     assert [(got.topic, got.seq, got.body) for got in robot.got] == [(CMD, 1, b"go")]
     assert robot.got[0].age_s == pytest.approx(0.13, abs=0.03)
     assert robot.opened[0].id.origin == OWNER
-    assert robot.opened[0].info == info()
+    assert robot.opened[0].info == replace(info(), reliable=False)
     held = world.relay.hub.objects.get("/jackal1/cmd_vel@feed_unity")
     assert held is not None
     assert (held.kind, held.value, held.owner) == ("command", b"go", OWNER)
