@@ -24,7 +24,7 @@ from sern_core.message import (
     TopicInfo,
     TopicSpec,
 )
-from sern_core.types import ClientName, Durability, PriorityClass, Reliability, TopicName
+from sern_core.types import ClientName, Durability, Encoding, PriorityClass, Reliability, TopicName
 
 NAME_MAX_CHARS: Final = 255
 """Longest topic name; ROS 2 middleware allows no more."""
@@ -383,8 +383,20 @@ class Discovery:
 
 
 @dataclass(frozen=True, slots=True)
+class FeedTopic:
+    """What a topic is that programs publish into the feed. `rule.match` is a pattern of global names."""
+
+    rule: TopicRule
+    type_name: str
+    encoding: Encoding
+
+
+@dataclass(frozen=True, slots=True)
 class FeedRole:
-    """One pair of plain ZMQ sockets on the relay. `ingest_endpoint` None: nobody can publish through this role."""
+    """One pair of plain ZMQ sockets on the relay. `ingest_endpoint` None: nobody can publish through this role.
+
+    `types`: what goes on to the clients, first match wins; anything else stays within the feed.
+    """
 
     name: str
     publish_endpoint: str
@@ -392,6 +404,16 @@ class FeedRole:
     subscribe: tuple[re.Pattern[str], ...] = ()
     publish: tuple[re.Pattern[str], ...] = ()
     allow_control: bool = False
+    types: tuple[FeedTopic, ...] = ()
+
+    @property
+    def owner(self) -> ClientName:
+        """The name under which the relay publishes what comes in through this role."""
+        return ClientName("feed_" + self.name.replace("-", "_"))
+
+    def topic(self, name: TopicName) -> FeedTopic | None:
+        """What the role publishes under this name; None where nothing says so."""
+        return next((topic for topic in self.types if topic.rule.match.fullmatch(name)), None)
 
     def may_see(self, name: TopicName) -> bool:
         return matches_any(self.subscribe, name)

@@ -101,8 +101,8 @@ def _check_path(text: str) -> None:
 
 
 def _check_phrase(text: str) -> None:
-    if not re.fullmatch(r"[a-z][a-z0-9_-]{0,62}", text):
-        raise UsageError("must be a lower-case letter, then up to 62 of a-z, 0-9, '_', '-'")
+    if not re.fullmatch(r"[a-z][a-z0-9_-]{0,57}", text):
+        raise UsageError("must be a lower-case letter, then up to 57 of a-z, 0-9, '_', '-'")
 
 
 def _check_frame_prefix(text: str) -> None:

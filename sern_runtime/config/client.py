@@ -46,6 +46,7 @@ from sern_runtime.config.base import (
 from sern_runtime.config.endpoints import EndpointSection
 from sern_runtime.config.load import Loaded, load
 from sern_runtime.config.shared import (
+    ClassWord,
     HttpSection,
     LinkSection,
     LogSection,
@@ -54,8 +55,6 @@ from sern_runtime.config.shared import (
     public_key_problems,
     secret_key_problems,
 )
-
-ClassWord = Literal["control", "state", "bulk"]
 
 
 class ClientSection(Section):

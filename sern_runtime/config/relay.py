@@ -2,14 +2,16 @@
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
 from sern_core.access import AccessRule
 from sern_core.errors import ConfigError
-from sern_core.rules import FeedRole, compile_pattern
-from sern_core.types import ClientName
+from sern_core.objects import COMMAND_OBJECT_TYPES
+from sern_core.rules import AUTO, FeedRole, FeedTopic, TopicRule, compile_pattern, plain_type
+from sern_core.types import ClientName, Durability, Encoding, PriorityClass, Reliability
+from sern_runtime import ros_types
 from sern_runtime.config.base import (
     BindEndpoint,
     Bytes,
@@ -24,12 +26,14 @@ from sern_runtime.config.base import (
     RoleText,
     Section,
     SelfPattern,
+    described,
     fault,
     is_local,
     resolve,
 )
 from sern_runtime.config.load import Loaded, load
 from sern_runtime.config.shared import (
+    ClassWord,
     LinkSection,
     LogSection,
     SchedulerSection,
@@ -103,7 +107,8 @@ class AccessSection(Section):
     max_bytes_per_s: Annotated[float, Field(gt=0, le=1e12)] | None = None
     """Bytes a second taken from it over all its topics; null: no limit."""
     max_queue_bytes: Bytes | None = None
-    """Bytes that may wait for it at the relay; null: no limit beside those of the topics."""
+    """Bytes that may wait for it at the relay. Beyond, best effort of the lowest class is dropped first, then what
+    does not fit, counted as `queue_full` and reported if reliable; null: no limit beside those of the topics."""
 
     def rule(self) -> AccessRule:
         return AccessRule(
@@ -115,6 +120,60 @@ class AccessSection(Section):
             max_rate_hz=self.max_rate_hz,
             max_queue_bytes=self.max_queue_bytes,
         )
+
+
+class FeedTypeSection(Section):
+    """What a topic is that programs of this role publish, so that it goes on to the clients as well."""
+
+    match: Pattern
+    """Regular expression for the whole (global) topic name; it must be among those of `publish` too."""
+    type: str
+    """Its message type, such as geometry_msgs/Twist: a standard one, as the definition has to be known here."""
+    encoding: Literal["ros1", "cdr"] = "ros1"
+    """How the programs serialise it: `ros1`, or `cdr` (ROS 2) with its four bytes of encapsulation."""
+    priority: Annotated[ClassWord | None, Field(alias="class")] = None
+    """Urgency, as in a client's `topics`; null: `control` for types that command a robot, else `bulk`."""
+    reliability: Literal["reliable", "best_effort"] = "best_effort"
+    """`reliable`: kept until delivered; `best_effort`: freshest first."""
+    durability: Literal["volatile", "transient_local"] = "volatile"
+    """`transient_local`: the last `depth` messages reach late joiners."""
+    depth: Annotated[int, Field(ge=1, le=10_000)] | None = None
+    """Messages kept; null: 10 if reliable, else 1."""
+    lifespan_s: Annotated[
+        Annotated[float, Field(gt=0, le=1e7)] | Literal["auto"] | None,
+        described("a number of seconds above 0, null (for ever) or auto"),
+    ] = "auto"
+    """Older messages, by stamp and age in their header, are not sent; null: for ever; `auto`: as for a client's topic,
+    0.3 for velocity commands in class control."""
+
+    @model_validator(mode="after")
+    def _known(self) -> "FeedTypeSection":
+        try:
+            known = ros_types.describe(self.type, Encoding(self.encoding))
+        except ConfigError as error:
+            raise fault(str(error), "type") from error
+        if known is None:
+            raise fault(
+                f"{self.type} has no definition here in {self.encoding}; standard types of ROS can be published", "type"
+            )
+        return self
+
+    @property
+    def commands(self) -> bool:
+        """Whether it can move a robot, whatever its class."""
+        return plain_type(self.type) in COMMAND_OBJECT_TYPES or self.priority == "control"
+
+    def topic(self) -> FeedTopic:
+        word = self.priority or ("control" if self.commands else "bulk")
+        rule = TopicRule(
+            match=compile_pattern(self.match),
+            priority=PriorityClass[word.upper()],
+            reliability=Reliability(self.reliability),
+            durability=Durability(self.durability),
+            depth=self.depth,
+            lifespan_s=AUTO if self.lifespan_s == "auto" else self.lifespan_s,
+        )
+        return FeedTopic(rule, ros_types.canonical(self.type), Encoding(self.encoding))
 
 
 class FeedRoleSection(Section):
@@ -132,6 +191,8 @@ class FeedRoleSection(Section):
     """Patterns of the global names this role may publish."""
     allow_control: bool = False
     """Let this role publish in class control (commands)."""
+    types: tuple[FeedTypeSection, ...] = ()
+    """What the topics are that go on to the clients, first match wins; a topic without stays within the feed."""
     insecure: bool = False
     """Accept an address beyond ipc and loopback: the feed has no keys, so the network itself must be trusted."""
 
@@ -147,6 +208,11 @@ class FeedRoleSection(Section):
             raise fault("names no topic, so ingest_endpoint has no use", "publish")
         if self.allow_control and not self.publish:
             raise fault("has no use without publish", "allow_control")
+        if self.types and not self.publish:
+            raise fault("has no use without publish", "types")
+        for index, entry in enumerate(self.types):
+            if entry.commands and not self.allow_control:
+                raise fault(f"{entry.type} commands a robot, which needs allow_control: true", "types", index)
         return self
 
     def role(self) -> FeedRole:
@@ -157,6 +223,7 @@ class FeedRoleSection(Section):
             subscribe=tuple(compile_pattern(text) for text in self.subscribe),
             publish=tuple(compile_pattern(text) for text in self.publish),
             allow_control=self.allow_control,
+            types=tuple(entry.topic() for entry in self.types),
         )
 
 
@@ -206,6 +273,12 @@ class RelayFile(FileModel):
             if role.name in names:
                 raise fault(f"{role.name} is already the name of another role", "feed", "roles", index, "name")
             names.add(role.name)
+            owners = [other.role().owner for other in self.feed.roles[:index]]
+            if role.role().owner in owners:
+                other = self.feed.roles[owners.index(role.role().owner)].name
+                raise fault(
+                    f"{role.name} and {other} are too much alike ('-' counts as '_')", "feed", "roles", index, "name"
+                )
             for key in ("publish_endpoint", "ingest_endpoint"):
                 endpoint = getattr(role, key)
                 if endpoint in taken:
@@ -219,8 +292,13 @@ class RelayFile(FileModel):
         return ClientName(self.relay.name)
 
     def access_rules(self) -> tuple[AccessRule, ...]:
-        """The rules for `sern_core.access.AccessTable`."""
-        return tuple(section.rule() for section in self.access)
+        """The rules for `sern_core.access.AccessTable`, those of the feed's roles first."""
+        roles = (
+            AccessRule(client=role.owner, publish=tuple(pattern.pattern for pattern in role.publish))
+            for role in self.feed_roles()
+            if role.types
+        )
+        return (*roles, *(section.rule() for section in self.access))
 
     def feed_roles(self) -> tuple[FeedRole, ...]:
         return tuple(section.role() for section in self.feed.roles)
@@ -242,6 +320,10 @@ class RelayFile(FileModel):
             yield FileProblem(loc, warning, warning=True)
         if not directory.names:
             yield FileProblem(loc, f"{directory.path} holds no .pub file: no client can connect", warning=True)
+        for index, role in enumerate(self.feed_roles()):
+            if role.owner in directory.names:
+                problem = f"the relay publishes for this role as {role.owner}, and there is a client of that name"
+                yield FileProblem(("feed", "roles", index, "name"), problem)
         rules = [compile_pattern(section.client) for section in self.access]
         for name in directory.names:
             if not any(rule.fullmatch(name) for rule in rules):

@@ -4,7 +4,7 @@ import os
 from collections.abc import Iterator
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import Field
 
@@ -15,6 +15,7 @@ from sern_runtime.config.base import Bytes, FileProblem, HttpListen, PathText, S
 from sern_runtime.config.yaml import Loc
 from sern_runtime.keys import load_public, load_secret, secret_warning
 
+ClassWord = Literal["control", "state", "bulk"]
 _SCHEDULER = SchedulerParams()
 _LINK = LinkParams()
 
