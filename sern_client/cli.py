@@ -1,14 +1,13 @@
 """`sern-client --config client.yaml`."""
 
+import signal
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sern_client.daemon import run_client
-from sern_runtime.config.client import load_client
-from sern_runtime.config.shared import LogSection
-from sern_runtime.entry import run_daemon
+if TYPE_CHECKING:
+    from sern_runtime.config.shared import LogSection
 
 
 def command(
@@ -16,13 +15,19 @@ def command(
 ) -> None:
     """Bridge this site's ROS topics to a SERN relay, until SIGTERM or Ctrl-C."""
 
-    def log() -> LogSection:
+    from sern_client.daemon import run_client
+    from sern_runtime.config.client import load_client
+    from sern_runtime.entry import run_daemon
+
+    def log() -> "LogSection":
         return load_client(config).model.log
 
     raise typer.Exit(run_daemon("sern-client", log, lambda shutdown: run_client(config, shutdown)))
 
 
 def main() -> None:
+    # Until the event loop takes the signals over: Ctrl-C during the imports is an end, not a traceback.
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
     typer.run(command)
 
 

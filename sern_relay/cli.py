@@ -1,14 +1,13 @@
 """`sern-relay --config relay.yaml`."""
 
+import signal
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sern_relay.daemon import run_relay
-from sern_runtime.config.relay import load_relay
-from sern_runtime.config.shared import LogSection
-from sern_runtime.entry import run_daemon
+if TYPE_CHECKING:
+    from sern_runtime.config.shared import LogSection
 
 
 def command(
@@ -16,13 +15,19 @@ def command(
 ) -> None:
     """Carry ROS topics between SERN clients, until SIGTERM or Ctrl-C. SIGHUP reads keys and access rules anew."""
 
-    def log() -> LogSection:
+    from sern_relay.daemon import run_relay
+    from sern_runtime.config.relay import load_relay
+    from sern_runtime.entry import run_daemon
+
+    def log() -> "LogSection":
         return load_relay(config).model.log
 
     raise typer.Exit(run_daemon("sern-relay", log, lambda shutdown: run_relay(config, shutdown)))
 
 
 def main() -> None:
+    # Until the event loop takes the signals over: Ctrl-C during the imports is an end, not a traceback.
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
     typer.run(command)
 
 

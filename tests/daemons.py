@@ -211,7 +211,7 @@ class Lab:
         self.endpoint = f"tcp://{HOST}:{self.port}"
         self.clients_dir = directory / "clients"
         self.clients_dir.mkdir(exist_ok=True)
-        self._relay_keys = self._keys("relay", directory / "relay.pub")
+        self.make_relay_keys()
         for name in clients:
             self.make_keys(name)
         self._processes: list[Process] = []
@@ -222,6 +222,10 @@ class Lab:
         write_secret(self.directory / f"{name}.key", pair, replace=True)
         write_public(public, PublicKeys(pair.name, (PublicKey(pair.public_key),)), replace=True)
         return pair
+
+    def make_relay_keys(self) -> SecretKey:
+        """A new pair for the relay; relay.pub is what the clients read at their next start."""
+        return self._keys("relay", self.directory / "relay.pub")
 
     def make_keys(self, name: str) -> SecretKey:
         """A client's pair; the relay knows it when it looks next."""
@@ -301,10 +305,11 @@ class Lab:
         endpoint = {"kind": "record", "path": path or name, "overwrite": True}
         return self.client_file(name, endpoint, client={"namespace": "/"}, subscribe=list(patterns), **sections)
 
-    def player_file(self, name: str, bag: Path, **sections: Any) -> Path:
-        """A robot that plays a recording as fast as it is taken, once somebody wants its topics; all reliable."""
+    def player_file(self, name: str, bag: Path, *, play: Json | None = None, **sections: Any) -> Path:
+        """A robot that plays a recording as fast as it is taken, once somebody wants its topics; all reliable.
+        `play` replaces settings of the endpoint."""
         endpoint: Json = {"kind": "bag", "path": str(bag), "rate": 0, "wait_for": sorted(bodies(bag))}
-        endpoint |= sections.pop("bag", {})
+        endpoint |= play or {}
         return self.client_file(name, endpoint, **{"topics": list(RELIABLE), **sections})
 
     # --- daemons ----------------------------------------------------------------------------------------------------
