@@ -49,6 +49,8 @@ COMMAND_OBJECT_TYPES: Final = COMMAND_TYPES | {
 }
 """A topic of class control with one of these types is an object of kind `command`."""
 TRANSFORM_TYPES: Final = frozenset({"tf2_msgs/TFMessage", "tf/tfMessage", "geometry_msgs/TransformStamped"})
+PATCH_TYPES: Final = frozenset({"map_msgs/OccupancyGridUpdate", "map_msgs/PointCloud2Update"})
+"""A topic with one of these types, which change part of a map, is an object of kind `patch`."""
 _RESERVED: Final = re.compile(r".*@([a-z][a-z0-9_]{0,62})", re.DOTALL)
 
 
@@ -513,13 +515,33 @@ def topic_object_id(stream: StreamId) -> str:
 
 
 def kind_of(stream: StreamInfo) -> ObjectKind:
-    """`command` for class control topics of command types, `transform` for tf, `topic` otherwise."""
+    """`command` for class control topics of command types, `transform` for tf, `patch` for parts of maps, `topic`
+    otherwise."""
     type_name = plain_type(stream.info.type_name)
     if stream.spec.priority is PriorityClass.CONTROL and type_name in COMMAND_OBJECT_TYPES:
         return ObjectKind.COMMAND
     if type_name in TRANSFORM_TYPES:
         return ObjectKind.TRANSFORM
+    if type_name in PATCH_TYPES:
+        return ObjectKind.PATCH
     return ObjectKind.TOPIC
+
+
+def changes_to_json(
+    changes: ObjectChanges, *, kind: ObjectKind | None = None, owner: ClientName | None = None, definitions: bool = True
+) -> dict[str, Any]:
+    """What `since` gave, of a kind and an owner (None: any); ids of deleted objects are all there."""
+    return {
+        "epoch": changes.epoch,
+        "version": changes.version,
+        "resync": changes.resync,
+        "objects": [
+            object_to_json(item, definition=definitions)
+            for item in changes.updated
+            if kind in (None, item.kind) and owner in (None, item.owner)
+        ],
+        "deleted": list(changes.deleted),
+    }
 
 
 def object_to_json(item: XrObject, *, definition: bool = True) -> dict[str, Any]:

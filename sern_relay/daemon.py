@@ -20,7 +20,9 @@ from sern_core.message import Message, StreamInfo
 from sern_core.queues import OutChannel
 from sern_core.types import ClientName
 from sern_relay.feed import RelayFeed
+from sern_relay.objects_view import objects_view
 from sern_relay.server import RelayServer
+from sern_relay.transforms import TransformObjects
 from sern_runtime.config.load import Loaded
 from sern_runtime.config.relay import RelayFile, load_relay
 from sern_runtime.entry import blamed_on, end_tasks, log_warnings, serve
@@ -90,6 +92,7 @@ class RelayDaemon:
         self.zap: ZapHandler | None = None
         self.server: RelayServer | None = None
         self.feed: RelayFeed | None = None
+        self.transforms: TransformObjects | None = None
         self._ctx: zmq.Context[zmq.Socket[bytes]] | None = None
         self._http: HttpServer | None = None
         self.tasks: list[asyncio.Task[None]] = []
@@ -114,6 +117,7 @@ class RelayDaemon:
                 self._http = self._make_http(model.http.listen)
                 await self._http.start()
         self._ctx = zmq.Context()
+        self.transforms = TransformObjects(self.hub.objects)
         if keys is not None:
             self.zap = ZapHandler(self._ctx)
             self.zap.add_domain(ZAP_DOMAIN, self._lookup)
@@ -137,7 +141,7 @@ class RelayDaemon:
             _log.warning("insecure: true: clients are not authenticated and nothing is encrypted")
         if model.feed.roles:
             with blamed_on(self.loaded.path, "feed", "roles"):
-                self.feed = RelayFeed(self._ctx, self.hub, model.feed_roles(), after=self._after)
+                self.feed = RelayFeed(self._ctx, self.hub, model.feed_roles(), after=self._after, refused=self.refused)
         self.tasks.append(asyncio.create_task(self._tick(), name="relay-tick"))
         self._ready = True
         self.notifier.ready(f"{model.name} on {', '.join(relay.listen)}")
@@ -190,7 +194,10 @@ class RelayDaemon:
         while True:
             await asyncio.sleep(SWEEP_S)
             self._end_lapsed()
-            self.hub.sweep(now=time.monotonic())
+            now = time.monotonic()
+            self.hub.sweep(now=now)
+            if self.feed is not None:
+                self.feed.sweep(now=now)
             self._flush()
             if self.zap is not None:
                 self.zap.ping()
@@ -243,6 +250,14 @@ class RelayDaemon:
                       read=lambda: [((), float(len(self.server.connections) if self.server else 0))])  # fmt: skip
         metrics.counter("sern_relay_connections_refused_total", "Connections or messages refused, by reason.",
                         ("reason",), self._refused_connections)  # fmt: skip
+        metrics.counter("sern_relay_replay_evicted_total", "Latched messages let go because of replay.cache_bytes.",
+                        read=lambda: [((), float(self.hub.replays.evicted))])  # fmt: skip
+        metrics.gauge("sern_relay_replay_bytes", "Latched messages kept for late joiners, bytes.",
+                      read=lambda: [((), float(self.hub.replays.held_bytes))])  # fmt: skip
+        metrics.counter("sern_relay_transforms_refused_total", "Transforms not taken as objects, by client and reason.",
+                        ("client", "code"), self._transforms_refused)  # fmt: skip
+        metrics.counter("sern_feed_messages_total", "Messages of the plain feed, by role and what became of them.",
+                        ("role", "result"), self._fed)  # fmt: skip
         metrics.counter("sern_relay_reload_failures_total", "Reloads that kept the old configuration.",
                         read=lambda: [((), float(self.reloads_failed))])  # fmt: skip
         return HttpServer(
@@ -252,7 +267,7 @@ class RelayDaemon:
             ready=lambda: Health(ok=self._ready, reason="listening" if self._ready else "starting"),
             json_routes={
                 "/api/link": lambda: [link.snapshot() for link in self.hub.links.values()],
-                "/api/objects": self.hub.objects.to_json,
+                "/api/objects": objects_view(self.hub.objects),
                 "/api/topics": self.topics,
             },
         )
@@ -275,6 +290,13 @@ class RelayDaemon:
             "revoked": server.revoked,
         }
         return [((reason,), float(count)) for reason, count in counts.items()]
+
+    def _transforms_refused(self) -> list[tuple[tuple[str, ...], float]]:
+        refused = self.transforms.refused if self.transforms is not None else {}
+        return [((client, code), float(n)) for (client, code), n in refused.items()]
+
+    def _fed(self) -> list[tuple[tuple[str, ...], float]]:
+        return [] if self.feed is None else [(labels, float(n)) for labels, n in self.feed.results()]
 
     def topics(self) -> dict[str, object]:
         """Counters by client link and topic, and of what arrived."""
@@ -313,7 +335,7 @@ class RelayDaemon:
             stack.callback(self._write_summary)
             if self._ctx is not None:
                 stack.callback(self._ctx.destroy, linger=0)
-            for part in (self.zap, self.server, self.feed):
+            for part in (self.zap, self.server, self.feed, self.transforms):
                 if part is not None:
                     stack.callback(part.close)
             if self._http is not None:
@@ -345,12 +367,20 @@ class RelayDaemon:
 
     def stream_added(self, stream: StreamInfo) -> None:
         _log.info("%s announces %s (%s)", stream.id.origin, stream.id.topic, stream.info.type_name)
+        if self.feed is not None:
+            self.feed.owners_changed()
 
     def stream_removed(self, stream: StreamInfo) -> None:
         _log.info("%s of %s has ended", stream.id.topic, stream.id.origin)
+        if self.transforms is not None:
+            self.transforms.stream_removed(stream)
+        if self.feed is not None:
+            self.feed.owners_changed()
 
     def message(self, stream: StreamInfo, message: Message, *, now: float) -> None:
         self.ages.observe(stream.spec.priority, now - message.born_s)
+        if self.transforms is not None:
+            self.transforms.message(stream, message, now=now)
         if self.feed is not None:
             self.feed.publish(stream, message, now=now)
 

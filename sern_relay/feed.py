@@ -1,21 +1,60 @@
-"""The relay's plain feed: what the clients' streams carry, for any ZeroMQ program on the local network."""
+"""The relay's plain feed: what the clients' streams carry, for any ZeroMQ program on the local network, and back.
 
+What a program publishes goes to the feed's own subscribers. Where the role says what the topic is (`types`), it is also
+a stream of the relay like any client's: it owns its name, obeys lifespan and access rules, and reaches clients and the
+object registry. Its name is taken with the first message and given back after `IDLE_S` of silence, as a publisher of
+plain ZeroMQ does not say that it has gone.
+"""
+
+import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Final
 
 import zmq
 
-from sern_core.hub import Hub
+from sern_core.errors import RefusedError
+from sern_core.hub import Hub, Relayed
 from sern_core.message import Message, StreamInfo
-from sern_core.rules import FeedRole
-from sern_core.types import ClientName, TopicName
+from sern_core.rules import FeedRole, FeedTopic, RuleSet
+from sern_core.types import ClientName, Durability, PriorityClass, TopicName
+from sern_runtime import ros_types
 from sern_runtime.feed import Feed, FeedHeader
+
+IDLE_S: Final = 30.0
+MAX_TOLD: Final = 1024
+"""Lines about topics that are logged once each."""
+
+_log = logging.getLogger(__name__)
+
+OnRefused = Callable[[ClientName, str, str], None]
+
+
+@dataclass(slots=True)
+class InjectCounters:
+    """What became of messages that a role published and the feed accepted, from start on."""
+
+    injected: int = 0  # went on to the clients
+    untyped: int = 0  # stayed within the feed: no entry in `types`
+    dropped: int = 0  # too old, or a reliable queue was full; the topic's counters say which
+    refused: int = 0  # times a name was refused: its owner is another, or access rules forbid it
+
+
+@dataclass(slots=True)
+class _Source:
+    """A topic that a role publishes now."""
+
+    handle: Relayed
+    latched: bool
+    last_s: float
 
 
 class RelayFeed:
     """Publishes what passes the hub to the roles that may see it, and makes their interest the hub's.
 
     A subscriber of the feed is a subscriber like any other: without one the robot need not send the stream.
+    `refused` is told of names that a role may not have; `after` is called when something came in.
     """
 
     def __init__(
@@ -25,28 +64,140 @@ class RelayFeed:
         roles: tuple[FeedRole, ...],
         *,
         after: Callable[[], None],
+        refused: OnRefused,
+        clock: Callable[[], float] = time.monotonic,
+        wall_ns: Callable[[], int] = time.time_ns,
     ) -> None:
         self._hub = hub
         self._after = after
-        self.feed = Feed(ctx, roles, on_interest=self._interest, accept=self._may_own)
+        self._refused = refused
+        self._clock = clock
+        self._wall_ns = wall_ns
+        self._sources: dict[tuple[str, TopicName], _Source] = {}
+        self._told: set[tuple[str, TopicName, str]] = set()
+        self.counters: dict[str, InjectCounters] = {role.name: InjectCounters() for role in roles}
+        hub.local_owners.update(role.owner for role in roles if role.ingest_endpoint is not None)
+        self.feed = Feed(ctx, roles, on_publish=self._published, on_interest=self._interest, accept=self._may_own)
         hub.tap = self._wants
 
     def close(self) -> None:
         self.feed.close()
 
     def publish(self, stream: StreamInfo, message: Message, *, now: float) -> None:
+        """To the roles' subscribers. They have had what came in through the feed itself."""
+        if stream.id.origin in self._hub.local_owners:
+            return
         age_us = max(0, int((now - message.born_s) * 1e6))
         header = FeedHeader(stream.spec.priority, message.seq, message.stamp_ns, age_us)
         self.feed.publish(stream.id.topic, header, message.body)
 
+    def results(self) -> Iterator[tuple[tuple[str, str], int]]:
+        """(role, what became of messages) and how many, for metrics."""
+        for name, fed in self.feed.counters().items():
+            injected = self.counters[name]
+            for result, count in (
+                ("sent", fed.sent),
+                ("received", fed.received),
+                ("forbidden", fed.forbidden),
+                ("malformed", fed.malformed),
+                ("injected", injected.injected),
+                ("untyped", injected.untyped),
+                ("dropped", injected.dropped),
+            ):
+                yield (name, result), count
+
+    def owners_changed(self) -> None:
+        """A stream came or went: who may publish what is asked anew."""
+        self.feed.refresh()
+
+    def sweep(self, *, now: float) -> None:
+        """Give back the names of topics that have gone quiet. Call about once a second."""
+        for key, source in list(self._sources.items()):
+            if not source.latched and now - source.last_s > IDLE_S:
+                self._hub.close_local(source.handle, now=now)
+            if not self._hub.is_open(source.handle):
+                self._sources.pop(key, None)
+
     def _wants(self, stream: StreamInfo) -> bool:
         return self.feed.wants(stream.id.topic)
 
-    def _may_own(self, role: FeedRole, name: TopicName) -> bool:
-        """A name that a client owns is not published by the feed as well."""
-        owners = self._hub.routing.owners(name)
-        return not owners or owners == (ClientName(role.name),)
-
     def _interest(self) -> None:
-        self._hub.refresh_interest(now=time.monotonic())
+        self._hub.refresh_interest(now=self._clock())
         self._after()
+
+    def _may_own(self, role: FeedRole, name: TopicName) -> bool:
+        """A name that a client owns is not published by the feed as well; what has a type takes the name now."""
+        if not role.may_publish(name, PriorityClass.BULK):
+            return False  # in no class at all
+        topic = role.topic(name)
+        if topic is not None:
+            return self._source(role, name, topic) is not None
+        owners = self._hub.routing.owners(name)
+        if owners:
+            self._refuse(role, name, "name_taken", f"{role.owner} may not publish {name}: {owners[0]} owns that name")
+        return not owners
+
+    def _source(self, role: FeedRole, name: TopicName, topic: FeedTopic) -> _Source | None:
+        """The stream of this topic, opened when there is none; None: refused."""
+        key = (role.name, name)
+        source = self._sources.get(key)
+        if source is not None and self._hub.is_open(source.handle):
+            return source
+        latched = topic.rule.durability is Durability.TRANSIENT_LOCAL
+        info = ros_types.topic_info(name, topic.type_name, topic.encoding, latched=latched)
+        spec = RuleSet((topic.rule,)).resolve(info, local_name=name).spec
+        now = self._clock()
+        try:
+            handle = self._hub.open_local(info, spec, role.owner, now=now)
+        except RefusedError as refusal:
+            self._refuse(role, name, refusal.code, str(refusal))
+            return None
+        source = self._sources[key] = _Source(handle, latched, now)
+        self._after()
+        return source
+
+    def _refuse(self, role: FeedRole, name: TopicName, code: str, text: str) -> None:
+        self.counters[role.name].refused += 1
+        if self._first(role, name, code):
+            self._refused(role.owner, code, text)
+
+    def _first(self, role: FeedRole, name: TopicName, what: str) -> bool:
+        """Whether this is to be said: once for each topic, and not for any number of them."""
+        key = (role.name, name, what)
+        if key in self._told or len(self._told) >= MAX_TOLD:
+            return False
+        self._told.add(key)
+        return True
+
+    def _published(self, role: FeedRole, name: TopicName, header: FeedHeader, body: bytes) -> None:
+        """A message came in; the feed's own subscribers have it."""
+        counters = self.counters[role.name]
+        topic = role.topic(name)
+        if topic is None:
+            counters.untyped += 1
+            if self._first(role, name, "untyped"):
+                _log.info("%s of feed role %s has no entry in types: it stays within the feed", name, role.name)
+            return
+        source = self._source(role, name, topic)
+        if source is None:
+            counters.dropped += 1
+            return
+        now = self._clock()
+        wall_ns = self._wall_ns()
+        age_s = header.age_us * 1e-6
+        if header.stamp_ns > 0:  # 0: the publisher does not say when
+            age_s = max(age_s, (wall_ns - header.stamp_ns) * 1e-9)
+        source.last_s = now
+        stamp_ns = header.stamp_ns if header.stamp_ns > 0 else wall_ns
+        if self._hub.inject(source.handle, body, stamp_ns, now=now, age_s=age_s):
+            counters.injected += 1
+            self._after()
+            return
+        counters.dropped += 1
+        lifespan_s = source.handle.stream.lifespan_s
+        if lifespan_s is not None and age_s > lifespan_s and self._first(role, name, "old"):
+            _log.warning(
+                "%s of feed role %s was %.3f s old, lifespan %.3f s: dropped; where its clock is not ours, a publisher "
+                "leaves the stamp 0",
+                name, role.name, age_s, lifespan_s,
+            )  # fmt: skip

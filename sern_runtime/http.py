@@ -16,6 +16,15 @@ Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 JsonSource = Callable[[], object]
 """Gives what `json.dumps` takes, from state, at once."""
 
+
+class JsonQuery(NamedTuple):
+    """A JSON source with parameters, all optional: `?name=value`. `read` gets those that were given, and raises
+    UsageError for a value it does not take; that and unknown names are answered with 400 and one line."""
+
+    accepts: tuple[str, ...]
+    read: Callable[[Mapping[str, str]], object]
+
+
 _SHUTDOWN_S: Final = 1.0
 _log = logging.getLogger(__name__)
 
@@ -53,7 +62,7 @@ class HttpServer:
         *,
         health: HealthCheck,
         ready: HealthCheck,
-        json_routes: Mapping[str, JsonSource] | None = None,
+        json_routes: Mapping[str, JsonSource | JsonQuery] | None = None,
     ) -> None:
         self.listen = listen
         self._host, self._port = parse_listen(listen)
@@ -66,7 +75,7 @@ class HttpServer:
         for path, source in (json_routes or {}).items():
             self.add_json(path, source)
 
-    def add_json(self, path: str, source: JsonSource) -> None:
+    def add_json(self, path: str, source: JsonSource | JsonQuery) -> None:
         """Add a JSON route. Before `start`."""
         if self._runner is not None:
             raise UsageError("routes are added before the server is started")
@@ -121,10 +130,19 @@ def _health_route(check: HealthCheck) -> Handler:
     return handle
 
 
-def _json_route(path: str, source: JsonSource) -> Handler:
-    async def handle(_request: web.Request) -> web.Response:
+def _asked(source: JsonQuery, query: Mapping[str, str]) -> object:
+    for name in query:
+        if name not in source.accepts:
+            raise UsageError(f"unknown parameter {name[:80]!r}; accepted: {', '.join(source.accepts)}")
+    return source.read({name: query[name] for name in query})
+
+
+def _json_route(path: str, source: JsonSource | JsonQuery) -> Handler:
+    async def handle(request: web.Request) -> web.Response:
         try:
-            text = json.dumps(source())
+            text = json.dumps(_asked(source, request.query) if isinstance(source, JsonQuery) else source())
+        except UsageError as error:
+            return web.json_response({"error": str(error)}, status=400)
         except Exception:  # noqa: BLE001  (a view that fails is told to its reader and the log, and ends nothing)
             _log.exception("%s could not be answered", path)
             return web.json_response({"error": "internal error, see the log"}, status=500)

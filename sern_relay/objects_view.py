@@ -1,0 +1,47 @@
+"""The object registry over HTTP: /api/objects with its parameters.
+
+kind=transform      objects of this kind only
+owner=jackal1       objects of this client only
+definitions=no      without the texts of message definitions; their hashes stay
+since=VERSION       what has changed after this version (`objects`) and the ids that are gone (`deleted`); with
+                    `resync` true forget everything first. epoch=EPOCH of the earlier answer, so that a relay that
+                    was started anew is noticed
+"""
+
+from collections.abc import Mapping
+
+from sern_core.errors import UsageError
+from sern_core.objects import ObjectRegistry, changes_to_json
+from sern_core.types import ClientName, ObjectKind
+from sern_runtime.http import JsonQuery
+
+
+def objects_view(registry: ObjectRegistry) -> JsonQuery:
+    """The route of /api/objects."""
+
+    def read(query: Mapping[str, str]) -> object:
+        kind = _one_of("kind", query["kind"], [str(kind) for kind in ObjectKind]) if "kind" in query else None
+        owner = ClientName(query["owner"]) if "owner" in query else None
+        definitions = _one_of("definitions", query.get("definitions", "yes"), ["yes", "no"]) == "yes"
+        wanted = None if kind is None else ObjectKind(kind)
+        if "since" not in query:
+            if "epoch" in query:
+                raise UsageError("epoch has no use without since")
+            return registry.to_json(kind=wanted, owner=owner, definitions=definitions)
+        epoch = _number("epoch", query["epoch"]) if "epoch" in query else None
+        changes = registry.since(_number("since", query["since"]), epoch=epoch)
+        return changes_to_json(changes, kind=wanted, owner=owner, definitions=definitions)
+
+    return JsonQuery(("kind", "owner", "definitions", "since", "epoch"), read)
+
+
+def _one_of(name: str, value: str, accepted: list[str]) -> str:
+    if value not in accepted:
+        raise UsageError(f"{name} is {value[:80]!r}; accepted: {', '.join(accepted)}")
+    return value
+
+
+def _number(name: str, value: str) -> int:
+    if not (value.isascii() and value.isdecimal() and len(value) <= 20):
+        raise UsageError(f"{name} is {value[:80]!r}; a version or epoch of an earlier answer is needed")
+    return int(value)
