@@ -4,6 +4,8 @@ import typer
 
 from sern_tools import check, keygen
 from sern_tools.demo import demo
+from sern_tools.echo import echo
+from sern_tools.topics import topics
 
 app = typer.Typer(
     name="sern",
@@ -15,6 +17,8 @@ app = typer.Typer(
 app.command()(demo)
 app.add_typer(keygen.app, name="keygen")
 app.command("check")(check.check_command)
+app.command()(topics)
+app.command()(echo)
 
 
 def main() -> None:

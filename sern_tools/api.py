@@ -1,0 +1,79 @@
+"""What the tools read from a running daemon: JSON over its HTTP server, and one line for what goes wrong.
+
+Exit codes of `sern topics` and `sern echo`: 0 done (Ctrl-C too, it is how they are ended), 1 the daemon, the relay or
+the topic could not be had, 2 wrong usage or configuration.
+"""
+
+import http.client
+import json
+import os
+import sys
+import urllib.error
+import urllib.request
+from collections.abc import Mapping
+from typing import Any, Final
+from urllib.parse import urlsplit
+
+from sern_core.errors import ConfigError, SernError, UsageError
+from sern_runtime.entry import EXIT_CONFIG, EXIT_FAILED
+
+DEFAULT_API: Final = "http://127.0.0.1:5580"
+"""Where the relay of the examples answers; the robot is at 5581, the site at 5582."""
+TIMEOUT_S: Final = 5.0
+
+# A daemon's HTTP server is on loopback or on a private network: a proxy for the outside must not come in between.
+_opener = urllib.request.build_opener(urllib.request.ProxyHandler({}))
+
+
+class NotFoundError(SernError):
+    """The daemon has no such path: it is another kind of daemon, or an older one."""
+
+
+def checked_api(api: str) -> str:
+    """`api` without a trailing slash. Raises UsageError when it is not http://HOST:PORT."""
+    try:
+        parts = urlsplit(api)
+        good = parts.scheme in {"http", "https"} and parts.hostname and parts.port != 0
+    except ValueError:
+        good = False
+    if not good:
+        raise UsageError(f"--api {api!r} is not an address; write it like {DEFAULT_API}")
+    return api.rstrip("/")
+
+
+def get_json(api: str, path: str, *, timeout_s: float = TIMEOUT_S) -> Any:
+    """The JSON at `path` of the daemon at `api`. Raises NotFoundError for a path it lacks, else SernError."""
+    try:
+        with _opener.open(api + path, timeout=timeout_s) as answer:
+            return json.load(answer)
+    except urllib.error.HTTPError as error:
+        with error:
+            if error.code == 404:
+                raise NotFoundError(f"{api} has no {path}: it is another kind of daemon") from None
+            raise SernError(f"{api}{path}: HTTP status {error.code}; see the daemon's log") from None
+    except urllib.error.URLError as error:
+        reason = getattr(error.reason, "strerror", None) or error.reason
+        raise SernError(
+            f"{api}: no answer ({str(reason).lower()}); is the daemon running, and is http.listen set in its file?"
+        ) from None
+    except (OSError, http.client.HTTPException, ValueError) as error:
+        problem = "no answer in time" if isinstance(error, TimeoutError) else "the answer is not JSON"
+        raise SernError(f"{api}{path}: {problem}; is this a SERN daemon?") from None
+
+
+def is_stream(item: Mapping[str, Any]) -> bool:
+    """Whether this element of /api/objects stands for a topic of one publisher (and not for one transform, or a node)."""
+    return item["attributes"].keys() >= {"topic", "encoding"}
+
+
+def say(program: str, error: SernError) -> int:
+    """Print `error` as one line and give the exit code for it."""
+    print(f"{program}: {error}", file=sys.stderr)
+    return EXIT_CONFIG if isinstance(error, (ConfigError, UsageError)) else EXIT_FAILED
+
+
+def drop_output() -> None:
+    """Whoever read our output has gone (`sern ... | head`): what is left to flush goes nowhere."""
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, sys.stdout.fileno())
+    os.close(nowhere)

@@ -1,0 +1,290 @@
+"""`sern topics`: the topics at a relay or a client: whose, what, how much, how old, and what was dropped.
+
+In and out are the daemon's own: at a relay, in is what its clients sent it and out what its subscribers have; at a
+client, in is what came from the relay and out what the relay has. Rates come from two looks at the counters.
+"""
+
+import json
+import re
+import time
+from collections import Counter
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field
+from typing import Annotated, Any, Final
+
+import typer
+from rich.console import Console
+from rich.live import Live
+from rich.table import Table
+from rich.text import Text
+
+from sern_core.errors import SernError, UsageError
+from sern_core.types import CLASS_LABELS
+from sern_tools.api import DEFAULT_API, NotFoundError, checked_api, drop_output, get_json, is_stream, say
+
+MIN_INTERVAL_S: Final = 0.1
+PLAIN_WIDTH: Final = 200
+"""Characters of a line where the output is no terminal: nothing is cut short in a file."""
+TYPE_WIDTH: Final = 150
+OWNER_WIDTH: Final = 110
+NOT_LOSSES: Final = frozenset({"duplicate"})
+"""Reasons that do not mean that a message is missing."""
+
+
+@dataclass(slots=True)
+class Counts:
+    """Counters of one topic at one time. `takers`: links over which it is wanted now."""
+
+    priority: str
+    received: int = 0
+    received_bytes: int = 0
+    delivered: int = 0
+    delivered_bytes: int = 0
+    queued: int = 0
+    takers: int = 0
+    age_s: float | None = None
+    reasons: Counter[str] = field(default_factory=Counter)
+
+
+@dataclass(frozen=True, slots=True)
+class Identity:
+    """Who publishes a topic and as what, from the relay's registry. Several owners are joined with commas."""
+
+    type_name: str
+    owner: str
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One line of the table, and one element of `--json`. `age_s` of the freshest sample at this daemon."""
+
+    topic: str
+    priority: str
+    type_name: str | None
+    owner: str | None
+    in_hz: float
+    out_hz: float
+    in_bytes_per_s: float
+    out_bytes_per_s: float
+    age_s: float | None
+    takers: int
+    queued: int
+    dropped: int
+    dropped_by_reason: Mapping[str, int]
+
+
+def parse_topics(answer: Mapping[str, Any]) -> dict[str, Counts]:
+    """/api/topics of a relay (`links` and `received`) or of a client (a flat map of topics)."""
+    relay = answer.keys() >= {"links", "received"}
+    tables = [*answer["links"].values(), answer["received"]] if relay else [answer]
+    topics: dict[str, Counts] = {}
+    for table in tables:
+        for name, row in table.items():
+            counts = topics.setdefault(name, Counts(row["class"]))
+            if row["direction"] == "receive":
+                counts.received += row["delivered"]
+                counts.received_bytes += row["bytes_delivered"]
+                counts.age_s = row.get("age_s")
+            else:
+                counts.delivered += row["delivered"]
+                counts.delivered_bytes += row["bytes_delivered"]
+                counts.queued += row["in_queue"] + row["in_flight"]
+                counts.takers += bool(row["wanted"])
+            counts.reasons.update({reason: n for reason, n in row["dropped"].items() if reason not in NOT_LOSSES})
+    return topics
+
+
+def parse_identities(answer: Mapping[str, Any]) -> dict[str, Identity]:
+    """/api/objects of a relay."""
+    found: dict[str, Identity] = {}
+    for item in answer["objects"]:
+        if not is_stream(item):
+            continue
+        topic = item["attributes"]["topic"]
+        known = found.get(topic)
+        owner = item["owner"] if known is None else f"{known.owner},{item['owner']}"
+        found[topic] = Identity(item["type"], owner)
+    return found
+
+
+def compare(
+    before: Mapping[str, Counts], now: Mapping[str, Counts], interval_s: float, identities: Mapping[str, Identity]
+) -> list[Row]:
+    """Rows by urgency and name. A topic that was not there `before`, or began anew, counts from 0."""
+    rows = []
+    for name, counts in now.items():
+        past = before.get(name)
+        if past is None or counts.received < past.received or counts.delivered < past.delivered:
+            past = Counts(counts.priority)
+        identity = identities.get(name)
+        rows.append(
+            Row(
+                topic=name,
+                priority=counts.priority,
+                type_name=None if identity is None else identity.type_name,
+                owner=None if identity is None else identity.owner,
+                in_hz=(counts.received - past.received) / interval_s,
+                out_hz=(counts.delivered - past.delivered) / interval_s,
+                in_bytes_per_s=(counts.received_bytes - past.received_bytes) / interval_s,
+                out_bytes_per_s=(counts.delivered_bytes - past.delivered_bytes) / interval_s,
+                age_s=counts.age_s,
+                takers=counts.takers,
+                queued=counts.queued,
+                dropped=counts.reasons.total(),
+                dropped_by_reason=dict(counts.reasons.most_common()),
+            )
+        )
+    return sorted(rows, key=lambda row: (CLASS_LABELS.index(row.priority), row.topic))
+
+
+class Watcher:
+    """Looks at one daemon again and again. `clock` in monotonic seconds."""
+
+    def __init__(
+        self,
+        api: str,
+        pattern: re.Pattern[str] | None = None,
+        *,
+        get: Callable[[str, str], Any] = get_json,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self.api = api
+        self._pattern = pattern
+        self._get = get
+        self._clock = clock
+        self._identities: dict[str, Identity] = {}
+        self._has_registry = True
+        self._at_s, self._before = self._look()
+
+    def _look(self) -> tuple[float, dict[str, Counts]]:
+        at_s = self._clock()
+        topics = parse_topics(self._get(self.api, "/api/topics"))
+        if self._pattern is not None:
+            topics = {name: counts for name, counts in topics.items() if self._pattern.fullmatch(name)}
+        return at_s, topics
+
+    def rows(self) -> list[Row]:
+        """What changed since the call before. Raises SernError when the daemon does not answer."""
+        at_s, now = self._look()
+        # The registry holds values too and is large: it is read only for names that are new.
+        if self._has_registry and not now.keys() <= self._identities.keys():
+            try:
+                self._identities = parse_identities(self._get(self.api, "/api/objects"))
+            except NotFoundError:
+                self._has_registry = False
+        rows = compare(self._before, now, max(at_s - self._at_s, 1e-3), self._identities)
+        self._at_s, self._before = at_s, now
+        return rows
+
+
+def table(rows: list[Row], width: int = PLAIN_WIDTH) -> Table:
+    """For a terminal of so many characters: what there is no room for is left out."""
+    known = any(row.owner for row in rows)
+    with_type, with_owner = known and width >= TYPE_WIDTH, known and width >= OWNER_WIDTH
+    result = Table(box=None, pad_edge=False)
+    for label in ("topic", "class", *(("type",) if with_type else ()), *(("owner",) if with_owner else ())):
+        result.add_column(label, no_wrap=True, overflow="ellipsis")
+    for label in ("in Hz", "out Hz", "in B/s", "out B/s", "age s", "subs", "queued", "drops"):
+        result.add_column(label, no_wrap=True, justify="right")
+    result.add_column("why", no_wrap=True, overflow="ellipsis")
+    for row in rows:
+        why = " ".join(f"{reason} {count}" for reason, count in list(row.dropped_by_reason.items())[:3])
+        cells = (
+            row.topic,
+            row.priority,
+            *((row.type_name or "",) if with_type else ()),
+            *((row.owner or "",) if with_owner else ()),
+            f"{row.in_hz:.1f}" if row.in_hz else "",
+            f"{row.out_hz:.1f}" if row.out_hz else "",
+            si(row.in_bytes_per_s),
+            si(row.out_bytes_per_s),
+            "" if row.age_s is None else f"{row.age_s:.3f}" if row.age_s < 10 else f"{row.age_s:.0f}",
+            str(row.takers) if row.takers else "",
+            str(row.queued) if row.queued else "",
+            str(row.dropped) if row.dropped else "",
+            why,
+        )
+        result.add_row(*(Text(cell) for cell in cells))
+    return result
+
+
+def si(value: float) -> str:
+    """A number of bytes a second in at most six characters, powers of 1000; empty for none."""
+    if value < 0.5:
+        return ""
+    for unit in ("", "k", "M", "G"):
+        if value < 999.5 or unit == "G":
+            return f"{value:.0f}{unit}" if not unit or value >= 99.95 else f"{value:.1f}{unit}"
+        value /= 1000
+    raise AssertionError("unreachable")
+
+
+def run_topics(
+    api: str,
+    pattern: str | None,
+    *,
+    watch: bool,
+    as_json: bool,
+    interval_s: float,
+    out: Console | None = None,
+    pause: Callable[[float], None] = time.sleep,
+) -> None:
+    """Print the table once, or until interrupted. Raises SernError."""
+    out = out or Console(highlight=False)
+    if not out.is_terminal:
+        out.width = PLAIN_WIDTH
+    try:
+        compiled = None if pattern is None else re.compile(pattern)
+    except re.error as error:
+        raise UsageError(f"{pattern!r} is not a regular expression: {error}") from None
+    watcher = Watcher(checked_api(api), compiled)
+    if not watch:
+        pause(interval_s)
+        rows = watcher.rows()
+        if as_json:
+            out.file.write(json.dumps([asdict(row) for row in rows], indent=1) + "\n")
+        elif rows:
+            out.print(table(rows, out.width))
+        else:
+            raise SernError(f"{watcher.api}: no topics" + ("" if pattern is None else f" that match {pattern}"))
+        return
+    if as_json or not out.is_terminal:
+        while True:
+            pause(interval_s)
+            rows = watcher.rows()
+            if as_json:
+                out.file.write(json.dumps([asdict(row) for row in rows]) + "\n")
+                out.file.flush()
+            else:
+                out.print(table(rows, out.width))
+    with Live(console=out, auto_refresh=False, screen=True) as live:
+        while True:
+            pause(interval_s)
+            live.update(table(watcher.rows(), out.width), refresh=True)
+
+
+def topics(
+    pattern: Annotated[
+        str | None, typer.Argument(help="Only topics whose whole name this regular expression matches.")
+    ] = None,
+    api: Annotated[
+        str, typer.Option("--api", help="HTTP address of a relay or a client (http.listen in its file).")
+    ] = DEFAULT_API,
+    watch: Annotated[bool, typer.Option("--watch", "-w", help="Again and again, until Ctrl-C.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="JSON; with --watch one line a look.")] = False,
+    interval_s: Annotated[
+        float, typer.Option("--interval", min=MIN_INTERVAL_S, help="Seconds between two looks.")
+    ] = 1.0,
+) -> None:
+    """List the topics at a relay or a client: class, owner, rates, age and drops.
+
+    Exit code 0 when listed (or ended by Ctrl-C), 1 when there is no daemon or no topic, 2 for wrong usage.
+    """
+    try:
+        run_topics(api, pattern, watch=watch, as_json=as_json, interval_s=interval_s)
+    except KeyboardInterrupt:
+        raise typer.Exit(0) from None
+    except BrokenPipeError:
+        drop_output()
+    except SernError as error:
+        raise typer.Exit(say("sern topics", error)) from None
