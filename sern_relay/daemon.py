@@ -209,7 +209,7 @@ class RelayDaemon:
         return sum(link.established for link in self.hub.links.values())
 
     def reload(self) -> None:
-        """SIGHUP: read keys and access rules anew; all or nothing. What was revoked ends now."""
+        """SIGHUP: read keys, access rules and the feed's roles anew; all or nothing. What was revoked ends now."""
         self.notifier.reloading()
         try:
             loaded = load_relay(self.loaded.path)
@@ -222,13 +222,16 @@ class RelayDaemon:
             return
         log_warnings(_log, loaded.warnings)
         self.directory = directory
-        self.hub.revoke(access, now=time.monotonic())
+        now = time.monotonic()
+        self.hub.revoke(access, now=now)
+        if self.feed is not None:
+            self._update_feed(loaded.model, now)
         if self.server is not None:
             self.server.cut_unbound()  # admitted by the old keys, and silent so far
         self._end_lapsed()
         self._after()
         self.notifier.ready("reloaded")
-        _log.info("reloaded keys and access rules; other changes need a restart")
+        _log.info("reloaded keys, access rules and feed roles; other changes need a restart")
 
     def _make_http(self, listen: str) -> HttpServer:
         registry = CollectorRegistry()
@@ -290,6 +293,14 @@ class RelayDaemon:
             "revoked": server.revoked,
         }
         return [((reason,), float(count)) for reason, count in counts.items()]
+
+    def _update_feed(self, model: RelayFile, now: float) -> None:
+        assert self.feed is not None
+        try:
+            self.feed.update(model.feed_roles(), now=now)
+        except ConfigError as error:
+            self.reloads_failed += 1
+            _log.error("%s: feed.roles: not all of them are in force: %s", self.loaded.path, error)
 
     def _transforms_refused(self) -> list[tuple[tuple[str, ...], float]]:
         refused = self.transforms.refused if self.transforms is not None else {}

@@ -46,8 +46,12 @@ class _Source:
     """A topic that a role publishes now."""
 
     handle: Relayed
-    latched: bool
+    topic: FeedTopic
     last_s: float
+
+    @property
+    def latched(self) -> bool:
+        return self.topic.rule.durability is Durability.TRANSIENT_LOCAL
 
 
 class RelayFeed:
@@ -82,6 +86,19 @@ class RelayFeed:
 
     def close(self) -> None:
         self.feed.close()
+
+    def update(self, roles: tuple[FeedRole, ...], *, now: float) -> None:
+        """Make these the roles, and end what they no longer say. Raises ConfigError (see `Feed.update`)."""
+        for role in roles:
+            self.counters.setdefault(role.name, InjectCounters())
+        self._hub.local_owners.update(role.owner for role in roles if role.ingest_endpoint is not None)
+        known = {role.name: role for role in roles}
+        for (role_name, name), source in self._sources.items():
+            current = known.get(role_name)
+            if current is None or current.topic(name) != source.topic:
+                self._hub.close_local(source.handle, now=now)  # with its next message it opens anew, if it may
+        self.feed.update(roles)
+        self._after()
 
     def publish(self, stream: StreamInfo, message: Message, *, now: float) -> None:
         """To the roles' subscribers. They have had what came in through the feed itself."""
@@ -152,7 +169,7 @@ class RelayFeed:
         except RefusedError as refusal:
             self._refuse(role, name, refusal.code, str(refusal))
             return None
-        source = self._sources[key] = _Source(handle, latched, now)
+        source = self._sources[key] = _Source(handle, topic, now)
         self._after()
         return source
 

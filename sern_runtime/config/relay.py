@@ -296,7 +296,6 @@ class RelayFile(FileModel):
         roles = (
             AccessRule(client=role.owner, publish=tuple(pattern.pattern for pattern in role.publish))
             for role in self.feed_roles()
-            if role.types
         )
         return (*roles, *(section.rule() for section in self.access))
 
