@@ -34,6 +34,8 @@ from sern_runtime.topics_view import link_summary, received_summary
 
 DRAIN_S: Final = 5.0
 """How long a stopping client goes on sending what reliable topics still owe."""
+PATIENCE_S: Final = 2.0
+"""How long it waits for the next confirmation of what the relay has got already."""
 TICK_S: Final = 0.5
 
 _log = logging.getLogger(__name__)
@@ -93,6 +95,7 @@ class ClientDaemon:
         self._http: HttpServer | None = None
         self.tasks: list[asyncio.Task[None]] = []
         self._endpoint_started = False
+        self._stopping = False
 
     async def start(self) -> None:
         model = self.loaded.model
@@ -137,7 +140,7 @@ class ClientDaemon:
     def _link_down(self, reason: str) -> None:
         """Told by the transport and by the session on it, usually of the same thing."""
         self.reason = reason
-        if reason not in self._said:
+        if reason not in self._said and not self._stopping:
             self._said.add(reason)
             _log.warning("%s: %s; trying again until it works", self.loaded.model.relay.endpoint, reason)
 
@@ -231,16 +234,30 @@ class ClientDaemon:
         }
 
     async def drain(self) -> None:
-        """Stop the sources, then go on sending for a while what is still owed. What arrives meanwhile is taken."""
+        """Stop the sources, then go on sending for a while what is still owed. What arrives meanwhile is taken.
+
+        The relay must get everything; whether all subscribers confirm it is waited for as long as confirmations come,
+        because a subscriber that is away is the relay's to wait for.
+        """
+        self._stopping = True
         self.bridge.stop_sources()
-        deadline_s = time.monotonic() + DRAIN_S
         link = self.core.link
-        while link.established and not link.lane.stalled and time.monotonic() < deadline_s:
-            waiting = [c for c in link.channels.values() if c.retained or (c.queue and c.wanted)]
-            if not waiting:
+        now = changed_s = time.monotonic()
+        deadline_s = now + DRAIN_S
+        before = -1
+        while link.established and not link.lane.stalled and now < deadline_s:
+            channels = [channel for channel in link.channels.values() if channel.wanted is not False]
+            unsent = sum(len(channel.queue) + len(channel.flying) for channel in channels)
+            unconfirmed = sum(len(channel.retained) for channel in channels)
+            if not unsent and not unconfirmed:
+                break
+            if unsent + unconfirmed != before:
+                before, changed_s = unsent + unconfirmed, now
+            elif not unsent and now - changed_s > PATIENCE_S:
                 break
             self._kick()
             await asyncio.sleep(0.02)
+            now = time.monotonic()
         unconfirmed = sum(len(channel.retained) for channel in link.channels.values())
         if unconfirmed:
             _log.warning("stopping with %d reliable messages that not everyone has confirmed", unconfirmed)

@@ -24,6 +24,11 @@ class AgeHistograms:
             yield (label,), histogram.snapshot()
 
 
+def _capacity(link: Link) -> float | None:
+    rate_bps = link.lane.estimator.rate_bps
+    return None if rate_bps is None else rate_bps / 8
+
+
 def register_links(metrics: Metrics, links: Callable[[], Collection[Link]]) -> None:
     """State of every link and the fate of every message offered to it."""
 
@@ -66,8 +71,8 @@ def register_links(metrics: Metrics, links: Callable[[], Collection[Link]]) -> N
     peer = ("peer",)
     gauge("sern_link_up", "1 while a session exists and the path answers.", peer,
           per_link(lambda link: float(link.established and not link.lane.stalled)))  # fmt: skip
-    gauge("sern_link_capacity_bits_per_second", "Estimated capacity of the link, bit/s.", peer,
-          per_link(lambda link: link.lane.estimator.rate_bps))  # fmt: skip
+    gauge("sern_link_capacity_bytes_per_second", "Estimated capacity of the link.", peer,
+          per_link(_capacity))  # fmt: skip
     gauge("sern_link_window_bytes", "Bytes that may be in flight.", peer,
           per_link(lambda link: link.lane.estimator.window_bytes))  # fmt: skip
     gauge("sern_link_inflight_bytes", "Bytes sent and not yet acknowledged.", peer,

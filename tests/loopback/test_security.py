@@ -1,0 +1,394 @@
+"""Who gets in, who may do what, and what an attacker achieves: nothing, counted, and nobody else notices.
+
+`Bystanders` is a robot whose numbered stream runs to a site the whole time; after each attack it must have gone on
+without a gap, a duplicate or a reconnection.
+"""
+
+import json
+import shutil
+import socket as socketlib
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+import zmq
+
+from sern_client.daemon import ClientDaemon
+from sern_core import wire
+from sern_core.types import TopicName
+from sern_relay.daemon import RelayDaemon
+from sern_runtime.keys import SecretKey, load_public, load_secret
+from sern_runtime.monitor import SocketMonitor
+from sern_runtime.zmq_socket import DealerSocket, make_client
+from tests.daemons import ALLOW_ALL, HOST, Lab, bodies, write_bag
+from tests.support import until
+
+CLIENTS = ("robot1", "robot2", "site")
+DEAD_ENDS = {"kind": "synthetic", "role": "robot", "topics": 1}
+
+
+class Stranger:
+    """A program that speaks to the relay without being a SERN client, with any keys or none."""
+
+    def __init__(self, lab: Lab, keys: SecretKey | None, *, identity: bytes = b"") -> None:
+        self.received: list[bytes] = []
+        self.events: list[zmq.Event] = []
+        self._context = zmq.Context[zmq.Socket[bytes]]()
+        self._monitor: SocketMonitor | None = None
+
+        def prepare(socket: "zmq.Socket[bytes]") -> None:
+            socket.setsockopt(zmq.RECONNECT_IVL, -1)  # what is closed stays closed
+            if identity:
+                socket.setsockopt(zmq.ROUTING_ID, identity)
+            self._monitor = SocketMonitor(socket, lambda event: self.events.append(event.kind))
+
+        server = None if keys is None else load_public(lab.directory / "relay.pub").keys[0].key
+        raw = make_client(
+            self._context, lab.endpoint, keys, server, max_message_bytes=-1, before_connect=prepare
+        )  # fmt: skip
+        self.socket = DealerSocket(raw, self.received.append)
+
+    async def send(self, *frames: bytes) -> None:
+        await until(lambda: self.socket.send_frames(frames), "the stranger can send")
+
+    async def cut(self) -> None:
+        await until(lambda: zmq.Event.DISCONNECTED in self.events, "the relay closes the stranger's connection")
+
+    def close(self) -> None:
+        if self._monitor is not None:
+            self._monitor.close()
+        self.socket.close()
+        self._context.destroy(linger=0)
+
+    async def __aenter__(self) -> "Stranger":
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        self.close()
+
+
+class Bystanders:
+    """A relay, a site, and a robot that plays a loop at 1 kHz to it."""
+
+    def __init__(self, lab: Lab, relay: RelayDaemon, site: ClientDaemon, robot: ClientDaemon) -> None:
+        self.lab = lab
+        self.relay = relay
+        self.site = site
+        self.robot = robot
+
+    @property
+    def arrived(self) -> int:
+        return sum(counters.delivered for counters in self.site.core.received.topics.values())
+
+    async def go_on(self) -> None:
+        """The stream is alive now."""
+        count = self.arrived
+        await until(lambda: self.arrived > count + 50, "the stream goes on")
+
+    async def refused(self, reason: str) -> None:
+        await until(lambda: dict(self.relay._refused_connections())[reason,] > 0, f"the relay counts {reason}")
+
+
+@asynccontextmanager
+async def bystanders(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> AsyncIterator[Bystanders]:
+    caplog.set_level("INFO")
+    bag = write_bag(tmp_path / "loop.bag", {"/count": 500})
+    async with Lab(tmp_path, *CLIENTS) as lab:
+        relay = await lab.relay()
+        site = await lab.connected(lab.recorder_file("site", "/robot1/.*"))
+        robot = await lab.connected(lab.player_file("robot1", bag, play={"rate": 1, "loop": True}))
+        world = Bystanders(lab, relay, site, robot)
+        await world.go_on()
+        yield world
+        await world.go_on()
+        for daemon in (robot, site, relay):
+            await lab.end(daemon)
+        connections = [m for m in caplog.messages if m.startswith(("site connected", "robot1 connected"))]
+        assert connections == ["site connected", "robot1 connected"], "a bystander had to connect again"
+    played = bodies(bag)["/count"]
+    arrived = bodies(tmp_path / "site.bag")["/robot1/count"]
+    assert arrived == [played[index % len(played)] for index in range(len(arrived))]
+
+
+def hello(name: str, tag: int = 1) -> bytes:
+    envelope: wire.Envelope = {"name": name, "boot": 7, "vmin": wire.VERSION_MIN, "vmax": wire.VERSION_MAX}
+    return wire.encode_handshake(wire.Kind.HELLO, tag, 0, envelope)
+
+
+async def test_a_stranger_and_a_client_without_keys_are_counted_and_shut_out(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, stranger_keys: SecretKey
+) -> None:
+    async with bystanders(tmp_path, caplog) as world:
+        zap = world.relay.zap
+        assert zap is not None
+        async with Stranger(world.lab, stranger_keys) as stranger:
+            await until(lambda: zmq.Event.HANDSHAKE_FAILED_AUTH in stranger.events)
+        assert zap.counters.unknown_key == 1
+        assert sum("unknown key" in message for message in caplog.messages) == 1
+        (tmp_path / "plain").mkdir()
+        async with Lab(tmp_path / "plain", secure=False, relay_port=world.lab.port) as plain:
+            client = await plain.client(plain.client_file("robot2", DEAD_ENDS))
+            await until(lambda: "one side has keys configured and the other has not" in client.reason)
+        await world.refused("handshake")
+
+
+async def test_what_a_stranger_sends_before_the_handshake_hurts_nobody(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    garbage = [
+        b"GET / HTTP/1.1\r\nHost: relay\r\n\r\n",
+        bytes(range(256)) * 64,
+        b"\xff\0\0\0\0\0\0\0\x01\x7f\x03\x01NULL" + bytes(50),  # a greeting of the plain mechanism
+        b"\xff\0\0\0\0\0\0\0\x01\x7f\x03\x01CURVE" + bytes(47) + b"\x06\xff" + b"\x7f" * 8,  # a frame of 2^63 bytes
+        b"",
+    ]
+    async with bystanders(tmp_path, caplog) as world:
+        connections = [socketlib.create_connection((HOST, world.lab.port)) for _ in garbage]
+        try:
+            for connection, data in zip(connections, garbage, strict=True):
+                connection.setblocking(False)
+                connection.sendall(data)
+            await world.refused("handshake")
+            await world.go_on()
+        finally:
+            for connection in connections:
+                connection.close()
+
+
+async def test_a_name_that_is_not_the_keys_is_refused_to_the_client(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    async with bystanders(tmp_path, caplog) as world:
+        async with Stranger(world.lab, load_secret(world.lab.directory / "robot2.key")) as impostor:
+            await impostor.send(hello("robot1"))
+            await until(lambda: impostor.received)
+            assert wire.decode_header(impostor.received[0]).kind == wire.Kind.REFUSE
+            answer = wire.decode_handshake(impostor.received[0])
+            assert answer == {"code": "name", "why": "your key belongs to robot2, not to robot1"}
+        assert "robot2" not in world.relay.hub.port_of
+
+
+async def test_a_claimed_routing_id_is_never_heard(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    async with bystanders(tmp_path, caplog) as world:
+        server = world.relay.server
+        assert server is not None
+        [victim] = [rid for rid, session in server._sessions.items() if session.port.client == "robot1"]
+        keys = load_secret(world.lab.directory / "robot2.key")
+        for identity in (b"robot1", victim + b"\0"):
+            async with Stranger(world.lab, keys, identity=identity) as impostor:
+                before = server.socket.refused_routing_ids
+                await impostor.send(hello("robot2"))
+                await until(lambda before=before: server.socket.refused_routing_ids > before)  # type: ignore[misc]
+                assert impostor.received == []
+
+
+def oversize() -> list[bytes]:
+    return [bytes(80 * 1024)]
+
+
+def bomb() -> list[bytes]:
+    header = wire.encode_header(wire.Kind.HELLO, 1, 0, 0)
+    return [header + b"\xdf\xff\xff\xff\xff" + b"\xa1a\x80" * 1000]
+
+
+BAD: dict[str, Callable[[], list[bytes]]] = {
+    "no frame at all": lambda: [b""],
+    "noise": lambda: [bytes(range(200))],
+    "a later version": lambda: [wire.encode_header(wire.Kind.HELLO, 1, 0, 0, version=99) + b"\x80"],
+    "a WELCOME": lambda: [hello("robot2"), wire.encode_handshake(wire.Kind.WELCOME, 1, 0, {})],
+    "an acknowledgement of nothing": lambda: [
+        hello("robot2"),
+        wire.encode_header(wire.Kind.DATA, 1, 1, 0) + wire.encode_ack(0, 4_000_000, 0, 0, 0, 0),
+    ],
+    "half a frame": lambda: [hello("robot2"), wire.encode_header(wire.Kind.DATA, 1, 1, 0) + b"\x01\0\0"],
+    "a control message of nobody": lambda: [hello("robot2"), control({"t": "nonsense"})],
+    "a subscription that is no list": lambda: [hello("robot2"), control({"t": "subscribe", "patterns": 7})],
+    "a map of four billion": bomb,
+}
+
+
+def control(envelope: wire.Envelope) -> bytes:
+    body = wire.encode_control(envelope)
+    head = wire.encode_data_first(0, 0, 1, len(body), len(body), 0, 0.0, 0)
+    return wire.encode_header(wire.Kind.DATA, 1, 1, 0) + head + body
+
+
+@pytest.mark.parametrize("kind", BAD)
+async def test_a_bad_frame_of_a_known_client_ends_its_connection_only(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, kind: str
+) -> None:
+    async with bystanders(tmp_path, caplog) as world:
+        server = world.relay.server
+        assert server is not None
+        async with Stranger(world.lab, load_secret(world.lab.directory / "robot2.key")) as stranger:
+            for datagram in BAD[kind]():
+                await stranger.send(datagram)
+            await stranger.cut()
+        assert server.bad_frames == 1
+        assert sum("bad frame" in message for message in caplog.messages) == 1
+
+
+async def test_oversize_and_multipart_messages_do_not_get_through(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    async with bystanders(tmp_path, caplog) as world:
+        keys = load_secret(world.lab.directory / "robot2.key")
+        async with Stranger(world.lab, keys) as stranger:
+            await stranger.send(*oversize())
+            await stranger.cut()
+        async with Stranger(world.lab, keys) as stranger:
+            await stranger.send(*[hello("robot2")] * 20)
+            await world.refused("multipart")
+            assert stranger.received == []
+
+
+async def test_access_rules_hold_and_name_what_they_refuse(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    bag = write_bag(tmp_path / "run.bag", {"/mine": 20, "/secret": 20})
+    rules = [
+        {"client": "robot1", "publish": ["/{self}/mine"]},
+        {"client": "site", "subscribe": ["/robot1/mine"]},
+    ]
+    async with Lab(tmp_path, *CLIENTS) as lab:
+        relay = await lab.relay(lab.relay_file(access=rules))
+        site = await lab.connected(lab.recorder_file("site", "/robot1/.*", "/robot2/.*"))
+        robot = await lab.connected(lab.player_file("robot1", bag, play={"wait_for": ["/mine"]}))
+        await until(lambda: robot.bridge.refusals == 1)
+        await until(lambda: sum(c.delivered for c in site.core.received.topics.values()) == 20)
+        assert "the relay refuses /robot1/secret (forbidden): robot1 may not publish /robot1/secret" in caplog.text
+        assert relay.refusals == {"forbidden": 1}
+        await lab.end(robot)
+        summary = json.loads((tmp_path / "robot1.summary.json").read_text())["topics"]
+        assert summary["/robot1/secret"]["delivered"] == 0
+        # Somebody whom no rule names may connect, and do nothing.
+        other = await lab.connected(lab.player_file("robot2", bag, play={"wait_for": []}))
+        await until(lambda: other.bridge.refusals == 2)
+        for daemon in (other, site, relay):
+            await lab.end(daemon)
+    assert set(bodies(tmp_path / "site.bag")) == {"/robot1/mine"}
+
+
+async def test_a_second_owner_of_a_global_name_is_refused_by_name(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    bag = write_bag(tmp_path / "run.bag", {"/odom": 20})
+    everywhere = {"client": {"namespace": "/"}}
+    async with Lab(tmp_path, *CLIENTS) as lab:
+        relay = await lab.relay()
+        site = await lab.connected(lab.recorder_file("site", "/.*"))
+        first = await lab.connected(lab.player_file("robot1", bag, **everywhere))
+        await until(lambda: sum(c.delivered for c in site.core.received.topics.values()) == 20)
+        second = await lab.connected(lab.player_file("robot2", bag, play={"wait_for": []}, **everywhere))
+        await until(lambda: second.bridge.refusals == 1)
+        [line] = [m for m in caplog.messages if m.startswith("the relay refuses /odom")]
+        assert "robot1" in line
+        for daemon in (second, first, site, relay):
+            await lab.end(daemon)
+    assert bodies(tmp_path / "site.bag") == bodies(bag)
+
+
+async def test_a_revoked_key_is_cut_off_both_ways_and_comes_back_when_allowed(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    async with bystanders(tmp_path, caplog) as world:
+        lab, relay = world.lab, world.relay
+        assert relay.server is not None and relay.zap is not None
+        bag = write_bag(tmp_path / "other.bag", {"/count": 500})
+        loop: dict[str, Any] = {"rate": 1, "loop": True}
+        config = lab.player_file("robot2", bag, play=loop, subscribe=["/robot1/.*"])
+        content = json.loads(config.read_text())
+        content["endpoint"] = [content["endpoint"], {"kind": "record", "path": "robot2"}]
+        config.write_text(json.dumps(content))
+        relay.hub.tap = lambda _stream: True
+        second = await lab.connected(config)
+        heard, topic = relay.hub.received.topics, TopicName("/robot2/count")
+        await until(lambda: topic in heard and heard[topic].delivered > 50)
+        await until(lambda: second.core.received.topics)
+
+        key = lab.clients_dir / "robot2.pub"
+        away = key.rename(tmp_path / "robot2.pub")
+        relay.reload()
+        assert [s.port.client for s in relay.server._sessions.values() if s.port.client == "robot2"] == []
+        before = heard[topic].delivered
+        await until(lambda: "refused our key" in second.reason)
+        refused = relay.zap.counters.unknown_key
+        assert refused > 0
+        taken = sum(c.delivered for c in second.core.received.topics.values())
+        await world.go_on()
+        assert heard[topic].delivered == before
+        assert sum(c.delivered for c in second.core.received.topics.values()) == taken
+        assert not second.core.link.established
+
+        shutil.copy(away, key)
+        relay.reload()
+        await until(lambda: second.core.link.established, "robot2 is back by itself")
+        await until(lambda: heard[topic].delivered > before)
+        # It is stopped after the robot, which would wait for its confirmations.
+
+
+async def test_a_rotated_key_ends_the_connections_of_the_old_one(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    async with Lab(tmp_path, *CLIENTS) as lab:
+        relay = await lab.relay()
+        robot = await lab.connected(lab.client_file("robot1", DEAD_ENDS))
+        lab.make_keys("robot1")  # the new pair is at the relay; the client runs with the old one
+        relay.reload()
+        await until(lambda: "refused our key" in robot.reason)
+        assert "robot1 lost a key; 1 connections cut" in caplog.text
+        await lab.end(robot)
+        robot = await lab.connected(tmp_path / "robot1.yaml")
+        await lab.end(robot)
+        await lab.end(relay)
+
+
+async def test_a_bad_file_at_reload_keeps_the_old_rules(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    async with bystanders(tmp_path, caplog) as world:
+        config, good = world.relay.loaded.path, world.relay.loaded.path.read_text()
+        config.write_text("relay: [")
+        world.relay.reload()
+        config.write_text(good.replace(json.dumps(ALLOW_ALL[0]["client"]), '"*"'))
+        world.relay.reload()
+        assert world.relay.reloads_failed == 2
+        told = [m for m in caplog.messages if m.startswith("reload failed, the old configuration stays: ")]
+        assert len(told) == 2
+        assert all(str(config) in message for message in told)
+        config.write_text(good)
+        (world.lab.clients_dir / "robot2.pub").write_text("nonsense")
+        world.relay.reload()
+        assert world.relay.reloads_failed == 3
+        await world.go_on()
+
+
+async def test_a_rule_taken_away_ends_the_stream_and_given_back_restores_it(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    bag = write_bag(tmp_path / "run.bag", {"/count": 500})
+    async with Lab(tmp_path, *CLIENTS) as lab:
+        relay = await lab.relay()
+        site = await lab.connected(lab.recorder_file("site", "/robot1/.*"))
+        robot = await lab.connected(lab.player_file("robot1", bag, play={"rate": 1, "loop": True}))
+        counters = site.core.received.topics
+        await until(lambda: counters and next(iter(counters.values())).delivered > 10)
+        lab.relay_file(access=[{"client": "site", "subscribe": [".*"]}], http={"listen": None})
+        relay.reload()
+        await until(lambda: robot.bridge.refusals == 1)
+        assert "robot1 may no longer publish /robot1/count: the access rules have changed" in caplog.text
+        assert robot.core.link.established and site.core.link.established
+        for daemon in (robot, site, relay):
+            await lab.end(daemon)
+
+
+async def test_half_open_connections_are_bounded(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    async with bystanders(tmp_path, caplog) as world:
+        server = world.relay.server
+        assert server is not None
+        connections = [socketlib.create_connection((HOST, world.lab.port)) for _ in range(100)]
+        try:
+            await world.refused("capped")
+            await until(lambda: server.connections.half_open <= server.connections.max_half_open_per_source)
+            await world.go_on()
+        finally:
+            for connection in connections:
+                connection.close()
