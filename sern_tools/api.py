@@ -62,8 +62,9 @@ def get_json(api: str, path: str, *, timeout_s: float = TIMEOUT_S) -> Any:
 
 
 def is_stream(item: Mapping[str, Any]) -> bool:
-    """Whether this element of /api/objects stands for a topic of one publisher (and not for one transform, or a node)."""
-    return item["attributes"].keys() >= {"topic", "encoding"}
+    """Whether this element of /api/objects stands for a topic of one publisher, and not for a transform or a node."""
+    attributes: Mapping[str, str] = item["attributes"]
+    return "topic" in attributes and "encoding" in attributes
 
 
 def say(program: str, error: SernError) -> int:

@@ -10,7 +10,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
-from typing import Annotated, Any, Final
+from typing import Annotated, Any, Final, Literal, NamedTuple
 
 import typer
 from rich.console import Console
@@ -25,8 +25,6 @@ from sern_tools.api import DEFAULT_API, NotFoundError, checked_api, drop_output,
 MIN_INTERVAL_S: Final = 0.1
 PLAIN_WIDTH: Final = 200
 """Characters of a line where the output is no terminal: nothing is cut short in a file."""
-TYPE_WIDTH: Final = 150
-OWNER_WIDTH: Final = 110
 NOT_LOSSES: Final = frozenset({"duplicate"})
 """Reasons that do not mean that a message is missing."""
 
@@ -177,34 +175,45 @@ class Watcher:
         return rows
 
 
+class Column(NamedTuple):
+    """One column of the table, shown on terminals of at least `width` characters."""
+
+    label: str
+    cell: Callable[[Row], str]
+    width: int = 0
+    number: bool = True
+
+
+COLUMNS: Final = (
+    Column("topic", lambda row: row.topic, number=False),
+    Column("class", lambda row: row.priority, number=False),
+    Column("type", lambda row: row.type_name or "", 150, number=False),
+    Column("owner", lambda row: row.owner or "", 110, number=False),
+    Column("in Hz", lambda row: f"{row.in_hz:.1f}" if row.in_hz else ""),
+    Column("out Hz", lambda row: f"{row.out_hz:.1f}" if row.out_hz else ""),
+    Column("in B/s", lambda row: si(row.in_bytes_per_s), 100),
+    Column("out B/s", lambda row: si(row.out_bytes_per_s), 100),
+    Column("age s", lambda row: "" if row.age_s is None else f"{row.age_s:.{3 if row.age_s < 10 else 0}f}"),
+    Column("subs", lambda row: str(row.takers or ""), 100),
+    Column("queued", lambda row: str(row.queued or ""), 100),
+    Column("drops", lambda row: str(row.dropped or "")),
+    Column("why", lambda row: _why(row), 100, number=False),
+)
+
+
+def _why(row: Row) -> str:
+    return " ".join(f"{reason} {count}" for reason, count in list(row.dropped_by_reason.items())[:3])
+
+
 def table(rows: list[Row], width: int = PLAIN_WIDTH) -> Table:
     """For a terminal of so many characters: what there is no room for is left out."""
-    known = any(row.owner for row in rows)
-    with_type, with_owner = known and width >= TYPE_WIDTH, known and width >= OWNER_WIDTH
     result = Table(box=None, pad_edge=False)
-    for label in ("topic", "class", *(("type",) if with_type else ()), *(("owner",) if with_owner else ())):
-        result.add_column(label, no_wrap=True, overflow="ellipsis")
-    for label in ("in Hz", "out Hz", "in B/s", "out B/s", "age s", "subs", "queued", "drops"):
-        result.add_column(label, no_wrap=True, justify="right")
-    result.add_column("why", no_wrap=True, overflow="ellipsis")
+    columns = [column for column in COLUMNS if width >= column.width]
+    for column in columns:
+        justify: Literal["right", "left"] = "right" if column.number else "left"
+        result.add_column(column.label, no_wrap=True, justify=justify)
     for row in rows:
-        why = " ".join(f"{reason} {count}" for reason, count in list(row.dropped_by_reason.items())[:3])
-        cells = (
-            row.topic,
-            row.priority,
-            *((row.type_name or "",) if with_type else ()),
-            *((row.owner or "",) if with_owner else ()),
-            f"{row.in_hz:.1f}" if row.in_hz else "",
-            f"{row.out_hz:.1f}" if row.out_hz else "",
-            si(row.in_bytes_per_s),
-            si(row.out_bytes_per_s),
-            "" if row.age_s is None else f"{row.age_s:.3f}" if row.age_s < 10 else f"{row.age_s:.0f}",
-            str(row.takers) if row.takers else "",
-            str(row.queued) if row.queued else "",
-            str(row.dropped) if row.dropped else "",
-            why,
-        )
-        result.add_row(*(Text(cell) for cell in cells))
+        result.add_row(*(Text(column.cell(row)) for column in columns))
     return result
 
 

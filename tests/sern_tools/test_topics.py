@@ -1,0 +1,245 @@
+"""`sern topics`: counters become rates, a relay and a client are told apart, and what is wrong is one line."""
+
+import json
+import re
+import socket
+import threading
+from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, HTTPServer
+from io import StringIO
+from pathlib import Path
+from typing import Any
+
+import pytest
+from rich.console import Console
+from typer.testing import CliRunner
+
+from sern_core.errors import SernError, UsageError
+from sern_tools import api
+from sern_tools.cli import app
+from sern_tools.topics import Counts, Row, Watcher, compare, parse_identities, parse_topics, run_topics, si, table
+from tests.daemons import Lab, in_thread, write_bag
+
+URL = "http://daemon"
+
+
+def sent(delivered: int, **fields: Any) -> dict[str, Any]:
+    row = {"class": "state", "direction": "send", "wanted": True, "offered": 99, "delivered": delivered, "dropped": {}}
+    return row | {"bytes_delivered": 10 * delivered, "in_queue": 0, "in_flight": 0} | fields
+
+
+def arrived(delivered: int, **fields: Any) -> dict[str, Any]:
+    row = {"class": "state", "direction": "receive", "delivered": delivered, "bytes_delivered": 10 * delivered}
+    return row | {"dropped": {}, "age_s": 0.25} | fields
+
+
+def relay_view(factor: int) -> dict[str, Any]:
+    return {
+        "links": {
+            "site1": {"/r/odom": sent(8 * factor, dropped={"superseded": 2, "duplicate": 5})},
+            "site2": {"/r/odom": sent(2 * factor, wanted=False, in_queue=3, in_flight=1, dropped={"lifespan": 1})},
+        },
+        "received": {"/r/odom": arrived(10 * factor), "/r/cmd_vel": arrived(factor, **{"class": "control"})},
+    }
+
+
+OBJECTS = {
+    "objects": [
+        {"owner": "r", "type": "nav_msgs/msg/Odometry", "attributes": {"topic": "/r/odom", "encoding": "ros1"}},
+        {"owner": "r", "type": "geometry_msgs/msg/TransformStamped", "attributes": {"topic": "/tf"}},
+        {"owner": "r", "type": "tf2_msgs/msg/TFMessage", "attributes": {"topic": "/tf", "encoding": "ros1"}},
+        {"owner": "s", "type": "tf2_msgs/msg/TFMessage", "attributes": {"topic": "/tf", "encoding": "ros1"}},
+        {"owner": "r", "type": "sern/client", "attributes": {"namespace": "/r"}},
+    ]
+}
+
+
+def test_a_relay_has_the_sum_of_its_links() -> None:
+    odom = parse_topics(relay_view(1))["/r/odom"]
+    assert (odom.received, odom.delivered, odom.queued, odom.takers, odom.age_s) == (10, 10, 4, 1, 0.25)
+    assert odom.reasons == {"superseded": 2, "lifespan": 1}  # a duplicate is no loss
+
+
+def test_a_client_has_one_flat_table() -> None:
+    topics = parse_topics({"/r/odom": sent(4), "/r/cmd_vel": arrived(3)})
+    assert (topics["/r/odom"].delivered, topics["/r/cmd_vel"].received) == (4, 3)
+    assert parse_topics({}) == {}
+
+
+def test_owners_come_from_streams_alone() -> None:
+    found = parse_identities(OBJECTS)
+    assert (found["/r/odom"].owner, found["/tf"].owner, found["/tf"].type_name) == (
+        "r",
+        "r,s",
+        "tf2_msgs/msg/TFMessage",
+    )
+
+
+def test_rates_are_over_the_interval_and_urgent_topics_first() -> None:
+    before, now = parse_topics(relay_view(1)), parse_topics(relay_view(3))
+    rows = compare(before, now, 2.0, parse_identities(OBJECTS))
+    assert [row.topic for row in rows] == ["/r/cmd_vel", "/r/odom"]
+    odom = rows[1]
+    assert (odom.in_hz, odom.out_hz, odom.in_bytes_per_s, odom.dropped) == (10.0, 10.0, 100.0, 3)
+    assert (odom.owner, rows[0].owner) == ("r", None)
+
+
+def test_a_topic_that_began_anew_counts_from_nothing() -> None:
+    row = compare({"/a": Counts("bulk", received=100)}, {"/a": Counts("bulk", received=3)}, 1.0, {})[0]
+    assert row.in_hz == 3.0
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (0.0, ""),
+        (7, "7"),
+        (999, "999"),
+        (1000, "1.0k"),
+        (99_940, "99.9k"),
+        (123_456, "123k"),
+        (2.5e6, "2.5M"),
+        (4e12, "4000G"),
+    ],
+)
+def test_sizes(value: float, text: str) -> None:
+    assert si(value) == text
+
+
+def test_the_registry_is_read_when_a_name_is_new() -> None:
+    asked: list[str] = []
+
+    def get(_api: str, path: str) -> Any:
+        asked.append(path)
+        return OBJECTS if path == "/api/objects" else {"links": {}, "received": {"/r/odom": arrived(1)}}
+
+    clock = iter((0.0, 1.0, 2.0))
+    watcher = Watcher(URL, re.compile("/r/.*"), get=get, clock=lambda: next(clock))
+    assert watcher.rows()[0].owner == "r"
+    assert watcher.rows()[0].owner == "r"
+    assert asked.count("/api/objects") == 1
+
+
+def text_of(rows: list[Row], width: int) -> str:
+    out = StringIO()
+    Console(file=out, width=width).print(table(rows, width))
+    return out.getvalue()
+
+
+def test_a_narrow_terminal_keeps_what_matters_most() -> None:
+    rows = compare({}, parse_topics(relay_view(1)), 1.0, parse_identities(OBJECTS))
+    wide, middle, narrow = (text_of(rows, width) for width in (200, 120, 80))
+    assert "nav_msgs/msg/Odometry" in wide
+    assert "superseded 2 lifespan 1" in wide
+    assert "Odometry" not in middle
+    assert "owner" in middle
+    assert "owner" not in narrow
+    assert "superseded" not in narrow
+    assert narrow.splitlines()[1].split() == ["/r/cmd_vel", "control", "1.0", "0.250"]
+
+
+class Stub(BaseHTTPRequestHandler):
+    def do_GET(self) -> None:
+        body = {"/api/bad": b"<html>", "/api/empty": b"{}"}.get(self.path)
+        self.send_response(200 if body is not None else 500 if self.path == "/api/broken" else 404)
+        self.end_headers()
+        self.wfile.write(body or b"")
+
+    def log_message(self, *_: object) -> None:
+        """Say nothing."""
+
+
+@pytest.fixture
+def stub() -> Iterator[str]:
+    with HTTPServer(("127.0.0.1", 0), Stub) as server:
+        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
+        thread.start()
+        yield f"http://127.0.0.1:{server.server_port}"
+        server.shutdown()
+        thread.join()
+
+
+def test_what_a_daemon_may_answer(stub: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("http_proxy", "http://127.0.0.1:1")  # a proxy for the outside is not asked
+    assert api.get_json(stub, "/api/empty") == {}
+    for path, error, words in (
+        ("/api/missing", api.NotFoundError, "another kind of daemon"),
+        ("/api/broken", SernError, "HTTP status 500; see the daemon's log"),
+        ("/api/bad", SernError, "the answer is not JSON"),
+    ):
+        with pytest.raises(error, match=words):
+            api.get_json(stub, path)
+
+
+@pytest.mark.parametrize("text", ["127.0.0.1:5580", "ftp://host", "http://", "http://host:x", "http://host:99999"])
+def test_an_address_must_be_one(text: str) -> None:
+    with pytest.raises(UsageError, match="write it like http://127"):
+        api.checked_api(text)
+
+
+def free_port() -> int:
+    with socket.socket() as sock:
+        sock.bind(("127.0.0.1", 0))
+        return int(sock.getsockname()[1])
+
+
+def test_exit_codes() -> None:
+    runner = CliRunner()
+    nobody = runner.invoke(app, ["topics", "--api", f"http://127.0.0.1:{free_port()}"])
+    assert nobody.exit_code == 1
+    assert nobody.stderr.count("\n") == 1
+    assert "is the daemon running" in nobody.stderr
+    assert runner.invoke(app, ["topics", "--api", "nonsense"]).exit_code == 2
+    assert runner.invoke(app, ["topics", "(", "--api", URL]).exit_code == 2
+
+
+async def test_a_real_relay_and_its_client(tmp_path: Path) -> None:
+    async with Lab(tmp_path, "robot1", "site") as lab:
+        relay = lab.process(lab.relay_file())
+        site = lab.process(lab.recorder_file("site", "/robot1/.*"))
+        bag = write_bag(tmp_path / "a.bag", {"/text": 20})
+        robot = lab.process(lab.player_file("robot1", bag, play={"rate": 1.0, "loop": True}))
+        for process in (relay, robot, site):
+            await process.ready()
+        await relay.until(lambda: relay.json("/api/topics")["received"].get("/robot1/text"), "has the topic")
+
+        def listed(port: int, *, pattern: str | None = None) -> Any:
+            out = StringIO()
+            url = f"http://127.0.0.1:{port}"
+            options = {"watch": False, "as_json": True, "interval_s": 0.2}
+            run_topics(url, pattern, **options, out=Console(file=out))  # type: ignore[arg-type]
+            return json.loads(out.getvalue())
+
+        rows = await in_thread(lambda: listed(relay.port))
+        assert [(row["topic"], row["owner"], row["priority"]) for row in rows] == [("/robot1/text", "robot1", "state")]
+        assert rows[0]["type_name"] == "std_msgs/msg/String"
+        assert rows[0]["takers"] == 1
+        assert [row["topic"] for row in await in_thread(lambda: listed(site.port))] == ["/robot1/text"]
+        assert await in_thread(lambda: listed(robot.port, pattern="/none")) == []
+
+
+def test_watching_ends_when_the_daemon_does() -> None:
+    out = StringIO()
+    looks = iter(range(3))
+
+    def pause(_interval_s: float) -> None:
+        if next(looks) == 2:
+            raise KeyboardInterrupt
+
+    with HTTPServer(("127.0.0.1", 0), Listing) as server:
+        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
+        thread.start()
+        url = f"http://127.0.0.1:{server.server_port}"
+        with pytest.raises(KeyboardInterrupt):
+            run_topics(url, None, watch=True, as_json=True, interval_s=0.1, out=Console(file=out), pause=pause)
+        server.shutdown()
+        thread.join()
+    assert [json.loads(line)[0]["topic"] for line in out.getvalue().splitlines()] == ["/a", "/a"]
+
+
+class Listing(Stub):
+    def do_GET(self) -> None:
+        found = self.path == "/api/topics"
+        self.send_response(200 if found else 404)
+        self.end_headers()
+        self.wfile.write(json.dumps({"/a": sent(1)}).encode() if found else b"")
