@@ -1,0 +1,107 @@
+"""Everything that moves through a relay is an object: all five kinds, with their parameters over HTTP."""
+
+import base64
+import json
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlencode
+
+import aiohttp
+import pytest
+
+from sern_core.types import ObjectKind
+from sern_relay.daemon import RelayDaemon
+from tests.daemons import Lab
+from tests.support import until
+
+
+async def ask(relay: RelayDaemon, **parameters: object) -> tuple[int, Any]:
+    url = f"http://{relay.loaded.model.http.listen}/api/objects?{urlencode(parameters)}"
+    async with aiohttp.ClientSession() as session, session.get(url) as answer:
+        return answer.status, json.loads(await answer.text(), parse_constant=pytest.fail)
+
+
+def kinds(relay: RelayDaemon, kind: ObjectKind) -> list[str]:
+    return [item.id for item in relay.hub.objects.select(kind=kind)]
+
+
+def has_value(relay: RelayDaemon, object_id: str) -> bool:
+    found = relay.hub.objects.get(object_id)
+    return found is not None and found.value_bytes > 0
+
+
+async def test_the_five_kinds_of_object(tmp_path: Path) -> None:
+    async with Lab(tmp_path, "jackal1", "operator1") as lab:
+        relay = await lab.relay()
+        topics = ["/odometry/filtered", "/tf", "/tf_static", "/map_updates"]
+        robot_endpoint = {"kind": "synthetic", "role": "robot", "topics": topics, "cloud_rate_hz": 0}
+        command = {"match": "/cmd_vel", "class": "control", "direction": "receive"}
+        robot = await lab.connected(lab.client_file("jackal1", robot_endpoint, topics=[command]))
+        operator = {"kind": "synthetic", "role": "operator", "command_topic": "/jackal1/cmd_vel"}
+        await lab.connected(
+            lab.client_file(
+                "operator1",
+                operator,
+                client={"namespace": "/"},
+                subscribe=["/jackal1/.*"],
+                topics=[{"match": "/jackal1/cmd_vel", "class": "control"}],
+            )
+        )
+        expected = {
+            ObjectKind.TOPIC: "/jackal1/odometry/filtered@jackal1",
+            ObjectKind.TRANSFORM: "tf:odom>base_link@jackal1",
+            ObjectKind.NODE: "node:jackal1",
+            ObjectKind.PATCH: "/jackal1/map_updates@jackal1",
+            ObjectKind.COMMAND: "/jackal1/cmd_vel@operator1",
+        }
+        for kind, object_id in expected.items():
+            await until(lambda k=kind, i=object_id: i in kinds(relay, k), f"{object_id} among {kind}")  # type: ignore[misc]
+        for object_id in (expected[ObjectKind.TOPIC], expected[ObjectKind.COMMAND], expected[ObjectKind.TRANSFORM]):
+            await until(lambda i=object_id: has_value(relay, i), f"{object_id} has a value")  # type: ignore[misc]
+
+        status, everything = await ask(relay, definitions="no")
+        assert status == 200
+        assert {item["kind"] for item in everything["objects"]} == set(ObjectKind)
+        assert all("definition" not in item for item in everything["objects"])
+
+        status, transforms = await ask(relay, kind="transform", owner="jackal1")
+        assert status == 200
+        assert {item["kind"] for item in transforms["objects"]} == {"transform"}
+        pair = next(item for item in transforms["objects"] if item["id"] == expected[ObjectKind.TRANSFORM])
+        assert (pair["attributes"]["parent"], pair["attributes"]["child"]) == ("odom", "base_link")
+        assert len(json.loads(base64.b64decode(pair["value"]["base64"]))["rotation"]) == 4
+        static = [item for item in transforms["objects"] if item["attributes"].get("static") == "true"]
+        assert static
+
+        assert (await ask(relay, owner="operator1", kind="transform"))[1]["objects"] == []
+
+        # What changes is listed once, and what is gone by its id.
+        first = (await ask(relay, since=0))[1]
+        assert len(first["objects"]) == len(relay.hub.objects)
+        await lab.drop(robot)
+        away = relay.hub.links[robot.core.name]
+        await until(lambda: not away.established, "the relay has noticed")
+        relay.hub.sweep(now=away.now + 10_000)
+        status, changes = await ask(relay, since=first["version"], epoch=first["epoch"], kind="node")
+        assert status == 200
+        assert changes["resync"] is False
+        assert {expected[ObjectKind.TRANSFORM], "node:jackal1"} <= set(changes["deleted"])
+        assert kinds(relay, ObjectKind.TRANSFORM) == []
+        assert (await ask(relay, since=1, epoch=first["epoch"] + 1))[1]["resync"] is True
+
+
+@pytest.mark.parametrize(
+    ("parameters", "said"),
+    [
+        ({"kind": "thing"}, "kind is 'thing'; accepted: topic, transform, node, patch, command"),
+        ({"kin": "node"}, "unknown parameter 'kin'; accepted: kind, owner, definitions, since, epoch"),
+        ({"since": "x"}, "since is 'x'; a version or epoch of an earlier answer is needed"),
+        ({"since": "-1"}, "since is '-1'; a version or epoch of an earlier answer is needed"),
+        ({"epoch": "1"}, "epoch has no use without since"),
+        ({"definitions": "maybe"}, "definitions is 'maybe'; accepted: yes, no"),
+    ],
+)
+async def test_a_wrong_question_is_answered_in_one_line(tmp_path: Path, parameters: dict[str, str], said: str) -> None:
+    async with Lab(tmp_path) as lab:
+        relay = await lab.relay()
+        assert await ask(relay, **parameters) == (400, {"error": said})
