@@ -1,0 +1,103 @@
+"""Senders and receivers of known traffic, on both sides of a lab at once: sockets of this process in its namespaces.
+
+Arrival times are the kernel's, so that they do not depend on when this process is scheduled.
+"""
+
+import socket
+import struct
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Final
+
+from sern_tools.lab.lab import Node
+
+HEADERS_BYTES: Final = 42
+"""Ethernet, IPv4 and UDP: what netem counts beside the payload of a datagram."""
+PORT: Final = 9000
+_TIMESTAMPNS: Final = 35
+_RCVBUFFORCE: Final = 33
+_BUFFER_BYTES: Final = 2**23
+_QUIET_S: Final = 0.4
+
+
+@dataclass(frozen=True)
+class Arrival:
+    number: int
+    sent_s: float
+    at_s: float
+
+    @property
+    def delay_s(self) -> float:
+        return self.at_s - self.sent_s
+
+
+@contextmanager
+def _pair(source: Node, target: Node) -> Iterator[tuple[socket.socket, socket.socket]]:
+    with source.socket() as sender, target.socket() as receiver:
+        receiver.setsockopt(socket.SOL_SOCKET, _TIMESTAMPNS, 1)
+        receiver.setsockopt(socket.SOL_SOCKET, _RCVBUFFORCE, _BUFFER_BYTES)
+        receiver.bind((target.address, PORT))
+        sender.connect((target.address, PORT))
+        yield sender, receiver
+
+
+def datagrams(
+    source: Node, target: Node, count: int, *, size_bytes: int = 100, gap_s: float = 0.0, quiet_s: float = _QUIET_S
+) -> list[Arrival]:
+    """Send `count` numbered datagrams, `gap_s` apart; those that have arrived when none came for `quiet_s`."""
+    with _pair(source, target) as (sender, receiver):
+        began_s = time.monotonic()
+        for number in range(count):
+            # Busy waiting, because sleeping is too coarse for some thousand a second.
+            while gap_s and time.monotonic() < began_s + number * gap_s:
+                time.sleep(gap_s / 4)
+            sender.send(struct.pack("Id", number, time.time()).ljust(size_bytes, b"\0"))
+        receiver.settimeout(quiet_s)
+        arrivals: list[Arrival] = []
+        while True:
+            try:
+                data, control, _, _ = receiver.recvmsg(2048, 128)
+            except TimeoutError:
+                return arrivals
+            number, sent_s = struct.unpack_from("Id", data)
+            seconds, nanoseconds = struct.unpack("qq", control[0][2])
+            arrivals.append(Arrival(number, sent_s, seconds + nanoseconds / 1e9))
+
+
+def rate_bps(arrivals: list[Arrival], size_bytes: int) -> float:
+    """The rate at which datagrams have left the link, headers included."""
+    span_s = arrivals[-1].at_s - arrivals[0].at_s
+    return (len(arrivals) - 1) * 8 * (size_bytes + HEADERS_BYTES) / span_s
+
+
+def reaches(source: Node, target: Node, *, within_s: float = 0.5) -> bool:
+    """Whether one datagram gets through."""
+    return bool(datagrams(source, target, 1, quiet_s=within_s))
+
+
+def stream(source: Node, target: Node, count_bytes: int) -> float:
+    """Carry bytes over one TCP connection; how long it took from the first byte to the last."""
+    with target.socket(socket.SOCK_STREAM) as listener, source.socket(socket.SOCK_STREAM) as sender:
+        listener.bind((target.address, PORT))
+        listener.listen()
+        listener.settimeout(20)
+        sender.settimeout(20)
+        sender.connect((target.address, PORT))
+        connection, _ = listener.accept()
+        thread = threading.Thread(target=sender.sendall, args=(bytes(count_bytes),))
+        thread.start()
+        try:
+            with connection:
+                connection.settimeout(20)
+                left = count_bytes - len(connection.recv(1))
+                began_s = time.monotonic()
+                while left:
+                    chunk = connection.recv(min(left, 65536))
+                    assert chunk, "the connection ended early"
+                    left -= len(chunk)
+                return time.monotonic() - began_s
+        finally:
+            thread.join()
