@@ -7,6 +7,10 @@ capacity in bits per second (None while unknown) and whether the path has stalle
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from typing import Final
+
+PACING_BURST_S: Final = 0.001
+"""What is due within this time may leave at once: timers are no finer."""
 
 
 @dataclass(slots=True)
@@ -20,6 +24,8 @@ class AckSample:
     receiver_s: float  # the receiver's clock when the newest acknowledged packet arrived
     cum_bytes: int  # bytes the receiver has got in all by then
     app_limited: bool  # the sender had nothing to send when that packet left
+    sent_s: float | None = None  # our clock when it left; with it the queue is told from forward delay alone
+    packet_bytes: int = 0  # its size, 0 when unknown: what it took to serialise is no queue
 
 
 class CapacityEstimator(ABC):
@@ -39,6 +45,11 @@ class CapacityEstimator(ABC):
     @abstractmethod
     def rtprop_s(self) -> float | None:
         """Round-trip time of the empty path; None while unknown."""
+
+    @property
+    def pacing_bps(self) -> float | None:
+        """How fast to send while the window is open; None: at once."""
+        return None
 
     @abstractmethod
     def on_sent(self, *, now: float, nbytes: int, inflight_bytes: int) -> None:
@@ -61,3 +72,22 @@ class CapacityEstimator(ABC):
     def snapshot(self) -> dict[str, float | None]:
         """State for /api/link and the metrics."""
         return {"window_bytes": self.window_bytes, "rate_bps": self.rate_bps, "rtprop_s": self.rtprop_s}
+
+
+class Pacer:
+    """Spreads what the window allows over time. Class 0 does not wait for it, but counts."""
+
+    __slots__ = ("due_s",)
+
+    def __init__(self) -> None:
+        self.due_s = 0.0
+        """When the next datagram may leave."""
+
+    def ready(self, now: float) -> bool:
+        return now >= self.due_s - PACING_BURST_S
+
+    def sent(self, *, now: float, nbytes: int, pacing_bps: float | None) -> None:
+        """`nbytes` left. Time that was not used is not saved up."""
+        if pacing_bps is not None:
+            start_s = self.due_s if self.due_s > now else now
+            self.due_s = start_s + 8 * nbytes / pacing_bps
