@@ -4,7 +4,6 @@
 Whatever it started, it ends: processes get SIGTERM and must exit 0, and are killed when the test has failed.
 """
 
-import asyncio
 import http.client
 import json
 import os
@@ -12,9 +11,8 @@ import signal
 import socket
 import subprocess
 import sys
-import threading
 from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, Self, cast
@@ -328,10 +326,12 @@ class Lab:
         await daemon.start()
         return daemon
 
-    async def client(self, config: Path) -> ClientDaemon:
-        """Start a client in this process."""
+    async def client(self, config: Path, prepare: Callable[[ClientDaemon], None] | None = None) -> ClientDaemon:
+        """Start a client in this process; `prepare` sees it before it starts."""
         daemon = ClientDaemon(load_client(config))
         self._here.append(daemon)
+        if prepare is not None:
+            prepare(daemon)
         await daemon.start()
         return daemon
 
@@ -366,29 +366,7 @@ def endpoint_of(daemon: ClientDaemon, kind: type[Any]) -> Any:
     return cast("Any", endpoint)
 
 
-async def in_thread(work: Any) -> Any:
-    """Run blocking work beside the loop, in a thread that ends with it."""
-    done = threading.Event()
-    result: list[Any] = []
-
-    def run() -> None:
-        try:
-            result.append(work())
-        finally:
-            done.set()
-
-    thread = threading.Thread(target=run)
-    thread.start()
-    await until(done.is_set, "the thread")
-    thread.join()
-    return result[0]
-
-
 def rss_bytes(process: Process) -> int:
     """Resident memory of a daemon's process."""
     pages = int(Path(f"/proc/{process.process.pid}/statm").read_text().split()[1])
     return pages * os.sysconf("SC_PAGE_SIZE")
-
-
-async def gather(*awaitables: Any) -> list[Any]:
-    return list(await asyncio.gather(*awaitables))
