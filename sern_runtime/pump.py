@@ -12,6 +12,8 @@ LANE_MESSAGE_BYTES: Final = 68 * 1024
 """The largest message a lane takes: the largest `fragment_bytes_max`, and what frames and CURVE put around it."""
 BURST: Final = 64
 """Datagrams sent in one go before others in the loop get their turn; about 1 ms of work."""
+BLOCKED_S: Final = 0.01
+"""While the lane is not ready, what the port has been due for must not turn the loop; `kick` follows when it is."""
 
 
 class Port(Protocol):
@@ -30,12 +32,25 @@ class Pump:
     Call `kick` after anything that may have given the port something to send: it costs one flag, and everything that
     happens before the loop comes round is sent together. `send` answers FULL when the socket cannot take more; `kick`
     again when it can. `on_gone` is called when the peer's connection is over.
+
+    A paced lane (UDP) says with `next_deadline` when its next datagram may leave. The timer wakes at whole
+    milliseconds, never early, and what has become due until then leaves as one burst: the core's pacing must grant what
+    was not used for at least that long. Give such a lane `ready`: it is asked before a datagram is taken, so that none
+    is held here, where it could no longer be overtaken, and its send stamp would grow old.
     """
 
-    def __init__(self, port: Port, send: Callable[[bytes], SendResult], *, on_gone: Callable[[], None]) -> None:
+    def __init__(
+        self,
+        port: Port,
+        send: Callable[[bytes], SendResult],
+        *,
+        on_gone: Callable[[], None],
+        ready: Callable[[], bool] | None = None,
+    ) -> None:
         self._port = port
         self._send = send
         self._on_gone = on_gone
+        self._ready = ready
         self._loop = asyncio.get_running_loop()
         self._timer = Timer(self._due)
         self._scheduled: asyncio.Handle | None = None
@@ -75,8 +90,13 @@ class Pump:
         if self._closed:
             return
         port = self._port
+        ready = self._ready
         now = time.monotonic()
+        earliest_s = now
         for _ in range(BURST):
+            if ready is not None and not ready():
+                earliest_s = now + BLOCKED_S
+                break
             datagram = self._held
             if datagram is None:
                 datagram = port.next_datagram(now=now)
@@ -97,4 +117,4 @@ class Pump:
         else:
             self.kick()
         deadline_s = port.next_deadline()
-        self._timer.arm(deadline_s if deadline_s is None else max(deadline_s, now))
+        self._timer.arm(deadline_s if deadline_s is None else max(deadline_s, earliest_s))
