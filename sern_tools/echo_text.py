@@ -7,6 +7,7 @@ from struct import error as StructError  # noqa: N812  (an exception, named like
 from typing import Any, Final
 
 import numpy as np
+from rosbags.typesys import TypesysError
 
 from sern_core.errors import ConfigError, SernError
 from sern_core.types import Encoding
@@ -15,6 +16,8 @@ from sern_runtime import ros_types
 MAX_ITEMS: Final = 32
 """Items of an array that are shown, without --full."""
 MAX_RAW_BYTES: Final = 256
+NOT_FIELDS: Final = frozenset({"__msgtype__", "structure_needs_at_least_one_member"})
+"""What rosbags adds: the name of the type, and what stands in for the fields of a type that has none."""
 
 
 def text_of(message: object, *, max_items: int | None = MAX_ITEMS) -> str:
@@ -25,8 +28,8 @@ def text_of(message: object, *, max_items: int | None = MAX_ITEMS) -> str:
 
 def _fields(value: Any, indent: str, max_items: int | None) -> Iterator[str]:
     for item in fields(value):
-        if item.name.startswith("__"):
-            continue  # rosbags keeps the type's name there
+        if item.name in NOT_FIELDS:
+            continue
         yield from _field(f"{indent}{item.name}:", getattr(value, item.name), indent, max_items)
 
 
@@ -103,7 +106,7 @@ class Decoder:
             name = ros_types.canonical(type_name)
             if definition:
                 ros_types.register(name, definition, encoding)
-            if ros_types.describe(name, encoding) is None:
+            if name not in ros_types.typestore(encoding).fielddefs:
                 raise ConfigError(f"type {name} is unknown here, and no definition came with the topic")
         except ConfigError as error:
             raise SernError(f"{topic} cannot be decoded: {error}; --raw prints the bytes") from None
@@ -113,7 +116,7 @@ class Decoder:
             return hex_text(body, max_bytes=self._max_bytes)
         try:
             message = ros_types.deserialise(body, ros_types.canonical(type_name), encoding)
-        except (ConfigError, ValueError, StructError) as error:
+        except (ConfigError, ValueError, KeyError, StructError, TypesysError) as error:
             text = ros_types.one_line(error)
             raise SernError(f"{topic} cannot be decoded: {text}; --raw prints the bytes") from None
         return text_of(message, max_items=self._max_items)

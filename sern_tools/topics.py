@@ -175,6 +175,10 @@ class Watcher:
         return rows
 
 
+def _why(row: Row) -> str:
+    return " ".join(f"{reason} {count}" for reason, count in list(row.dropped_by_reason.items())[:3])
+
+
 class Column(NamedTuple):
     """One column of the table, shown on terminals of at least `width` characters."""
 
@@ -197,12 +201,8 @@ COLUMNS: Final = (
     Column("subs", lambda row: str(row.takers or ""), 100),
     Column("queued", lambda row: str(row.queued or ""), 100),
     Column("drops", lambda row: str(row.dropped or "")),
-    Column("why", lambda row: _why(row), 100, number=False),
+    Column("why", _why, 100, number=False),
 )
-
-
-def _why(row: Row) -> str:
-    return " ".join(f"{reason} {count}" for reason, count in list(row.dropped_by_reason.items())[:3])
 
 
 def table(rows: list[Row], width: int = PLAIN_WIDTH) -> Table:
