@@ -18,7 +18,7 @@ from sern_core.errors import SernError, UsageError
 from sern_tools import api
 from sern_tools.cli import app
 from sern_tools.topics import Counts, Row, Watcher, compare, parse_identities, parse_topics, run_topics, si, table
-from tests.daemons import Lab, in_thread, write_bag
+from tests.daemons import Lab, write_bag
 
 URL = "http://daemon"
 
@@ -210,12 +210,12 @@ async def test_a_real_relay_and_its_client(tmp_path: Path) -> None:
             run_topics(url, pattern, **options, out=Console(file=out))  # type: ignore[arg-type]
             return json.loads(out.getvalue())
 
-        rows = await in_thread(lambda: listed(relay.port))
+        rows = listed(relay.port)
         assert [(row["topic"], row["owner"], row["priority"]) for row in rows] == [("/robot1/text", "robot1", "state")]
         assert rows[0]["type_name"] == "std_msgs/msg/String"
         assert rows[0]["takers"] == 1
-        assert [row["topic"] for row in await in_thread(lambda: listed(site.port))] == ["/robot1/text"]
-        assert await in_thread(lambda: listed(robot.port, pattern="/none")) == []
+        assert [row["topic"] for row in listed(site.port)] == ["/robot1/text"]
+        assert listed(robot.port, pattern="/none") == []
 
 
 def test_watching_ends_when_the_daemon_does() -> None:
