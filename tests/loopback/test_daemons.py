@@ -1,50 +1,220 @@
-"""Recordings through a relay and its clients as their user runs them: byte for byte, in order, and everything counted."""
+"""Recordings through a relay and its clients as their user runs them: byte for byte, in order, everything counted."""
 
+import json
+import os
+import signal
+import socket
 from pathlib import Path
+from typing import Any
 
 import pytest
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_typestore
 
-from sern_client.endpoints.record import RecordEndpoint
-from tests.daemons import START_NS, Lab, Process, balance, bodies, endpoint_of, recording, under, write_bag
+from sern_client.daemon import ClientDaemon
+from tests.daemons import START_NS, Lab, Process, balance, bodies, recording, rss_bytes, under, write_bag
 from tests.support import until
 
+HUSKY, JACKAL = "husky_gps_imu_odom.bag", "jackal_imu_odom.bag"
 
-def written(site: Process, name: str, count: int) -> bool:
-    """Whether a site has been delivered `count` messages."""
+
+def arrived(site: Process) -> int:
+    """How many messages a site in its own process has been delivered."""
     topics = site.json("/api/topics")
-    return count <= sum(int(topic["delivered"]) for topic in topics.values() if topic["direction"] == "receive")
+    return sum(int(topic["delivered"]) for topic in topics.values() if topic["direction"] == "receive")
 
 
-async def carried(lab: Lab, players: dict[str, Path], site: Process) -> None:
-    """Play bags, each from a robot of its name, until the site has everything; then stop everybody in order."""
-    count = sum(len(texts) for bag in players.values() for texts in bodies(bag).values())
-    robots = [lab.process(lab.player_file(name, bag)) for name, bag in players.items()]
-    await site.until(lambda: written(site, site.name, count), f"has {count} messages")
-    for robot in robots:
-        await robot.stop()
-        summary = robot.summary()["topics"]
-        assert balance(summary) == []
-        assert sum(topic["delivered"] for topic in summary.values()) == sum(map(len, bodies(players[robot.name]).values()))
-    await site.stop()
+def count(site: ClientDaemon) -> int:
+    return sum(counters.delivered for counters in site.core.received.topics.values())
+
+
+def size(content: dict[str, list[bytes]]) -> int:
+    return sum(map(len, content.values()))
 
 
 @pytest.mark.parametrize(
-    "bag_of", [{"husky": "husky_gps_imu_odom.bag"}, {"jackal": "jackal_imu_odom.bag"},
-               {"husky": "husky_gps_imu_odom.bag", "jackal": "jackal_imu_odom.bag"}, {}],
-    ids=["husky", "jackal", "both", "generated"],
-)  # fmt: skip
-async def test_recordings_arrive_byte_for_byte_and_in_order(tmp_path: Path, bag_of: dict[str, str]) -> None:
-    bags = {name: recording(file) for name, file in bag_of.items()}
+    "files",
+    [{"husky": HUSKY}, {"husky": HUSKY, "jackal": JACKAL}, {}],
+    ids=["husky", "husky and jackal", "generated"],
+)
+async def test_recordings_arrive_byte_for_byte_and_in_order(tmp_path: Path, files: dict[str, str]) -> None:
+    bags = {name: recording(file) for name, file in files.items()}
     bags = bags or {"robot1": write_bag(tmp_path / "run.bag", {"/chat": 500, "/log": 300, "/map": 1}, latched=["/map"])}
+    contents = {name: bodies(bag) for name, bag in bags.items()}
     async with Lab(tmp_path, *bags, "site") as lab:
         relay = await lab.process(lab.relay_file()).ready()
         site = await lab.process(lab.recorder_file("site", "/.*")).ready()
-        await carried(lab, bags, site)
+        robots = [lab.process(lab.player_file(name, bag)) for name, bag in bags.items()]
+        await site.until(lambda: arrived(site) >= sum(map(size, contents.values())), "has everything")
+        for robot in robots:
+            await robot.stop()
+            topics = robot.summary()["topics"]
+            assert balance(topics) == []
+            sent = {topic: counters["delivered"] for topic, counters in topics.items()}
+            assert sent == {topic: len(texts) for topic, texts in under(robot.name, contents[robot.name]).items()}
+        await site.stop()
         await relay.stop()
-        expected = {topic: texts for name, bag in bags.items() for topic, texts in under(name, bodies(bag)).items()}
-        assert bodies(tmp_path / "site.bag") == expected
         for counters in relay.summary()["links"].values():
             assert balance(counters) == []
+    expected: dict[str, list[bytes]] = {}
+    for name, content in contents.items():
+        expected |= under(name, content)
+    assert bodies(tmp_path / "site.bag") == expected
+
+
+async def test_cdr_arrives_in_an_mcap(tmp_path: Path) -> None:
+    store = get_typestore(Stores.ROS2_JAZZY)
+    string = "std_msgs/msg/String"
+    with Writer2(tmp_path / "ros2", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        topics = [writer.add_connection(name, string, typestore=store) for name in ("/chat", "/log")]
+        for number in range(200):
+            for connection in topics:
+                body = store.serialize_cdr(store.types[string](data=f"{connection.topic} {number}"), string)
+                writer.write(connection, START_NS + number * 1_000_000, body)
+    [bag] = (tmp_path / "ros2").glob("*.mcap")
+    content = bodies(bag)
+    async with Lab(tmp_path, "robot1", "site") as lab:
+        relay = await lab.relay()
+        site = await lab.connected(lab.recorder_file("site", "/.*"))
+        robot = await lab.connected(lab.player_file("robot1", bag))
+        await until(lambda: count(site) == size(content))
+        for daemon in (robot, site, relay):
+            await lab.end(daemon)
+    assert bodies(tmp_path / "site.mcap") == under("robot1", content)
+    assert not (tmp_path / "site.bag").exists()
+
+
+async def test_one_recording_plays_as_many_robots(tmp_path: Path) -> None:
+    bag = write_bag(tmp_path / "run.bag", {"/chat": 100, "/log": 50})
+    content = bodies(bag)
+    names = [f"r{number}" for number in range(1, 9)]
+    async with Lab(tmp_path, "fleet", "site") as lab:
+        relay = await lab.relay()
+        site = await lab.connected(lab.recorder_file("site", "/r[0-9]+/.*"))
+        play = {"namespaces": names, "wait_for": [f"/{name}/chat" for name in names]}
+        robots = await lab.connected(lab.player_file("fleet", bag, play=play, client={"namespace": "/"}))
+        await until(lambda: count(site) == len(names) * size(content))
+        for daemon in (robots, site, relay):
+            await lab.end(daemon)
+    expected: dict[str, list[bytes]] = {}
+    for name in names:
+        expected |= under(name, content)
+    assert bodies(tmp_path / "site.bag") == expected
+
+
+async def test_a_burst_of_small_messages_passes_whole(tmp_path: Path) -> None:
+    """20,000 messages as fast as they are taken, to two sites: nothing stalls, nothing is lost or repeated."""
+    bag = write_bag(tmp_path / "run.bag", {"/a": 10_000, "/b": 10_000})
+    async with Lab(tmp_path, "robot1", "site1", "site2") as lab:
+        relay = await lab.process(lab.relay_file()).ready()
+        sites = [await lab.connected(lab.recorder_file(name, "/.*")) for name in ("site1", "site2")]
+        robot = await lab.connected(lab.player_file("robot1", bag))
+        await until(lambda: all(count(site) == 20_000 for site in sites), "both sites have all")
+        for daemon in (robot, *sites):
+            await lab.end(daemon)
+        await relay.stop()
+        topics = relay.summary()
+        assert all(balance(counters) == [] for counters in topics["links"].values())
+        assert {name: entry["delivered"] for name, entry in topics["links"]["site2"].items()} == {
+            "/robot1/a": 10_000,
+            "/robot1/b": 10_000,
+        }
+    for name in ("site1", "site2"):
+        assert bodies(tmp_path / f"{name}.bag") == under("robot1", bodies(bag))
+
+
+@pytest.mark.parametrize("who", ["robot", "relay"])
+async def test_sigterm_under_load_drains_and_everything_is_accounted_for(tmp_path: Path, who: str) -> None:
+    bag = write_bag(tmp_path / "run.bag", {"/chat": 2000, "/fresh": 2000})
+    rules = [
+        {"match": "/chat", "class": "state", "reliability": "reliable"},
+        {"match": "/fresh", "class": "control", "reliability": "best_effort", "depth": 2},
+    ]
+    async with Lab(tmp_path, "robot1", "site") as lab:
+        relay = await lab.process(lab.relay_file()).ready()
+        site = await lab.process(lab.recorder_file("site", "/.*", message_log="site.csv")).ready()
+        play: dict[str, Any] = {"loop": True, "wait_for": ["/chat", "/fresh"]}
+        robot = lab.process(lab.player_file("robot1", bag, play=play, topics=rules, message_log="robot1.csv"))
+        await site.until(lambda: arrived(site) > 1000, "is being sent to")
+        first, second = (robot, relay) if who == "robot" else (relay, robot)
+        await first.stop()
+        if who == "robot":
+            chat = robot.summary()["topics"]["/robot1/chat"]
+            assert chat["delivered"] == chat["offered"], "a stopping robot leaves nothing behind"
+        await second.stop()
+        await site.stop()
+        for process, key in ((robot, "topics"), (site, "topics")):
+            assert balance(process.summary()[key]) == []
+        for counters in relay.summary()["links"].values():
+            assert balance(counters) == []
+        chat = robot.summary()["topics"]["/robot1/chat"]
+    played, recorded = bodies(bag)["/chat"], bodies(tmp_path / "site.bag")["/robot1/chat"]
+    assert recorded == [played[index % len(played)] for index in range(len(recorded))]
+    if who == "robot":
+        assert len(recorded) == chat["offered"]
+    else:  # what the relay held had been confirmed when it went; nobody has more than was offered
+        assert chat["delivered"] <= len(recorded) <= chat["offered"]
+
+
+async def test_sockets_are_read_in_batches_and_never_by_the_safety_tick_alone(tmp_path: Path) -> None:
+    bag = write_bag(tmp_path / "run.bag", {"/chat": 3000})
+    async with Lab(tmp_path, "robot1", "site") as lab:
+        relay = await lab.relay()
+        assert relay.server is not None
+        site = await lab.connected(lab.recorder_file("site", "/.*"))
+        robot = await lab.connected(lab.player_file("robot1", bag))
+        await until(lambda: count(site) == 3000)
+        # Many small messages share a datagram, and many datagrams a look at the socket.
+        assert relay.server.socket.messages < 3000
+        for daemon in (robot, site, relay):
+            await lab.end(daemon)
+
+
+async def test_memory_does_not_grow_with_what_passed_through(tmp_path: Path) -> None:
+    """What a relay and a site have passed on they forget: the second half of a long run costs no more than noise."""
+    bag = write_bag(tmp_path / "run.bag", {"/chat": 2000})
+    async with Lab(tmp_path, "robot1", "site") as lab:
+        relay = await lab.process(lab.relay_file()).ready()
+        site = await lab.process(lab.recorder_file("site", "/.*", message_log="site.csv")).ready()
+        rule = {"match": "/chat", "class": "state", "reliability": "reliable", "max_queue_bytes": 20_000}
+        robot = await lab.process(lab.player_file("robot1", bag, play={"loop": True}, topics=[rule])).ready()
+        await site.until(lambda: arrived(site) > 10_000, "has warmed up")
+        before = {process.name: rss_bytes(process) for process in (relay, site, robot)}
+        await site.until(lambda: arrived(site) > 40_000, "has much more")
+        grown = {process.name: rss_bytes(process) - before[process.name] for process in (relay, site, robot)}
+        assert max(grown.values()) < 16 * 2**20, grown
+        for process in (robot, site, relay):
+            await process.stop()
+
+
+async def test_the_relay_tells_systemd_what_it_does(tmp_path: Path) -> None:
+    """Ready, reloading and stopping, over a socket as systemd makes it."""
+    path = tmp_path / "notify"
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as notify:
+        notify.bind(str(path))
+        notify.setblocking(False)
+        told: list[str] = []
+
+        def says(word: str) -> bool:
+            try:
+                while True:
+                    told.append(notify.recv(4096).decode())
+            except BlockingIOError:
+                return any(word in text for text in told)
+
+        async with Lab(tmp_path, "robot1") as lab:
+            config = lab.relay_file()
+            os.environ["NOTIFY_SOCKET"] = str(path)
+            try:
+                relay = lab.process(config)
+            finally:
+                del os.environ["NOTIFY_SOCKET"]
+            await until(lambda: says("READY=1"))
+            relay.signal(signal.SIGHUP)
+            await until(lambda: says("RELOADING=1") and says("STATUS=reloaded"))
+            config.write_text(json.dumps({"relay": 1}))
+            relay.signal(signal.SIGHUP)
+            await until(lambda: says("STATUS=reload failed"))
+            await relay.stop()
+            assert says("STOPPING=1")
