@@ -4,12 +4,13 @@ VENV   ?= .venv
 BIN    := $(VENV)/bin
 PACKAGES := sern_core sern_runtime sern_relay sern_client sern_sim sern_tools benchmarks tests
 
-.PHONY: help setup lint format types test bench demo schemas clean
+.PHONY: help setup lint format types test lab bench demo schemas clean
 
 help:
 	@echo "make setup    create $(VENV) with pinned dependencies"
 	@echo "make demo     relay, robot and site over a bad link, on this machine, next to plain ZMQ"
 	@echo "make test     every test;  make lint, make types: static checks"
+	@echo "make lab      the longer runs over tc netem; needs root"
 	@echo "make bench    the quick benchmarks;  make schemas: regenerate schemas/ and the configuration reference"
 
 $(VENV)/.ready: pyproject.toml constraints.txt
@@ -33,6 +34,9 @@ types: setup
 
 test: setup
 	$(BIN)/python -m pytest
+
+lab: setup
+	$(BIN)/python -m pytest tests/lab -m lab_long
 
 bench: setup
 	$(BIN)/python -m benchmarks.scheduler --quick

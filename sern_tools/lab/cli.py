@@ -23,6 +23,8 @@ from sern_tools.lab.removal import sweep
 
 EXIT_ERROR: Final = 2
 EXIT_INTERRUPTED: Final = 130
+_POLL_S: Final = 0.05
+_LAST_WORDS_S: Final = 1.0
 _RATES: Final = {"bit": 1.0, "kbit": 1e3, "mbit": 1e6, "gbit": 1e9}
 _TIMES: Final = {"s": 1.0, "ms": 1e-3, "us": 1e-6}
 
@@ -250,12 +252,15 @@ def _run_both(lab: Lab, profile: Any, sides: Sequence[Sequence[str]]) -> int:
             command = [word.replace("{a}", lab.a.address).replace("{b}", lab.b.address) for word in words]
             typer.echo(f"{node.namespace}: {shlex.join(command)}", err=True)
             processes.append(lab.popen(node, command, stdin=subprocess.DEVNULL))
-        while True:
-            for process in processes:
-                if process.poll() is not None:
-                    return process.returncode if process.returncode >= 0 else 128 - process.returncode
+        while not any(process.poll() is not None for process in processes):
             left_s = control.step()
-            time.sleep(0.05 if left_s is None else min(0.05, left_s))
+            time.sleep(_POLL_S if left_s is None else min(_POLL_S, left_s))
+        # Often the end of one ends the other too: it may have its last words.
+        give_up_s = time.monotonic() + _LAST_WORDS_S
+        first = next(process for process in processes if process.poll() is not None)
+        while any(process.poll() is None for process in processes) and time.monotonic() < give_up_s:
+            time.sleep(_POLL_S)
+        return first.returncode if first.returncode >= 0 else 128 - first.returncode
     finally:
         control.close()
 

@@ -137,21 +137,34 @@ class Control:
 
     def _change(self, request: dict[str, Any]) -> None:
         direction = request.get("direction", "both")
-        changes = dict(request.get("changes") or {})
-        unknown = sorted(changes.keys() - CHANGEABLE)
-        if unknown:
-            raise UsageError(f"unknown parameter {unknown[0]}; there are: {', '.join(sorted(CHANGEABLE))}")
-        if "jitter" in changes:
-            changes["jitter"] = Jitter(changes["jitter"])
+        changes = _checked(request.get("changes") or {})
         if changes:
             self.lab.change(direction, **changes)
         if request.get("blackout") is not None:
             self.lab.blackout(bool(request["blackout"]), direction)
 
 
-CHANGEABLE: Final = frozenset(
-    {"rate_bps", "delay_s", "jitter_s", "jitter", "loss", "duplicate", "reorder", "queue_packets"}
-)
+NUMBERS: Final = frozenset({"rate_bps", "delay_s", "jitter_s", "loss", "duplicate", "reorder", "queue_packets"})
+
+
+def _checked(changes: object) -> dict[str, Any]:
+    """What a request wants changed. UsageError for what is no parameter, or has no value that one can have."""
+    if not isinstance(changes, dict):
+        raise UsageError("changes is a mapping from parameters to values")
+    checked: dict[str, Any] = {}
+    for name, value in changes.items():
+        if name == "jitter" and value in list(Jitter):
+            checked[name] = Jitter(value)
+        elif name in NUMBERS and isinstance(value, int | float) and not isinstance(value, bool):
+            checked[name] = round(value) if name == "queue_packets" else value
+        elif name == "rate_bps" and value is None:
+            checked[name] = None
+        else:
+            raise UsageError(
+                f"{name} cannot be {value!r}; there are: jitter ({', '.join(Jitter)}), numbers for "
+                f"{', '.join(sorted(NUMBERS))}"
+            )
+    return checked
 
 
 def describe(lab: Lab) -> str:
