@@ -159,9 +159,9 @@ class UdpClient(Sealed):
     async def _look_up(self) -> None:
         try:
             found = await self._loop.getaddrinfo(self._host, self._port, type=socketlib.SOCK_DGRAM)
-        except OSError as error:
+        except (OSError, UnicodeError) as error:  # UnicodeError: no name that DNS could hold
             self._lookup = None
-            self._later(f"cannot find {self._host}: {error.strerror}")
+            self._later(f"cannot find {self._host}: {getattr(error, 'strerror', None) or 'not a host name'}")
         else:
             self._lookup = None
             self._open(found)

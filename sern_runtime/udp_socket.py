@@ -275,8 +275,8 @@ def bound_socket(endpoint: str, *, tos: int = 0) -> socketlib.socket:
             type=socketlib.SOCK_DGRAM,
             flags=socketlib.AI_PASSIVE,
         )
-    except OSError as error:
-        raise ConfigError(f"{endpoint}: cannot find the address ({error.strerror}); write one of this host") from None
+    except (OSError, UnicodeError):  # UnicodeError: no name that DNS could hold
+        raise ConfigError(f"{endpoint}: cannot find the address; write one of this host's") from None
     family, _, _, _, address = found[0]
     socket = socketlib.socket(family, socketlib.SOCK_DGRAM)
     try:
