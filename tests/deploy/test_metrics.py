@@ -1,0 +1,189 @@
+"""Dashboard and alerts against the metrics of real daemons: what they ask for exists, with the labels they name."""
+
+import asyncio
+import json
+import re
+import shutil
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Final
+
+import pytest
+from prometheus_client.parser import text_string_to_metric_families
+from ruamel.yaml import YAML
+
+from sern_core.types import DropReason
+from tests.daemons import Lab, write_bag
+
+DEPLOY: Final = Path(__file__).resolve().parents[2] / "deploy"
+OPERATIONS: Final = DEPLOY.parent / "docs" / "operations.md"
+DASHBOARD: Final[dict[str, Any]] = json.loads((DEPLOY / "grafana" / "sern.json").read_text())
+RULES: Final[dict[str, Any]] = YAML(typ="safe").load((DEPLOY / "prometheus" / "sern.rules.yml").read_text())
+OF_PROMETHEUS: Final = {"up"}
+TARGET_LABELS: Final = {"instance", "job"}
+_SELECTOR: Final = re.compile(r"\b((?:sern|process)_\w+|up)\b(?:\{([^}]*)\})?")
+_GROUPING: Final = re.compile(r"\b(?:by|without)\s*\(([^)]*)\)")
+
+
+def panels() -> list[dict[str, Any]]:
+    return [panel for panel in DASHBOARD["panels"] if panel["type"] != "row"]
+
+
+def alerts() -> list[dict[str, Any]]:
+    return [rule for group in RULES["groups"] for rule in group["rules"]]
+
+
+def expressions() -> list[str]:
+    """Every expression of dashboard and rules, with the dashboard's variables filled in."""
+    found = [target["expr"] for panel in panels() for target in panel["targets"]]
+    found += [rule["expr"] for rule in alerts()]
+    return [re.sub(r"\$\w+", ".*", text) for text in found]
+
+
+@pytest.fixture(scope="module")
+def metrics(tmp_path_factory: pytest.TempPathFactory) -> dict[str, set[str]]:
+    """Sample name -> labels, of a relay with a robot and a site. A family without samples yet has the label `?`."""
+
+    async def collect() -> list[str]:
+        directory = tmp_path_factory.mktemp("metrics")
+        async with Lab(directory, "robot1", "site") as lab:
+            relay = lab.process(lab.relay_file())
+            site = lab.process(lab.recorder_file("site", "/robot1/.*"))
+            bag = write_bag(directory / "a.bag", {"/text": 20})
+            robot = lab.process(lab.player_file("robot1", bag, play={"rate": 1.0, "loop": True}))
+            for process in (relay, site, robot):
+                await process.ready()
+            known = 'sern_link_rtt_seconds{peer="site"}'
+            await site.until(lambda: "sern_topic_age_seconds{" in site.get("/metrics")[1], "receives")
+            await relay.until(lambda: known in relay.get("/metrics")[1], "knows the link")
+            return [process.get("/metrics")[1] for process in (relay, site, robot)]
+
+    found: dict[str, set[str]] = {}
+    for text in asyncio.run(collect()):
+        for family in text_string_to_metric_families(text):
+            name = family.name + ("_total" if family.type == "counter" else "")
+            found.setdefault(name, {"?"})
+            for sample in family.samples:
+                labels = found.setdefault(sample.name, set())
+                labels.discard("?")
+                labels.update(sample.labels)
+    return found
+
+
+def test_every_metric_that_is_asked_for_exists_with_its_labels(metrics: dict[str, set[str]]) -> None:
+    asked = 0
+    for text in expressions():
+        grouped = {label.strip() for part in _GROUPING.findall(text) for label in part.split(",")}
+        for name, matchers in _SELECTOR.findall(text):
+            if name in OF_PROMETHEUS:
+                continue
+            asked += 1
+            assert name in metrics, f"no daemon has {name}: {text}"
+            known = metrics[name] | TARGET_LABELS
+            if "?" in known:
+                continue
+            assert set(re.findall(r"(\w+)\s*(?:=|!)", matchers)) <= known, f"{name} has only {sorted(known)}: {text}"
+            if len(_SELECTOR.findall(text)) == 1:
+                assert grouped <= known, f"{name} has only {sorted(known)}: {text}"
+    assert asked > 40
+
+
+def test_values_of_labels_exist() -> None:
+    for text in expressions():
+        for reasons in re.findall(r'reason=~"([a-z|_]+)"', text):
+            assert set(reasons.split("|")) <= set(DropReason)
+
+
+def test_every_metric_is_explained(metrics: dict[str, set[str]]) -> None:
+    text = OPERATIONS.read_text()
+    names = {re.sub(r"_(bucket|count|sum)$", "", name) for name in metrics if name.startswith("sern_")}
+    assert sorted(name for name in names if f"`{name}`" not in text) == []
+    assert sorted(set(re.findall(r"`(sern_\w+)`", text)) - names) == []
+
+
+def test_every_alert_and_drop_reason_is_explained() -> None:
+    text = OPERATIONS.read_text()
+    assert [rule["alert"] for rule in alerts() if f"`{rule['alert']}`" not in text] == []
+    assert [reason for reason in DropReason if f"| `{reason}` |" not in text] == []
+
+
+def balanced(text: str) -> Iterator[str]:
+    """What is left open or closed too often; strings do not count."""
+    pairs = {")": "(", "]": "[", "}": "{"}
+    stack: list[str] = []
+    for character in re.sub(r'"[^"]*"', "", text):
+        if character in pairs.values():
+            stack.append(character)
+        elif character in pairs and (not stack or stack.pop() != pairs[character]):
+            yield character
+    yield from stack
+
+
+def test_expressions_parse(tmp_path: Path) -> None:
+    promtool = shutil.which("promtool")
+    if promtool is None:  # the Debian package `prometheus` has it
+        for text in expressions():
+            assert not list(balanced(text)), text
+            assert not re.search(r"\$\w", text), text
+        return
+    shutil.copytree(DEPLOY / "prometheus", tmp_path, dirs_exist_ok=True)
+    rules = [{"record": f"panel:{index}", "expr": text} for index, text in enumerate(expressions())]
+    (tmp_path / "panels.yml").write_text(json.dumps({"groups": [{"name": "panels", "rules": rules}]}))
+    for arguments in (
+        ["check", "config", "prometheus.yml"],
+        ["check", "rules", "--lint=all", "--lint-fatal", "sern.rules.yml"],
+        ["check", "rules", "--lint=none", "panels.yml"],
+    ):
+        result = subprocess.run(
+            [promtool, *arguments], cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False
+        )
+        assert result.returncode == 0, result.stdout + result.stderr
+
+
+def test_the_dashboard_is_whole() -> None:
+    ids = [panel["id"] for panel in DASHBOARD["panels"]]
+    assert len(ids) == len(set(ids)) > 30
+    titles = [panel["title"] for panel in panels()]
+    assert len(titles) == len(set(titles))
+    assert [item["name"] for item in DASHBOARD["templating"]["list"]] == ["datasource", "instance", "peer", "topic"]
+    for panel in panels():
+        defaults = panel["fieldConfig"]["defaults"]
+        assert defaults["unit"], panel["title"]
+        values = [step["value"] for step in defaults["thresholds"]["steps"]]
+        assert values[0] is None, panel["title"]
+        assert values[1:] == sorted(values[1:]), panel["title"]
+        references = [target["refId"] for target in panel["targets"]]
+        assert len(references) == len(set(references))
+        assert panel["description"], panel["title"]
+        assert panel["datasource"] == {"type": "prometheus", "uid": "${datasource}"}
+
+
+def test_panels_do_not_overlap() -> None:
+    taken: dict[tuple[int, int], str] = {}
+    for panel in DASHBOARD["panels"]:
+        place = panel["gridPos"]
+        assert place["x"] + place["w"] <= 24
+        for x in range(place["x"], place["x"] + place["w"]):
+            for y in range(place["y"], place["y"] + place["h"]):
+                assert (x, y) not in taken, f"{panel['title']} lies on {taken[x, y]}"
+                taken[x, y] = panel["title"]
+
+
+def test_alerts_say_what_and_how_bad() -> None:
+    for rule in alerts():
+        assert rule["labels"]["severity"] in {"page", "warn", "info"}
+        assert rule["annotations"]["summary"]
+
+
+def test_the_scrape_targets_are_those_of_the_examples() -> None:
+    config = YAML(typ="safe").load((DEPLOY / "prometheus" / "prometheus.yml").read_text())
+    targets = {
+        target for job in config["scrape_configs"] for group in job["static_configs"] for target in group["targets"]
+    }
+    listens = {
+        YAML(typ="safe").load((DEPLOY / "examples" / name).read_text())["http"]["listen"]
+        for name in ("relay.yaml", "robot.yaml", "site.yaml")
+    }
+    assert targets == listens
+    assert config["rule_files"] == ["sern.rules.yml"]

@@ -1,0 +1,81 @@
+"""What the daemons tell systemd, with this test in its place: real processes, as a unit of Type=notify starts them."""
+
+import signal
+import socket
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.daemons import Lab, Process
+from tests.support import until
+
+
+class Systemd:
+    """Receives on NOTIFY_SOCKET."""
+
+    def __init__(self, address: Path) -> None:
+        self.told: list[str] = []
+        self.socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self.socket.bind(str(address))
+        self.socket.setblocking(False)
+
+    def read(self) -> list[str]:
+        while True:
+            try:
+                self.told.append(self.socket.recv(4096).decode())
+            except BlockingIOError:
+                return self.told
+
+    def count(self, state: str) -> int:
+        return sum(state in message.splitlines() for message in self.read())
+
+    def status(self, words: str) -> bool:
+        return any(line.startswith("STATUS=") and words in line for text in self.read() for line in text.splitlines())
+
+
+@pytest.fixture
+def systemd(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Systemd]:
+    address = tmp_path / "notify"
+    systemd = Systemd(address)
+    monkeypatch.setenv("NOTIFY_SOCKET", str(address))
+    monkeypatch.setenv("WATCHDOG_USEC", "15000000")
+    monkeypatch.delenv("WATCHDOG_PID", raising=False)
+    yield systemd
+    systemd.socket.close()
+
+
+async def ends(process: Process, systemd: Systemd) -> None:
+    process.signal(signal.SIGTERM)
+    assert await process.ended() == 0
+    assert systemd.count("STOPPING=1") == 1
+
+
+async def test_the_relay(tmp_path: Path, systemd: Systemd) -> None:
+    async with Lab(tmp_path, "robot1") as lab:
+        relay = lab.process(lab.relay_file())
+        await until(lambda: systemd.count("READY=1"), "ready")
+        # Nobody is connected: an idle relay must not look like one that hangs.
+        await until(lambda: systemd.count("WATCHDOG=1") >= 3, "pings")
+        assert systemd.status("0 clients")
+        relay.signal(signal.SIGHUP)
+        await until(lambda: systemd.count("READY=1") == 2, "reloaded")
+        assert systemd.count("RELOADING=1") == 1
+        assert systemd.status("reloaded")
+        relay.config.write_text("relay: {name: relay")
+        relay.signal(signal.SIGHUP)
+        await until(lambda: systemd.status("reload failed: "), "says that the reload failed")
+        assert systemd.count("STOPPING=1") == 0
+        await ends(relay, systemd)
+
+
+async def test_the_client(tmp_path: Path, systemd: Systemd) -> None:
+    async with Lab(tmp_path, "site") as lab:
+        client = lab.process(lab.recorder_file("site", "/.*"))
+        # Ready without its relay: a unit that waits for the network would hold up the boot of a robot.
+        await until(lambda: systemd.count("READY=1"), "ready")
+        await until(lambda: systemd.count("WATCHDOG=1") >= 3, "pings")
+        await until(lambda: systemd.status("link down"), "says why it is not connected")
+        await lab.relay()
+        await until(lambda: systemd.status("link up"), "says that the link is up")
+        await ends(client, systemd)

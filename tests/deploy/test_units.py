@@ -1,0 +1,112 @@
+"""The systemd units: systemd reads them, they hold what the daemons need, and libzmq is not locked out."""
+
+import re
+import shutil
+import subprocess
+from pathlib import Path
+from typing import Final
+
+import pytest
+
+UNITS: Final = Path(__file__).resolve().parents[2] / "deploy" / "systemd"
+NAMES: Final = ("sern-relay.service", "sern-client.service", "sern-client@.service")
+ONCE: Final = {
+    ("Unit", "StartLimitIntervalSec"): "0",
+    ("Service", "Type"): "notify",
+    ("Service", "NotifyAccess"): "main",
+    ("Service", "Restart"): "always",
+    ("Service", "RestartSec"): "2",
+    ("Service", "WatchdogSec"): "15",
+    ("Service", "KillSignal"): "SIGTERM",
+    ("Service", "TimeoutStopSec"): "45",
+    ("Service", "User"): "sern",
+    ("Service", "UMask"): "0077",
+    ("Service", "NoNewPrivileges"): "yes",
+    ("Service", "ProtectSystem"): "strict",
+    ("Install", "WantedBy"): "multi-user.target",
+}
+KNOWN: Final = {
+    "Unit": {"Description", "After", "StartLimitIntervalSec"},
+    "Service": {
+        "Type NotifyAccess ExecStart ExecReload User Group UMask WorkingDirectory StateDirectory StateDirectoryMode",
+        "Restart RestartSec WatchdogSec KillSignal TimeoutStopSec LimitNOFILE LimitCORE NoNewPrivileges",
+        "CapabilityBoundingSet ProtectSystem ProtectHome PrivateTmp PrivateDevices ProtectKernelTunables",
+        "ProtectKernelModules ProtectKernelLogs ProtectControlGroups ProtectClock ProtectHostname LockPersonality",
+        "RestrictSUIDSGID RestrictNamespaces RestrictAddressFamilies SystemCallArchitectures",
+    },
+    "Install": {"WantedBy"},
+}
+
+
+def read(name: str) -> list[tuple[str, str, str]]:
+    """(section, key, value) of every line of a unit."""
+    found, section = [], ""
+    for line in (UNITS / name).read_text().splitlines():
+        if not line or line.startswith("#"):
+            continue
+        if match := re.fullmatch(r"\[(\w+)\]", line):
+            section = match[1]
+            continue
+        key, equals, value = line.partition("=")
+        assert equals, f"{name}: {line}"
+        found.append((section, key, value))
+    return found
+
+
+def values(name: str, key: str) -> list[str]:
+    return [value for _, known, value in read(name) if known == key]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_key_is_known_and_stands_once(name: str) -> None:
+    lines = read(name)
+    known = {(section, key) for section, groups in KNOWN.items() for group in groups for key in group.split()}
+    keys = [(section, key) for section, key, _ in lines]
+    assert set(keys) <= known
+    assert len(keys) == len(set(keys))
+    assert ONCE.items() <= {(section, key): value for section, key, value in lines}.items()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_libzmq_is_not_locked_out(name: str) -> None:
+    families = values(name, "RestrictAddressFamilies")[0].split()
+    assert {"AF_INET", "AF_INET6", "AF_UNIX", "AF_NETLINK"} <= set(families)
+    # A filter of system calls must let sched_setscheduler through; RestrictRealtime and writable code are other traps.
+    assert not values(name, "SystemCallFilter")
+    assert not values(name, "MemoryDenyWriteExecute")
+
+
+def test_reload_is_for_the_relay() -> None:
+    assert values("sern-relay.service", "ExecReload") == ["/bin/kill -HUP $MAINPID"]
+    assert not values("sern-client.service", "ExecReload")
+
+
+def test_the_template_is_the_client_with_its_name_in_it() -> None:
+    expected = {
+        "Description": "SERN client %i",
+        "ExecStart": "/opt/sern/bin/sern-client --config /etc/sern/%i.yaml",
+        "WorkingDirectory": "/var/lib/sern/%i",
+        "StateDirectory": "sern sern/%i",
+    }
+    single = read("sern-client.service")
+    assert read("sern-client@.service") == [(s, key, expected.get(key, value)) for s, key, value in single]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_systemd_accepts_them(name: str, tmp_path: Path) -> None:
+    program = shutil.which("systemd-analyze")
+    if program is None:
+        pytest.skip("systemd-analyze is not installed")
+    unit = tmp_path / name.replace("@", "@robot1")
+    # It looks whether the program is there: /opt/sern is only on hosts where SERN is installed.
+    unit.write_text(re.sub(r"/opt/sern/bin/\S+", "/bin/true", (UNITS / name).read_text()))
+    result = subprocess.run(
+        [program, "verify", "--recursive-errors=no", "--man=no", str(unit)],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    if "Failed to initialize manager" in result.stderr:
+        pytest.skip(f"systemd-analyze does not work here: {result.stderr.splitlines()[0]}")
+    assert (result.returncode, result.stderr) == (0, "")
