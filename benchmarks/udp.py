@@ -1,0 +1,299 @@
+"""What the UDP lane costs: sealing, one server socket, and a server under junk.
+
+seal       microseconds to seal and to open `UDP_PAYLOAD_BYTES`, and to refuse a forgery, by cipher
+socket     datagrams a second through one server socket, a client process in closed loop, and the server's CPU for each
+junk       CPU of the server's process (user and system) while another sends 20,000 datagrams a second, evenly spaced,
+           to it: of an unknown session, and with a known id and a bad tag, each with the peer that a plain loop of
+           `recvfrom_into` without filter and pause is; and a real session's round trip meanwhile
+
+The load generators share this machine: on two cores they take one of them. Where allowed, the server (only) has
+real-time priority, so that other load is not in its figures.
+"""
+
+import argparse
+import asyncio
+import multiprocessing
+import os
+import socket as socketlib
+import statistics
+import struct
+import sys
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from multiprocessing.connection import Connection
+from typing import Final
+
+import uvloop
+
+from benchmarks.common import Report, interleaved, main, try_realtime
+from sern_core.types import ClientName
+from sern_runtime import udp_socket
+from sern_runtime.seal import (
+    ROOM_BYTES,
+    SEAL_BYTES,
+    UDP_PAYLOAD_BYTES,
+    Cipher,
+    Opener,
+    Sealer,
+    SessionParameters,
+    Side,
+    make_seals,
+)
+from sern_runtime.udp import INNER_BYTES, TYPE_CHALLENGE, TYPE_DATA, TYPE_RESPONSE, UdpServer, UdpSession
+
+JUNK_HZ: Final = 20_000
+CPU_LIMIT_PERCENT: Final = 10.0
+SEAL_LIMITS_US: Final = {Cipher.AES_256_GCM: 2.0, Cipher.CHACHA20_POLY1305: 3.5}
+WINDOW: Final = 32
+"""Datagrams in flight in the closed loop."""
+ECHO_HZ: Final = 100
+WARM_UP_S: Final = 0.3
+ROBOT: Final = ClientName("robot")
+OFFERED: Final = tuple(Cipher)
+
+
+# --- sealing ----------------------------------------------------------------------------------------------------------
+
+
+def seal_us(cipher: Cipher, count: int) -> dict[str, float]:
+    """Microseconds a datagram of the full size: sealed, opened, and refused for its tag."""
+    parameters = SessionParameters.draw(1, cipher, 1)
+    sealer, opener = Sealer(parameters, Side.CLIENT), Opener(parameters, Side.CLIENT)
+    data = os.urandom(ROOM_BYTES)
+    begun_s = time.perf_counter()
+    datagrams = [sealer.seal(data) for _ in range(count)]
+    sealed_s = time.perf_counter()
+    for datagram in datagrams:
+        opener.open(datagram)
+    opened_s = time.perf_counter()
+    forged = datagrams[0][:4] + struct.pack("!Q", count + 1) + datagrams[0][12:]
+    for _ in range(count):
+        opener.open(forged)
+    refused_s = time.perf_counter()
+    return {
+        "seal_us": (sealed_s - begun_s) / count * 1e6,
+        "open_us": (opened_s - sealed_s) / count * 1e6,
+        "refuse_us": (refused_s - opened_s) / count * 1e6,
+    }
+
+
+# --- a server in a process of its own ---------------------------------------------------------------------------------
+
+
+def serve(control: Connection, plain: bool, echo: bool) -> None:
+    """A server with one session, whose parameters it tells; each later word on `control` is answered with
+    (process CPU s, wall s, datagrams of ours). `plain`: without the filter and the pause."""
+    try_realtime()
+
+    async def run() -> None:
+        received = 0
+
+        def datagram(session: UdpSession, data: bytes, _now: float) -> None:
+            nonlocal received
+            received += 1
+            if echo:
+                session.send(data)
+
+        if plain:
+            udp_socket.MAX_FILTER_IDS = -1  # type: ignore[misc]  # the peer that the module's text compares with
+            udp_socket.DatagramSocket._readable = udp_socket.DatagramSocket._take  # type: ignore[method-assign,assignment]
+        server = UdpServer(["udp://127.0.0.1:*"], datagram)
+        control.send(server.open_session(ROBOT, OFFERED).parameters)
+        loop = asyncio.get_running_loop()
+        ended = asyncio.Event()
+
+        def asked() -> None:
+            if control.recv():
+                control.send((time.process_time(), time.monotonic(), received))
+            else:
+                ended.set()
+
+        loop.add_reader(control.fileno(), asked)
+        await ended.wait()
+        loop.remove_reader(control.fileno())
+        server.close()
+
+    uvloop.run(run())
+
+
+class ServerProcess:
+    """Started on entry, ended on exit."""
+
+    def __init__(self, *, plain: bool = False, echo: bool = True) -> None:
+        self._control, self._far = multiprocessing.Pipe()
+        self._process = multiprocessing.get_context("spawn").Process(
+            target=serve, args=(self._far, plain, echo), daemon=True
+        )
+
+    def __enter__(self) -> "ServerProcess":
+        self._process.start()
+        self.parameters: SessionParameters = self._control.recv()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._control.send(False)
+        self._process.join(10)
+        if self._process.is_alive():
+            self._process.kill()
+            self._process.join()
+        self._control.close()
+        self._far.close()
+
+    def usage(self) -> tuple[float, float, int]:
+        self._control.send(True)
+        cpu_s, wall_s, received = self._control.recv()
+        return float(cpu_s), float(wall_s), int(received)
+
+
+class Peer:
+    """A client by hand on a blocking socket, validated by the server."""
+
+    def __init__(self, parameters: SessionParameters) -> None:
+        self.sealer, self.opener = make_seals(parameters, Side.CLIENT)
+        self.socket = socketlib.socket(socketlib.AF_INET, socketlib.SOCK_DGRAM)
+        self.socket.connect(("127.0.0.1", parameters.port))
+        self.socket.settimeout(2.0)
+        self.send(b"here")
+        challenge = self.receive(TYPE_CHALLENGE)
+        self.send(challenge, TYPE_RESPONSE)
+
+    def send(self, data: bytes, kind: bytes = TYPE_DATA) -> None:
+        self.socket.send(self.sealer.seal(kind + data))
+
+    def receive(self, kind: bytes = TYPE_DATA) -> bytes:
+        """The next of one inner type. Raises TimeoutError."""
+        while True:
+            inner = self.opener.open(self.socket.recv(2048))
+            if inner is not None and inner[:1] == kind:
+                return inner[1:]
+
+
+def throughput(duration_s: float) -> dict[str, float]:
+    """Datagrams of the full size there and back, WINDOW in flight."""
+    with ServerProcess() as server:
+        peer = Peer(server.parameters)
+        data = bytes(INNER_BYTES)
+        with peer.socket:
+            with suppress(TimeoutError):  # the echo of "here" may have come before the validation, or after it
+                peer.socket.settimeout(0.1)
+                peer.receive()
+            peer.socket.settimeout(2.0)
+            for _ in range(WINDOW):
+                peer.send(data)
+            cpu_s, begun_s, received = server.usage()
+            end_s = time.monotonic() + duration_s
+            while time.monotonic() < end_s:
+                peer.receive()
+                peer.send(data)
+            cpu_end_s, end_s, received_end = server.usage()
+    count = received_end - received
+    return {"datagrams_hz": count / (end_s - begun_s), "server_cpu_us": (cpu_end_s - cpu_s) / count * 1e6}
+
+
+# --- junk -------------------------------------------------------------------------------------------------------------
+
+
+def flood(port: int, session_id: int, until_s: float, sent: Connection) -> None:
+    """JUNK_HZ datagrams a second with random contents, as evenly as a busy loop can."""
+    target = socketlib.socket(socketlib.AF_INET, socketlib.SOCK_DGRAM)
+    target.connect(("127.0.0.1", port))
+    clear = [struct.pack("!IQ", session_id, 2**32 + number) for number in range(256)]
+    junk = [head + os.urandom(UDP_PAYLOAD_BYTES - len(head)) for head in clear]
+    count = 0
+    begun_s = time.monotonic()
+    with target:
+        while (now := time.monotonic()) < until_s:
+            if count < (now - begun_s) * JUNK_HZ:
+                with suppress(OSError):
+                    target.send(junk[count & 0xFF])
+                count += 1
+    sent.send(count / (time.monotonic() - begun_s))
+
+
+def under_junk(known_id: bool, plain: bool, duration_s: float) -> dict[str, float]:
+    context = multiprocessing.get_context("spawn")
+    with ServerProcess(plain=plain) as server:
+        parameters = server.parameters
+        peer = Peer(parameters)
+        ours, far = multiprocessing.Pipe(duplex=False)
+        session_id = parameters.id if known_id else parameters.id ^ 1
+        until_s = time.monotonic() + 1.0 + WARM_UP_S + duration_s + 0.3
+        generator = context.Process(target=flood, args=(parameters.port, session_id, until_s, far), daemon=True)
+        generator.start()
+        round_trips = []
+        with peer.socket, ours, far:
+            time.sleep(1.0 + WARM_UP_S)  # the generator's interpreter starts
+            cpu_s, begun_s, _ = server.usage()
+            lost = 0
+            end_s = time.monotonic() + duration_s
+            number = 0
+            while time.monotonic() < end_s:
+                number += 1
+                mark = struct.pack("!I", number)
+                sent_s = time.monotonic()
+                peer.send(mark)
+                try:
+                    while peer.receive() != mark:
+                        pass
+                except TimeoutError:
+                    lost += 1
+                else:
+                    round_trips.append(time.monotonic() - sent_s)
+                time.sleep(1 / ECHO_HZ)
+            cpu_end_s, end_s, _ = server.usage()
+            rate_hz = ours.recv() if ours.poll(5.0) else 0.0
+            generator.join()
+    round_trips.sort()
+    return {
+        "cpu_percent": 100 * (cpu_end_s - cpu_s) / (end_s - begun_s),
+        "junk_hz": float(rate_hz),
+        "echo_p50_ms": 1000 * statistics.median(round_trips),
+        "echo_p99_ms": 1000 * round_trips[int(0.99 * len(round_trips))],
+        "echo_lost_count": float(lost),
+    }
+
+
+# --- the report -------------------------------------------------------------------------------------------------------
+
+
+def median(runs: list[dict[str, float]]) -> dict[str, float]:
+    return {name: statistics.median(run[name] for run in runs) for name in runs[0]}
+
+
+def bench(options: argparse.Namespace, report: Report) -> None:
+    rounds, duration_s, count = (1, 1.0, 5_000) if options.quick else (3, 3.0, 30_000)
+    sealed = interleaved({cipher.value: _sealing(cipher, count) for cipher in Cipher}, max(rounds, 3))
+    for cipher in Cipher:
+        report.row("seal", cipher.value, **median(sealed[cipher.value]))
+    report.row("socket", "echo", **median([throughput(duration_s) for _ in range(rounds)]))
+    for known_id in (False, True):
+        case = "junk, bad tag" if known_id else "junk, unknown"
+        systems = {"sern": _junk(known_id, False, duration_s), "plain": _junk(known_id, True, duration_s)}
+        for name, runs in interleaved(systems, rounds).items():
+            report.row(case, name, **median(runs))
+    for case in ("junk, unknown", "junk, bad tag"):
+        report.reach(
+            f"server CPU at {JUNK_HZ:,} datagrams/s, {case} [% of a core]",
+            report.value(case, "sern", "cpu_percent"),
+            CPU_LIMIT_PERCENT,
+        )
+    for cipher, limit_us in SEAL_LIMITS_US.items():
+        cost_us = report.value("seal", cipher.value, "seal_us")
+        report.reach(f"{cipher.value}: seal {UDP_PAYLOAD_BYTES} bytes [us]", cost_us, limit_us)
+    report.note(f"datagrams of {UDP_PAYLOAD_BYTES} bytes ({SEAL_BYTES} of them the seal); medians of {rounds} rounds")
+
+
+def _sealing(cipher: Cipher, count: int) -> Callable[[], dict[str, float]]:
+    return lambda: seal_us(cipher, count)
+
+
+def _junk(known_id: bool, plain: bool, duration_s: float) -> Callable[[], dict[str, float]]:
+    return lambda: under_junk(known_id, plain, duration_s)
+
+
+if __name__ == "__main__":
+    # Spawned processes import this file by its name, not as __main__.
+    from benchmarks.udp import bench as imported_bench
+
+    sys.exit(main("udp", imported_bench, description=__doc__))
