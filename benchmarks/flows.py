@@ -121,6 +121,7 @@ class Flow:
         self._pose_s: float | None = None
         self._ping = False
         self._ping_due_s = now
+        self._now = now
         self._chunk = 0
         self._again: deque[int] = deque()
         self.stalled = False
@@ -134,6 +135,7 @@ class Flow:
         return self.start_s <= now < self.stop_s
 
     def poll(self, now: float) -> bytes | None:
+        self._now = now
         if self.stalled and now < self.probe_due_s:
             return None
         if self.pose_due_s <= now:
@@ -225,7 +227,7 @@ class Flow:
                 deadline_s = loss_s
             if flight.waiting_since_s is not None:
                 deadline_s = min(deadline_s, flight.waiting_since_s + flight.stall_timeout_s())
-            if flight.inflight_bytes < self.estimator.window_bytes:
+            if self._now < self.stop_s and flight.inflight_bytes < self.estimator.window_bytes:
                 bulk_s = max(self.pacer.due_s, self.start_s)
                 if bulk_s < min(deadline_s, self.stop_s):
                     deadline_s = bulk_s

@@ -1,0 +1,544 @@
+"""Window, pacing and capacity from forward delay and from the rate timed at the receiver.
+
+Theory of operation
+    *Delay.* What queues on the way out shows in the forward delay d = receiver's stamp − our stamp (the clocks' offset
+    is in every d alike, as in LEDBAT, RFC 6817): an acknowledgement that waits on a busy way back is no queue of ours.
+    Small and large packets are told apart, for a large one takes longer to serialise. Once an *epoch* (a round trip,
+    at least 40 ms) the 20th percentile is compared with its least value of the last ten seconds: the queue q.
+    *Rate.* Bytes received between two stamps of the receiver, over a round trip and at least 120 ms; the capacity B is
+    the greatest of the recent ones while there was more to send.
+    *Window.* The queue is W − B·RTT, so an error of q is corrected as what it is in bytes: W += γ·B·(q* − q). While
+    the path looks empty the step doubles every epoch, up to a quarter of W. A queue above `hi` cuts W to what the
+    receiver saw; one far above for longer than a moment does it at once (the link got slower).
+    *Start-up.* The first packets leave in a train: its dispersion shows the capacity one round trip later, and the
+    window goes there in steps of at most `STARTUP_GAIN`.
+    *Draining.* When no empty queue was seen for a while, one round trip at 0.6 of the product shows it. A queue that
+    stays although we made way is either a longer path (constant: taken as the new empty path) or somebody else's:
+    then the window follows CUBIC (RFC 9438) until a drain finds the queue gone.
+    *Loss* alone changes nothing (radio), unless there is clearly more of it than where we sent less.
+"""
+
+from collections import deque
+from math import inf
+from typing import Final
+
+from sern_core.capacity import AckSample, CapacityEstimator
+
+MIN_EPOCH_S: Final = 0.040
+MIN_EPOCH_SAMPLES: Final = 4
+BASE_WINDOW_S: Final = 10.0
+DRAIN_INTERVAL_S: Final = 5.0
+DRAIN_RTTS: Final = 20.0
+"""On long paths draining is rarer: a round trip at 0.6 of the product costs 2 % of twenty."""
+DRAIN_GAIN: Final = 0.6
+RATE_WINDOW_S: Final = 1.2
+MIN_RATE_SPAN_S: Final = 0.120
+BURST_RATE_SPAN_S: Final = 0.150
+MARK_SPACING_S: Final = 0.020
+TARGET_S: Final = 0.0005
+TARGET_PACKETS: Final = 0.3
+GAIN: Final = 0.35
+PATIENT_EPOCHS: Final = 2
+"""The effect of a step is seen two epochs later; only then may the next one be larger."""
+MAX_GROWTH: Final = 0.25
+CUT: Final = 0.95
+EMERGENCY_CUT: Final = 0.9
+EMERGENCY_S: Final = 0.050
+STARTUP_GAIN: Final = 4.0
+STARTUP_PACING: Final = 4.0
+STARTUP_AIM: Final = 0.9
+PACING_GAIN: Final = 1.05
+TRAIN_BYTES: Final = 8 * 1200
+INITIAL_WINDOW_BYTES: Final = 12_600
+MIN_WINDOW_FRAGMENTS: Final = 1.5
+"""And the hop commits one fragment beyond the window."""
+MAX_WINDOW_BYTES: Final = 64 * 2**20
+IDLE_S: Final = 2.0
+"""What was not used for so long is halved, for the link may have changed; start-up brings it back."""
+STUCK_EPOCHS: Final = 4
+STUCK_WAIT_S: Final = 1.0
+FLAT_S: Final = 0.003
+LOSS_MEMORY_S: Final = 3.0
+RIVAL_MEMORY_S: Final = 30.0
+COMPETE_MAX_S: Final = 30.0
+PEAK_DECAY: Final = 0.02
+"""Share of the peak rate that is forgotten each second."""
+CUBIC_C: Final = 0.4
+CUBIC_BETA: Final = 0.7
+CUBIC_RENO: Final = 3 * (1 - CUBIC_BETA) / (1 + CUBIC_BETA)
+
+
+class _Base:
+    """The least forward delay of one size of packets over a sliding window."""
+
+    __slots__ = ("epoch", "least")
+
+    def __init__(self) -> None:
+        self.least: deque[tuple[float, float]] = deque()  # (time, delay), both rising
+        self.epoch: list[float] = []
+
+    @property
+    def value_s(self) -> float | None:
+        return self.least[0][1] if self.least else None
+
+    def note(self, now: float, delay_s: float, window_s: float) -> None:
+        least = self.least
+        while least and least[-1][1] >= delay_s:
+            least.pop()
+        least.append((now, delay_s))
+        while least[0][0] < now - window_s:
+            least.popleft()
+
+
+class _Cubic:
+    """The window of CUBIC (RFC 9438, section 4) in bytes, from the time somebody else was found to keep the queue."""
+
+    __slots__ = ("began_s", "cut_s", "from_bytes", "k_s", "most_bytes", "since_s")
+
+    def __init__(self, now: float, window: float, fragment: float) -> None:
+        self.began_s = now
+        self.cut_s = now
+        self.most_bytes = window
+        self._from(now, window, fragment)
+
+    def _from(self, now: float, window: float, fragment: float) -> None:
+        self.since_s = now
+        self.from_bytes = window
+        self.k_s = (max(0.0, self.most_bytes - window) / fragment / CUBIC_C) ** (1 / 3)
+
+    def window(self, now: float, rtt_s: float, fragment: float) -> float:
+        t = now - self.since_s
+        cubic = self.most_bytes + CUBIC_C * fragment * (t + rtt_s - self.k_s) ** 3
+        return max(cubic, self.from_bytes + CUBIC_RENO * fragment * t / rtt_s)
+
+    def cut(self, now: float, window: float, fragment: float) -> float:
+        """A loss: the new window. Fast convergence (4.7) lets others have what they lack."""
+        self.cut_s = now
+        self.most_bytes = window if window >= self.most_bytes else window * (1 + CUBIC_BETA) / 2
+        window *= CUBIC_BETA
+        self._from(now, window, fragment)
+        return window
+
+
+class HybridWindow(CapacityEstimator):
+    """See the module. `fragment_bytes` is the size of a datagram of the lane before any was sent."""
+
+    def __init__(self, *, fragment_bytes: int = 1260, initial_bytes: int = INITIAL_WINDOW_BYTES) -> None:
+        self._first_fragment_bytes = fragment_bytes
+        self._initial_bytes = initial_bytes
+        self._begin()
+
+    def _begin(self) -> None:
+        self._window = float(self._initial_bytes)
+        self._fragment = float(self._first_fragment_bytes)
+        self._rate: float | None = None  # bytes/s, the capacity
+        self._peak = 0.0  # bytes/s, the greatest rate of the last minute or so
+        self._rates: deque[tuple[float, float]] = deque()  # (time, bytes/s), the greatest first
+        self._pacing: float | None = None  # bytes/s
+        self._small, self._large = _Base(), _Base()
+        self._queue_s = 0.0
+        self._jitter_s = 0.0
+        self._target_s = 0.0
+        self._high_s = inf
+        self._rtt_s: float | None = None  # with our own queue on the way out empty
+        self._startup = True
+        self._cubic: _Cubic | None = None  # while somebody else keeps the queue
+        self._loss_floor = 0.0
+        self._lost_s = -inf
+        self._restart()
+
+    def _restart(self) -> None:
+        """What was under way says nothing about what will be."""
+        self._epoch_s: float | None = None
+        self._samples: list[tuple[float, float]] = []  # (queue, way back) of the epoch
+        self._limited = 0
+        self._lost_bytes = self._acked_bytes = 0
+        self._small.epoch.clear()
+        self._large.epoch.clear()
+        self._mark: tuple[float, int] | None = None
+        self._span_limited = False
+        self._marks: deque[tuple[float, int]] = deque(maxlen=16)
+        self._busy_s: float | None = None
+        self._high_since_s: float | None = None
+        self._hold_until_s = -inf
+        self._empty_epochs = 0
+        self._above_epochs = 0
+        self._recent: deque[float] = deque(maxlen=STUCK_EPOCHS)  # queues of the last epochs
+        self._emptied_s = -inf
+        self._drain_until_s: float | None = None
+        self._judging = False
+        self._drained_s = -inf
+        self._saved_window = 0.0
+        self._adopted_until_s = -inf
+        self._rival_until_s = -inf
+        self._calm_window = 0.0  # the last one with which the queue was as wanted
+        self._begin_round(-inf)
+
+    def _begin_round(self, now: float) -> None:
+        self._round_s = now  # packets sent later belong to this round of start-up
+        self._round_window = self._window
+        self._train: deque[tuple[float, int]] = deque()
+        self._train_rate = 0.0
+        self._train_bytes = 0
+        self._round_sent_pacing = self._pacing
+
+    # --- what it says ---------------------------------------------------------------------------------------------
+
+    @property
+    def window_bytes(self) -> float:
+        return self._window
+
+    @property
+    def rate_bps(self) -> float | None:
+        return 8 * self._rate if self._rate is not None else None
+
+    @property
+    def pacing_bps(self) -> float | None:
+        return 8 * self._pacing if self._pacing is not None else None
+
+    @property
+    def rtprop_s(self) -> float | None:
+        return self._rtt_s
+
+    def snapshot(self) -> dict[str, float | None]:
+        return {
+            **super().snapshot(),
+            "pacing_bps": self.pacing_bps,
+            "queue_s": self._queue_s,
+            "startup": float(self._startup),
+            "competing": float(self._cubic is not None),
+        }
+
+    # --- what it sees ---------------------------------------------------------------------------------------------
+
+    def on_sent(self, *, now: float, nbytes: int, inflight_bytes: int) -> None:
+        if nbytes > self._fragment:
+            self._fragment = float(nbytes)
+        if 2 * inflight_bytes >= self._window or self._busy_s is None:
+            self._busy_s = now
+        elif now > self._busy_s + IDLE_S:
+            self._busy_s = now
+            if self._window > self._initial_bytes:
+                self._window = max(self._window / 2, self._initial_bytes)
+                self._start_again(now)
+
+    def on_ack(self, sample: AckSample) -> None:
+        now, receiver_s, cum_bytes = sample.now, sample.receiver_s, sample.cum_bytes
+        rtt_s, nbytes = sample.rtt_s, sample.packet_bytes
+        sent_s = sample.sent_s
+        if sent_s is None:
+            sent_s = now - rtt_s
+            delay_s = rtt_s
+        else:
+            delay_s = receiver_s - sent_s
+        base = self._large if nbytes == 0 or 2 * nbytes >= self._fragment else self._small
+        base.epoch.append(delay_s)
+        least = base.least
+        queue_s = delay_s - least[0][1] if least else 0.0
+        self._samples.append((queue_s, rtt_s - delay_s))
+        if not sample.app_limited:
+            self._limited += 1
+        self._acked_bytes += sample.acked_bytes
+        marks = self._marks
+        if not marks or receiver_s >= marks[-1][0] + MARK_SPACING_S:
+            marks.append((receiver_s, cum_bytes))
+        if self._startup:
+            if self._rtt_s is None or rtt_s < self._rtt_s:
+                self._rtt_s = rtt_s
+            if not sample.app_limited and sent_s >= self._round_s:
+                self._ramp(now, receiver_s, cum_bytes, sample.acked_bytes)
+        elif queue_s > 3 * self._high_s and self._cubic is None:
+            if self._high_since_s is None:
+                self._high_since_s = receiver_s
+            elif receiver_s >= self._high_since_s + EMERGENCY_S and now >= self._hold_until_s:
+                self._emergency(now)
+        else:
+            self._high_since_s = None
+        self._measure_rate(now, receiver_s, cum_bytes, sample.app_limited)
+        if self._epoch_s is None:
+            self._epoch_s = now
+        elif now >= self._epoch_s + max(MIN_EPOCH_S, self._rtt_s or 0.0) and len(self._samples) >= MIN_EPOCH_SAMPLES:
+            self._close_epoch(now)
+
+    def _measure_rate(self, now: float, receiver_s: float, cum_bytes: int, app_limited: bool) -> None:
+        mark = self._mark
+        if mark is None or cum_bytes < mark[1]:
+            self._mark = (receiver_s, cum_bytes)
+            self._span_limited = app_limited
+            return
+        if app_limited:
+            self._span_limited = True
+        span_s = receiver_s - mark[0]
+        if span_s < MIN_RATE_SPAN_S or span_s < (self._rtt_s or 0.0):
+            return
+        rate = (cum_bytes - mark[1]) / span_s
+        # What was sent while draining or with nothing more to send only shows a lower bound.
+        if rate > (self._rate or 0.0) or not (self._span_limited or self._draining(now)):
+            self._note_rate(now, rate)
+        self._mark = (receiver_s, cum_bytes)
+        self._span_limited = False
+
+    def _draining(self, now: float) -> bool:
+        """Whether what arrives now may have been sent while draining."""
+        return self._drain_until_s is not None or now < self._drained_s + 2 * (self._rtt_s or 0.0) + MIN_RATE_SPAN_S
+
+    def _note_rate(self, now: float, rate: float) -> None:
+        rates = self._rates
+        while rates and rates[-1][1] <= rate:
+            rates.pop()
+        rates.append((now, rate))
+        oldest_s = now - max(RATE_WINDOW_S, 3 * (self._rtt_s or 0.0))
+        while rates[0][0] < oldest_s:
+            rates.popleft()
+        self._rate = rates[0][1]
+
+    def _recent_rate(self) -> float | None:
+        """Bytes/s that arrived in the last 150 ms."""
+        marks = self._marks
+        if len(marks) < 2:
+            return None
+        last_s, last_bytes = marks[-1]
+        since = next((mark for mark in reversed(marks) if last_s - mark[0] >= BURST_RATE_SPAN_S), marks[0])
+        return (last_bytes - since[1]) / (last_s - since[0])
+
+    # --- start-up -------------------------------------------------------------------------------------------------
+
+    def _start_again(self, now: float) -> None:
+        self._startup = True
+        self._cubic = None
+        self._drain_until_s = None
+        if self._rtt_s is not None:
+            self._pacing = STARTUP_PACING * self._window / self._rtt_s
+        self._begin_round(now)
+
+    def _ramp(self, now: float, receiver_s: float, cum_bytes: int, acked_bytes: int) -> None:
+        """One acknowledgement of start-up: the window doubles in a round, and goes where the trains point."""
+        train = self._train
+        train.append((receiver_s, cum_bytes))
+        self._train_bytes += acked_bytes
+        while cum_bytes - train[1][1] >= TRAIN_BYTES if len(train) > 2 else False:
+            train.popleft()
+        at_s, nbytes = train[0]
+        rtt_s = self._rtt_s or MIN_EPOCH_S
+        if cum_bytes - nbytes < TRAIN_BYTES:
+            return
+        span_s = receiver_s - at_s
+        rate = (cum_bytes - nbytes) / span_s if span_s > 1e-5 else inf
+        if rate > self._train_rate:
+            self._train_rate = rate
+        seen = self._train_rate * rtt_s
+        pacing = self._round_sent_pacing
+        held = pacing is None or self._train_rate < 0.75 * pacing  # by the bottleneck, not by our own pacing
+        if held and self._window > seen + 2 * self._fragment:
+            self._end_startup(seen + self._fragment)
+            return
+        if self._train_bytes >= self._round_window / 4:
+            self._window = max(self._window, min(STARTUP_GAIN * self._round_window, STARTUP_AIM * seen))
+            self._window = min(self._window, MAX_WINDOW_BYTES)
+            self._pacing = STARTUP_PACING * self._window / rtt_s
+            if held and self._window >= 0.85 * seen:
+                self._end_startup(self._window)
+            else:
+                self._begin_round(now)
+
+    def _end_startup(self, window: float) -> None:
+        self._startup = False
+        self._window = max(window, MIN_WINDOW_FRAGMENTS * self._fragment)
+        self._hold_until_s = -inf
+        self._empty_epochs = 0
+        self._pace()
+
+    # --- once an epoch --------------------------------------------------------------------------------------------
+
+    def _close_epoch(self, now: float) -> None:
+        samples = self._samples
+        count = len(samples)
+        queues = sorted([queue_s for queue_s, _ in samples])
+        backs = sorted([back_s for _, back_s in samples])
+        fifth = count // 5
+        queue_s = self._queue_s = max(0.0, queues[fifth])
+        interval_s = max(DRAIN_INTERVAL_S, DRAIN_RTTS * (self._rtt_s or 0.0))
+        window_s = max(BASE_WINDOW_S, 2.2 * interval_s) if self._cubic is None else COMPETE_MAX_S + BASE_WINDOW_S
+        for base in (self._small, self._large):
+            if base.epoch:
+                base.epoch.sort()
+                base.note(now, base.epoch[len(base.epoch) // 5], window_s)
+                base.epoch.clear()
+        if queues[fifth] < -self._high_s and now < self._adopted_until_s:
+            self._rival_until_s = now + RIVAL_MEMORY_S  # the short way is back: it was a queue
+        known = self._large.least or self._small.least
+        rtt_s = self._rtt_s = max(1e-5, known[0][1] + backs[count // 2])
+        spread_s = queues[count * 4 // 5] - queues[fifth]
+        self._jitter_s += 0.1 * (min(spread_s, 0.020 + 0.2 * rtt_s) - self._jitter_s)
+        # Of the link, not of our share of it: by the greatest rate seen lately.
+        self._peak = max(self._rate or 0.0, self._peak * (1 - PEAK_DECAY * (now - (self._epoch_s or now))))
+        serialise_s = self._fragment / self._peak if self._peak else 0.0
+        own_s = self._fragment / self._rate if self._rate else 0.0
+        noise_s = max(0.0, self._jitter_s - serialise_s)
+        # A slower flow wants a longer queue than a faster one, so that their shares meet.
+        self._target_s = TARGET_S + TARGET_PACKETS * min(own_s, 4 * serialise_s) + noise_s
+        self._high_s = max(0.010, 0.1 * rtt_s) + serialise_s + 1.5 * noise_s
+        self._recent.append(queue_s)
+        if self._judging and self._drain_until_s is None:
+            self._judging = False
+            self._judge(now, queue_s, rtt_s)
+        if queue_s < 0.25 * self._target_s:
+            self._emptied_s = now
+        limited = 2 * self._limited >= count
+        lost = self._lost_bytes / max(1, self._lost_bytes + self._acked_bytes)
+        if self._drain_until_s is not None:
+            if now >= self._drain_until_s:
+                self._window = self._saved_window
+                self._drain_until_s = None
+                self._drained_s = now
+                self._judging = True
+        elif self._startup:
+            if queue_s > self._high_s / 2 or lost > 0.2:
+                rate = self._recent_rate()
+                self._end_startup(min(self._window, rate * rtt_s) if rate else self._window / 2)
+        elif limited:
+            if self._cubic is not None:
+                window = self._cubic.window(now, rtt_s + queue_s, self._fragment)
+                self._window = min(max(window, MIN_WINDOW_FRAGMENTS * self._fragment), 1.5 * self._window)
+            else:
+                self._steer(now, queue_s, rtt_s)
+            stuck = self._cubic is None and self._above_epochs >= STUCK_EPOCHS
+            if stuck and now < self._rival_until_s:
+                self._compete(now, rtt_s + queue_s)
+            elif (stuck and now >= self._drained_s + STUCK_WAIT_S) or (
+                now >= max(self._drained_s, self._emptied_s) + interval_s
+            ):
+                self._drain(now, rtt_s)
+        self._pace()
+        samples.clear()
+        self._limited = 0
+        self._lost_bytes = self._acked_bytes = 0
+        self._epoch_s = now
+
+    def _steer(self, now: float, queue_s: float, rtt_s: float) -> None:
+        rate = self._rate
+        if rate is None:
+            return
+        window = self._window
+        if queue_s > self._high_s:
+            self._empty_epochs = 0
+            self._above_epochs += 1
+            if now >= self._hold_until_s:
+                recent = self._recent_rate() or rate
+                if self._above_epochs >= 2:
+                    self._rates.clear()
+                    self._note_rate(now, recent)
+                window = min(window, CUT * min(recent, rate) * rtt_s + self._fragment)
+                self._hold_until_s = now + rtt_s
+        else:
+            self._above_epochs = 0
+            if now >= self._rival_until_s:
+                self._calm_window = window
+            target_s = self._target_s
+            error_s = target_s - queue_s
+            step = GAIN * rate * max(error_s, -queue_s)
+            if queue_s < 0.25 * target_s:
+                step *= 2 ** min(max(0, self._empty_epochs - PATIENT_EPOCHS), 16)
+                self._empty_epochs += 1
+            else:
+                self._empty_epochs = 0
+            window += min(step, MAX_GROWTH * window)
+            window = min(window, 1.4 * rate * (rtt_s + target_s) + 3 * self._fragment)
+        self._window = min(max(window, MIN_WINDOW_FRAGMENTS * self._fragment), MAX_WINDOW_BYTES)
+
+    def _pace(self) -> None:
+        rtt_s = self._rtt_s
+        if rtt_s is None:
+            return
+        if self._startup:
+            self._pacing = STARTUP_PACING * self._window / rtt_s
+            return
+        if self._cubic is not None:
+            self._pacing = 1.2 * self._window / rtt_s
+            return
+        self._pacing = PACING_GAIN * self._window / rtt_s
+        rate = self._rate
+        if rate is not None and self._queue_s >= 0.25 * self._target_s:
+            self._pacing = max(min(self._pacing, PACING_GAIN * rate), 1.0)
+
+    def _drain(self, now: float, rtt_s: float) -> None:
+        if self._rate is None:
+            return
+        self._saved_window = self._window
+        self._window = max(min(self._window, DRAIN_GAIN * self._rate * rtt_s), MIN_WINDOW_FRAGMENTS * self._fragment)
+        wait_s = rtt_s + self._queue_s if self._cubic is not None or self._above_epochs else rtt_s
+        self._drain_until_s = now + wait_s + (self._saved_window - self._window) / self._rate
+
+    def _judge(self, now: float, queue_s: float, rtt_s: float) -> None:
+        """We made way for a round trip: whose is the queue?"""
+        cubic = self._cubic
+        if queue_s <= self._high_s:
+            if cubic is not None:
+                self._cubic = None
+                self._calm_window = self._window
+                self._rival_until_s = now + RIVAL_MEMORY_S
+                self._window = min(self._window, (self._rate or 0.0) * rtt_s + self._fragment)
+        elif cubic is not None:
+            if now > cubic.began_s + COMPETE_MAX_S:
+                self._new_path(now, queue_s)
+        elif self._above_epochs >= STUCK_EPOCHS:
+            flat = max(self._recent) - min(self._recent) < max(FLAT_S, 0.1 * queue_s)
+            if flat and now > max(self._rival_until_s, self._lost_s + LOSS_MEMORY_S):
+                self._new_path(now, queue_s)
+            else:
+                self._compete(now, rtt_s + queue_s)
+
+    def _compete(self, now: float, rtt_s: float) -> None:
+        window = max(self._window, self._calm_window, (self._recent_rate() or 0.0) * rtt_s)
+        self._cubic = _Cubic(now, window, self._fragment)
+        self._window = window
+        self._above_epochs = 0
+
+    def _new_path(self, now: float, queue_s: float) -> None:
+        """What looked like a queue is a longer way."""
+        for base in (self._small, self._large):
+            if base.least:
+                delay_s = base.least[0][1] + queue_s
+                base.least.clear()
+                base.least.append((now, delay_s))
+        if self._rtt_s is not None:
+            self._rtt_s += queue_s
+        self._queue_s = 0.0
+        self._above_epochs = 0
+        self._adopted_until_s = now + RIVAL_MEMORY_S
+        self._start_again(now)
+
+    def _emergency(self, now: float) -> None:
+        """The queue is far too long: the link got slower."""
+        rtt_s = self._rtt_s
+        rate = self._recent_rate()
+        if rtt_s is None or rate is None:
+            return
+        self._rates.clear()
+        self._note_rate(now, rate)
+        self._mark = None
+        self._drain_until_s = None
+        self._window = min(self._window, max(EMERGENCY_CUT * rate * rtt_s, MIN_WINDOW_FRAGMENTS * self._fragment))
+        self._hold_until_s = now + max(0.1, rtt_s + self._queue_s)
+        self._high_since_s = None
+        self._empty_epochs = 0
+        self._pace()
+
+    def on_loss(self, *, now: float, nbytes: int) -> None:
+        self._lost_bytes += nbytes
+        self._lost_s = now
+        cubic = self._cubic
+        if cubic is None or self._drain_until_s is not None:
+            return
+        if now >= cubic.cut_s + (self._rtt_s or 0.0) + self._queue_s:
+            self._window = max(cubic.cut(now, self._window, self._fragment), MIN_WINDOW_FRAGMENTS * self._fragment)
+
+    def on_reset(self, *, now: float) -> None:
+        self._begin()
+
+    def on_stall(self, *, now: float) -> None:
+        self._rates.clear()
+        self._rate = None
+        self._restart()
+        self._window = max(min(self._window, self._initial_bytes), MIN_WINDOW_FRAGMENTS * self._fragment)
+        self._start_again(now)
