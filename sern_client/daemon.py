@@ -30,7 +30,7 @@ from sern_runtime.link_metrics import register_links, register_received
 from sern_runtime.loop import Shutdown
 from sern_runtime.metrics import Metrics
 from sern_runtime.sdnotify import Notifier, Watchdog
-from sern_runtime.topics_view import link_summary, received_summary
+from sern_runtime.topics_view import both_ways
 
 DRAIN_S: Final = 5.0
 """How long a stopping client goes on sending what reliable topics still owe."""
@@ -227,11 +227,7 @@ class ClientDaemon:
 
     def topics(self) -> dict[str, object]:
         """Counters of every topic by global name, sent and received."""
-        now = time.monotonic()
-        return {
-            **link_summary(self.core.link, direction="send"),
-            **received_summary(self.core.received, now=now),
-        }
+        return dict(both_ways(self.core.link, self.core.received, now=time.monotonic()))
 
     async def drain(self) -> None:
         """Stop the sources, then go on sending for a while what is still owed. What arrives meanwhile is taken.

@@ -13,7 +13,9 @@ LANE_MESSAGE_BYTES: Final = 68 * 1024
 BURST: Final = 64
 """Datagrams sent in one go before others in the loop get their turn; about 1 ms of work."""
 BLOCKED_S: Final = 0.01
-"""While the lane is not ready, what the port has been due for must not turn the loop; `kick` follows when it is."""
+"""A lane that is not ready or full is tried again at most this often, whatever has become due meanwhile. libzmq
+reports every change of a full socket and seldom the one that helps: trying at each of them kept a core busy for as long
+as the peer took nothing (measured)."""
 
 
 class Port(Protocol):
@@ -30,8 +32,8 @@ class Pump:
     """Sends what `port` has, when it has it, and wakes it at its deadline.
 
     Call `kick` after anything that may have given the port something to send: it costs one flag, and everything that
-    happens before the loop comes round is sent together. `send` answers FULL when the socket cannot take more; `kick`
-    again when it can. `on_gone` is called when the peer's connection is over.
+    happens before the loop comes round is sent together. `send` answers FULL when the socket cannot take more; it is
+    tried again soon. `on_gone` is called when the peer's connection is over.
 
     A paced lane (UDP) says with `next_deadline` when its next datagram may leave. The timer wakes at whole
     milliseconds, never early, and what has become due until then leaves as one burst: the core's pacing must grant what
@@ -55,6 +57,7 @@ class Pump:
         self._timer = Timer(self._due)
         self._scheduled: asyncio.Handle | None = None
         self._held: bytes | None = None
+        self._retry_s = 0.0  # not before then, while something is held
         self._closed = False
         self.datagrams = 0
         self.bytes = 0
@@ -92,6 +95,9 @@ class Pump:
         port = self._port
         ready = self._ready
         now = time.monotonic()
+        if self._held is not None and now < self._retry_s:
+            self._timer.arm(self._retry_s)
+            return
         earliest_s = now
         for _ in range(BURST):
             if ready is not None and not ready():
@@ -108,8 +114,10 @@ class Pump:
                 self.datagrams += 1
                 self.bytes += len(datagram)
             elif result is SendResult.FULL:
-                self._held = datagram  # the socket says when it can take more
-                break
+                self._held = datagram
+                self._retry_s = now + BLOCKED_S
+                self._timer.arm(self._retry_s)
+                return
             else:
                 self._held = None
                 self._on_gone()

@@ -14,7 +14,7 @@ def link_summary(link: Link, *, direction: str) -> dict[str, dict[str, object]]:
         queued, _queued_bytes, flying, _flying_bytes = channel.held()
         cell[0] += queued
         cell[1] += flying
-        wanted[channel.stream.id.topic] = bool(channel.wanted)
+        wanted[channel.stream.id.topic] = wanted.get(channel.stream.id.topic, False) or bool(channel.wanted)
     result: dict[str, dict[str, object]] = {}
     for topic, counters in link.ledger.topics.items():
         in_queue, in_flight = held.get(topic, (0, 0))
@@ -49,3 +49,14 @@ def received_summary(received: ReceiveLedger, *, now: float) -> dict[str, dict[s
         }
         for counters in received.topics.values()
     }
+
+
+def both_ways(link: Link, received: ReceiveLedger, *, now: float) -> dict[str, dict[str, object]]:
+    """The topics of a client. One that goes both ways (/tf of several robots) has what arrived under `received`."""
+    topics = link_summary(link, direction="send")
+    for topic, arrived in received_summary(received, now=now).items():
+        if topic in topics:
+            topics[topic]["received"] = arrived
+        else:
+            topics[topic] = arrived
+    return topics
