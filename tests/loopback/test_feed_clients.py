@@ -118,7 +118,10 @@ async def test_a_program_without_sern_code_sees_odometry_and_drives(tmp_path: Pa
         relay = await lab.relay(lab.relay_file(feed={"roles": [programs.role()]}))
         robot = await lab.connected(
             lab.client_file(
-                "jackal1", ROBOT, topics=[{"match": "/cmd_vel", "class": "control", "direction": "receive"}]
+                "jackal1",
+                ROBOT,
+                client={"frame_prefix": "jackal1/"},
+                topics=[{"match": "/cmd_vel", "class": "control", "direction": "receive"}],
             )
         )
         odometry = programs.subscriber(b"/jackal1/odometry/filtered\0")
@@ -133,7 +136,7 @@ async def test_a_program_without_sern_code_sees_odometry_and_drives(tmp_path: Pa
         assert 0 <= before_ns - stamp_ns < 30e9
         assert age_us < 30e6
         message = ros_types.deserialise(body, "nav_msgs/msg/Odometry", Encoding.ROS1)
-        assert message.header.frame_id == "odom"
+        assert (message.header.frame_id, message.child_frame_id) == ("jackal1/odom", "jackal1/base_link")
 
         start_x_m = endpoint_of(robot, SyntheticEndpoint).state().pose.x_m
         publisher = await programs.publisher()

@@ -71,6 +71,8 @@ def refused(registry: ObjectRegistry, object_id: str, owner: ClientName = A, **m
         ("nav_msgs/Odometry", PriorityClass.CONTROL, ObjectKind.TOPIC),
         ("tf2_msgs/msg/TFMessage", PriorityClass.CONTROL, ObjectKind.TRANSFORM),
         ("tf/tfMessage", PriorityClass.BULK, ObjectKind.TRANSFORM),
+        ("map_msgs/msg/OccupancyGridUpdate", PriorityClass.STATE, ObjectKind.PATCH),
+        ("map_msgs/PointCloud2Update", PriorityClass.BULK, ObjectKind.PATCH),
     ],
 )
 def test_kinds(type_name: str, priority: PriorityClass, kind: ObjectKind) -> None:
