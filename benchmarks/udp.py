@@ -61,16 +61,16 @@ def seal_us(cipher: Cipher, count: int) -> dict[str, float]:
     parameters = SessionParameters.draw(1, cipher, 1)
     sealer, opener = Sealer(parameters, Side.CLIENT), Opener(parameters, Side.CLIENT)
     data = os.urandom(ROOM_BYTES)
-    begun_s = time.perf_counter()
+    begun_s = time.process_time()  # not the clock: other load on this machine is no cost of ours
     datagrams = [sealer.seal(data) for _ in range(count)]
-    sealed_s = time.perf_counter()
+    sealed_s = time.process_time()
     for datagram in datagrams:
         opener.open(datagram)
-    opened_s = time.perf_counter()
+    opened_s = time.process_time()
     forged = datagrams[0][:4] + struct.pack("!Q", count + 1) + datagrams[0][12:]
     for _ in range(count):
         opener.open(forged)
-    refused_s = time.perf_counter()
+    refused_s = time.process_time()
     return {
         "seal_us": (sealed_s - begun_s) / count * 1e6,
         "open_us": (opened_s - sealed_s) / count * 1e6,

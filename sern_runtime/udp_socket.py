@@ -14,7 +14,7 @@ one core (two-core virtual machine, Python 3.11, uvloop; user and system time of
 
 The wake-ups are what costs, not the receives: hence the pause. `recvmmsg` saves little on top, and would need the
 kernel's structures in ctypes. `python -m benchmarks.udp` measures the finished server with a real session beside the
-junk (100 round trips a second): 0.5 % and 5.8 %, where a server without filter and pause takes 16 % and 18 %.
+junk (100 round trips a second): 0.4-0.5 % and 4.8-5.8 %; without filter and pause 8-16 % and 9-18 %.
 
 The pause: after a batch with more junk than datagrams of ours, the socket is looked at every `PAUSE_S` instead of at
 each arrival, until a look finds no junk. Under a flood ours wait up to that long; without one nothing changes.
