@@ -30,7 +30,7 @@ from sern_runtime.link_metrics import register_links, register_received
 from sern_runtime.loop import Shutdown
 from sern_runtime.metrics import Metrics
 from sern_runtime.sdnotify import Notifier, Watchdog
-from sern_runtime.topics_view import both_ways
+from sern_runtime.topics_view import TopicView, both_ways
 
 DRAIN_S: Final = 5.0
 """How long a stopping client goes on sending what reliable topics still owe."""
@@ -225,9 +225,9 @@ class ClientDaemon:
             return Health(ok=True, reason=f"connected to {self.core.link.peer}")
         return Health(ok=False, reason=self.bridge.rejected_reason or self.reason)
 
-    def topics(self) -> dict[str, object]:
+    def topics(self) -> dict[str, TopicView]:
         """Counters of every topic by global name, sent and received."""
-        return dict(both_ways(self.core.link, self.core.received, now=time.monotonic()))
+        return both_ways(self.core.link, self.core.received, now=time.monotonic())
 
     async def drain(self) -> None:
         """Stop the sources, then go on sending for a while what is still owed. What arrives meanwhile is taken.

@@ -39,6 +39,12 @@ ZAP_DOMAIN: Final = "sern"
 DRAIN_S: Final = 10.0
 """How long a stopping relay goes on sending what it holds for clients that are connected."""
 SWEEP_S: Final = 1.0
+OTHER_CODE: Final = "other"
+REFUSAL_CODES: Final = frozenset({
+    "bad_id", "bad_name", "bad_pattern", "forbidden", "name_taken", "not_owner", "old_boot", "origin", "registry_full",
+    "too_large", "too_many_objects", "too_many_patterns", "too_many_streams", "type_mismatch",
+})  # fmt: skip
+"""What a refusal is counted under; a code that a client made up is counted as `other`."""
 
 _log = logging.getLogger(__name__)
 
@@ -75,7 +81,7 @@ class RelayDaemon:
         self.notifier = Notifier.from_environment()
         self.directory = self._directory(loaded)
         self.ages = AgeHistograms()
-        self.refusals: dict[str, int] = {}
+        self.refusals = dict.fromkeys((*sorted(REFUSAL_CODES), OTHER_CODE), 0)
         self.reloads_failed = 0
         self.hub = Hub(
             name=model.name,
@@ -396,5 +402,5 @@ class RelayDaemon:
             self.feed.publish(stream, message, now=now)
 
     def refused(self, client: ClientName, code: str, text: str) -> None:
-        self.refusals[code] = self.refusals.get(code, 0) + 1
+        self.refusals[code if code in REFUSAL_CODES else OTHER_CODE] += 1
         _log.warning("%s: %s", client, text)

@@ -1,11 +1,16 @@
 """Counters of topics as JSON: for /api/topics, the summaries written at exit, and the tools that read them."""
 
+from typing import Any
+
 from sern_core.ledger import ReceiveLedger
 from sern_core.link import Link
 from sern_core.types import CLASS_LABELS
 
+TopicView = dict[str, Any]
+"""The counters of one topic, as `json.dumps` takes them."""
 
-def link_summary(link: Link, *, direction: str) -> dict[str, dict[str, object]]:
+
+def link_summary(link: Link, *, direction: str) -> dict[str, TopicView]:
     """What was offered to a link and what became of it: offered = delivered + dropped + in_queue + in_flight."""
     held: dict[str, list[int]] = {}
     wanted: dict[str, bool] = {}
@@ -15,7 +20,7 @@ def link_summary(link: Link, *, direction: str) -> dict[str, dict[str, object]]:
         cell[0] += queued
         cell[1] += flying
         wanted[channel.stream.id.topic] = wanted.get(channel.stream.id.topic, False) or bool(channel.wanted)
-    result: dict[str, dict[str, object]] = {}
+    result: dict[str, TopicView] = {}
     for topic, counters in link.ledger.topics.items():
         in_queue, in_flight = held.get(topic, (0, 0))
         result[topic] = {
@@ -35,7 +40,7 @@ def link_summary(link: Link, *, direction: str) -> dict[str, dict[str, object]]:
     return result
 
 
-def received_summary(received: ReceiveLedger, *, now: float) -> dict[str, dict[str, object]]:
+def received_summary(received: ReceiveLedger, *, now: float) -> dict[str, TopicView]:
     """What arrived, by topic, and how old the freshest sample of each is."""
     return {
         counters.topic: {
@@ -51,7 +56,7 @@ def received_summary(received: ReceiveLedger, *, now: float) -> dict[str, dict[s
     }
 
 
-def both_ways(link: Link, received: ReceiveLedger, *, now: float) -> dict[str, dict[str, object]]:
+def both_ways(link: Link, received: ReceiveLedger, *, now: float) -> dict[str, TopicView]:
     """The topics of a client. One that goes both ways (/tf of several robots) has what arrived under `received`."""
     topics = link_summary(link, direction="send")
     for topic, arrived in received_summary(received, now=now).items():

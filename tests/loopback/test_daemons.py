@@ -218,3 +218,27 @@ async def test_the_relay_tells_systemd_what_it_does(tmp_path: Path) -> None:
             await until(lambda: says("STATUS=reload failed"))
             await relay.stop()
             assert says("STOPPING=1")
+
+
+async def test_a_topic_that_goes_both_ways_is_counted_both_ways(tmp_path: Path) -> None:
+    """Two robots on one global /tf: each sends its own and records the other's."""
+    bag = write_bag(tmp_path / "run.bag", {"/tf": 50})
+    everywhere: dict[str, Any] = {"client": {"namespace": "/"}, "subscribe": ["/tf"]}
+    async with Lab(tmp_path, "robot1", "robot2") as lab:
+        relay = await lab.relay()
+        robots = []
+        for name in ("robot1", "robot2"):
+            play = {"kind": "bag", "path": str(bag), "rate": 0, "wait_for": ["/tf"]}
+            rule = {"match": "/tf", "class": "state", "reliability": "reliable"}
+            config = lab.client_file(name, [play, {"kind": "record", "path": name}], topics=[rule], **everywhere)
+            robots.append(await lab.connected(config))
+        await until(lambda: all(count(robot) == 50 for robot in robots))
+        await until(lambda: all(robot.topics()["/tf"]["delivered"] == 50 for robot in robots))
+        for robot in robots:
+            topics = robot.topics()
+            assert balance(topics) == []
+            assert topics["/tf"]["received"]["delivered"] == 50
+        for robot in robots:
+            await lab.end(robot)
+        await lab.end(relay)
+    assert bodies(tmp_path / "robot1.bag") == bodies(tmp_path / "robot2.bag") == bodies(bag)

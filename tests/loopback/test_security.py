@@ -5,6 +5,7 @@ without a gap, a duplicate or a reconnection.
 """
 
 import json
+import re
 import shutil
 import socket as socketlib
 from collections.abc import AsyncIterator, Callable
@@ -15,10 +16,11 @@ from typing import Any
 import pytest
 import zmq
 
+import sern_core
 from sern_client.daemon import ClientDaemon
 from sern_core import wire
 from sern_core.types import TopicName
-from sern_relay.daemon import RelayDaemon
+from sern_relay.daemon import REFUSAL_CODES, RelayDaemon
 from sern_runtime.keys import SecretKey, load_public, load_secret
 from sern_runtime.monitor import SocketMonitor
 from sern_runtime.zmq_socket import DealerSocket, make_client
@@ -257,7 +259,7 @@ async def test_access_rules_hold_and_name_what_they_refuse(tmp_path: Path, caplo
         await until(lambda: robot.bridge.refusals == 1)
         await until(lambda: sum(c.delivered for c in site.core.received.topics.values()) == 20)
         assert "the relay refuses /robot1/secret (forbidden): robot1 may not publish /robot1/secret" in caplog.text
-        assert relay.refusals == {"forbidden": 1}
+        assert {code: count for code, count in relay.refusals.items() if count} == {"forbidden": 1}
         await lab.end(robot)
         summary = json.loads((tmp_path / "robot1.summary.json").read_text())["topics"]
         assert summary["/robot1/secret"]["delivered"] == 0
@@ -378,6 +380,13 @@ async def test_a_rule_taken_away_ends_the_stream_and_given_back_restores_it(
         assert robot.core.link.established and site.core.link.established
         for daemon in (robot, site, relay):
             await lab.end(daemon)
+
+
+def test_every_refusal_of_the_core_has_a_counter() -> None:
+    core = Path(sern_core.__file__ or "").parent
+    codes = {code for file in core.glob("*.py") for code in re.findall(r'RefusedError\(\s*"(\w+)"', file.read_text())}
+    assert codes <= REFUSAL_CODES
+    assert "forbidden" in codes
 
 
 async def test_half_open_connections_are_bounded(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
