@@ -257,7 +257,7 @@ class ClientCore:
         self.events.publication_refused(channel.stream, code, text)
 
     def on_skipped(self, link: Link, stream: InStream, count: int, *, now: float) -> None:
-        if stream.begun and stream.stream.id in self._open:
+        if stream.known and stream.stream.id in self._open:
             self.events.skipped(stream.stream, count)
 
     def on_control(self, link: Link, envelope: wire.Envelope, attachment: bytes, *, now: float) -> None:

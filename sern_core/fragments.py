@@ -95,7 +95,10 @@ class InStream:
         self.delivered = first - 1
         self.confirmed = first - 1  # what the peer was told (`Hop.confirm`)
         self.channel_id: int | None = None  # in this session
-        self.begun = False  # something has had its turn
+        self.wanted = True  # what the peer was told
+        self.paused = False  # it was not wanted, and the peer has not said yet where it goes on
+        self.pause_seq = 0  # the control message of this session that said so
+        self.known = False  # something has had its turn, or an earlier session announced it: a gap is then a gap
         self.reports: list[DropReport] = []  # drops that the peer may not know of yet
         self._seen = 0  # best effort: bit i set when seq delivered-1-i arrived
         self._partials: dict[int, Partial] = {}
@@ -266,12 +269,12 @@ class InStream:
                 return
             self._on_drop(self, DropReason.LIFESPAN, size, message.seq)
             message = self._tombstone(message.seq, DropReason.LIFESPAN, message.stamp_ns, message.born_s)
-        self.begun = True
+        self.known = True
         self._deliver(self, message)
 
     def sweep(self, now: float, up_since_s: float) -> None:
         """Give up half-received best-effort messages that nobody completes, though the link has been there."""
-        if self.reliable or not self._partials:
+        if not self._partials or self.reliable:
             return
         for seq, partial in list(self._partials.items()):
             if now - max(partial.touched_s, up_since_s) > PARTIAL_IDLE_S:
@@ -279,13 +282,17 @@ class InStream:
                 self._discard_partial(seq)
 
     def close(self) -> None:
-        """The stream ends; half-received messages are let go."""
+        """The stream ends."""
+        self.forget(DropReason.DISCONNECTED)
+        self.reports.clear()
+
+    def forget(self, reason: DropReason) -> None:
+        """Let go of half-received and waiting messages: the sender has given them up."""
         for seq in list(self._partials):
-            self._on_drop(self, DropReason.DISCONNECTED, len(self._partials[seq].body), 0)
+            self._on_drop(self, reason, len(self._partials[seq].body), 0)
             self._discard_partial(seq)
         self._reassembly.held_bytes -= self._waiting_bytes()
         self._waiting.clear()
-        self.reports.clear()
 
     def _waiting_bytes(self) -> int:
         return sum(len(message.body) for message in self._waiting.values() if not message.tombstone)

@@ -112,7 +112,7 @@ class Hop(ABC):
         self._rx_stamp_us = 0
         self._rx_delay: tuple[float, float] | None = None  # of the datagram at hand, and its uncertainty
         self._now = now
-        self._begin_control()
+        self._control, self._control_in = self._control_streams()
 
     # --- what the control plane provides --------------------------------------------------------------------------
 
@@ -131,6 +131,10 @@ class Hop(ABC):
 
     def _begin_control(self) -> None:
         """A fresh control stream in both directions, for a new session."""
+        self._control_in.close()
+        self._control, self._control_in = self._control_streams()
+
+    def _control_streams(self) -> tuple[OutChannel, InStream]:
         spec = TopicSpec(
             priority=PriorityClass.CONTROL,
             reliability=Reliability.RELIABLE,
@@ -141,9 +145,9 @@ class Hop(ABC):
         info = TopicInfo(CONTROL_TOPIC, "", Encoding.RAW)
         stream = StreamInfo(StreamId(self.name, self.boot, CONTROL_TOPIC), info, spec)
         counters = SendCounters(CONTROL_TOPIC, PriorityClass.CONTROL)
-        self._control = OutChannel(CONTROL_CHANNEL, stream, counters, lambda _out, _reason: None, first=1)
-        self._control.wanted = self._control.ready = True
-        self._control_in = InStream(stream, self.reassembly, self._control_message, self._in_drop, first=1)
+        control = OutChannel(CONTROL_CHANNEL, stream, counters, lambda _out, _reason: None, first=1)
+        control.wanted = control.ready = True
+        return control, InStream(stream, self.reassembly, self._control_message, self._in_drop, first=1)
 
     # --- messages out ---------------------------------------------------------------------------------------------
 
@@ -215,7 +219,7 @@ class Hop(ABC):
         items: list[SentData | SentWatermark | SentPing] = []
         if not lane.stalled or now >= lane.probe_due_s:
             self._compose(frames, items, now)
-            if lane.stalled and items:
+            if lane.stalled:
                 lane.probe_due_s = now + PROBE_INTERVAL_S
         arrivals = lane.arrivals
         if arrivals.unacked and (items or arrivals.due or now >= arrivals.since_s + ACK_DELAY_S):
@@ -296,23 +300,27 @@ class Hop(ABC):
             self._refresh(channel, now)
             if lane.stalled:
                 break
-        if not items and (self._ping or lane.stalled):
+        # A stream delivers what is under way, so one question at a time is enough there.
+        if not items and (self._ping or lane.stalled) and not (lane.lossless and lane.flight.packets):
             frames.append(wire.PING_FRAME)
             items.append(SentPing())
         self._ping = False
 
     def _put_watermarks(self, frames: list[bytes], items: list[SentData | SentWatermark | SentPing], size: int) -> int:
-        acked = self._control.watermark
         for slot in list(self._watermarks)[:MAX_WATERMARKS]:
-            reports = self.incoming[slot].reports
-            while reports and 0 < reports[0].control_seq <= acked:
-                del reports[0]
-            if reports:
-                continue  # the peer must hear of drops first: behind the watermark it would take them for delivered
+            if self._must_hear(self.incoming[slot]):
+                continue  # of drops first: behind the watermark it would take them for delivered
             frames.append(wire.encode_watermark(slot, self._watermarks.pop(slot)))
             items.append(SentWatermark(slot))
             size += wire.WATERMARK.size
         return size
+
+    def _must_hear(self, stream: InStream) -> bool:
+        """Whether the peer does not know yet of all the drops that were reported to it."""
+        reports = stream.reports
+        while reports and 0 < reports[0].control_seq <= self._control.watermark:
+            del reports[0]
+        return bool(reports)
 
     def _pick(self, now: float, *, window_open: bool) -> int | None:
         """The scheduler's choice; under `ordering: paper` what it found stale is dropped first."""
@@ -548,13 +556,14 @@ class Hop(ABC):
         for channel in list(self.channels.values()):
             watermark = channel.watermark
             channel.sweep(now, up=self.established)
-            if channel.offered:
+            if channel.offered or channel.active:
                 self._refresh(channel, now)
             if channel.watermark > watermark:
                 self._watermark_moved(channel)
-        if self.established:
-            for stream in self.incoming.values():
-                stream.sweep(now, self._up_since_s)
+        for stream in self.incoming.values():
+            self._must_hear(stream)
+            if 0 < stream.pause_seq <= self._control.watermark:
+                stream.forget(DropReason.UNWANTED)
 
 
 def _class_of(channel: OutChannel, out: OutMessage) -> PriorityClass:

@@ -575,7 +575,7 @@ class Hub:
         if relayed is None or not stream.reliable:
             return
         for out_link, channel in relayed.outs.values():
-            out_link.skip(channel, stream.delivered + 1, now=now)
+            out_link.skip(channel, stream.delivered + 1, now=now, silent=stream.paused)
 
     def on_wanted(self, link: Link, channel: OutChannel, *, now: float) -> None:
         """Nothing depends on it here: what a client subscribed to it gets."""

@@ -236,9 +236,14 @@ class Link(Session):
 
     def answer(self, stream: InStream, wanted: bool, *, now: float, owed: tuple[str, ...] = ()) -> None:
         """Tell the peer whether its stream is wanted; `owed` names the clients that must get a reliable one."""
+        stream.wanted = wanted
+        stream.paused = stream.paused or not wanted
+        stream.pause_seq = 0
         if self.established and stream.channel_id is not None:
             envelope = {"t": "want", "ch": stream.channel_id, "on": wanted, "owed": list(owed[:MAX_STRINGS])}
-            self.send_control(envelope, now=now)
+            seq = self.send_control(envelope, now=now)
+            if not wanted:
+                stream.pause_seq = seq
 
     def refuse(self, stream: InStream, code: str, text: str, *, now: float) -> None:
         """Take back what `on_announce` allowed (an access rule changed)."""
@@ -286,6 +291,8 @@ class Link(Session):
         if left_out:
             self.handler.on_skipped(self, stream, left_out, now=now)
             self._confirm_own(stream)
+        if stream.wanted:
+            stream.paused = False
 
     def _confirm_own(self, stream: InStream) -> None:
         if self.auto_confirm and stream.reliable:
@@ -304,8 +311,16 @@ class Link(Session):
         else:
             self.handler.on_in_drop(self, stream, reason, nbytes)
 
-    def skip(self, channel: OutChannel, first: int, *, now: float) -> None:
-        """The stream goes on at seq `first`: what lies between will not come, and the peer must not wait for it."""
+    def skip(self, channel: OutChannel, first: int, *, now: float, silent: bool = False) -> None:
+        """The stream goes on at seq `first`: what lies between will not come, and the peer must not wait for it.
+
+        `silent`: it was sent before anybody behind the peer wanted it, so there is nothing to report.
+        """
+        if silent and not channel.retained:
+            channel.start_at(first)
+            if self.established:
+                self._announce(channel, now)
+            return
         channel.skip_to(first)
         self._tell_gap(channel, now)
 
@@ -324,7 +339,7 @@ class Link(Session):
         a stream it has not been told of yet keeps its delivered count here, so that "once" survives its restart."""
         for identity, stream in list(self.streams.items()):
             if stream.channel_id is None:
-                if self.initiator and not self._resumed:
+                if self.initiator and (identity in self._missing or not self._resumed):
                     self._missing.setdefault(identity, now)
                 else:
                     self._retract(stream, now)
@@ -334,12 +349,16 @@ class Link(Session):
         self._missing.pop(stream.stream.id, None)
         if stream.channel_id is not None:
             self.incoming.pop(stream.channel_id, None)
+            self._watermarks.pop(stream.channel_id, None)
         self.handler.on_retract(self, stream, now=now)
         stream.close()
         stream.channel_id = None
 
     def _sweep(self, now: float) -> None:
         super()._sweep(now)
+        if self.established:
+            for stream in self.streams.values():
+                stream.sweep(now, self._up_since_s)
         for identity, since_s in list(self._missing.items()):
             if now - since_s > self.params.retention_s:
                 self._retract(self.streams[identity], now)
@@ -362,6 +381,7 @@ class Link(Session):
             if incoming is None:
                 return
             if kind == "first":
+                incoming.known = True  # had it been nobody's before, it would have been announced again
                 self._skip(incoming, wire.take_int(envelope, "seq", low=1), now)
             else:
                 self._retract(incoming, now)

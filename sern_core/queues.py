@@ -410,6 +410,12 @@ class OutChannel:
             self.gaps.append((self.next_seq - 1, first))
             self.next_seq = first
 
+    def start_at(self, first: int) -> None:
+        """Nothing has been submitted yet: begin at seq `first` instead."""
+        self.gaps.clear()
+        self.next_seq = first
+        self.watermark = first - 1
+
     def next_gap(self) -> int | None:
         """The seq to go on at, once everything before the gap is delivered; each gap is given out once."""
         first = None

@@ -148,6 +148,8 @@ class Session(Hop):
             self._give_back(packet.items, now)
         for stream in self.incoming.values():
             stream.channel_id = None
+            stream.known = True
+            stream.pause_seq = 0
         self.incoming.clear()
         self._watermarks.clear()
         if not self.established:

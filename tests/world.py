@@ -1,13 +1,19 @@
-"""A relay core and client cores in the virtual-time network, with a record of everything promised."""
+"""A relay core and client cores in the virtual-time network, with a record of everything promised.
+
+Every node has a clock of its own (offset and rate); what is recorded here is on the network's clock, the true one.
+"""
 
 from collections import defaultdict
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
+from random import Random
+from typing import NamedTuple
 
 from sern_core.access import AccessRule, AccessTable
 from sern_core.client import ClientCore
 from sern_core.hub import Hub, HubParams, HubPort
-from sern_core.message import Message, StreamInfo, TopicInfo, TopicSpec
+from sern_core.link import Link
+from sern_core.message import Message, StreamId, StreamInfo, TopicInfo, TopicSpec
 from sern_core.params import LinkParams, SchedulerParams
 from sern_core.queues import OutChannel
 from sern_core.types import (
@@ -23,7 +29,7 @@ from sern_sim.models import LinkModel
 from sern_sim.network import Hop, Network
 from sern_sim.ports import Port
 
-OPEN_ACCESS = AccessTable([AccessRule(client=".*", publish=(".*",), subscribe=(".*",))])
+OPEN_ACCESS = AccessTable([AccessRule(client=".*", publish=(".*",), subscribe=(".*",), replay=(".*",))])
 
 
 def spec(
@@ -52,51 +58,124 @@ def spec(
     )
 
 
+class Clock(NamedTuple):
+    """A node's clock against the network's: `offset_s` ahead, and fast by `rate_ppm`."""
+
+    offset_s: float = 0.0
+    rate_ppm: float = 0.0
+
+    def local(self, true_s: float) -> float:
+        return self.offset_s + true_s * (1.0 + self.rate_ppm * 1e-6)
+
+    def true(self, local_s: float) -> float:
+        return (local_s - self.offset_s) / (1.0 + self.rate_ppm * 1e-6)
+
+
+class ClockedPort:
+    """A port whose node lives on another clock than the network's. `sent` is told every datagram that leaves."""
+
+    def __init__(self, port: Port, clock: Clock) -> None:
+        self.inner = port
+        self.clock = clock
+        self.sent: Callable[[bytes, float], object] | None = None
+
+    def receive(self, data: bytes, *, now: float) -> None:
+        self.inner.receive(data, now=self.clock.local(now))
+
+    def next_datagram(self, *, now: float) -> bytes | None:
+        data = self.inner.next_datagram(now=self.clock.local(now))
+        if data is not None and self.sent is not None:
+            self.sent(data, now)
+        return data
+
+    def next_deadline(self) -> float | None:
+        deadline_s = self.inner.next_deadline()
+        if deadline_s is None or self.clock == Clock():
+            return deadline_s
+        # A nanosecond late: converted back it must not lie before the deadline.
+        return self.clock.true(deadline_s) + 1e-9
+
+    def handle_timeout(self, *, now: float) -> None:
+        self.inner.handle_timeout(now=self.clock.local(now))
+
+    def connected(self, *, now: float) -> None:
+        self.inner.connected(now=self.clock.local(now))
+
+    def disconnected(self, *, now: float) -> None:
+        self.inner.disconnected(now=self.clock.local(now))
+
+
 @dataclass(slots=True)
 class Got:
-    """One message as it was delivered."""
+    """One message as it was delivered. `age_s` is what the receiver thinks, `at_s` true time."""
 
     topic: str
     seq: int
     body: bytes
     age_s: float
+    error_s: float
     at_s: float
     replay: bool
+    stream: StreamId
+
+
+class Dropped(NamedTuple):
+    """A message of ours of which we were told that it was dropped."""
+
+    topic: str
+    seq: int
+    reason: DropReason
 
 
 @dataclass
 class SimClient:
-    """A client core as a node of the network; it records what it is told."""
+    """A client core as a node of the network; it records what it is told. One object a process: a restarted client is
+    another."""
 
     name: ClientName
+    world: "World"
+    clock: Clock = field(default_factory=Clock)
     core: ClientCore = field(init=False)
+    port: ClockedPort = field(init=False)
     got: list[Got] = field(default_factory=list)
+    turns: dict[StreamId, list[int]] = field(default_factory=lambda: defaultdict(list))
+    """Seqs delivered or expired, by stream, in the order of their turns; -n for n that were skipped."""
     expired_seqs: dict[str, list[int]] = field(default_factory=lambda: defaultdict(list))
     skipped_count: dict[str, int] = field(default_factory=lambda: defaultdict(int))
-    dropped_out: list[tuple[str, int, DropReason]] = field(default_factory=list)
+    sent: dict[tuple[str, int], tuple[float, bytes]] = field(default_factory=dict)
+    """What was accepted from us, by topic and seq: true time and body."""
+    refused: dict[str, int] = field(default_factory=lambda: defaultdict(int))
+    dropped_out: list[Dropped] = field(default_factory=list)
     refusals: list[tuple[str, str]] = field(default_factory=list)
     rejections: list[tuple[str, str]] = field(default_factory=list)
     opened: list[StreamInfo] = field(default_factory=list)
     closed: list[StreamInfo] = field(default_factory=list)
-    wants: dict[str, bool] = field(default_factory=dict)
-    ups: int = 0
+    wants: dict[str, list[bool]] = field(default_factory=lambda: defaultdict(list))
+    ups: list[bool] = field(default_factory=list)
+    """Of each session, whether it was with the same relay process as the one before."""
+    downs: list[str] = field(default_factory=list)
 
-    def start(
-        self, now: float, *, boot: int, lossless: bool, link: LinkParams, scheduler: SchedulerParams
-    ) -> "SimClient":
+    def start(self, *, boot: int, lossless: bool, link: LinkParams, scheduler: SchedulerParams) -> "SimClient":
         self.core = ClientCore(
-            name=self.name, boot=boot, events=self, link=link, scheduler=scheduler, now=now, lossless=lossless
+            name=self.name, boot=boot, events=self, link=link, scheduler=scheduler, now=self.now, lossless=lossless
         )
+        self.port = ClockedPort(self.core.link, self.clock)
         return self
 
+    @property
+    def now(self) -> float:
+        """Our own clock."""
+        return self.clock.local(self.world.network.now)
+
     def ports(self) -> list[Port]:
-        return [self.core.link]
+        return [self.port]
 
     # ClientEvents
     def link_up(self, *, resumed: bool) -> None:
-        self.ups += 1
+        self.ups.append(resumed)
 
-    def link_down(self, reason: str) -> None: ...
+    def link_down(self, reason: str) -> None:
+        self.downs.append(reason)
 
     def rejected(self, code: str, text: str) -> None:
         self.rejections.append((code, text))
@@ -108,27 +187,64 @@ class SimClient:
         self.closed.append(stream)
 
     def message(self, stream: StreamInfo, message: Message, *, now: float) -> None:
-        self.got.append(Got(stream.id.topic, message.seq, message.body, now - message.born_s, now, message.replay))
+        true_s = self.world.network.now
+        self.turns[stream.id].append(message.seq)
+        self.got.append(
+            Got(
+                stream.id.topic,
+                message.seq,
+                message.body,
+                now - message.born_s,
+                message.error_s,
+                true_s,
+                message.replay,
+                stream.id,
+            )
+        )
 
     def expired(self, stream: StreamInfo, seq: int, reason: DropReason) -> None:
+        self.turns[stream.id].append(seq)
         self.expired_seqs[stream.id.topic].append(seq)
 
     def skipped(self, stream: StreamInfo, count: int) -> None:
+        self.turns[stream.id].append(-count)
         self.skipped_count[stream.id.topic] += count
 
     def send_dropped(self, stream: StreamInfo, seq: int, reason: DropReason) -> None:
-        self.dropped_out.append((stream.id.topic, seq, reason))
+        self.dropped_out.append(Dropped(stream.id.topic, seq, reason))
 
     def wanted(self, stream: StreamInfo, wanted: bool) -> None:
-        self.wants[stream.id.topic] = wanted
+        self.wants[stream.id.topic].append(wanted)
 
     def publication_refused(self, stream: StreamInfo, code: str, text: str) -> None:
         self.refusals.append((code, text))
 
     # helpers
-    def publish(self, topic: str, topic_spec: TopicSpec, now: float, definition: str = "") -> OutChannel:
+    def publish(self, topic: str, topic_spec: TopicSpec, definition: str = "") -> OutChannel:
         info = TopicInfo(TopicName(topic), "std_msgs/msg/String", Encoding.CDR, "RIHS01_0", definition)
-        return self.core.publish(info, topic_spec, now=now)
+        return self.core.publish(info, topic_spec, now=self.now)
+
+    def send(self, channel: OutChannel, body: bytes) -> bool:
+        """Offer a message now; it is recorded under its seq if it is accepted."""
+        seq = channel.next_seq
+        if not self.core.send(channel, body, 0, now=self.now):
+            self.refused[channel.stream.id.topic] += 1
+            return False
+        self.sent[channel.stream.id.topic, seq] = (self.world.network.now, body)
+        return True
+
+    def every(
+        self, period_s: float, channel: OutChannel, body: Callable[[int], bytes] | bytes, *, first_s: float = 0.0
+    ) -> Callable[[], None]:
+        """Send every `period_s`, from `first_s` from now, until the function that this returns is called."""
+
+        def tick(_now: float) -> None:
+            self.send(channel, body if isinstance(body, bytes) else body(channel.next_seq))
+
+        return self.world.network.every(period_s, tick, node=self, first_s=first_s).cancel
+
+    def subscribe(self, *patterns: str) -> None:
+        self.core.subscribe(patterns, now=self.now)
 
     def on(self, topic: str) -> list[Got]:
         return [got for got in self.got if got.topic == topic]
@@ -140,28 +256,41 @@ class SimClient:
 class SimHub:
     """A relay core as a node."""
 
-    def __init__(self, now: float, *, boot: int, lossless: bool, link: LinkParams, access: AccessTable) -> None:
+    def __init__(self, world: "World", *, boot: int) -> None:
+        self.world = world
+        self.clock = world.relay_clock
         self.refusals: list[tuple[str, str]] = []
+        self.fed: list[Message] = []
         self.hub = Hub(
             name=ClientName("relay"),
             boot=boot,
-            access=access,
+            access=world.access,
             known=lambda _name: True,
             events=self,
-            link=link,
+            link=world.link,
             scheduler=SchedulerParams(),
-            params=HubParams(),
+            params=world.hub_params,
             wall_ns=lambda t: int(t * 1e9),
-            now=now,
-            lossless=lossless,
+            now=self.now,
+            lossless=world.lossless,
         )
-        self.sides: dict[ClientName, HubPort] = {}
+        self.sides: dict[ClientName, ClockedPort] = {}
 
-    def port(self, client: ClientName) -> HubPort:
-        return self.sides.setdefault(client, HubPort(self.hub, client))
+    @property
+    def now(self) -> float:
+        return self.clock.local(self.world.network.now)
+
+    def port(self, client: ClientName) -> ClockedPort:
+        port = self.sides.get(client)
+        if port is None:
+            port = self.sides[client] = ClockedPort(HubPort(self.hub, client), self.clock)
+        return port
 
     def ports(self) -> list[Port]:
         return [*self.sides.values()]
+
+    def links(self) -> Iterator[Link]:
+        yield from self.hub.links.values()
 
     def client_up(self, client: ClientName, *, resumed: bool) -> None: ...
 
@@ -171,7 +300,8 @@ class SimHub:
 
     def stream_removed(self, stream: StreamInfo) -> None: ...
 
-    def message(self, stream: StreamInfo, message: Message, *, now: float) -> None: ...
+    def message(self, stream: StreamInfo, message: Message, *, now: float) -> None:
+        self.fed.append(message)
 
     def refused(self, client: ClientName, code: str, text: str) -> None:
         self.refusals.append((code, text))
@@ -181,28 +311,41 @@ class World:
     """One relay and any number of clients, each behind a link of its own."""
 
     def __init__(
-        self, seed: int = 1, *, link: LinkParams | None = None, access: AccessTable = OPEN_ACCESS, lossless: bool = True
+        self,
+        seed: int = 1,
+        *,
+        link: LinkParams | None = None,
+        access: AccessTable = OPEN_ACCESS,
+        lossless: bool = True,
+        hub_params: HubParams | None = None,
+        relay_clock: Clock | None = None,
     ) -> None:
         self.network = Network(seed)
         self.link = link or LinkParams()
         self.access = access
         self.lossless = lossless
-        self._boots = 1000
-        self.relay = self._new_relay()
+        self.hub_params = hub_params or HubParams()
+        self.relay_clock = relay_clock or Clock()
+        self._boots = Random(seed)
+        self.relay = SimHub(self, boot=self._boot())
         self.clients: dict[str, SimClient] = {}
         self.hops: dict[str, Hop] = {}
-        self.network.every(1.0, lambda now: self.relay.hub.sweep(now=now))
+        self.network.every(1.0, lambda _now: self.relay.hub.sweep(now=self.relay.now))
 
     @property
     def now(self) -> float:
         return self.network.now
 
     def _boot(self) -> int:
-        self._boots += 1
-        return self._boots
+        return self._boots.getrandbits(63)
 
-    def _new_relay(self) -> SimHub:
-        return SimHub(self.now, boot=self._boot(), lossless=self.lossless, link=self.link, access=self.access)
+    def _process(self, name: str, clock: Clock, scheduler: SchedulerParams, patterns: Iterable[str]) -> SimClient:
+        client = SimClient(ClientName(name), self, clock).start(
+            boot=self._boot(), lossless=self.lossless, link=self.link, scheduler=scheduler
+        )
+        client.subscribe(*patterns)
+        self.clients[name] = client
+        return client
 
     def client(
         self,
@@ -212,38 +355,45 @@ class World:
         *,
         patterns: Iterable[str] = (),
         scheduler: SchedulerParams | None = None,
+        clock: Clock | None = None,
     ) -> SimClient:
         """A client that connects now; `up` carries its traffic to the relay (a perfect wire by default)."""
         wire = LinkModel().as_stream() if self.lossless else LinkModel()
-        client = SimClient(ClientName(name)).start(
-            self.now,
-            boot=self._boot(),
-            lossless=self.lossless,
-            link=self.link,
-            scheduler=scheduler or SchedulerParams(),
-        )
-        client.core.subscribe(tuple(patterns), now=self.now)
-        self.clients[name] = client
+        client = self._process(name, clock or Clock(), scheduler or SchedulerParams(), patterns)
+        relay_port = self.relay.port(client.name)
         self.hops[name] = self.network.join(
-            client.core.link,
-            client,
-            self.relay.port(client.name),
-            self.relay,
-            up or wire,
-            down or up or wire,
-            name=name,
+            client.port, client, relay_port, self.relay, up or wire, down or up or wire, name=name
         )
         return client
+
+    def restart_client(self, name: str, *, patterns: Iterable[str] | None = None) -> SimClient:
+        """kill -9 of a client: a new process in its place that knows nothing. Returns it; the old one is the record."""
+        old = self.clients[name]
+        new = self._process(name, old.clock, SchedulerParams(), old.core.patterns if patterns is None else patterns)
+        self.network.replace_node(old, new, [(old.port, new.port)])
+        return new
 
     def restart_relay(self) -> None:
         """kill -9: a new process in its place that knows nothing."""
         old = self.relay
-        self.relay = self._new_relay()
+        self.relay = SimHub(self, boot=self._boot())
         pairs = [(old.sides[name], self.relay.port(name)) for name in old.sides]
         self.network.replace_node(old, self.relay, pairs)
 
     def run(self, seconds: float) -> None:
         self.network.run_for(seconds)
+
+    def until(self, condition: Callable[[], object], *, within_s: float = 60.0, what: str = "condition") -> float:
+        return self.network.run_until_true(condition, within_s=within_s, what=what)
+
+    def links(self) -> Iterator[Link]:
+        yield from (client.core.link for client in self.clients.values())
+        yield from self.relay.links()
+
+    def watch(self, period_s: float = 0.1) -> "World":
+        """Validate everything again and again while the world runs."""
+        self.network.every(period_s, lambda _now: self.validate())
+        return self
 
     def validate(self) -> None:
         self.relay.hub.validate()

@@ -15,7 +15,7 @@ def test_one_message_arrives_whole_and_with_its_age() -> None:
     world = World()
     robot = world.client("robot", thin())
     site = world.client("site", patterns=["/robot/.*"])
-    channel = robot.publish("/robot/map", spec(reliable=True), world.now, definition="string data")
+    channel = robot.publish("/robot/map", spec(reliable=True), definition="string data")
     world.network.at(1.0, lambda now: robot.core.send(channel, b"x" * 100_000, 123, now=now), node=robot)
     world.run(3.0)
     assert [(got.seq, got.body) for got in site.got] == [(1, b"x" * 100_000)]
@@ -30,8 +30,8 @@ def test_pose_stays_fresh_under_overload() -> None:
     world = World()
     robot = world.client("robot", thin())
     site = world.client("site", patterns=["/robot/.*"])
-    pose = robot.publish("/robot/odom", spec(PriorityClass.CONTROL), world.now)
-    cloud = robot.publish("/robot/points", spec(PriorityClass.BULK), world.now)
+    pose = robot.publish("/robot/odom", spec(PriorityClass.CONTROL))
+    cloud = robot.publish("/robot/points", spec(PriorityClass.BULK))
     world.network.every(0.02, lambda now: robot.core.send(pose, b"p" * 100, 0, now=now), node=robot)
     world.network.every(0.1, lambda now: robot.core.send(cloud, b"c" * 100_000, 0, now=now), node=robot)
     world.run(20.0)
@@ -49,7 +49,7 @@ def test_reliable_survives_a_relay_restart_once_and_in_order(lossless: bool) -> 
     model = thin() if lossless else LinkModel(rate_bps=4e6, delay_s=0.025, loss=0.02)
     robot = world.client("robot", model)
     site = world.client("site", model, patterns=["/robot/.*"])
-    log = robot.publish("/robot/log", spec(reliable=True), world.now)
+    log = robot.publish("/robot/log", spec(reliable=True))
     bodies: list[bytes] = []
 
     def offer(now: float) -> None:
