@@ -10,12 +10,19 @@ new process and everything is sent again.
 from collections.abc import Callable
 from typing import Final
 
+from sern_core.errors import WireError
 from sern_core.message import Message, StreamInfo
 from sern_core.types import DROP_CODES, DROP_REASONS, DropReason
 from sern_core.wire import FLAG_REPLAY, FLAG_TOMBSTONE
 
 PARTIAL_IDLE_S: Final = 10.0
 """A half-received best-effort message that gets no fragment for so long will not be completed."""
+MAX_PARTIALS: Final = 256
+"""Half-received best-effort messages of a stream; each whole one that arrives looks through them."""
+MAX_SPANS: Final = 1024
+"""Pieces of a half-received message: more gaps than a sender has packets in flight."""
+HELD_OVERHEAD_BYTES: Final = 512
+"""What a half-received or waiting message costs beside its body: without it, small ones could fill the memory."""
 SEEN_BITS: Final = 64
 SEEN_MASK: Final = (1 << SEEN_BITS) - 1
 
@@ -49,6 +56,8 @@ class Partial:
                     merged[-1] = (merged[-1][0], max(merged[-1][1], stop))
                 else:
                     merged.append((start, stop))
+            if len(merged) > MAX_SPANS:
+                raise WireError(f"a message of {len(self.body)} bytes in more than {MAX_SPANS} pieces")
             self.spans = merged
 
     @property
@@ -156,7 +165,7 @@ class InStream:
         partial = self._partials.get(seq)
         if partial is None or len(partial.body) != total:
             self._discard_partial(seq)
-            if not self._make_room(total):
+            if not self._make_room(total + HELD_OVERHEAD_BYTES):
                 self.give_up(seq, DropReason.REASSEMBLY, len(body), now)
                 return
             partial = self._partials[seq] = Partial(total)
@@ -189,7 +198,11 @@ class InStream:
 
     def _make_room(self, total: int) -> bool:
         reassembly = self._reassembly
-        while self._partials and not self.reliable and reassembly.held_bytes + total > reassembly.limit_bytes:
+        while (
+            self._partials
+            and not self.reliable
+            and (reassembly.held_bytes + total > reassembly.limit_bytes or len(self._partials) >= MAX_PARTIALS)
+        ):
             oldest = min(self._partials)
             self._on_drop(self, DropReason.REASSEMBLY, len(self._partials[oldest].body), 0)
             self._discard_partial(oldest)
@@ -201,7 +214,7 @@ class InStream:
     def _discard_partial(self, seq: int) -> None:
         partial = self._partials.pop(seq, None) if self._partials else None
         if partial is not None:
-            self._reassembly.held_bytes -= len(partial.body)
+            self._reassembly.held_bytes -= len(partial.body) + HELD_OVERHEAD_BYTES
 
     def _late(self, seq: int, size: int) -> None:
         if self.reliable:
@@ -237,10 +250,13 @@ class InStream:
                 self._advance()
             return
         size = len(message.body)
-        if not message.tombstone and not self._make_room(size):
+        if not self._make_room(size + HELD_OVERHEAD_BYTES):
             # Without the message before it this one cannot be kept; its tombstone can.
-            self._on_drop(self, DropReason.REASSEMBLY, size, seq)
-            message = self._tombstone(seq, DropReason.REASSEMBLY, message.stamp_ns, message.born_s)
+            if not message.tombstone:
+                self._on_drop(self, DropReason.REASSEMBLY, size, seq)
+                message = self._tombstone(seq, DropReason.REASSEMBLY, message.stamp_ns, message.born_s)
+            if not self._make_room(len(message.body) + HELD_OVERHEAD_BYTES):
+                raise WireError(f"more messages out of order than {self._reassembly.limit_bytes} bytes hold")
         self._waiting[seq] = message
 
     def _advance(self) -> None:
@@ -250,8 +266,7 @@ class InStream:
     def _take_turn(self, seq: int) -> None:
         """A message that waited for those before it."""
         message = self._waiting.pop(seq)
-        if not message.tombstone:
-            self._reassembly.held_bytes -= len(message.body)
+        self._reassembly.held_bytes -= len(message.body) + HELD_OVERHEAD_BYTES
         self.delivered = seq
         self._turn(message)
 
@@ -295,12 +310,13 @@ class InStream:
         self._waiting.clear()
 
     def _waiting_bytes(self) -> int:
-        return sum(len(message.body) for message in self._waiting.values() if not message.tombstone)
+        return sum(len(message.body) + HELD_OVERHEAD_BYTES for message in self._waiting.values())
 
     @property
     def held_bytes(self) -> int:
         """Memory of half-received and waiting messages."""
-        return sum(len(partial.body) for partial in self._partials.values()) + self._waiting_bytes()
+        partial_bytes = sum(len(partial.body) + HELD_OVERHEAD_BYTES for partial in self._partials.values())
+        return partial_bytes + self._waiting_bytes()
 
     def validate(self, check: Callable[[bool, str], None]) -> None:
         name = self.stream.id.topic

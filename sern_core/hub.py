@@ -33,6 +33,8 @@ from sern_core.types import DROP_CODES, ClientName, DropReason, ObjectKind, Topi
 
 MAX_SUBSCRIPTION_PARTS: Final = 64
 RESET_INTERVAL_S: Final = 0.5
+MAX_AWAITED_TOPICS: Final = 2048
+"""Streams held for one client that has not come back yet; origins name them, so there must be an end to it."""
 MAX_LOCAL_SEQS: Final = 4096
 
 
@@ -121,6 +123,7 @@ class HubPort:
             self._out.append(wire.encode_handshake(wire.Kind.RESET, header.tag, microseconds(now), {}))
 
     def _refuse(self, tag: int, code: str, text: str, now: float) -> None:
+        self._out.clear()
         self._out.append(wire.encode_handshake(wire.Kind.REFUSE, tag, microseconds(now), {"code": code, "why": text}))
 
     def next_datagram(self, *, now: float) -> bytes | None:
@@ -498,6 +501,8 @@ class Hub:
                 continue
             self._link(client, now)
             topics = self._awaited.setdefault(client, set())
+            if len(topics) >= MAX_AWAITED_TOPICS and identity.topic not in topics:
+                continue
             topics.add(identity.topic)
             if self.routing.info(identity) is not None and client not in self.routing.subscribers(identity):
                 try:

@@ -26,7 +26,13 @@ from sern_core.session import Session
 from sern_core.trace import DecisionTrace, TraceEvent
 from sern_core.types import CLASS_LABELS, DROP_CODES, DROP_REASONS, ClientName, DropReason
 
-MAX_DEFINITIONS: Final = 4096
+MAX_DEFINITIONS: Final = 16_384
+"""Texts that a process keeps, of all its peers."""
+MAX_PEER_DEFINITIONS: Final = 2048
+MAX_PEER_DEFINITION_BYTES: Final = 16 * 2**20
+"""Texts that one peer may add; all types of a ROS distribution together have less than 2 MB."""
+MAX_UNHEARD: Final = 20_000
+"""Control messages that a peer may have answered, beside four for each channel, before it reads an answer."""
 
 
 class LinkHandler(Protocol):
@@ -101,6 +107,11 @@ class Link(Session):
         """Incoming streams across sessions."""
         self._next_channel = 1
         self._asked: set[str] = set()  # definitions the peer asked for before we had them
+        self._told: set[str] = set()  # definitions the peer has had in this session
+        self._needed: set[str] = set()  # definitions we asked the peer for, not here yet
+        self._peer_definitions = self._peer_definition_bytes = 0
+        self._unheard = 0  # answers since the peer acknowledged the one of number `_unheard_seq`
+        self._unheard_seq = 0
         self._announcing: deque[tuple[int, OutChannel]] = deque()  # may send once that control message is on its way
         self._missing: dict[StreamId, float] = {}  # not announced by a new peer, and since when
         super().__init__(
@@ -117,6 +128,9 @@ class Link(Session):
 
     def _session_began(self, resumed: bool, now: float) -> None:
         self._asked.clear()
+        self._told.clear()
+        self._needed.clear()
+        self._unheard = self._unheard_seq = 0
         self._announcing.clear()
         self.handler.on_up(self, resumed=resumed, now=now)
         for channel in list(self.channels.values()):
@@ -254,6 +268,8 @@ class Link(Session):
         identity = announcement.stream.id
         slot = announcement.channel
         stream = self.streams.get(identity)
+        if self.incoming.get(slot, stream) is not stream or (stream and stream.channel_id not in (None, slot)):
+            raise WireError(f"channel {slot} or its stream {identity.topic!r} is announced twice")
         if stream is None or stream.stream.spec != announcement.stream.spec:
             replaced = stream
             stream = InStream(
@@ -271,13 +287,17 @@ class Link(Session):
         definition = self.definitions.get(announcement.definition_hash, "")
         if announcement.definition_hash:
             stream.stream.attributes["definition"] = announcement.definition_hash
-            if not definition:
+            if not definition and announcement.definition_hash not in self._needed:
+                self._needed.add(announcement.definition_hash)
                 self.send_control({"t": "need", "dh": announcement.definition_hash}, now=now)
         try:
             wanted = self.handler.on_announce(self, announcement, now=now)
         except RefusedError as refusal:
             del self.incoming[slot]
             del self.streams[identity]
+            self._watermarks.pop(slot, None)
+            stream.channel_id = None
+            stream.close()
             self.send_control({"t": "refuse", "ch": slot, "code": refusal.code, "why": str(refusal)[:400]}, now=now)
             return
         self._skip(stream, announcement.first, now)
@@ -308,6 +328,7 @@ class Link(Session):
             return
         if seq:
             self.report_drop(stream, seq, reason, self.name, now=self._now)  # its tombstone tells the handler
+            self._answered(1)
         else:
             self.handler.on_in_drop(self, stream, reason, nbytes)
 
@@ -369,6 +390,22 @@ class Link(Session):
         envelope, attachment = wire.decode_control(message.body)
         now = self._now
         kind = wire.take_str(envelope, "t", max_length=16)
+        before = self._control.next_seq
+        self._handle_control(kind, envelope, attachment, now)
+        said = self._control.next_seq - before
+        # Reports of drops are repeated at an announcement: those are ours to say, not an answer.
+        self._answered(min(1, said) if kind == "announce" else said)
+
+    def _answered(self, count: int) -> None:
+        """The peer made us say `count` things. Raises WireError if it never reads what it makes us say."""
+        control = self._control
+        if control.watermark >= self._unheard_seq:
+            self._unheard, self._unheard_seq = 0, control.next_seq - 1
+        self._unheard += count
+        if self._unheard > MAX_UNHEARD + 4 * (len(self.channels) + len(self.incoming)):
+            raise WireError(f"{self.peer} does not read {self._unheard} answers and goes on asking")
+
+    def _handle_control(self, kind: str, envelope: wire.Envelope, attachment: bytes, now: float) -> None:
         if kind == "announce":
             self._announced(decode_announcement(envelope), now)
         elif kind in ("want", "refuse", "dropped"):
@@ -382,7 +419,7 @@ class Link(Session):
                 return
             if kind == "first":
                 incoming.known = True  # had it been nobody's before, it would have been announced again
-                self._skip(incoming, wire.take_int(envelope, "seq", low=1), now)
+                self._skip(incoming, wire.take_int(envelope, "seq", low=1, high=wire.MAX_SEQ), now)
             else:
                 self._retract(incoming, now)
         elif kind == "synced":
@@ -431,8 +468,11 @@ class Link(Session):
     def _send_definition(self, digest: str, now: float) -> None:
         definition = self.definitions.get(digest)
         if definition is None:
+            if len(self._asked) >= MAX_PEER_DEFINITIONS:
+                raise WireError(f"{self.peer} asks for more than {MAX_PEER_DEFINITIONS} definitions that nobody has")
             self._asked.add(digest)
-        else:
+        elif digest not in self._told:
+            self._told.add(digest)
             self.send_control({"t": "define", "dh": digest}, definition.encode(), now=now)
 
     def _defined(self, envelope: wire.Envelope, attachment: bytes, now: float) -> None:
@@ -443,7 +483,14 @@ class Link(Session):
             raise WireError("a message definition is not UTF-8") from error
         if definition_hash(text) != digest:
             raise WireError("a message definition does not match its hash")
+        if digest not in self._needed:
+            raise WireError(f"{self.peer} defines {digest}, which it was not asked for")
+        self._needed.discard(digest)
         if digest not in self.definitions:
+            self._peer_definitions += 1
+            self._peer_definition_bytes += len(attachment)
+            if self._peer_definitions > MAX_PEER_DEFINITIONS or self._peer_definition_bytes > MAX_PEER_DEFINITION_BYTES:
+                raise WireError(f"{self.peer} sends more definitions than {MAX_PEER_DEFINITION_BYTES} bytes")
             self._define(text)
             self.handler.on_definition(self, digest, now=now)
 

@@ -109,6 +109,7 @@ class Session(Hop):
             self.version = version
         at_us = microseconds(now)
         welcome = {"name": self.name, "boot": self.boot, "version": version, "echo": stamp_us, "at": at_us}
+        self._handshake_out.clear()  # of an older greeting, if the peer greets faster than it reads
         self._handshake_out.append(wire.encode_handshake(wire.Kind.WELCOME, tag, at_us, welcome))
         self.dirty = True
         if not again:
@@ -201,6 +202,8 @@ class Session(Hop):
             self._now = now
             self._handshake(header, data, now)
         elif header.tag == self.tag and self.established:
+            if header.version != self.version:
+                raise WireError(f"datagram of version {header.version} in a session of version {self.version}")
             self._receive_data(header, data, now)
         elif not self.initiator:
             # Of another session; if that one is the peer's latest, it does not know yet that it is over.
