@@ -4,6 +4,7 @@ The shell (sern_client) feeds it endpoint messages and lane bytes, and is told t
 appear and which messages have their turn. Everything about bandwidth, order, replay and loss is in the link below.
 """
 
+from collections.abc import Sequence
 from typing import Protocol
 
 from sern_core import wire
@@ -32,6 +33,12 @@ class ClientEvents(Protocol):
 
     def rejected(self, code: str, text: str) -> None:
         """The relay refused the session."""
+
+    def lane_offered(self, parameters: wire.Envelope) -> None:
+        """The relay has opened a datagram session for us; open the socket, then call `ClientCore.link.open_lane`."""
+
+    def lane_closed(self) -> None:
+        """The datagram lane ended with its session: close its socket."""
 
     def stream_opened(self, stream: StreamInfo) -> None:
         """A stream from elsewhere, definition included. Raises ConfigError if this site cannot publish it."""
@@ -187,6 +194,9 @@ class ClientCore:
     def on_down(self, link: Link, reason: str, *, now: float) -> None:
         self.events.link_down(reason)
 
+    def on_lane_closed(self, link: Link) -> None:
+        self.events.lane_closed()
+
     def on_rejected(self, link: Link, code: str, text: str, *, now: float) -> None:
         self.events.rejected(code, text)
 
@@ -261,4 +271,11 @@ class ClientCore:
             self.events.skipped(stream.stream, count)
 
     def on_control(self, link: Link, envelope: wire.Envelope, attachment: bytes, *, now: float) -> None:
-        raise WireError(f"unknown control message {envelope.get('t')!r}")
+        if envelope["t"] == "udp":
+            self.events.lane_offered(envelope)
+        else:
+            raise WireError(f"unknown control message {envelope.get('t')!r}")
+
+    def ask_lane(self, ciphers: Sequence[str], *, now: float) -> None:
+        """Ask the relay for a datagram session; `ClientEvents.lane_offered` has the answer, if it has one."""
+        self.link.send_control({"t": "udp", "ask": list(ciphers)}, now=now)

@@ -13,7 +13,15 @@ from sern_core.clocksync import ClockSync
 from sern_core.errors import WireError
 from sern_core.flight import ACK_DELAY_S
 from sern_core.fragments import InStream, Reassembly
-from sern_core.lanes import LANE_NAMES, LANE_ZMQ, OVERHEAD_BYTES, PROBE_INTERVAL_S, Lane
+from sern_core.lanes import (
+    LANE_UDP,
+    LANE_ZMQ,
+    OVERHEAD_BYTES,
+    PING_INTERVAL_S,
+    PROBE_INTERVAL_S,
+    PROVEN_ACKS,
+    Lane,
+)
 from sern_core.ledger import SendCounters, SendLedger
 from sern_core.message import Message, StreamId, StreamInfo, TopicInfo, TopicSpec
 from sern_core.params import LinkParams, SchedulerParams
@@ -33,7 +41,6 @@ from sern_core.types import (
 
 CONTROL_CHANNEL: Final = 0
 CONTROL_TOPIC: Final = TopicName("/_sern/control")
-PING_INTERVAL_S: Final = 0.5
 SWEEP_INTERVAL_S: Final = 0.25
 RATE_INTERVAL_S: Final = 0.05
 MIN_SHARE_BYTES: Final = 64
@@ -87,6 +94,8 @@ class Hop(ABC):
         self.peer = peer
         self.params = link
         self.lane = Lane(LANE_ZMQ, link, lossless=lossless)
+        """The lane that carries data now."""
+        self.lanes = {LANE_ZMQ: self.lane}
         self.scheduler = Scheduler(scheduler, now=now)
         self._paper = scheduler.ordering is Ordering.PAPER
         self.trace = trace
@@ -103,8 +112,7 @@ class Hop(ABC):
         self.tag = boot % 255  # so that a late datagram of an earlier process is not taken for one of ours
         self.dirty = False
         """Something may be sendable: the owner should poll `next_datagram`."""
-        self._ping = False
-        self._ping_due_s = now
+        self._rx_lane = self.lane
         self._sweep_due_s = now + SWEEP_INTERVAL_S
         self._rate_due_s = now
         self._up_since_s = now
@@ -210,15 +218,20 @@ class Hop(ABC):
 
     # --- bytes out ------------------------------------------------------------------------------------------------
 
-    def _next_data(self, now: float) -> bytes | None:
-        """The next kind-16 datagram of an established session, or None."""
+    def _next_data(self, lane: Lane, now: float) -> bytes | None:
+        """The next kind-16 datagram of an established session for one lane, or None."""
         self._now = now
-        self.dirty = False
-        lane = self.lane
         frames: list[bytes] = []
         items: list[SentData | SentWatermark | SentPing] = []
         if not lane.stalled or now >= lane.probe_due_s:
-            self._compose(frames, items, now)
+            if lane is self.lane:
+                self.dirty = False
+                self._compose(frames, items, now)
+            # A stream delivers what is under way, so one question at a time is enough there.
+            if not items and (lane.ping or lane.stalled) and not (lane.lossless and lane.flight.packets):
+                frames.append(wire.PING_FRAME)
+                items.append(SentPing())
+            lane.ping = False
             if lane.stalled:
                 lane.probe_due_s = now + PROBE_INTERVAL_S
         arrivals = lane.arrivals
@@ -244,7 +257,7 @@ class Hop(ABC):
         app_limited = inflight_bytes < estimator.window_bytes and not self._backlog
         flight.sent(now=now, nbytes=nbytes, items=items, app_limited=app_limited)
         estimator.on_sent(now=now, nbytes=nbytes, inflight_bytes=inflight_bytes)
-        self._ping_due_s = now + PING_INTERVAL_S
+        lane.ping_due_s = now + PING_INTERVAL_S
         return datagram
 
     def _header(self, number: int, now: float) -> bytes:
@@ -300,11 +313,6 @@ class Hop(ABC):
             self._refresh(channel, now)
             if lane.stalled:
                 break
-        # A stream delivers what is under way, so one question at a time is enough there.
-        if not items and (self._ping or lane.stalled) and not (lane.lossless and lane.flight.packets):
-            frames.append(wire.PING_FRAME)
-            items.append(SentPing())
-        self._ping = False
 
     def _put_watermarks(self, frames: list[bytes], items: list[SentData | SentWatermark | SentPing], size: int) -> int:
         for slot in list(self._watermarks)[:MAX_WATERMARKS]:
@@ -367,13 +375,14 @@ class Hop(ABC):
 
     # --- bytes in -------------------------------------------------------------------------------------------------
 
-    def _receive_data(self, header: wire.Header, data: bytes, now: float) -> None:
+    def _receive_data(self, lane: Lane, header: wire.Header, data: bytes, now: float) -> None:
         """A kind-16 datagram of this session."""
+        self._rx_lane = lane
         self._rx_stamp_us = header.stamp_us
         self._rx_delay = None
         self._now = now
         if header.number:
-            arrivals = self.lane.arrivals
+            arrivals = lane.arrivals
             if not arrivals.arrived(header.number, header.stamp_us, len(data) + OVERHEAD_BYTES, now=now):
                 return
             self.dirty = True  # an acknowledgement is owed
@@ -397,7 +406,7 @@ class Hop(ABC):
         if codec:
             raise WireError(f"codec {codec} was not agreed")
         if flags & wire.FLAG_URGENT:
-            self.lane.arrivals.due = True
+            self._rx_lane.arrivals.due = True
         if channel == CONTROL_CHANNEL:
             stream = self._control_in
             if total > MAX_CONTROL_BYTES:
@@ -424,10 +433,12 @@ class Hop(ABC):
 
     def on_ack(self, lane: int, highest: int, sack: int, echo_us: int, received_us: int, cum_bytes: int) -> None:
         """FrameSink: an acknowledgement of what we sent."""
-        state = self.lane
-        flight = state.flight
-        if lane not in LANE_NAMES:
+        state = self.lanes.get(lane)
+        if state is None:
+            if lane == LANE_UDP:
+                return  # of a lane that was closed meanwhile
             raise WireError(f"acknowledgement of unknown lane {lane}")
+        flight = state.flight
         if highest >= flight.next_number:
             raise WireError(f"acknowledgement of packet {highest}, which was never sent")
         now = self._now
@@ -443,11 +454,14 @@ class Hop(ABC):
             state.estimator.on_ack(
                 AckSample(now, rtt_s, acked_bytes, flight.inflight_bytes, received_s, cum_bytes, app_limited)
             )
-            if now >= self._rate_due_s:
+            if state is self.lane and now >= self._rate_due_s:
                 self._rate_known(now)
         if newer or packets:
             state.stalled = False
+            state.proofs += 1
             self.dirty = True
+            if len(self.lanes) > 1:
+                self._choose_lane(now)
         for packet in packets:
             for item in packet.items:
                 if type(item) is SentData:
@@ -456,20 +470,47 @@ class Hop(ABC):
         if control.retained:
             control.settle()
         if not flight.lossless:
-            self._find_losses(now)
+            self._find_losses(state, now)
+
+    # --- lanes ----------------------------------------------------------------------------------------------------
+
+    def _choose_lane(self, now: float) -> None:
+        """UDP where it works, else ZMQ; in a blackout stay, and be found by whichever lane answers first."""
+        zmq, udp = self.lanes[LANE_ZMQ], self.lanes.get(LANE_UDP)
+        if udp is not None and udp.usable and udp.proofs >= (PROVEN_ACKS if zmq.usable else 1):
+            # What the peer was told over the stream must be there before data can overtake it.
+            if self.lane is udp or not self._control.retained or not zmq.usable:
+                self._use_lane(udp, now)
+        elif zmq.usable:
+            self._use_lane(zmq, now)
+
+    def _use_lane(self, lane: Lane, now: float) -> None:
+        old = self.lane
+        if lane is old:
+            return
+        self.lane = lane
+        if not old.lossless or not old.usable:
+            self._recall(old, now)
+        self.trace.record(now, LINK, TraceEvent.LINK_UP, peer=self.peer, reason=f"lane {lane.name}")
+        self._rate_known(now)
+        self.dirty = True
+
+    def _recall(self, lane: Lane, now: float) -> None:
+        """What is in flight on this lane goes another way; what arrives twice is dropped there."""
+        for packet in lane.flight.abandon():
+            self._give_back(lane, packet.items, now)
 
     def _rate_known(self, now: float) -> None:
         self._rate_due_s = now + RATE_INTERVAL_S
         self.scheduler.set_rate(self.lane.rate_changed() or None, now=now)
 
-    def _find_losses(self, now: float) -> None:
-        lane = self.lane
+    def _find_losses(self, lane: Lane, now: float) -> None:
         for packet in lane.flight.lost(now=now):
             lane.estimator.on_loss(now=now, nbytes=packet.nbytes)
-            self._give_back(packet.items, now)
+            self._give_back(lane, packet.items, now)
             self.dirty = True
 
-    def _give_back(self, items: list[Any], now: float) -> None:
+    def _give_back(self, lane: Lane, items: list[Any], now: float) -> None:
         """What a packet carried did not arrive: send again what is still wanted."""
         for item in items:
             if type(item) is SentData:
@@ -485,7 +526,7 @@ class Hop(ABC):
                 if item.channel in self.incoming:
                     self._watermarks[item.channel] = self.incoming[item.channel].confirmed
             else:
-                self._ping = True
+                lane.ping = True
 
     def on_watermark(self, channel: int, delivered: int) -> None:
         """FrameSink: everything of a reliable channel up to `delivered` has had its turn at the far side."""
@@ -501,7 +542,7 @@ class Hop(ABC):
 
     def on_ping(self) -> None:
         """FrameSink: the peer asks for an acknowledgement now."""
-        self.lane.arrivals.due = True
+        self._rx_lane.arrivals.due = True
         self.dirty = True
 
     def confirm(self, stream: InStream, delivered: int) -> None:
@@ -514,10 +555,11 @@ class Hop(ABC):
 
     # --- time -----------------------------------------------------------------------------------------------------
 
-    def _data_deadline(self) -> float | None:
-        """When `handle_timeout` or `next_datagram` has something to do by time alone."""
-        lane = self.lane
-        deadline = min(self._sweep_due_s, self._ping_due_s)
+    def _data_deadline(self, lane: Lane) -> float | None:
+        """When `handle_timeout` or `next_datagram` has something to do on this lane by time alone."""
+        deadline = lane.ping_due_s
+        if lane.id == LANE_ZMQ and self._sweep_due_s < deadline:
+            deadline = self._sweep_due_s
         arrivals = lane.arrivals
         if arrivals.unacked:
             due_s = arrivals.since_s + ACK_DELAY_S
@@ -527,26 +569,31 @@ class Hop(ABC):
             lane.stall_deadline(),
             lane.flight.loss_deadline(),
             lane.probe_due_s if lane.stalled else None,
-            self.scheduler.next_deadline(now=self._now, window_open=lane.window_open and not lane.stalled),
+            self.scheduler.next_deadline(now=self._now, window_open=lane.window_open and not lane.stalled)
+            if lane is self.lane
+            else None,
         ):
             if candidate is not None and candidate < deadline:
                 deadline = candidate
         return deadline
 
-    def _data_timeout(self, now: float) -> None:
+    def _data_timeout(self, lane: Lane, now: float) -> None:
         self._now = now
-        lane = self.lane
-        self._find_losses(now)
+        self._find_losses(lane, now)
         stall_s = lane.stall_deadline()
         if stall_s is not None and now >= stall_s:
             lane.stalled = True
+            lane.proofs = 0
             lane.probe_due_s = now
             lane.estimator.on_stall(now=now)
-            self.trace.record(now, LINK, TraceEvent.LINK_DOWN, peer=self.peer, reason="no acknowledgement")
-        if now >= self._ping_due_s:
-            self._ping = True
-            self._ping_due_s = now + PING_INTERVAL_S
-        if now >= self._sweep_due_s:
+            reason = f"{lane.name}: no acknowledgement"
+            self.trace.record(now, LINK, TraceEvent.LINK_DOWN, peer=self.peer, reason=reason)
+            if len(self.lanes) > 1:
+                self._choose_lane(now)
+        if now >= lane.ping_due_s:
+            lane.ping = True
+            lane.ping_due_s = now + PING_INTERVAL_S
+        if lane.id == LANE_ZMQ and now >= self._sweep_due_s:
             self._sweep(now)
         self.dirty = True
 

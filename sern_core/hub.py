@@ -62,6 +62,12 @@ class HubEvents(Protocol):
 
     def refused(self, client: ClientName, code: str, text: str) -> None: ...
 
+    def lane_asked(self, client: ClientName, ciphers: list[str]) -> None:
+        """A client would use a datagram lane: open a session for it and call `Hub.offer_lane`, or do nothing."""
+
+    def lane_closed(self, client: ClientName) -> None:
+        """The client's datagram lane ended with its session."""
+
 
 class Relayed:
     """One stream at the relay: where it comes from (None: the relay itself), where it goes, what is kept of it."""
@@ -199,9 +205,10 @@ class Hub:
     def greet(self, port: HubPort, hello: wire.Envelope, header: wire.Header, *, now: float) -> None:
         """A client says hello on a connection. A newer connection of the same client retires the older one."""
         link = self._link(port.client, now)
-        if not link.accept(hello, header.tag, header.stamp_us, now=now):
-            return
         older = self.port_of.get(port.client)
+        another = older is not port
+        if not link.accept(hello, header.tag, header.stamp_us, now=now, another_connection=another):
+            return
         if older is not None and older is not port:
             older.link = None
         port.link = link
@@ -250,6 +257,12 @@ class Hub:
             link.handle_timeout(now=now)  # retention goes on while a client is away
             if now - since_s > self.params.resume_s:
                 self._forget(client, now)
+        for client, link in self.links.items():
+            if client not in self.port_of and link.established:  # only its datagram lane is left
+                link.handle_timeout(now=now)
+                waiting_s = link.lane.flight.waiting_since_s
+                if link.lane.stalled and waiting_s is not None and now - waiting_s > self.params.resume_s:
+                    link.close_lane(now=now)
         for link, channel in list(self._draining):
             if not channel.retained or not channel.reliable:
                 self._draining.remove((link, channel))
@@ -448,6 +461,15 @@ class Hub:
         self._absent_since[link.peer] = now
         self.events.client_down(link.peer, reason)
 
+    def on_lane_closed(self, link: Link) -> None:
+        self.events.lane_closed(link.peer)
+
+    def offer_lane(self, client: ClientName, parameters: wire.Envelope, *, now: float) -> None:
+        """Tell a client the keys of its datagram session (they travel inside CURVE), and use that lane when it works."""
+        link = self.links[client]
+        link.send_control({**parameters, "t": "udp"}, now=now)
+        link.open_lane(now=now)
+
     def on_rejected(self, link: Link, code: str, text: str, *, now: float) -> None:
         """A relay is never the initiator."""
         raise WireError("REFUSE is not for a relay")
@@ -595,6 +617,8 @@ class Hub:
             self._subscribe(link.peer, envelope, now)
         elif kind == "object":
             self._object(link.peer, envelope, attachment, now)
+        elif kind == "udp":
+            self.events.lane_asked(link.peer, wire.take_strings(envelope, "ask", max_length=32))
         else:
             raise WireError(f"unknown control message {kind!r}")
 

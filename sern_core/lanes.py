@@ -9,7 +9,8 @@ from sern_core.flight import Arrivals, Flight
 from sern_core.params import LinkParams, WindowAlgorithm
 
 LANE_ZMQ: Final = 0
-LANE_NAMES: Final = {LANE_ZMQ: "zmq"}
+LANE_UDP: Final = 1
+LANE_NAMES: Final = {LANE_ZMQ: "zmq", LANE_UDP: "udp"}
 
 MIN_FRAGMENT_BYTES: Final = 1200
 FRAGMENT_TIME_S: Final = 0.003
@@ -17,6 +18,9 @@ FRAGMENT_TIME_S: Final = 0.003
 UNKNOWN_RATE_FRAGMENT_BYTES: Final = 1400
 OVERHEAD_BYTES: Final = 60
 """What one datagram costs beside its own bytes: ZMTP, CURVE, TCP/IP or UDP/IP and AEAD."""
+PROVEN_ACKS: Final = 3
+"""A lane that failed while another one worked is used again after so many acknowledged questions."""
+PING_INTERVAL_S: Final = 0.5
 PROBE_INTERVAL_S: Final = 0.2
 """While stalled, one fresh class-0 message goes out this often and finds out whether the path is back."""
 
@@ -37,6 +41,10 @@ class Lane:
         self.arrivals = Arrivals()
         self.stalled = False
         self.probe_due_s = 0.0
+        self.up = False  # it has a transport
+        self.proofs = 0  # questions answered since it was opened or had stalled
+        self.ping = False
+        self.ping_due_s = 0.0
         self.fragment_bytes = self._fragment_bytes(None)
 
     def _fragment_bytes(self, rate_bps: float | None) -> int:
@@ -62,8 +70,19 @@ class Lane:
             return None
         return flight.waiting_since_s + flight.stall_timeout_s()
 
-    def new_session(self) -> None:
+    @property
+    def name(self) -> str:
+        return LANE_NAMES[self.id]
+
+    @property
+    def usable(self) -> bool:
+        return self.up and not self.stalled
+
+    def new_session(self, now: float) -> None:
         """Numbers start again; the flight was abandoned before."""
+        self.proofs = 0
+        self.ping = False
+        self.ping_due_s = now
         self.flight = Flight(lossless=self.lossless)
         self.arrivals = Arrivals()
         self.stalled = False

@@ -43,6 +43,9 @@ class LinkHandler(Protocol):
 
     def on_down(self, link: "Link", reason: str, *, now: float) -> None: ...
 
+    def on_lane_closed(self, link: "Link") -> None:
+        """The datagram lane ended with the session: close its transport; its keys are of no more use."""
+
     def on_rejected(self, link: "Link", code: str, text: str, *, now: float) -> None:
         """The peer refused the session itself."""
 
@@ -139,6 +142,9 @@ class Link(Session):
 
     def _session_ended(self, reason: str, now: float) -> None:
         self.handler.on_down(self, reason, now=now)
+
+    def _lane_closed(self) -> None:
+        self.handler.on_lane_closed(self)
 
     def _session_refused(self, code: str, text: str, now: float) -> None:
         self.handler.on_rejected(self, code, text, now=now)
@@ -521,7 +527,7 @@ class Link(Session):
         flight = self.lane.flight
         return {
             "peer": self.peer,
-            "lane": "zmq",
+            "lane": self.lane.name,
             "up": self.established and not self.lane.stalled,
             "stalled": self.lane.stalled,
             "version": self.version,
@@ -549,7 +555,34 @@ class Link(Session):
         check(self.reassembly.held_bytes == held_bytes, "reassembly bytes do not add up")
         for stream in self.streams.values():
             stream.validate(check)
-        self.lane.flight.validate(check)
+        for lane in self.lanes.values():
+            lane.flight.validate(check)
         self.scheduler.validate()
         check(len(self.by_stream) == len(self.channels), "channel tables differ")
         check(self._watermarks.keys() <= self.incoming.keys(), "watermarks of streams that are gone")
+
+
+class LanePort:
+    """One lane of a link as a port of its own: for a pump, or for the virtual-time network."""
+
+    def __init__(self, link: Link, lane: int) -> None:
+        self.link = link
+        self.lane = lane
+
+    def receive(self, data: bytes, *, now: float) -> None:
+        self.link.receive(data, now=now, lane=self.lane)
+
+    def next_datagram(self, *, now: float) -> bytes | None:
+        return self.link.next_datagram(now=now, lane=self.lane)
+
+    def next_deadline(self) -> float | None:
+        return self.link.next_deadline(self.lane)
+
+    def handle_timeout(self, *, now: float) -> None:
+        self.link.handle_timeout(now=now, lane=self.lane)
+
+    def connected(self, *, now: float) -> None:
+        """A datagram socket has no connection: `Link.open_lane` begins the lane, when its keys are there."""
+
+    def disconnected(self, *, now: float) -> None:
+        """Nor can it lose one."""

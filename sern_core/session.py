@@ -18,6 +18,7 @@ from sern_core import wire
 from sern_core.clocksync import ClockSync
 from sern_core.errors import WireError
 from sern_core.hop import Hop, microseconds
+from sern_core.lanes import LANE_UDP, LANE_ZMQ, Lane
 from sern_core.params import LinkParams, SchedulerParams
 from sern_core.trace import LINK, DecisionTrace, TraceEvent
 from sern_core.types import ClientName
@@ -62,22 +63,60 @@ class Session(Hop):
     def _session_ended(self, reason: str, now: float) -> None: ...
 
     @abstractmethod
+    def _lane_closed(self) -> None:
+        """The datagram lane ended with its session: its transport and keys are of no more use."""
+
+    @abstractmethod
     def _session_refused(self, code: str, text: str, now: float) -> None: ...
 
     # --- transport ------------------------------------------------------------------------------------------------
 
     def connected(self, *, now: float) -> None:
-        """The lane's transport is there. The initiator says hello; the other side waits for it."""
+        """The stream lane's transport is there. The initiator says hello; the other side waits for it."""
         self.transport_up = True
         if self.initiator:
-            self._greet(now, now)
+            if self.established:
+                self._hello_due_s = now  # the session went on over the other lane: say who this is
+                self.dirty = True
+            else:
+                self._greet(now, now)
 
     def disconnected(self, *, now: float, reason: str = "connection lost") -> None:
-        """The lane's transport is gone, and with it whatever was in flight."""
+        """The stream lane's transport is gone, and with it whatever was in flight there.
+
+        A session that has a datagram lane goes on: a TCP connection does not survive a long blackout, the peer does.
+        """
         self.transport_up = False
         self._hello_due_s = None
         self._handshake_out.clear()
+        if self.established and LANE_UDP in self.lanes:
+            self._now = now
+            lane = self.lanes[LANE_ZMQ]
+            lane.up = False
+            self._recall(lane, now)
+            self._choose_lane(now)
+            return
         self._end_session(reason, now)
+
+    def open_lane(self, *, now: float) -> None:
+        """The datagram lane has a transport (its keys came in this session): ask whether it works, then use it."""
+        lane = self.lanes[LANE_UDP] = Lane(LANE_UDP, self.params, lossless=False)
+        lane.up = True
+        lane.new_session(now)
+        lane.estimator.on_reset(now=now)
+        self.dirty = True
+
+    def close_lane(self, *, now: float) -> None:
+        """The datagram lane's transport is gone or its keys are used up."""
+        lane = self.lanes.pop(LANE_UDP, None)
+        if lane is None:
+            return
+        self._now = now
+        if self.lane is lane:
+            self._use_lane(self.lanes[LANE_ZMQ], now)
+        self._recall(lane, now)
+        if self.established and not self.transport_up:
+            self._end_session("both lanes are gone", now)
 
     def _greet(self, due_s: float, now: float) -> None:
         self._end_session("new session", now)
@@ -90,7 +129,9 @@ class Session(Hop):
         hello = {"name": self.name, "boot": self.boot, "vmin": wire.VERSION_MIN, "vmax": wire.VERSION_MAX}
         return wire.encode_handshake(wire.Kind.HELLO, self.tag, microseconds(now), hello)
 
-    def accept(self, hello: wire.Envelope, tag: int, stamp_us: int, *, now: float) -> bool:
+    def accept(
+        self, hello: wire.Envelope, tag: int, stamp_us: int, *, now: float, another_connection: bool = False
+    ) -> bool:
         """The relay's end: a peer whose name and key were checked says hello; WELCOME is queued.
 
         False: an old HELLO that the network delivered late. Raises WireError, or VersionError when no wire version is
@@ -107,11 +148,21 @@ class Session(Hop):
             self._end_session("new session", now)
             self.tag = tag
             self.version = version
+        elif another_connection:
+            self._recall(self.lanes[LANE_ZMQ], now)  # the session goes on, what the old connection held does not
         at_us = microseconds(now)
-        welcome = {"name": self.name, "boot": self.boot, "version": version, "echo": stamp_us, "at": at_us}
+        welcome: wire.Envelope = {
+            "name": self.name,
+            "boot": self.boot,
+            "version": version,
+            "echo": stamp_us,
+            "at": at_us,
+            "again": again,
+        }
         self._handshake_out.clear()  # of an older greeting, if the peer greets faster than it reads
         self._handshake_out.append(wire.encode_handshake(wire.Kind.WELCOME, tag, at_us, welcome))
         self.dirty = True
+        self.lanes[LANE_ZMQ].up = True
         if not again:
             self._establish(boot, now)
         return True
@@ -133,10 +184,11 @@ class Session(Hop):
         self.peer_boot = peer_boot
         self.established = True
         self._hello_due_s = None
-        self.lane.new_session()
-        self.lane.estimator.on_reset(now=now)
+        lane = self.lane = self.lanes[LANE_ZMQ]
+        lane.up = True
+        lane.new_session(now)
+        lane.estimator.on_reset(now=now)
         self._rate_known(now)
-        self._ping_due_s = now
         self._up_since_s = now
         self._watermarks.clear()
         self._begin_control()
@@ -145,17 +197,21 @@ class Session(Hop):
 
     def _end_session(self, reason: str, now: float) -> None:
         self._now = now
-        for packet in self.lane.flight.abandon():
-            self._give_back(packet.items, now)
+        for lane in self.lanes.values():
+            self._recall(lane, now)
+        self.lane = self.lanes[LANE_ZMQ]
         for stream in self.incoming.values():
             stream.channel_id = None
             stream.known = True
             stream.pause_seq = 0
         self.incoming.clear()
         self._watermarks.clear()
+        udp = self.lanes.pop(LANE_UDP, None)  # its keys end with the session
         if not self.established:
             return
         self.established = False
+        if udp is not None:
+            self._lane_closed()
         for channel in self.channels.values():
             channel.ready = False
             self._refresh(channel, now)
@@ -164,22 +220,24 @@ class Session(Hop):
 
     # --- bytes and time -------------------------------------------------------------------------------------------
 
-    def next_datagram(self, *, now: float) -> bytes | None:
+    def next_datagram(self, *, now: float, lane: int = LANE_ZMQ) -> bytes | None:
         """The next bytes for the lane, or None if nothing may or need be sent now."""
-        if self._handshake_out:
-            return self._handshake_out.popleft()
-        if self._hello_due_s is not None and self.transport_up:
-            if now >= self._hello_due_s:
-                return self._hello(now)
+        if lane == LANE_ZMQ:
+            if self._handshake_out:
+                return self._handshake_out.popleft()
+            if self._hello_due_s is not None and self.transport_up:
+                if now >= self._hello_due_s:
+                    return self._hello(now)
+                self.dirty = False
+                return None
+        state = self.lanes.get(lane)
+        if not self.established or state is None or not state.up:
             self.dirty = False
             return None
-        if not self.established:
-            self.dirty = False
-            return None
-        if self.lane.flight.next_number >= wire.MAX_PACKET_NUMBER:
+        if state.flight.next_number >= wire.MAX_PACKET_NUMBER:
             self._renew(now)
-            return self.next_datagram(now=now)
-        return self._next_data(now)
+            return self.next_datagram(now=now, lane=lane)
+        return self._next_data(state, now)
 
     def _renew(self, now: float) -> None:
         """Packet numbers are used up: go on in another session."""
@@ -195,32 +253,41 @@ class Session(Hop):
             self._handshake_out.append(wire.encode_handshake(wire.Kind.RESET, tag, microseconds(now), {}))
             self.dirty = True
 
-    def receive(self, data: bytes, *, now: float) -> None:
+    def receive(self, data: bytes, *, now: float, lane: int = LANE_ZMQ) -> None:
         """One datagram from the lane. Raises WireError or VersionError for bytes no honest peer sends."""
         header = wire.decode_header(data)
         if header.kind != wire.Kind.DATA:
+            if lane != LANE_ZMQ:
+                raise WireError("a handshake has no place on the datagram lane")
             self._now = now
             self._handshake(header, data, now)
-        elif header.tag == self.tag and self.established:
+            return
+        if header.tag == self.tag and self.established:
             if header.version != self.version:
-                raise WireError(f"datagram of version {header.version} in a session of version {self.version}")
-            self._receive_data(header, data, now)
-        elif not self.initiator:
+                raise WireError(f"version {header.version} was not agreed, {self.version} was")
+            state = self.lanes.get(lane)
+            if state is not None:
+                self._receive_data(state, header, data, now)
+        elif not self.initiator and lane == LANE_ZMQ:
             # Of another session; if that one is the peer's latest, it does not know yet that it is over.
             self._send_reset(header.tag, now)
 
-    def next_deadline(self) -> float | None:
+    def next_deadline(self, lane: int = LANE_ZMQ) -> float | None:
         """When to call `handle_timeout` and `next_datagram` at the latest, if nothing else happens."""
-        if self.established:
-            return self._data_deadline()
-        if self._hello_due_s is not None:
+        state = self.lanes.get(lane)
+        if lane != LANE_ZMQ:
+            return self._data_deadline(state) if self.established and state is not None else None
+        if self._hello_due_s is not None and self.transport_up:
             return min(self._hello_due_s, self._sweep_due_s)
+        if self.established and state is not None and state.up:
+            return self._data_deadline(state)
         return self._sweep_due_s
 
-    def handle_timeout(self, *, now: float) -> None:
-        if self.established:
-            self._data_timeout(now)
-        elif now >= self._sweep_due_s:
+    def handle_timeout(self, *, now: float, lane: int = LANE_ZMQ) -> None:
+        state = self.lanes.get(lane)
+        if self.established and state is not None and state.up and not (lane == LANE_ZMQ and self._hello_due_s):
+            self._data_timeout(state, now)
+        elif lane == LANE_ZMQ and now >= self._sweep_due_s:
             self._now = now
             self._sweep(now)
         self.dirty = True
@@ -246,7 +313,15 @@ class Session(Hop):
             self.peer = ClientName(wire.take_str(envelope, "name", max_length=64))
             echo_us = wire.take_int(envelope, "echo", high=2**64 - 1)
             at_us = wire.take_int(envelope, "at", high=2**64 - 1)
-            self._establish(wire.take_int(envelope, "boot"), now)
+            boot = wire.take_int(envelope, "boot")
+            if self.established and boot == self.peer_boot and wire.take_bool(envelope, "again"):
+                self._hello_due_s = None  # the session went on meanwhile; the stream lane is back
+                self.lanes[LANE_ZMQ].up = True
+                self.lanes[LANE_ZMQ].stalled = False
+                self._choose_lane(now)
+            else:
+                self._end_session("new session", now)
+                self._establish(boot, now)
             self.clock.sample(echo_us * 1e-6, at_us * 1e-6, header.stamp_us * 1e-6, now)
         elif kind is wire.Kind.REFUSE:
             code, text = wire.take_str(envelope, "code", max_length=64), wire.take_str(envelope, "why")
