@@ -213,6 +213,20 @@ async def test_keys_that_do_not_fit_are_explained_and_tried_again(tmp_path: Path
         assert sum("WARNING" in line or "ERROR" in line for line in robot.lines) <= 1, robot.text
 
 
+async def test_a_key_that_the_relay_knows_by_another_name_is_explained(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    async with Lab(tmp_path, "robot1") as lab:
+        known = lab.clients_dir / "robot1.pub"
+        broken(known, "name: robot1", "name: robot2")
+        await lab.relay()
+        robot = await lab.client(lab.client_file("robot1", ROBOT))
+        await until(lambda: robot.bridge.rejected_reason)
+        why = "your key belongs to robot2, not to robot1"
+        assert f"the relay refuses us (name): {why}" in caplog.messages
+        assert robot._ready() == (False, why)
+
+
 def refused(relay: Process, reason: str) -> float:
     """The relay's count of refused connections for a reason."""
     for line in relay.get("/metrics")[1].splitlines():
