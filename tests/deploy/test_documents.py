@@ -1,0 +1,82 @@
+"""The guides for people: what they name exists, and what they tell to type is right."""
+
+import re
+import shlex
+from pathlib import Path
+from typing import Final
+
+import pytest
+import typer.main
+
+from sern_runtime.profiles import load_profiles
+from sern_sim.netem import netem_commands
+from sern_tools.cli import app
+from tests.daemons import Lab
+
+ROOT: Final = Path(__file__).resolve().parents[2]
+GUIDES: Final = ("deploy/README.md", "docs/operations.md", "CONTRIBUTING.md")
+_PATH: Final = re.compile(r"(?<![\w/.~])((?:deploy|docs|schemas|tests|sern_[a-z]+)/[\w/.@-]*\w)(?![\w*])")
+
+
+def commands(guide: str) -> list[list[str]]:
+    """The words of every command in the `sh` blocks of a guide."""
+    blocks = re.findall(r"^```sh\n(.*?)^```", (ROOT / guide).read_text(), flags=re.MULTILINE | re.DOTALL)
+    return [shlex.split(line) for block in blocks for line in block.splitlines()]
+
+
+@pytest.mark.parametrize("guide", GUIDES)
+def test_files_that_are_named_exist(guide: str) -> None:
+    text = (ROOT / guide).read_text()
+    assert [path for path in _PATH.findall(text) if not (ROOT / path).exists()] == []
+    links = re.findall(r"\]\(([^)#]+)\)", text)
+    assert [link for link in links if not ((ROOT / guide).parent / link).exists()] == []
+
+
+@pytest.mark.parametrize("guide", GUIDES)
+def test_links_within_a_guide_lead_somewhere(guide: str) -> None:
+    text = (ROOT / guide).read_text()
+    titles = {re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-") for title in re.findall(r"^#+ (.*)$", text, re.M)}
+    assert set(re.findall(r"\]\(#([^)]*)\)", text)) <= titles
+
+
+@pytest.mark.parametrize("guide", GUIDES)
+def test_sern_commands_and_their_options_exist(guide: str) -> None:
+    root = typer.main.get_command(app)
+    for words in commands(guide):
+        if "/opt/sern/bin/sern" not in words:
+            continue
+        rest = words[words.index("/opt/sern/bin/sern") + 1 :]
+        command = root
+        while rest and rest[0] in (known := getattr(command, "commands", {})):
+            command, rest = known[rest[0]], rest[1:]
+        assert not getattr(command, "commands", None), f"{guide}: no such command: {' '.join(words)}"
+        options = {option for parameter in command.params for option in parameter.opts}
+        assert {word for word in rest if word.startswith("-")} <= options, f"{guide}: {' '.join(words)}"
+
+
+def test_what_is_installed_is_there() -> None:
+    named = {word for guide in GUIDES for words in commands(guide) for word in words if word.startswith("deploy/")}
+    assert [word for word in named if not (ROOT / word).exists()] == []
+    assert named >= {f"deploy/systemd/sern-{name}.service" for name in ("relay", "client")}
+
+
+def test_the_netem_line_is_the_profile() -> None:
+    profile = load_profiles(ROOT / "deploy" / "netem" / "profiles.yaml")["field-wifi"]
+    expected = netem_commands(profile, "eth0")
+    assert [shlex.join(["sudo", *shlex.split(line)]) for line in expected] == [
+        shlex.join(words) for words in commands("deploy/README.md") if words[:4] == ["sudo", "tc", "qdisc", "replace"]
+    ]
+
+
+async def test_a_key_file_may_hold_two_keys_as_the_rotation_says(tmp_path: Path) -> None:
+    """Rotation of a client's key: the relay takes both; of the relay's key: the client tries both."""
+    async with Lab(tmp_path, "site") as lab:
+        await lab.relay()
+        config = lab.recorder_file("site", "/.*")
+        public = (tmp_path / "relay.pub").read_text().splitlines()
+        lab.make_keys("stranger")
+        other = (lab.clients_dir / "stranger.pub").read_text().splitlines()
+        key = next(line for line in other if "public_key" in line)
+        at = next(index for index, line in enumerate(public) if "public_key" in line)
+        (tmp_path / "relay.pub").write_text("\n".join([*public[:at], key, *public[at:]]) + "\n")
+        await lab.end(await lab.connected(config))
