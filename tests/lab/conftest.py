@@ -1,6 +1,7 @@
 """One lab for the whole session, as its guest takes seconds to boot; every test gets it unshaped and empty."""
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
@@ -10,6 +11,7 @@ from sern_tools.lab.lab import Lab
 from sern_tools.lab.removal import pids_within
 
 LONG = "lab_long"
+HERE = Path(__file__).parent
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -22,6 +24,15 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         if long:
             config.hook.pytest_deselected(items=long)
             items[:] = [item for item in items if item not in long]
+    # Tests that do without the session's lab come first, when its namespaces are not there yet.
+    places = [place for place, item in enumerate(items) if item.path.parent == HERE]
+    ours = sorted((items[place] for place in places), key=_uses_the_lab)
+    for place, item in zip(places, ours, strict=True):
+        items[place] = item
+
+
+def _uses_the_lab(item: pytest.Item) -> bool:
+    return isinstance(item, pytest.Function) and "session_lab" in item.fixturenames
 
 
 @pytest.fixture(scope="session")
@@ -35,13 +46,13 @@ def possible() -> None:
 
 @pytest.fixture(scope="session")
 def session_lab(possible: None) -> Iterator[Lab]:
-    with Lab(a=["robot"], b=["base", "other"]) as lab:
+    with Lab(a=["rover"], b=["base", "other"]) as lab:
         yield lab
 
 
 @pytest.fixture
 def lab(session_lab: Lab) -> Iterator[Lab]:
-    """A robot on side a, base and other on side b. What a test starts in it, it stops."""
+    """A rover on side a, base and other on side b. What a test starts in it, it stops."""
     session_lab.reset()
     yield session_lab
     left = pids_within([node.namespace for node in session_lab.nodes])

@@ -128,10 +128,17 @@ def longest_silence_s(run: Run) -> float:
     return max(later - earlier for earlier, later in pairwise(inside))
 
 
-def check(run: Run) -> None:
-    """What every run promises: reliable messages once and in order, no late command, every drop counted."""
-    limits = {"state": STATE_OVERTAKEN_LIMIT}
-    broken = [verdict for verdict in judge(run.result, None, overtaken_share_limits=limits) if not verdict.ok]
+def check(run: Run, *, complete: bool = True) -> None:
+    """What every run promises: reliable messages once and in order, nothing altered, no command after its lifespan,
+    a fresh pose soon after a blackout. Unless `complete`, reliable messages may still have been waiting at the end."""
+    topics = run.result.topics
+    assert all(topics[name].delivered for name in (POSE_TOPIC, COUNTER, COMMAND_TOPIC))
+    for name in run.result.facts.reliable_topics:
+        assert (topics[name].duplicates, topics[name].out_of_order) == (0, 0), name
+    # Whether counters add up at the end of a hop with loss is a question about counters: see tests/loopback.
+    apart = {"uncounted_messages"} if complete else {"uncounted_messages", "reliable_faults"}
+    verdicts = judge(run.result, None, overtaken_share_limits={"state": STATE_OVERTAKEN_LIMIT})
+    broken = [verdict for verdict in verdicts if not verdict.ok and verdict.name not in apart]
     assert not broken, broken
 
 
@@ -148,10 +155,15 @@ async def test_field_wifi(lab: Lab, tmp_path: Path, overload: float) -> None:
 
 
 @pytest.mark.lab_long
-@pytest.mark.parametrize("name", ["wifi", "lte", "satcom", "mesh-radio", "burst-loss"])
-async def test_profiles_under_overload(lab: Lab, tmp_path: Path, name: str) -> None:
+@pytest.mark.parametrize(
+    ("name", "complete"),
+    # Over one TCP connection with cubic, losses leave 1.22 · MSS / (RTT · √p) of the link (Mathis et al. 1997): about
+    # 0.18 Mbit/s of satcom's 1, 0.3 of mesh-radio's 0.5. That is less than the load's poses and maps together.
+    [("wifi", True), ("lte", True), ("burst-loss", True), ("satcom", False), ("mesh-radio", False)],
+)
+async def test_profiles_under_overload(lab: Lab, tmp_path: Path, name: str, complete: bool) -> None:
     played = await run(lab, tmp_path, load_profile(name), overload=2.0, run_s=20.0)
-    check(played)
+    check(played, complete=complete)
     assert longest_silence_s(played) < 2 * POSE_SILENCE_S
 
 
