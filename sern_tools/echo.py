@@ -27,6 +27,7 @@ import zmq
 from pydantic import ValidationError
 
 from sern_client.transport import RelayTransport
+from sern_core import wire
 from sern_core.client import ClientCore
 from sern_core.errors import ConfigError, RefusedError, SernError, UsageError
 from sern_core.message import Message, StreamId, StreamInfo
@@ -225,6 +226,12 @@ class Listener:
             self.turns += 1
         elif not self.done:
             self._warn(f"link down: {reason}; waiting")
+
+    def lane_offered(self, parameters: wire.Envelope) -> None:
+        """Never asked for: one lane is enough to look."""
+
+    def lane_closed(self) -> None:
+        """There is none."""
 
     def rejected(self, code: str, text: str) -> None:
         self.problem = RefusedError(code, f"the relay refuses us: {text}")
