@@ -186,12 +186,16 @@ def test_native_wiring_on_a_kernel_that_has_netem(lab: Lab) -> None:
 
 
 OWNER = """
-import sys
+import asyncio, sys
 from sern_tools.lab.lab import Lab
-with Lab() as lab:
-    child = lab.popen(lab.a, ["sleep", "1000"])
-    print(lab.id, child.pid, flush=True)
-    sys.stdin.read()
+
+async def main():
+    async with Lab() as lab:
+        child = lab.popen(lab.a, ["sleep", "1000"])
+        print(lab.id, child.pid, flush=True)
+        sys.stdin.read()
+
+asyncio.run(main())
 """
 
 
