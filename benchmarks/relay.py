@@ -41,6 +41,7 @@ import zmq
 
 from benchmarks import common
 from sern_client.transport import RelayTransport
+from sern_core import wire
 from sern_core.client import ClientCore
 from sern_core.errors import SernError
 from sern_core.message import Message, StreamInfo, TopicInfo, TopicSpec
@@ -252,6 +253,10 @@ class _Site:
     def link_up(self, *, resumed: bool) -> None: ...
 
     def link_down(self, reason: str) -> None: ...
+
+    def lane_offered(self, parameters: wire.Envelope) -> None: ...
+
+    def lane_closed(self) -> None: ...
 
     def rejected(self, code: str, text: str) -> None: ...
 

@@ -8,6 +8,8 @@ from dataclasses import replace
 from sern_client.endpoints.base import Endpoint, Publisher, Subscription
 from sern_client.frames import FramePrefixer, Rewrite
 from sern_client.message_log import MessageLog
+from sern_client.udp import ClientLane
+from sern_core import wire
 from sern_core.client import ClientCore
 from sern_core.errors import ConfigError, UsageError
 from sern_core.lease import CommandLease
@@ -75,6 +77,8 @@ class Bridge:
         self.frames = FramePrefixer(frame_prefix)
         self.ages = AgeHistograms()
         self.rejected_reason: str | None = None
+        self.lane: ClientLane | None = None
+        """The datagram lane, where there is one; set by the daemon."""
         self.refusals = 0
         self.deadlines_missed: dict[TopicName, int] = {}
         self.leases_fired = 0
@@ -188,6 +192,14 @@ class Bridge:
         if text != self.rejected_reason:  # it is asked again every few seconds
             _log.error("the relay refuses us (%s): %s", code, text)
         self.rejected_reason = text
+
+    def lane_offered(self, parameters: wire.Envelope) -> None:
+        if self.lane is not None:
+            self.lane.offered(parameters)
+
+    def lane_closed(self) -> None:
+        if self.lane is not None:
+            self.lane.closed()
 
     def stream_opened(self, stream: StreamInfo) -> None:
         local = self.rules.inward(stream.id.topic, namespace=self.namespace)

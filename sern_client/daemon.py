@@ -17,10 +17,12 @@ from sern_client.bridge import Bridge
 from sern_client.factory import make_endpoint
 from sern_client.message_log import MessageLog
 from sern_client.transport import RelayTransport
+from sern_client.udp import ClientLane
 from sern_core.client import ClientCore
 from sern_core.errors import ConfigError
 from sern_core.trace import DecisionTrace
 from sern_core.types import CLASS_LABELS, ObjectKind
+from sern_runtime.config.base import split_tcp
 from sern_runtime.config.client import ClientFile, load_client
 from sern_runtime.config.load import Loaded
 from sern_runtime.entry import blamed_on, end_tasks, log_warnings, serve
@@ -92,6 +94,7 @@ class ClientDaemon:
         self._said: set[str] = set()  # since the last session: an attempt that fails as before is no news
         self._ctx: zmq.Context[zmq.Socket[bytes]] | None = None
         self._transport: RelayTransport | None = None
+        self._lane: ClientLane | None = None
         self._http: HttpServer | None = None
         self.tasks: list[asyncio.Task[None]] = []
         self._endpoint_started = False
@@ -128,7 +131,12 @@ class ClientDaemon:
                 heartbeat_timeout_s=model.link.heartbeat_timeout_s,
                 random=Random(secrets.randbits(64)),
                 on_reason=self._link_down,
+                after=self._kick,
             )
+        address = split_tcp(relay.endpoint)
+        if relay.udp and keys is not None and address is not None:
+            self._lane = ClientLane(self.core, address[0], kick=self._kick)
+            self.bridge.lane = self._lane
         self.tasks.append(asyncio.create_task(self._tick(), name="client-tick"))
         self.notifier.ready(f"{model.name} -> {relay.endpoint}")
         _log.info("client %s started, relay %s", model.name, relay.endpoint)
@@ -136,6 +144,8 @@ class ClientDaemon:
     def _kick(self) -> None:
         if self._transport is not None:
             self._transport.pump.kick()
+        if self._lane is not None:
+            self._lane.kick()
 
     def _link_down(self, reason: str) -> None:
         """Told by the transport and by the session on it, usually of the same thing."""
@@ -147,6 +157,8 @@ class ClientDaemon:
     def _link_up(self) -> None:
         self._said.clear()
         self._put_node()
+        if self._lane is not None:
+            self._lane.ask()
 
     async def _tick(self) -> None:
         watchdog = Watchdog(self.notifier, {"loop": lambda: int(time.monotonic() * 1e3)})
@@ -155,6 +167,8 @@ class ClientDaemon:
             if self.message_log is not None:
                 self.message_log.flush()
             link = self.core.link
+            if self._lane is not None:
+                self._lane.tick()
             if watchdog.interval_s is not None:
                 watchdog.check()
             state = "up" if link.established and not link.lane.stalled else f"down: {self.reason}"
@@ -279,6 +293,8 @@ class ClientDaemon:
             stack.callback(self.bridge.close)
             if self._transport is not None:
                 stack.callback(self._transport.close)
+            if self._lane is not None:
+                stack.callback(self._lane.closed)
             stack.push_async_callback(end_tasks, self.tasks)
 
     def _write_summary(self) -> None:

@@ -27,7 +27,8 @@ _log = logging.getLogger(__name__)
 class RelayTransport:
     """Joins `link` to `endpoint`; with several `server_keys` (a rotation) they are tried in turn.
 
-    `on_reason` is told why the transport is down.
+    `on_reason` is told why the transport is down; `after` is called when the link has something to send, which may be
+    for another lane.
     """
 
     def __init__(
@@ -41,7 +42,9 @@ class RelayTransport:
         heartbeat_timeout_s: float,
         random: Random,
         on_reason: Callable[[str], None],
+        after: Callable[[], None] = lambda: None,
     ) -> None:
+        self.after = after
         self.link = link
         self.endpoint = endpoint
         self.bad_frames = 0
@@ -114,6 +117,7 @@ class RelayTransport:
             return
         if self.link.dirty:
             self.pump.kick()
+            self.after()
 
     def _up(self, handle: TcpHandle | None) -> None:
         if handle is not None:

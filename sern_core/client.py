@@ -271,11 +271,12 @@ class ClientCore:
             self.events.skipped(stream.stream, count)
 
     def on_control(self, link: Link, envelope: wire.Envelope, attachment: bytes, *, now: float) -> None:
-        if envelope["t"] == "udp":
+        kind = envelope["t"]
+        if kind == "lane":
             self.events.lane_offered(envelope)
         else:
-            raise WireError(f"unknown control message {envelope.get('t')!r}")
+            raise WireError(f"unknown control message {kind!r}")
 
     def ask_lane(self, ciphers: Sequence[str], *, now: float) -> None:
         """Ask the relay for a datagram session; `ClientEvents.lane_offered` has the answer, if it has one."""
-        self.link.send_control({"t": "udp", "ask": list(ciphers)}, now=now)
+        self.link.send_control({"t": "lane_ask", "ciphers": list(ciphers)}, now=now)

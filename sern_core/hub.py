@@ -465,9 +465,18 @@ class Hub:
         self.events.lane_closed(link.peer)
 
     def offer_lane(self, client: ClientName, parameters: wire.Envelope, *, now: float) -> None:
-        """Tell a client the keys of its datagram session (they travel inside CURVE), and use that lane when it works."""
+        """Tell a client the keys of its datagram session (inside CURVE), and use that lane when it works."""
         link = self.links[client]
-        link.send_control({**parameters, "t": "udp"}, now=now)
+        link.send_control(
+            {
+                "t": "lane",
+                "sid": parameters["sid"],
+                "secret": parameters["secret"],
+                "cipher": parameters["cipher"],
+                "port": parameters["port"],
+            },
+            now=now,
+        )
         link.open_lane(now=now)
 
     def on_rejected(self, link: Link, code: str, text: str, *, now: float) -> None:
@@ -617,8 +626,8 @@ class Hub:
             self._subscribe(link.peer, envelope, now)
         elif kind == "object":
             self._object(link.peer, envelope, attachment, now)
-        elif kind == "udp":
-            self.events.lane_asked(link.peer, wire.take_strings(envelope, "ask", max_length=32))
+        elif kind == "lane_ask":
+            self.events.lane_asked(link.peer, wire.take_strings(envelope, "ciphers", max_length=64))
         else:
             raise WireError(f"unknown control message {kind!r}")
 

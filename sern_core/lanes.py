@@ -12,6 +12,8 @@ LANE_ZMQ: Final = 0
 LANE_UDP: Final = 1
 LANE_NAMES: Final = {LANE_ZMQ: "zmq", LANE_UDP: "udp"}
 
+DATAGRAM_BYTES: Final = 1171
+"""A datagram of the UDP lane: with seal, session and kind it is 1200 bytes of UDP payload, which every path carries."""
 MIN_FRAGMENT_BYTES: Final = 1200
 FRAGMENT_TIME_S: Final = 0.003
 """On a stream lane one fragment takes about 3 ms of the link: what a more urgent message may have to wait."""
@@ -31,7 +33,7 @@ class Lane:
     def __init__(self, lane: int, params: LinkParams, *, lossless: bool) -> None:
         self.id = lane
         self.lossless = lossless
-        self.fragment_bytes_max = params.fragment_bytes_max if lossless else MIN_FRAGMENT_BYTES
+        self.fragment_bytes_max = params.fragment_bytes_max if lossless else DATAGRAM_BYTES
         self.estimator: CapacityEstimator
         if params.window.algorithm is WindowAlgorithm.FIXED:
             self.estimator = FixedWindow(params.window.fixed_bytes)
@@ -49,7 +51,7 @@ class Lane:
 
     def _fragment_bytes(self, rate_bps: float | None) -> int:
         if not self.lossless:
-            return MIN_FRAGMENT_BYTES
+            return DATAGRAM_BYTES
         if rate_bps is None:
             return min(UNKNOWN_RATE_FRAGMENT_BYTES, self.fragment_bytes_max)
         return int(min(max(FRAGMENT_TIME_S * rate_bps / 8, MIN_FRAGMENT_BYTES), self.fragment_bytes_max))

@@ -23,6 +23,7 @@ from sern_relay.feed import RelayFeed
 from sern_relay.objects_view import objects_view
 from sern_relay.server import RelayServer
 from sern_relay.transforms import TransformObjects
+from sern_relay.udp import RelayLanes
 from sern_runtime.config.load import Loaded
 from sern_runtime.config.relay import RelayFile, load_relay
 from sern_runtime.entry import blamed_on, end_tasks, log_warnings, serve
@@ -98,6 +99,7 @@ class RelayDaemon:
         self.zap: ZapHandler | None = None
         self.server: RelayServer | None = None
         self.feed: RelayFeed | None = None
+        self.lanes: RelayLanes | None = None
         self.transforms: TransformObjects | None = None
         self._ctx: zmq.Context[zmq.Socket[bytes]] | None = None
         self._http: HttpServer | None = None
@@ -140,6 +142,9 @@ class RelayDaemon:
                 max_connections=relay.max_connections,
                 after=self._after,
             )
+        if keys is not None and relay.udp:
+            with blamed_on(self.loaded.path, "relay", "listen"):
+                self.lanes = RelayLanes(self.hub, relay.listen, after=self._after)
         if keys is not None and self.zap is not None:
             await self_test(self._ctx, self.zap, relay.listen, keys.public_key)
             _log.info("self-test passed: a stranger's key is refused on %s", ", ".join(relay.listen))
@@ -191,6 +196,8 @@ class RelayDaemon:
         self._flush_due = None
         if self.server is not None:
             self.server.flush()
+        if self.lanes is not None:
+            self.lanes.flush()
 
     async def _tick(self) -> None:
         progress = {"socket": lambda: self.server.socket.drains if self.server else 0}
@@ -352,7 +359,7 @@ class RelayDaemon:
             stack.callback(self._write_summary)
             if self._ctx is not None:
                 stack.callback(self._ctx.destroy, linger=0)
-            for part in (self.zap, self.server, self.feed, self.transforms):
+            for part in (self.zap, self.server, self.lanes, self.feed, self.transforms):
                 if part is not None:
                     stack.callback(part.close)
             if self._http is not None:
@@ -378,6 +385,14 @@ class RelayDaemon:
 
     def client_up(self, client: ClientName, *, resumed: bool) -> None:
         _log.info("%s connected%s", client, " again" if resumed else "")
+
+    def lane_asked(self, client: ClientName, ciphers: list[str]) -> None:
+        if self.lanes is not None:
+            self.lanes.asked(client, ciphers)
+
+    def lane_closed(self, client: ClientName) -> None:
+        if self.lanes is not None:
+            self.lanes.closed(client)
 
     def client_down(self, client: ClientName, reason: str) -> None:
         _log.info("%s is away: %s", client, reason)

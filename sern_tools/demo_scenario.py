@@ -201,6 +201,7 @@ def _client(
             "endpoint": f"tcp://{HOST}:{relay_port}",
             "server_key_file": f"{RELAY}.pub",
             "secret_key_file": f"{name}.key",
+            "udp": False,  # the shaping proxy carries TCP only
         },
         "endpoint": list(endpoint),
         "topics": list(topics),

@@ -224,7 +224,7 @@ def valid() -> list[Vector]:
             "welcome",
             "the session exists; `echo` is the stamp of the HELLO",
             "WELCOME",
-            {"name": "relay", "boot": 2**63 - 1, "version": 1, "echo": 1_400_000, "at": 1_500_000},
+            {"name": "relay", "boot": 2**63 - 1, "version": 1, "echo": 1_400_000, "at": 1_500_000, "again": False},
         ),
         _handshake("refuse", "no session", "REFUSE", {"code": "version", "why": "no wire version in common"}),
         _handshake("reset", "say hello again", "RESET", {}, tag=255),
@@ -289,6 +289,16 @@ def valid() -> list[Vector]:
             "subscribe",
             "the last part of a client's patterns",
             {"t": "subscribe", "patterns": ["/jackal1/.*", "/tf"], "more": False},
+        ),
+        _control(
+            "lane-ask",
+            "the client would use a datagram lane",
+            {"t": "lane_ask", "ciphers": ["aes-256-gcm", "chacha20-poly1305"]},
+        ),
+        _control(
+            "lane",
+            "the keys of a datagram lane",
+            {"t": "lane", "sid": 305419896, "secret": "5e" * 32, "cipher": "aes-256-gcm", "port": 5555},
         ),
         _control(
             "object-put",

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from random import Random
 from typing import NamedTuple
 
+from sern_core import wire
 from sern_core.access import AccessRule, AccessTable
 from sern_core.client import ClientCore
 from sern_core.hub import Hub, HubParams, HubPort
@@ -105,6 +106,24 @@ class ClockedPort:
         self.inner.disconnected(now=self.clock.local(now))
 
 
+class DeadPort:
+    """Where datagrams arrive that nobody has the keys for."""
+
+    def receive(self, data: bytes, *, now: float) -> None: ...
+
+    def next_datagram(self, *, now: float) -> bytes | None:
+        return None
+
+    def next_deadline(self) -> float | None:
+        return None
+
+    def handle_timeout(self, *, now: float) -> None: ...
+
+    def connected(self, *, now: float) -> None: ...
+
+    def disconnected(self, *, now: float) -> None: ...
+
+
 @dataclass(slots=True)
 class Got:
     """One message as it was delivered. `age_s` is what the receiver thinks, `at_s` true time."""
@@ -154,6 +173,8 @@ class SimClient:
     ups: list[bool] = field(default_factory=list)
     """Of each session, whether it was with the same relay process as the one before."""
     downs: list[str] = field(default_factory=list)
+    more_ports: list[Port] = field(default_factory=list)
+    lanes_closed: int = 0
 
     def start(self, *, boot: int, lossless: bool, link: LinkParams, scheduler: SchedulerParams) -> "SimClient":
         self.core = ClientCore(
@@ -168,7 +189,7 @@ class SimClient:
         return self.clock.local(self.world.network.now)
 
     def ports(self) -> list[Port]:
-        return [self.port]
+        return [self.port, *self.more_ports]
 
     # ClientEvents
     def link_up(self, *, resumed: bool) -> None:
@@ -176,6 +197,11 @@ class SimClient:
 
     def link_down(self, reason: str) -> None:
         self.downs.append(reason)
+
+    def lane_offered(self, parameters: wire.Envelope) -> None: ...
+
+    def lane_closed(self) -> None:
+        self.lanes_closed += 1
 
     def rejected(self, code: str, text: str) -> None:
         self.rejections.append((code, text))
@@ -275,6 +301,7 @@ class SimHub:
             lossless=world.lossless,
         )
         self.sides: dict[ClientName, ClockedPort] = {}
+        self.more_ports: list[Port] = []
 
     @property
     def now(self) -> float:
@@ -287,10 +314,14 @@ class SimHub:
         return port
 
     def ports(self) -> list[Port]:
-        return [*self.sides.values()]
+        return [*self.sides.values(), *self.more_ports]
 
     def links(self) -> Iterator[Link]:
         yield from self.hub.links.values()
+
+    def lane_asked(self, client: ClientName, ciphers: list[str]) -> None: ...
+
+    def lane_closed(self, client: ClientName) -> None: ...
 
     def client_up(self, client: ClientName, *, resumed: bool) -> None: ...
 
@@ -377,7 +408,10 @@ class World:
         """kill -9: a new process in its place that knows nothing."""
         old = self.relay
         self.relay = SimHub(self, boot=self._boot())
-        pairs = [(old.sides[name], self.relay.port(name)) for name in old.sides]
+        pairs: list[tuple[Port, Port]] = [(old.sides[name], self.relay.port(name)) for name in old.sides]
+        for port in old.more_ports:  # lanes whose keys nobody has any more
+            self.relay.more_ports.append(DeadPort())
+            pairs.append((port, self.relay.more_ports[-1]))
         self.network.replace_node(old, self.relay, pairs)
 
     def run(self, seconds: float) -> None:

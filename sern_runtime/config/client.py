@@ -84,6 +84,8 @@ class RelayConnection(Section):
     """The relay's public key file (.pub): the client talks to nobody else."""
     secret_key_file: PathText | None = None
     """This client's secret key file (.key)."""
+    udp: bool = True
+    """Use the datagram lane when the relay offers it and it gets through: a lost packet then delays nothing else."""
     insecure: bool = False
     """No keys and no encryption; only for ipc and loopback, for trials on one machine."""
 

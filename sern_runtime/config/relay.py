@@ -56,6 +56,8 @@ class RelaySection(Section):
     """The relay's secret key file (.key)."""
     clients_dir: PathText | None = None
     """Directory with the public key files (.pub) of the clients that may connect."""
+    udp: bool = True
+    """Offer clients the datagram lane, on the UDP ports with the numbers of `listen`; not with insecure: true."""
     insecure: bool = False
     """No keys and no encryption, clients are who they say they are; only for ipc and loopback."""
     max_connections: Count = 256

@@ -1,0 +1,106 @@
+"""The relay's datagram lanes: one UDP socket for each listener, one session for each client that asks for one."""
+
+import logging
+import time
+from collections.abc import Callable, Sequence
+
+from sern_core.errors import RefusedError, RemoteError
+from sern_core.hub import Hub
+from sern_core.lanes import LANE_UDP
+from sern_core.link import LanePort
+from sern_core.types import ClientName
+from sern_runtime.config.base import split_tcp
+from sern_runtime.pump import Pump
+from sern_runtime.udp import UdpServer, UdpSession
+from sern_runtime.udp_socket import Address
+
+_log = logging.getLogger(__name__)
+
+
+def udp_endpoints(listen: Sequence[str]) -> tuple[str, ...]:
+    """The UDP addresses beside the TCP ones that the relay listens on: same address, same port number."""
+    return tuple(f"udp://{endpoint.removeprefix('tcp://')}" for endpoint in listen if split_tcp(endpoint) is not None)
+
+
+class RelayLanes:
+    """Opens a session for a client that asks, and joins it to the client's link until the core closes the lane.
+
+    Raises ConfigError when an address cannot be had. `after` is called whenever something came in.
+    """
+
+    def __init__(self, hub: Hub, listen: Sequence[str], *, after: Callable[[], None]) -> None:
+        self.hub = hub
+        self.bad_frames = 0
+        self.moved = 0
+        """Times a client's address changed."""
+        self._lanes: dict[ClientName, tuple[UdpSession, Pump]] = {}
+        self.server = UdpServer(
+            udp_endpoints(listen), self._received, on_path=self._path, on_writable=self._writable, after=after
+        )
+
+    def close(self) -> None:
+        for _, pump in self._lanes.values():
+            pump.close()
+        self._lanes.clear()
+        self.server.close()
+
+    def asked(self, client: ClientName, ciphers: Sequence[str]) -> None:
+        """A client would like a datagram lane: give it one, over the session that its CURVE key opened."""
+        self.closed(client)
+        link = self.hub.links[client]
+        link.close_lane(now=time.monotonic())
+        try:
+            session = self.server.open_session(client, ciphers)
+        except RefusedError as refusal:
+            _log.warning("%s gets no datagram lane: %s", client, refusal)
+            return
+        port = LanePort(link, LANE_UDP)
+        pump = Pump(port, session.send, on_gone=lambda: self._gone(client, session), ready=session.ready)
+        self._lanes[client] = (session, pump)
+        self.hub.offer_lane(client, session.parameters.to_envelope(), now=time.monotonic())
+        pump.kick()
+
+    def closed(self, client: ClientName) -> None:
+        """The core has closed the client's lane."""
+        lane = self._lanes.pop(client, None)
+        if lane is not None:
+            session, pump = lane
+            pump.close()
+            self.server.close_session(session)
+
+    def flush(self) -> None:
+        """Let every lane that has something to say say it."""
+        for session, pump in self._lanes.values():
+            if self.hub.links[session.client].dirty:
+                pump.kick()
+
+    def _received(self, session: UdpSession, data: bytes, now: float) -> None:
+        link = self.hub.links.get(session.client)
+        lane = self._lanes.get(session.client)
+        if link is None or lane is None or lane[0] is not session:
+            return
+        try:
+            link.receive(data, now=now, lane=LANE_UDP)
+        except RemoteError as error:
+            self.bad_frames += 1
+            _log.warning("datagram lane of %s closed: bad frame: %s", session.client, error)
+            self._gone(session.client, session)
+
+    def _gone(self, client: ClientName, session: UdpSession) -> None:
+        """The session can send no more: its key is used up, or its client sent what no honest one does."""
+        lane = self._lanes.get(client)
+        if lane is not None and lane[0] is session:
+            self.closed(client)
+            self.hub.links[client].close_lane(now=time.monotonic())
+
+    def _path(self, session: UdpSession, address: Address, validated: bool) -> None:
+        if validated:
+            _log.info("%s is reached over UDP at %s", session.client, address[0])
+        else:
+            self.moved += 1
+        self._writable(session)
+
+    def _writable(self, session: UdpSession) -> None:
+        lane = self._lanes.get(session.client)
+        if lane is not None and lane[0] is session:
+            lane[1].kick()

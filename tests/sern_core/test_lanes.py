@@ -1,0 +1,118 @@
+"""Two lanes under one session: which carries data, what a lost lane costs, and how a session outlives its stream."""
+
+from sern_core.client import ClientCore
+from sern_core.lanes import LANE_UDP, LANE_ZMQ
+from sern_core.link import LanePort
+from sern_core.types import ClientName, PriorityClass
+from sern_sim.models import LinkModel, Window
+from sern_sim.network import Hop
+from tests.world import SimClient, World, spec
+
+RATE_BPS = 4e6
+
+
+def models(*blackouts: Window, loss: float = 0.0) -> tuple[LinkModel, LinkModel]:
+    """The same path as a stream and as datagrams."""
+    path = LinkModel(rate_bps=RATE_BPS, delay_s=0.025, blackouts=blackouts, loss=loss)
+    return path.as_stream(), path
+
+
+class TwoLanes:
+    """A robot that reaches the relay over both lanes, and a site beside the relay."""
+
+    def __init__(self, *, stream: LinkModel, datagrams: LinkModel, open_at_s: float = 1.0) -> None:
+        self.world = World()
+        self.robot = self.world.client("robot", stream)
+        self.site = self.world.client("site", patterns=["/robot/.*"])
+        self.hop = self._join(self.robot, datagrams)
+        self.pose = self.robot.publish("/robot/pose", spec(PriorityClass.CONTROL))
+        self.log = self.robot.publish("/robot/log", spec(reliable=True))
+        self.cloud = self.robot.publish("/robot/points", spec(PriorityClass.BULK))
+        self.logged = 0
+        every = self.world.network.every
+        every(0.02, lambda now: self.core.send(self.pose, b"p" * 100, 0, now=now), node=self.robot)
+        every(0.1, lambda now: self.core.send(self.cloud, b"c" * 100_000, 0, now=now), node=self.robot)
+        every(0.1, self._log, node=self.robot)
+        self.world.network.at(open_at_s, self._open)
+
+    @property
+    def core(self) -> ClientCore:
+        return self.robot.core
+
+    def _log(self, now: float) -> None:
+        self.logged += 1
+        assert self.core.send(self.log, b"%d" % self.logged, 0, now=now)
+
+    def _join(self, robot: SimClient, datagrams: LinkModel) -> Hop:
+        hub = self.world.relay.hub
+        near = LanePort(robot.core.link, LANE_UDP)
+        far = LanePort(hub._link(ClientName("robot"), self.world.now), LANE_UDP)
+        robot.more_ports.append(near)
+        self.world.relay.more_ports.append(far)
+        return self.world.network.join(near, robot, far, self.world.relay, datagrams, datagrams, name="udp")
+
+    def _open(self, now: float) -> None:
+        self.world.relay.hub.links[ClientName("robot")].open_lane(now=now)
+        self.core.link.open_lane(now=now)
+
+    def run(self, seconds: float) -> None:
+        self.world.run(seconds)
+        self.world.validate()
+
+    def check_log(self) -> None:
+        """Reliable, whatever the lanes did: once, in order, complete up to what is still under way."""
+        bodies = [got.body for got in self.site.on("/robot/log")]
+        assert bodies == [b"%d" % n for n in range(1, len(bodies) + 1)]
+        assert self.logged - len(bodies) <= 3
+
+    def first_pose_after(self, time_s: float) -> float:
+        start_s = self.world.network.start_s
+        return min(g.at_s - start_s for g in self.site.on("/robot/pose") if g.at_s - start_s > time_s) - time_s
+
+
+def test_data_moves_to_the_datagram_lane_once_it_answers() -> None:
+    lanes = TwoLanes(stream=models()[0], datagrams=models()[1])
+    lanes.run(0.9)
+    assert lanes.core.link.lane.id == LANE_ZMQ
+    lanes.run(9.1)
+    assert lanes.core.link.lane.id == LANE_UDP
+    assert lanes.hop.forward.stats.goodput_bps > 0.8 * RATE_BPS * 0.85
+    lanes.check_log()
+
+
+def test_a_path_that_carries_no_datagrams_is_not_used() -> None:
+    lanes = TwoLanes(stream=models()[0], datagrams=models(Window(0.0, 1000.0))[1])
+    lanes.run(10.0)
+    assert lanes.core.link.lane.id == LANE_ZMQ
+    assert len(lanes.site.on("/robot/pose")) > 400
+    lanes.check_log()
+
+
+def test_it_falls_back_when_datagrams_cease_and_returns_by_itself() -> None:
+    lanes = TwoLanes(stream=models()[0], datagrams=models(Window(5.0, 10.0))[1])
+    lanes.run(8.0)
+    assert lanes.core.link.lane.id == LANE_ZMQ
+    assert lanes.first_pose_after(5.1) < 1.0
+    lanes.run(7.0)
+    assert lanes.core.link.lane.id == LANE_UDP
+    lanes.check_log()
+
+
+def test_a_session_outlives_the_stream_and_a_fresh_pose_is_there_at_once() -> None:
+    stream, datagrams = models(Window(10.0, 40.0))  # the stream's connection breaks after 5 s of it
+    lanes = TwoLanes(stream=stream, datagrams=datagrams)
+    lanes.run(60.0)
+    assert lanes.robot.ups == [False]  # one session all along
+    assert lanes.first_pose_after(40.0) <= 0.3
+    assert lanes.core.link.lanes[LANE_ZMQ].up
+    lanes.check_log()
+
+
+def test_the_lane_closes_with_its_session() -> None:
+    lanes = TwoLanes(stream=models()[0], datagrams=models()[1])
+    lanes.run(3.0)
+    lanes.world.restart_relay()
+    lanes.run(10.0)
+    assert LANE_UDP not in lanes.core.link.lanes
+    assert lanes.robot.lanes_closed == 1
+    lanes.check_log()
