@@ -279,6 +279,8 @@ class _Site:
 
     def publication_refused(self, stream: StreamInfo, code: str, text: str) -> None: ...
 
+    def subscription_refused(self, code: str, text: str) -> None: ...
+
 
 Work = Callable[[ClientCore, Pump, _Site], Awaitable[None]]
 

@@ -4,6 +4,7 @@ import logging
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Final
 
 from sern_client.endpoints.base import Endpoint, Publisher, Subscription
 from sern_client.frames import FramePrefixer, Rewrite
@@ -20,6 +21,8 @@ from sern_core.types import DropReason, TopicName
 from sern_runtime import ros_types
 from sern_runtime.link_metrics import AgeHistograms
 from sern_runtime.loop import Timer
+
+MAX_PROBLEMS: Final = 256
 
 _log = logging.getLogger(__name__)
 
@@ -80,6 +83,8 @@ class Bridge:
         self.lane: ClientLane | None = None
         """The datagram lane, where there is one; set by the daemon."""
         self.refusals = 0
+        self.subscription_problems: dict[str, str] = {}
+        """What the relay does not let us have, in its words, with the code."""
         self.deadlines_missed: dict[TopicName, int] = {}
         self.leases_fired = 0
         self.publish_failures = 0
@@ -275,6 +280,12 @@ class Bridge:
     def publication_refused(self, stream: StreamInfo, code: str, text: str) -> None:
         self.refusals += 1
         _log.error("the relay refuses %s (%s): %s", stream.id.topic, code, text)
+
+    def subscription_refused(self, code: str, text: str) -> None:
+        if text not in self.subscription_problems:  # it is said again in every session
+            _log.error("the relay refuses a subscription (%s): %s", code, text)
+            if len(self.subscription_problems) < MAX_PROBLEMS:
+                self.subscription_problems[text] = code
 
     # --- leases -----------------------------------------------------------------------------------------------------
 

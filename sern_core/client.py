@@ -61,6 +61,9 @@ class ClientEvents(Protocol):
 
     def publication_refused(self, stream: StreamInfo, code: str, text: str) -> None: ...
 
+    def subscription_refused(self, code: str, text: str) -> None:
+        """Something that this site named is not ours to have, or the relay takes none of our patterns."""
+
 
 class ClientCore:
     """One client. `boot` is a random 63-bit number of this process, `now` any monotonic time in seconds."""
@@ -274,6 +277,10 @@ class ClientCore:
         kind = envelope["t"]
         if kind == "lane":
             self.events.lane_offered(envelope)
+        elif kind == "denied":
+            self.events.subscription_refused(
+                wire.take_str(envelope, "code", max_length=64), wire.take_str(envelope, "why")
+            )
         else:
             raise WireError(f"unknown control message {kind!r}")
 

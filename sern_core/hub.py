@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import Final, Protocol
 
 from sern_core import wire
-from sern_core.access import AccessTable, RateGuard
+from sern_core.access import AccessTable, RateGuard, compile_peer_pattern
 from sern_core.announce import Announcement
 from sern_core.bound import QueueBound
 from sern_core.errors import RefusedError, VersionError, WireError
@@ -28,6 +28,7 @@ from sern_core.params import LinkParams, SchedulerParams
 from sern_core.queues import OutChannel, OutMessage
 from sern_core.replay import ReplayStore
 from sern_core.routing import RouteChange, RoutingTable
+from sern_core.rules import name_problem
 from sern_core.trace import DecisionTrace
 from sern_core.types import DROP_CODES, ClientName, DropReason, ObjectKind, TopicName
 
@@ -36,6 +37,8 @@ RESET_INTERVAL_S: Final = 0.5
 MAX_AWAITED_TOPICS: Final = 2048
 """Streams held for one client that has not come back yet; origins name them, so there must be an end to it."""
 MAX_LOCAL_SEQS: Final = 4096
+MAX_DENIED: Final = 64
+"""Topics of one subscription that a client is told it may not have; a client has no use for a longer list."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -320,9 +323,16 @@ class Hub:
             if relayed is not None and relayed.source is not None:
                 relayed.source.answer(relayed.stream, self._wanted(relayed), now=now, owed=tuple(relayed.outs))
                 self._confirm(relayed)
-        for denied in change.denied:
-            if denied.by_name:
-                self.events.refused(denied.client, "forbidden", f"{denied.client} may not subscribe to {denied.topic}")
+        for denied in [each for each in change.denied if each.by_name][:MAX_DENIED]:
+            text = f"{denied.client} may not subscribe to {denied.topic}: no access rule grants it"
+            self.events.refused(denied.client, "forbidden", text)
+            self._tell(denied.client, {"t": "denied", "topic": denied.topic, "code": "forbidden", "why": text}, now)
+
+    def _tell(self, client: ClientName, envelope: wire.Envelope, now: float) -> None:
+        """Say something to a client, if it is there; whoever comes later says what it wants anew, and is told then."""
+        link = self.links.get(client)
+        if link is not None:
+            link.send_control(envelope, now=now)
 
     def _close(self, client: ClientName, identity: StreamId, reason: DropReason, now: float) -> None:
         relayed = self.relayed.get(identity)
@@ -641,10 +651,15 @@ class Hub:
         del self._subscriptions[client]
         self._awaited.pop(client, None)
         self._heard.add(client)
+        # What is a name and no pattern is denied by name: that gives nothing away about what there is.
+        names = {TopicName(part) for part in parts if name_problem(part) is None}
+        patterns = [part for part in parts if part not in names]
         try:
-            self._apply(self.routing.subscribe(client, parts), now)
+            self._apply(self.routing.subscribe(client, patterns, exact=names), now)
         except RefusedError as refusal:
             self.events.refused(client, refusal.code, str(refusal))
+            bad = next((part for part in patterns if not _acceptable(part)), "")
+            self._tell(client, {"t": "denied", "pattern": bad, "code": refusal.code, "why": str(refusal)[:400]}, now)
 
     def _object(self, client: ClientName, envelope: wire.Envelope, attachment: bytes, now: float) -> None:
         object_id = wire.take_str(envelope, "id")
@@ -681,3 +696,11 @@ class Hub:
         for identity, relayed in self.relayed.items():
             outs = set(self.routing.subscribers(identity))
             assert set(relayed.outs) == outs, f"{identity.topic}: channels {set(relayed.outs)} but routes {outs}"
+
+
+def _acceptable(pattern: str) -> bool:
+    try:
+        compile_peer_pattern(pattern)
+    except RefusedError:
+        return False
+    return True

@@ -219,14 +219,13 @@ class RoutingTable:
                 f"and {self._limits.max_exact} are taken; join patterns with '|'",
             )
         old = self._interests.get(client)
+        denied = [Denied(client, name, by_name=True) for name in names if not self._access.may_subscribe(client, name)]
         if old is not None and old.texts == texts and old.exact == names:
-            return NO_CHANGE
+            return RouteChange(denied=tuple(sorted(denied)))  # said again: it may be another process that asks
         for text in texts:
             compile_peer_pattern(text)
         change = _Collector()
-        change.denied.update(
-            Denied(client, name, by_name=True) for name in names if not self._access.may_subscribe(client, name)
-        )
+        change.denied.update(denied)
         self._set_interest(client, _Interest(texts, names) if texts or names else None, change)
         return change.result(self._routes)
 

@@ -279,6 +279,9 @@ class Listener:
     def publication_refused(self, stream: StreamInfo, code: str, text: str) -> None:
         """We send nothing."""
 
+    def subscription_refused(self, code: str, text: str) -> None:
+        self.problem = RefusedError(code, f"the relay refuses us: {text}")
+
 
 async def listen(
     topic: TopicName,
@@ -362,8 +365,8 @@ def _check_patience(
     if not core.link.established:
         raise SernError(f"{identity.endpoint}: {reason} (waited {timeout_s:g} s)")
     raise SernError(
-        f"{topic} has not appeared at {core.link.peer} within {timeout_s:g} s: nobody publishes it, or the relay's "
-        f"access rules do not let {identity.name} subscribe to it (`sern topics` at the relay lists what there is)"
+        f"{topic} has not appeared at {core.link.peer} within {timeout_s:g} s: nobody publishes it "
+        "(`sern topics` at the relay lists what there is)"
     )
 
 

@@ -291,6 +291,16 @@ def valid() -> list[Vector]:
             {"t": "subscribe", "patterns": ["/jackal1/.*", "/tf"], "more": False},
         ),
         _control(
+            "denied",
+            "the client may not have a topic that it named",
+            {"t": "denied", "topic": "/jackal2/map", "code": "forbidden", "why": "no access rule grants it"},
+        ),
+        _control(
+            "denied-pattern",
+            "the relay takes nothing of this subscription",
+            {"t": "denied", "pattern": "/(a*)*", "code": "bad_pattern", "why": "it could take too long to match"},
+        ),
+        _control(
             "lane-ask",
             "the client would use a datagram lane",
             {"t": "lane_ask", "ciphers": ["aes-256-gcm", "chacha20-poly1305"]},

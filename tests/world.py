@@ -166,6 +166,8 @@ class SimClient:
     refused: dict[str, int] = field(default_factory=lambda: defaultdict(int))
     dropped_out: list[Dropped] = field(default_factory=list)
     refusals: list[tuple[str, str]] = field(default_factory=list)
+    denials: list[tuple[str, str]] = field(default_factory=list)
+    """Subscriptions that the relay refused."""
     rejections: list[tuple[str, str]] = field(default_factory=list)
     opened: list[StreamInfo] = field(default_factory=list)
     closed: list[StreamInfo] = field(default_factory=list)
@@ -244,6 +246,9 @@ class SimClient:
 
     def publication_refused(self, stream: StreamInfo, code: str, text: str) -> None:
         self.refusals.append((code, text))
+
+    def subscription_refused(self, code: str, text: str) -> None:
+        self.denials.append((code, text))
 
     # helpers
     def publish(self, topic: str, topic_spec: TopicSpec, definition: str = "") -> OutChannel:

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from ruamel.yaml import YAML
 from typer.testing import CliRunner
 
-from sern_core.errors import ConfigError, SernError, UsageError
+from sern_core.errors import ConfigError, RefusedError, SernError, UsageError
 from sern_core.message import Message, StreamId, StreamInfo, TopicInfo, TopicSpec
 from sern_core.types import ClientName, DropReason, Encoding, TopicName
 from sern_runtime import ros_types
@@ -198,6 +198,8 @@ async def test_what_a_listener_is_told() -> None:
     assert "my_msgs/msg/Thing is unknown" in str(listener.problem)
     listener.rejected("name", "your key belongs to r")
     assert str(listener.problem) == "the relay refuses us: your key belongs to r"
+    listener.subscription_refused("forbidden", "r may not subscribe to /x")
+    assert str(listener.problem) == "the relay refuses us: r may not subscribe to /x"
 
 
 # --- who it is --------------------------------------------------------------------------------------------------------
@@ -300,9 +302,10 @@ async def test_it_prints_what_a_site_would_get_and_leaves_nothing(tmp_path: Path
 async def test_a_topic_that_may_not_be_seen_or_is_not_there(tmp_path: Path) -> None:
     async with Lab(tmp_path, "robot1", "viewer") as lab:
         await start(lab, three_texts)
-        for topic in ("/robot1/secret", "/robot1/none"):
-            with pytest.raises(SernError, match=f"{topic} has not appeared .* access rules do not let viewer"):
-                await Show(lab).run(topic, timeout_s=0.3)
+        with pytest.raises(RefusedError, match="refuses us: viewer may not subscribe to /robot1/secret"):
+            await Show(lab).run("/robot1/secret")
+        with pytest.raises(SernError, match=r"/robot1/hidden has not appeared .* nobody publishes it"):
+            await Show(lab).run("/robot1/hidden", timeout_s=0.3)
 
 
 async def test_who_is_not_let_in(tmp_path: Path) -> None:

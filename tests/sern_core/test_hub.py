@@ -1,0 +1,73 @@
+"""What the relay's core promises its clients beside delivery: answers, and that they are let go."""
+
+from sern_core.access import AccessRule, AccessTable
+from sern_core.hub import MAX_DENIED
+from tests.world import World, spec
+
+ONE_SECRET = AccessTable(
+    [
+        AccessRule(client="robot", publish=(".*",)),
+        AccessRule(client="site", subscribe=("/robot/odom",)),
+    ]
+)
+
+
+def test_a_topic_that_was_named_and_is_forbidden_is_told_in_every_session() -> None:
+    world = World(access=ONE_SECRET).watch()
+    site = world.client("site", patterns=["/robot/odom", "/robot/none", "/robot/se.*"])
+    robot = world.client("robot")
+    world.run(1.0)
+    told = ("forbidden", "site may not subscribe to /robot/none: no access rule grants it")
+    assert site.denials == [told]
+    assert world.relay.refusals == [told]
+    world.hops["site"].break_connection()
+    world.until(lambda: len(site.ups) == 2)
+    world.run(1.0)
+    assert site.denials == [told] * 2
+    assert robot.denials == []
+
+
+def test_what_only_a_pattern_covers_is_not_mentioned() -> None:
+    world = World(access=ONE_SECRET).watch()
+    robot = world.client("robot")
+    site = world.client("site", patterns=["/robot/.*"])
+    world.run(1.0)
+    for name in ("/robot/odom", "/robot/secret"):
+        robot.publish(name, spec())
+    world.run(1.0)
+    assert [stream.id.topic for stream in site.opened] == ["/robot/odom"]
+    assert site.denials == []
+
+
+def test_new_rules_are_told_to_whom_they_take_something_from() -> None:
+    world = World().watch()
+    site = world.client("site", patterns=["/robot/odom", "/robot/map"])
+    world.run(1.0)
+    assert site.denials == []
+    world.relay.hub.revoke(ONE_SECRET, now=world.relay.now)
+    world.run(1.0)
+    assert [text.split(":")[0] for _, text in site.denials] == ["site may not subscribe to /robot/map"]
+
+
+def test_a_bad_pattern_is_told_and_what_was_wanted_before_stays() -> None:
+    world = World().watch()
+    robot = world.client("robot")
+    site = world.client("site", patterns=["/robot/odom"])
+    channel = robot.publish("/robot/odom", spec())
+    world.run(1.0)
+    site.subscribe("/robot/map", "/(a*)*")
+    world.run(1.0)
+    assert [code for code, _ in site.denials] == ["bad_pattern"] and "'/(a*)*'" in site.denials[0][1]
+    site.subscribe(*(f"/x.?{n}" for n in range(300)))
+    world.run(1.0)
+    assert [code for code, _ in site.denials] == ["bad_pattern", "too_many_patterns"]
+    robot.send(channel, b"1")
+    world.run(1.0)
+    assert site.seqs("/robot/odom") == [1]
+
+
+def test_the_list_of_what_is_denied_has_an_end() -> None:
+    world = World(access=ONE_SECRET).watch()
+    site = world.client("site", patterns=[f"/robot/n{n}" for n in range(200)])
+    world.run(2.0)
+    assert len(site.denials) == MAX_DENIED
