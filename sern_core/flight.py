@@ -15,8 +15,8 @@ from sern_core.clocksync import RttEstimator
 
 REORDER_THRESHOLD: Final = 3
 MIN_LOSS_TIMEOUT_S: Final = 0.100
-FIRST_LOSS_TIMEOUT_S: Final = 1.0
-"""Before any round trip was measured (RFC 6298, 2.1)."""
+FIRST_LOSS_TIMEOUT_S: Final = 2.0
+"""Before any round trip was measured: a path of 1 s and its first queue must not look like loss."""
 STALL_MIN_S: Final = 0.5
 STALL_RTTS: Final = 4.0
 FIRST_STALL_S: Final = 3.0

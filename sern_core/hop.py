@@ -14,6 +14,7 @@ from sern_core.errors import WireError
 from sern_core.flight import ACK_DELAY_S
 from sern_core.fragments import InStream, Reassembly
 from sern_core.lanes import (
+    COPY_DELAY_S,
     LANE_UDP,
     LANE_ZMQ,
     OVERHEAD_BYTES,
@@ -221,6 +222,9 @@ class Hop(ABC):
     def _next_data(self, lane: Lane, now: float) -> bytes | None:
         """The next kind-16 datagram of an established session for one lane, or None."""
         self._now = now
+        if lane.copies and (copy := lane.due_copy(now)) is not None:
+            self.scheduler.charge(PriorityClass.CONTROL, len(copy), now=now)
+            return copy
         frames: list[bytes] = []
         items: list[SentData | SentWatermark | SentPing] = []
         if not lane.stalled or now >= lane.probe_due_s:
@@ -254,10 +258,13 @@ class Hop(ABC):
         nbytes = len(datagram) + OVERHEAD_BYTES
         estimator = lane.estimator
         inflight_bytes = flight.inflight_bytes + nbytes
-        app_limited = inflight_bytes < estimator.window_bytes and not self._backlog
+        app_limited = inflight_bytes < estimator.window_bytes and not (lane is self.lane and self._backlog)
         flight.sent(now=now, nbytes=nbytes, items=items, app_limited=app_limited)
         estimator.on_sent(now=now, nbytes=nbytes, inflight_bytes=inflight_bytes)
+        lane.pacer.sent(now=now, nbytes=nbytes, pacing_bps=estimator.pacing_bps)
         lane.ping_due_s = now + PING_INTERVAL_S
+        if lane.redundant and any(type(item) is SentData and _urgent(item.channel) for item in items):
+            lane.copies.append((now + COPY_DELAY_S, flight.next_number - 1, datagram))
         return datagram
 
     def _header(self, number: int, now: float) -> bytes:
@@ -278,7 +285,7 @@ class Hop(ABC):
         lane = self.lane
         limit = lane.fragment_bytes - (wire.ACK.size if lane.arrivals.unacked else 0)
         scheduler = self.scheduler
-        window_open = lane.window_open and not lane.stalled
+        window_open = lane.open_at(now)
         size = wire.HEADER_BYTES
         if self._watermarks:
             size = self._put_watermarks(frames, items, size)
@@ -449,13 +456,24 @@ class Hop(ABC):
             rtt_s = max(1e-6, now - sent_s - (stamp_s - received_s))
             flight.rtt.sample(rtt_s, now=now)
             self.clock.sample(sent_s, received_s, stamp_s, now)
-            acked_bytes = sum([packet.nbytes for packet in packets])
-            app_limited = bool(packets) and packets[-1].app_limited
+            newest = packets[-1] if packets else None
             state.estimator.on_ack(
-                AckSample(now, rtt_s, acked_bytes, flight.inflight_bytes, received_s, cum_bytes, app_limited)
+                AckSample(
+                    now,
+                    rtt_s,
+                    sum([packet.nbytes for packet in packets]),
+                    flight.inflight_bytes,
+                    received_s,
+                    cum_bytes,
+                    newest is not None and newest.app_limited,
+                    sent_s,
+                    newest.nbytes if newest is not None and newest.number == highest else 0,
+                )
             )
             if state is self.lane and now >= self._rate_due_s:
                 self._rate_known(now)
+        if packets:
+            state.resolved(acked=len(packets))
         if newer or packets:
             state.stalled = False
             state.proofs += 1
@@ -505,7 +523,10 @@ class Hop(ABC):
         self.scheduler.set_rate(self.lane.rate_changed() or None, now=now)
 
     def _find_losses(self, lane: Lane, now: float) -> None:
-        for packet in lane.flight.lost(now=now):
+        gone = lane.flight.lost(now=now)
+        if gone:
+            lane.resolved(lost=len(gone))
+        for packet in gone:
             lane.estimator.on_loss(now=now, nbytes=packet.nbytes)
             self._give_back(lane, packet.items, now)
             self.dirty = True
@@ -569,13 +590,21 @@ class Hop(ABC):
             lane.stall_deadline(),
             lane.flight.loss_deadline(),
             lane.probe_due_s if lane.stalled else None,
-            self.scheduler.next_deadline(now=self._now, window_open=lane.window_open and not lane.stalled)
-            if lane is self.lane
-            else None,
+            lane.copies[0][0] if lane.copies else None,
+            self._service_deadline(lane) if lane is self.lane else None,
         ):
             if candidate is not None and candidate < deadline:
                 deadline = candidate
         return deadline
+
+    def _service_deadline(self, lane: Lane) -> float | None:
+        """When something that waits may leave by time alone: the pacer or class 0's bucket lets it."""
+        now = self._now
+        if lane.window_open and not lane.pacer.ready(now) and self._backlog:
+            pacing_s = lane.pacing_deadline()
+            bucket_s = self.scheduler.next_deadline(now=now, window_open=False)
+            return pacing_s if bucket_s is None or pacing_s < bucket_s else bucket_s
+        return self.scheduler.next_deadline(now=now, window_open=lane.open_at(now))
 
     def _data_timeout(self, lane: Lane, now: float) -> None:
         self._now = now
@@ -611,6 +640,10 @@ class Hop(ABC):
             self._must_hear(stream)
             if 0 < stream.pause_seq <= self._control.watermark:
                 stream.forget(DropReason.UNWANTED)
+
+
+def _urgent(channel: OutChannel) -> bool:
+    return channel.spec.priority is PriorityClass.CONTROL and channel.slot != CONTROL_CHANNEL
 
 
 def _class_of(channel: OutChannel, out: OutMessage) -> PriorityClass:

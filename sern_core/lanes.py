@@ -1,12 +1,13 @@
 """One lane of a hop: its flight, its arrivals, its estimator, its fragment size."""
 
+from collections import deque
 from typing import Final
 
-from sern_core.capacity import CapacityEstimator
+from sern_core.capacity import PACING_BURST_S, CapacityEstimator, Pacer
 from sern_core.control.delay import DelayWindow
 from sern_core.control.fixed import FixedWindow
 from sern_core.flight import Arrivals, Flight
-from sern_core.params import LinkParams, WindowAlgorithm
+from sern_core.params import LinkParams, Redundancy, WindowAlgorithm
 
 LANE_ZMQ: Final = 0
 LANE_UDP: Final = 1
@@ -27,6 +28,13 @@ PROBE_INTERVAL_S: Final = 0.2
 """While stalled, one fresh class-0 message goes out this often and finds out whether the path is back."""
 
 
+COPY_DELAY_S: Final = 0.007
+"""Losses come in bursts: a copy right behind its original would share its fate. Long enough to leave a short burst,
+short against what a command may be late."""
+COPY_LOSS: Final = 0.005
+LOSS_GAIN: Final = 0.01
+
+
 class Lane:
     """State of one lane of one link. `lossless`: a stream (TCP) underneath."""
 
@@ -39,6 +47,7 @@ class Lane:
             self.estimator = FixedWindow(params.window.fixed_bytes)
         else:
             self.estimator = DelayWindow(fragment_bytes=MIN_FRAGMENT_BYTES + OVERHEAD_BYTES)
+        self.pacer = Pacer()
         self.flight = Flight(lossless=lossless)
         self.arrivals = Arrivals()
         self.stalled = False
@@ -47,6 +56,11 @@ class Lane:
         self.proofs = 0  # questions answered since it was opened or had stalled
         self.ping = False
         self.ping_due_s = 0.0
+        self.loss = 0.0
+        """Share of recent packets that were lost."""
+        self.copies: deque[tuple[float, int, bytes]] = deque()
+        """Second copies to send: when, of which packet, the datagram."""
+        self._redundancy = params.redundancy
         self.fragment_bytes = self._fragment_bytes(None)
 
     def _fragment_bytes(self, rate_bps: float | None) -> int:
@@ -64,7 +78,16 @@ class Lane:
 
     @property
     def window_open(self) -> bool:
-        return self.flight.inflight_bytes < self.estimator.window_bytes
+        """Whether the bytes in flight leave room; class 0 does not ask, and the pacer has a word as well."""
+        return not self.stalled and self.flight.inflight_bytes < self.estimator.window_bytes
+
+    def open_at(self, now: float) -> bool:
+        """Whether a datagram below class 0 may leave now."""
+        return self.window_open and self.pacer.ready(now)
+
+    def pacing_deadline(self) -> float:
+        """When the pacer lets the next datagram go."""
+        return self.pacer.due_s - PACING_BURST_S
 
     def stall_deadline(self) -> float | None:
         flight = self.flight
@@ -76,6 +99,27 @@ class Lane:
     def name(self) -> str:
         return LANE_NAMES[self.id]
 
+    def resolved(self, *, acked: int = 0, lost: int = 0) -> None:
+        """The fate of packets is known: follow the share of losses, over about the last hundred."""
+        self.loss *= (1.0 - LOSS_GAIN) ** (acked + lost)
+        self.loss = min(1.0, self.loss + LOSS_GAIN * lost)
+
+    @property
+    def redundant(self) -> bool:
+        """Whether class control is sent twice."""
+        if self.lossless or self._redundancy is Redundancy.OFF:
+            return False
+        return self._redundancy is Redundancy.ALWAYS or self.loss > COPY_LOSS
+
+    def due_copy(self, now: float) -> bytes | None:
+        """A second copy whose time has come and whose packet nobody has acknowledged yet."""
+        copies = self.copies
+        while copies and copies[0][0] <= now:
+            _, number, datagram = copies.popleft()
+            if number in self.flight.packets:
+                return datagram
+        return None
+
     @property
     def usable(self) -> bool:
         return self.up and not self.stalled
@@ -85,6 +129,8 @@ class Lane:
         self.proofs = 0
         self.ping = False
         self.ping_due_s = now
+        self.copies.clear()
         self.flight = Flight(lossless=self.lossless)
         self.arrivals = Arrivals()
+        self.pacer = Pacer()
         self.stalled = False

@@ -68,6 +68,14 @@ class WindowParams:
             raise UsageError(f"WindowParams: fixed_bytes = {self.fixed_bytes!r} must be at least 1")
 
 
+class Redundancy(StrEnum):
+    """h of the paper's eq. (config_vector): whether class control is sent twice over a lane that loses packets."""
+
+    AUTO = "auto"  # while the lane loses more than one packet in 200
+    ALWAYS = "always"
+    OFF = "off"
+
+
 @dataclass(frozen=True, slots=True)
 class LinkParams:
     """What one hop needs besides the scheduler."""
@@ -79,6 +87,8 @@ class LinkParams:
     """A peer that says nothing for so long is gone; its connection is closed and rebuilt."""
     retention_s: float = DEFAULT_RETENTION_S
     """How long a reliable message waits for delivery when its topic gives no `retention_s` of its own."""
+    redundancy: Redundancy = Redundancy.AUTO
+    """Second copies of class control, a few milliseconds behind the first; what arrives twice counts once."""
     max_message_bytes: int = 16 * 2**20
     """Larger messages are dropped with reason `too_large`; also the receiver's reassembly limit a message."""
 

@@ -103,6 +103,9 @@ class Session(Hop):
         lane = self.lanes[LANE_UDP] = Lane(LANE_UDP, self.params, lossless=False)
         lane.up = True
         lane.new_session(now)
+        stream_rtt = self.lanes[LANE_ZMQ].flight.rtt
+        if stream_rtt.samples:
+            lane.flight.rtt.sample(stream_rtt.srtt_s, now=now)
         lane.estimator.on_reset(now=now)
         self.dirty = True
 
@@ -323,6 +326,8 @@ class Session(Hop):
                 self._end_session("new session", now)
                 self._establish(boot, now)
             self.clock.sample(echo_us * 1e-6, at_us * 1e-6, header.stamp_us * 1e-6, now)
+            # Without it the first packets on a long path would be given up before they can be acknowledged.
+            self.lanes[LANE_ZMQ].flight.rtt.sample(max(1e-6, now - echo_us * 1e-6), now=now)
         elif kind is wire.Kind.REFUSE:
             code, text = wire.take_str(envelope, "code", max_length=64), wire.take_str(envelope, "why")
             self._greet(now + REFUSED_INTERVAL_S, now)

@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from sern_core.errors import ConfigError
-from sern_core.params import LinkParams, SchedulerParams, WindowAlgorithm, WindowParams
+from sern_core.params import LinkParams, Redundancy, SchedulerParams, WindowAlgorithm, WindowParams
 from sern_core.types import Ordering
 from sern_runtime.config.base import Bytes, FileProblem, HttpListen, PathText, Seconds, SecondsOrZero, Section, resolve
 from sern_runtime.config.yaml import Loc
@@ -74,6 +74,8 @@ class LinkSection(Section):
     """A peer that is silent for so long is gone, and its connection is rebuilt. Satellite links need more than 2 s."""
     retention_s: Seconds = _LINK.retention_s
     """How long an undelivered reliable message is kept when its topic has no `retention_s`."""
+    redundancy: Redundancy = _LINK.redundancy
+    """Class control sent twice over the datagram lane: `auto` while it loses packets, `always`, or `off`."""
     max_message_bytes: Annotated[int, Field(ge=1024, le=1 << 30)] = _LINK.max_message_bytes
     """Larger messages are dropped and counted as `too_large`."""
 
@@ -83,6 +85,7 @@ class LinkSection(Section):
             fragment_bytes_max=self.fragment_bytes_max,
             heartbeat_timeout_s=self.heartbeat_timeout_s,
             retention_s=self.retention_s,
+            redundancy=self.redundancy,
             max_message_bytes=self.max_message_bytes,
         )
 
