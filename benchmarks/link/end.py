@@ -1,0 +1,37 @@
+"""The process at one end of the link: `python -m benchmarks.link.end SPEC` (JSON, `load.Spec`).
+
+It says `ready` on standard output when messages pass, and leaves ROLE.npy (its log) and ROLE.json (what else it saw).
+"""
+
+import json
+import sys
+from collections.abc import Callable
+from typing import Any, Final
+
+from benchmarks.link import peers, sern
+from benchmarks.link.load import Load, Log, Orders, Spec
+
+End = Callable[[Spec, Load, Orders, Log], dict[str, Any]]
+ENDS: Final[dict[str, tuple[End, End]]] = {
+    "floor": (peers.udp_sender, peers.udp_receiver),
+    "zmq": (peers.zmq_sender, peers.zmq_receiver),
+    "zenoh": (peers.zenoh_sender, peers.zenoh_receiver),
+    "zenoh-multilink": (peers.zenoh_sender, peers.zenoh_receiver),
+    "zenoh-multilink-bbr": (peers.zenoh_sender, peers.zenoh_receiver),
+    "sern-udp": (sern.sender, sern.receiver),
+    "sern-zmq": (sern.sender, sern.receiver),
+}
+"""Sender and receiver of each system."""
+
+
+def main() -> None:
+    spec = Spec(**json.loads(sys.argv[1]))
+    sender, receiver = ENDS[spec.system]
+    log = Log()
+    seen = (sender if spec.sends else receiver)(spec, Load(**spec.load), Orders(), log)
+    log.save(spec.path / f"{spec.role}.npy")
+    (spec.path / f"{spec.role}.json").write_text(json.dumps(seen))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,172 @@
+"""What is offered, message by message, and what the two ends write down about it.
+
+Every message begins with its kind, its number (from 1; 0 is a hello before the run) and the time at which it was
+handed to the system, by the host's monotonic clock, which all network namespaces share.
+"""
+
+import os
+import random
+import select
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from enum import IntEnum
+from heapq import merge
+from pathlib import Path
+from struct import Struct
+from typing import Any, Final, NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+HELLO: Final = 0
+HELLO_PERIOD_S: Final = 0.05
+JITTER_S: Final = 0.020
+"""Large messages come up to so much later than their period says, or each would always meet the same poses."""
+_HEAD: Final = Struct("!BIQ")
+
+Records = NDArray[np.int64]
+
+
+class Kind(IntEnum):
+    """Most urgent first; the values are those of `PriorityClass`."""
+
+    POSE = 0
+    MAP = 1
+    BULK = 2
+
+
+class Flow(NamedTuple):
+    kind: Kind
+    rate_hz: float
+    size_bytes: int
+
+
+POSES: Final = Flow(Kind.POSE, 50.0, 100)
+MAPS: Final = Flow(Kind.MAP, 5.0, 20_000)
+
+
+@dataclass(frozen=True)
+class Load:
+    """Poses at 50 Hz; beside them maps and clouds, unless `cloud_bytes` is 0."""
+
+    cloud_bytes: int = 0
+    seed: int = 1
+
+    @property
+    def flows(self) -> tuple[Flow, ...]:
+        return (POSES, MAPS, Flow(Kind.BULK, 10.0, self.cloud_bytes)) if self.cloud_bytes else (POSES,)
+
+    def schedule(self, duration_s: float) -> Iterator[tuple[float, Flow, int]]:
+        """(seconds since the start, flow, number), in order of time."""
+        return merge(*(self._times(flow, duration_s) for flow in self.flows), key=lambda item: item[0])
+
+    def _times(self, flow: Flow, duration_s: float) -> Iterator[tuple[float, Flow, int]]:
+        chance = random.Random(f"{self.seed} {flow.kind}")
+        for number in range(1, int(duration_s * flow.rate_hz) + 1):
+            late_s = chance.random() * JITTER_S if flow.kind is not Kind.POSE else 0.0
+            yield (number - 1) / flow.rate_hz + late_s, flow, number
+
+
+class Log:
+    """What one end saw: rows of kind, number, stamp, time and size; `COLUMNS` names them. Times in ns."""
+
+    COLUMNS: Final = ("kind", "number", "stamp_ns", "at_ns", "nbytes")
+
+    def __init__(self) -> None:
+        self.rows: list[tuple[int, int, int, int, int]] = []
+        self.heard = False
+
+    def sent(self, flow: Flow, number: int, stamp_ns: int, due_ns: int) -> None:
+        self.rows.append((flow.kind, number, stamp_ns, due_ns, flow.size_bytes))
+
+    def arrived(self, body: bytes | memoryview) -> None:
+        at_ns = time.monotonic_ns()
+        kind, number, stamp_ns = _HEAD.unpack_from(body)
+        if number == HELLO:
+            self.heard = True
+        else:
+            self.rows.append((kind, number, stamp_ns, at_ns, len(body)))
+
+    def save(self, path: Path) -> None:
+        np.save(path, np.array(self.rows, dtype=np.int64).reshape(-1, len(self.COLUMNS)))
+
+
+def read_log(path: Path) -> Records:
+    """Shape (messages, len(Log.COLUMNS))."""
+    records: Records = np.load(path)
+    return records
+
+
+class Send(Protocol):
+    """Hands one message to the system."""
+
+    def __call__(self, kind: Kind, body: bytes) -> object: ...
+
+
+class Orders:
+    """What the benchmark says on standard input: one line `go START_NS`; its end is the order to stop."""
+
+    def __init__(self) -> None:
+        self._text = b""
+        self.start_ns: int | None = None
+        self.stopped = False
+
+    def poll(self) -> None:
+        while not self.stopped and select.select([0], [], [], 0)[0]:
+            data = os.read(0, 4096)
+            self.stopped = not data
+            self._text += data
+            line, newline, rest = self._text.partition(b"\n")
+            if newline:
+                self._text = rest
+                self.start_ns = int(line.split()[1])
+
+
+def ready() -> None:
+    """Tell the benchmark that this end works."""
+    os.write(1, b"ready\n")
+
+
+def offer(load: Load, duration_s: float, orders: Orders, log: Log, send: Send) -> Iterator[float]:
+    """The sender's life, as pauses in seconds for its caller to keep: hellos until told to go, the load, the end."""
+    hello = _HEAD.pack(Kind.POSE, HELLO, 0).ljust(POSES.size_bytes, b"\0")
+    while orders.start_ns is None and not orders.stopped:
+        send(Kind.POSE, hello)
+        yield HELLO_PERIOD_S
+        orders.poll()
+    padding = {flow.kind: os.urandom(flow.size_bytes - _HEAD.size) for flow in load.flows}
+    start_ns = orders.start_ns or 0
+    for at_s, flow, number in load.schedule(duration_s):
+        if orders.stopped:
+            return
+        due_ns = start_ns + int(at_s * 1e9)
+        while (left_ns := due_ns - time.monotonic_ns()) > 0:
+            yield left_ns / 1e9
+        stamp_ns = time.monotonic_ns()
+        log.sent(flow, number, stamp_ns, due_ns)
+        send(flow.kind, _HEAD.pack(flow.kind, number, stamp_ns) + padding[flow.kind])
+    while not orders.stopped:
+        yield HELLO_PERIOD_S
+        orders.poll()
+
+
+@dataclass(frozen=True)
+class Spec:
+    """What an end is told, as JSON: which system, which role, where, and what to do."""
+
+    system: str
+    sends: bool
+    address: str
+    """Of the far side's namespace."""
+    directory: str
+    duration_s: float
+    load: dict[str, Any]
+
+    @property
+    def path(self) -> Path:
+        return Path(self.directory)
+
+    @property
+    def role(self) -> str:
+        return "robot" if self.sends else "site"

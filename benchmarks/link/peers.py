@@ -1,0 +1,138 @@
+"""What SERN is measured beside: a bare datagram (the floor), plain ZeroMQ, zenoh. Each has a sender and a receiver."""
+
+import json
+import socket
+import time
+from typing import Any, Final
+
+import zmq
+
+from benchmarks.link.load import Kind, Load, Log, Orders, Spec, offer, ready
+
+PORT: Final = 7447
+POLL_S: Final = 0.02
+NOTHING: Final[dict[str, Any]] = {}
+
+
+def _drive(spec: Spec, load: Load, orders: Orders, log: Log, send: Any) -> None:
+    ready()
+    for pause_s in offer(load, spec.duration_s, orders, log, send):
+        time.sleep(pause_s)
+
+
+def _listen(orders: Orders, log: Log, wait: Any) -> None:
+    """`wait` takes what arrives for about POLL_S."""
+    said = False
+    while not orders.stopped:
+        wait()
+        if log.heard and not said:
+            said = True
+            ready()
+        orders.poll()
+
+
+# --- one datagram ---------------------------------------------------------------------------------------------------
+
+
+def udp_sender(spec: Spec, load: Load, orders: Orders, log: Log) -> dict[str, Any]:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+        sock.connect((spec.address, PORT))
+        _drive(spec, load, orders, log, lambda _kind, body: sock.send(body))
+    return NOTHING
+
+
+def udp_receiver(spec: Spec, load: Load, orders: Orders, log: Log) -> dict[str, Any]:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+        sock.bind(("", PORT))
+        sock.settimeout(POLL_S)
+
+        def wait() -> None:
+            try:
+                log.arrived(sock.recv(2048))
+            except TimeoutError:
+                return
+
+        _listen(orders, log, wait)
+    return NOTHING
+
+
+# --- plain ZeroMQ -----------------------------------------------------------------------------------------------------
+
+
+def zmq_sender(spec: Spec, load: Load, orders: Orders, log: Log) -> dict[str, Any]:
+    """One PUB socket, as it comes."""
+    topics = {kind: kind.name.lower().encode() for kind in Kind}
+    with zmq.Context() as context, context.socket(zmq.PUB) as out:
+        out.setsockopt(zmq.LINGER, 0)
+        out.connect(f"tcp://{spec.address}:{PORT}")
+        _drive(spec, load, orders, log, lambda kind, body: out.send_multipart((topics[kind], body)))
+    return NOTHING
+
+
+def zmq_receiver(spec: Spec, load: Load, orders: Orders, log: Log) -> dict[str, Any]:
+    with zmq.Context() as context, context.socket(zmq.SUB) as inlet:
+        inlet.setsockopt(zmq.LINGER, 0)
+        inlet.subscribe(b"")
+        inlet.bind(f"tcp://*:{PORT}")
+
+        def wait() -> None:
+            if inlet.poll(int(1000 * POLL_S)):
+                log.arrived(inlet.recv_multipart()[1])
+
+        _listen(orders, log, wait)
+    return NOTHING
+
+
+# --- zenoh ------------------------------------------------------------------------------------------------------------
+
+
+def _zenoh_session(spec: Spec, *, listens: bool) -> Any:
+    """A peer; with two links, the urgent half of the priorities has one for itself."""
+    import zenoh
+
+    ends = [f"tcp/{spec.address if not listens else '0.0.0.0'}:{PORT}"]
+    if spec.system != "zenoh":
+        ends = [f"{ends[0]}?prio=0-3", f"{ends[0][:-1]}{PORT % 10 + 1}?prio=4-7"]
+    config = zenoh.Config()
+    settings: dict[str, object] = {
+        "mode": "peer",
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": False,
+        "transport/shared_memory/enabled": False,  # it would pass by the link
+        "transport/unicast/max_links": len(ends),
+        "listen/endpoints" if listens else "connect/endpoints": ends,
+    }
+    if not listens:
+        settings["listen/endpoints"] = []
+    for key, value in settings.items():
+        config.insert_json5(key, json.dumps(value))
+    return zenoh.open(config)
+
+
+def zenoh_sender(spec: Spec, load: Load, orders: Orders, log: Log) -> dict[str, Any]:
+    import zenoh
+
+    priorities = {
+        Kind.POSE: zenoh.Priority.REAL_TIME,
+        Kind.MAP: zenoh.Priority.DATA,
+        Kind.BULK: zenoh.Priority.DATA_LOW,
+    }
+    with _zenoh_session(spec, listens=False) as session:
+        publishers = {
+            kind: session.declare_publisher(
+                f"bench/{kind.name.lower()}",
+                priority=priority,
+                congestion_control=zenoh.CongestionControl.DROP,
+                express=kind is Kind.POSE,
+            )
+            for kind, priority in priorities.items()
+        }
+        _drive(spec, load, orders, log, lambda kind, body: publishers[kind].put(body))
+    return NOTHING
+
+
+def zenoh_receiver(spec: Spec, load: Load, orders: Orders, log: Log) -> dict[str, Any]:
+    with _zenoh_session(spec, listens=True) as session:
+        session.declare_subscriber("bench/**", lambda sample: log.arrived(sample.payload.to_bytes()))
+        _listen(orders, log, lambda: time.sleep(POLL_S))
+    return NOTHING

@@ -1,0 +1,90 @@
+"""Pictures of runs: latency against time, and what a sender's link thought. matplotlib is an optional extra."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Final
+
+from benchmarks.link import figures
+from benchmarks.link.load import Kind
+from benchmarks.link.runs import Outcome
+from benchmarks.link.sern import SAMPLE_COLUMNS
+from sern_core.errors import ConfigError
+
+SIZE_INCHES: Final = (7.5, 3.6)
+DPI: Final = 90
+COLOURS: Final = {
+    "sern-udp": "#0b6e4f",
+    "sern-zmq": "#6bbf59",
+    "zmq": "#c1292e",
+    "zenoh": "#f1a208",
+    "zenoh-multilink": "#3066be",
+    "zenoh-multilink-bbr": "#8e6bbf",
+}
+
+
+def check() -> None:
+    """ConfigError when pictures cannot be made."""
+    try:
+        import matplotlib
+    except ImportError as error:
+        raise ConfigError("--plots needs matplotlib: pip install 'sern[report]'") from error
+    matplotlib.use("Agg")
+
+
+def latency(path: Path, title: str, outcomes: Sequence[Outcome]) -> None:
+    """Each pose that arrived: when it was sent, and how long it took."""
+    from matplotlib import pyplot
+
+    figure, axes = pyplot.subplots(figsize=SIZE_INCHES)
+    for outcome in reversed(outcomes):
+        rows = outcome.arrived[outcome.arrived[:, figures.KIND] == Kind.POSE]
+        at_s = (rows[:, figures.STAMP] - outcome.start_ns) / 1e9
+        took_ms = (rows[:, figures.AT] - rows[:, figures.STAMP]) / 1e6
+        axes.plot(at_s, took_ms, ".", markersize=2.5, label=outcome.system, color=COLOURS.get(outcome.system))
+    axes.set_yscale("log")
+    axes.set_xlabel("time of sending [s]")
+    axes.set_ylabel("latency of a pose [ms]")
+    axes.set_title(title, fontsize=10)
+    _mark(axes, outcomes[0])
+    handles, labels = axes.get_legend_handles_labels()
+    axes.legend(handles[::-1], labels[::-1], fontsize=7, markerscale=4, loc="upper right")
+    _save(figure, path)
+
+
+def window(path: Path, title: str, outcome: Outcome) -> None:
+    """Capacity, window and round trip as the sender's link saw them."""
+    from matplotlib import pyplot
+
+    samples = figures.samples_of(outcome)
+    if not len(samples):
+        return
+    columns = dict(zip(SAMPLE_COLUMNS, samples.T, strict=True))
+    at_s = (columns["at_ns"] - outcome.start_ns) / 1e9
+    figure, (above, below) = pyplot.subplots(2, 1, sharex=True, figsize=(SIZE_INCHES[0], 4.2))
+    above.plot(at_s, columns["rate_bps"] / 1e6, label="capacity, estimated [Mbit/s]", color="#0b6e4f", linewidth=1)
+    above.legend(fontsize=7, loc="upper right")
+    above.set_ylim(bottom=0)
+    above.set_title(title, fontsize=10)
+    below.plot(at_s, columns["window_bytes"] / 1e3, label="window [kB]", color="#3066be", linewidth=1)
+    below.plot(at_s, columns["inflight_bytes"] / 1e3, label="in flight [kB]", color="#f1a208", linewidth=0.7)
+    below.plot(at_s, columns["srtt_s"] * 1e3, label="round trip [ms]", color="#c1292e", linewidth=1)
+    below.set_ylim(bottom=0)
+    below.legend(fontsize=7, loc="upper right")
+    below.set_xlabel("time [s]")
+    for axes in (above, below):
+        _mark(axes, outcome)
+    _save(figure, path)
+
+
+def _mark(axes: Any, outcome: Outcome) -> None:
+    for asked_ns, _done_ns in outcome.events.values():
+        axes.axvline((asked_ns - outcome.start_ns) / 1e9, color="grey", linewidth=0.7, linestyle="--")
+    axes.grid(alpha=0.3)
+
+
+def _save(figure: Any, path: Path) -> None:
+    from matplotlib import pyplot
+
+    figure.tight_layout()
+    figure.savefig(path, dpi=DPI)
+    pyplot.close(figure)
