@@ -330,7 +330,5 @@ def bench_all(options: argparse.Namespace, report: Report, note: str) -> None:
         for name in options.cases or (QUICK_CASES if options.quick else CASES):
             CASES[name](bench)
         report.note(f"lab: {lab.backend}; {note}; the machine's processors were up to {100 * bench.busiest:.0f} % busy")
-    report.note(f"poses of {Kind.POSE.name.lower()} class control; the floor is one datagram on the idle link")
-    report.note(
-        "against TCPROS: not measured, rospy is not installed (Debian packages python3-rospy and python3-rosmaster)"
-    )
+    report.note("the floor is the median of a pose in one datagram on the idle link; limits are multiples of it")
+    report.note("TCPROS is not measured: no rospy here (Debian packages python3-rospy and python3-rosmaster)")
