@@ -66,7 +66,7 @@ class RelayTransport:
 
     def _open(self) -> None:
         def attach(socket: "zmq.Socket[bytes]") -> None:
-            self._watch = TransportWatch(socket, self._up, self._down, self._give_up)
+            self._watch = TransportWatch(socket, self._up, self._down, self._refused)
 
         raw = make_client(
             self._ctx,
@@ -137,6 +137,11 @@ class RelayTransport:
         if len(self._server_keys) > 1 and not self._was_up:
             self._again(reason, REBUILD_MIN_S)  # the relay may have another of the keys it announced
         self._was_up = False
+
+    def _refused(self, reason: str) -> None:
+        """The relay is there and does not want us: then not by another lane either."""
+        self.link.close(reason, now=time.monotonic())
+        self._give_up(reason)
 
     def _give_up(self, reason: str) -> None:
         self._again(reason, self._backoff_s)

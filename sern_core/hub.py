@@ -6,7 +6,8 @@ with a scheduler and a window of its own: a slow subscriber sheds only its own t
 Reliable streams: the origin is told "delivered up to n" when every client that is owed the stream has confirmed n.
 An origin remembers who is owed; a relay that starts anew learns it from the announcement and holds messages for
 those clients before they have come back (they are *awaited*). A client that stays away longer than `resume_s` is
-dropped, and what it was owed is reported to the origins.
+dropped, and what it was owed is reported to the origins. One that says goodbye and is owed nothing is dropped at once,
+and so is one whose name is revoked.
 """
 
 from collections.abc import Callable, Iterable
@@ -111,7 +112,10 @@ class HubPort:
     def receive(self, data: bytes, *, now: float) -> None:
         """One datagram. Raises WireError or VersionError; the caller closes the connection."""
         if self.link is not None and self.current and data[2:3] != b"\x01":
+            had_session = self.link.established
             self.link.receive(data, now=now)
+            if had_session and data[2] == wire.Kind.CLOSE and not self.link.established:
+                self.hub.left(self.client, now=now)
             return
         header = wire.decode_header(data)
         if header.kind == wire.Kind.HELLO:
@@ -272,13 +276,38 @@ class Hub:
                 if link.channels.get(channel.slot) is channel:
                     link.close_channel(channel, DropReason.DISCONNECTED, now=now)
 
-    def _forget(self, client: ClientName, now: float) -> None:
+    def left(self, client: ClientName, *, now: float) -> None:
+        """A client has said goodbye. One that has streams, or wants reliable ones, may come back to them (a daemon that
+        is started anew), and is waited for like any other; the others are forgotten."""
         link = self.links[client]
-        self._apply(self.routing.drop_client(client), now, reason=DropReason.DISCONNECTED)
+        if not self.routing.streams_of(client) and not any(channel.reliable for channel in link.channels.values()):
+            self._forget(client, now)
+
+    def end_session(self, client: ClientName, reason: str, *, now: float) -> None:
+        """The client's key no longer holds: its session ends, whatever lanes it has. It may come back with another."""
+        link = self.links.get(client)
+        if link is not None:
+            link.close(reason, now=now)
+            link.disconnected(now=now)
+
+    def forget(self, client: ClientName, reason: str, *, now: float) -> None:
+        """The client's name is revoked: its session ends, and with it whatever is held of it or for it."""
+        if client in self.links:
+            self.end_session(client, reason, now=now)
+            self._forget(client, now, reason=DropReason.FORBIDDEN)
+
+    def _forget(self, client: ClientName, now: float, *, reason: DropReason = DropReason.DISCONNECTED) -> None:
+        link = self.links[client]
+        self._apply(self.routing.drop_client(client), now, reason=reason)
         for channel in list(link.channels.values()):
-            link.close_channel(channel, DropReason.DISCONNECTED, now=now)
+            link.close_channel(channel, reason, now=now)
         self._draining = [(other, channel) for other, channel in self._draining if other is not link]
+        self.events.lane_closed(client)
         del self.links[client]
+        port = self.port_of.pop(client, None)
+        if port is not None:
+            port.link = None
+        self._subscriptions.pop(client, None)
         self._absent_since.pop(client, None)
         self._awaited.pop(client, None)
         self._heard.discard(client)

@@ -186,6 +186,7 @@ class RelayDaemon:
         for client, keys in before.items():
             if keys - self._valid.get(client, frozenset()) and self.server is not None:
                 _log.warning("%s lost a key; %d connections cut", client, self.server.cut_client(client))
+                self.hub.end_session(client, "the key no longer holds", now=time.monotonic())
 
     def _after(self) -> None:
         """Something came in: before the loop comes round again, whoever has something to send sends it."""
@@ -242,6 +243,9 @@ class RelayDaemon:
         if self.server is not None:
             self.server.cut_unbound()  # admitted by the old keys, and silent so far
         self._end_lapsed()
+        for client in [name for name in self.hub.links if not self._known(name)]:
+            _log.warning("%s is in the directory no more; what was held for it is dropped", client)
+            self.hub.forget(client, "the name is revoked", now=now)
         self._after()
         self.notifier.ready("reloaded")
         _log.info("reloaded keys, access rules and feed roles; other changes need a restart")

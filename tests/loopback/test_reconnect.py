@@ -105,7 +105,7 @@ async def test_a_robot_that_is_killed_begins_a_new_stream(tmp_path: Path) -> Non
         robot = lab.process(lab.player_file("robot1", bag, play=STEADY))
         await until(lambda: count(site) > 200)
         robot.kill()
-        await until(lambda: not relay.hub.links[ClientName("robot1")].established, "the relay notices")
+        await until(lambda: not relay.hub.links[ClientName("robot1")].snapshot()["up"], "the relay notices")
         robot = await lab.process(robot.config).ready()
         await robot.until(lambda: confirmed(robot) == 1000, "has the whole recording delivered")
         await robot.stop()

@@ -2,6 +2,8 @@
 
 from sern_core.access import AccessRule, AccessTable
 from sern_core.hub import MAX_DENIED
+from sern_core.types import DropReason
+from sern_sim.models import LinkModel, Window
 from tests.world import World, spec
 
 ONE_SECRET = AccessTable(
@@ -71,3 +73,69 @@ def test_the_list_of_what_is_denied_has_an_end() -> None:
     site = world.client("site", patterns=[f"/robot/n{n}" for n in range(200)])
     world.run(2.0)
     assert len(site.denials) == MAX_DENIED
+
+
+# --- who is let go ----------------------------------------------------------------------------------------------------
+
+
+def test_a_client_that_says_goodbye_and_is_owed_nothing_is_forgotten_at_once() -> None:
+    world = World().watch()
+    robot = world.client("robot")
+    site = world.client("site", patterns=["/robot/.*"])
+    channel = robot.publish("/robot/odom", spec())
+    world.run(1.0)
+    assert channel.wanted
+    site.core.link.close("client stops", now=site.now)
+    world.until(lambda: site.name not in world.relay.hub.links, within_s=0.5)
+    assert not world.relay.hub.routing.subscribers(channel.stream.id)
+    assert site.name not in world.relay.hub.port_of
+    world.until(lambda: channel.wanted is False, within_s=0.5)
+    world.hops["site"].break_connection()
+    world.until(lambda: len(site.ups) == 2)  # it may change its mind
+    world.until(lambda: channel.wanted)
+    robot.send(channel, b"1")
+    world.until(lambda: site.seqs("/robot/odom") == [1])
+
+
+def test_a_client_that_is_owed_a_reliable_stream_or_has_its_own_is_waited_for() -> None:
+    world = World().watch()
+    robot = world.client("robot")
+    site = world.client("site", patterns=["/robot/.*"])
+    log = robot.publish("/robot/log", spec(reliable=True))
+    world.run(1.0)
+    site.core.link.close("client stops", now=site.now)
+    robot.core.link.close("client stops", now=robot.now)
+    world.run(0.5)
+    assert {robot.name, site.name} <= world.relay.hub.links.keys()
+    robot.send(log, b"meanwhile")
+    for hop in world.hops.values():
+        hop.break_connection()
+    world.until(lambda: site.seqs("/robot/log") == [1])
+
+
+def test_a_connection_that_breaks_is_no_goodbye() -> None:
+    world = World().watch()
+    site = world.client("site", LinkModel(blackouts=(Window(1.0, 3.0),), disconnect_after_s=0.5).as_stream())
+    world.until(lambda: site.downs)
+    assert site.name in world.relay.hub.links
+
+
+def test_a_revoked_name_is_forgotten_and_what_it_was_owed_is_reported() -> None:
+    world = World().watch()
+    hub = world.relay.hub
+    robot = world.client("robot")
+    site = world.client("site", patterns=["/robot/.*"])
+    own = site.publish("/site/plan", spec(reliable=True, latched=True))
+    log = robot.publish("/robot/log", spec(reliable=True))
+    world.run(1.0)
+    site.core.link.close("away", now=site.now)
+    world.run(0.2)
+    for _ in range(3):
+        robot.send(log, b"x")
+    world.run(0.2)
+    assert hub.links[site.name].by_stream[log.stream.id].retained
+    hub.forget(site.name, "the name is revoked", now=world.relay.now)
+    assert site.name not in hub.links and not hub.routing.known(own.stream.id)
+    world.until(lambda: len(robot.dropped_out) == 3, within_s=0.8)
+    assert {drop.reason for drop in robot.dropped_out} == {DropReason.FORBIDDEN}
+    assert not log.retained
