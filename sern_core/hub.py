@@ -475,9 +475,7 @@ class Hub:
         if spec.lifespan_s is not None and age_s > spec.lifespan_s:
             counters.drop_arrived(DropReason.LIFESPAN)
             return False
-        if spec.reliable and any(
-            channel.held_bytes + len(body) > spec.max_queue_bytes for _link, channel in handle.outs.values()
-        ):
+        if spec.reliable and not all(channel.has_room(len(body)) for _link, channel in handle.outs.values()):
             counters.drop_arrived(DropReason.REFUSED)
             return False
         stream.delivered += 1

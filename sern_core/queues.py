@@ -20,6 +20,10 @@ from sern_core.types import DROP_CODES, DROP_REASONS, DropReason
 RATE_CAP_SLACK: Final = 0.25
 """A sample this fraction of a period early still passes a rate cap, so that jitter does not halve the rate."""
 
+MESSAGE_OVERHEAD_BYTES: Final = 256
+"""What a retained message counts for beside its body, about what its objects take: else the bound of a stream of many
+small ones would not bound memory."""
+
 OnDrop = Callable[["OutMessage", DropReason], None]
 
 
@@ -118,7 +122,7 @@ class OutChannel:
         counters = self.counters
         size = len(message.body)
         if self.reliable:
-            if not forced and self.retained_bytes + size > self.spec.max_queue_bytes:
+            if not forced and not self.has_room(size):
                 counters.refuse(size)
                 return False
             counters.offer(size)
@@ -293,6 +297,11 @@ class OutChannel:
                 self._entomb(out, reason)
                 return size - out.size
         return 0
+
+    def has_room(self, size_bytes: int) -> bool:
+        """Whether one more reliable message keeps within the stream's bound."""
+        overhead_bytes = MESSAGE_OVERHEAD_BYTES * (len(self.retained) + 1)
+        return self.retained_bytes + size_bytes + overhead_bytes <= self.spec.max_queue_bytes
 
     @property
     def held_bytes(self) -> int:

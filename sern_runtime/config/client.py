@@ -167,7 +167,8 @@ class TopicSection(Section):
     retention_s: Seconds | None = None
     """How long an undelivered reliable message is kept; null: `link.retention_s`."""
     max_queue_bytes: Bytes = DEFAULT_RELIABLE_QUEUE_BYTES
-    """Undelivered reliable messages kept at most; beyond, new ones are refused to their publisher."""
+    """Undelivered reliable messages kept at most, each counted with 256 bytes beside its own; beyond, new ones are
+    refused to their publisher."""
     many_writers: bool | None = None
     """Several clients may publish this global name; null: only /tf and /tf_static."""
     remap: TopicText | None = None

@@ -2,6 +2,7 @@
 
 from sern_core.access import AccessRule, AccessTable
 from sern_core.hub import MAX_DENIED
+from sern_core.queues import MESSAGE_OVERHEAD_BYTES
 from sern_core.types import DropReason
 from sern_sim.models import LinkModel, Window
 from tests.world import World, spec
@@ -139,3 +140,15 @@ def test_a_revoked_name_is_forgotten_and_what_it_was_owed_is_reported() -> None:
     world.until(lambda: len(robot.dropped_out) == 3, within_s=0.8)
     assert {drop.reason for drop in robot.dropped_out} == {DropReason.FORBIDDEN}
     assert not log.retained
+
+
+# --- what may be kept -------------------------------------------------------------------------------------------------
+
+
+def test_small_reliable_messages_count_with_their_overhead() -> None:
+    world = World()
+    robot = world.client("robot")
+    channel = robot.publish("/robot/log", spec(reliable=True, max_queue_bytes=1000 * (MESSAGE_OVERHEAD_BYTES + 30)))
+    assert [robot.send(channel, b"x" * 30) for _ in range(1001)] == [True] * 1000 + [False]
+    assert channel.counters.refused == 1
+    assert channel.held_bytes == 30_000
