@@ -16,7 +16,9 @@ from sern_core.types import DROP_CODES, DROP_REASONS, DropReason
 from sern_core.wire import FLAG_REPLAY, FLAG_TOMBSTONE
 
 PARTIAL_IDLE_S: Final = 10.0
-"""A half-received best-effort message that gets no fragment for so long will not be completed."""
+"""A half-received best-effort message with a newer one behind it that gets no fragment for so long was given up. The
+newest one is waited for: on a slow link its next fragment may have to wait for much else, and its sender, told that
+the others have arrived, would take it for delivered."""
 MAX_PARTIALS: Final = 256
 """Half-received best-effort messages of a stream; each whole one that arrives looks through them."""
 MAX_SPANS: Final = 1024
@@ -68,11 +70,21 @@ class Partial:
 class Reassembly:
     """Memory that half-received and waiting messages of one link may hold in all."""
 
-    __slots__ = ("held_bytes", "limit_bytes")
+    __slots__ = ("held_bytes", "holders", "limit_bytes")
 
     def __init__(self, limit_bytes: int) -> None:
         self.limit_bytes = limit_bytes
         self.held_bytes = 0
+        self.holders: dict[InStream, None] = {}  # best-effort streams with half-received messages
+
+    def make_room(self, nbytes: int) -> bool:
+        """Take `nbytes` into account; best-effort messages untouched for longest make way. False: it is too much."""
+        while self.held_bytes + nbytes > self.limit_bytes:
+            if not self.holders:
+                return False
+            min(self.holders, key=InStream.stalest_s).evict()
+        self.held_bytes += nbytes
+        return True
 
 
 class DropReport:
@@ -165,10 +177,14 @@ class InStream:
         partial = self._partials.get(seq)
         if partial is None or len(partial.body) != total:
             self._discard_partial(seq)
-            if not self._make_room(total + HELD_OVERHEAD_BYTES):
+            if not self.reliable and len(self._partials) >= MAX_PARTIALS:
+                self.evict()
+            if not self._reassembly.make_room(total + HELD_OVERHEAD_BYTES):
                 self.give_up(seq, DropReason.REASSEMBLY, len(body), now)
                 return
             partial = self._partials[seq] = Partial(total)
+            if not self.reliable:
+                self._reassembly.holders[self] = None
         partial.touched_s = now
         partial.add(offset, body)
         if offset == 0:
@@ -196,25 +212,25 @@ class InStream:
         code = DROP_CODES[reason]
         return Message(self.stream.id, seq, bytes([code]), stamp_ns, born_s, code)
 
-    def _make_room(self, total: int) -> bool:
-        reassembly = self._reassembly
-        while (
-            self._partials
-            and not self.reliable
-            and (reassembly.held_bytes + total > reassembly.limit_bytes or len(self._partials) >= MAX_PARTIALS)
-        ):
-            oldest = min(self._partials)
-            self._on_drop(self, DropReason.REASSEMBLY, len(self._partials[oldest].body), 0)
-            self._discard_partial(oldest)
-        if reassembly.held_bytes + total > reassembly.limit_bytes:
-            return False
-        reassembly.held_bytes += total
-        return True
+    def stalest_s(self) -> float:
+        """When the half-received message that was untouched for longest got its last fragment; there must be one."""
+        return min(partial.touched_s for partial in self._partials.values())
+
+    def evict(self) -> None:
+        """Lose the half-received best-effort message that was untouched for longest."""
+        seq = min(self._partials, key=lambda held: self._partials[held].touched_s)
+        self._lose(seq, DropReason.REASSEMBLY)
+
+    def _lose(self, seq: int, reason: DropReason) -> None:
+        self._on_drop(self, reason, len(self._partials[seq].body), 0)
+        self._discard_partial(seq)
 
     def _discard_partial(self, seq: int) -> None:
         partial = self._partials.pop(seq, None) if self._partials else None
         if partial is not None:
             self._reassembly.held_bytes -= len(partial.body) + HELD_OVERHEAD_BYTES
+            if not self._partials:
+                self._reassembly.holders.pop(self, None)
 
     def _late(self, seq: int, size: int) -> None:
         if self.reliable:
@@ -239,8 +255,7 @@ class InStream:
             self.delivered = seq
             if self._partials:
                 for stale in [s for s in self._partials if s <= seq]:
-                    self._on_drop(self, DropReason.SUPERSEDED, len(self._partials[stale].body), 0)
-                    self._discard_partial(stale)
+                    self._lose(stale, DropReason.SUPERSEDED)
             self._turn(message)
             return
         if seq == self.delivered + 1:
@@ -250,12 +265,12 @@ class InStream:
                 self._advance()
             return
         size = len(message.body)
-        if not self._make_room(size + HELD_OVERHEAD_BYTES):
+        if not self._reassembly.make_room(size + HELD_OVERHEAD_BYTES):
             # Without the message before it this one cannot be kept; its tombstone can.
             if not message.tombstone:
                 self._on_drop(self, DropReason.REASSEMBLY, size, seq)
                 message = self._tombstone(seq, DropReason.REASSEMBLY, message.stamp_ns, message.born_s)
-            if not self._make_room(len(message.body) + HELD_OVERHEAD_BYTES):
+            if not self._reassembly.make_room(len(message.body) + HELD_OVERHEAD_BYTES):
                 raise WireError(f"more messages out of order than {self._reassembly.limit_bytes} bytes hold")
         self._waiting[seq] = message
 
@@ -288,13 +303,17 @@ class InStream:
         self._deliver(self, message)
 
     def sweep(self, now: float, up_since_s: float) -> None:
-        """Give up half-received best-effort messages that nobody completes, though the link has been there."""
+        """Give up half-received best-effort messages that will not be completed, or not in time."""
         if not self._partials or self.reliable:
             return
+        newest = max(self._partials)
+        lifespan_s = self.lifespan_s
         for seq, partial in list(self._partials.items()):
-            if now - max(partial.touched_s, up_since_s) > PARTIAL_IDLE_S:
-                self._on_drop(self, DropReason.LOST, len(partial.body), 0)
-                self._discard_partial(seq)
+            since_s = partial.born_s if partial.born_s is not None else partial.touched_s
+            if lifespan_s is not None and now - since_s > lifespan_s:
+                self._lose(seq, DropReason.LIFESPAN)
+            elif seq != newest and now - max(partial.touched_s, up_since_s) > PARTIAL_IDLE_S:
+                self._lose(seq, DropReason.LOST)
 
     def close(self) -> None:
         """The stream ends."""
@@ -304,8 +323,7 @@ class InStream:
     def forget(self, reason: DropReason) -> None:
         """Let go of half-received and waiting messages: the sender has given them up."""
         for seq in list(self._partials):
-            self._on_drop(self, reason, len(self._partials[seq].body), 0)
-            self._discard_partial(seq)
+            self._lose(seq, reason)
         self._reassembly.held_bytes -= self._waiting_bytes()
         self._waiting.clear()
 
