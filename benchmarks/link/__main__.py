@@ -16,11 +16,6 @@ from benchmarks import common
 from benchmarks.link.cases import ALL, CASES, bench_all
 
 
-def bench(options: argparse.Namespace, report: common.Report) -> None:
-    # The guest, the daemons and the ends inherit it.
-    bench_all(options, report, common.try_realtime())
-
-
 def _arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--cases", nargs="+", choices=list(CASES), help="these alone")
     parser.add_argument("--systems", nargs="+", choices=ALL, help="these alone")
@@ -30,11 +25,18 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
 
 def main() -> int:
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that everything is stopped then, too
+    complete = True
+
+    def bench(options: argparse.Namespace, report: common.Report) -> None:
+        nonlocal complete
+        complete = bench_all(options, report, common.try_realtime())  # all that is started inherits the priority
+
     try:
-        return common.main("link", bench, description=__doc__, arguments=_arguments)
+        code = common.main("link", bench, description=__doc__, arguments=_arguments)
     except KeyboardInterrupt:
         print("benchmarks.link: interrupted", file=sys.stderr)
         return 130
+    return code if complete else 1
 
 
 if __name__ == "__main__":

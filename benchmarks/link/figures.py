@@ -59,7 +59,7 @@ def superseded(outcome: Outcome) -> int:
     """Poses that gave way to a newer one before they were sent, at the robot or the relay."""
     topic = TOPICS[Kind.POSE]
     found = 0
-    for topics in (outcome.robot.get("topics", {}), outcome.relay.get("topics", {})):
+    for topics in (outcome.robot.get("topics", {}), outcome.relay.get("links", {}).get("site", {})):
         found += int(topics.get(topic, {}).get("dropped", {}).get("superseded", 0))
     return found
 
@@ -140,15 +140,11 @@ def metrics(outcome: Outcome) -> dict[str, float]:
         found |= {
             "pose_p50_ms": quantile(poses, 0.50),
             "pose_p99_ms": quantile(poses, 0.99),
-            "pose_mean_ms": float(poses.mean()),
         }
     found["poses_percent"] = 100 * delivered_share(outcome)
     if outcome.load.cloud_bytes:
         found["goodput_Mbps"] = goodput_bps(outcome) / 1e6
         found["wire_percent"] = 100 * link_use(outcome)
-        clouds = latencies_ms(outcome, Kind.BULK)
-        if len(clouds):
-            found["cloud_p50_ms"] = quantile(clouds, 0.50)
     for role, label in (("robot", "robot_cpu"), ("relay", "relay_cpu"), ("site", "site_cpu")):
         if role in outcome.cpu_percent:
             found[f"{label}_percent"] = outcome.cpu_percent[role]

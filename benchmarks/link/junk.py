@@ -4,29 +4,58 @@ import os
 import socket
 import time
 from contextlib import suppress
+from multiprocessing import Pipe, get_context
 from multiprocessing.connection import Connection
 from struct import Struct
-from typing import Final
+from typing import Final, Self
 
 from benchmarks.link.sern import RELAY_PORT
 from sern_runtime.seal import UDP_PAYLOAD_BYTES
 from sern_tools.lab.host import inside
+from sern_tools.lab.lab import Node
 
 JUNK_HZ: Final = 20_000
 _CLEAR: Final = Struct("!IQ")
 
 
-def flood(namespace: str, session_id: int, seconds: float, told: Connection) -> None:
-    """JUNK_HZ datagrams of full size a second to the relay in `namespace`, as evenly as a busy loop can. Tells when it
-    begins, and its rate when it ends."""
+class Junk:
+    """A process that waits for `begin` and then sends; ended on exit."""
+
+    def __init__(self, node: Node, seconds: float) -> None:
+        self._ours, far = Pipe()
+        self._process = get_context("spawn").Process(target=_flood, args=(node.namespace, seconds, far), daemon=True)
+
+    def __enter__(self) -> Self:
+        self._process.start()
+        self._ours.recv()  # it is ready
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._process.kill()
+        self._process.join()
+        self._ours.close()
+
+    def begin(self, session_id: int) -> None:
+        self._ours.send(session_id)
+
+    def rate_hz(self) -> float:
+        """What it came to; waits for its end."""
+        return float(self._ours.recv())
+
+
+def _flood(namespace: str, seconds: float, told: Connection) -> None:
+    """JUNK_HZ datagrams of full size a second to the relay in `namespace`, as evenly as a busy loop can."""
     with suppress(OSError):
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))  # the relay must not wait for its attacker
-    sock = inside(namespace, lambda: socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
-    junk = [_CLEAR.pack(session_id, number) + os.urandom(UDP_PAYLOAD_BYTES - _CLEAR.size) for number in range(1, 257)]
-    count = 0
-    with sock:
+    with inside(namespace, lambda: socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as sock:
         sock.connect(("127.0.0.1", RELAY_PORT))
         told.send(True)
+        session_id = told.recv()
+        junk = [
+            _CLEAR.pack(session_id, 2**32 + number) + os.urandom(UDP_PAYLOAD_BYTES - _CLEAR.size)
+            for number in range(256)
+        ]
+        count = 0
         begun_s = time.monotonic()
         while (passed_s := time.monotonic() - begun_s) < seconds:
             if count < passed_s * JUNK_HZ:

@@ -65,10 +65,6 @@ class Outcome:
     """Share of the machine's processors in use during the run, by everybody, 0 to 1."""
     warm_s: float = 0.0
 
-    @property
-    def step_names(self) -> list[str]:
-        return list(self.events)
-
 
 @dataclass
 class Running:
@@ -125,7 +121,7 @@ def run(
         _sleep_until(start_ns)
         wire_before, cpu_before = lab.traffic()[0], running.cpu_s()
         psutil.cpu_percent()
-        events = _play(lab, start_ns, script, running)
+        events = _play(lab, start_ns, script)
         _sleep_until(start_ns + int(duration_s * 1e9))
         cpu_after, wire_after, busy = running.cpu_s(), lab.traffic()[0], psutil.cpu_percent()
         _sleep_until(time.monotonic_ns() + int(DRAIN_S * 1e9))
@@ -240,7 +236,7 @@ def _finish(running: Running) -> None:
             raise SernError(f"{role} ended with {code}")
 
 
-def _play(lab: Lab, start_ns: int, script: Sequence[Step], running: Running) -> dict[str, tuple[int, int]]:
+def _play(lab: Lab, start_ns: int, script: Sequence[Step]) -> dict[str, tuple[int, int]]:
     events: dict[str, tuple[int, int]] = {}
     for step in script:
         _sleep_until(start_ns + int(step.at_s * 1e9))

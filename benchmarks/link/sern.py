@@ -121,6 +121,8 @@ class End:
     def lane_offered(self, parameters: wire.Envelope) -> None:
         if self._lane is not None:
             self._lane.offered(parameters)
+        if self.spec.sends:  # for an attacker who has seen it on the wire, where it is in clear
+            (self.spec.path / "session").write_text(str(parameters["sid"]))
 
     def lane_closed(self) -> None:
         if self._lane is not None:
