@@ -6,7 +6,7 @@ announcement names the hash, the receiver asks with `need` if it lacks the text,
 
 import hashlib
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 from sern_core import wire
@@ -38,13 +38,15 @@ def definition_hash(definition: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Announcement:
-    """A stream on a channel of this session. `first`: nothing below this seq will come. `owed`: who must get it."""
+    """A stream on a channel of this session. `first`: nothing below this seq will come. `owed`: who must get it.
+    `more`: only `owed` counts, and goes on in another part."""
 
     channel: int
     stream: StreamInfo
     definition_hash: str
     first: int
     owed: tuple[str, ...] = ()
+    more: bool = False
 
 
 def encode_announcement(announcement: Announcement) -> wire.Envelope:
@@ -73,10 +75,25 @@ def encode_announcement(announcement: Announcement) -> wire.Envelope:
         "ret": spec.retention_s,
         "mw": spec.many_writers,
         "attr": dict(stream.attributes),
+        "more": announcement.more,
     }
     while envelope["owed"] and wire.envelope_bytes(envelope) > wire.MAX_ENVELOPE_BYTES:
         envelope["owed"].pop()
     return envelope
+
+
+def announcement_parts(announcement: Announcement) -> list[wire.Envelope]:
+    """The envelopes of an announcement, so many that all of `owed` has room."""
+    parts: list[wire.Envelope] = []
+    stream = announcement.stream
+    part = replace(announcement, stream=StreamInfo(stream.id, stream.info, stream.spec), more=True)
+    owed = announcement.owed
+    while True:
+        last = encode_announcement(replace(announcement, owed=owed))
+        if len(last["owed"]) == len(owed):
+            return [*parts, last]
+        parts.append(encode_announcement(replace(part, owed=owed)))  # without attributes: names fit for certain
+        owed = owed[len(parts[-1]["owed"]) :]
 
 
 def check_stream(stream: StreamInfo) -> None:
@@ -137,4 +154,5 @@ def decode_announcement(envelope: wire.Envelope) -> Announcement:
         definition_hash=digest,
         first=wire.take_int(envelope, "first", low=1, high=wire.MAX_SEQ),
         owed=tuple(wire.take_strings(envelope, "owed", max_length=64)),
+        more=wire.take_bool(envelope, "more"),
     )

@@ -34,6 +34,9 @@ from sern_core.trace import DecisionTrace
 from sern_core.types import DROP_CODES, ClientName, DropReason, ObjectKind, TopicName
 
 MAX_SUBSCRIPTION_PARTS: Final = 64
+ORPHAN_S: Final = 60.0
+"""A session whose TCP connection is gone and whose datagram lane says nothing for so long has ended: longer than any
+blackout that is worth waiting for with keys in hand."""
 RESET_INTERVAL_S: Final = 0.5
 MAX_AWAITED_TOPICS: Final = 2048
 """Streams held for one client that has not come back yet; origins name them, so there must be an end to it."""
@@ -268,7 +271,7 @@ class Hub:
             if client not in self.port_of and link.established:  # only its datagram lane is left
                 link.handle_timeout(now=now)
                 waiting_s = link.lane.flight.waiting_since_s
-                if link.lane.stalled and waiting_s is not None and now - waiting_s > self.params.resume_s:
+                if link.lane.stalled and waiting_s is not None and now - waiting_s > ORPHAN_S:
                     link.close_lane(now=now)
         for link, channel in list(self._draining):
             if not channel.retained or not channel.reliable:
@@ -531,6 +534,7 @@ class Hub:
             self.events.refused(link.peer, refusal.code, str(refusal))
             raise
         if stream.reliable:
+            relayed.source = None  # one answer for all who are awaited
             self._await(announcement.owed, identity, now)
         relayed.source = link
         link.answer(stream, self._wanted(relayed), now=now, owed=tuple(relayed.outs))

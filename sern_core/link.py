@@ -13,10 +13,11 @@ told what happens through its `LinkHandler`.
 
 from collections import deque
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Final, Protocol
 
 from sern_core import wire
-from sern_core.announce import MAX_STRINGS, Announcement, decode_announcement, definition_hash, encode_announcement
+from sern_core.announce import MAX_STRINGS, Announcement, announcement_parts, decode_announcement, definition_hash
 from sern_core.errors import RefusedError, UsageError, WireError
 from sern_core.fragments import DropReport, InStream
 from sern_core.message import Message, StreamId, StreamInfo
@@ -31,6 +32,8 @@ MAX_DEFINITIONS: Final = 16_384
 MAX_PEER_DEFINITIONS: Final = 2048
 MAX_PEER_DEFINITION_BYTES: Final = 16 * 2**20
 """Texts that one peer may add; all types of a ROS distribution together have less than 2 MB."""
+MAX_OWED: Final = 8192
+"""Names in lists that have begun and not ended."""
 MAX_UNHEARD: Final = 20_000
 """Control messages that a peer may have answered, beside four for each channel, before it reads an answer."""
 
@@ -115,6 +118,7 @@ class Link(Session):
         self._peer_definitions = self._peer_definition_bytes = 0
         self._unheard = 0  # answers since the peer acknowledged the one of number `_unheard_seq`
         self._unheard_seq = 0
+        self._owed_parts: dict[tuple[str, int], tuple[str, ...]] = {}  # by message and channel: more will come
         self._announcing: deque[tuple[int, OutChannel]] = deque()  # may send once that control message is on its way
         self._missing: dict[StreamId, float] = {}  # not announced by a new peer, and since when
         super().__init__(
@@ -135,6 +139,7 @@ class Link(Session):
         self._needed.clear()
         self._unheard = self._unheard_seq = 0
         self._announcing.clear()
+        self._owed_parts.clear()
         self.handler.on_up(self, resumed=resumed, now=now)
         for channel in list(self.channels.values()):
             self._announce(channel, now)
@@ -214,7 +219,9 @@ class Link(Session):
         owed = channel.owed if channel.reliable else ()
         announcement = Announcement(channel.slot, stream, digest, channel.first_seq, owed)
         channel.ready = False
-        seq = self.send_control(encode_announcement(announcement), now=now)
+        seq = 0
+        for envelope in announcement_parts(announcement):
+            seq = self.send_control(envelope, now=now)
         if self.lane.lossless and self._resumed and channel.wanted:
             # On a stream lane data may follow its announcement at once, if the same peer wanted it before.
             self._announcing.append((seq, channel))
@@ -260,8 +267,11 @@ class Link(Session):
         stream.paused = stream.paused or not wanted
         stream.pause_seq = 0
         if self.established and stream.channel_id is not None:
-            envelope = {"t": "want", "ch": stream.channel_id, "on": wanted, "owed": list(owed[:MAX_STRINGS])}
-            seq = self.send_control(envelope, now=now)
+            seq = 0
+            for start in range(0, max(1, len(owed)), MAX_STRINGS):
+                part, more = list(owed[start : start + MAX_STRINGS]), start + MAX_STRINGS < len(owed)
+                envelope = {"t": "want", "ch": stream.channel_id, "on": wanted, "owed": part, "more": more}
+                seq = self.send_control(envelope, now=now)
             if not wanted:
                 stream.pause_seq = seq
 
@@ -413,7 +423,10 @@ class Link(Session):
 
     def _handle_control(self, kind: str, envelope: wire.Envelope, attachment: bytes, now: float) -> None:
         if kind == "announce":
-            self._announced(decode_announcement(envelope), now)
+            announcement = decode_announcement(envelope)
+            owed = self._owed_so_far(("announce", announcement.channel), announcement.owed, more=announcement.more)
+            if owed is not None:
+                self._announced(replace(announcement, owed=owed), now)
         elif kind in ("want", "refuse", "dropped"):
             channel = self.channels.get(wire.take_int(envelope, "ch", high=0xFFFF))
             if channel is not None:  # else closed meanwhile
@@ -437,10 +450,23 @@ class Link(Session):
         else:
             self.handler.on_control(self, envelope, attachment, now=now)
 
+    def _owed_so_far(self, key: tuple[str, int], names: tuple[str, ...], *, more: bool) -> tuple[str, ...] | None:
+        """The names of a list that travels in parts, once it is complete."""
+        if more:
+            if sum(map(len, self._owed_parts.values())) + len(names) > MAX_OWED:
+                raise WireError(f"{self.peer} leaves lists of more than {MAX_OWED} names unfinished")
+            self._owed_parts[key] = self._owed_parts.get(key, ()) + names
+            return None
+        return self._owed_parts.pop(key, ()) + names
+
     def _about_channel(self, kind: str, channel: OutChannel, envelope: wire.Envelope, now: float) -> None:
         if kind == "want":
             wanted = wire.take_bool(envelope, "on")
-            channel.owed = tuple(wire.take_strings(envelope, "owed", max_length=64))
+            names = tuple(wire.take_strings(envelope, "owed", max_length=64))
+            owed = self._owed_so_far(("want", channel.slot), names, more=wire.take_bool(envelope, "more"))
+            if owed is None:
+                return
+            channel.owed = owed
             if wanted and channel.wanted is False and channel.reliable:
                 self.send_control({"t": "first", "ch": channel.slot, "seq": channel.first_seq}, now=now)
             self._set_wanted(channel, wanted, now)

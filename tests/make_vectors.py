@@ -269,6 +269,11 @@ def valid() -> list[Vector]:
         _control(
             "want", "channel 3 is wanted by two clients", {"t": "want", "ch": 3, "on": True, "owed": ["site1", "site2"]}
         ),
+        _control(
+            "want-part",
+            "the first of several messages that name who is owed channel 3",
+            {"t": "want", "ch": 3, "on": True, "owed": ["site1"], "more": True},
+        ),
         _control("want-not", "nobody wants channel 3", {"t": "want", "ch": 3, "on": False, "owed": []}),
         _control(
             "refuse-stream",

@@ -15,6 +15,7 @@ from sern_core.announce import (
     MAX_STRINGS,
     MAX_TIME_S,
     Announcement,
+    announcement_parts,
     check_stream,
     decode_announcement,
     definition_hash,
@@ -73,7 +74,7 @@ def plain(**changed: Any) -> dict[str, Any]:
     return {key: value for key, value in envelope.items() if value is not ...}
 
 
-OPTIONAL = {"t", "owed", "rel", "lat", "life", "dead", "mw", "attr"}
+OPTIONAL = {"t", "owed", "rel", "lat", "life", "dead", "mw", "attr", "more"}
 """Keys that a sender may leave out; `t` was read before."""
 
 
@@ -171,6 +172,19 @@ def test_owed_is_cut_to_what_fits(name_chars: int) -> None:
     assert len(wire.encode_envelope(envelope)) <= wire.MAX_ENVELOPE_BYTES
     assert tuple(envelope["owed"]) == owed[: len(envelope["owed"])]
     assert len(envelope["owed"]) == MAX_STRINGS if name_chars <= 40 else len(envelope["owed"]) > 40
+
+
+@pytest.mark.parametrize("count", [0, 1, 48, 49, 500])
+def test_owed_travels_in_as_many_parts_as_it_takes(count: int) -> None:
+    announcement = decode_announcement(plain(type="x" * NAME_MAX_CHARS, attr={f"{i}": "b" * 200 for i in range(5)}))
+    announcement = replace(announcement, owed=tuple(f"{i:03}".rjust(63, "a") for i in range(count)))
+    parts = [
+        decode_announcement(wire.decode_envelope(wire.encode_envelope(e))) for e in announcement_parts(announcement)
+    ]
+    assert [part.more for part in parts] == [True] * (len(parts) - 1) + [False]
+    assert tuple(name for part in parts for name in part.owed) == announcement.owed
+    assert replace(parts[-1], owed=announcement.owed) == announcement
+    assert len(parts) <= 1 + count // 20
 
 
 def test_check_stream_says_what_no_peer_would_take() -> None:

@@ -152,3 +152,25 @@ def test_small_reliable_messages_count_with_their_overhead() -> None:
     assert [robot.send(channel, b"x" * 30) for _ in range(1001)] == [True] * 1000 + [False]
     assert channel.counters.refused == 1
     assert channel.held_bytes == 30_000
+
+
+def test_a_new_relay_holds_for_every_one_of_many_subscribers() -> None:
+    world = World()
+    robot = world.client("robot")
+    away = LinkModel(blackouts=(Window(5.0, 12.0),), disconnect_after_s=0.5).as_stream()
+    sites = [world.client(f"s{n:03d}_" + "x" * 40, away, patterns=["/robot/.*"]) for n in range(120)]
+    log = robot.publish("/robot/log", spec(reliable=True))
+    world.run(4.0)
+    assert set(log.owed) == {site.name for site in sites}
+    world.run(2.0)
+    world.restart_relay()
+    world.until(lambda: len(robot.ups) == 2, within_s=3.0)
+    robot.send(log, b"1")
+    world.run(1.0)
+    relayed = world.relay.hub.relayed[log.stream.id]
+    assert relayed.outs.keys() == {site.name for site in sites}
+    assert log.retained
+    world.until(lambda: all(site.seqs("/robot/log") == [1] for site in sites))
+    world.until(lambda: not log.retained)
+    assert set(log.owed) == {site.name for site in sites}
+    world.validate()
