@@ -477,6 +477,7 @@ class Hop(ABC):
         if newer or packets:
             state.stalled = False
             state.proofs += 1
+            state.answered = True
             self.dirty = True
             if len(self.lanes) > 1:
                 self._choose_lane(now)

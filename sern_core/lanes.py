@@ -54,6 +54,7 @@ class Lane:
         self.probe_due_s = 0.0
         self.up = False  # it has a transport
         self.proofs = 0  # questions answered since it was opened or had stalled
+        self.answered = False  # at all, in this session
         self.ping = False
         self.ping_due_s = 0.0
         self.loss = 0.0
@@ -127,6 +128,7 @@ class Lane:
     def new_session(self, now: float) -> None:
         """Numbers start again; the flight was abandoned before."""
         self.proofs = 0
+        self.answered = False
         self.ping = False
         self.ping_due_s = now
         self.copies.clear()

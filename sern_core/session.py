@@ -89,12 +89,12 @@ class Session(Hop):
         self.transport_up = False
         self._hello_due_s = None
         self._handshake_out.clear()
-        if self.established and LANE_UDP in self.lanes:
+        udp = self.lanes.get(LANE_UDP)
+        if self.established and udp is not None and udp.answered:
             self._now = now
-            lane = self.lanes[LANE_ZMQ]
-            lane.up = False
-            self._recall(lane, now)
-            self._choose_lane(now)
+            self.lanes[LANE_ZMQ].up = False
+            self._recall(self.lanes[LANE_ZMQ], now)
+            self._use_lane(udp, now)
             return
         self._end_session(reason, now)
 

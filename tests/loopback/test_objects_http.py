@@ -80,8 +80,9 @@ async def test_the_five_kinds_of_object(tmp_path: Path) -> None:
         assert len(first["objects"]) == len(relay.hub.objects)
         await lab.drop(robot)
         away = relay.hub.links[robot.core.name]
-        await until(lambda: not away.established, "the relay has noticed")
-        relay.hub.sweep(now=away.now + 10_000)
+        await until(lambda: not away.snapshot()["up"], "the relay has noticed")
+        for later_s in (1_000, 10_000):  # the session is given up, then the client
+            relay.hub.sweep(now=away.now + later_s)
         status, changes = await ask(relay, since=first["version"], epoch=first["epoch"], kind="node")
         assert status == 200
         assert changes["resync"] is False
