@@ -10,7 +10,7 @@ help:
 	@echo "make setup    create $(VENV) with pinned dependencies"
 	@echo "make demo     relay, robot and site over a bad link, on this machine, next to plain ZMQ"
 	@echo "make test     every test;  make lint, make types: static checks"
-	@echo "make lab      the longer runs over tc netem; needs root"
+	@echo "make lab      the longer runs over tc netem, which need root, and the whole matrix of bad links"
 	@echo "make bench    the quick benchmarks;  make schemas: regenerate schemas/ and the configuration reference"
 
 $(VENV)/.ready: pyproject.toml constraints.txt
@@ -36,7 +36,7 @@ test: setup
 	$(BIN)/python -m pytest
 
 lab: setup
-	$(BIN)/python -m pytest tests/lab -m lab_long
+	$(BIN)/python -m pytest tests/lab tests/matrix -m lab_long
 
 bench: setup
 	$(BIN)/python -m benchmarks.scheduler --quick
