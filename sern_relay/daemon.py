@@ -287,7 +287,7 @@ class RelayDaemon:
             ready=lambda: Health(ok=self._ready, reason="listening" if self._ready else "starting"),
             json_routes={
                 "/api/link": lambda: [link.snapshot() for link in self.hub.links.values()],
-                "/api/objects": objects_view(self.hub.objects),
+                "/api/objects": objects_view(self.hub),
                 "/api/topics": self.topics,
             },
         )

@@ -9,15 +9,18 @@ since=VERSION       what has changed after this version (`objects`) and the ids 
 """
 
 from collections.abc import Mapping
+from typing import Any
 
 from sern_core.errors import UsageError
-from sern_core.objects import ObjectRegistry, changes_to_json
+from sern_core.hub import Hub
+from sern_core.objects import changes_to_json, topic_object_id
 from sern_core.types import ClientName, ObjectKind
 from sern_runtime.http import JsonQuery
 
 
-def objects_view(registry: ObjectRegistry) -> JsonQuery:
+def objects_view(hub: Hub) -> JsonQuery:
     """The route of /api/objects."""
+    registry = hub.objects
 
     def read(query: Mapping[str, str]) -> object:
         kind = _one_of("kind", query["kind"], [str(kind) for kind in ObjectKind]) if "kind" in query else None
@@ -27,12 +30,22 @@ def objects_view(registry: ObjectRegistry) -> JsonQuery:
         if "since" not in query:
             if "epoch" in query:
                 raise UsageError("epoch has no use without since")
-            return registry.to_json(kind=wanted, owner=owner, definitions=definitions)
+            return _defined(hub, registry.to_json(kind=wanted, owner=owner, definitions=definitions), definitions)
         epoch = _number("epoch", query["epoch"]) if "epoch" in query else None
         changes = registry.since(_number("since", query["since"]), epoch=epoch)
-        return changes_to_json(changes, kind=wanted, owner=owner, definitions=definitions)
+        return _defined(hub, changes_to_json(changes, kind=wanted, owner=owner, definitions=definitions), definitions)
 
     return JsonQuery(("kind", "owner", "definitions", "since", "epoch"), read)
+
+
+def _defined(hub: Hub, answer: dict[str, Any], definitions: bool) -> dict[str, Any]:
+    """Put in the texts of streams, which the hub has once for all streams of a type."""
+    if definitions:
+        streams = [relayed.stream.stream for relayed in hub.relayed.values()]
+        digests = {topic_object_id(stream.id): stream.attributes.get("definition", "") for stream in streams}
+        for item in answer["objects"]:
+            item["definition"] = item["definition"] or hub.definitions.get(digests.get(item["id"], ""), "")
+    return answer
 
 
 def _one_of(name: str, value: str, accepted: list[str]) -> str:

@@ -57,11 +57,24 @@ def received_summary(received: ReceiveLedger, *, now: float) -> dict[str, TopicV
 
 
 def both_ways(link: Link, received: ReceiveLedger, *, now: float) -> dict[str, TopicView]:
-    """The topics of a client. One that goes both ways (/tf of several robots) has what arrived under `received`."""
+    """The topics of a client, with type and owners (comma between several; empty when nobody offers it any more).
+
+    One that goes both ways (/tf of several robots) has what arrived under `received`.
+    """
     topics = link_summary(link, direction="send")
     for topic, arrived in received_summary(received, now=now).items():
         if topic in topics:
             topics[topic]["received"] = arrived
         else:
             topics[topic] = arrived
+    types: dict[str, str] = {}
+    owners: dict[str, set[str]] = {}
+    for side in (link.channels, link.streams):
+        for item in side.values():
+            stream = item.stream
+            types.setdefault(stream.id.topic, stream.info.type_name)
+            owners.setdefault(stream.id.topic, set()).add(stream.id.origin)
+    for topic, view in topics.items():
+        view["type"] = types.get(topic, "")
+        view["owner"] = ",".join(sorted(owners.get(topic, ())))
     return topics

@@ -46,7 +46,7 @@ class Counts:
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """Who publishes a topic and as what, from the relay's registry. Several owners are joined with commas."""
+    """Who publishes a topic and as what. Several owners are joined with commas."""
 
     type_name: str
     owner: str
@@ -71,10 +71,13 @@ class Row:
     dropped_by_reason: Mapping[str, int]
 
 
+def _is_relay(answer: Mapping[str, Any]) -> bool:
+    return answer.keys() >= {"links", "received"}
+
+
 def parse_topics(answer: Mapping[str, Any]) -> dict[str, Counts]:
     """/api/topics of a relay (`links` and `received`) or of a client (a flat map of topics)."""
-    relay = answer.keys() >= {"links", "received"}
-    tables = [*answer["links"].values(), answer["received"]] if relay else [answer]
+    tables = [*answer["links"].values(), answer["received"]] if _is_relay(answer) else [answer]
     topics: dict[str, Counts] = {}
     for table in tables:
         for name, row in table.items():
@@ -93,7 +96,9 @@ def parse_topics(answer: Mapping[str, Any]) -> dict[str, Counts]:
 
 
 def parse_identities(answer: Mapping[str, Any]) -> dict[str, Identity]:
-    """/api/objects of a relay."""
+    """/api/objects of a relay, or /api/topics of a client."""
+    if "objects" not in answer:
+        return {topic: Identity(row["type"], row["owner"]) for topic, row in answer.items() if row.get("owner")}
     found: dict[str, Identity] = {}
     for item in answer["objects"]:
         if not is_stream(item):
@@ -156,7 +161,11 @@ class Watcher:
 
     def _look(self) -> tuple[float, dict[str, Counts]]:
         at_s = self._clock()
-        topics = parse_topics(self._get(self.api, "/api/topics"))
+        answer = self._get(self.api, "/api/topics")
+        topics = parse_topics(answer)
+        if not _is_relay(answer):
+            self._has_registry = False
+            self._identities |= parse_identities(answer)
         if self._pattern is not None:
             topics = {name: counts for name, counts in topics.items() if self._pattern.fullmatch(name)}
         return at_s, topics

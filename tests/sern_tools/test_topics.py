@@ -17,7 +17,18 @@ from typer.testing import CliRunner
 from sern_core.errors import SernError, UsageError
 from sern_tools import api
 from sern_tools.cli import app
-from sern_tools.topics import Counts, Row, Watcher, compare, parse_identities, parse_topics, run_topics, si, table
+from sern_tools.topics import (
+    Counts,
+    Identity,
+    Row,
+    Watcher,
+    compare,
+    parse_identities,
+    parse_topics,
+    run_topics,
+    si,
+    table,
+)
 from tests.daemons import Lab, write_bag
 
 URL = "http://daemon"
@@ -64,6 +75,8 @@ def test_a_client_has_one_flat_table() -> None:
     topics = parse_topics({"/r/odom": sent(4), "/r/cmd_vel": arrived(3)})
     assert (topics["/r/odom"].delivered, topics["/r/cmd_vel"].received) == (4, 3)
     assert parse_topics({}) == {}
+    answer = {"/a": sent(4, type="std_msgs/msg/String", owner="r"), "/gone": arrived(3, type="", owner="")}
+    assert parse_identities(answer) == {"/a": Identity("std_msgs/msg/String", "r")}
 
 
 def test_owners_come_from_streams_alone() -> None:
@@ -214,7 +227,9 @@ async def test_a_real_relay_and_its_client(tmp_path: Path) -> None:
         assert [(row["topic"], row["owner"], row["priority"]) for row in rows] == [("/robot1/text", "robot1", "state")]
         assert rows[0]["type_name"] == "std_msgs/msg/String"
         assert rows[0]["takers"] == 1
-        assert [row["topic"] for row in listed(site.port)] == ["/robot1/text"]
+        for client in (site, robot):
+            (row,) = listed(client.port)
+            assert (row["topic"], row["owner"], row["type_name"]) == ("/robot1/text", "robot1", "std_msgs/msg/String")
         assert listed(robot.port, pattern="/none") == []
 
 

@@ -1,0 +1,24 @@
+"""What /api/objects adds to the registry."""
+
+from typing import Any
+
+from sern_relay.objects_view import objects_view
+from tests.world import World, spec
+
+
+def objects(world: World, **query: str) -> dict[str, dict[str, Any]]:
+    answer: Any = objects_view(world.relay.hub).read(query)
+    return {item["id"]: item for item in answer["objects"]}
+
+
+def test_streams_have_the_text_of_their_definition_when_asked() -> None:
+    world = World()
+    robot = world.client("robot")
+    for name in ("/robot/a", "/robot/b"):
+        robot.publish(name, spec(), definition="string data")
+    robot.publish("/robot/c", spec())
+    world.run(1.0)
+    texts = {name: item["definition"] for name, item in objects(world).items()}
+    assert texts == {"/robot/a@robot": "string data", "/robot/b@robot": "string data", "/robot/c@robot": ""}
+    assert objects(world, since="0")["/robot/a@robot"]["definition"] == "string data"
+    assert not any("definition" in item for item in objects(world, definitions="no").values())
