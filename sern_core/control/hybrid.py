@@ -35,11 +35,12 @@ RATE_WINDOW_S: Final = 1.2
 MIN_RATE_SPAN_S: Final = 0.120
 BURST_RATE_SPAN_S: Final = 0.150
 MARK_SPACING_S: Final = 0.020
-TARGET_S: Final = 0.0005
-TARGET_PACKETS: Final = 0.3
+TARGET_S: Final = 0.0002
+TARGET_PACKETS: Final = 0.4
 GAIN: Final = 0.35
 PATIENT_EPOCHS: Final = 2
 """The effect of a step is seen two epochs later; only then may the next one be larger."""
+FIRST_GROWTH: Final = 0.02
 MAX_GROWTH: Final = 0.25
 CUT: Final = 0.95
 EMERGENCY_CUT: Final = 0.9
@@ -48,6 +49,7 @@ STARTUP_GAIN: Final = 4.0
 STARTUP_PACING: Final = 4.0
 STARTUP_AIM: Final = 0.9
 PACING_GAIN: Final = 1.05
+DRAIN_PACING: Final = 0.98
 TRAIN_BYTES: Final = 8 * 1200
 INITIAL_WINDOW_BYTES: Final = 12_600
 MIN_WINDOW_FRAGMENTS: Final = 1.5
@@ -56,11 +58,14 @@ MAX_WINDOW_BYTES: Final = 64 * 2**20
 IDLE_S: Final = 2.0
 """What was not used for so long is halved, for the link may have changed; start-up brings it back."""
 STUCK_EPOCHS: Final = 4
+PINNED_S: Final = 2.0
 STUCK_WAIT_S: Final = 1.0
 FLAT_S: Final = 0.003
 LOSS_MEMORY_S: Final = 3.0
 RIVAL_MEMORY_S: Final = 30.0
 COMPETE_MAX_S: Final = 30.0
+NOISE: Final = 1.0
+"""The least of many epochs lies so many times their spread below the usual one, though no queue ever was."""
 PEAK_DECAY: Final = 0.02
 """Share of the peak rate that is forgotten each second."""
 CUBIC_C: Final = 0.4
@@ -71,9 +76,10 @@ CUBIC_RENO: Final = 3 * (1 - CUBIC_BETA) / (1 + CUBIC_BETA)
 class _Base:
     """The least forward delay of one size of packets over a sliding window."""
 
-    __slots__ = ("epoch", "least")
+    __slots__ = ("before_s", "epoch", "least")
 
     def __init__(self) -> None:
+        self.before_s: float | None = None
         self.least: deque[tuple[float, float]] = deque()  # (time, delay), both rising
         self.epoch: list[float] = []
 
@@ -82,6 +88,10 @@ class _Base:
         return self.least[0][1] if self.least else None
 
     def note(self, now: float, delay_s: float, window_s: float) -> None:
+        # Two epochs must agree: one may have had few packets, and all of them early.
+        before_s, self.before_s = self.before_s, delay_s
+        if before_s is not None and before_s > delay_s:
+            delay_s = before_s
         least = self.least
         while least and least[-1][1] >= delay_s:
             least.pop()
@@ -104,12 +114,13 @@ class _Cubic:
     def _from(self, now: float, window: float, fragment: float) -> None:
         self.since_s = now
         self.from_bytes = window
-        self.k_s = (max(0.0, self.most_bytes - window) / fragment / CUBIC_C) ** (1 / 3)
+        self.k_s: float = (max(0.0, self.most_bytes - window) / fragment / CUBIC_C) ** (1 / 3)
 
     def window(self, now: float, rtt_s: float, fragment: float) -> float:
         t = now - self.since_s
-        cubic = self.most_bytes + CUBIC_C * fragment * (t + rtt_s - self.k_s) ** 3
-        return max(cubic, self.from_bytes + CUBIC_RENO * fragment * t / rtt_s)
+        cubic: float = self.most_bytes + CUBIC_C * fragment * (t + rtt_s - self.k_s) ** 3
+        reno = self.from_bytes + CUBIC_RENO * fragment * t / rtt_s
+        return cubic if cubic > reno else reno
 
     def cut(self, now: float, window: float, fragment: float) -> float:
         """A loss: the new window. Fast convergence (4.7) lets others have what they lack."""
@@ -136,8 +147,11 @@ class HybridWindow(CapacityEstimator):
         self._rates: deque[tuple[float, float]] = deque()  # (time, bytes/s), the greatest first
         self._pacing: float | None = None  # bytes/s
         self._small, self._large = _Base(), _Base()
-        self._queue_s = 0.0
+        self._queue_s = 0.0  # 20th percentile of the epoch
+        self._queue_most_s = 0.0  # 80th
+        self._serialise_s = 0.0
         self._jitter_s = 0.0
+        self._spreads: deque[float] = deque(maxlen=16)
         self._target_s = 0.0
         self._high_s = inf
         self._rtt_s: float | None = None  # with our own queue on the way out empty
@@ -163,6 +177,9 @@ class HybridWindow(CapacityEstimator):
         self._hold_until_s = -inf
         self._empty_epochs = 0
         self._above_epochs = 0
+        self._pinned_s: float | None = None  # since when the window is at its least
+        self._pinned_least_s = inf
+        self._pinned_most_s = 0.0
         self._recent: deque[float] = deque(maxlen=STUCK_EPOCHS)  # queues of the last epochs
         self._emptied_s = -inf
         self._drain_until_s: float | None = None
@@ -307,8 +324,7 @@ class HybridWindow(CapacityEstimator):
         self._startup = True
         self._cubic = None
         self._drain_until_s = None
-        if self._rtt_s is not None:
-            self._pacing = STARTUP_PACING * self._window / self._rtt_s
+        self._pace()
         self._begin_round(now)
 
     def _ramp(self, now: float, receiver_s: float, cum_bytes: int, acked_bytes: int) -> None:
@@ -335,7 +351,8 @@ class HybridWindow(CapacityEstimator):
         if self._train_bytes >= self._round_window / 4:
             self._window = max(self._window, min(STARTUP_GAIN * self._round_window, STARTUP_AIM * seen))
             self._window = min(self._window, MAX_WINDOW_BYTES)
-            self._pacing = STARTUP_PACING * self._window / rtt_s
+            self._peak = max(self._peak, min(self._train_rate, self._window / rtt_s))
+            self._pace()
             if held and self._window >= 0.85 * seen:
                 self._end_startup(self._window)
             else:
@@ -372,9 +389,11 @@ class HybridWindow(CapacityEstimator):
         self._jitter_s += 0.1 * (min(spread_s, 0.020 + 0.2 * rtt_s) - self._jitter_s)
         # Of the link, not of our share of it: by the greatest rate seen lately.
         self._peak = max(self._rate or 0.0, self._peak * (1 - PEAK_DECAY * (now - (self._epoch_s or now))))
-        serialise_s = self._fragment / self._peak if self._peak else 0.0
+        serialise_s = self._serialise_s = self._fragment / self._peak if self._peak else 0.0
+        self._queue_most_s = queues[count * 4 // 5]
+        self._spreads.append(self._queue_most_s - queues[fifth])
         own_s = self._fragment / self._rate if self._rate else 0.0
-        noise_s = max(0.0, self._jitter_s - serialise_s)
+        noise_s = NOISE * max(0.0, self._jitter_s - serialise_s)
         # A slower flow wants a longer queue than a faster one, so that their shares meet.
         self._target_s = TARGET_S + TARGET_PACKETS * min(own_s, 4 * serialise_s) + noise_s
         self._high_s = max(0.010, 0.1 * rtt_s) + serialise_s + 1.5 * noise_s
@@ -393,7 +412,7 @@ class HybridWindow(CapacityEstimator):
                 self._drained_s = now
                 self._judging = True
         elif self._startup:
-            if queue_s > self._high_s / 2 or lost > 0.2:
+            if limited and (queue_s > self._high_s / 2 or lost > 0.2):
                 rate = self._recent_rate()
                 self._end_startup(min(self._window, rate * rtt_s) if rate else self._window / 2)
         elif limited:
@@ -402,7 +421,7 @@ class HybridWindow(CapacityEstimator):
                 self._window = min(max(window, MIN_WINDOW_FRAGMENTS * self._fragment), 1.5 * self._window)
             else:
                 self._steer(now, queue_s, rtt_s)
-            stuck = self._cubic is None and self._above_epochs >= STUCK_EPOCHS
+            stuck = self._cubic is None and (self._above_epochs >= STUCK_EPOCHS or self._pinned(now, queue_s))
             if stuck and now < self._rival_until_s:
                 self._compete(now, rtt_s + queue_s)
             elif (stuck and now >= self._drained_s + STUCK_WAIT_S) or (
@@ -435,15 +454,19 @@ class HybridWindow(CapacityEstimator):
             if now >= self._rival_until_s:
                 self._calm_window = window
             target_s = self._target_s
-            error_s = target_s - queue_s
-            step = GAIN * rate * max(error_s, -queue_s)
-            if queue_s < 0.25 * target_s:
-                step *= 2 ** min(max(0, self._empty_epochs - PATIENT_EPOCHS), 16)
-                self._empty_epochs += 1
-            else:
+            step = GAIN * rate * max(target_s - queue_s, -queue_s)
+            if queue_s >= 0.25 * target_s:
                 self._empty_epochs = 0
-            window += min(step, MAX_GROWTH * window)
-            window = min(window, 1.4 * rate * (rtt_s + target_s) + 3 * self._fragment)
+            elif self._queue_most_s <= min(self._spreads) + 0.3 * self._serialise_s:
+                # Clearly empty: hardly a packet met another one. Otherwise a little more will do.
+                self._empty_epochs += 1
+                if self._empty_epochs > PATIENT_EPOCHS:
+                    step = max(step, FIRST_GROWTH * window) * 2 ** min(self._empty_epochs - PATIENT_EPOCHS - 1, 8)
+            if step > 0:
+                most = 1.4 * rate * (rtt_s + target_s) + 3 * self._fragment
+                window = max(window, min(window + min(step, MAX_GROWTH * window), most))
+            else:
+                window = min(window, 1.1 * rate * (rtt_s + queue_s) + 4 * self._fragment) + step
         self._window = min(max(window, MIN_WINDOW_FRAGMENTS * self._fragment), MAX_WINDOW_BYTES)
 
     def _pace(self) -> None:
@@ -451,7 +474,9 @@ class HybridWindow(CapacityEstimator):
         if rtt_s is None:
             return
         if self._startup:
-            self._pacing = STARTUP_PACING * self._window / rtt_s
+            # The first train leaves at once: its dispersion is the bottleneck's, not our own.
+            first = self._window <= self._initial_bytes
+            self._pacing = None if first else STARTUP_PACING * self._window / rtt_s
             return
         if self._cubic is not None:
             self._pacing = 1.2 * self._window / rtt_s
@@ -459,7 +484,8 @@ class HybridWindow(CapacityEstimator):
         self._pacing = PACING_GAIN * self._window / rtt_s
         rate = self._rate
         if rate is not None and self._queue_s >= 0.25 * self._target_s:
-            self._pacing = max(min(self._pacing, PACING_GAIN * rate), 1.0)
+            gain = PACING_GAIN if self._queue_s < 2 * self._target_s + self._serialise_s else DRAIN_PACING
+            self._pacing = max(min(self._pacing, gain * rate), 1.0)
 
     def _drain(self, now: float, rtt_s: float) -> None:
         if self._rate is None:
@@ -487,6 +513,21 @@ class HybridWindow(CapacityEstimator):
                 self._new_path(now, queue_s)
             else:
                 self._compete(now, rtt_s + queue_s)
+
+    def _pinned(self, now: float, queue_s: float) -> bool:
+        """Whether the window has long been at its least while the queue swings more than ours can: it is not ours,
+        though no empty queue was ever seen to measure it by."""
+        if self._window > 2 * self._fragment:
+            self._pinned_s = None
+            return False
+        if self._pinned_s is None:
+            self._pinned_s = now
+            self._pinned_least_s = self._pinned_most_s = queue_s
+            return False
+        self._pinned_least_s = min(self._pinned_least_s, queue_s)
+        self._pinned_most_s = max(self._pinned_most_s, queue_s)
+        swing_s = max(0.010, min(0.100, 2 * self._window / self._peak)) if self._peak else inf
+        return now > self._pinned_s + PINNED_S and self._pinned_most_s - self._pinned_least_s > swing_s
 
     def _compete(self, now: float, rtt_s: float) -> None:
         window = max(self._window, self._calm_window, (self._recent_rate() or 0.0) * rtt_s)
