@@ -4,7 +4,8 @@ Offered: a pose at 50 Hz (100 bytes, class control), clouds at 10 Hz (100 kB in 
 (20 kB, state). Latency is from the hand-over at one end to the delivery at the other, by the one clock of this host.
 
 systems: sern-udp, sern-zmq (robot, relay and site, both hops on that lane; CURVE), zmq (PUB/SUB as it comes), zenoh,
-zenoh-multilink, zenoh-multilink-bbr (peers, REAL_TIME against DATA_LOW, one TCP connection or two by priority)
+zenoh-multilink, zenoh-multilink-bbr (peers, REAL_TIME against DATA_LOW, one TCP connection or two by priority),
+tcpros (rospy, where it is installed)
 """
 
 import argparse

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Final
 
 from benchmarks.common import Report
-from benchmarks.link import figures, plots
+from benchmarks.link import figures, peers, plots
 from benchmarks.link.junk import JUNK_HZ, Junk
 from benchmarks.link.load import Load
 from benchmarks.link.runs import Outcome, Step, run
@@ -18,7 +18,7 @@ from sern_sim.models import LinkModel
 from sern_tools.lab.lab import Lab
 
 SERN: Final = ("sern-udp", "sern-zmq")
-ALL: Final = (*SERN, "zmq", "zenoh", "zenoh-multilink", "zenoh-multilink-bbr")
+ALL: Final = (*SERN, "zmq", "zenoh", "zenoh-multilink", "zenoh-multilink-bbr", "tcpros")
 QUICK: Final = (*SERN, "zmq", "zenoh-multilink")
 MULTILINK: Final = ("zenoh-multilink", "zenoh-multilink-bbr")
 MEGABIT: Final = 1e6
@@ -150,6 +150,9 @@ def _field(bench: Bench, case: str, name: str, model: LinkModel) -> None:
             arrived = figures.delivered_share(ours, forgive_superseded=True)
             report.reach(f"{case}, sern-udp: poses that arrive, unless superseded", arrived, 1.0, at_least=True)
         _against_zenoh(bench, case, found)
+        if "tcpros" in found:
+            means = [float(figures.latencies_ms(found[system]).mean()) for system in ("tcpros", "sern-udp")]
+            report.reach(f"{case}: mean latency, times lower than TCPROS's", means[0] / means[1], 5.0, at_least=True)
         report.reach(
             f"{case}: CPU of the busier side [% of a core]",
             max(ours.cpu_percent["robot"], ours.cpu_percent["relay"]),
@@ -312,6 +315,9 @@ def bench_all(options: argparse.Namespace, report: Report, note: str) -> bool:
     if importlib.util.find_spec("zenoh") is None:
         systems = tuple(system for system in systems if not system.startswith("zenoh"))
         report.note("without zenoh: pip install eclipse-zenoh")
+    if lacking := peers.missing_ros():
+        systems = tuple(system for system in systems if system != "tcpros")
+        report.note(f"without rospy over TCPROS, which needs Debian packages: {', '.join(lacking)}")
     if options.plots is not None:
         plots.check()
         options.plots.mkdir(parents=True, exist_ok=True)
@@ -330,5 +336,4 @@ def bench_all(options: argparse.Namespace, report: Report, note: str) -> bool:
                 failed = True
         report.note(f"lab: {lab.backend}; {note}; the machine's processors were up to {100 * bench.busiest:.0f} % busy")
     report.note("the floor is the median of a pose in one datagram on the idle link; limits are multiples of it")
-    report.note("TCPROS is not measured: no rospy here (Debian packages python3-rospy and python3-rosmaster)")
     return not failed

@@ -18,6 +18,7 @@ ENDS: Final[dict[str, tuple[End, End]]] = {
     "zenoh": (peers.zenoh_sender, peers.zenoh_receiver),
     "zenoh-multilink": (peers.zenoh_sender, peers.zenoh_receiver),
     "zenoh-multilink-bbr": (peers.zenoh_sender, peers.zenoh_receiver),
+    "tcpros": (peers.ros_sender, peers.ros_receiver),
     "sern-udp": (sern.sender, sern.receiver),
     "sern-zmq": (sern.sender, sern.receiver),
 }

@@ -158,7 +158,8 @@ class Spec:
     system: str
     sends: bool
     address: str
-    """Of the far side's namespace."""
+    """Of the site's namespace."""
+    own_address: str
     directory: str
     duration_s: float
     load: dict[str, Any]

@@ -1,8 +1,11 @@
-"""What SERN is measured beside: a bare datagram (the floor), plain ZeroMQ, zenoh. Each has a sender and a receiver."""
+"""What SERN is measured beside: a bare datagram (the floor), plain ZeroMQ, zenoh, rospy. Each has two ends."""
 
 import json
+import os
 import socket
+import sys
 import time
+from pathlib import Path
 from typing import Any, Final
 
 import zmq
@@ -12,6 +15,9 @@ from benchmarks.link.load import Kind, Load, Log, Orders, Spec, offer, ready
 PORT: Final = 7447
 POLL_S: Final = 0.02
 NOTHING: Final[dict[str, Any]] = {}
+ROS_PACKAGES: Final = Path("/usr/lib/python3/dist-packages")
+ROS_MASTER: Final = f"import sys; sys.path.append({str(ROS_PACKAGES)!r}); import rosmaster; rosmaster.rosmaster_main()"
+ROS_PORT: Final = 11311
 
 
 def _drive(spec: Spec, load: Load, orders: Orders, log: Log, send: Any) -> None:
@@ -135,4 +141,49 @@ def zenoh_receiver(spec: Spec, load: Load, orders: Orders, log: Log) -> dict[str
     with _zenoh_session(spec, listens=True) as session:
         session.declare_subscriber("bench/**", lambda sample: log.arrived(sample.payload.to_bytes()))
         _listen(orders, log, lambda: time.sleep(POLL_S))
+    return NOTHING
+
+
+# --- rospy ------------------------------------------------------------------------------------------------------------
+
+
+def missing_ros() -> list[str]:
+    """Debian packages that rospy over TCPROS needs and this machine lacks."""
+    needs = {
+        "python3-rospy": ROS_PACKAGES / "rospy",
+        "python3-std-msgs": ROS_PACKAGES / "std_msgs",
+        "python3-rosmaster": ROS_PACKAGES / "rosmaster",
+    }
+    return [package for package, path in needs.items() if not path.exists()]
+
+
+def _rospy(spec: Spec) -> tuple[Any, Any]:
+    """The module, with a node begun, and the message type. The master runs on the site's side."""
+    os.environ["ROS_MASTER_URI"] = f"http://{spec.address}:{ROS_PORT}"
+    os.environ["ROS_IP"] = spec.own_address
+    sys.path.append(str(ROS_PACKAGES))  # behind our own: only what is not there comes from the system
+    import importlib
+
+    rospy = importlib.import_module("rospy")
+    rospy.init_node(spec.role, disable_signals=True, disable_rosout=True)
+    return rospy, importlib.import_module("std_msgs.msg").UInt8MultiArray
+
+
+def ros_sender(spec: Spec, load: Load, orders: Orders, log: Log) -> dict[str, Any]:
+    """The freshest message of each topic waits, no more."""
+    rospy, kind_of_message = _rospy(spec)
+    publishers = {
+        kind: rospy.Publisher(f"/bench/{kind.name.lower()}", kind_of_message, queue_size=1, tcp_nodelay=True)
+        for kind in Kind
+    }
+    _drive(spec, load, orders, log, lambda kind, body: publishers[kind].publish(data=body))
+    return NOTHING
+
+
+def ros_receiver(spec: Spec, load: Load, orders: Orders, log: Log) -> dict[str, Any]:
+    rospy, kind_of_message = _rospy(spec)
+    for kind in Kind:
+        topic = f"/bench/{kind.name.lower()}"
+        rospy.Subscriber(topic, kind_of_message, lambda message: log.arrived(message.data), tcp_nodelay=True)
+    _listen(orders, log, lambda: time.sleep(POLL_S))
     return NOTHING

@@ -19,6 +19,7 @@ COLOURS: Final = {
     "zenoh": "#f1a208",
     "zenoh-multilink": "#3066be",
     "zenoh-multilink-bbr": "#8e6bbf",
+    "tcpros": "#5c4742",
 }
 
 

@@ -4,6 +4,7 @@ import json
 import os
 import select
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -15,6 +16,7 @@ from typing import Any, Final, NamedTuple
 
 import psutil
 
+from benchmarks.link import peers
 from benchmarks.link.load import Load, Records, Spec, read_log
 from benchmarks.link.sern import RELAY_PORT
 from sern_core.errors import SernError
@@ -111,8 +113,10 @@ def run(
         if system.startswith("sern"):
             make_keys(directory)
             running.ends["relay"] = start_relay(lab, directory, udp=system == "sern-udp")
+        if system == "tcpros":
+            running.ends["master"] = _start_master(lab)
         for sends, node in ((False, lab.b), (True, lab.a)):
-            spec = Spec(system, sends, lab.b.address, str(directory), duration_s, asdict(load))
+            spec = Spec(system, sends, lab.b.address, node.address, str(directory), duration_s, asdict(load))
             running.ends[spec.role] = _start(lab, node, spec)
         for role in ("robot", "site"):
             _await_ready(running.ends[role], directory / f"{role}.log", f"{system}, {role}")
@@ -184,6 +188,21 @@ def start_relay(lab: Lab, directory: Path, *, udp: bool) -> "subprocess.Popen[by
         )
 
 
+def _start_master(lab: Lab) -> "subprocess.Popen[bytes]":
+    """Returns when it listens."""
+    command = [sys.executable, "-c", peers.ROS_MASTER, "--core", "-p", str(peers.ROS_PORT)]
+    environment = {**os.environ, "ROS_MASTER_URI": f"http://{lab.b.address}:{peers.ROS_PORT}", "ROS_IP": lab.b.address}
+    quiet = subprocess.DEVNULL
+    master = lab.popen(lab.b, command, env=environment, stdin=quiet, stdout=quiet, stderr=quiet, start_new_session=True)
+    give_up_s = time.monotonic() + START_S
+    with lab.b.socket(socket.SOCK_STREAM) as probe:
+        while probe.connect_ex((lab.b.address, peers.ROS_PORT)):
+            if master.poll() is not None or time.monotonic() > give_up_s:
+                raise SernError("rosmaster does not start")
+            time.sleep(0.1)
+    return master
+
+
 def _start(lab: Lab, node: Node, spec: Spec) -> "subprocess.Popen[bytes]":
     command = [sys.executable, "-m", "benchmarks.link.end", json.dumps(asdict(spec))]
     with (spec.path / f"{spec.role}.log").open("wb") as log:
@@ -226,13 +245,13 @@ def _finish(running: Running) -> None:
         assert process.stdin is not None
         process.stdin.close()
     for role, process in reversed(running.ends.items()):
-        if role == "relay":
+        if role in ("relay", "master"):
             process.send_signal(signal.SIGTERM)
         try:
             code = process.wait(STOP_S)
         except subprocess.TimeoutExpired as error:
             raise SernError(f"{role} does not end") from error
-        if code:
+        if code and role != "master":
             raise SernError(f"{role} ended with {code}")
 
 
