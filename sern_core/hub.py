@@ -12,18 +12,20 @@ and so is one whose name is revoked.
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Final, Protocol
+from typing import Final
 
 from sern_core import wire
 from sern_core.access import AccessTable, RateGuard, compile_peer_pattern
 from sern_core.announce import Announcement
 from sern_core.bound import QueueBound
-from sern_core.errors import RefusedError, VersionError, WireError
+from sern_core.errors import RefusedError, WireError
 from sern_core.fragments import InStream, Reassembly
-from sern_core.hop import microseconds
+from sern_core.hub_events import HubEvents, Relayed
+from sern_core.hub_port import HubPort
 from sern_core.ledger import ReceiveLedger
 from sern_core.link import Link
 from sern_core.message import Message, StreamId, StreamInfo, TopicInfo, TopicSpec
+from sern_core.object_control import apply_object
 from sern_core.objects import ObjectRegistry
 from sern_core.params import LinkParams, SchedulerParams
 from sern_core.queues import OutChannel, OutMessage
@@ -31,13 +33,12 @@ from sern_core.replay import ReplayStore
 from sern_core.routing import RouteChange, RoutingTable
 from sern_core.rules import name_problem
 from sern_core.trace import DecisionTrace
-from sern_core.types import DROP_CODES, ClientName, DropReason, ObjectKind, TopicName
+from sern_core.types import DROP_CODES, ClientName, DropReason, TopicName
 
 MAX_SUBSCRIPTION_PARTS: Final = 64
 ORPHAN_S: Final = 60.0
 """A session whose TCP connection is gone and whose datagram lane says nothing for so long has ended: longer than any
 blackout that is worth waiting for with keys in hand."""
-RESET_INTERVAL_S: Final = 0.5
 MAX_AWAITED_TOPICS: Final = 2048
 """Streams held for one client that has not come back yet; origins name them, so there must be an end to it."""
 MAX_LOCAL_SEQS: Final = 4096
@@ -51,112 +52,6 @@ class HubParams:
 
     cache_bytes: int = 64 * 2**20
     resume_s: float = 600.0
-
-
-class HubEvents(Protocol):
-    """What the relay's shell is told."""
-
-    def client_up(self, client: ClientName, *, resumed: bool) -> None: ...
-
-    def client_down(self, client: ClientName, reason: str) -> None: ...
-
-    def stream_added(self, stream: StreamInfo) -> None: ...
-
-    def stream_removed(self, stream: StreamInfo) -> None: ...
-
-    def message(self, stream: StreamInfo, message: Message, *, now: float) -> None:
-        """For the plain feed. Tombstones are not reported."""
-
-    def refused(self, client: ClientName, code: str, text: str) -> None: ...
-
-    def lane_asked(self, client: ClientName, ciphers: list[str]) -> None:
-        """A client would use a datagram lane: open a session for it and call `Hub.offer_lane`, or do nothing."""
-
-    def lane_closed(self, client: ClientName) -> None:
-        """The client's datagram lane ended with its session."""
-
-
-class Relayed:
-    """One stream at the relay: where it comes from (None: the relay itself), where it goes, what is kept of it."""
-
-    __slots__ = ("cache", "definition_known", "outs", "source", "stream")
-
-    def __init__(self, source: Link | None, stream: InStream, replays: ReplayStore) -> None:
-        self.source = source
-        self.stream = stream
-        self.outs: dict[ClientName, tuple[Link, OutChannel]] = {}
-        spec = stream.stream.spec
-        self.cache = replays.open(spec.depth) if spec.latched else None
-
-
-class HubPort:
-    """One transport connection of one client, as the lane below sees it. `client` is bound to the peer's key."""
-
-    def __init__(self, hub: "Hub", client: ClientName) -> None:
-        self.hub = hub
-        self.client = client
-        self.link: Link | None = None
-        self._out: list[bytes] = []
-        self._reset_due_s = -float("inf")
-
-    @property
-    def current(self) -> bool:
-        return self.link is not None and self.hub.port_of.get(self.client) is self
-
-    def connected(self, *, now: float) -> None:
-        """The client speaks first."""
-
-    def disconnected(self, *, now: float) -> None:
-        if self.current and self.link is not None:
-            del self.hub.port_of[self.client]
-            self.link.disconnected(now=now)
-        self.link = None
-
-    def receive(self, data: bytes, *, now: float) -> None:
-        """One datagram. Raises WireError or VersionError; the caller closes the connection."""
-        if self.link is not None and self.current and data[2:3] != b"\x01":
-            had_session = self.link.established
-            self.link.receive(data, now=now)
-            if had_session and data[2] == wire.Kind.CLOSE and not self.link.established:
-                self.hub.left(self.client, now=now)
-            return
-        header = wire.decode_header(data)
-        if header.kind == wire.Kind.HELLO:
-            hello = wire.decode_handshake(data)
-            name = wire.take_str(hello, "name", max_length=64)
-            if name != self.client:
-                self._refuse(header.tag, "name", f"your key belongs to {self.client}, not to {name}", now)
-                return
-            if name in self.hub.local_owners:
-                self._refuse(header.tag, "name", f"{name} is the relay's own name for its feed; take another", now)
-                return
-            try:
-                self.hub.greet(self, hello, header, now=now)
-            except VersionError as error:
-                self._refuse(header.tag, "version", str(error), now)
-        elif header.kind == wire.Kind.DATA and now >= self._reset_due_s:
-            self._reset_due_s = now + RESET_INTERVAL_S
-            self._out.append(wire.encode_handshake(wire.Kind.RESET, header.tag, microseconds(now), {}))
-
-    def _refuse(self, tag: int, code: str, text: str, now: float) -> None:
-        self._out.clear()
-        self._out.append(wire.encode_handshake(wire.Kind.REFUSE, tag, microseconds(now), {"code": code, "why": text}))
-
-    def next_datagram(self, *, now: float) -> bytes | None:
-        if self._out:
-            return self._out.pop(0)
-        return self.link.next_datagram(now=now) if self.link is not None and self.current else None
-
-    def next_deadline(self) -> float | None:
-        return self.link.next_deadline() if self.link is not None and self.current else None
-
-    def handle_timeout(self, *, now: float) -> None:
-        if self.link is not None and self.current:
-            self.link.handle_timeout(now=now)
-
-    @property
-    def dirty(self) -> bool:
-        return bool(self._out) or (self.link is not None and self.current and self.link.dirty)
 
 
 class Hub:
@@ -666,7 +561,10 @@ class Hub:
         if kind == "subscribe":
             self._subscribe(link.peer, envelope, now)
         elif kind == "object":
-            self._object(link.peer, envelope, attachment, now)
+            try:
+                apply_object(self.objects, link.peer, envelope, attachment, now=now)
+            except RefusedError as refusal:
+                self.events.refused(link.peer, refusal.code, str(refusal))
         elif kind == "lane_ask":
             self.events.lane_asked(link.peer, wire.take_strings(envelope, "ciphers", max_length=64))
         else:
@@ -691,31 +589,6 @@ class Hub:
             self.events.refused(client, refusal.code, str(refusal))
             bad = next((part for part in patterns if not _acceptable(part)), "")
             self._tell(client, {"t": "denied", "pattern": bad, "code": refusal.code, "why": str(refusal)[:400]}, now)
-
-    def _object(self, client: ClientName, envelope: wire.Envelope, attachment: bytes, now: float) -> None:
-        object_id = wire.take_str(envelope, "id")
-        attributes = envelope.get("attr", {})
-        kind = wire.take_str(envelope, "kind", max_length=16, default="node")
-        if kind not in set(ObjectKind) or not isinstance(attributes, dict):
-            raise WireError(f"bad object {object_id!r}")
-        if not all(isinstance(key, str) and isinstance(value, str) for key, value in attributes.items()):
-            raise WireError(f"attributes of object {object_id!r} must map strings to strings")
-        try:
-            if wire.take_str(envelope, "op", max_length=8) == "delete":
-                self.objects.delete(object_id, owner=client)
-            else:
-                self.objects.put(
-                    object_id,
-                    owner=client,
-                    kind=ObjectKind(kind),
-                    type_name=wire.take_str(envelope, "type", default=""),
-                    attributes=attributes,
-                    value=attachment or None,
-                    wall_ns=wire.take_int(envelope, "wall", default=0),
-                    now=now,
-                )
-        except RefusedError as refusal:
-            self.events.refused(client, refusal.code, str(refusal))
 
     def validate(self) -> None:
         """Internal consistency, for tests."""

@@ -15,7 +15,8 @@ from typing import Final
 import zmq
 
 from sern_core.errors import RefusedError
-from sern_core.hub import Hub, Relayed
+from sern_core.hub import Hub
+from sern_core.hub_events import Relayed
 from sern_core.message import Message, StreamInfo
 from sern_core.rules import FeedRole, FeedTopic, RuleSet
 from sern_core.types import ClientName, Durability, PriorityClass, TopicName

@@ -9,7 +9,8 @@ import zmq
 
 from sern_core import wire
 from sern_core.errors import RemoteError, UsageError, WireError
-from sern_core.hub import Hub, HubPort
+from sern_core.hub import Hub
+from sern_core.hub_port import HubPort
 from sern_core.rules import client_name
 from sern_core.types import ClientName
 from sern_runtime.monitor import ConnectionTable

@@ -12,7 +12,8 @@ from typing import NamedTuple
 from sern_core import wire
 from sern_core.access import AccessRule, AccessTable
 from sern_core.client import ClientCore
-from sern_core.hub import Hub, HubParams, HubPort
+from sern_core.hub import Hub, HubParams
+from sern_core.hub_port import HubPort
 from sern_core.link import Link
 from sern_core.message import Message, StreamId, StreamInfo, TopicInfo, TopicSpec
 from sern_core.params import LinkParams, SchedulerParams

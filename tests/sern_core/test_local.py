@@ -6,7 +6,7 @@ import pytest
 
 from sern_core.access import AccessRule, AccessTable
 from sern_core.errors import RefusedError
-from sern_core.hub import Relayed
+from sern_core.hub_events import Relayed
 from sern_core.message import TopicInfo, TopicSpec
 from sern_core.types import ClientName, DropReason, Encoding, PriorityClass, TopicName
 from sern_sim.models import LinkModel

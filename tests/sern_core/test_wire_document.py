@@ -18,7 +18,10 @@ from tests.world import World
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCUMENT = (ROOT / "schemas" / "wire.md").read_text()
-CORE = [ROOT / "sern_core" / name for name in ("announce.py", "client.py", "hop.py", "hub.py", "link.py", "session.py")]
+CORE = [
+    ROOT / "sern_core" / name
+    for name in ("announce.py", "client.py", "hop.py", "hub.py", "hub_port.py", "link.py", "session.py")
+]
 
 
 def section(title: str) -> str:

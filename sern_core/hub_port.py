@@ -1,0 +1,88 @@
+"""The relay's end of one transport connection: what the lane below hands its datagrams to. Pure.
+
+A connection is not yet a client: who speaks is known from the key (or believed, without keys), a session exists after
+HELLO, and a newer connection of the same client takes the session over. `Hub` keeps the links; a port finds its own.
+"""
+
+from typing import TYPE_CHECKING, Final
+
+from sern_core import wire
+from sern_core.errors import VersionError
+from sern_core.hop import microseconds
+from sern_core.link import Link
+from sern_core.types import ClientName
+
+if TYPE_CHECKING:
+    from sern_core.hub import Hub
+
+RESET_INTERVAL_S: Final = 0.5
+
+
+class HubPort:
+    """One transport connection of one client, as the lane below sees it. `client` is bound to the peer's key."""
+
+    def __init__(self, hub: "Hub", client: ClientName) -> None:
+        self.hub = hub
+        self.client = client
+        self.link: Link | None = None
+        self._out: list[bytes] = []
+        self._reset_due_s = -float("inf")
+
+    @property
+    def current(self) -> bool:
+        return self.link is not None and self.hub.port_of.get(self.client) is self
+
+    def connected(self, *, now: float) -> None:
+        """The client speaks first."""
+
+    def disconnected(self, *, now: float) -> None:
+        if self.current and self.link is not None:
+            del self.hub.port_of[self.client]
+            self.link.disconnected(now=now)
+        self.link = None
+
+    def receive(self, data: bytes, *, now: float) -> None:
+        """One datagram. Raises WireError or VersionError; the caller closes the connection."""
+        if self.link is not None and self.current and data[2:3] != b"\x01":
+            had_session = self.link.established
+            self.link.receive(data, now=now)
+            if had_session and data[2] == wire.Kind.CLOSE and not self.link.established:
+                self.hub.left(self.client, now=now)
+            return
+        header = wire.decode_header(data)
+        if header.kind == wire.Kind.HELLO:
+            hello = wire.decode_handshake(data)
+            name = wire.take_str(hello, "name", max_length=64)
+            if name != self.client:
+                self._refuse(header.tag, "name", f"your key belongs to {self.client}, not to {name}", now)
+                return
+            if name in self.hub.local_owners:
+                self._refuse(header.tag, "name", f"{name} is the relay's own name for its feed; take another", now)
+                return
+            try:
+                self.hub.greet(self, hello, header, now=now)
+            except VersionError as error:
+                self._refuse(header.tag, "version", str(error), now)
+        elif header.kind == wire.Kind.DATA and now >= self._reset_due_s:
+            self._reset_due_s = now + RESET_INTERVAL_S
+            self._out.append(wire.encode_handshake(wire.Kind.RESET, header.tag, microseconds(now), {}))
+
+    def _refuse(self, tag: int, code: str, text: str, now: float) -> None:
+        self._out.clear()
+        self._out.append(wire.encode_handshake(wire.Kind.REFUSE, tag, microseconds(now), {"code": code, "why": text}))
+
+    def next_datagram(self, *, now: float) -> bytes | None:
+        if self._out:
+            return self._out.pop(0)
+        return self.link.next_datagram(now=now) if self.link is not None and self.current else None
+
+    def next_deadline(self) -> float | None:
+        return self.link.next_deadline() if self.link is not None and self.current else None
+
+    def handle_timeout(self, *, now: float) -> None:
+        if self.link is not None and self.current:
+            self.link.handle_timeout(now=now)
+
+    @property
+    def dirty(self) -> bool:
+        return bool(self._out) or (self.link is not None and self.current and self.link.dirty)
