@@ -1,384 +1,36 @@
 """The data plane of one end of a hop: from messages to datagrams and back, for one session after another.
 
-`Link` (link.py) adds the control plane: handshake, announcements, interest. The next fragment is chosen only when the
-lane can take it (late binding), so that nothing waits where it can no longer be overtaken.
+`Sender` (sending.py) composes what leaves; this adds what arrives, losses, the choice between lanes, and time.
+`Session` and `Link` add the control plane: handshake, announcements, interest.
 """
 
-from abc import ABC, abstractmethod
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 from sern_core import wire
 from sern_core.capacity import AckSample
-from sern_core.clocksync import ClockSync
 from sern_core.errors import WireError
 from sern_core.flight import ACK_DELAY_S
-from sern_core.fragments import InStream, Reassembly
+from sern_core.fragments import InStream
 from sern_core.lanes import (
-    COPY_DELAY_S,
     LANE_UDP,
     LANE_ZMQ,
     OVERHEAD_BYTES,
     PING_INTERVAL_S,
-    PROBE_INTERVAL_S,
     PROVEN_ACKS,
     Lane,
 )
-from sern_core.ledger import SendCounters, SendLedger
-from sern_core.message import Message, StreamId, StreamInfo, TopicInfo, TopicSpec
-from sern_core.params import LinkParams, SchedulerParams
-from sern_core.queues import OutChannel, OutMessage
-from sern_core.scheduler import Scheduler
-from sern_core.trace import LINK, DecisionTrace, TraceEvent
+from sern_core.sending import CONTROL_CHANNEL, RATE_INTERVAL_S, SWEEP_INTERVAL_S, Sender, SentData, SentWatermark
+from sern_core.trace import LINK, TraceEvent
 from sern_core.types import (
-    CLASSES,
-    ClientName,
     DropReason,
-    Encoding,
-    Ordering,
-    PriorityClass,
-    Reliability,
-    TopicName,
 )
 
-CONTROL_CHANNEL: Final = 0
-CONTROL_TOPIC: Final = TopicName("/_sern/control")
-SWEEP_INTERVAL_S: Final = 0.25
-RATE_INTERVAL_S: Final = 0.05
-MIN_SHARE_BYTES: Final = 64
-"""A fragment smaller than this is not worth its header: the datagram ends instead."""
-MAX_WATERMARKS: Final = 64
 MAX_CONTROL_BYTES: Final = 2 + wire.MAX_ENVELOPE_BYTES + wire.MAX_ATTACHMENT_BYTES + 1024
 """A control message: envelope and packed attachment (what cannot be packed grows a little)."""
 
 
-class SentData(NamedTuple):
-    """A fragment that a packet carried."""
-
-    channel: OutChannel
-    out: OutMessage
-    generation: int
-    start: int
-    end: int
-
-
-class SentWatermark(NamedTuple):
-    """A delivered watermark that a packet carried."""
-
-    channel: int
-
-
-class SentPing(NamedTuple):
-    """A packet that only asked for an acknowledgement."""
-
-
-def microseconds(now: float) -> int:
-    return int(now * 1e6)
-
-
-class Hop(ABC):
-    """Queues, scheduler, flight and reassembly of one end. `boot` is this process's random 63-bit number."""
-
-    def __init__(
-        self,
-        *,
-        name: ClientName,
-        boot: int,
-        peer: ClientName,
-        link: LinkParams,
-        scheduler: SchedulerParams,
-        trace: DecisionTrace,
-        now: float,
-        lossless: bool,
-    ) -> None:
-        self.name = name
-        self.boot = boot
-        self.peer = peer
-        self.params = link
-        self.lane = Lane(LANE_ZMQ, link, lossless=lossless)
-        """The lane that carries data now."""
-        self.lanes = {LANE_ZMQ: self.lane}
-        self.scheduler = Scheduler(scheduler, now=now)
-        self._paper = scheduler.ordering is Ordering.PAPER
-        self.trace = trace
-        self.clock = ClockSync()
-        self.ledger = SendLedger()
-        """Counters of what goes out, by topic."""
-        self.strays = 0  # fragments of streams that are unknown here (drop reason `unknown_channel`)
-        self.channels: dict[int, OutChannel] = {}
-        self.incoming: dict[int, InStream] = {}
-        """Streams of this session by the peer's channel number."""
-        self.reassembly = Reassembly(max(64 * 2**20, 2 * link.max_message_bytes))
-        self.established = False
-        self.version = wire.VERSION_MAX
-        self.tag = boot % 255  # so that a late datagram of an earlier process is not taken for one of ours
-        self.dirty = False
-        """Something may be sendable: the owner should poll `next_datagram`."""
-        self._rx_lane = self.lane
-        self._sweep_due_s = now + SWEEP_INTERVAL_S
-        self._rate_due_s = now
-        self._up_since_s = now
-        self._watermarks: dict[int, int] = {}  # channel -> delivered, not yet on the wire
-        self._rx_stamp_us = 0
-        self._rx_delay: tuple[float, float] | None = None  # of the datagram at hand, and its uncertainty
-        self._now = now
-        self._control, self._control_in = self._control_streams()
-
-    # --- what the control plane provides --------------------------------------------------------------------------
-
-    @abstractmethod
-    def _control_message(self, stream: InStream, message: Message) -> None: ...
-
-    @abstractmethod
-    def _in_drop(self, stream: InStream, reason: DropReason, nbytes: int, seq: int) -> None: ...
-
-    @abstractmethod
-    def _control_sent(self, seq: int) -> None:
-        """Control message `seq` is on the wire."""
-
-    @abstractmethod
-    def _watermark_moved(self, channel: OutChannel) -> None: ...
-
-    def _begin_control(self) -> None:
-        """A fresh control stream in both directions, for a new session."""
-        self._control_in.close()
-        self._control, self._control_in = self._control_streams()
-
-    def _control_streams(self) -> tuple[OutChannel, InStream]:
-        spec = TopicSpec(
-            priority=PriorityClass.CONTROL,
-            reliability=Reliability.RELIABLE,
-            lifespan_s=None,
-            retention_s=float("inf"),
-            max_queue_bytes=2**62,
-        )
-        info = TopicInfo(CONTROL_TOPIC, "", Encoding.RAW)
-        stream = StreamInfo(StreamId(self.name, self.boot, CONTROL_TOPIC), info, spec)
-        counters = SendCounters(CONTROL_TOPIC, PriorityClass.CONTROL)
-        control = OutChannel(CONTROL_CHANNEL, stream, counters, lambda _out, _reason: None, first=1)
-        control.wanted = control.ready = True
-        return control, InStream(stream, self.reassembly, self._control_message, self._in_drop, first=1)
-
-    # --- messages out ---------------------------------------------------------------------------------------------
-
-    def submit(self, channel: OutChannel, message: Message, *, now: float, forced: bool = False) -> bool:
-        """Offer a message of an open channel. False: refused, the reliable queue is full.
-
-        `forced` is for forwarding: rate cap and reliable bound were enforced at the origin.
-        """
-        self._now = now
-        nbytes = len(message.body)
-        if nbytes > self.params.max_message_bytes:
-            self.reject(channel, message, DropReason.TOO_LARGE, now=now)
-            return True
-        backlog = channel.offered
-        accepted = channel.submit(message, now=now, forced=forced)
-        if self.trace.enabled:
-            event = TraceEvent.QUEUED if accepted else TraceEvent.REFUSED
-            self.trace.record(now, message.stream.topic, event, seq=message.seq, peer=self.peer)
-        if not backlog or channel.coalesced:
-            self._refresh(channel, now)
-        return accepted
-
-    def reject(self, channel: OutChannel, message: Message, reason: DropReason, *, now: float) -> None:
-        """Drop a message on its way in; of a reliable stream a tombstone goes on in its place."""
-        self._now = now
-        channel.reject(message, reason)
-        self.trace.record(now, message.stream.topic, TraceEvent.DROPPED, seq=message.seq, reason=reason)
-        self._refresh(channel, now)
-
-    def shed(self, channel: OutChannel, reason: DropReason, *, now: float) -> int:
-        """Give up one message that waits and has not been begun; returns the bytes that are free now, 0: none."""
-        self._now = now
-        freed_bytes = channel.shed(reason)
-        self._refresh(channel, now)
-        return freed_bytes
-
-    def _refresh(self, channel: OutChannel, now: float) -> None:
-        """Tell the scheduler what this channel would send next."""
-        out = channel.head(now) if channel.ready and channel.wanted else None
-        if out is None:
-            if channel.offered:
-                channel.offered = False
-                self.scheduler.withdraw(channel.slot)
-            return
-        spec = channel.spec
-        since_s = out.message.born_s
-        if channel.coalesced and channel.last_sent_s is not None:
-            # With message age each new sample would reset the priority, and the topic could starve.
-            since_s = channel.last_sent_s
-        channel.offered = True
-        self.dirty = True
-        self.scheduler.offer(
-            channel.slot,
-            priority=_class_of(channel, out),
-            weight=spec.weight,
-            size_bytes=out.unsent_bytes,
-            since_s=since_s,
-            stale_after_s=spec.lifespan_s if self._paper else None,
-        )
-
-    # --- bytes out ------------------------------------------------------------------------------------------------
-
-    def _next_data(self, lane: Lane, now: float) -> bytes | None:
-        """The next kind-16 datagram of an established session for one lane, or None."""
-        self._now = now
-        if lane.copies and (copy := lane.due_copy(now)) is not None:
-            self.scheduler.charge(PriorityClass.CONTROL, len(copy), now=now)
-            return copy
-        frames: list[bytes] = []
-        items: list[SentData | SentWatermark | SentPing] = []
-        if not lane.stalled or now >= lane.probe_due_s:
-            if lane is self.lane:
-                self.dirty = False
-                self._compose(frames, items, now)
-            # A stream delivers what is under way, so one question at a time is enough there.
-            if not items and (lane.ping or lane.stalled) and not (lane.lossless and lane.flight.packets):
-                frames.append(wire.PING_FRAME)
-                items.append(SentPing())
-            lane.ping = False
-            if lane.stalled:
-                lane.probe_due_s = now + PROBE_INTERVAL_S
-        arrivals = lane.arrivals
-        if arrivals.unacked and (items or arrivals.due or now >= arrivals.since_s + ACK_DELAY_S):
-            # In front: the receiver's clock estimate has the newest sample before it judges the age of what follows.
-            frames.insert(
-                0,
-                wire.encode_ack(
-                    lane.id, arrivals.highest, arrivals.mask, arrivals.echo_us, arrivals.received_us, arrivals.cum_bytes
-                ),
-            )
-            arrivals.flushed()
-        if not frames:
-            return None
-        self.dirty = True
-        if not items:
-            return b"".join((self._header(0, now), *frames))
-        flight = lane.flight
-        datagram = b"".join((self._header(flight.next_number, now), *frames))
-        nbytes = len(datagram) + OVERHEAD_BYTES
-        estimator = lane.estimator
-        inflight_bytes = flight.inflight_bytes + nbytes
-        app_limited = inflight_bytes < estimator.window_bytes and not (lane is self.lane and self._backlog)
-        flight.sent(now=now, nbytes=nbytes, items=items, app_limited=app_limited)
-        estimator.on_sent(now=now, nbytes=nbytes, inflight_bytes=inflight_bytes)
-        lane.pacer.sent(now=now, nbytes=nbytes, pacing_bps=estimator.pacing_bps)
-        lane.ping_due_s = now + PING_INTERVAL_S
-        if lane.redundant and any(type(item) is SentData and _urgent(item.channel) for item in items):
-            lane.copies.append((now + COPY_DELAY_S, flight.next_number - 1, datagram))
-        return datagram
-
-    def _header(self, number: int, now: float) -> bytes:
-        return wire.encode_header(wire.Kind.DATA, self.tag, number, microseconds(now), version=self.version)
-
-    @property
-    def _backlog(self) -> bool:
-        """Whether more could be sent if the window allowed it."""
-        control = self._control
-        scheduler = self.scheduler
-        return bool(control.queue or control.active) or any(scheduler.pending(priority) for priority in CLASSES)
-
-    def _compose(self, frames: list[bytes], items: list[SentData | SentWatermark | SentPing], now: float) -> None:
-        """Fill one datagram: watermarks, then what the scheduler picks, of one class; control ahead of all but class 0.
-
-        Control keeps to the window like everything below class 0: a thousand announcements must not fill the path.
-        """
-        lane = self.lane
-        limit = lane.fragment_bytes - (wire.ACK.size if lane.arrivals.unacked else 0)
-        scheduler = self.scheduler
-        window_open = lane.open_at(now)
-        size = wire.HEADER_BYTES
-        if self._watermarks:
-            size = self._put_watermarks(frames, items, size)
-        control = self._control
-        served: PriorityClass | None = None
-        while size < limit - MIN_SHARE_BYTES:
-            chosen = self._pick(now, window_open=window_open)
-            channel = self.channels[chosen] if chosen is not None else None
-            if window_open and (channel is None or channel.spec.priority is not PriorityClass.CONTROL):
-                order = control.head(now)
-                if order is not None:
-                    size = self._put(control, order, frames, items, size, limit, now)
-                    if not order.has_unsent:
-                        self._control_sent(order.seq)
-                    continue
-            if channel is None:
-                break
-            out = channel.head(now)
-            if out is None:
-                self._refresh(channel, now)
-                continue
-            priority = _class_of(channel, out)
-            if frames and (
-                (served is not None and priority is not served)
-                or out.unsent_bytes > limit - size - wire.DATA_FIRST_BYTES
-            ):
-                break
-            served = priority
-            before = size
-            size = self._put(channel, out, frames, items, size, limit, now)
-            scheduler.charge(priority, size - before, now=now)
-            self._refresh(channel, now)
-            if lane.stalled:
-                break
-
-    def _put_watermarks(self, frames: list[bytes], items: list[SentData | SentWatermark | SentPing], size: int) -> int:
-        for slot in list(self._watermarks)[:MAX_WATERMARKS]:
-            if self._must_hear(self.incoming[slot]):
-                continue  # of drops first: behind the watermark it would take them for delivered
-            frames.append(wire.encode_watermark(slot, self._watermarks.pop(slot)))
-            items.append(SentWatermark(slot))
-            size += wire.WATERMARK.size
-        return size
-
-    def _must_hear(self, stream: InStream) -> bool:
-        """Whether the peer does not know yet of all the drops that were reported to it."""
-        reports = stream.reports
-        while reports and 0 < reports[0].control_seq <= self._control.watermark:
-            del reports[0]
-        return bool(reports)
-
-    def _pick(self, now: float, *, window_open: bool) -> int | None:
-        """The scheduler's choice; under `ordering: paper` what it found stale is dropped first."""
-        slot = self.scheduler.pick(now=now, window_open=window_open)
-        if self._paper:
-            for stale in self.scheduler.take_stale(now):
-                channel = self.channels[stale]
-                channel.drop_head(DropReason.STALE, now)
-                self._refresh(channel, now)
-        return slot
-
-    def _put(
-        self,
-        channel: OutChannel,
-        out: OutMessage,
-        frames: list[bytes],
-        items: list[SentData | SentWatermark | SentPing],
-        size: int,
-        limit: int,
-        now: float,
-    ) -> int:
-        """Append one fragment of `out`; returns the datagram's new size."""
-        message = out.message
-        if self.trace.enabled and not out.started:
-            self.trace.record(now, message.stream.topic, TraceEvent.CHOSEN, seq=out.seq, peer=self.peer)
-        start, end = channel.take(out, max(limit - size - wire.DATA_FIRST_BYTES, MIN_SHARE_BYTES), now)
-        flags = wire.FLAG_TOMBSTONE if message.tombstone else 0
-        if message.replay:
-            flags |= wire.FLAG_REPLAY
-        if channel.spec.priority is PriorityClass.CONTROL:
-            flags |= wire.FLAG_URGENT
-        if start == 0:
-            age_s = now - message.born_s
-            error_s = message.error_s + wire.AGE_UNIT_S  # the age itself is cut to its unit
-            head = wire.encode_data_first(
-                flags, channel.slot, out.seq, out.size, end, message.stamp_ns, age_s, 0, error_s
-            )
-        else:
-            head = wire.encode_data_next(flags, channel.slot, out.seq, start, out.size, end - start)
-        frames.append(head)
-        frames.append(message.body if end - start == out.size else message.body[start:end])
-        items.append(SentData(channel, out, out.generation, start, end))
-        return size + len(head) + end - start
+class Hop(Sender):
+    """Both halves. State is set up by `Sender`."""
 
     # --- bytes in -------------------------------------------------------------------------------------------------
 
@@ -641,12 +293,3 @@ class Hop(ABC):
             self._must_hear(stream)
             if 0 < stream.pause_seq <= self._control.watermark:
                 stream.forget(DropReason.UNWANTED)
-
-
-def _urgent(channel: OutChannel) -> bool:
-    return channel.spec.priority is PriorityClass.CONTROL and channel.slot != CONTROL_CHANNEL
-
-
-def _class_of(channel: OutChannel, out: OutMessage) -> PriorityClass:
-    """A replay for a late joiner competes with deferrable traffic only, never with live state."""
-    return PriorityClass.BULK if out.message.replay else channel.spec.priority

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Final
 
 from sern_core import wire
 from sern_core.errors import VersionError
-from sern_core.hop import microseconds
 from sern_core.link import Link
+from sern_core.sending import microseconds
 from sern_core.types import ClientName
 
 if TYPE_CHECKING:

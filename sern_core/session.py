@@ -17,9 +17,10 @@ from typing import Final
 from sern_core import wire
 from sern_core.clocksync import ClockSync
 from sern_core.errors import WireError
-from sern_core.hop import Hop, microseconds
+from sern_core.hop import Hop
 from sern_core.lanes import LANE_UDP, LANE_ZMQ, Lane
 from sern_core.params import LinkParams, SchedulerParams
+from sern_core.sending import microseconds
 from sern_core.trace import LINK, DecisionTrace, TraceEvent
 from sern_core.types import ClientName
 

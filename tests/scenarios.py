@@ -11,9 +11,9 @@ from itertools import pairwise
 from hypothesis import strategies as st
 
 from sern_core.fragments import PARTIAL_IDLE_S
-from sern_core.hop import SentPing
 from sern_core.message import StreamId, TopicSpec
 from sern_core.queues import OutChannel
+from sern_core.sending import SentPing
 from sern_core.types import DropReason, PriorityClass
 from sern_sim.models import Jitter, LinkModel, Window
 from tests.world import Clock, SimClient, World, spec

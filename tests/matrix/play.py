@@ -8,13 +8,13 @@ differ.
 from collections.abc import Callable
 from itertools import pairwise
 
-from sern_core.hop import SentPing
 from sern_core.lanes import LANE_UDP
 from sern_core.link import LanePort, Link
 from sern_core.message import TopicSpec
 from sern_core.params import SchedulerParams
 from sern_core.queues import OutChannel
 from sern_core.scheduler import CREDIT_QUANTA, DEFAULT_QUANTUM_BYTES, Scheduler
+from sern_core.sending import SentPing
 from sern_core.types import CLASS_LABELS, ClientName, PriorityClass
 from sern_sim.events import SimulationTimeoutError
 from sern_sim.models import LinkModel
