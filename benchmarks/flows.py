@@ -26,6 +26,8 @@ HEADER_BYTES: Final = 56
 POSE_BYTES: Final = 100
 POSE_PERIOD_S: Final = 0.020
 PROBE_INTERVAL_S: Final = 0.2
+THIN_DATAGRAMS: Final = 32
+"""Half of what an acknowledgement's map covers."""
 
 _DATA: Final = Struct("!BBIQi")  # flow, kind, number, send stamp us, chunk (bulk) or -1 (pose)
 _ACK: Final = Struct("!BBIQQQQQ")  # flow, kind, highest, sack, echo us, received us, cumulative bytes, send stamp us
@@ -256,8 +258,9 @@ class Flow:
 class Sink:
     """The receiving end: acknowledges as a hop does, and keeps count of what is new."""
 
-    def __init__(self, id_: int, *, clock_offset_s: float = 1000.0) -> None:
+    def __init__(self, id_: int, *, clock_offset_s: float = 1000.0, thin: bool = False) -> None:
         self.id = id_
+        self.thin = thin  # acknowledge by time, not every second datagram
         self.offset_s = clock_offset_s
         self.arrivals = Arrivals()
         self.poses: list[tuple[float, float]] = []
@@ -271,12 +274,14 @@ class Sink:
         arrivals = self.arrivals
         if not arrivals.arrived(number, stamp_us, len(data) + OVERHEAD_BYTES, now=now + self.offset_s):
             return
+        if self.thin:
+            arrivals.due = arrivals.unacked >= THIN_DATAGRAMS
         if chunk >= 0:
             if chunk not in self._seen:
                 self._seen.add(chunk)
                 self.payload.append((now, len(data) - HEADER_BYTES))
         else:
-            arrivals.due = True
+            arrivals.due = not self.thin
             if chunk == -1:
                 born_s = _POSE.unpack_from(data, _DATA.size)[0]
                 self.poses.append((born_s, now - born_s))
@@ -327,7 +332,7 @@ class World:
         start_s: float = 0.0,
         stop_s: float = inf,
         reverse: bool = False,
-        drift: float = 0.0,
+        thin: bool = False,
     ) -> int:
         """Add a flow whose bulk runs in [start_s, stop_s) of the run; returns its index."""
         network = self.network
@@ -341,7 +346,7 @@ class World:
             start_s=network.start_s + start_s,
             stop_s=network.start_s + stop_s,
         )
-        sink = Sink(index)
+        sink = Sink(index, thin=thin)
         near, far = (self.b, self.a) if reverse else (self.a, self.b)
         near.add(flow, _KIND_ACK)
         far.add(sink, _KIND_DATA)

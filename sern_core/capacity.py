@@ -87,7 +87,7 @@ class Pacer:
         return now >= self.due_s - PACING_BURST_S
 
     def sent(self, *, now: float, nbytes: int, pacing_bps: float | None) -> None:
-        """`nbytes` left. Time that was not used is not saved up."""
+        """`nbytes` left. Of the time that was not used no more is saved up than a timer may be late."""
         if pacing_bps is not None:
-            start_s = self.due_s if self.due_s > now else now
-            self.due_s = start_s + 8 * nbytes / pacing_bps
+            earliest_s = now - PACING_BURST_S
+            self.due_s = (self.due_s if self.due_s > earliest_s else earliest_s) + 8 * nbytes / pacing_bps

@@ -37,6 +37,9 @@ BURST_RATE_SPAN_S: Final = 0.150
 MARK_SPACING_S: Final = 0.020
 TARGET_S: Final = 0.0002
 TARGET_PACKETS: Final = 0.4
+FAST_PACKETS: Final = 2.0
+FAST_S: Final = 0.002
+"""Where a packet takes less than this, up to two more: they cost little, and flows share more fairly."""
 GAIN: Final = 0.35
 PATIENT_EPOCHS: Final = 2
 """The effect of a step is seen two epochs later; only then may the next one be larger."""
@@ -395,7 +398,8 @@ class HybridWindow(CapacityEstimator):
         own_s = self._fragment / self._rate if self._rate else 0.0
         noise_s = NOISE * max(0.0, self._jitter_s - serialise_s)
         # A slower flow wants a longer queue than a faster one, so that their shares meet.
-        self._target_s = TARGET_S + TARGET_PACKETS * min(own_s, 4 * serialise_s) + noise_s
+        packets = TARGET_PACKETS + FAST_PACKETS * max(0.0, 1 - serialise_s / FAST_S)
+        self._target_s = TARGET_S + packets * min(own_s, 4 * serialise_s) + noise_s
         self._high_s = max(0.010, 0.1 * rtt_s) + serialise_s + 1.5 * noise_s
         self._recent.append(queue_s)
         if self._judging and self._drain_until_s is None:
