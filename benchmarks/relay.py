@@ -243,12 +243,8 @@ class Zenoh(System):
                 time.sleep(0.02)
 
 
-class _Site:
-    """The shell of a client core in this benchmark: it counts what arrives and answers nothing."""
-
-    def __init__(self, flow: Flow) -> None:
-        self.flow = flow
-        self.wanted_now = False
+class IdleSite:
+    """The shell of a client core in a benchmark: it answers nothing."""
 
     def link_up(self, *, resumed: bool) -> None: ...
 
@@ -264,9 +260,7 @@ class _Site:
 
     def stream_closed(self, stream: StreamInfo) -> None: ...
 
-    def message(self, stream: StreamInfo, message: Message, *, now: float) -> None:
-        if len(message.body) == self.flow.size_bytes:
-            self.flow.arrived()
+    def message(self, stream: StreamInfo, message: Message, *, now: float) -> None: ...
 
     def expired(self, stream: StreamInfo, seq: int, reason: DropReason) -> None: ...
 
@@ -274,12 +268,26 @@ class _Site:
 
     def send_dropped(self, stream: StreamInfo, seq: int, reason: DropReason) -> None: ...
 
-    def wanted(self, stream: StreamInfo, wanted: bool) -> None:
-        self.wanted_now = wanted
+    def wanted(self, stream: StreamInfo, wanted: bool) -> None: ...
 
     def publication_refused(self, stream: StreamInfo, code: str, text: str) -> None: ...
 
     def subscription_refused(self, code: str, text: str) -> None: ...
+
+
+class _Site(IdleSite):
+    """Counts what arrives."""
+
+    def __init__(self, flow: Flow) -> None:
+        self.flow = flow
+        self.wanted_now = False
+
+    def message(self, stream: StreamInfo, message: Message, *, now: float) -> None:
+        if len(message.body) == self.flow.size_bytes:
+            self.flow.arrived()
+
+    def wanted(self, stream: StreamInfo, wanted: bool) -> None:
+        self.wanted_now = wanted
 
 
 Work = Callable[[ClientCore, Pump, _Site], Awaitable[None]]
@@ -414,14 +422,14 @@ def measure(system: System, size_bytes: int, duration_s: float) -> Sample:
         _wait_for_messages(system, flow, (relay, *ends))
         time.sleep(duration_s / 4)
         watched = psutil.Process(relay.pid)
-        start_s, start, start_cpu_s = time.monotonic(), flow.received.value, _cpu_s(watched)
+        start_s, start, start_cpu_s = time.monotonic(), flow.received.value, cpu_s(watched)
         time.sleep(duration_s)
-        end_s, end, end_cpu_s = time.monotonic(), flow.received.value, _cpu_s(watched)
+        end_s, end, end_cpu_s = time.monotonic(), flow.received.value, cpu_s(watched)
     finally:
         flow.stopped.value = True
         for process in ends:
-            _end(process, patient=True)
-        _end(relay, patient=False)
+            end_process(process, patient=True)
+        end_process(relay, patient=False)
     messages = end - start
     if not messages:
         raise SernError(f"{system.name} carried nothing at {size_bytes} bytes")
@@ -429,7 +437,7 @@ def measure(system: System, size_bytes: int, duration_s: float) -> Sample:
     return Sample(rate_hz, rate_hz * size_bytes / 1e6, (end_cpu_s - start_cpu_s) / messages * 1e6)
 
 
-def _cpu_s(process: psutil.Process) -> float:
+def cpu_s(process: psutil.Process) -> float:
     times = process.cpu_times()
     return float(times.user + times.system)
 
@@ -442,7 +450,7 @@ def _wait_for_messages(system: System, flow: Flow, processes: tuple[BaseProcess,
         time.sleep(0.01)
 
 
-def _end(process: BaseProcess, *, patient: bool) -> None:
+def end_process(process: BaseProcess, *, patient: bool) -> None:
     """End one of our processes, started or not."""
     if process.pid is None:
         return

@@ -1,0 +1,348 @@
+"""One relay and 1 to 50 robots of 20 topics each, and one site that receives everything, over loopback with CURVE.
+
+The robots are client cores with transports of their own, several in each process; relay and site are one process each.
+All clocks are one, so an age is the difference of two readings. Latency is from `send` at the robot to the site's
+callback, through the relay; CPU is the relay process's, I/O threads included, for each message that reached the site.
+
+A robot sends 56 messages a second: 2 topics of class control (100 B, 20 and 10 Hz), 8 of class state (300 B, 2 Hz) and
+10 of class bulk (1 kB, 1 Hz).
+"""
+
+import argparse
+import asyncio
+import heapq
+import multiprocessing
+import random
+import struct
+import sys
+import tempfile
+import time
+from array import array
+from collections.abc import Callable
+from contextlib import ExitStack
+from ctypes import c_bool, c_uint64
+from functools import partial
+from multiprocessing.process import BaseProcess
+from multiprocessing.sharedctypes import RawValue
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+import psutil
+import uvloop
+import zmq
+
+from benchmarks import common
+from benchmarks.relay import IdleSite, cpu_s, end_process, free_ports
+from sern_client.transport import RelayTransport
+from sern_core.client import ClientCore
+from sern_core.errors import ConfigError, SernError
+from sern_core.message import Message, StreamInfo, TopicInfo, TopicSpec
+from sern_core.params import LinkParams, SchedulerParams
+from sern_core.queues import OutChannel
+from sern_core.types import CLASS_LABELS, ClientName, Encoding, PriorityClass, TopicName
+from sern_relay.daemon import RelayDaemon
+from sern_runtime import logs
+from sern_runtime.config.relay import load_relay
+from sern_runtime.keys import PublicKey, PublicKeys, generate, load_public, load_secret, write_public, write_secret
+from sern_runtime.loop import Shutdown, run
+
+FLEETS: Final = (1, 5, 10, 20, 50)
+HOSTS: Final = 2
+"""Processes that the robots are spread over."""
+START_S: Final = 30.0
+STAMP: Final = struct.Struct("!d")
+LATENCY_LIMIT_MS: Final = 10.0
+CPU_RATIO_LIMIT: Final = 1.2
+
+RELAY: Final = """
+relay: {{name: relay, listen: [tcp://127.0.0.1:{port}], secret_key_file: relay.key, clients_dir: clients, udp: false}}
+access: [{{client: '.*', publish: ['.*'], subscribe: ['.*']}}]
+http: {{listen: null}}
+log: {{level: error}}
+"""
+
+
+class Kind(NamedTuple):
+    """Some topics of a robot."""
+
+    priority: PriorityClass
+    topics: int
+    nbytes: int
+    rate_hz: float
+
+
+ROBOT: Final = (
+    Kind(PriorityClass.CONTROL, 1, 100, 20.0),
+    Kind(PriorityClass.CONTROL, 1, 100, 10.0),
+    Kind(PriorityClass.STATE, 8, 300, 2.0),
+    Kind(PriorityClass.BULK, 10, 1000, 1.0),
+)
+TOPICS: Final = sum(kind.topics for kind in ROBOT)
+RATE_HZ: Final = sum(kind.topics * kind.rate_hz for kind in ROBOT)
+
+
+class Shared:
+    """What the processes share."""
+
+    def __init__(self) -> None:
+        self.opened = RawValue(c_uint64, 0)
+        self.received = RawValue(c_uint64, 0)
+        self.measuring = RawValue(c_bool, False)
+        self.stopped = RawValue(c_bool, False)
+
+
+class Sample(NamedTuple):
+    """One measured fleet: `ages_s` of what arrived while measuring, by class label."""
+
+    robots: int
+    messages_hz: float
+    relay_cpu_us: float
+    ages_s: dict[str, Any]
+
+    def percentile_ms(self, label: str, percent: float) -> float:
+        return float(np.percentile(self.ages_s[label], percent)) * 1e3
+
+
+def robot_name(number: int) -> ClientName:
+    return ClientName(f"robot{number}")
+
+
+def _relay(folder: Path, ready: Any) -> None:
+    async def main(shutdown: Shutdown) -> None:
+        daemon = RelayDaemon(load_relay(folder / "relay.yaml"))
+        try:
+            await daemon.start()
+            ready.set()
+            await shutdown.wait()
+        finally:
+            await daemon.stop()
+
+    logs.configure(level="ERROR")
+    run(main)
+
+
+def _client(
+    context: "zmq.Context[zmq.Socket[bytes]]", folder: Path, port: int, name: ClientName, events: IdleSite
+) -> tuple[ClientCore, RelayTransport]:
+    core = ClientCore(
+        name=name,
+        boot=random.getrandbits(63),
+        events=events,
+        link=LinkParams(),
+        scheduler=SchedulerParams(),
+        now=time.monotonic(),
+    )
+    transport = RelayTransport(
+        context,
+        core.link,
+        f"tcp://127.0.0.1:{port}",
+        load_secret(folder / f"{name}.key"),
+        [key.key for key in load_public(folder / "relay.pub").valid_at(time.time())],
+        heartbeat_timeout_s=5.0,
+        random=random.Random(1),
+        on_reason=lambda _reason: None,
+    )
+    return core, transport
+
+
+class _Site(IdleSite):
+    def __init__(self, shared: Shared) -> None:
+        self.shared = shared
+        self.ages_s = {label: array("d") for label in CLASS_LABELS}
+
+    def stream_opened(self, stream: StreamInfo) -> None:
+        self.shared.opened.value += 1
+
+    def message(self, stream: StreamInfo, message: Message, *, now: float) -> None:
+        self.shared.received.value += 1
+        if self.shared.measuring.value:
+            (sent_s,) = STAMP.unpack_from(message.body)
+            self.ages_s[CLASS_LABELS[stream.spec.priority]].append(time.monotonic() - sent_s)
+
+
+def _site(folder: Path, port: int, shared: Shared, result: Any) -> None:
+    async def main() -> None:
+        site = _Site(shared)
+        with zmq.Context() as context:
+            core, transport = _client(context, folder, port, ClientName("site"), site)
+            core.subscribe((".*",), now=time.monotonic())
+            try:
+                while not shared.stopped.value:  # noqa: ASYNC110  (a flag in shared memory has no event)
+                    await asyncio.sleep(0.02)
+            finally:
+                transport.close()
+        result.send({label: np.array(ages_s) for label, ages_s in site.ages_s.items()})
+
+    with asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:
+        runner.run(main())
+
+
+def _offer(core: ClientCore) -> list[tuple[OutChannel, Kind]]:
+    channels: list[tuple[OutChannel, Kind]] = []
+    for kind in ROBOT:
+        for _ in range(kind.topics):
+            info = TopicInfo(TopicName(f"/{core.name}/topic{len(channels)}"), "bench/Bytes", Encoding.RAW)
+            channels.append((core.publish(info, TopicSpec(priority=kind.priority), now=time.monotonic()), kind))
+    return channels
+
+
+def _robots(folder: Path, port: int, numbers: range, shared: Shared) -> None:
+    async def main() -> None:
+        rng = random.Random(numbers.start)
+        with zmq.Context() as context, ExitStack() as stack:
+            due: list[tuple[float, int, ClientCore, RelayTransport, OutChannel, Kind]] = []
+            for number in numbers:
+                core, transport = _client(context, folder, port, robot_name(number), IdleSite())
+                stack.callback(transport.close)
+                for channel, kind in _offer(core):
+                    start_s = time.monotonic() + rng.random() / kind.rate_hz
+                    due.append((start_s, len(due), core, transport, channel, kind))
+            heapq.heapify(due)
+            while not shared.stopped.value:
+                now = time.monotonic()
+                while due[0][0] <= now:
+                    due_s, order, core, transport, channel, kind = due[0]
+                    body = STAMP.pack(time.monotonic()).ljust(kind.nbytes, b"\0")
+                    core.send(channel, body, 0, now=now)
+                    transport.pump.kick()
+                    heapq.heapreplace(due, (due_s + 1.0 / kind.rate_hz, order, core, transport, channel, kind))
+                await asyncio.sleep(min(0.02, max(0.0, due[0][0] - time.monotonic())))
+
+    with asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:
+        runner.run(main())
+
+
+def _prepare(folder: Path, robots: int, port: int) -> None:
+    clients = folder / "clients"
+    clients.mkdir()
+    for name in (ClientName("relay"), ClientName("site"), *map(robot_name, range(robots))):
+        key = generate(name)
+        write_secret(folder / f"{name}.key", key)
+        write_public(
+            (folder if name == "relay" else clients) / f"{name}.pub", PublicKeys(name, (PublicKey(key.public_key),))
+        )
+    (folder / "relay.yaml").write_text(RELAY.format(port=port))
+
+
+def measure(robots: int, duration_s: float) -> Sample:
+    """Start a fleet, wait until the site has every stream, and measure for `duration_s`."""
+    processes = multiprocessing.get_context("spawn")
+    shared, ready, port = Shared(), processes.Event(), free_ports().ingest
+    ours, theirs = processes.Pipe(duplex=False)
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        _prepare(folder, robots, port)
+        relay = processes.Process(target=_relay, args=(folder, ready), daemon=True)
+        ends: list[BaseProcess] = [
+            processes.Process(target=_site, args=(folder, port, shared, theirs), daemon=True),
+            *(
+                processes.Process(target=_robots, args=(folder, port, numbers, shared), daemon=True)
+                for host in range(HOSTS)
+                if len(numbers := range(host * robots // HOSTS, (host + 1) * robots // HOSTS))
+            ),
+        ]
+        try:
+            relay.start()
+            if not ready.wait(START_S):
+                raise SernError("the relay did not start")
+            for process in ends:
+                process.start()
+            _wait(lambda: shared.opened.value == robots * TOPICS, (relay, *ends), f"{robots} robots are not all there")
+            settled = shared.received.value + int(robots * RATE_HZ)
+            _wait(lambda: shared.received.value > settled, (relay, *ends), "messages do not flow")
+            watched = psutil.Process(relay.pid)
+            start_s, start, start_cpu_s = time.monotonic(), shared.received.value, cpu_s(watched)
+            shared.measuring.value = True
+            time.sleep(duration_s)
+            shared.measuring.value = False
+            end_s, end, end_cpu_s = time.monotonic(), shared.received.value, cpu_s(watched)
+            shared.stopped.value = True
+            if not ours.poll(START_S):
+                raise SernError("the site does not answer")
+            ages_s = ours.recv()
+        finally:
+            shared.stopped.value = True
+            for process in ends:
+                end_process(process, patient=True)
+            end_process(relay, patient=False)
+    return Sample(robots, (end - start) / (end_s - start_s), (end_cpu_s - start_cpu_s) / (end - start) * 1e6, ages_s)
+
+
+def _wait(condition: Callable[[], bool], processes: tuple[BaseProcess, ...], problem: str) -> None:
+    give_up_s = time.monotonic() + START_S
+    while not condition():
+        if time.monotonic() > give_up_s or not all(process.is_alive() for process in processes):
+            raise SernError(problem)
+        time.sleep(0.02)
+
+
+def bench(options: argparse.Namespace, report: common.Report) -> None:
+    rounds, duration_s = (1, 3.0) if options.quick else (3, 10.0)
+    samples = common.interleaved({str(n): partial(measure, n, duration_s) for n in options.robots}, rounds)
+    median: dict[int, dict[str, float]] = {}
+    for found in samples.values():
+        figures = {
+            "messages_hz": [sample.messages_hz for sample in found],
+            "control_p50_ms": [sample.percentile_ms("control", 50) for sample in found],
+            "control_p99_ms": [sample.percentile_ms("control", 99) for sample in found],
+            "state_p99_ms": [sample.percentile_ms("state", 99) for sample in found],
+            "relay_cpu_us": [sample.relay_cpu_us for sample in found],
+        }
+        robots = found[0].robots
+        median[robots] = {name: float(np.median(values)) for name, values in figures.items()}
+        report.row(f"{robots} robots", "sern", **median[robots])
+    most = max(median)
+    report.reach(f"p99 of class control at {most} robots, ms", median[most]["control_p99_ms"], LATENCY_LIMIT_MS)
+    if 5 in median and most > 5:
+        ratio = median[most]["relay_cpu_us"] / median[5]["relay_cpu_us"]
+        report.reach(f"relay CPU a message at {most} robots, times that at 5", ratio, CPU_RATIO_LIMIT)
+    report.note(f"{TOPICS} topics and {RATE_HZ:g} messages/s a robot; medians of {rounds} rounds of {duration_s:g} s")
+    if options.figure is not None:
+        _draw(options.figure, median)
+        report.note(f"figure: {options.figure}")
+
+
+def _draw(path: Path, median: dict[int, dict[str, float]]) -> None:
+    try:
+        import matplotlib
+    except ImportError as error:
+        raise ConfigError("--figure needs matplotlib: pip install 'sern[report]'") from error
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    figure, (left, right) = pyplot.subplots(1, 2, figsize=(9.0, 3.4))
+    robots = sorted(median)
+    for name, label in (
+        ("control_p50_ms", "control, median"),
+        ("control_p99_ms", "control, p99"),
+        ("state_p99_ms", "state, p99"),
+    ):
+        left.plot(robots, [median[n][name] for n in robots], "o-", label=label)
+    left.axhline(LATENCY_LIMIT_MS, color="grey", linewidth=0.8, linestyle="--")
+    left.set_ylabel("robot to site [ms]")
+    left.legend(fontsize=8)
+    right.plot(robots, [median[n]["relay_cpu_us"] for n in robots], "o-")
+    right.set_ylabel("relay CPU a message [µs]")
+    for axes in (left, right):
+        axes.set_xlabel(f"robots of {TOPICS} topics, {RATE_HZ:g} messages/s")
+        axes.set_ylim(bottom=0)
+    figure.tight_layout()
+    figure.savefig(path, dpi=150)
+    pyplot.close(figure)
+
+
+def _arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--robots", nargs="+", type=int, default=list(FLEETS), metavar="N", help="measure these fleets")
+    parser.add_argument("--figure", type=Path, metavar="FILE", help="also draw the figures (PNG)")
+
+
+def main() -> int:
+    return common.main("robots", bench, description=__doc__, arguments=_arguments)
+
+
+if __name__ == "__main__":
+    # Spawned processes import this file by its name, not as __main__.
+    from benchmarks.robots import main as imported_main
+
+    sys.exit(imported_main())
