@@ -1,0 +1,321 @@
+"""Relay, robot and site with keys and both lanes, over real bad links: what is promised holds, whatever the link does.
+
+Judged from message logs and counters. Robot on side a, relay and site on side b.
+"""
+
+import json
+import time
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
+from contextlib import asynccontextmanager, contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from sern_runtime.profiles import load_profile
+from sern_sim.models import Flap, LinkModel, RateStep, Window
+from sern_sim.profiles import LinkProfile
+from sern_tools.counters import read_counters
+from sern_tools.demo_scenario import COMMAND_TOPIC, POSE_TOPIC, RELAY, ROBOT, SITE, Scenario
+from sern_tools.lab.host import LabError
+from sern_tools.lab.host import run as run_command
+from sern_tools.lab.lab import Lab, Node
+from sern_tools.message_log import read_logs
+from sern_tools.summary import RunFacts, analyse
+from tests.lab.test_sern import (
+    COUNTER,
+    MAP,
+    POSE_SILENCE_S,
+    Placed,
+    Run,
+    check,
+    files_for,
+    longest_silence_s,
+    received,
+    waiting,
+)
+from tests.support import until
+
+pytestmark = pytest.mark.root
+UDP, ZMQ = "udp", "zmq"
+IDLE, TWICE = 0.2, 2.0
+RUN_S = 4.0
+NEW_ADDRESS = "198.18.0.77"
+CALM = LinkModel(rate_bps=4e6, delay_s=0.025)
+
+
+class Stage:
+    """The three daemons, connected over the lab's link, and what is known of the run."""
+
+    def __init__(self, lab: Lab, directory: Path, profile: LinkProfile, overload: float, run_s: float) -> None:
+        self.lab = lab
+        self.profile = profile
+        self.run_s = run_s
+        self.scenario = Scenario(profile, run_s, overload)
+        self.files = files_for(self.scenario, directory, lab.b)
+        robot = json.loads(self.files[ROBOT].read_text())
+        robot["relay"]["udp"] = True
+        self.files[ROBOT].write_text(json.dumps(robot))
+        self.daemons: dict[str, Placed] = {}
+
+    @property
+    def relay(self) -> Placed:
+        return self.daemons[RELAY]
+
+    @property
+    def site(self) -> Placed:
+        return self.daemons[SITE]
+
+    @property
+    def robot(self) -> Placed:
+        return self.daemons[ROBOT]
+
+    async def start(self) -> None:
+        self.lab.apply(self.profile)
+        for name, node in ((RELAY, self.lab.b), (SITE, self.lab.b), (ROBOT, self.lab.a)):
+            program = "relay" if name == RELAY else "client"
+            self.daemons[name] = Placed(node, name, program, self.files[name])
+        for daemon in self.daemons.values():
+            await daemon.ready()
+        await self.site.until(lambda: {POSE_TOPIC, COUNTER} <= received(self.site), "hears from the robot")
+        await self.robot.until(lambda: COMMAND_TOPIC in received(self.robot), "hears commands")
+
+    def lane(self) -> str:
+        """The lane that carries the robot's data."""
+        return str(_only(self.robot.json("/api/link"))["lane"])
+
+    async def uses(self, lane: str) -> None:
+        await self.robot.until(lambda: self.lane() == lane, f"uses lane {lane}")
+
+    def delivered(self, topic: str) -> int:
+        return int(self.site.json("/api/topics").get(topic, {}).get("delivered", 0))
+
+    async def hears(self, topic: str = POSE_TOPIC) -> None:
+        """The site gets something new on a topic."""
+        before = self.delivered(topic)
+        await self.site.until(lambda: self.delivered(topic) > before, f"hears {topic}")
+
+    async def play(self, during: Callable[["Stage"], Awaitable[None]] | None = None) -> Run:
+        """Play the profile's script, or what `during` does instead, then stop everything and read what was logged."""
+        origin_ns, before = time.time_ns(), self.lab.traffic()[0]
+        if during is None:
+            await self.lab.play(self.profile, until_s=self.run_s)
+        else:
+            await during(self)
+        after, took_s = self.lab.traffic()[0], (time.time_ns() - origin_ns) / 1e9
+        # Upstream first: what the robot still has goes to the relay, and from there to the site.
+        await self.robot.stop()
+        await self.site.until(lambda: not waiting(self.relay), "has been given everything")
+        await self.site.stop()
+        await self.relay.stop()
+        facts = RunFacts(
+            origin_ns=origin_ns,
+            duration_s=took_s,
+            floor_s={ROBOT: self.profile.up.delay_s, SITE: self.profile.down.delay_s},
+            blackouts=tuple((window.start_s, window.end_s) for window in self.profile.up.blackouts),
+            reliable_topics=frozenset({COUNTER, MAP}),
+            command_lifespans_s={COMMAND_TOPIC: self.scenario.command_lifespan_s},
+            pose_topic=POSE_TOPIC,
+        )
+        logs = read_logs([(name, self.files[name].with_suffix(".csv")) for name in (ROBOT, SITE)])
+        counters = read_counters([file.with_suffix(".summary.json") for file in self.files.values()])
+        return Run(analyse("SERN", logs, facts, counters), 8 * (after.bytes - before.bytes) / took_s)
+
+
+@asynccontextmanager
+async def staged(
+    lab: Lab, directory: Path, profile: LinkProfile, *, overload: float, run_s: float = RUN_S, lane: str = UDP
+) -> AsyncIterator[Stage]:
+    """A stage whose robot has come to use `lane`; what is left of it in the end is killed."""
+    stage = Stage(lab, directory, profile, overload, run_s)
+    try:
+        await stage.start()
+        await stage.uses(lane)
+        yield stage
+    finally:
+        for daemon in stage.daemons.values():
+            daemon.kill()
+
+
+async def play(lab: Lab, directory: Path, profile: LinkProfile, *, overload: float, run_s: float = RUN_S) -> Run:
+    async with staged(lab, directory, profile, overload=overload, run_s=run_s) as stage:
+        return await stage.play()
+
+
+def scripted(name: str, *, steps: tuple[RateStep, ...] = (), blackouts: tuple[Window, ...] = ()) -> LinkProfile:
+    """A named profile with another script: the same link, sooner."""
+    profile = load_profile(name)
+    up, down = (
+        replace(model, rate_steps=steps, blackouts=blackouts, flap=None) for model in (profile.up, profile.down)
+    )
+    return replace(profile, up=up, down=down)
+
+
+def flapping(flap: Flap, until_s: float) -> tuple[Window, ...]:
+    period_s = flap.up_s + flap.down_s
+    return tuple(
+        Window(n * period_s + flap.up_s, (n + 1) * period_s) for n in range(int((until_s - flap.up_s) / period_s))
+    )
+
+
+def _only(links: object) -> dict[str, object]:
+    """A client has one link."""
+    if isinstance(links, list):
+        (links,) = links
+    assert isinstance(links, dict)
+    return links
+
+
+# --- what a lab's nodes are made to do ------------------------------------------------------------------------------
+
+
+@contextmanager
+def dropped(lab: Lab, protocol: str) -> Iterator[None]:
+    """Packets of one protocol that cross the link are dropped where they arrive, without a word to their sender."""
+    nodes = (lab.a, lab.b)
+    for node in nodes:
+        # The rule must come before the table of local addresses, which is the first of all.
+        _ip(node, "rule", "add", "pref", "20", "lookup", "local")
+        _ip(node, "rule", "add", "pref", "10", "iif", "eth0", "ipproto", protocol, "blackhole")
+        _ip(node, "rule", "delete", "pref", "0")
+    try:
+        yield
+    finally:
+        for node in nodes:
+            _ip(node, "rule", "add", "pref", "0", "lookup", "local")
+            _ip(node, "rule", "delete", "pref", "10")
+            _ip(node, "rule", "delete", "pref", "20")
+
+
+@contextmanager
+def moved(lab: Lab, address: str = NEW_ADDRESS) -> Iterator[None]:
+    """The robot's address is another one: its connections are dead, and only it knows."""
+    old = lab.a.address
+    neighbours = json.loads(run_command(["ip", "-j", "-n", lab.b.namespace, "neigh", "show", old]))
+    hardware, device = neighbours[0]["lladdr"], neighbours[0]["dev"]
+    _ip(lab.b, "neigh", "replace", address, "lladdr", hardware, "dev", device, "nud", "permanent")
+    _swap(lab.a, old, address)
+    try:
+        yield
+    finally:
+        _swap(lab.a, address, old)
+        _ip(lab.b, "neigh", "delete", address, "dev", device)
+
+
+def _swap(node: Node, old: str, new: str) -> None:
+    route = run_command(["ip", "-n", node.namespace, "route", "show", "dev", "eth0"]).splitlines()[0]
+    length = route.split()[0].partition("/")[2]
+    _ip(node, "address", "delete", f"{old}/{length}", "dev", "eth0")
+    _ip(node, "address", "add", f"{new}/{length}", "dev", "eth0")
+    # As it was: with the congestion control of the lab.
+    _ip(node, "route", "replace", *route.replace(old, new).split(), "dev", "eth0")
+
+
+def _ip(node: Node, *words: str) -> None:
+    run_command(["ip", "-n", node.namespace, *words])
+
+
+@pytest.fixture
+def filtering(lab: Lab) -> Lab:
+    """The lab, where its kernel can drop by protocol."""
+    try:
+        with dropped(lab, UDP):
+            pass
+    except LabError as error:
+        pytest.skip(f"this kernel has no routing rules by protocol: {error}")
+    return lab
+
+
+# --- the runs -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "overload"),
+    [
+        pytest.param("wifi", IDLE, id="wifi-idle"),
+        pytest.param("wifi", TWICE, id="wifi-2x"),
+        pytest.param("field-wifi", TWICE, id="field-wifi-2x"),
+        pytest.param("lte", TWICE, id="lte-2x"),
+        pytest.param("satcom", TWICE, id="satcom-2x"),
+        pytest.param("mesh-radio", TWICE, id="mesh-radio-2x"),
+        pytest.param("burst-loss", TWICE, id="burst-loss-2x"),
+    ],
+)
+async def test_promises_hold(lab: Lab, tmp_path: Path, name: str, overload: float) -> None:
+    profile = load_profile(name)
+    played = await play(lab, tmp_path, profile, overload=overload)
+    check(played)
+    assert longest_silence_s(played) < POSE_SILENCE_S
+    assert profile.up.rate_bps is not None
+    assert played.carried_bps <= profile.up.rate_bps * 1.05, "more than the link carries: something went past it"
+
+
+async def test_rate_steps(lab: Lab, tmp_path: Path) -> None:
+    """8, 1, 4 Mbit/s: the fall to an eighth is what fills queues."""
+    profile = scripted("step", steps=(RateStep(1.5, 1e6), RateStep(3.5, 4e6)))
+    played = await play(lab, tmp_path, profile, overload=TWICE, run_s=5.0)
+    check(played)
+    assert longest_silence_s(played) < POSE_SILENCE_S
+
+
+async def test_flapping_path(lab: Lab, tmp_path: Path) -> None:
+    flap = load_profile("flap").up.flap
+    assert flap is not None
+    profile = scripted("flap", blackouts=flapping(flap, 4.0))
+    check(await play(lab, tmp_path, profile, overload=TWICE, run_s=5.0))
+
+
+async def test_blackout(lab: Lab, tmp_path: Path) -> None:
+    """Shorter than its name says; `make lab` has it whole."""
+    profile = scripted("blackout-10", blackouts=(Window(1.0, 3.5),))
+    check(await play(lab, tmp_path, profile, overload=TWICE, run_s=5.0))
+
+
+async def test_udp_blocked_it_falls_back_and_returns_by_itself(filtering: Lab, tmp_path: Path) -> None:
+    async def block(stage: Stage) -> None:
+        with dropped(filtering, UDP):
+            await stage.uses(ZMQ)
+            await stage.hears()
+            await stage.hears(COUNTER)
+        await stage.uses(UDP)
+        await stage.hears()
+
+    async with staged(filtering, tmp_path, LinkProfile("calm", "", CALM, CALM), overload=TWICE) as stage:
+        played = await stage.play(block)
+    check(played)
+
+
+async def test_tcp_blocked_while_udp_flows_the_session_outlives_it(filtering: Lab, tmp_path: Path) -> None:
+    """Until the stream's connection is given up, and on from there."""
+
+    async def block(stage: Stage) -> None:
+        with dropped(filtering, "tcp"):
+            await until(lambda: not _stream_up(stage), "the stream is given up", deadline_s=30.0)
+            await stage.hears()
+            await stage.hears(COUNTER)
+            assert stage.lane() == UDP
+        await until(lambda: _stream_up(stage), "the stream is back", deadline_s=30.0)
+        await stage.hears()
+
+    async with staged(filtering, tmp_path, LinkProfile("calm", "", CALM, CALM), overload=TWICE) as stage:
+        played = await stage.play(block)
+        assert stage.robot.text.count("connected to relay") == 1, "another session"
+    check(played)
+
+
+def _stream_up(stage: Stage) -> bool:
+    command = ["ss", "-Htn", "state", "established", "dport", "=", ":5555"]
+    return bool(run_command([*stage.lab.a.prefix, *command]).strip())
+
+
+async def test_another_address_loses_nothing_reliable(lab: Lab, tmp_path: Path) -> None:
+    async def move(stage: Stage) -> None:
+        with moved(lab):
+            await stage.relay.said("robot is reached over UDP at", NEW_ADDRESS)
+            await stage.hears()
+            await stage.hears(COUNTER)
+        await stage.hears()
+
+    async with staged(lab, tmp_path, LinkProfile("calm", "", CALM, CALM), overload=TWICE) as stage:
+        played = await stage.play(move)
+    check(played)
