@@ -34,15 +34,14 @@ class Hop(Sender):
 
     # --- bytes in -------------------------------------------------------------------------------------------------
 
-    def _receive_data(self, lane: Lane, header: wire.Header, data: bytes, now: float) -> None:
+    def _receive_data(self, lane: Lane, number: int, stamp_us: int, data: bytes, now: float) -> None:
         """A kind-16 datagram of this session."""
         self._rx_lane = lane
-        self._rx_stamp_us = header.stamp_us
+        self._rx_stamp_us = stamp_us
         self._rx_delay = None
         self._now = now
-        if header.number:
-            arrivals = lane.arrivals
-            if not arrivals.arrived(header.number, header.stamp_us, len(data) + OVERHEAD_BYTES, now=now):
+        if number:
+            if not lane.arrivals.arrived(number, stamp_us, len(data) + OVERHEAD_BYTES, now=now):
                 return
             self.dirty = True  # an acknowledgement is owed
         wire.decode_frames(data, self)

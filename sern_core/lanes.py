@@ -3,7 +3,7 @@
 from collections import deque
 from typing import Final
 
-from sern_core.capacity import PACING_BURST_S, CapacityEstimator, Pacer
+from sern_core.capacity import CapacityEstimator, Pacer
 from sern_core.control.delay import DelayWindow
 from sern_core.control.fixed import FixedWindow
 from sern_core.flight import Arrivals, Flight
@@ -88,7 +88,7 @@ class Lane:
 
     def pacing_deadline(self) -> float:
         """When the pacer lets the next datagram go."""
-        return self.pacer.due_s - PACING_BURST_S
+        return self.pacer.due_s
 
     def stall_deadline(self) -> float | None:
         flight = self.flight

@@ -27,7 +27,6 @@ from sern_core.queues import OutChannel, OutMessage
 from sern_core.scheduler import Scheduler
 from sern_core.trace import DecisionTrace, TraceEvent
 from sern_core.types import (
-    CLASSES,
     ClientName,
     DropReason,
     Encoding,
@@ -268,9 +267,14 @@ class Sender(ABC):
     @property
     def _backlog(self) -> bool:
         """Whether more could be sent if the window allowed it."""
-        control = self._control
-        scheduler = self.scheduler
-        return bool(control.queue or control.active) or any(scheduler.pending(priority) for priority in CLASSES)
+        control, pending = self._control, self.scheduler.pending
+        return bool(
+            control.queue
+            or control.active
+            or pending(PriorityClass.BULK)
+            or pending(PriorityClass.STATE)
+            or pending(PriorityClass.CONTROL)
+        )
 
     def _compose(self, frames: list[bytes], items: list[SentData | SentWatermark | SentPing], now: float) -> None:
         """Fill one datagram: watermarks, then what the scheduler picks, of one class; control ahead of all but class 0.
@@ -279,7 +283,6 @@ class Sender(ABC):
         """
         lane = self.lane
         limit = lane.fragment_bytes - (wire.ACK.size if lane.arrivals.unacked else 0)
-        scheduler = self.scheduler
         window_open = lane.open_at(now)
         size = wire.HEADER_BYTES
         if self._watermarks:
@@ -289,13 +292,16 @@ class Sender(ABC):
         while size < limit - MIN_SHARE_BYTES:
             chosen = self._pick(now, window_open=window_open)
             channel = self.channels[chosen] if chosen is not None else None
-            if window_open and (channel is None or channel.spec.priority is not PriorityClass.CONTROL):
-                order = control.head(now)
-                if order is not None:
-                    size = self._put(control, order, frames, items, size, limit, now)
-                    if not order.has_unsent:
-                        self._control_sent(order.seq)
-                    continue
+            if (
+                (control.queue or control.active)
+                and window_open
+                and (channel is None or channel.spec.priority is not PriorityClass.CONTROL)
+                and (order := control.head(now)) is not None
+            ):
+                size = self._put(control, order, frames, items, size, limit, now)
+                if not order.has_unsent:
+                    self._control_sent(order.seq)
+                continue
             if channel is None:
                 break
             out = channel.head(now)
@@ -305,13 +311,13 @@ class Sender(ABC):
             priority = _class_of(channel, out)
             if frames and (
                 (served is not None and priority is not served)
-                or out.unsent_bytes > limit - size - wire.DATA_FIRST_BYTES
+                or (out.size if out.ranges is None else out.unsent_bytes) > limit - size - wire.DATA_FIRST_BYTES
             ):
                 break
             served = priority
             before = size
             size = self._put(channel, out, frames, items, size, limit, now)
-            scheduler.charge(priority, size - before, now=now)
+            self.scheduler.charge(priority, size - before, now=now)
             self._refresh(channel, now)
             if lane.stalled:
                 break

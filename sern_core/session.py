@@ -10,6 +10,7 @@ Every session has a tag; datagrams of another one are ignored. The acceptor answ
 not know yet that its session is over.
 """
 
+import struct
 from abc import abstractmethod
 from collections import deque
 from typing import Final
@@ -27,6 +28,7 @@ from sern_core.types import ClientName
 HELLO_INTERVAL_S: Final = 1.0
 RESET_INTERVAL_S: Final = 0.5
 REFUSED_INTERVAL_S: Final = 5.0
+NUMBER_AND_STAMP: Final = struct.Struct("!IQ")
 
 
 class Session(Hop):
@@ -53,6 +55,7 @@ class Session(Hop):
         self._hello_stamp_us = -1
         self._reset_due_s = -float("inf")
         self._resumed = False
+        self._data_prefix = b""  # how a data datagram of this session begins
         super().__init__(
             name=name, boot=boot, peer=peer, link=link, scheduler=scheduler, trace=trace, now=now, lossless=lossless
         )
@@ -187,6 +190,7 @@ class Session(Hop):
             self.clock = ClockSync()
         self.peer_boot = peer_boot
         self.established = True
+        self._data_prefix = bytes((wire.MAGIC, self.version, wire.Kind.DATA, self.tag))
         self._hello_due_s = None
         lane = self.lane = self.lanes[LANE_ZMQ]
         lane.up = True
@@ -214,6 +218,7 @@ class Session(Hop):
         if not self.established:
             return
         self.established = False
+        self._data_prefix = b""
         if udp is not None:
             self._lane_closed()
         for channel in self.channels.values():
@@ -259,6 +264,12 @@ class Session(Hop):
 
     def receive(self, data: bytes, *, now: float, lane: int = LANE_ZMQ) -> None:
         """One datagram from the lane. Raises WireError or VersionError for bytes no honest peer sends."""
+        if data[:4] == self._data_prefix and wire.HEADER_BYTES <= len(data) <= wire.MAX_DATAGRAM_BYTES:
+            state = self.lanes.get(lane)
+            if state is not None:
+                number, stamp_us = NUMBER_AND_STAMP.unpack_from(data, 4)
+                self._receive_data(state, number, stamp_us, data, now)
+            return
         header = wire.decode_header(data)
         if header.kind != wire.Kind.DATA:
             if lane != LANE_ZMQ:
@@ -267,12 +278,8 @@ class Session(Hop):
             self._handshake(header, data, now)
             return
         if header.tag == self.tag and self.established:
-            if header.version != self.version:
-                raise WireError(f"version {header.version} was not agreed, {self.version} was")
-            state = self.lanes.get(lane)
-            if state is not None:
-                self._receive_data(state, header, data, now)
-        elif not self.initiator and lane == LANE_ZMQ:
+            raise WireError(f"version {header.version} was not agreed, {self.version} was")
+        if not self.initiator and lane == LANE_ZMQ:
             # Of another session; if that one is the peer's latest, it does not know yet that it is over.
             self._send_reset(header.tag, now)
 
