@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Final
 
 PACING_BURST_S: Final = 0.001
-"""What is due within this time may leave at once: timers are no finer."""
+"""By so much a timer may be late; what could have left meanwhile leaves at once."""
 
 
 @dataclass(slots=True)
@@ -84,7 +84,7 @@ class Pacer:
         """When the next datagram may leave."""
 
     def ready(self, now: float) -> bool:
-        return now >= self.due_s - PACING_BURST_S
+        return now >= self.due_s
 
     def sent(self, *, now: float, nbytes: int, pacing_bps: float | None) -> None:
         """`nbytes` left. Of the time that was not used no more is saved up than a timer may be late."""

@@ -15,7 +15,7 @@ Theory of operation
     *Draining.* When no empty queue was seen for a while, one round trip at 0.6 of the product shows it. A queue that
     stays although we made way is either a longer path (constant: taken as the new empty path) or somebody else's:
     then the window follows CUBIC (RFC 9438) until a drain finds the queue gone.
-    *Loss* alone changes nothing (radio), unless there is clearly more of it than where we sent less.
+    *Loss* alone changes nothing (radio): it counts only against a rival, and when a fifth is lost in start-up.
 """
 
 from collections import deque
@@ -36,13 +36,15 @@ MIN_RATE_SPAN_S: Final = 0.120
 BURST_RATE_SPAN_S: Final = 0.150
 MARK_SPACING_S: Final = 0.020
 TARGET_S: Final = 0.0002
-TARGET_PACKETS: Final = 0.4
+TARGET_PACKETS: Final = 0.32
 FAST_PACKETS: Final = 2.0
 FAST_S: Final = 0.002
 """Where a packet takes less than this, up to two more: they cost little, and flows share more fairly."""
 GAIN: Final = 0.35
 PATIENT_EPOCHS: Final = 2
 """The effect of a step is seen two epochs later; only then may the next one be larger."""
+CLEAR_PACKETS: Final = 1.0
+"""The path counts as empty when four packets of five met at most about one other."""
 FIRST_GROWTH: Final = 0.02
 MAX_GROWTH: Final = 0.25
 CUT: Final = 0.95
@@ -51,7 +53,7 @@ EMERGENCY_S: Final = 0.050
 STARTUP_GAIN: Final = 4.0
 STARTUP_PACING: Final = 4.0
 STARTUP_AIM: Final = 0.9
-PACING_GAIN: Final = 1.05
+PACING_GAIN: Final = 1.03
 DRAIN_PACING: Final = 0.98
 TRAIN_BYTES: Final = 8 * 1200
 INITIAL_WINDOW_BYTES: Final = 12_600
@@ -461,7 +463,7 @@ class HybridWindow(CapacityEstimator):
             step = GAIN * rate * max(target_s - queue_s, -queue_s)
             if queue_s >= 0.25 * target_s:
                 self._empty_epochs = 0
-            elif self._queue_most_s <= min(self._spreads) + 0.3 * self._serialise_s:
+            elif self._queue_most_s <= min(self._spreads) + CLEAR_PACKETS * self._serialise_s:
                 # Clearly empty: hardly a packet met another one. Otherwise a little more will do.
                 self._empty_epochs += 1
                 if self._empty_epochs > PATIENT_EPOCHS:
