@@ -33,6 +33,7 @@ def within_binomial(lost: int, count: int, probability: float) -> bool:
     return abs(lost - count * probability) <= SIGMAS * math.sqrt(count * probability * (1 - probability))
 
 
+@pytest.mark.lab_long
 @pytest.mark.parametrize("direction", ["up", "down"])
 def test_delay_and_jitter_are_exact(lab: Lab, direction: str) -> None:
     source, target = (lab.a, lab.b) if direction == "up" else (lab.b, lab.a)
@@ -51,6 +52,7 @@ def test_delay_and_jitter_are_exact(lab: Lab, direction: str) -> None:
         assert 0.080 < statistics.median(delays) < 0.092
 
 
+@pytest.mark.lab_long
 @pytest.mark.parametrize("size_bytes", [pytest.param(100, marks=pytest.mark.lab_long), 1200])
 def test_rate_is_exact_and_the_queue_is_as_long_as_asked(lab: Lab, size_bytes: int) -> None:
     model = LinkModel(rate_bps=4e6, delay_s=0.010, queue_packets=50)
@@ -63,6 +65,7 @@ def test_rate_is_exact_and_the_queue_is_as_long_as_asked(lab: Lab, size_bytes: i
     assert max(arrival.delay_s for arrival in full) == pytest.approx(longest_s, rel=0.1, abs=0.012)
 
 
+@pytest.mark.lab_long
 def test_tcp_fills_the_link_with_packets_of_ordinary_size(lab: Lab) -> None:
     lab.change(rate_bps=20e6, delay_s=0.005)
     count_bytes = 4_000_000
@@ -109,6 +112,7 @@ def test_duplicates_and_reordering(lab: Lab) -> None:
     assert numbers != sorted(numbers)
 
 
+@pytest.mark.lab_long
 def test_a_link_changes_while_it_carries(lab: Lab) -> None:
     lab.change(delay_s=0.010)
     seen: list[float] = []

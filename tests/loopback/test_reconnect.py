@@ -82,7 +82,9 @@ async def test_a_site_that_restarts_misses_nothing_and_gets_nothing_twice(tmp_pa
             base = len(arrived)
             await site.until(lambda base=base, site=site, wanted=wanted: base + delivered(site) >= wanted, "has more")
             await site.stop()
-            arrived += bodies(tmp_path / f"{path}.bag")["/robot1/chat"]
+            recording = tmp_path / f"{path}.bag"
+            if recording.exists():  # on a slow machine the earlier ones may have had everything
+                arrived += bodies(recording)["/robot1/chat"]
         await lab.end(robot)
     assert arrived == bodies(bag)["/chat"]
 
