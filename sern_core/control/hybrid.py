@@ -269,11 +269,11 @@ class HybridWindow(CapacityEstimator):
                 self._rtt_s = rtt_s
             if not sample.app_limited and sent_s >= self._round_s:
                 self._ramp(now, receiver_s, cum_bytes, sample.acked_bytes)
-        elif queue_s > 3 * self._high_s and self._cubic is None:
+        elif queue_s > 3 * self._high_s and self._cubic is None and self._drain_until_s is None:
             if self._high_since_s is None:
                 self._high_since_s = receiver_s
             elif receiver_s >= self._high_since_s + EMERGENCY_S and now >= self._hold_until_s:
-                self._emergency(now)
+                self._emergency(now, queue_s)
         else:
             self._high_since_s = None
         self._measure_rate(now, receiver_s, cum_bytes, sample.app_limited)
@@ -555,7 +555,7 @@ class HybridWindow(CapacityEstimator):
         self._adopted_until_s = now + RIVAL_MEMORY_S
         self._start_again(now)
 
-    def _emergency(self, now: float) -> None:
+    def _emergency(self, now: float, queue_s: float) -> None:
         """The queue is far too long: the link got slower."""
         rtt_s = self._rtt_s
         rate = self._recent_rate()
@@ -566,7 +566,7 @@ class HybridWindow(CapacityEstimator):
         self._mark = None
         self._drain_until_s = None
         self._window = min(self._window, max(EMERGENCY_CUT * rate * rtt_s, MIN_WINDOW_FRAGMENTS * self._fragment))
-        self._hold_until_s = now + max(0.1, rtt_s + self._queue_s)
+        self._hold_until_s = now + max(0.1, rtt_s + queue_s)
         self._high_since_s = None
         self._empty_epochs = 0
         self._pace()
