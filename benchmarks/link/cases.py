@@ -214,7 +214,7 @@ def steps(bench: Bench) -> None:
 
 def blackout_10(bench: Bench) -> None:
     """4 Mbit/s, 50 ms, gone for 10 s."""
-    _blackout(bench, 10.0, SERN if bench.quick else ALL)
+    _blackout(bench, 10.0, ("sern-udp",) if bench.quick else ALL)
 
 
 def blackout_30(bench: Bench) -> None:
