@@ -228,22 +228,19 @@ class Hop(Sender):
 
     # --- time -----------------------------------------------------------------------------------------------------
 
-    def _data_deadline(self, lane: Lane) -> float | None:
+    def _data_deadline(self, lane: Lane) -> float:
         """When `handle_timeout` or `next_datagram` has something to do on this lane by time alone."""
         deadline = lane.ping_due_s
         if lane.id == LANE_ZMQ and self._sweep_due_s < deadline:
             deadline = self._sweep_due_s
         arrivals = lane.arrivals
-        if arrivals.unacked:
-            due_s = arrivals.since_s + ACK_DELAY_S
-            if due_s < deadline:
-                deadline = due_s
+        if arrivals.unacked and arrivals.since_s + ACK_DELAY_S < deadline:
+            deadline = arrivals.since_s + ACK_DELAY_S
         for candidate in (
-            lane.stall_deadline(),
-            lane.flight.loss_deadline(),
-            lane.probe_due_s if lane.stalled else None,
+            lane.probe_due_s if lane.stalled else lane.stall_deadline(),
+            None if lane.lossless else lane.flight.loss_deadline(),
+            self._service_deadline(lane) if lane is self.lane and self._backlog else None,
             lane.copies[0][0] if lane.copies else None,
-            self._service_deadline(lane) if lane is self.lane else None,
         ):
             if candidate is not None and candidate < deadline:
                 deadline = candidate
@@ -252,7 +249,7 @@ class Hop(Sender):
     def _service_deadline(self, lane: Lane) -> float | None:
         """When something that waits may leave by time alone: the pacer or class 0's bucket lets it."""
         now = self._now
-        if lane.window_open and not lane.pacer.ready(now) and self._backlog:
+        if lane.window_open and not lane.pacer.ready(now):
             pacing_s = lane.pacing_deadline()
             bucket_s = self.scheduler.next_deadline(now=now, window_open=False)
             return pacing_s if bucket_s is None or pacing_s < bucket_s else bucket_s

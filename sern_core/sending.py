@@ -106,7 +106,7 @@ class Sender(ABC):
         self.version = wire.VERSION_MAX
         self.tag = boot % 255  # so that a late datagram of an earlier process is not taken for one of ours
         self.dirty = False
-        """Something may be sendable: the owner should poll `next_datagram`."""
+        """Something may be sendable: the owner should poll `next_datagram`. Set by every call that changes anything."""
         self._rx_lane = self.lane
         self._sweep_due_s = now + SWEEP_INTERVAL_S
         self._rate_due_s = now
@@ -215,6 +215,8 @@ class Sender(ABC):
 
     def _next_data(self, lane: Lane, now: float) -> bytes | None:
         """The next kind-16 datagram of an established session for one lane, or None."""
+        if not self.dirty and len(self.lanes) == 1:
+            return None  # nothing has changed since the last answer, and `handle_timeout` says when time has
         self._now = now
         if lane.copies and (copy := lane.due_copy(now)) is not None:
             self.scheduler.charge(PriorityClass.CONTROL, len(copy), now=now)
@@ -224,7 +226,8 @@ class Sender(ABC):
         if not lane.stalled or now >= lane.probe_due_s:
             if lane is self.lane:
                 self.dirty = False
-                self._compose(frames, items, now)
+                if self._sendable(lane, now):
+                    self._compose(frames, items, now)
             # A stream delivers what is under way, so one question at a time is enough there.
             if not items and (lane.ping or lane.stalled) and not (lane.lossless and lane.flight.packets):
                 frames.append(wire.PING_FRAME)
@@ -244,8 +247,8 @@ class Sender(ABC):
             arrivals.flushed()
         if not frames:
             return None
-        self.dirty = True
         if not items:
+            self.dirty = self.dirty or len(self.lanes) > 1
             return b"".join((self._header(0, now), *frames))
         flight = lane.flight
         datagram = b"".join((self._header(flight.next_number, now), *frames))
@@ -257,12 +260,22 @@ class Sender(ABC):
         estimator.on_sent(now=now, nbytes=nbytes, inflight_bytes=inflight_bytes)
         lane.pacer.sent(now=now, nbytes=nbytes, pacing_bps=estimator.pacing_bps)
         lane.ping_due_s = now + PING_INTERVAL_S
+        self.dirty = len(self.lanes) > 1 or self._sendable(lane, now)
         if lane.redundant and any(type(item) is SentData and _urgent(item.channel) for item in items):
             lane.copies.append((now + COPY_DELAY_S, flight.next_number - 1, datagram))
         return datagram
 
     def _header(self, number: int, now: float) -> bytes:
         return wire.encode_header(wire.Kind.DATA, self.tag, number, microseconds(now), version=self.version)
+
+    def _sendable(self, lane: Lane, now: float) -> bool:
+        """Whether there is something for the next datagram, acknowledgements aside."""
+        if self._watermarks:
+            return True
+        window_open = lane.open_at(now)
+        if window_open and (self._control.queue or self._control.active):
+            return True
+        return self._pick(now, window_open=window_open) is not None
 
     @property
     def _backlog(self) -> bool:

@@ -81,6 +81,10 @@ class ClockedPort:
         self.clock = clock
         self.sent: Callable[[bytes, float], object] | None = None
 
+    @property
+    def dirty(self) -> bool:
+        return getattr(self.inner, "dirty", True)
+
     def receive(self, data: bytes, *, now: float) -> None:
         self.inner.receive(data, now=self.clock.local(now))
 
@@ -321,6 +325,10 @@ class SimHub:
 
     def ports(self) -> list[Port]:
         return [*self.sides.values(), *self.more_ports]
+
+    def take_dirty(self) -> list[Port]:
+        """Only these ports are asked for more after an event on another."""
+        return [*(port for port in self.sides.values() if port.dirty), *self.more_ports]
 
     def links(self) -> Iterator[Link]:
         yield from self.hub.links.values()
