@@ -6,8 +6,7 @@ import pytest
 
 from sern_runtime.profiles import load_profiles
 from sern_tools.lab.lab import Lab
-from tests.lab.test_bad_links import IDLE, TWICE, play
-from tests.lab.test_sern import check
+from tests.lab.test_bad_links import IDLE, TWICE, check, play
 
 pytestmark = [pytest.mark.root, pytest.mark.lab_long]
 THIRTEEN = 13.0
@@ -28,4 +27,4 @@ async def test_promises_hold(lab: Lab, tmp_path: Path, name: str, overload: floa
     profile = PROFILES[name]
     scripted = profile.next_change_s(0.0) is not None
     run_s = profile.duration_s if scripted and profile.up.flap is None else RUN_S
-    check(await play(lab, tmp_path, profile, overload=IDLE_LAN if name == "lan" else overload, run_s=run_s))
+    check(await play(lab, tmp_path, profile, overload=IDLE_LAN if name == "lan" else overload, run_s=run_s), profile)
