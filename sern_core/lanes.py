@@ -4,8 +4,8 @@ from collections import deque
 from typing import Final
 
 from sern_core.capacity import CapacityEstimator, Pacer
-from sern_core.control.delay import DelayWindow
 from sern_core.control.fixed import FixedWindow
+from sern_core.control.hybrid import HybridWindow
 from sern_core.flight import Arrivals, Flight
 from sern_core.params import LinkParams, Redundancy, WindowAlgorithm
 
@@ -46,7 +46,7 @@ class Lane:
         if params.window.algorithm is WindowAlgorithm.FIXED:
             self.estimator = FixedWindow(params.window.fixed_bytes)
         else:
-            self.estimator = DelayWindow(fragment_bytes=MIN_FRAGMENT_BYTES + OVERHEAD_BYTES)
+            self.estimator = HybridWindow(fragment_bytes=MIN_FRAGMENT_BYTES + OVERHEAD_BYTES)
         self.pacer = Pacer()
         self.flight = Flight(lossless=lossless)
         self.arrivals = Arrivals()
