@@ -11,15 +11,15 @@ from tests.lab.test_bad_links import IDLE, TWICE, check, play
 pytestmark = [pytest.mark.root, pytest.mark.lab_long]
 THIRTEEN = 13.0
 RUN_S = 15.0
+IDLE_LAN = 2e-4
 PROFILES = load_profiles()
 TOO_FAST = {
     "lan": "twice a gigabit is more than this machine's guest and two processors carry; played idle only",
     "wifi": "thirteen times 50 Mbit/s is more than the machine composes; played idle and overloaded twice",
 }
 """Profiles that are not overloaded as much as the others, and why."""
-LOADS = {"lan": (IDLE,), "wifi": (IDLE, TWICE)}
+LOADS = {"lan": (IDLE_LAN,), "wifi": (IDLE, TWICE)}
 RUNS = [(name, load) for name in PROFILES for load in LOADS.get(name, (IDLE, TWICE, THIRTEEN))]
-IDLE_LAN = 2e-4
 
 
 @pytest.mark.parametrize(("name", "overload"), [pytest.param(*run, id=f"{run[0]}-{run[1]:g}x") for run in RUNS])
@@ -27,4 +27,4 @@ async def test_promises_hold(lab: Lab, tmp_path: Path, name: str, overload: floa
     profile = PROFILES[name]
     scripted = profile.next_change_s(0.0) is not None
     run_s = profile.duration_s if scripted and profile.up.flap is None else RUN_S
-    check(await play(lab, tmp_path, profile, overload=IDLE_LAN if name == "lan" else overload, run_s=run_s), profile)
+    check(await play(lab, tmp_path, profile, overload=overload, run_s=run_s), profile)
