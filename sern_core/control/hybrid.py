@@ -428,6 +428,7 @@ class HybridWindow(CapacityEstimator):
             else:
                 self._steer(now, queue_s, rtt_s)
             stuck = self._cubic is None and (self._above_epochs >= STUCK_EPOCHS or self._pinned(now, queue_s))
+            stuck = stuck and not self._own(queue_s)
             if stuck and now < self._rival_until_s:
                 self._compete(now, rtt_s + queue_s)
             elif (stuck and now >= self._drained_s + STUCK_WAIT_S) or (
@@ -513,7 +514,7 @@ class HybridWindow(CapacityEstimator):
         elif cubic is not None:
             if now > cubic.began_s + COMPETE_MAX_S:
                 self._new_path(now, queue_s)
-        elif self._above_epochs >= STUCK_EPOCHS:
+        elif self._above_epochs >= STUCK_EPOCHS and not self._own(queue_s):
             flat = max(self._recent) - min(self._recent) < max(FLAT_S, 0.1 * queue_s)
             if flat and now > max(self._rival_until_s, self._lost_s + LOSS_MEMORY_S):
                 self._new_path(now, queue_s)
@@ -534,6 +535,10 @@ class HybridWindow(CapacityEstimator):
         self._pinned_most_s = max(self._pinned_most_s, queue_s)
         swing_s = max(0.010, min(0.100, 2 * self._window / self._peak)) if self._peak else inf
         return now > self._pinned_s + PINNED_S and self._pinned_most_s - self._pinned_least_s > swing_s
+
+    def _own(self, queue_s: float) -> bool:
+        """Whether the least that we have under way, and class 0 beside it, may be all that queues: on a thin link."""
+        return self._window <= 2 * self._fragment and queue_s * self._peak < self._window + 2 * self._fragment
 
     def _compete(self, now: float, rtt_s: float) -> None:
         window = max(self._window, self._calm_window, (self._recent_rate() or 0.0) * rtt_s)
