@@ -19,6 +19,8 @@ Theory of operation
 """
 
 from collections import deque
+from collections.abc import Iterable
+from itertools import pairwise
 from math import inf
 from typing import Final
 
@@ -66,6 +68,7 @@ STUCK_EPOCHS: Final = 4
 PINNED_S: Final = 2.0
 STUCK_WAIT_S: Final = 1.0
 FLAT_S: Final = 0.003
+STALL_S: Final = 0.1
 LOSS_MEMORY_S: Final = 3.0
 RIVAL_MEMORY_S: Final = 30.0
 COMPETE_MAX_S: Final = 30.0
@@ -76,6 +79,11 @@ PEAK_DECAY: Final = 0.02
 CUBIC_C: Final = 0.4
 CUBIC_BETA: Final = 0.7
 CUBIC_RENO: Final = 3 * (1 - CUBIC_BETA) / (1 + CUBIC_BETA)
+
+
+def _one_gap(train: Iterable[tuple[float, int]], gap_s: float) -> bool:
+    """Whether two packets of a train are further apart than `gap_s`."""
+    return any(later - earlier > gap_s for (earlier, _), (later, _) in pairwise(train))
 
 
 class _Base:
@@ -344,6 +352,9 @@ class HybridWindow(CapacityEstimator):
         if cum_bytes - nbytes < TRAIN_BYTES:
             return
         span_s = receiver_s - at_s
+        if span_s > STALL_S and _one_gap(train, 0.6 * span_s):
+            train.clear()  # a stream stood still for a lost segment: that says nothing about its rate
+            return
         rate = (cum_bytes - nbytes) / span_s if span_s > 1e-5 else inf
         if rate > self._train_rate:
             self._train_rate = rate
