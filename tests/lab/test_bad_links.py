@@ -43,7 +43,7 @@ from tests.lab.test_sern import (
 )
 from tests.support import until
 
-pytestmark = pytest.mark.root
+pytestmark = [pytest.mark.root, pytest.mark.lab_long]  # minutes of traffic: a busy machine ends some of it late
 UDP, ZMQ = "udp", "zmq"
 IDLE, TWICE = 0.2, 2.0
 RUN_S = 4.0
