@@ -1,0 +1,206 @@
+"""Reassembly: pieces in any order, repeated, overlapping; order, once, limits and tombstones."""
+
+from itertools import pairwise
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sern_core.fragments import HELD_OVERHEAD_BYTES, MAX_PARTIALS, PARTIAL_IDLE_S, InStream, Reassembly
+from sern_core.message import Message, StreamId, StreamInfo, TopicInfo
+from sern_core.types import DROP_CODES, ClientName, DropReason, Encoding, TopicName
+from sern_core.wire import FLAG_TOMBSTONE
+from tests.world import spec
+
+
+class Receiver:
+    """An `InStream` with a record of what it did."""
+
+    def __init__(
+        self, *, reliable: bool = False, lifespan_s: float | None = None, limit_bytes: int = 10**6, first: int = 1
+    ) -> None:
+        info = TopicInfo(TopicName("/t"), "", Encoding.RAW)
+        stream = StreamInfo(
+            StreamId(ClientName("a"), 1, info.name), info, spec(reliable=reliable, lifespan_s=lifespan_s)
+        )
+        self.room = Reassembly(limit_bytes)
+        self.turns: list[Message] = []
+        self.drops: list[tuple[DropReason, int]] = []
+        self.stream = InStream(stream, self.room, self._turn, self._drop, first=first)
+
+    def _turn(self, stream: InStream, message: Message) -> None:
+        self.turns.append(message)
+
+    def _drop(self, stream: InStream, reason: DropReason, nbytes: int, seq: int) -> None:
+        self.drops.append((reason, seq))
+
+    def piece(self, seq: int, start: int, end: int, total: int, *, now: float = 0.0, born_s: float = 0.0) -> None:
+        self.stream.fragment(0, seq, start, total, _body(seq, total)[start:end], 7, born_s, 0.0, now)
+        self.check()
+
+    def whole(self, seq: int, *, now: float = 0.0, born_s: float = 0.0, error_s: float = 0.0) -> None:
+        self.stream.fragment(0, seq, 0, 8, _body(seq, 8), 7, born_s, error_s, now)
+        self.check()
+
+    def tombstone(self, seq: int, reason: DropReason) -> None:
+        self.stream.fragment(FLAG_TOMBSTONE, seq, 0, 1, bytes([DROP_CODES[reason]]), 0, 0.0, 0.0, 0.0)
+        self.check()
+
+    def check(self) -> None:
+        def check(ok: bool, text: str) -> None:
+            assert ok, text
+
+        self.stream.validate(check)
+        assert self.room.held_bytes == self.stream.held_bytes
+
+    @property
+    def seqs(self) -> list[int]:
+        return [message.seq for message in self.turns]
+
+
+def _body(seq: int, total: int) -> bytes:
+    return (b"%08d" % seq * (total // 8 + 1))[:total]
+
+
+@settings(derandomize=True, database=None, deadline=None, max_examples=200)
+@given(st.data())
+def test_pieces_in_any_order_repeated_and_overlapping(data: st.DataObject) -> None:
+    total = data.draw(st.integers(2, 300))
+    cuts = sorted({0, total, *data.draw(st.lists(st.integers(1, total - 1), max_size=8))})
+    pieces = [*pairwise(cuts)]
+    pieces += data.draw(st.lists(st.sampled_from(pieces), max_size=5))
+    starts = data.draw(st.lists(st.integers(0, total - 1), max_size=5))
+    pieces += [(start, data.draw(st.integers(start + 1, total))) for start in starts]
+    receiver = Receiver(reliable=data.draw(st.booleans()))
+    for start, end in data.draw(st.permutations(pieces)):
+        receiver.piece(1, start, end, total)
+    assert [(message.seq, message.body) for message in receiver.turns] == [(1, _body(1, total))]
+    assert receiver.room.held_bytes == 0
+
+
+@settings(derandomize=True, database=None, deadline=None, max_examples=200)
+@given(st.lists(st.tuples(st.integers(1, 20), st.booleans()), max_size=60))
+def test_reliable_is_once_and_in_order_best_effort_rises(arrivals: list[tuple[int, bool]]) -> None:
+    reliable, best = Receiver(reliable=True), Receiver()
+    for seq, dead in arrivals:
+        best.whole(seq)
+        if dead:
+            reliable.tombstone(seq, DropReason.LIFESPAN)
+        else:
+            reliable.whole(seq)
+    arrived = {seq for seq, _ in arrivals}
+    expected = 0
+    while expected + 1 in arrived:
+        expected += 1
+    assert reliable.seqs == list(range(1, expected + 1))
+    assert best.seqs == sorted(set(best.seqs)) and (not arrived or best.seqs[-1] == max(arrived))
+
+
+def test_an_older_sample_and_a_repeated_one_are_told_apart() -> None:
+    receiver = Receiver()
+    for seq in (1, 4, 2, 2, 4):
+        receiver.whole(seq)
+    assert receiver.seqs == [1, 4]
+    assert [reason for reason, _ in receiver.drops] == [
+        DropReason.SUPERSEDED,
+        DropReason.DUPLICATE,
+        DropReason.DUPLICATE,
+    ]
+
+
+def test_a_far_jump_of_seqs_costs_nothing() -> None:
+    receiver = Receiver()
+    receiver.whole(2**40)
+    assert receiver.seqs == [2**40]
+
+
+@pytest.mark.parametrize("reliable", [True, False])
+def test_late_as_far_as_can_be_known_is_late(reliable: bool) -> None:
+    receiver = Receiver(reliable=reliable, lifespan_s=0.3)
+    receiver.whole(1, now=0.2)
+    receiver.whole(2, now=0.2, error_s=0.15)
+    assert receiver.drops == [(DropReason.LIFESPAN, 2 if reliable else 0)]
+    assert receiver.seqs == ([1, 2] if reliable else [1])
+    if reliable:
+        assert receiver.turns[1].drop_reason is DropReason.LIFESPAN
+
+
+def test_a_message_that_grew_old_waiting_for_the_one_before_it_is_late() -> None:
+    receiver = Receiver(reliable=True, lifespan_s=1.0)
+    receiver.whole(2, now=0.1)
+    receiver.whole(1, now=5.0, born_s=4.9)
+    assert [bool(message.tombstone) for message in receiver.turns] == [False, True]
+
+
+def test_a_tombstone_takes_the_place_of_what_is_half_received() -> None:
+    receiver = Receiver(reliable=True)
+    receiver.piece(1, 0, 50, 100)
+    receiver.tombstone(1, DropReason.RETENTION)
+    receiver.piece(1, 50, 100, 100)
+    assert receiver.seqs == [1] and receiver.turns[0].drop_reason is DropReason.RETENTION
+    assert receiver.room.held_bytes == 0
+
+
+def test_a_reliable_message_without_room_is_given_up_in_its_turn() -> None:
+    """Its sender believes the pieces have arrived: without this the stream would wait for ever."""
+    receiver = Receiver(reliable=True, limit_bytes=200 + HELD_OVERHEAD_BYTES)
+    receiver.piece(1, 0, 100, 1000)
+    receiver.whole(2)
+    assert receiver.drops == [(DropReason.REASSEMBLY, 1)]
+    assert receiver.seqs == [1, 2] and receiver.turns[0].drop_reason is DropReason.REASSEMBLY
+
+
+def test_best_effort_makes_way_when_memory_is_short() -> None:
+    receiver = Receiver(limit_bytes=3 * (100 + HELD_OVERHEAD_BYTES))
+    for seq in range(1, 6):
+        receiver.piece(seq, 0, 50, 100, now=float(seq))
+    assert [reason for reason, _ in receiver.drops] == [DropReason.REASSEMBLY] * 2
+    receiver.piece(5, 50, 100, 100)
+    assert receiver.seqs == [5]
+    for seq in range(10, 12 + MAX_PARTIALS):
+        receiver.piece(seq, 0, 1, 2)
+    assert len(receiver.stream._partials) <= MAX_PARTIALS
+
+
+def test_the_newest_half_received_message_is_waited_for() -> None:
+    receiver = Receiver()
+    receiver.piece(1, 0, 50, 100)
+    receiver.piece(2, 0, 50, 100)
+    receiver.stream.sweep(PARTIAL_IDLE_S + 1, 0.0)
+    assert receiver.drops == [(DropReason.LOST, 0)]
+    receiver.piece(2, 50, 100, 100, now=10 * PARTIAL_IDLE_S)
+    assert receiver.seqs == [2]
+
+
+def test_a_link_that_was_down_is_no_reason_to_give_up() -> None:
+    receiver = Receiver()
+    receiver.piece(1, 0, 50, 100)
+    receiver.piece(2, 0, 50, 100)
+    receiver.stream.sweep(100.0, 99.0)
+    assert receiver.drops == []
+
+
+def test_half_received_and_too_old_is_given_up() -> None:
+    receiver = Receiver(lifespan_s=1.0)
+    receiver.piece(1, 0, 50, 100)
+    receiver.stream.sweep(2.0, 0.0)
+    assert receiver.drops == [(DropReason.LIFESPAN, 0)] and receiver.room.held_bytes == 0
+
+
+def test_skipping_delivers_what_waited_and_counts_the_rest() -> None:
+    receiver = Receiver(reliable=True)
+    receiver.whole(3)
+    receiver.whole(6)
+    receiver.piece(4, 0, 50, 100)
+    assert receiver.stream.skip_to(6, 0.0) == 4
+    assert receiver.seqs == [3, 6] and receiver.stream.delivered == 6 and receiver.room.held_bytes == 0
+    assert receiver.stream.skip_to(2**60, 0.0) == 2**60 - 7
+    assert receiver.stream.skip_to(5, 0.0) == 0
+
+
+def test_closing_lets_go_of_everything() -> None:
+    receiver = Receiver(reliable=True)
+    receiver.whole(3)
+    receiver.piece(2, 0, 50, 100)
+    receiver.stream.close()
+    assert receiver.room.held_bytes == 0

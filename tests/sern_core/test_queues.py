@@ -1,0 +1,318 @@
+"""The sending side of one stream: what is kept, dropped, resent and reported, and that the counters always add up."""
+
+from random import Random
+
+import pytest
+from hypothesis import settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
+
+from sern_core.ledger import SendLedger
+from sern_core.message import Message, StreamId, StreamInfo, TopicInfo, TopicSpec
+from sern_core.queues import OutChannel, OutMessage
+from sern_core.types import ClientName, DropReason, Encoding, TopicName
+from tests.world import spec
+
+
+class Sender:
+    """A channel with a record of its drops; it is announced and wanted from the start."""
+
+    def __init__(self, topic_spec: TopicSpec, *, first: int = 1) -> None:
+        info = TopicInfo(TopicName("/t"), "", Encoding.RAW)
+        self.stream = StreamInfo(StreamId(ClientName("a"), 1, info.name), info, topic_spec)
+        self.ledger = SendLedger()
+        self.drops: list[tuple[int, DropReason]] = []
+        counters = self.ledger.topic(info.name, topic_spec.priority)
+        self.channel = OutChannel(
+            1, self.stream, counters, lambda out, reason: self.drops.append((out.seq, reason)), first=first
+        )
+        self.channel.wanted = self.channel.ready = True
+
+    def message(self, seq: int, size: int = 100, *, now: float = 0.0, replay: bool = False) -> Message:
+        return Message(self.stream.id, seq, bytes(size), 0, now, 0, replay)
+
+    def submit(self, count: int = 1, size: int = 100, *, now: float = 0.0) -> list[bool]:
+        channel = self.channel
+        return [channel.submit(self.message(channel.next_seq, size, now=now), now=now) for _ in range(count)]
+
+    def take(self, room: int = 1000, *, now: float = 0.0) -> tuple[OutMessage, int, int, int] | None:
+        out = self.channel.head(now)
+        if out is None:
+            return None
+        return (out, out.generation, *self.channel.take(out, room, now))
+
+    def check(self) -> None:
+        def check(ok: bool, text: str) -> None:
+            assert ok, text
+
+        self.channel.validate(check)
+        self.ledger.validate([(self.channel.counters, *self.channel.held())], check)
+
+    @property
+    def waiting(self) -> list[int]:
+        return [out.seq for out in self.channel.queue]
+
+
+def test_keep_last_drops_the_oldest_that_has_not_begun() -> None:
+    sender = Sender(spec(depth=2))
+    sender.submit(1, 5000)
+    assert sender.take() is not None  # 1 has begun
+    sender.submit(3)
+    assert sender.waiting == [3, 4] and sender.drops == [(2, DropReason.SUPERSEDED)]
+    head = sender.channel.head(0.0)
+    assert head is not None and head.seq == 1, "what has begun goes on"
+    sender.check()
+
+
+def test_a_rate_cap_lets_the_right_number_pass_in_spite_of_jitter() -> None:
+    sender = Sender(spec(depth=1000, max_rate_hz=10.0))
+    random = Random(1)
+    for index in range(1000):
+        sender.submit(now=0.02 * index + random.uniform(-0.005, 0.005))
+    passed = 1000 - sender.channel.counters.by_reason[DropReason.RATE_CAP]
+    assert passed == pytest.approx(200, abs=3)
+    sender.check()
+
+
+def test_a_lost_sample_is_not_sent_again_behind_a_fresher_one() -> None:
+    sender = Sender(spec())
+    sender.submit()
+    first = sender.take()
+    sender.submit()
+    second = sender.take()
+    assert first is not None and second is not None
+    assert sender.channel.fragment_lost(first[0], first[1], 0, 100, now=0.1) is False
+    assert sender.drops == [(1, DropReason.SUPERSEDED)]
+    assert sender.channel.fragment_lost(second[0], second[1], 0, 100, now=0.1) is True, "the newest is"
+    sender.check()
+
+
+def test_a_lost_sample_of_a_queue_is_not_sent_again_once_a_newer_one_has_arrived() -> None:
+    sender = Sender(spec(depth=10))
+    sender.submit(3)
+    parts = [sender.take() for _ in range(3)]
+    assert parts[0] is not None and parts[1] is not None
+    assert sender.channel.fragment_lost(parts[0][0], parts[0][1], 0, 100, now=0.1) is True
+    sender.channel.fragment_acked(parts[1][0], parts[1][1])
+    head = sender.channel.head(0.1)
+    assert head is None and sender.drops == [(1, DropReason.SUPERSEDED)]
+    sender.check()
+
+
+def test_a_large_sample_of_which_most_arrived_is_completed() -> None:
+    sender = Sender(spec())
+    sender.submit(1, 3000)
+    parts = [sender.take() for _ in range(3)]
+    sender.submit(1, 3000)
+    assert all(parts)
+    for part in parts[:2]:
+        assert part is not None
+        sender.channel.fragment_acked(part[0], part[1])
+    lost = parts[2]
+    assert lost is not None
+    assert sender.channel.fragment_lost(lost[0], lost[1], lost[2], lost[3], now=0.1) is True
+    again = sender.take()
+    assert again is not None and again[0].seq == 1 and again[2:] == (2000, 3000)
+    sender.check()
+
+
+def test_a_message_past_its_lifespan_is_neither_begun_nor_continued() -> None:
+    sender = Sender(spec(lifespan_s=1.0, depth=5))
+    sender.submit(2, 3000)
+    assert sender.take() is not None
+    sender.submit(1, now=1.5)
+    head = sender.channel.head(2.0)
+    assert head is not None and head.seq == 3
+    assert sender.drops == [(1, DropReason.LIFESPAN), (2, DropReason.LIFESPAN)]
+    sender.check()
+
+
+def test_the_uncertainty_of_an_age_counts_against_it() -> None:
+    sender = Sender(spec(lifespan_s=1.0))
+    message = sender.message(1)
+    message.error_s = 0.6
+    sender.channel.submit(message, now=0.0)
+    assert sender.channel.head(0.5) is None and sender.drops == [(1, DropReason.LIFESPAN)]
+
+
+def test_an_expired_reliable_message_becomes_a_tombstone_and_is_reported_once() -> None:
+    sender = Sender(spec(reliable=True, lifespan_s=1.0, retention_s=5.0))
+    sender.submit(2, 3000)
+    taken = sender.take()
+    assert taken is not None
+    head = sender.channel.head(2.0)
+    assert head is not None and head.message.tombstone and head.unsent_bytes == 1
+    sender.channel.fragment_acked(taken[0], taken[1])  # of the body that is no more
+    assert sender.channel.head(2.0) is head
+    for at_s in (2.0, 3.0, 10.0):
+        sender.channel.sweep(at_s, up=True)
+        sender.check()
+    assert sender.drops == [(1, DropReason.LIFESPAN), (2, DropReason.LIFESPAN)]
+    assert [out.seq for out in sender.channel.retained] == [1, 2], "kept until the peer's watermark passes them"
+
+
+def test_what_the_peer_has_whole_does_not_hide_what_has_expired_behind_it() -> None:
+    sender = Sender(spec(reliable=True, lifespan_s=1.0))
+    sender.submit(3)
+    taken = sender.take()
+    assert taken is not None
+    sender.channel.fragment_acked(taken[0], taken[1])
+    sender.channel.sweep(2.0, up=False)
+    assert sender.drops == [(2, DropReason.LIFESPAN), (3, DropReason.LIFESPAN)]
+    sender.check()
+
+
+def test_without_a_link_what_lapsed_is_left_behind() -> None:
+    sender = Sender(spec(reliable=True, retention_s=1.0))
+    sender.submit(3)
+    sender.channel.sweep(2.0, up=False)
+    assert sender.channel.watermark == 3 and not sender.channel.retained and sender.channel.first_seq == 4
+    sender.check()
+
+
+def test_a_reported_message_is_dropped_once_and_not_sent_to_a_new_peer() -> None:
+    sender = Sender(spec(reliable=True))
+    sender.submit(2)
+    parts = [sender.take(), sender.take()]
+    for part in parts:
+        assert part is not None
+        sender.channel.fragment_acked(part[0], part[1])
+    sender.channel.reported(1, DropReason.RATE_CAP)
+    sender.channel.reported(1, DropReason.RATE_CAP)
+    assert sender.drops == [(1, DropReason.RATE_CAP)]
+    sender.check()
+    sender.channel.peer_restarted()
+    assert [bool(out.message.tombstone) for out in sender.channel.queue] == [True, False]
+    sender.check()
+
+
+def test_a_new_peer_gets_everything_that_is_not_confirmed_again() -> None:
+    sender = Sender(spec(reliable=True))
+    sender.submit(4, 3000)
+    for _ in range(5):
+        assert sender.take() is not None
+    sender.channel.delivered_to(1)
+    sender.channel.peer_restarted()
+    assert sender.waiting == [2, 3, 4] and not sender.channel.flying
+    sender.check()
+
+
+def test_a_watermark_may_lie_beyond_what_was_submitted() -> None:
+    """The peer had more from an earlier run of this relay."""
+    sender = Sender(spec(reliable=True), first=5)
+    sender.channel.delivered_to(7)
+    assert sender.submit(5) == [True] * 5
+    assert sender.waiting == [8, 9] and sender.channel.counters.delivered == 3
+    sender.channel.reject(sender.message(10), DropReason.TOO_LARGE)
+    assert sender.drops == [(10, DropReason.TOO_LARGE)]
+    sender.check()
+
+
+def test_gaps_are_told_in_their_turn() -> None:
+    sender = Sender(spec(reliable=True))
+    sender.submit(2)
+    sender.channel.skip_to(10)
+    sender.submit(1)
+    assert sender.waiting == [1, 2, 10] and sender.channel.next_gap() is None
+    sender.channel.delivered_to(2)
+    assert sender.channel.next_gap() == 10 and sender.channel.watermark == 9 and sender.channel.next_gap() is None
+    sender.check()
+
+
+@pytest.mark.parametrize("reliable", [True, False])
+def test_replays_go_first_and_gaps_between_them_are_known(reliable: bool) -> None:
+    sender = Sender(spec(reliable=reliable, latched=True, depth=3), first=8)
+    sender.submit(1)
+    sender.channel.prime([sender.message(seq, replay=True) for seq in (2, 4, 7, 8)], now=100.0)
+    assert sender.waiting == ([2, 4, 7, 8] if reliable else [4, 7, 8])
+    if reliable:
+        assert sender.channel.watermark == 1 and list(sender.channel.gaps) == [(2, 4), (4, 7)]
+        sender.channel.sweep(120.0, up=True)
+        assert not sender.drops, "retention counts from the replay"
+    sender.check()
+
+
+class Channel(RuleBasedStateMachine):
+    """Whatever happens to a channel in whatever order, everything adds up and nothing is delivered twice."""
+
+    @initialize(
+        reliable=st.booleans(),
+        depth=st.integers(1, 4),
+        lifespan_s=st.sampled_from([None, 1.0]),
+        retention_s=st.sampled_from([100.0, 2.0]),
+    )
+    def begin(self, reliable: bool, depth: int, lifespan_s: float | None, retention_s: float) -> None:
+        self.now = 0.0
+        self.sender = Sender(spec(reliable=reliable, depth=depth, lifespan_s=lifespan_s, retention_s=retention_s))
+        self.flying: list[tuple[OutMessage, int, int, int]] = []
+
+    @rule(size=st.sampled_from([0, 1, 100, 3000]))
+    def submit(self, size: int) -> None:
+        self.sender.submit(1, size, now=self.now)
+
+    @rule(room=st.sampled_from([64, 1000]))
+    def take(self, room: int) -> None:
+        part = self.sender.take(room, now=self.now)
+        if part is not None:
+            self.flying.append(part)
+
+    @precondition(lambda self: bool(self.flying))
+    @rule(data=st.data(), lost=st.booleans())
+    def outcome(self, data: st.DataObject, lost: bool) -> None:
+        out, generation, start, end = self.flying.pop(data.draw(st.integers(0, len(self.flying) - 1)))
+        if lost:
+            self.sender.channel.fragment_lost(out, generation, start, end, now=self.now)
+        else:
+            self.sender.channel.fragment_acked(out, generation)
+
+    @precondition(lambda self: self.sender.channel.reliable)
+    @rule(ahead=st.integers(0, 3))
+    def confirm(self, ahead: int) -> None:
+        channel = self.sender.channel
+        channel.delivered_to(min(channel.watermark + ahead, channel.next_seq - 1))
+
+    @precondition(lambda self: self.sender.channel.reliable)
+    @rule(seq=st.integers(1, 10))
+    def report(self, seq: int) -> None:
+        self.sender.channel.reported(seq, DropReason.RATE_CAP)
+
+    @rule(seconds=st.sampled_from([0.1, 0.6, 3.0]), up=st.booleans())
+    def wait(self, seconds: float, up: bool) -> None:
+        self.now += seconds
+        self.sender.channel.sweep(self.now, up=up)
+
+    @rule()
+    def lose_session(self) -> None:
+        for out, generation, start, end in self.flying:
+            self.sender.channel.fragment_lost(out, generation, start, end, now=self.now)
+        self.flying.clear()
+
+    @rule()
+    def meet_a_new_peer(self) -> None:
+        self.lose_session()
+        self.sender.channel.peer_restarted()
+
+    @rule(wanted=st.booleans())
+    def answer(self, wanted: bool) -> None:
+        self.sender.channel.set_wanted(wanted)
+
+    @rule()
+    def drop_head(self) -> None:
+        self.sender.channel.drop_head(DropReason.STALE, self.now)
+
+    @rule()
+    def shed(self) -> None:
+        self.sender.channel.shed(DropReason.QUEUE_FULL)
+
+    @invariant()
+    def adds_up(self) -> None:
+        if hasattr(self, "sender"):
+            self.sender.check()
+            dropped = [seq for seq, _ in self.sender.drops]
+            assert len(dropped) == len(set(dropped)), "reported twice"
+
+
+TestChannel = Channel.TestCase
+TestChannel.settings = settings(
+    derandomize=True, database=None, deadline=None, max_examples=150, stateful_step_count=40
+)
