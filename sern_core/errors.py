@@ -6,7 +6,8 @@ SernError
 └── RemoteError           a peer did something wrong or said no
     ├── WireError         bytes that are not a valid frame
     ├── VersionError      no wire version in common
-    └── RefusedError      the peer refused us, with its reason
+    ├── RefusedError      the peer refused us, with its reason
+    └── ServiceError      a service call got no answer, and why
 
 Each renders as one line: what, where, what to do.
 """
@@ -61,3 +62,7 @@ class RefusedError(RemoteError):
     def __init__(self, code: str, problem: str) -> None:
         super().__init__(problem)
         self.code = code
+
+
+class ServiceError(RemoteError):
+    """A service call got no answer: no such service, an error of its own, the link, or the time. The caller is told."""

@@ -5,11 +5,12 @@ its business. All calls happen on the event-loop thread; an endpoint with thread
 `call_soon_threadsafe`.
 """
 
-from collections.abc import Callable
-from typing import Protocol
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
 
 from sern_core.message import TopicInfo
-from sern_core.types import TopicName
+from sern_core.types import Encoding, TopicName
 
 Sink = Callable[[bytes, int], bool]
 """`sink(body, stamp_ns) -> accepted`. False: refused (a reliable queue is full); the endpoint may hold the message
@@ -61,3 +62,47 @@ class Endpoint(Protocol):
     def exhausted(self) -> bool:
         """True when a finite source (a bag without loop) has offered all it has and all of it was accepted."""
         ...
+
+
+@dataclass(frozen=True, slots=True)
+class ServiceInfo:
+    """A service of one side. `type_name` is `pkg/srv/Type`, `definition` its .srv text (request, `---`, response) or
+    empty where nobody knows it, `type_hash` the md5sum (ROS 1) or RIHS01 hash (ROS 2), empty where unknown."""
+
+    name: TopicName
+    type_name: str
+    encoding: Encoding
+    type_hash: str
+    definition: str = ""
+
+
+ServiceHandler = Callable[[bytes], Awaitable[bytes]]
+"""`await handler(request_body) -> response_body`; raises ServiceError, whose text the caller is shown."""
+
+
+class ServiceEvents(Protocol):
+    """Told by the endpoint as services of this side come and go; calls are idempotent per service name."""
+
+    def service_added(self, info: ServiceInfo) -> None: ...
+
+    def service_removed(self, name: TopicName) -> None: ...
+
+
+class ServiceServer(Protocol):
+    def close(self) -> None:
+        """Withdraw the service; calls under way fail."""
+
+
+@runtime_checkable
+class ServiceEndpoint(Protocol):
+    """An endpoint that also knows services. `watch_services` is called once, before or after `start`.
+
+    `call` raises ServiceError when there is no such service, it answers with an error, or `timeout_s` passes. `serve`
+    raises ConfigError with one line when the type cannot be served here; its own services are never announced.
+    """
+
+    def watch_services(self, events: ServiceEvents) -> None: ...
+
+    async def call(self, name: TopicName, request: bytes, *, timeout_s: float) -> bytes: ...
+
+    def serve(self, info: ServiceInfo, handler: ServiceHandler) -> ServiceServer: ...
