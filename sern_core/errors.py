@@ -3,6 +3,7 @@
 SernError
 ├── UsageError            local misuse: the caller broke a documented duty
 ├── ConfigError           a file a person wrote is wrong (file, line, key path, what is accepted)
+├── BodyError             a message body that does not fit its type, or a layout that is not read here
 └── RemoteError           a peer did something wrong or said no
     ├── WireError         bytes that are not a valid frame
     ├── VersionError      no wire version in common
@@ -42,6 +43,10 @@ class ConfigError(SernError):
             where += f":{self.line}"
         parts = [part for part in (where, self.key, self.problem) if part]
         return ": ".join(parts)
+
+
+class BodyError(SernError):
+    """The bytes of a message do not fit its type, or are laid out in a way that is not read here."""
 
 
 class RemoteError(SernError):
