@@ -6,7 +6,9 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Final
 
+from sern_client.conversion import Converter
 from sern_client.endpoints.base import Endpoint, Publisher, Subscription
+from sern_client.endpoints.composite import CompositeEndpoint
 from sern_client.frames import FramePrefixer, Rewrite
 from sern_client.message_log import MessageLog
 from sern_client.udp import ClientLane
@@ -78,6 +80,7 @@ class Bridge:
         self.discovery = discovery
         self.namespace = namespace
         self.frames = FramePrefixer(frame_prefix)
+        self.converter = endpoint.converter if isinstance(endpoint, CompositeEndpoint) else Converter()
         self.ages = AgeHistograms()
         self.rejected_reason: str | None = None
         self.lane: ClientLane | None = None
@@ -213,7 +216,7 @@ class Bridge:
             resolved = self.rules.resolve(info, local_name=local)
             if not resolved.direction.receives:
                 raise ConfigError(f"{local} is only sent from here (direction: send); not received")
-            publisher = self.endpoint.advertise(info)
+            publisher = self.converter.advertise(self.endpoint, info)
         except ConfigError as error:
             _log.error("%s from %s is not received: %s", stream.id.topic, stream.id.origin, error)
             raise

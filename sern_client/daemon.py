@@ -213,6 +213,11 @@ class ClientDaemon:
             read=lambda: [((), float(self.bridge.frames.unreadable))],
         )
         metrics.counter(
+            "sern_conversion_failures_total",
+            "Messages dropped because they could not be converted between ROS 1 and ROS 2.",
+            read=lambda: [((), float(self.bridge.converter.failures))],
+        )
+        metrics.counter(
             "sern_publish_failures_total",
             "Messages that arrived and could not be published here.",
             read=lambda: [((), float(self.bridge.publish_failures))],

@@ -9,15 +9,17 @@ connection headers carry: the type itself, then every type it uses below a line 
 """
 
 import re
+from collections.abc import Callable
 from functools import cache, lru_cache
 from hashlib import md5
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 from rosbags.interfaces import Nodetype
-from rosbags.interfaces.typing import FieldDesc, Typesdict
+from rosbags.interfaces.typing import BaseDesc, Basetype, Fielddefs, FieldDesc, NameDesc, Typesdict
 from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, TypesysError, get_types_from_idl, get_types_from_msg, get_typestore
+from rosbags.typesys.base import normalize_fieldname
 from rosbags.typesys.store import Typestore
 
 from sern_core.errors import ConfigError, UsageError
@@ -39,6 +41,13 @@ _ROS1_BUILTIN: Final = frozenset(
     {"bool", "int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", "uint64"}
     | {"float32", "float64", "string", "time", "duration", "char", "byte"}
 )
+_NO_FIELDS: Final[Fielddefs] = [("structure_needs_at_least_one_member", (Nodetype.BASE, ("uint8", 0)))]
+"""What ROS 2 puts into a type without fields, because IDL has no empty structs; ROS 1 sends nothing for it."""
+_ONE_BYTE: Final = frozenset({"byte", "char", "int8", "uint8"})
+_BY_VALUE: Final = frozenset(
+    {"sensor_msgs/msg/Range", "shape_msgs/msg/SolidPrimitive", "visualization_msgs/msg/Marker"}
+)
+"""Types that ROS 2 extended: what only one side has is zero on the way there and lost on the way back."""
 _STOPPABLE: Final = frozenset({"geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"})
 
 
@@ -47,6 +56,23 @@ class TypeText(NamedTuple):
 
     definition: str
     type_hash: str
+
+
+class ResolvedType(NamedTuple):
+    """A type that can be read and written: the store that holds it, and what a publisher must say of it."""
+
+    name: str
+    encoding: Encoding
+    store: Typestore
+    text: TypeText
+
+
+class Counterpart(NamedTuple):
+    """The same type in the other encoding. `same_layout`: bodies differ only in how they are serialised, so they can
+    be converted without reading them; otherwise field by field."""
+
+    type: ResolvedType
+    same_layout: bool
 
 
 def canonical(type_name: str) -> str:
@@ -84,7 +110,7 @@ def describe(type_name: str, encoding: Encoding) -> TypeText | None:
         return None
     if encoding is Encoding.ROS1:
         return TypeText(*store.generate_msgdef(name, ros_version=1))
-    return TypeText(store.generate_msgdef(name, ros_version=2)[0], store.hash_rihs01(name))
+    return TypeText(store.generate_msgdef(name, ros_version=2)[0], rihs01(store, name))
 
 
 def topic_info(
@@ -109,12 +135,12 @@ def hash_of(type_name: str, definition: str, encoding: Encoding) -> str:
     types = _parse(name, definition)
     try:
         if encoding is Encoding.ROS1:
-            return _ros1_md5(name, definition)
+            return md5(ros1_md5_text(name, definition).encode(), usedforsecurity=False).hexdigest()
         scratch = get_typestore(Stores.EMPTY)
         # rosbag2 texts may leave out types that every ROS 2 install has.
         scratch.fielddefs.update(typestore(Encoding.CDR).fielddefs)
         scratch.fielddefs.update(types)
-        return scratch.hash_rihs01(name)
+        return rihs01(scratch, name)
     except (KeyError, RecursionError) as error:
         raise ConfigError(f"type {name}: its definition uses a type it does not define ({error})") from None
 
@@ -140,6 +166,140 @@ def register(type_name: str, definition: str, encoding: Encoding) -> None:
     describe.cache_clear()
 
 
+@lru_cache(maxsize=512)
+def resolve(type_name: str, definition: str, encoding: Encoding) -> ResolvedType:
+    """A type as its definition text has it, or as it is known here when the text is empty.
+
+    Two versions of a type do not get in each other's way: one that differs from the known type has a store of its own.
+    ConfigError when there is no definition, or it cannot be read.
+    """
+    name = canonical(type_name)
+    shared = typestore(encoding)
+    if not definition:
+        text = describe(name, encoding)
+        if text is None:
+            raise ConfigError(f"type {name} is unknown here, and its definition did not come with it")
+        return ResolvedType(name, encoding, shared, text)
+    text = TypeText(definition, hash_of(name, definition, encoding))
+    return ResolvedType(name, encoding, _store_with(_parse(name, definition), shared), text)
+
+
+@lru_cache(maxsize=512)
+def counterpart(type_name: str, definition: str, encoding: Encoding) -> Counterpart:
+    """The type of the other encoding (ROS 1 for CDR, CDR for ROS 1) that stands for this one.
+
+    A type that is known there is taken from there and must have the same fields; `_BY_VALUE` are the known exceptions.
+    Any other is made up from the definition: fields of the same names (lower case in ROS 2, which allows no other)
+    and without bounds in ROS 1, which has none. ConfigError when that does not work out.
+    """
+    source = resolve(type_name, definition, encoding)
+    other = Encoding.CDR if encoding is Encoding.ROS1 else Encoding.ROS1
+    shared = typestore(other)
+    made: Typesdict = {}
+    same_layout = True
+    for name in used_by(source.name, source.store.fielddefs):
+        fields = source.store.fielddefs[name]
+        if name in shared.fielddefs:
+            same_layout &= _same_layout(name, fields[1], shared.fielddefs[name][1], other)
+        else:
+            made[name] = (fields[0], _translated(name, fields[1], other))
+    store = _store_with(made, shared)
+    try:
+        definition, md5sum = store.generate_msgdef(source.name, ros_version=1 if other is Encoding.ROS1 else 2)
+    except (TypesysError, RecursionError) as error:
+        raise ConfigError(f"type {source.name} cannot be converted to {other}: {one_line(error)}") from None
+    type_hash = md5sum if other is Encoding.ROS1 else rihs01(store, source.name)
+    return Counterpart(ResolvedType(source.name, other, store, TypeText(definition, type_hash)), same_layout)
+
+
+def _store_with(types: Typesdict, shared: Typestore) -> Typestore:
+    """`shared` where it has these types or none of them is given, else a store of their own on top of it."""
+    if all(name in shared.fielddefs and shared.fielddefs[name][1] == types[name][1] for name in types):
+        return shared
+    own = get_typestore(Stores.EMPTY)
+    own.fielddefs.update({key: value for key, value in shared.fielddefs.items() if key not in types})
+    own.types.update({key: value for key, value in shared.types.items() if key not in types})
+    try:
+        own.register(types)
+    except (TypesysError, SyntaxError) as error:
+        raise ConfigError(f"type {next(iter(types))}: {one_line(error)}") from None
+    return own
+
+
+def used_by(type_name: str, fielddefs: Typesdict) -> list[str]:
+    """A type and every type it uses, each once, itself first."""
+    found = [type_name]
+    for name in found:
+        for _, desc in fielddefs[name][1]:
+            inner = desc[1][0] if desc[0] in {Nodetype.ARRAY, Nodetype.SEQUENCE} else desc
+            if inner[0] == Nodetype.NAME and inner[1] not in found:
+                found.append(str(inner[1]))
+    return found
+
+
+def _same_layout(name: str, mine: Fielddefs, theirs: Fielddefs, other: Encoding) -> bool:
+    """Whether the fields of one type follow each other alike in both. ConfigError when it cannot be converted."""
+    ours = [(key.lower(), _layout(desc)) for key, desc in mine if (name, key) != ("std_msgs/msg/Header", "seq")]
+    known = [(key.lower(), _layout(desc)) for key, desc in theirs if (name, key) != ("std_msgs/msg/Header", "seq")]
+    if ours == known:
+        return True
+    if name in _BY_VALUE:
+        return False
+    odd = sorted({key for key, _ in set(ours) ^ set(known)}) or [key for key, _ in ours]
+    raise ConfigError(
+        f"type {name} cannot be converted: its {other} version known here differs in {', '.join(odd[:5])}; "
+        "both sides need the same fields"
+    )
+
+
+def _layout(desc: FieldDesc) -> tuple[object, ...]:
+    """A field's type without what does not show in its bytes: bounds, and the sign of a byte."""
+    if desc[0] == Nodetype.BASE:
+        base = str(desc[1][0])
+        return ("uint8" if base in _ONE_BYTE else base,)
+    if desc[0] == Nodetype.NAME:
+        return (str(desc[1]),)
+    return (desc[0], _layout(desc[1][0]), desc[1][1] if desc[0] == Nodetype.ARRAY else 0)
+
+
+def _translated(name: str, fields: Fielddefs, other: Encoding) -> Fielddefs:
+    """The fields of a type that only one side has, as the other side would write them."""
+    if other is Encoding.ROS1:
+        odd = [key for key, desc in fields if "float128" in repr(desc)]
+        if odd:
+            raise ConfigError(f"type {name} cannot be converted to ros1: no float128 there ({odd[0]})")
+        return [(key, _each_base(desc, lambda base: (base[0], 0), bounds=False)) for key, desc in fields]
+    if len({key.lower() for key, _ in fields}) != len(fields):
+        raise ConfigError(f"type {name} cannot be converted to cdr: two of its fields differ in case only")
+    return [(key.lower(), desc) for key, desc in fields]
+
+
+def _each_base(desc: FieldDesc, change: Callable[[Basetype], Basetype], *, bounds: bool = True) -> FieldDesc:
+    """A field's type with its base type changed, and with or without the bound of a sequence."""
+    if desc[0] == Nodetype.BASE:
+        return (Nodetype.BASE, change(desc[1]))
+    if desc[0] == Nodetype.NAME:
+        return desc
+    inner, size = desc[1]
+    item: BaseDesc | NameDesc = inner if inner[0] == Nodetype.NAME else (Nodetype.BASE, change(inner[1]))
+    if desc[0] == Nodetype.ARRAY:
+        return (Nodetype.ARRAY, (item, size))
+    return (Nodetype.SEQUENCE, (item, size if bounds else 0))
+
+
+def rihs01(store: Typestore, type_name: str) -> str:
+    """The RIHS01 hash (REP 2011). ROS 2 makes uint8 of a .msg's `char` before it hashes, the typestore does not."""
+    scratch = get_typestore(Stores.EMPTY)
+    for name in used_by(type_name, store.fielddefs):
+        constants, fields = store.fielddefs[name]
+        scratch.fielddefs[name] = (constants, [(key, _each_base(desc, _char_as_uint8)) for key, desc in fields])
+    return scratch.hash_rihs01(type_name)
+
+
+def _char_as_uint8(base: Basetype) -> Basetype:
+    return ("uint8", 0) if base[0] == "char" else base
+
+
 def serialise(message: object, type_name: str, encoding: Encoding) -> bytes:
     """Message object -> body."""
     store = typestore(encoding)
@@ -163,12 +323,21 @@ def deserialise(body: bytes, type_name: str, encoding: Encoding) -> Any:
 
 def new(type_name: str, encoding: Encoding, /, **fields: Any) -> Any:
     """A message object of this type, zero in every field but those given by name. UsageError for an unknown field."""
-    store = typestore(encoding)
+    return new_in(typestore(encoding), type_name, **fields)
+
+
+def new_in(store: Typestore, type_name: str, /, **fields: Any) -> Any:
+    """As `new`, of a type in any typestore."""
     definition = store.fielddefs[type_name][1]
     if fields and not fields.keys() <= {name for name, _ in definition}:
         raise UsageError(f"{type_name} has no field {sorted(fields.keys() - {name for name, _ in definition})}")
-    values = {name: fields[name] if name in fields else _zero(desc, encoding) for name, desc in definition}
+    values = {attribute(name): fields[name] if name in fields else zero(desc, store) for name, desc in definition}
     return store.types[type_name](**values)
+
+
+def attribute(field: str) -> str:
+    """What a field is called in message objects: a Python keyword gets an underscore."""
+    return normalize_fieldname(field)
 
 
 def time_of(stamp_ns: int, encoding: Encoding) -> Any:
@@ -192,19 +361,19 @@ def zero_message(type_name: str, encoding: Encoding) -> bytes | None:
     return serialise(new(name, encoding), name, encoding)
 
 
-def _zero(desc: FieldDesc, encoding: Encoding) -> Any:
+def zero(desc: FieldDesc, store: Typestore) -> Any:
     """The zero of one field: number, string, message, numpy array of numbers, or list of strings or messages."""
     if desc[0] == Nodetype.BASE:
         base = str(desc[1][0])
         return "" if base == "string" else False if base == "bool" else 0.0 if base.startswith("float") else 0
     if desc[0] == Nodetype.NAME:
-        return new(str(desc[1]), encoding)
+        return new_in(store, str(desc[1]))
     item, count = desc[1]
     length = int(count) if desc[0] == Nodetype.ARRAY else 0
     if item[0] == Nodetype.BASE and item[1][0] != "string":
         base = str(item[1][0])
         return np.zeros(length, dtype="uint8" if base in {"byte", "char"} else base)
-    return [_zero(item, encoding) for _ in range(length)]
+    return [zero(item, store) for _ in range(length)]
 
 
 def _parse(type_name: str, definition: str) -> Typesdict:
@@ -212,18 +381,23 @@ def _parse(type_name: str, definition: str) -> Typesdict:
         raise ConfigError(f"type {type_name}: its definition of {len(definition)} characters is over the limit")
     idl_mark = f"{_SEPARATOR}\nIDL: "
     try:
-        if not definition.startswith(idl_mark):
-            return get_types_from_msg(definition, type_name)
         types: Typesdict = {}
-        for part in definition.split(f"{_SEPARATOR}\n")[1:]:
-            types.update(get_types_from_idl(part.partition("\n")[2]))
-        return types
+        if not definition.startswith(idl_mark):
+            # The parser knows messages only; half of a service is one of another name.
+            parsed = type_name.replace("/srv/", "/msg/")
+            types = get_types_from_msg(definition, parsed)
+            types[type_name] = types.pop(parsed)
+        else:
+            for part in definition.split(f"{_SEPARATOR}\n")[1:]:
+                types.update(get_types_from_idl(part.partition("\n")[2]))
+        return {name: (constants, fields or _NO_FIELDS) for name, (constants, fields) in types.items()}
     except (TypesysError, RecursionError) as error:
         raise ConfigError(f"type {type_name}: its definition cannot be parsed: {one_line(error)}") from None
 
 
-def _ros1_md5(type_name: str, definition: str) -> str:
-    """ROS 1 md5sum (wiki.ros.org/ROS/Technical%20Overview): constants as written, then fields, types by their md5.
+def ros1_md5_text(type_name: str, definition: str) -> str:
+    """What the ROS 1 md5sum of a type is taken of: constants as written, then fields, types by their own md5sum
+    (wiki.ros.org/ROS/Technical%20Overview).
 
     Worked out from the text, not from the parsed types: a constant counts as it is spelt (`0x0F`, `1e-3`).
     """
@@ -236,12 +410,16 @@ def _ros1_md5(type_name: str, definition: str) -> str:
         elif line.rstrip() != _SEPARATOR:
             texts[current] += line + "\n"
     sums: dict[str, str] = {}
-    return _ros1_md5_of(ros1_name(type_name), texts, sums)
+    return _ros1_md5_text(ros1_name(type_name), texts, sums)
 
 
 def _ros1_md5_of(name: str, texts: dict[str, str], sums: dict[str, str]) -> str:
-    if name in sums:
-        return sums[name]
+    if name not in sums:
+        sums[name] = md5(_ros1_md5_text(name, texts, sums).encode(), usedforsecurity=False).hexdigest()
+    return sums[name]
+
+
+def _ros1_md5_text(name: str, texts: dict[str, str], sums: dict[str, str]) -> str:
     constants, fields = [], []
     for line in texts[name].splitlines():
         clean = line.partition("#")[0].strip()
@@ -261,8 +439,7 @@ def _ros1_md5_of(name: str, texts: dict[str, str], sums: dict[str, str]) -> str:
         if "/" not in element:
             element = "std_msgs/Header" if element == "Header" else f"{name.partition('/')[0]}/{element}"
         fields.append(f"{_ros1_md5_of(element, texts, sums)} {rest.strip()}")
-    sums[name] = md5("\n".join(constants + fields).encode(), usedforsecurity=False).hexdigest()
-    return sums[name]
+    return "\n".join(constants + fields)
 
 
 def one_line(error: BaseException) -> str:

@@ -190,6 +190,11 @@ class BagEndpoint:
         self._audience.set()
 
     @property
+    def encoding(self) -> None:
+        """Takes nothing, so it asks for no conversion."""
+        return None
+
+    @property
     def exhausted(self) -> bool:
         """The last message was offered (or playback ended with `problem`) and no latched one still waits."""
         return self._finished and not any(s.backlog for t in self._topics.values() for s in t.subscriptions)

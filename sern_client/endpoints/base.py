@@ -59,6 +59,11 @@ class Endpoint(Protocol):
         """
 
     @property
+    def encoding(self) -> Encoding | None:
+        """The one encoding that `advertise` takes; None: any. What comes in another is converted for it."""
+        ...
+
+    @property
     def exhausted(self) -> bool:
         """True when a finite source (a bag without loop) has offered all it has and all of it was accepted."""
         ...

@@ -4,6 +4,7 @@ import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
+from sern_client.conversion import Converter
 from sern_client.endpoints.base import Endpoint, Publisher, Sink, Subscription, TopicEvents
 from sern_core.errors import ConfigError, UsageError
 from sern_core.message import TopicInfo
@@ -65,6 +66,7 @@ class CompositeEndpoint:
     def __init__(self, endpoints: Sequence[Endpoint]) -> None:
         if not endpoints:
             raise UsageError("a composite endpoint needs at least one member")
+        self.converter = Converter()
         self._members = list(endpoints)
         self._events: TopicEvents | None = None
         self._started: list[Endpoint] = []
@@ -108,7 +110,7 @@ class CompositeEndpoint:
         refusals: list[ConfigError] = []
         for member in self._members:
             try:
-                publishers.append(member.advertise(info))
+                publishers.append(self.converter.advertise(member, info))
             except ConfigError as error:
                 refusals.append(error)
         if publishers:
@@ -120,6 +122,11 @@ class CompositeEndpoint:
     def interest(self, name: TopicName, wanted: bool) -> None:
         for index in self._givers.get(name, ()):
             self._members[index].interest(name, wanted)
+
+    @property
+    def encoding(self) -> None:
+        """Each member says for itself."""
+        return None
 
     @property
     def exhausted(self) -> bool:

@@ -139,6 +139,11 @@ class RecordEndpoint:
         """Makes no difference here."""
 
     @property
+    def encoding(self) -> None:
+        """Records every encoding as it is."""
+        return None
+
+    @property
     def exhausted(self) -> bool:
         """Always true: a recorder offers nothing."""
         return True

@@ -212,6 +212,11 @@ class SyntheticEndpoint:
         """Makes no difference here."""
 
     @property
+    def encoding(self) -> None:
+        """Reads commands in either encoding."""
+        return None
+
+    @property
     def exhausted(self) -> bool:
         """Never: the simulation goes on."""
         return False

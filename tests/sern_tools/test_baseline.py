@@ -49,6 +49,10 @@ class Source:
         raise UsageError("publishes nothing")
 
     @property
+    def encoding(self) -> None:
+        return None
+
+    @property
     def exhausted(self) -> bool:
         return False
 

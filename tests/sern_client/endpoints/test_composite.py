@@ -27,8 +27,9 @@ STRING = topic_info(CHAT, "std_msgs/msg/String", Encoding.ROS1)
 class Fake:
     """An endpoint under the test's hand."""
 
-    def __init__(self, problem: str = "") -> None:
+    def __init__(self, problem: str = "", takes: Encoding | None = None) -> None:
         self.problem = problem
+        self.takes = takes
         self.events: TopicEvents | None = None
         self.sinks: list[Sink] = []
         self.got: list[bytes] = []
@@ -71,6 +72,10 @@ class Fake:
                 fake.got.append(b"closed")
 
         return Out()
+
+    @property
+    def encoding(self) -> Encoding | None:
+        return self.takes
 
     @property
     def exhausted(self) -> bool:
@@ -184,3 +189,12 @@ async def test_the_far_side_s_interest_reaches_those_that_give_the_topic(events:
     assert giver.interests == [(STRING.name, True)]
     assert other.interests == []
     await endpoint.stop()
+
+
+def test_each_member_gets_the_encoding_it_takes() -> None:
+    one, two = Fake(takes=Encoding.ROS1), Fake(takes=Encoding.CDR)
+    whole = CompositeEndpoint([one, two])
+    whole.advertise(STRING).publish(b"\x02\0\0\0hi", 1)
+    assert one.got == [b"\x02\0\0\0hi"]
+    assert two.got == [b"\0\x01\0\0\x03\0\0\0hi\0"]
+    assert whole.encoding is None and whole.converter.failures == 0
