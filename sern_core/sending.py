@@ -42,6 +42,9 @@ SWEEP_INTERVAL_S: Final = 0.25
 RATE_INTERVAL_S: Final = 0.05
 MIN_SHARE_BYTES: Final = 64
 """A fragment smaller than this is not worth its header: the datagram ends instead."""
+RIDE_BYTES: Final = 256
+"""So much of a control message travels with each datagram of class 0: where class 0 alone keeps the window shut, what
+would open a better lane, or another stream, must come through all the same."""
 MAX_WATERMARKS: Final = 64
 
 
@@ -292,7 +295,8 @@ class Sender(ABC):
     def _compose(self, frames: list[bytes], items: list[SentData | SentWatermark | SentPing], now: float) -> None:
         """Fill one datagram: watermarks, then what the scheduler picks, of one class; control ahead of all but class 0.
 
-        Control keeps to the window like everything below class 0: a thousand announcements must not fill the path.
+        Control keeps to the window like everything below class 0, as a thousand announcements must not fill the path;
+        but a little of it rides in each datagram of class 0, at the cost of that class's share.
         """
         lane = self.lane
         limit = lane.fragment_bytes - (wire.ACK.size if lane.arrivals.unacked else 0)
@@ -305,15 +309,20 @@ class Sender(ABC):
         while size < limit - MIN_SHARE_BYTES:
             chosen = self._pick(now, window_open=window_open)
             channel = self.channels[chosen] if chosen is not None else None
+            rides = served is PriorityClass.CONTROL and not window_open
             if (
                 (control.queue or control.active)
-                and window_open
-                and (channel is None or channel.spec.priority is not PriorityClass.CONTROL)
+                and (rides or (window_open and (channel is None or channel.spec.priority is not PriorityClass.CONTROL)))
                 and (order := control.head(now)) is not None
             ):
-                size = self._put(control, order, frames, items, size, limit, now)
+                before = size
+                end = min(limit, size + wire.DATA_FIRST_BYTES + RIDE_BYTES) if rides else limit
+                size = self._put(control, order, frames, items, size, end, now)
                 if not order.has_unsent:
                     self._control_sent(order.seq)
+                if rides:
+                    self.scheduler.charge(PriorityClass.CONTROL, size - before, now=now)
+                    break
                 continue
             if channel is None:
                 break

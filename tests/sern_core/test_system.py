@@ -2,6 +2,7 @@
 
 import pytest
 
+from sern_core.control.fixed import FixedWindow
 from sern_core.types import PriorityClass
 from sern_sim.models import LinkModel
 from tests.world import World, spec
@@ -65,4 +66,23 @@ def test_reliable_survives_a_relay_restart_once_and_in_order(lossless: bool) -> 
     world.run(20.0)
     assert [got.body for got in site.got] == bodies
     assert log.counters.delivered == 400
+    world.validate()
+
+
+def test_urgent_messages_that_keep_the_window_shut_leave_a_way_for_what_must_be_said() -> None:
+    """Class control passes the window, and its bytes in flight alone are more than the window."""
+    world = World()
+    robot = world.client("robot", thin(rate_bps=1e6, delay_s=0.25))
+    site = world.client("site", patterns=["/robot/.*"])
+    pose = robot.publish("/robot/pose", spec(PriorityClass.CONTROL))
+    robot.every(0.02, pose, b"p" * 700)
+    world.until(lambda: site.on("/robot/pose"), what="poses")
+    lane = robot.core.link.lane
+    lane.estimator = FixedWindow(1_000, rate_bps=1e6)
+    world.run(2.0)
+    shut: list[bool] = []
+    world.network.every(0.001, lambda _now: shut.append(not lane.window_open))
+    robot.publish("/robot/chat", spec(reliable=True), definition="string data")
+    world.until(lambda: len(site.opened) == 2, what="the site hears of another stream")
+    assert shut and all(shut)
     world.validate()
