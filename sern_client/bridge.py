@@ -11,6 +11,7 @@ from sern_client.endpoints.base import Endpoint, Publisher, Subscription
 from sern_client.endpoints.composite import CompositeEndpoint
 from sern_client.frames import FramePrefixer, Rewrite
 from sern_client.message_log import MessageLog
+from sern_client.services import ServiceBridge
 from sern_client.udp import ClientLane
 from sern_core import wire
 from sern_core.client import ClientCore
@@ -19,6 +20,7 @@ from sern_core.lease import CommandLease
 from sern_core.message import Message, StreamId, StreamInfo, TopicInfo
 from sern_core.queues import OutChannel
 from sern_core.rules import Discovery, RuleSet, to_global
+from sern_core.services import parse as parse_service
 from sern_core.types import DropReason, TopicName
 from sern_runtime import ros_types
 from sern_runtime.link_metrics import AgeHistograms
@@ -85,6 +87,8 @@ class Bridge:
         self.rejected_reason: str | None = None
         self.lane: ClientLane | None = None
         """The datagram lane, where there is one; set by the daemon."""
+        self.services: ServiceBridge | None = None
+        """Services offered and used, where there are rules for them; set by the daemon."""
         self.refusals = 0
         self.subscription_problems: dict[str, str] = {}
         """What the relay does not let us have, in its words, with the code."""
@@ -210,6 +214,11 @@ class Bridge:
             self.lane.closed()
 
     def stream_opened(self, stream: StreamInfo) -> None:
+        if parse_service(stream.id.topic) is not None:
+            if self.services is None:
+                raise ConfigError(f"{stream.id.topic} is of a service; nothing in `services` here")
+            self.services.stream_opened(stream)
+            return
         local = self.rules.inward(stream.id.topic, namespace=self.namespace)
         info = replace(stream.info, name=local)
         try:
@@ -231,6 +240,8 @@ class Bridge:
         _log.info("receiving %s from %s as %s", stream.id.topic, stream.id.origin, local)
 
     def stream_closed(self, stream: StreamInfo) -> None:
+        if self.services is not None:
+            self.services.stream_closed(stream)
         incoming = self._incoming.pop(stream.id, None)
         self._last_arrival_s.pop(stream.id, None)
         if incoming is not None:
@@ -240,6 +251,8 @@ class Bridge:
     def message(self, stream: StreamInfo, message: Message, *, now: float) -> None:
         incoming = self._incoming.get(stream.id)
         if incoming is None:
+            if self.services is not None:
+                self.services.message(stream, message)
             return
         age_s = now - message.born_s
         body = message.body if incoming.rewrite is None else incoming.rewrite(message.body)
@@ -277,6 +290,8 @@ class Bridge:
                 break
 
     def send_dropped(self, stream: StreamInfo, seq: int, reason: DropReason) -> None:
+        if self.services is not None:
+            self.services.send_dropped(stream, seq, reason)
         if stream.spec.reliable:
             _log.warning("%s: our reliable message %d was dropped: %s", stream.id.topic, seq, reason)
 

@@ -18,8 +18,8 @@ from rosbags.interfaces import Nodetype
 from rosbags.interfaces.typing import FieldDesc
 from rosbags.serde import SerdeError
 
-from sern_client.endpoints.base import Endpoint, Publisher, ServiceInfo
-from sern_core.errors import ConfigError
+from sern_client.endpoints.base import Endpoint, Publisher, ServiceEndpoint, ServiceHandler, ServiceInfo, ServiceServer
+from sern_core.errors import ConfigError, ServiceError
 from sern_core.message import TopicInfo
 from sern_core.types import Encoding
 from sern_runtime import ros_services, ros_types
@@ -109,6 +109,22 @@ class Converter:
         other, convert = converted(info, wanted)
         _log.info("%s: %s is converted from %s to %s", info.name, info.type_name, info.encoding, wanted)
         return _Converting(self, info, endpoint.advertise(other), convert)
+
+
+def serve(endpoint: ServiceEndpoint, info: ServiceInfo, handler: ServiceHandler) -> ServiceServer:
+    """As `ServiceEndpoint.serve`, with requests and responses converted where the endpoint wants another encoding."""
+    wanted = endpoint.encoding
+    if wanted is None or wanted is info.encoding:
+        return endpoint.serve(info, handler)
+    other, request_back, response_on = converted_service(info, wanted)
+
+    async def convert(request: bytes) -> bytes:
+        try:
+            return response_on(await handler(request_back(request)))
+        except ConfigError as error:
+            raise ServiceError(str(error)) from None
+
+    return endpoint.serve(other, convert)
 
 
 class _Converting:

@@ -14,8 +14,10 @@ import zmq
 from prometheus_client import CollectorRegistry
 
 from sern_client.bridge import Bridge
+from sern_client.endpoints.base import Endpoint, ServiceEndpoint
 from sern_client.factory import make_endpoint
 from sern_client.message_log import MessageLog
+from sern_client.services import ServiceBridge
 from sern_client.transport import RelayTransport
 from sern_client.udp import ClientLane
 from sern_core.client import ClientCore
@@ -23,7 +25,7 @@ from sern_core.errors import ConfigError
 from sern_core.trace import DecisionTrace
 from sern_core.types import CLASS_LABELS, ObjectKind
 from sern_runtime.config.base import split_tcp
-from sern_runtime.config.client import ClientFile, load_client
+from sern_runtime.config.client import ClientFile, ServicesSection, load_client
 from sern_runtime.config.load import Loaded
 from sern_runtime.entry import blamed_on, end_tasks, log_warnings, serve
 from sern_runtime.http import Health, HttpServer
@@ -90,6 +92,7 @@ class ClientDaemon:
         )
         self.bridge.attach(self.core)
         self.core.subscribe(model.subscribe_patterns(), now=now)
+        self._serve_services(endpoint)
         self.reason = "not connected yet"
         self._said: set[str] = set()  # since the last session: an attempt that fails as before is no news
         self._ctx: zmq.Context[zmq.Socket[bytes]] | None = None
@@ -99,6 +102,22 @@ class ClientDaemon:
         self.tasks: list[asyncio.Task[None]] = []
         self._endpoint_started = False
         self._stopping = False
+
+    def _serve_services(self, endpoint: Endpoint) -> None:
+        """Where the file has service rules, an endpoint must know services."""
+        model = self.loaded.model
+        offer, use = model.offered_services(), model.used_services()
+        if not offer and not use:
+            return
+        if not isinstance(endpoint, ServiceEndpoint) and model.services == ServicesSection():
+            return  # actions of ROS 1 are topics
+        with blamed_on(self.loaded.path, "services"):
+            if not isinstance(endpoint, ServiceEndpoint):
+                kind = model.endpoints[0].kind
+                raise ConfigError(f"an endpoint of kind {kind} has no services; leave the section out")
+            self.bridge.services = ServiceBridge(
+                self.core, endpoint, offer=offer, use=use, namespace=model.namespace, kick=self._kick
+            )
 
     async def start(self) -> None:
         model = self.loaded.model
@@ -218,6 +237,12 @@ class ClientDaemon:
             read=lambda: [((), float(self.bridge.converter.failures))],
         )
         metrics.counter(
+            "sern_service_calls_total",
+            "Calls from here of services of other sites, by outcome: ok, error, timeout.",
+            ("service", "outcome"),
+            self._service_calls,
+        )
+        metrics.counter(
             "sern_publish_failures_total",
             "Messages that arrived and could not be published here.",
             read=lambda: [((), float(self.bridge.publish_failures))],
@@ -238,6 +263,10 @@ class ClientDaemon:
                 "/api/trace": self.core.trace.to_json,
             },
         )
+
+    def _service_calls(self) -> list[tuple[tuple[str, str], float]]:
+        services = self.bridge.services
+        return [] if services is None else [(labels, float(count)) for labels, count in services.outcomes.items()]
 
     def _ready(self) -> Health:
         if self.core.link.established:
@@ -296,6 +325,8 @@ class ClientDaemon:
             if self._endpoint_started:
                 stack.push_async_callback(self.bridge.endpoint.stop)
             stack.callback(self.bridge.close)
+            if self.bridge.services is not None:
+                stack.push_async_callback(self.bridge.services.stop)
             if self._transport is not None:
                 stack.callback(self._transport.close)
             if self._lane is not None:

@@ -238,6 +238,8 @@ class RuleSet:
 
     rules: tuple[TopicRule, ...] = ()
     retention_s: float = DEFAULT_RETENTION_S
+    implied: int = 0
+    """So many rules at the front follow from other sections: places in messages count from the one after them."""
     _inward: dict[TopicName, TopicName] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -245,12 +247,14 @@ class RuleSet:
         for index, rule in enumerate(self.rules):
             name = rule.plain_name
             if rule.remap is not None and (name is None or rule.type_match is not None):
-                raise RuleError(index, "remap", "needs a plain topic name in `match` and no `type`")
+                raise RuleError(index - self.implied, "remap", "needs a plain topic name in `match` and no `type`")
             if name is not None:
                 self._refuse_shadowed(index, rule, name)
             if rule.remap is not None and name is not None:
                 if rule.remap in inward:
-                    raise RuleError(index, "remap", f"{rule.remap} is already the new name of {inward[rule.remap]}")
+                    raise RuleError(
+                        index - self.implied, "remap", f"{rule.remap} is already the new name of {inward[rule.remap]}"
+                    )
                 inward[rule.remap] = name
         object.__setattr__(self, "_inward", inward)
 
@@ -259,8 +263,9 @@ class RuleSet:
         for earlier_index, earlier in enumerate(self.rules[:index]):
             certain = earlier.type_match is None or rule.remap is not None
             if certain and earlier.match.fullmatch(name):
-                problem = f"is never used: topics.{earlier_index} ({earlier.match.pattern!r}) matches first; move it up"
-                raise RuleError(index, "match", problem)
+                place = f"topics.{earlier_index - self.implied}" if earlier_index >= self.implied else "actions"
+                problem = f"is never used: {place} ({earlier.match.pattern!r}) matches first; move it up"
+                raise RuleError(index - self.implied, "match", problem)
 
     def find(self, type_name: str, local_name: TopicName) -> int | None:
         """The index of the first rule that matches, or None."""
@@ -302,7 +307,7 @@ class RuleSet:
         if rule.lease is not None and info.type_name and not command:
             raise ConfigError(
                 f"{local_name} is {info.type_name}; on_link_loss can publish only {', '.join(sorted(COMMAND_TYPES))}",
-                key=f"topics.{index}.on_link_loss",
+                key=f"topics.{index - self.implied}.on_link_loss",
             )
         durability = rule.durability or durability
         reliability = rule.reliability or _offered_reliability(info)

@@ -106,6 +106,10 @@ class ServiceEndpoint(Protocol):
     raises ConfigError with one line when the type cannot be served here; its own services are never announced.
     """
 
+    @property
+    def encoding(self) -> Encoding | None:
+        """As `Endpoint.encoding`."""
+
     def watch_services(self, events: ServiceEvents) -> None: ...
 
     async def call(self, name: TopicName, request: bytes, *, timeout_s: float) -> bytes: ...

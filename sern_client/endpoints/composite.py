@@ -4,9 +4,20 @@ import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from sern_client.conversion import Converter
-from sern_client.endpoints.base import Endpoint, Publisher, Sink, Subscription, TopicEvents
-from sern_core.errors import ConfigError, UsageError
+from sern_client.conversion import Converter, serve
+from sern_client.endpoints.base import (
+    Endpoint,
+    Publisher,
+    ServiceEndpoint,
+    ServiceEvents,
+    ServiceHandler,
+    ServiceInfo,
+    ServiceServer,
+    Sink,
+    Subscription,
+    TopicEvents,
+)
+from sern_core.errors import ConfigError, ServiceError, UsageError
 from sern_core.message import TopicInfo
 from sern_core.types import TopicName
 
@@ -56,6 +67,29 @@ class _Publishers:
             publisher.close()
 
 
+class _ServiceMembers:
+    """The `ServiceEvents` handed to one member."""
+
+    def __init__(self, owner: "CompositeEndpoint", member: ServiceEndpoint) -> None:
+        self._owner = owner
+        self._member = member
+
+    def service_added(self, info: ServiceInfo) -> None:
+        self._owner.service_added(self._member, info)
+
+    def service_removed(self, name: TopicName) -> None:
+        self._owner.service_removed(self._member, name)
+
+
+class _Servers:
+    def __init__(self, servers: list[ServiceServer]) -> None:
+        self._servers = servers
+
+    def close(self) -> None:
+        for server in self._servers:
+            server.close()
+
+
 class CompositeEndpoint:
     """An `Endpoint` made of others, which it starts and stops.
 
@@ -72,6 +106,8 @@ class CompositeEndpoint:
         self._started: list[Endpoint] = []
         self._givers: dict[TopicName, dict[int, TopicInfo]] = {}  # members in the order they announced
         self._joined: list[_Joined] = []
+        self._service_events: ServiceEvents | None = None
+        self._servers: dict[TopicName, list[ServiceEndpoint]] = {}  # members in the order they announced
 
     async def start(self, events: TopicEvents) -> None:
         """Starts the members in order; if one fails, those already started are stopped and its error is raised."""
@@ -132,7 +168,57 @@ class CompositeEndpoint:
     def exhausted(self) -> bool:
         return all(member.exhausted for member in self._members)
 
+    # Services: called at the first member that has them, served at every member that takes them
+
+    def watch_services(self, events: ServiceEvents) -> None:
+        """ConfigError when no member knows services."""
+        members = self._service_members()
+        if not members:
+            raise ConfigError("none of the endpoints has services; leave the section `services` out")
+        self._service_events = events
+        for member in members:
+            member.watch_services(_ServiceMembers(self, member))
+
+    async def call(self, name: TopicName, request: bytes, *, timeout_s: float) -> bytes:
+        owners = self._servers.get(name)
+        if not owners:
+            raise ServiceError(f"no service {name}")
+        return await owners[0].call(name, request, timeout_s=timeout_s)
+
+    def serve(self, info: ServiceInfo, handler: ServiceHandler) -> ServiceServer:
+        """ConfigError, with every reason, when no member takes it."""
+        servers: list[ServiceServer] = []
+        refusals: list[str] = []
+        for member in self._service_members():
+            try:
+                servers.append(serve(member, info, handler))
+            except ConfigError as error:
+                refusals.append(str(error))
+        if not servers:
+            raise ConfigError("; ".join(dict.fromkeys(refusals)) or f"no endpoint serves {info.name}")
+        return _Servers(servers)
+
+    def _service_members(self) -> list[ServiceEndpoint]:
+        return [member for member in self._members if isinstance(member, ServiceEndpoint)]
+
     # For the parts of this module
+
+    def service_added(self, member: ServiceEndpoint, info: ServiceInfo) -> None:
+        assert self._service_events is not None
+        owners = self._servers.setdefault(info.name, [])
+        if member not in owners:
+            owners.append(member)
+        if len(owners) == 1:
+            self._service_events.service_added(info)
+
+    def service_removed(self, member: ServiceEndpoint, name: TopicName) -> None:
+        assert self._service_events is not None
+        owners = self._servers.get(name, [])
+        if member in owners:
+            owners.remove(member)
+            if not owners:
+                del self._servers[name]
+                self._service_events.service_removed(name)
 
     def member_added(self, index: int, info: TopicInfo) -> None:
         assert self._events is not None

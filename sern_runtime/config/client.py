@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Final, Literal
 
 from pydantic import Discriminator, Field, Tag, model_validator
 
@@ -23,6 +23,7 @@ from sern_core.rules import (
     compile_pattern,
     normal_namespace,
 )
+from sern_core.services import ServiceRule, subscriptions
 from sern_core.types import ClientName, Durability, PriorityClass, Reliability, TopicName
 from sern_runtime.config.base import (
     Bytes,
@@ -219,6 +220,102 @@ class TopicSection(Section):
         )
 
 
+SERVICE_TIMEOUT_S: Final = 5.0
+ACTION_STATE: Final = "(?:_action/)?(?:status|feedback)"
+"""The topics below an action's name on which its server says how it goes, in ROS 1 and ROS 2."""
+
+
+class ServiceSection(Section):
+    """Services that one rule is about."""
+
+    match: Pattern
+    """Regular expression for the whole service name: the local name in `offer`, the global name in `use`."""
+    timeout_s: Annotated[float, Field(gt=0, le=3600)] = SERVICE_TIMEOUT_S
+    """An answer that takes longer is an error for the caller, and a call that waited longer is not executed."""
+    priority: Annotated[ClassWord, Field(alias="class")] = "state"
+    """Urgency of the calls (`use`) or answers (`offer`): `control`, `state`, `bulk`."""
+
+    @model_validator(mode="after")
+    def _simple(self) -> "ServiceSection":
+        try:
+            compile_peer_pattern(f"(?:{self.match})/_call/[a-z0-9_]+")
+        except RefusedError as error:
+            raise fault(str(error), "match") from error
+        return self
+
+    def rule(self) -> ServiceRule:
+        """The rule as the core reads it."""
+        return ServiceRule(compile_pattern(self.match), self.timeout_s, PriorityClass[self.priority.upper()])
+
+
+class ServicesSection(Section):
+    """Services across the link. The first rule that matches holds; a service without a rule stays at home."""
+
+    offer: tuple[ServiceSection, ...] = ()
+    """Services of this site that others may call (who may is a matter of the relay's access rules)."""
+    use: tuple[ServiceSection, ...] = ()
+    """Services of other sites to serve here, under their global name (our own namespace is left out)."""
+
+
+class ActionSection(Section):
+    """Actions that one rule is about: a rule for each of their topics and services."""
+
+    match: Pattern
+    """Regular expression for the whole action name: the local name in `offer`, the global name in `use`."""
+    timeout_s: Annotated[float, Field(gt=0, le=86_400)] = 600.0
+    """How long a goal may take: asking for its result (ROS 2) fails after it."""
+
+    @model_validator(mode="after")
+    def _simple(self) -> "ActionSection":
+        try:
+            compile_peer_pattern(self.under("_action/get_result/_call/[a-z0-9_]+"))
+        except RefusedError as error:
+            raise fault(str(error), "match") from error
+        return self
+
+    def under(self, pattern: str) -> str:
+        """The pattern of names below the action's."""
+        return f"(?:{self.match})/{pattern}"
+
+    def service_rules(self) -> tuple[ServiceRule, ...]:
+        """ROS 2: three services."""
+        ask = compile_pattern(self.under("_action/(?:send_goal|cancel_goal)"))
+        return (
+            ServiceRule(ask, min(self.timeout_s, SERVICE_TIMEOUT_S), PriorityClass.CONTROL),
+            ServiceRule(compile_pattern(self.under("_action/get_result")), self.timeout_s),
+        )
+
+    def topic_rules(self, *, offered: bool) -> tuple[TopicRule, ...]:
+        """ROS 1: goal and cancel one way, status, feedback and result the other; ROS 2: status and feedback."""
+        there, back = (Direction.RECEIVE, Direction.SEND) if offered else (Direction.SEND, Direction.BOTH)
+        reliable = Reliability.RELIABLE
+        return (
+            TopicRule(
+                compile_pattern(self.under("(?:goal|cancel)")), None, PriorityClass.CONTROL, there, None, reliable
+            ),
+            TopicRule(compile_pattern(self.under("result")), None, PriorityClass.STATE, back, None, reliable),
+            TopicRule(compile_pattern(self.under(ACTION_STATE)), None, PriorityClass.STATE, back),
+        )
+
+
+class ActionsSection(Section):
+    """Actions across the link, of ROS 1 (actionlib) and ROS 2. Their rules come before those of `topics`."""
+
+    offer: tuple[ActionSection, ...] = ()
+    """Actions whose server is at this site."""
+    use: tuple[ActionSection, ...] = ()
+    """Actions of other sites. For ROS 1, whose goals are a topic, this site needs `namespace: "/"`."""
+
+    def topic_rules(self) -> tuple[TopicRule, ...]:
+        offered = (rule for section in self.offer for rule in section.topic_rules(offered=True))
+        used = (rule for section in self.use for rule in section.topic_rules(offered=False))
+        return (*offered, *used)
+
+    def patterns(self) -> tuple[str, ...]:
+        """What to subscribe to for the actions of other sites."""
+        return tuple(section.under(part) for section in self.use for part in ("result", ACTION_STATE))
+
+
 def _one_or_list(value: Any) -> str:
     return "<list>" if isinstance(value, (list, tuple)) else "<one>"
 
@@ -242,6 +339,10 @@ class ClientFile(FileModel):
     """Rules for topics, first match wins. A topic without a rule: bulk, best effort, depth 1, lifespan 1 s."""
     subscribe: tuple[PeerPattern, ...] = ()
     """Regular expressions for the whole global names that this site wants, beside rules with direction `receive`."""
+    services: ServicesSection = ServicesSection()
+    """Services offered to other sites and used from them."""
+    actions: ActionsSection = ActionsSection()
+    """Actions offered to other sites and used from them."""
     scheduler: SchedulerSection = SchedulerSection()
     """Which message the link carries next."""
     link: LinkSection = LinkSection()
@@ -278,12 +379,25 @@ class ClientFile(FileModel):
 
     def rules(self) -> RuleSet:
         """The topic rules as the core reads them."""
-        return RuleSet(tuple(section.rule() for section in self.topics), retention_s=self.link.retention_s)
+        implied = self.actions.topic_rules()
+        rules = (*implied, *(section.rule() for section in self.topics))
+        return RuleSet(rules, retention_s=self.link.retention_s, implied=len(implied))
+
+    def offered_services(self) -> tuple[ServiceRule, ...]:
+        """Services of this site that others may call, those of actions included."""
+        actions = (rule for section in self.actions.offer for rule in section.service_rules())
+        return (*(section.rule() for section in self.services.offer), *actions)
+
+    def used_services(self) -> tuple[ServiceRule, ...]:
+        """Services of other sites to serve here, those of actions included."""
+        actions = (rule for section in self.actions.use for rule in section.service_rules())
+        return (*(section.rule() for section in self.services.use), *actions)
 
     def subscribe_patterns(self) -> tuple[str, ...]:
-        """What to ask the relay for, on global names: `subscribe`, and the rules with direction `receive`."""
+        """What to ask the relay for, on global names: `subscribe`, rules with direction `receive`, and services."""
         received = (pattern.pattern for pattern in self.rules().receive_patterns(self.namespace))
-        return tuple(dict.fromkeys((*self.subscribe, *received)))
+        services = subscriptions(self.name, self.namespace, offer=self.offered_services(), use=self.used_services())
+        return tuple(dict.fromkeys((*self.subscribe, *received, *services, *self.actions.patterns())))
 
     def file_problems(self, base_dir: Path) -> Iterator[FileProblem]:
         if self.relay.server_key_file is not None:

@@ -9,14 +9,23 @@ from typing import Any
 import pytest
 
 from sern_client.endpoints.bag import BagEndpoint, BagOptions
-from sern_client.endpoints.base import Endpoint, Publisher, Sink, Subscription, TopicEvents
+from sern_client.endpoints.base import (
+    Endpoint,
+    Publisher,
+    ServiceEndpoint,
+    ServiceInfo,
+    Sink,
+    Subscription,
+    TopicEvents,
+)
 from sern_client.endpoints.composite import CompositeEndpoint
 from sern_client.endpoints.record import RecordEndpoint, RecordOptions
 from sern_client.endpoints.synthetic import SyntheticEndpoint, SyntheticOptions
-from sern_core.errors import ConfigError, UsageError
+from sern_core.errors import ConfigError, ServiceError, UsageError
 from sern_core.message import TopicInfo
 from sern_core.types import Encoding, TopicName
 from sern_runtime.ros_types import topic_info
+from tests.fake_services import Services
 
 Make = Callable[..., Path]
 Until = Callable[[Callable[[], bool]], Awaitable[None]]
@@ -198,3 +207,57 @@ def test_each_member_gets_the_encoding_it_takes() -> None:
     assert one.got == [b"\x02\0\0\0hi"]
     assert two.got == [b"\0\x01\0\0\x03\0\0\0hi\0"]
     assert whole.encoding is None and whole.converter.failures == 0
+
+
+async def test_services_are_called_where_they_are_and_served_where_they_are_taken() -> None:
+    added: list[ServiceInfo] = []
+    removed: list[TopicName] = []
+
+    class Events:
+        def service_added(self, info: ServiceInfo) -> None:
+            added.append(info)
+
+        def service_removed(self, name: TopicName) -> None:
+            removed.append(name)
+
+    first, second = Services(), Services()
+    composite = CompositeEndpoint([Fake(), first, second])
+    assert isinstance(composite, ServiceEndpoint)
+    composite.watch_services(Events())
+    assert first.events is not None and second.events is not None
+    mode = ServiceInfo(TopicName("/mode"), "std_srvs/srv/Trigger", Encoding.ROS1, "")
+    with pytest.raises(ServiceError, match="no service /mode"):
+        await composite.call(mode.name, b"x", timeout_s=1)
+
+    second.events.service_added(mode)
+    first.events.service_added(mode)
+    assert added == [mode], "once, though two members have it"
+    assert await composite.call(mode.name, b"x", timeout_s=1) == b"re: x"
+    assert (first.calls, second.calls) == ([], [(mode.name, b"x")])
+    second.events.service_removed(mode.name)
+    assert await composite.call(mode.name, b"y", timeout_s=1) == b"re: y"
+    assert first.calls == [(mode.name, b"y")]
+    assert removed == []
+    first.events.service_removed(mode.name)
+    assert removed == [mode.name]
+
+    first.refuse = "not here"
+    server = composite.serve(mode, first.echo)
+    assert (list(first.served), list(second.served)) == ([], [mode.name])
+    server.close()
+    assert second.served == {}
+    second.refuse = "nor here"
+    with pytest.raises(ConfigError, match="not here; nor here"):
+        composite.serve(mode, first.echo)
+
+
+def test_services_need_a_member_that_knows_them() -> None:
+    class Nobody:
+        def service_added(self, info: ServiceInfo) -> None:
+            raise AssertionError(info)
+
+        def service_removed(self, name: TopicName) -> None:
+            raise AssertionError(name)
+
+    with pytest.raises(ConfigError, match="none of the endpoints has services"):
+        CompositeEndpoint([Fake()]).watch_services(Nobody())

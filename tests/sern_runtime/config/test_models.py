@@ -1,5 +1,6 @@
 """Good files, what they become for the core, and the second step: the files that they name."""
 
+import re
 from pathlib import Path
 
 import pytest
@@ -75,6 +76,45 @@ def test_topic_rules_and_subscriptions() -> None:
     spec = rules.resolve(grid, local_name=TopicName("/costmap/a")).spec
     assert (spec.weight, spec.lifespan_s) == (7.0, None)
     assert model.subscribe_patterns() == ("/site/.*", "/jackal1(?:/cmd_vel)", "/jackal1(?:/target)")
+
+
+def test_services_and_actions_become_rules_and_subscriptions() -> None:
+    robot = client(
+        ROBOT + "services: {offer: [{match: '/set_.*', timeout_s: 2, class: control}]}\n"
+        "actions: {offer: [{match: /dock, timeout_s: 60}]}\n"
+        "topics: [{match: '.*'}]\n"
+    )
+    modes, ask, result = robot.offered_services()
+    assert (modes.match.pattern, modes.timeout_s, modes.priority) == ("/set_.*", 2.0, PriorityClass.CONTROL)
+    assert ask.match.fullmatch("/dock/_action/send_goal") and ask.timeout_s == 5.0
+    assert result.match.fullmatch("/dock/_action/get_result") and result.timeout_s == 60.0
+    assert robot.used_services() == ()
+    rules = robot.rules()
+
+    def treated(name: str) -> tuple[Direction, PriorityClass, bool]:
+        resolved = rules.resolve(TopicInfo(TopicName(name), "a/B", Encoding.CDR), local_name=TopicName(name))
+        return resolved.direction, resolved.spec.priority, resolved.spec.reliable
+
+    assert treated("/dock/goal") == (Direction.RECEIVE, PriorityClass.CONTROL, True)
+    assert treated("/dock/result") == (Direction.SEND, PriorityClass.STATE, True)
+    assert treated("/dock/_action/feedback") == (Direction.SEND, PriorityClass.STATE, False)
+    assert treated("/docks/goal") == (Direction.BOTH, PriorityClass.BULK, False)
+    patterns = [re.compile(text) for text in robot.subscribe_patterns()]
+
+    def heard(name: str) -> bool:
+        return any(pattern.fullmatch(name) for pattern in patterns)
+
+    assert heard("/jackal1/set_mode/_call/site") and heard("/jackal1/dock/_action/get_result/_call/site")
+    assert heard("/jackal1/dock/goal") and not heard("/jackal1/dock/result") and not heard("/jackal2/dock/goal")
+
+    site = client(
+        ROBOT.replace("jackal1", "site")
+        + "services: {use: [{match: '/jackal1/.*'}]}\nactions: {use: [{match: /jackal1/dock}]}\n"
+    )
+    patterns = [re.compile(text) for text in site.subscribe_patterns()]
+    assert heard("/jackal1/set_mode/_service") and heard("/jackal1/set_mode/_reply/site")
+    assert heard("/jackal1/dock/status") and heard("/jackal1/dock/_action/feedback") and heard("/jackal1/dock/result")
+    assert not heard("/jackal1/set_mode/_reply/other") and not heard("/jackal1/dock/goal")
 
 
 def test_one_endpoint_or_several() -> None:
