@@ -230,11 +230,18 @@ def used_by(type_name: str, fielddefs: Typesdict) -> list[str]:
     """A type and every type it uses, each once, itself first."""
     found = [type_name]
     for name in found:
-        for _, desc in fielddefs[name][1]:
-            inner = desc[1][0] if desc[0] in {Nodetype.ARRAY, Nodetype.SEQUENCE} else desc
-            if inner[0] == Nodetype.NAME and inner[1] not in found:
-                found.append(str(inner[1]))
+        found += [used for used in uses(fielddefs[name][1]) if used not in found]
     return found
+
+
+def uses(fields: Fielddefs) -> list[str]:
+    """The types that fields have, each once."""
+    found: dict[str, None] = {}
+    for _, desc in fields:
+        inner = desc[1][0] if desc[0] in {Nodetype.ARRAY, Nodetype.SEQUENCE} else desc
+        if inner[0] == Nodetype.NAME:
+            found[str(inner[1])] = None
+    return list(found)
 
 
 def _same_layout(name: str, mine: Fielddefs, theirs: Fielddefs, other: Encoding) -> bool:
