@@ -15,6 +15,7 @@ from prometheus_client import CollectorRegistry
 
 from sern_client.bridge import Bridge
 from sern_client.endpoints.base import Endpoint, ServiceEndpoint
+from sern_client.express import ClientExpress
 from sern_client.factory import make_endpoint
 from sern_client.message_log import MessageLog
 from sern_client.services import ServiceBridge
@@ -98,6 +99,7 @@ class ClientDaemon:
         self._ctx: zmq.Context[zmq.Socket[bytes]] | None = None
         self._transport: RelayTransport | None = None
         self._lane: ClientLane | None = None
+        self._express: ClientExpress | None = None
         self._http: HttpServer | None = None
         self.tasks: list[asyncio.Task[None]] = []
         self._endpoint_started = False
@@ -156,6 +158,14 @@ class ClientDaemon:
         if relay.udp and keys is not None and address is not None:
             self._lane = ClientLane(self.core, address[0], kick=self._kick)
             self.bridge.lane = self._lane
+        if relay.express and address is not None:
+            self._express = ClientExpress(
+                self.core,
+                self._transport,
+                model.link.redundancy,
+                datagrams=self._lane is not None,
+                kick=self._kick,
+            )
         self.tasks.append(asyncio.create_task(self._tick(), name="client-tick"))
         self.notifier.ready(f"{model.name} -> {relay.endpoint}")
         _log.info("client %s started, relay %s", model.name, relay.endpoint)
@@ -165,6 +175,8 @@ class ClientDaemon:
             self._transport.pump.kick()
         if self._lane is not None:
             self._lane.kick()
+        if self._express is not None:
+            self._express.kick()
 
     def _link_down(self, reason: str) -> None:
         """Told by the transport and by the session on it, usually of the same thing."""
@@ -178,6 +190,8 @@ class ClientDaemon:
         self._put_node()
         if self._lane is not None:
             self._lane.ask()
+        if self._express is not None:
+            self._express.begin()
 
     async def _tick(self) -> None:
         watchdog = Watchdog(self.notifier, {"loop": lambda: int(time.monotonic() * 1e3)})
@@ -188,6 +202,8 @@ class ClientDaemon:
             link = self.core.link
             if self._lane is not None:
                 self._lane.tick()
+            if self._express is not None:
+                self._express.tick()
             if watchdog.interval_s is not None:
                 watchdog.check()
             state = "up" if link.established and not link.lane.stalled else f"down: {self.reason}"
@@ -329,6 +345,8 @@ class ClientDaemon:
                 stack.push_async_callback(self.bridge.services.stop)
             if self._transport is not None:
                 stack.callback(self._transport.close)
+            if self._express is not None:
+                stack.callback(self._express.close)
             if self._lane is not None:
                 stack.callback(self._lane.closed)
             stack.push_async_callback(end_tasks, self.tasks)

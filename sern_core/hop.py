@@ -12,6 +12,7 @@ from sern_core.errors import WireError
 from sern_core.flight import ACK_DELAY_S
 from sern_core.fragments import InStream
 from sern_core.lanes import (
+    LANE_EXPRESS,
     LANE_UDP,
     LANE_ZMQ,
     OVERHEAD_BYTES,
@@ -93,7 +94,7 @@ class Hop(Sender):
         """FrameSink: an acknowledgement of what we sent."""
         state = self.lanes.get(lane)
         if state is None:
-            if lane == LANE_UDP:
+            if lane in (LANE_UDP, LANE_EXPRESS):
                 return  # of a lane that was closed meanwhile
             raise WireError(f"acknowledgement of unknown lane {lane}")
         flight = state.flight
@@ -153,6 +154,22 @@ class Hop(Sender):
                 self._use_lane(udp, now)
         elif zmq.usable:
             self._use_lane(zmq, now)
+        self._choose_express(now)
+
+    def _choose_express(self, now: float) -> None:
+        """Class control goes beside the stream while that works; what the peer was told must be there before it."""
+        lane = self.lanes.get(LANE_EXPRESS)
+        if lane is not None and (self.lane.id != LANE_ZMQ or self._paper or not lane.usable):
+            lane = None
+        if lane is not None and lane is not self.express and (lane.proofs < PROVEN_ACKS or self._control.retained):
+            return
+        if lane is not self.express:
+            left, self.express = self.express, lane
+            if left is not None:
+                self._recall(left, now)
+            state = "takes" if lane is not None else "leaves"
+            self.trace.record(now, LINK, TraceEvent.LINK_UP, peer=self.peer, reason=f"class control {state} express")
+            self.dirty = True
 
     def _use_lane(self, lane: Lane, now: float) -> None:
         old = self.lane
@@ -241,6 +258,7 @@ class Hop(Sender):
             None if lane.lossless else lane.flight.loss_deadline(),
             self._service_deadline(lane) if lane is self.lane and self._backlog else None,
             lane.copies[0][0] if lane.copies else None,
+            self.scheduler.control_deadline() if lane is self.express else None,
         ):
             if candidate is not None and candidate < deadline:
                 deadline = candidate

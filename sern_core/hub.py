@@ -22,6 +22,7 @@ from sern_core.errors import RefusedError, WireError
 from sern_core.fragments import InStream, Reassembly
 from sern_core.hub_events import HubEvents, Relayed
 from sern_core.hub_port import HubPort
+from sern_core.lanes import LANE_EXPRESS
 from sern_core.ledger import ReceiveLedger
 from sern_core.link import Link
 from sern_core.message import Message, StreamId, StreamInfo, TopicInfo, TopicSpec
@@ -413,6 +414,20 @@ class Hub:
             now=now,
         )
         link.open_lane(now=now)
+
+    def join(self, client: ClientName, data: bytes, *, now: float) -> bool:
+        """A connection says that it belongs to the client's session: open the express lane, unless it is open. `client`
+        is bound to the connection's key. False: there is no such session. Raises WireError."""
+        header = wire.decode_header(data)
+        envelope = wire.decode_handshake(data)
+        link = self.links.get(client)
+        if link is None or wire.take_str(envelope, "name", max_length=64) != client:
+            return False
+        if not link.joins(envelope, header.tag):
+            return False
+        if LANE_EXPRESS not in link.lanes:
+            link.open_lane(now=now, lane_id=LANE_EXPRESS)
+        return True
 
     def on_rejected(self, link: Link, code: str, text: str, *, now: float) -> None:
         """A relay is never the initiator."""

@@ -11,7 +11,9 @@ from sern_core.params import LinkParams, Redundancy, WindowAlgorithm
 
 LANE_ZMQ: Final = 0
 LANE_UDP: Final = 1
-LANE_NAMES: Final = {LANE_ZMQ: "zmq", LANE_UDP: "udp"}
+LANE_EXPRESS: Final = 2
+"""Class control alone, over TCP connections of its own: behind no bulk byte, and no retransmission of one."""
+LANE_NAMES: Final = {LANE_ZMQ: "zmq", LANE_UDP: "udp", LANE_EXPRESS: "express"}
 
 DATAGRAM_BYTES: Final = 1171
 """A datagram of the UDP lane: with seal, session and kind it is 1200 bytes of UDP payload, which every path carries."""
@@ -107,8 +109,8 @@ class Lane:
 
     @property
     def redundant(self) -> bool:
-        """Whether class control is sent twice."""
-        if self.lossless or self._redundancy is Redundancy.OFF:
+        """Whether class control is sent twice here; the express lane's connections see to that themselves."""
+        if self.lossless or self.id == LANE_EXPRESS or self._redundancy is Redundancy.OFF:
             return False
         return self._redundancy is Redundancy.ALWAYS or self.loss > COPY_LOSS
 

@@ -25,7 +25,7 @@ from sern_core.params import LinkParams, SchedulerParams
 from sern_core.queues import OutChannel, OutMessage
 from sern_core.session import Session
 from sern_core.trace import DecisionTrace, TraceEvent
-from sern_core.types import CLASS_LABELS, DROP_CODES, DROP_REASONS, ClientName, DropReason
+from sern_core.types import CLASS_LABELS, DROP_CODES, DROP_REASONS, ClientName, DropReason, PriorityClass
 
 MAX_DEFINITIONS: Final = 16_384
 """Texts that a process keeps, of all its peers."""
@@ -222,7 +222,8 @@ class Link(Session):
         seq = 0
         for envelope in announcement_parts(announcement):
             seq = self.send_control(envelope, now=now)
-        if self.lane.lossless and self._resumed and channel.wanted:
+        beside = channel.spec.priority is PriorityClass.CONTROL and self.express is not None
+        if self.lane.lossless and self._resumed and channel.wanted and not beside:
             # On a stream lane data may follow its announcement at once, if the same peer wanted it before.
             self._announcing.append((seq, channel))
         self._refresh(channel, now)

@@ -321,6 +321,27 @@ class Scheduler:
             return bulk.best(now)
         return control.best(now) if control.slots else None  # spent, but nobody else wants the link
 
+    def pick_control(self, *, now: float) -> int | None:
+        """The slot of class control to serve next on a connection of its own: its share of the link is the limit.
+
+        Ordering `class` only, like `pick_rest`.
+        """
+        control = self._control
+        if control.slots and (now >= self._bucket.ready_s or not (self._state.slots or self._bulk.slots)):
+            return control.best(now)
+        return None
+
+    def control_deadline(self) -> float | None:
+        """When `pick_control`, None by now, can name a slot by time alone."""
+        return self._bucket.ready_s if self._control.slots else None
+
+    def pick_rest(self, *, now: float) -> int | None:
+        """The slot to serve next when class control has a connection of its own."""
+        state, bulk = self._state, self._bulk
+        if bulk.slots and (not state.slots or self._bulk_credit >= self._quantum_bytes):
+            return bulk.best(now)
+        return state.best(now) if state.slots else None
+
     def _pick_marked(self, interval: _Interval, now: float, *, window_open: bool) -> int | None:
         interval.advance(self._entries, now)
         for slot in interval.marked:

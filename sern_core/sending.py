@@ -94,6 +94,8 @@ class Sender(ABC):
         self.lane = Lane(LANE_ZMQ, link, lossless=lossless)
         """The lane that carries data now."""
         self.lanes = {LANE_ZMQ: self.lane}
+        self.express: Lane | None = None
+        """The lane that carries class control beside it, if there is one."""
         self.scheduler = Scheduler(scheduler, now=now)
         self._paper = scheduler.ordering is Ordering.PAPER
         self.trace = trace
@@ -227,10 +229,10 @@ class Sender(ABC):
         frames: list[bytes] = []
         items: list[SentData | SentWatermark | SentPing] = []
         if not lane.stalled or now >= lane.probe_due_s:
-            if lane is self.lane:
+            if lane is self.lane or lane is self.express:
                 self.dirty = False
                 if self._sendable(lane, now):
-                    self._compose(frames, items, now)
+                    self._compose(lane, frames, items, now)
             # A stream delivers what is under way, so one question at a time is enough there.
             if not items and (lane.ping or lane.stalled) and not (lane.lossless and lane.flight.packets):
                 frames.append(wire.PING_FRAME)
@@ -273,6 +275,8 @@ class Sender(ABC):
 
     def _sendable(self, lane: Lane, now: float) -> bool:
         """Whether there is something for the next datagram, acknowledgements aside."""
+        if lane is self.express:
+            return self.scheduler.pick_control(now=now) is not None
         if self._watermarks:
             return True
         window_open = lane.open_at(now)
@@ -292,24 +296,26 @@ class Sender(ABC):
             or pending(PriorityClass.CONTROL)
         )
 
-    def _compose(self, frames: list[bytes], items: list[SentData | SentWatermark | SentPing], now: float) -> None:
+    def _compose(
+        self, lane: Lane, frames: list[bytes], items: list[SentData | SentWatermark | SentPing], now: float
+    ) -> None:
         """Fill one datagram: watermarks, then what the scheduler picks, of one class; control ahead of all but class 0.
 
         Control keeps to the window like everything below class 0, as a thousand announcements must not fill the path;
         but a little of it rides in each datagram of class 0, at the cost of that class's share.
         """
-        lane = self.lane
         limit = lane.fragment_bytes - (wire.ACK.size if lane.arrivals.unacked else 0)
-        window_open = lane.open_at(now)
+        express = lane is self.express
+        window_open = not express and lane.open_at(now)
         size = wire.HEADER_BYTES
-        if self._watermarks:
+        if self._watermarks and not express:
             size = self._put_watermarks(frames, items, size)
         control = self._control
         served: PriorityClass | None = None
         while size < limit - MIN_SHARE_BYTES:
-            chosen = self._pick(now, window_open=window_open)
+            chosen = self.scheduler.pick_control(now=now) if express else self._pick(now, window_open=window_open)
             channel = self.channels[chosen] if chosen is not None else None
-            rides = served is PriorityClass.CONTROL and not window_open
+            rides = served is PriorityClass.CONTROL and not window_open and not express
             if (
                 (control.queue or control.active)
                 and (rides or (window_open and (channel is None or channel.spec.priority is not PriorityClass.CONTROL)))
@@ -362,6 +368,8 @@ class Sender(ABC):
 
     def _pick(self, now: float, *, window_open: bool) -> int | None:
         """The scheduler's choice; under `ordering: paper` what it found stale is dropped first."""
+        if self.express is not None:  # class control goes there
+            return self.scheduler.pick_rest(now=now) if window_open else None
         slot = self.scheduler.pick(now=now, window_open=window_open)
         if self._paper:
             for stale in self.scheduler.take_stale(now):

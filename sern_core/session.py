@@ -19,7 +19,7 @@ from sern_core import wire
 from sern_core.clocksync import ClockSync
 from sern_core.errors import WireError
 from sern_core.hop import Hop
-from sern_core.lanes import LANE_UDP, LANE_ZMQ, Lane
+from sern_core.lanes import LANE_EXPRESS, LANE_UDP, LANE_ZMQ, Lane
 from sern_core.params import LinkParams, SchedulerParams
 from sern_core.sending import microseconds
 from sern_core.trace import LINK, DecisionTrace, TraceEvent
@@ -99,12 +99,13 @@ class Session(Hop):
             self.lanes[LANE_ZMQ].up = False
             self._recall(self.lanes[LANE_ZMQ], now)
             self._use_lane(udp, now)
+            self._choose_express(now)
             return
         self._end_session(reason, now)
 
-    def open_lane(self, *, now: float) -> None:
-        """The datagram lane has a transport (its keys came in this session): ask whether it works, then use it."""
-        lane = self.lanes[LANE_UDP] = Lane(LANE_UDP, self.params, lossless=False)
+    def open_lane(self, *, now: float, lane_id: int = LANE_UDP) -> None:
+        """Another lane has a transport (admitted in this session): ask whether it works, then use it."""
+        lane = self.lanes[lane_id] = Lane(lane_id, self.params, lossless=False)
         lane.up = True
         lane.new_session(now)
         stream_rtt = self.lanes[LANE_ZMQ].flight.rtt
@@ -113,14 +114,15 @@ class Session(Hop):
         lane.estimator.on_reset(now=now)
         self.dirty = True
 
-    def close_lane(self, *, now: float) -> None:
-        """The datagram lane's transport is gone or its keys are used up."""
-        lane = self.lanes.pop(LANE_UDP, None)
+    def close_lane(self, *, now: float, lane_id: int = LANE_UDP) -> None:
+        """A lane's transport is gone or its keys are used up."""
+        lane = self.lanes.pop(lane_id, None)
         if lane is None:
             return
         self._now = now
         if self.lane is lane:
             self._use_lane(self.lanes[LANE_ZMQ], now)
+        self._choose_express(now)
         self._recall(lane, now)
         if self.established and not self.transport_up:
             self._end_session("both lanes are gone", now)
@@ -135,6 +137,25 @@ class Session(Hop):
         self._hello_due_s = now + HELLO_INTERVAL_S
         hello = {"name": self.name, "boot": self.boot, "vmin": wire.VERSION_MIN, "vmax": wire.VERSION_MAX}
         return wire.encode_handshake(wire.Kind.HELLO, self.tag, microseconds(now), hello)
+
+    def join(self, *, now: float) -> bytes | None:
+        """What the initiator says first on a connection of the express lane; None without a session."""
+        if not self.established:
+            return None
+        join = {"name": self.name, "boot": self.boot, "relay": self.peer_boot}
+        return wire.encode_handshake(wire.Kind.JOIN, self.tag, microseconds(now), join)
+
+    def joins(self, join: wire.Envelope, tag: int) -> bool:
+        """The relay's end: whether a connection whose name and key were checked belongs to the session there is.
+
+        The name is what admits; boots and tag say that this session is meant, not an earlier one.
+        """
+        return (
+            self.established
+            and tag == self.tag
+            and wire.take_int(join, "boot") == self.peer_boot
+            and wire.take_int(join, "relay") == self.boot
+        )
 
     def accept(
         self, hello: wire.Envelope, tag: int, stamp_us: int, *, now: float, another_connection: bool = False
@@ -215,6 +236,8 @@ class Session(Hop):
         self.incoming.clear()
         self._watermarks.clear()
         udp = self.lanes.pop(LANE_UDP, None)  # its keys end with the session
+        self.lanes.pop(LANE_EXPRESS, None)
+        self.express = None
         if not self.established:
             return
         self.established = False
@@ -315,7 +338,7 @@ class Session(Hop):
                 else:
                     self._end_session(why, now)
             return
-        if not self.initiator or kind is wire.Kind.HELLO:
+        if not self.initiator or kind in (wire.Kind.HELLO, wire.Kind.JOIN):
             raise WireError(f"{kind.name} is not for this side")
         if header.tag != self.tag:
             return

@@ -98,10 +98,11 @@ class Kind(IntEnum):
     REFUSE = 3  # relay to client: no, and why
     RESET = 4  # "I know no such session": the peer says hello again
     CLOSE = 5  # the session ends on purpose
+    JOIN = 6  # client to relay: this connection, too, belongs to the session
     DATA = 16
 
 
-_HANDSHAKE_KINDS: Final = frozenset({Kind.HELLO, Kind.WELCOME, Kind.REFUSE, Kind.RESET, Kind.CLOSE})
+_HANDSHAKE_KINDS: Final = frozenset({Kind.HELLO, Kind.WELCOME, Kind.REFUSE, Kind.RESET, Kind.CLOSE, Kind.JOIN})
 
 FRAME_DATA: Final = 1
 FRAME_ACK: Final = 2

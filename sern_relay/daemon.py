@@ -140,6 +140,7 @@ class RelayDaemon:
                 heartbeat_timeout_s=model.link.heartbeat_timeout_s,
                 handshake_interval_s=relay.handshake_interval_s,
                 max_connections=relay.max_connections,
+                redundancy=model.link.redundancy,
                 after=self._after,
             )
         if keys is not None and relay.udp:
@@ -210,6 +211,8 @@ class RelayDaemon:
             self._end_lapsed()
             now = time.monotonic()
             self.hub.sweep(now=now)
+            if self.server is not None:
+                self.server.express.look()
             if self.feed is not None:
                 self.feed.sweep(now=now)
             self._flush()
@@ -308,6 +311,7 @@ class RelayDaemon:
             "routing_id": socket.refused_routing_ids,
             "multipart": socket.malformed,
             "revoked": server.revoked,
+            "join": server.express.refused,
         }
         return [((reason,), float(count)) for reason, count in counts.items()]
 

@@ -3,7 +3,6 @@
 import logging
 import time
 from collections.abc import Callable
-from typing import Final
 
 import zmq
 
@@ -11,14 +10,13 @@ from sern_core import wire
 from sern_core.errors import RemoteError, UsageError, WireError
 from sern_core.hub import Hub
 from sern_core.hub_port import HubPort
+from sern_core.params import Redundancy
 from sern_core.rules import client_name
 from sern_core.types import ClientName
+from sern_relay.express import JOIN, Joined, RelayExpress
 from sern_runtime.monitor import ConnectionTable
 from sern_runtime.pump import LANE_MESSAGE_BYTES, Pump
 from sern_runtime.zmq_socket import CurvePair, RouterSocket, SendResult, make_server
-
-CONGESTION_CONTROL: Final = "cubic"
-"""See sern_client.transport: BBR's probing shows in class 0."""
 
 _log = logging.getLogger(__name__)
 
@@ -54,6 +52,7 @@ class RelayServer:
         heartbeat_timeout_s: float,
         handshake_interval_s: float,
         max_connections: int,
+        redundancy: Redundancy,
         after: Callable[[], None],
     ) -> None:
         self.hub = hub
@@ -64,6 +63,7 @@ class RelayServer:
         self._insecure = keys is None
         self._after = after
         self._sessions: dict[bytes, Session] = {}
+        self.express = RelayExpress(hub, self._send, redundancy, after=after)
         raw = make_server(
             ctx,
             listen,
@@ -80,12 +80,17 @@ class RelayServer:
         for session in self._sessions.values():
             session.pump.close()
         self._sessions.clear()
+        self.express.close()
         self.connections.close()
         self.socket.close()
 
     def _received(self, routing_id: bytes, user: str, data: bytes) -> None:
         session = self._sessions.get(routing_id)
         if session is None:
+            joined = self.express.joined.get(routing_id)
+            if joined is not None:
+                self._received_express(routing_id, joined, user, data)
+                return
             session = self._accept(routing_id, user, data)
             if session is None:
                 return
@@ -99,6 +104,22 @@ class RelayServer:
             self._cut(routing_id, session, f"bad frame: {error}")
             return
         self._after()
+
+    def _received_express(self, routing_id: bytes, joined: Joined, user: str, data: bytes) -> None:
+        if not self._insecure and user != joined.client:
+            problem = f"its identity changed to {user!r}"
+        else:
+            try:
+                self.express.received(routing_id, joined, data)
+            except RemoteError as error:
+                self.bad_frames += 1
+                problem = f"bad frame: {error}"
+            else:
+                self._after()
+                return
+        _log.warning("connection of %s for class control closed: %s", joined.client, problem)
+        self.express.left(routing_id)
+        self._cut_fd(joined.fd)
 
     def _accept(self, routing_id: bytes, user: str, data: bytes) -> Session | None:
         """A connection speaks for the first time: find out whose it is."""
@@ -119,8 +140,10 @@ class RelayServer:
         connection = self.connections.by_fd(details.fd)
         handle = connection.handle if connection is not None else None
         if handle is not None:
-            handle.set_congestion(CONGESTION_CONTROL)
-            handle.set_rto_max()
+            handle.prepare(express=data[2:3] == JOIN)
+        if data[2:3] == JOIN:
+            self._join(routing_id, Joined(name, details.fd, connection), data)
+            return None
         port = HubPort(self.hub, name)
 
         def send(datagram: bytes) -> SendResult:
@@ -130,12 +153,27 @@ class RelayServer:
         session = self._sessions[routing_id] = Session(port, pump, details.fd, connection)
         return session
 
+    def _send(self, routing_id: bytes, datagram: bytes) -> SendResult:
+        return self.socket.send_to(routing_id, datagram)
+
+    def _join(self, routing_id: bytes, joined: Joined, data: bytes) -> None:
+        """A connection for class control: of a session that its own client has, or of none, and then it is closed."""
+        try:
+            older = self.express.join(routing_id, joined, data)
+        except RemoteError as error:
+            self.bad_frames += 1
+            _log.warning("connection of %s for class control closed: bad frame: %s", joined.client, error)
+            older = joined
+        if older is not None:
+            self._cut_fd(older.fd)
+        self._after()
+
     @staticmethod
     def _claimed(data: bytes) -> str:
-        """Without keys the first datagram must be a HELLO, and its name is believed."""
+        """Without keys the first datagram must be a HELLO or a JOIN, and its name is believed."""
         header = wire.decode_header(data)
-        if header.kind != wire.Kind.HELLO:
-            raise WireError("the first datagram of a connection must be HELLO")
+        if header.kind not in (wire.Kind.HELLO, wire.Kind.JOIN):
+            raise WireError("the first datagram of a connection must be HELLO or JOIN")
         return wire.take_str(wire.decode_handshake(data), "name", max_length=64)
 
     def flush(self) -> None:
@@ -143,6 +181,7 @@ class RelayServer:
         for session in self._sessions.values():
             if session.port.dirty:
                 session.pump.kick()
+        self.express.flush()
 
     def run_all(self) -> None:
         for session in list(self._sessions.values()):
@@ -151,12 +190,14 @@ class RelayServer:
     def _writable(self) -> None:
         for session in self._sessions.values():
             session.pump.kick()
+        self.express.kick()
 
     def cut_client(self, client: str) -> int:
         """End every connection of a client at once; returns how many there were."""
         for routing_id, session in list(self._sessions.items()):
             if session.port.client == client:
                 self._gone(routing_id)
+        self.express.end(client)
         return self.connections.cut_user(client)
 
     def cut_unbound(self) -> int:
@@ -184,3 +225,6 @@ class RelayServer:
         for routing_id, session in list(self._sessions.items()):
             if self.connections.by_fd(session.fd) is not session.connection:
                 self._gone(routing_id)
+        for routing_id, joined in list(self.express.joined.items()):
+            if self.connections.by_fd(joined.fd) is not joined.connection:
+                self.express.left(routing_id)

@@ -228,6 +228,12 @@ def valid() -> list[Vector]:
         ),
         _handshake("refuse", "no session", "REFUSE", {"code": "version", "why": "no wire version in common"}),
         _handshake("reset", "say hello again", "RESET", {}, tag=255),
+        _handshake(
+            "join",
+            "this connection, too, belongs to the session with that tag",
+            "JOIN",
+            {"name": "jackal1", "boot": 5, "relay": 2**63 - 1},
+        ),
         _handshake("close", "the session ends on purpose", "CLOSE", {"why": "shutting down"}, tag=1),
         _data("data-whole", "one message in one fragment", _frame(body=b"hello")),
         _data("data-empty", "a message of no bytes", _frame(body=b"")),
@@ -357,7 +363,7 @@ def _bad_bytes() -> Iterator[tuple[str, str, bytes]]:
     yield "version-2", "datagram", changed(header, 1, 2)
     yield "handshake-version-2", "datagram", changed(by_name["hello"], 1, 2)
     yield "kind-0", "datagram", changed(header, 2, 0)
-    yield "kind-6", "datagram", changed(header, 2, 6)
+    yield "kind-7", "datagram", changed(header, 2, 7)
     yield "kind-17", "datagram", changed(header, 2, 17)
     yield "frame-type-0", "datagram", header + b"\x00"
     yield "frame-type-5", "datagram", header + b"\x05"

@@ -11,6 +11,7 @@ import zmq
 
 from benchmarks.link.load import HELLO_PERIOD_S, Kind, Load, Log, Orders, Spec, offer, ready
 from sern_client.daemon import TICK_S
+from sern_client.express import ClientExpress
 from sern_client.transport import RelayTransport
 from sern_client.udp import ClientLane
 from sern_core import wire
@@ -63,9 +64,13 @@ class End:
             on_reason=self.problems.append,
             after=self.kick,
         )
+        self._express = ClientExpress(
+            self.core, self._transport, LinkParams().redundancy, datagrams=self._lane is not None, kick=self.kick
+        )
 
     def kick(self) -> None:
         self._transport.pump.kick()
+        self._express.kick()
         if self._lane is not None:
             self._lane.kick()
 
@@ -73,13 +78,16 @@ class End:
     def connected(self) -> bool:
         """On the lane that is to be measured."""
         link = self.core.link
-        return link.established and link.lane.name == ("zmq" if self._lane is None else "udp")
+        if self._lane is None:
+            return link.established and link.express is not None
+        return link.established and link.lane.name == "udp"
 
     async def tick(self) -> None:
         while True:
             await asyncio.sleep(TICK_S)
             if self._lane is not None:
                 self._lane.tick()
+            self._express.tick()
 
     async def sample(self) -> None:
         while True:
@@ -101,6 +109,7 @@ class End:
             )
 
     def close(self) -> None:
+        self._express.close()
         self._transport.close()
         if self._lane is not None:
             self._lane.closed()
@@ -111,6 +120,7 @@ class End:
     def link_up(self, *, resumed: bool) -> None:
         if self._lane is not None:
             self._lane.ask()
+        self._express.begin()
 
     def link_down(self, reason: str) -> None:
         self.problems.append(reason)

@@ -186,6 +186,25 @@ async def test_a_claimed_routing_id_is_never_heard(tmp_path: Path, caplog: pytes
                 assert impostor.received == []
 
 
+async def test_nobody_joins_the_session_of_another(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    async with bystanders(tmp_path, caplog) as world:
+        server = world.relay.server
+        assert server is not None
+        said = world.robot.core.link.join(now=0.0)  # as if it had been overheard
+        assert said is not None
+        envelope = wire.decode_handshake(said) | {"name": "robot2"}
+        own_name = wire.encode_handshake(wire.Kind.JOIN, wire.decode_header(said).tag, 0, envelope)
+        keys = load_secret(world.lab.directory / "robot2.key")
+        for number, datagram in enumerate((said, own_name), start=1):
+            async with Stranger(world.lab, keys) as impostor:
+                await impostor.send(datagram)
+                await impostor.cut()
+                assert impostor.received == []
+            assert server.express.refused == number
+        await world.refused("join")
+        assert not any(joined.client == "robot2" for joined in server.express.joined.values())
+
+
 def oversize() -> list[bytes]:
     return [bytes(80 * 1024)]
 

@@ -202,6 +202,7 @@ def test_handshakes_have_the_documented_keys() -> None:
     note(port.next_datagram(now=0.0))
     port.receive(hello, now=0.0)
     link.receive(note(port.next_datagram(now=0.0)), now=0.0)
+    note(link.join(now=0.0))
     link.close("done", now=0.0)
     note(link.next_datagram(now=0.0))
     assert set(said) == {kind.name for kind in wire.Kind if kind is not wire.Kind.DATA}

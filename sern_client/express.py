@@ -1,0 +1,168 @@
+"""The client's express lane: class control on TCP connections of its own, where data goes over the stream lane."""
+
+import asyncio
+import logging
+import time
+from collections.abc import Callable
+from typing import Final
+
+from sern_client.transport import Dialer, RelayTransport
+from sern_core.client import ClientCore
+from sern_core.errors import ConfigError, RemoteError
+from sern_core.lanes import LANE_EXPRESS, LANE_ZMQ
+from sern_core.link import LanePort
+from sern_core.params import Redundancy
+from sern_runtime.express import CONNECTIONS, ExpressPaths
+from sern_runtime.monitor import TcpHandle
+from sern_runtime.pump import Pump
+
+DATAGRAMS_FIRST_S: Final = 3.0
+"""How long the datagram lane has in a session to show that it works, where it may be used."""
+ATTEMPTS: Final = 3
+"""Connections that ended before the relay said anything on them: it does not want them."""
+ASK_AGAIN_S: Final = 30.0
+
+_log = logging.getLogger(__name__)
+
+
+class ClientExpress:
+    """Opens the connections when they are of use and joins each to the session. `kick` is called when the core may have
+    something to send. Call `tick` about twice a second."""
+
+    def __init__(
+        self,
+        core: ClientCore,
+        transport: RelayTransport,
+        redundancy: Redundancy,
+        *,
+        datagrams: bool,
+        kick: Callable[[], None],
+    ) -> None:
+        self.core = core
+        self.bad_frames = 0
+        self.paths: ExpressPaths[_Connection] = ExpressPaths(redundancy)
+        self._transport = transport
+        self._wait_s = DATAGRAMS_FIRST_S if datagrams else 0.0
+        self._kick = kick
+        self._connections: list[_Connection] = []
+        self._pump: Pump | None = None
+        self._open_s = 0.0
+        self._failures = 0
+
+    def begin(self) -> None:
+        """A session has begun: what is connected must join it."""
+        self._open_s = time.monotonic() + self._wait_s
+        self._failures = 0
+        self.paths.clear()
+        for connection in self._connections:
+            connection.join()
+
+    def tick(self) -> None:
+        link = self.core.link
+        if not self._connections:
+            if link.established and link.lane.id == LANE_ZMQ and time.monotonic() >= self._open_s:
+                self._open()
+        else:
+            self.paths.look()
+
+    def _open(self) -> None:
+        self._failures = 0
+        self._pump = Pump(LanePort(self.core.link, LANE_EXPRESS), self.paths.send, on_gone=lambda: None)
+        try:
+            for _ in range(CONNECTIONS):
+                self._connections.append(_Connection(self, self._transport))
+        except ConfigError as error:
+            _log.warning("class control has no connection of its own: %s", error)
+            self._give_up()
+
+    def _give_up(self) -> None:
+        self.close()
+        self._open_s = time.monotonic() + ASK_AGAIN_S
+
+    def close(self) -> None:
+        """The daemon stops, or the relay does not want the lane."""
+        if self._pump is not None:
+            self._pump.close()
+            self._pump = None
+        for connection in self._connections:
+            connection.dialer.close()
+        self._connections.clear()
+        self.paths.clear()
+        self.core.link.close_lane(now=time.monotonic(), lane_id=LANE_EXPRESS)
+
+    def kick(self) -> None:
+        if self._pump is not None:
+            self._pump.kick()
+
+    def joined(self, connection: "_Connection", handle: TcpHandle | None) -> None:
+        self.paths.add(connection, connection.dialer.send, handle)
+        link = self.core.link
+        if LANE_EXPRESS not in link.lanes:
+            if self._pump is not None:
+                self._pump.reset()
+            link.open_lane(now=time.monotonic(), lane_id=LANE_EXPRESS)
+        self._kick()
+
+    def lost(self, connection: "_Connection", *, answered: bool) -> None:
+        self.paths.discard(connection)
+        if not self.paths:
+            self.core.link.close_lane(now=time.monotonic(), lane_id=LANE_EXPRESS)
+        self._failures = 0 if answered else self._failures + 1
+        link = self.core.link
+        if self._failures >= ATTEMPTS * CONNECTIONS and link.established and link.express is None:
+            self._failures = 0
+            _log.warning("the relay takes no connection for class control alone; asking again in %g s", ASK_AGAIN_S)
+            asyncio.get_running_loop().call_soon(self._give_up)
+        self._kick()
+
+    def received(self, connection: "_Connection", data: bytes) -> None:
+        try:
+            self.core.link.receive(data, now=time.monotonic(), lane=LANE_EXPRESS)
+        except RemoteError as error:
+            self.bad_frames += 1
+            _log.warning("the relay sent a bad frame for class control (%s); reconnecting", error)
+            connection.dialer.again(f"bad frame: {error}")
+            return
+        if self.core.link.dirty:
+            self._kick()
+
+
+class _Connection:
+    """One connection of the lane."""
+
+    def __init__(self, lane: ClientExpress, transport: RelayTransport) -> None:
+        self._lane = lane
+        self._handle: TcpHandle | None = None
+        self._up = False
+        self._answered = False
+        self.dialer: Dialer = transport.another(self)
+        self.dialer.open()
+
+    def join(self) -> None:
+        """Say whose connection this is; without a session, when there is one."""
+        said = self._lane.core.link.join(now=time.monotonic())
+        if self._up and said is not None and self.dialer.send(said):
+            self._lane.joined(self, self._handle)
+
+    def up(self, handle: TcpHandle | None) -> None:
+        self._handle = handle
+        self._up = True
+        self._answered = False
+        self.join()
+
+    def down(self, reason: str) -> None:
+        self._up = False
+        self._lane.lost(self, answered=self._answered)
+
+    def refused(self, reason: str) -> None: ...
+
+    def given_up(self, reason: str) -> None:
+        self._up = False
+        self._lane.lost(self, answered=True)
+
+    def received(self, data: bytes) -> None:
+        self._answered = True
+        self._lane.received(self, data)
+
+    def writable(self) -> None:
+        self._lane.kick()
