@@ -6,6 +6,7 @@ SernError
 ├── BodyError             a message body that does not fit its type, or a layout that is not read here
 └── RemoteError           a peer did something wrong or said no
     ├── WireError         bytes that are not a valid frame
+    ├── CodecError        an encoded body that cannot be decoded
     ├── VersionError      no wire version in common
     ├── RefusedError      the peer refused us, with its reason
     └── ServiceError      a service call got no answer, and why
@@ -55,6 +56,10 @@ class RemoteError(SernError):
 
 class WireError(RemoteError):
     """Bytes that are not a valid frame. The sender's connection is closed; nobody else notices."""
+
+
+class CodecError(RemoteError):
+    """An encoded body that is damaged, lies about its size, or is too large. Only its message is dropped."""
 
 
 class VersionError(RemoteError):
