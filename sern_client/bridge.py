@@ -299,6 +299,9 @@ class Bridge:
         self.refusals += 1
         _log.error("the relay refuses %s (%s): %s", stream.id.topic, code, text)
 
+    def undecodable(self, stream: StreamInfo, problem: str) -> None:
+        _log.error("%s from %s cannot be decoded and is dropped: %s", stream.id.topic, stream.id.origin, problem)
+
     def subscription_refused(self, code: str, text: str) -> None:
         if text not in self.subscription_problems:  # it is said again in every session
             _log.error("the relay refuses a subscription (%s): %s", code, text)

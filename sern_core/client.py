@@ -9,16 +9,18 @@ from typing import Protocol
 
 from sern_core import wire
 from sern_core.announce import MAX_STRINGS, Announcement, check_stream
+from sern_core.codecs import CodecProfile, Coder, Compression
+from sern_core.decoding import Decoder
 from sern_core.errors import ConfigError, WireError
 from sern_core.fragments import InStream
-from sern_core.ledger import ReceiveLedger
+from sern_core.ledger import MAX_TOPICS, ReceiveLedger
 from sern_core.link import Link
 from sern_core.message import Message, StreamId, StreamInfo, TopicInfo, TopicSpec
 from sern_core.params import LinkParams, SchedulerParams
 from sern_core.queues import OutChannel, OutMessage
 from sern_core.replay import LatchedCache
 from sern_core.trace import DecisionTrace, TraceEvent
-from sern_core.types import ClientName, DropReason, ObjectKind
+from sern_core.types import ClientName, DropReason, ObjectKind, TopicName
 
 RELAY_NAME = ClientName("relay")
 """What the relay is called until its WELCOME says its own name."""
@@ -64,9 +66,15 @@ class ClientEvents(Protocol):
     def subscription_refused(self, code: str, text: str) -> None:
         """Something that this site named is not ours to have, or the relay takes none of our patterns."""
 
+    def undecodable(self, stream: StreamInfo, problem: str) -> None:
+        """The body of a message could not be decoded: it is dropped. Said once for each topic."""
+
 
 class ClientCore:
-    """One client. `boot` is a random 63-bit number of this process, `now` any monotonic time in seconds."""
+    """One client. `boot` is a random 63-bit number of this process, `now` any monotonic time in seconds.
+
+    With a `coder` what is published is compressed as each topic's spec says; without one it is sent as it comes.
+    """
 
     def __init__(
         self,
@@ -79,6 +87,7 @@ class ClientCore:
         trace: DecisionTrace | None = None,
         now: float,
         lossless: bool = True,
+        coder: Coder | None = None,
     ) -> None:
         self.name = name
         self.boot = boot
@@ -93,6 +102,11 @@ class ClientCore:
         self._generations: dict[StreamId, int] = {}
         self._latched: dict[StreamId, LatchedCache] = {}  # for a relay that comes back with nothing
         self._open: set[StreamId] = set()
+        self._undecodable: set[TopicName] = set()
+        self.coder = coder or Coder(max_bytes=link.max_message_bytes)
+        self._decoder = Decoder[InStream](
+            self.coder, lambda stream: stream.stream, self._handle, self._failed, self._settled
+        )
         self.link = Link(
             name=name,
             boot=boot,
@@ -106,6 +120,8 @@ class ClientCore:
             now=now,
             lossless=lossless,
         )
+        if coder is not None:
+            self.link.encode_with(coder)
 
     # --- publishing -----------------------------------------------------------------------------------------------
 
@@ -135,6 +151,14 @@ class ClientCore:
         if accepted and channel.spec.latched:
             self._latched[channel.stream.id].add(message)
         return accepted
+
+    def set_compression(self, channel: OutChannel, setting: Compression | None, *, now: float) -> None:
+        """Compress what leaves this channel from the next message on with another mode; None: `auto`."""
+        self.link.set_compression(channel, setting, now=now)
+
+    def codec_profiles(self, channel: OutChannel) -> dict[Compression, CodecProfile]:
+        """What each mode makes of this channel's messages, as measured so far."""
+        return {} if channel.codec is None else dict(channel.codec.profiles)
 
     # --- receiving ------------------------------------------------------------------------------------------------
 
@@ -241,10 +265,20 @@ class ClientCore:
 
     def on_retract(self, link: Link, stream: InStream, *, now: float) -> None:
         if stream.stream.id in self._open:
+            self._decoder.forget(stream.stream.id, now=now)
             self._open.discard(stream.stream.id)
             self.events.stream_closed(stream.stream)
 
     def on_message(self, link: Link, stream: InStream, message: Message, *, now: float) -> None:
+        self._decoder.message(stream, message, now=now)
+        stream.unhandled = self._decoder.oldest(message.stream)
+
+    def _handle(self, stream: InStream, message: Message, now: float) -> None:
+        """A message has had its turn and is decoded."""
+        lifespan_s = stream.lifespan_s
+        if stream.unhandled and not stream.reliable and lifespan_s is not None and message.age_s(now) > lifespan_s:
+            self._failed(stream, message, DropReason.LIFESPAN, "", now)  # while it was decoded
+            return
         if message.tombstone:
             reason = message.drop_reason
             self.received.of(stream.stream).drop_arrived(reason)
@@ -252,6 +286,26 @@ class ClientCore:
             return
         self.received.of(stream.stream).arrived(len(message.body), now - message.born_s, now)
         self.events.message(stream.stream, message, now=now)
+
+    def _failed(self, stream: InStream, message: Message, reason: DropReason, problem: str, now: float) -> None:
+        """A message has had its turn and cannot be handed on."""
+        topic = stream.stream.id.topic
+        self.received.of(stream.stream).drop_arrived(reason)
+        self.trace.record(now, topic, TraceEvent.DROPPED, seq=message.seq, reason=reason, peer=self.link.peer)
+        told = self._undecodable
+        if reason is DropReason.UNDECODABLE and topic not in told and len(told) < MAX_TOPICS:
+            told.add(topic)
+            self.events.undecodable(stream.stream, problem)
+        if stream.reliable and reason is not DropReason.DISCONNECTED:
+            self.link.report_drop(stream, message.seq, reason, self.name, now=now)
+            self.events.expired(stream.stream, message.seq, reason)
+
+    def _settled(self, stream: InStream) -> None:
+        """A body is decoded, or dropped: the peer may be told how far the stream has come."""
+        identity = stream.stream.id
+        current = self.link.streams.get(identity)
+        if current is not None:
+            self.link.handled(current, self._decoder.oldest(identity))
 
     def on_in_drop(self, link: Link, stream: InStream, reason: DropReason, nbytes: int) -> None:
         self.received.of(stream.stream).drop_arrived(reason)

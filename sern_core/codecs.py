@@ -244,8 +244,8 @@ class Coder:
         self.clock = clock
         self.offload = offload
         self.inline_bytes = inline_bytes
-        self.encoded = {mode: CodecCounters() for mode in Compression if mode is not Compression.NONE}
-        self.decoded = {codec: CodecCounters() for codec in Codec if codec is not Codec.NONE}
+        self.encoded: dict[Compression, CodecCounters] = {mode: CodecCounters() for mode in list(Compression)[1:]}
+        self.decoded: dict[Codec, CodecCounters] = {codec: CodecCounters() for codec in list(Codec)[1:]}
         self.undecodable = 0
 
     def encode(self, mode: Compression, body: bytes) -> Encoded:

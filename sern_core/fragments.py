@@ -32,13 +32,14 @@ SEEN_MASK: Final = (1 << SEEN_BITS) - 1
 class Partial:
     """One message of which some fragments have arrived."""
 
-    __slots__ = ("body", "born_s", "error_s", "spans", "stamp_ns", "touched_s")
+    __slots__ = ("body", "born_s", "codec", "error_s", "spans", "stamp_ns", "touched_s")
 
     def __init__(self, total: int) -> None:
         self.body = bytearray(total)
         self.spans: list[tuple[int, int]] = []  # merged [start, end) that have arrived
         self.born_s: float | None = None  # known with the first fragment
         self.error_s = 0.0
+        self.codec = 0
         self.stamp_ns = 0
         self.touched_s = 0.0
 
@@ -115,6 +116,7 @@ class InStream:
         self.lifespan_s = stream.spec.lifespan_s
         self.delivered = first - 1
         self.confirmed = first - 1  # what the peer was told (`Hop.confirm`)
+        self.unhandled = 0  # the first seq that had its turn and is still being decoded; 0: none
         self.channel_id: int | None = None  # in this session
         self.wanted = True  # what the peer was told
         self.paused = False  # it was not wanted, and the peer has not said yet where it goes on
@@ -155,8 +157,9 @@ class InStream:
         born_s: float,
         error_s: float,
         now: float,
+        codec: int = 0,
     ) -> None:
-        """One fragment arrived; `seq` is widened already, `born_s` and `error_s` hold for offset 0 only."""
+        """One fragment arrived; `seq` is widened already; `born_s`, `error_s` and `codec` hold for offset 0 only."""
         self._now = now
         if seq <= self.delivered:
             self._late(seq, len(body))
@@ -172,7 +175,7 @@ class InStream:
             return
         replay = bool(flags & FLAG_REPLAY)
         if len(body) == total:
-            self._arrived(Message(self.stream.id, seq, body, stamp_ns, born_s, 0, replay, error_s))
+            self._arrived(Message(self.stream.id, seq, body, stamp_ns, born_s, 0, replay, error_s, codec))
             return
         partial = self._partials.get(seq)
         if partial is None or len(partial.body) != total:
@@ -189,12 +192,23 @@ class InStream:
         partial.add(offset, body)
         if offset == 0:
             partial.born_s, partial.error_s, partial.stamp_ns = born_s, error_s, stamp_ns
+            partial.codec = codec
         if partial.complete:
             assert partial.born_s is not None
             self._discard_partial(seq)
             whole = bytes(partial.body)
             self._arrived(
-                Message(self.stream.id, seq, whole, partial.stamp_ns, partial.born_s, 0, replay, partial.error_s)
+                Message(
+                    self.stream.id,
+                    seq,
+                    whole,
+                    partial.stamp_ns,
+                    partial.born_s,
+                    0,
+                    replay,
+                    partial.error_s,
+                    partial.codec,
+                )
             )
 
     def give_up(self, seq: int, reason: DropReason, nbytes: int, now: float) -> None:

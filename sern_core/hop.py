@@ -8,6 +8,7 @@ from typing import Any, Final
 
 from sern_core import wire
 from sern_core.capacity import AckSample
+from sern_core.codecs import KNOWN_CODECS
 from sern_core.errors import WireError
 from sern_core.flight import ACK_DELAY_S
 from sern_core.fragments import InStream
@@ -62,8 +63,8 @@ class Hop(Sender):
     ) -> None:
         """FrameSink: one fragment."""
         now = self._now
-        if codec:
-            raise WireError(f"codec {codec} was not agreed")
+        if codec and (codec not in KNOWN_CODECS or channel == CONTROL_CHANNEL or flags & wire.FLAG_TOMBSTONE):
+            raise WireError(f"codec {codec} has no place there")
         if flags & wire.FLAG_URGENT:
             self._rx_lane.arrivals.due = True
         if channel == CONTROL_CHANNEL:
@@ -88,7 +89,7 @@ class Hop(Sender):
             delay_s, uncertainty_s = self._rx_delay
             born_s = now - age_s - delay_s
             error_s += uncertainty_s  # infinite before the first round trip
-        stream.fragment(flags, wide, offset, total, body, stamp_ns, born_s, error_s, now)
+        stream.fragment(flags, wide, offset, total, body, stamp_ns, born_s, error_s, now, codec)
 
     def on_ack(self, lane: int, highest: int, sack: int, echo_us: int, received_us: int, cum_bytes: int) -> None:
         """FrameSink: an acknowledgement of what we sent."""

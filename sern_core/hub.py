@@ -527,7 +527,9 @@ class Hub:
         if not message.tombstone:
             if relayed.cache is not None:
                 self.replays.add(relayed.cache, message)
-            self.objects.observe(stream.stream.id, message.seq, message.body, wall_ns=message.stamp_ns, now=now)
+            self.objects.observe(
+                stream.stream.id, message.seq, message.body, wall_ns=message.stamp_ns, now=now, codec=message.codec
+            )
             self.events.message(stream.stream, message, now=now)
         return behind
 

@@ -184,6 +184,7 @@ class Link(Session):
         channel = OutChannel(slot, stream, counters, self._reporter(slot), first=first)
         channel.owed = owed
         channel.wanted = wanted
+        channel.codec = self._new_codec(stream.spec.compression)
         channel.prime(replays, now=now)
         self.channels[slot] = channel
         self.by_stream[stream.id] = channel
@@ -333,7 +334,12 @@ class Link(Session):
 
     def _confirm_own(self, stream: InStream) -> None:
         if self.auto_confirm and stream.reliable:
-            self.confirm(stream, stream.delivered)
+            self.confirm(stream, min(stream.delivered, stream.unhandled - 1) if stream.unhandled else stream.delivered)
+
+    def handled(self, stream: InStream, oldest: int) -> None:
+        """Of what had its turn, everything below seq `oldest` has been dealt with by now; 0: everything."""
+        stream.unhandled = oldest
+        self._confirm_own(stream)
 
     def _deliver(self, stream: InStream, message: Message) -> None:
         self.handler.on_message(self, stream, message, now=self._now)

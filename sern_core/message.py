@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
+from sern_core.codecs import Codec, Compression
 from sern_core.types import (
     DROP_REASONS,
     ClientName,
@@ -44,6 +45,7 @@ class TopicSpec:
     retention_s: float = DEFAULT_RETENTION_S
     max_queue_bytes: int = DEFAULT_RELIABLE_QUEUE_BYTES
     many_writers: bool = False  # several clients may own this global name, e.g. /tf
+    compression: Compression | None = None  # None: whatever is quickest; for the origin alone, never on the wire
 
     @property
     def reliable(self) -> bool:
@@ -89,7 +91,8 @@ class Message:
     `seq` counts from 1 per stream without gaps as assigned by the origin. `stamp_ns` is the wall time at which the
     origin's endpoint took it (never used for expiry). `born_s` is its birth on *this* process's monotonic clock:
     arrival time minus the age it had gathered, so that age needs no common clock.
-    A `tombstone` has an empty body and stands for a reliable message that was dropped for `reason` upstream.
+    A `tombstone` has a body of one byte and stands for a reliable message that was dropped for `reason` upstream.
+    `body` is encoded as `codec` says, from the origin to whoever publishes it; relays pass it on as it is.
     """
 
     stream: StreamId
@@ -100,6 +103,7 @@ class Message:
     tombstone: int = 0  # 0, or a DROP_CODES value
     replay: bool = False  # a transient_local message sent again to a late joiner
     error_s: float = 0.0  # the message may be older than `born_s` says by as much: clock offsets of the hops so far
+    codec: int = Codec.NONE
 
     def age_s(self, now: float) -> float:
         return now - self.born_s

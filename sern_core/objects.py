@@ -36,7 +36,8 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, Final, NamedTuple
 
-from sern_core.errors import RefusedError
+from sern_core.codecs import Codec, decode
+from sern_core.errors import CodecError, RefusedError
 from sern_core.message import StreamId, StreamInfo
 from sern_core.rules import COMMAND_TYPES, plain_type
 from sern_core.types import ClientName, ObjectKind, PriorityClass
@@ -62,6 +63,7 @@ class ObjectLimits:
     max_total_bytes: int = 64 * 2**20  # ids, type names, definitions, attributes and kept values
     max_held_bytes: int = 64 * 2**20  # references to larger values
     max_value_bytes: int = 4_096
+    max_decoded_bytes: int = 16 * 2**20  # of a value that came encoded, when somebody asks for it
     max_definition_bytes: int = 256 * 2**10
     max_attributes: int = 64
     max_attribute_bytes: int = 4_096
@@ -113,6 +115,7 @@ class _Entry:
     __slots__ = (
         "attributes",
         "body",
+        "codec",
         "created_s",
         "definition",
         "definition_hash",
@@ -140,6 +143,7 @@ class _Entry:
         self.definition_hash = ""
         self.attributes: Mapping[str, str] = MappingProxyType({})
         self.body: bytes | None = None  # the value, or a reference to a large one that nobody has hashed yet
+        self.codec = 0  # of the body, until somebody asks for the value
         self.value_bytes = -1
         self.sha256: str | None = None
         self.fixed_bytes = 0
@@ -270,8 +274,9 @@ class ObjectRegistry:
         wall_ns: int,
         now: float,
         ros_stamp_ns: int | None = None,
+        codec: int = Codec.NONE,
     ) -> bool:
-        """A message of an announced stream went by: keep it as the latest value. Never copies, hashes or raises.
+        """A message of an announced stream went by: keep it as the latest value. Never copies, decodes or raises.
 
         False when it was not taken: the stream has no object (`put_stream` was refused or not called, or a newer
         boot replaced it), or `seq` is not newer than the value there.
@@ -282,7 +287,7 @@ class ObjectRegistry:
         entry.seq = seq
         entry.wall_ns = wall_ns
         entry.ros_stamp_ns = ros_stamp_ns
-        self._set_value(entry, body)
+        self._set_value(entry, body, codec)
         self._touch(entry, now)
         return True
 
@@ -422,11 +427,16 @@ class ObjectRegistry:
                 "limit; delete some",
             )
 
-    def _set_value(self, entry: _Entry, body: bytes) -> None:
+    def _set_value(self, entry: _Entry, body: bytes, codec: int = Codec.NONE) -> None:
         """Store a value, a reference, or only its size, whichever the budgets allow."""
         limits = self.limits
         self._forget_value(entry)
         size = len(body)
+        if codec:
+            if self._held_bytes + size <= limits.max_held_bytes:
+                self._held_bytes += size
+                entry.body, entry.codec = body, codec
+            return
         entry.value_bytes = size
         if size <= limits.max_value_bytes:
             if self._total_bytes + size <= limits.max_total_bytes:
@@ -439,11 +449,12 @@ class ObjectRegistry:
     def _forget_value(self, entry: _Entry) -> None:
         old = entry.body
         if old is not None:
-            if len(old) <= self.limits.max_value_bytes:
+            if not entry.codec and len(old) <= self.limits.max_value_bytes:
                 self._total_bytes -= len(old)
             else:
                 self._held_bytes -= len(old)
             entry.body = None
+        entry.codec = 0
         entry.value_bytes = -1
         entry.sha256 = None
 
@@ -469,12 +480,28 @@ class ObjectRegistry:
         self._deletions.append((self._version, entry.id))
 
     def _kept_bytes(self, entry: _Entry) -> int:
-        return len(entry.body) if entry.body is not None and entry.value_bytes <= self.limits.max_value_bytes else 0
+        return len(entry.body) if entry.body is not None and not self._is_reference(entry) else 0
 
     def _referenced_bytes(self, entry: _Entry) -> int:
-        return len(entry.body) if entry.body is not None and entry.value_bytes > self.limits.max_value_bytes else 0
+        return len(entry.body) if entry.body is not None and self._is_reference(entry) else 0
+
+    def _is_reference(self, entry: _Entry) -> bool:
+        return bool(entry.codec) or entry.value_bytes > self.limits.max_value_bytes
+
+    def _decode(self, entry: _Entry) -> None:
+        """Somebody asks for a value that came encoded; what cannot be decoded has no value."""
+        body, codec = entry.body, entry.codec
+        self._forget_value(entry)
+        if body is not None:
+            try:
+                raw = decode(codec, body, max_bytes=self.limits.max_decoded_bytes)
+            except CodecError:
+                return
+            self._set_value(entry, raw)
 
     def _seen(self, entry: _Entry) -> XrObject:
+        if entry.codec:
+            self._decode(entry)
         if entry.body is not None and entry.sha256 is None:
             entry.sha256 = hashlib.sha256(entry.body).hexdigest()
             if entry.value_bytes > self.limits.max_value_bytes:

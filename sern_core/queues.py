@@ -13,6 +13,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Final
 
+from sern_core.encoding import ChannelCodec, Coding
 from sern_core.ledger import SendCounters
 from sern_core.message import Message, StreamInfo
 from sern_core.types import DROP_CODES, DROP_REASONS, DropReason
@@ -28,13 +29,18 @@ OnDrop = Callable[["OutMessage", DropReason], None]
 
 
 class OutMessage:
-    """One message on its way over one hop. `ranges` are the parts of the body still to be sent, as [start, end)."""
+    """One message on its way over one hop. `ranges` are the parts of the body still to be sent, as [start, end).
+
+    `size` is that of the body as it is now, `offered_bytes` as it was when it came: the counters count that one.
+    """
 
     __slots__ = (
+        "coding",
         "counted",
         "fragments_inflight",
         "generation",
         "message",
+        "offered_bytes",
         "ranges",
         "retain_from_s",
         "seq",
@@ -46,7 +52,8 @@ class OutMessage:
     def __init__(self, message: Message) -> None:
         self.message = message
         self.seq = message.seq
-        self.size = len(message.body)
+        self.size = self.offered_bytes = len(message.body)
+        self.coding = Coding.RAW
         self.ranges: list[tuple[int, int]] | None = None  # None: untouched, send from 0
         self.generation = 0  # of the body: acknowledgements of an earlier one no longer count
         self.some_acked = False
@@ -60,6 +67,11 @@ class OutMessage:
         if self.ranges is None:
             return self.size
         return sum(end - start for start, end in self.ranges)
+
+    @property
+    def withheld(self) -> bool:
+        """Whether it waits for its body to be encoded."""
+        return self.coding is Coding.RUNNING or self.coding is Coding.HELD
 
     @property
     def has_unsent(self) -> bool:
@@ -79,6 +91,7 @@ class OutMessage:
             old.stream, old.seq, bytes([DROP_CODES[reason]]), old.stamp_ns, old.born_s, tombstone=DROP_CODES[reason]
         )
         self.size = 1
+        self.coding = Coding.DONE
         self.restart()
         self.counted = True
 
@@ -111,6 +124,7 @@ class OutChannel:
         self.gaps: deque[tuple[int, int]] = deque()  # reliable: after this seq, the next that will come
         self.offered = False  # the scheduler knows of a pending message
         self.owed: tuple[str, ...] = ()  # reliable subscribers behind the peer, as it told us
+        self.codec: ChannelCodec | None = None  # None: bodies go as they come
 
     # --- entry ------------------------------------------------------------------------------------------------
 
@@ -180,7 +194,7 @@ class OutChannel:
             return
         for out in fresh:
             out.retain_from_s = now
-            self.counters.offer(out.size)
+            self.counters.offer(out.offered_bytes)
             self.queued_bytes += out.size
         self.queue.extendleft(reversed(fresh))
         if self.reliable:
@@ -214,7 +228,8 @@ class OutChannel:
         return out
 
     def _drop(self, out: OutMessage, reason: DropReason) -> None:
-        self.counters.drop(reason, out.size)
+        out.coding = Coding.DONE  # whatever another thread makes of it
+        self.counters.drop(reason, out.offered_bytes)
         self.on_drop(out, reason)
 
     # --- service ------------------------------------------------------------------------------------------------
@@ -265,7 +280,7 @@ class OutChannel:
         self.retained_bytes -= size - 1
         reported = out.counted
         if not reported:
-            self.counters.drop(reason, size)
+            self.counters.drop(reason, out.offered_bytes)
         out.entomb(reason)
         if not reported:
             self.on_drop(out, reason)
@@ -308,8 +323,8 @@ class OutChannel:
         """Bytes that wait here or are under way, and would have to be sent again to a peer that has lost them."""
         return self.retained_bytes if self.reliable else self.queued_bytes + sum(o.size for o in self.flying.values())
 
-    def _begin(self, out: OutMessage, now: float) -> None:
-        """`out` was the head of the queue and its first bytes leave now."""
+    def begin(self, out: OutMessage, now: float) -> None:
+        """`out` was the head of the queue and its first bytes leave now, or once its body is encoded."""
         out.started = True
         popped = self._pop_queue()
         assert popped is out
@@ -336,11 +351,21 @@ class OutChannel:
             else:
                 del out.ranges[0]
         if not out.started:
-            self._begin(out, now)
+            self.begin(out, now)
         elif not out.ranges:
             self.active.remove(out)
         out.fragments_inflight += 1
         return start, end
+
+    def recoded(self, out: OutMessage, message: Message) -> None:
+        """The body of `out`, of which nothing was sent yet, is another one now: encoded."""
+        size = len(message.body)
+        if not out.started:
+            self.queued_bytes += size - out.size
+        if self.reliable:
+            self.retained_bytes += size - out.size
+        out.message = message
+        out.size = size
 
     # --- outcomes -----------------------------------------------------------------------------------------------
 
@@ -352,7 +377,7 @@ class OutChannel:
         if out.fragments_inflight <= 0 and not out.has_unsent and self.flying.get(out.seq) is out:
             del self.flying[out.seq]
             if not self.reliable:
-                self.counters.deliver(out.size)
+                self.counters.deliver(out.offered_bytes)
                 if out.seq > self.acked_seq:
                     self.acked_seq = out.seq
 
@@ -405,7 +430,7 @@ class OutChannel:
             out = retained.popleft()
             self.retained_bytes -= out.size
             if not out.counted:
-                self.counters.deliver(out.size)
+                self.counters.deliver(out.offered_bytes)
             self._forget(out)
 
     def settle(self) -> None:
@@ -435,6 +460,7 @@ class OutChannel:
 
     def _forget(self, out: OutMessage) -> None:
         """Take a reliable message out of wherever it still is."""
+        out.coding = Coding.DONE
         if not out.started:
             self.queue.remove(out)
             self.queued_bytes -= out.size
@@ -449,7 +475,7 @@ class OutChannel:
         for out in self.retained:
             if out.seq == seq:
                 if not out.counted:
-                    self.counters.drop(reason, out.size)
+                    self.counters.drop(reason, out.offered_bytes)
                     out.counted = True
                     self.on_drop(out, reason)
                 return
@@ -526,6 +552,7 @@ class OutChannel:
         """The stream ends: whatever is left is dropped for `reason`."""
         if self.reliable:
             for out in self.retained:
+                out.coding = Coding.DONE
                 if not out.counted:
                     self._drop(out, reason)
             self.retained.clear()
@@ -543,13 +570,15 @@ class OutChannel:
     # --- accounting -----------------------------------------------------------------------------------------------
 
     def held(self) -> tuple[int, int, int, int]:
-        """(messages queued, bytes queued, messages in flight, bytes in flight); counted tombstones are neither."""
+        """(messages queued, bytes queued, messages in flight, bytes in flight), bytes as they were offered; counted
+        tombstones are neither."""
         if self.reliable:
             queued = [out for out in self.retained if not out.started and not out.counted]
             flying = [out for out in self.retained if out.started and not out.counted]
         else:
             queued, flying = list(self.queue), list(self.flying.values())
-        return len(queued), sum(o.size for o in queued), len(flying), sum(o.size for o in flying)
+        queued_bytes, flying_bytes = sum(o.offered_bytes for o in queued), sum(o.offered_bytes for o in flying)
+        return len(queued), queued_bytes, len(flying), flying_bytes
 
     def validate(self, check: Callable[[bool, str], None]) -> None:
         """Internal consistency; that the counters add up is checked by the link, as streams of one topic share them."""

@@ -48,7 +48,15 @@ class LatchedCache:
         """Copies marked as replay, oldest first."""
         return [
             Message(
-                message.stream, message.seq, message.body, message.stamp_ns, message.born_s, 0, True, message.error_s
+                message.stream,
+                message.seq,
+                message.body,
+                message.stamp_ns,
+                message.born_s,
+                0,
+                True,
+                message.error_s,
+                message.codec,
             )
             for message in self._messages
         ]

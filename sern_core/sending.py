@@ -10,6 +10,8 @@ from typing import Final, NamedTuple
 
 from sern_core import wire
 from sern_core.clocksync import ClockSync
+from sern_core.codecs import Coder, Compression
+from sern_core.encoding import ChannelCodec, Coding, Encoder
 from sern_core.flight import ACK_DELAY_S
 from sern_core.fragments import InStream, Reassembly
 from sern_core.lanes import (
@@ -102,6 +104,8 @@ class Sender(ABC):
         self.clock = ClockSync()
         self.ledger = SendLedger()
         """Counters of what goes out, by topic."""
+        self.encoder: Encoder | None = None
+        """Encodes bodies on their way out; None: they go as they come."""
         self.strays = 0  # fragments of streams that are unknown here (drop reason `unknown_channel`)
         self.channels: dict[int, OutChannel] = {}
         self.incoming: dict[int, InStream] = {}
@@ -200,6 +204,14 @@ class Sender(ABC):
                 channel.offered = False
                 self.scheduler.withdraw(channel.slot)
             return
+        size_bytes: float = out.unsent_bytes
+        codec = channel.codec
+        if codec is not None and out.coding is not Coding.DONE:
+            if out.withheld:
+                channel.offered = True
+                self.scheduler.withdraw(channel.slot, encoding=True)
+                return
+            size_bytes *= codec.ratio
         spec = channel.spec
         since_s = out.message.born_s
         if channel.coalesced and channel.last_sent_s is not None:
@@ -211,10 +223,42 @@ class Sender(ABC):
             channel.slot,
             priority=_class_of(channel, out),
             weight=spec.weight,
-            size_bytes=out.unsent_bytes,
+            size_bytes=size_bytes,
             since_s=since_s,
             stale_after_s=spec.lifespan_s if self._paper else None,
         )
+
+    # --- encoding -------------------------------------------------------------------------------------------------
+
+    def set_compression(self, channel: OutChannel, setting: Compression | None, *, now: float) -> None:
+        """Use another mode from the next body on (None: auto). Nothing is lost or changes its place."""
+        if channel.codec is not None:
+            channel.codec.use(setting)
+            self._now = now
+            self._refresh(channel, now)
+
+    def _encoded(self, channel: OutChannel, out: OutMessage, now: float) -> bool:
+        """Whether the body of what was chosen can go now. If not, it comes back when it is encoded."""
+        assert self.encoder is not None and channel.codec is not None
+        if self.encoder.ready(channel, out, channel.codec, now=now):
+            return True
+        if self.trace.enabled:
+            self.trace.record(now, out.message.stream.topic, TraceEvent.ENCODING, seq=out.seq, peer=self.peer)
+        self._refresh(channel, now)
+        return False
+
+    def _recoded(self, channel: OutChannel, now: float) -> None:
+        """A body is encoded, or may be now."""
+        self._now = now
+        if self.channels.get(channel.slot) is channel:
+            self._refresh(channel, now)
+
+    def encode_with(self, coder: Coder) -> None:
+        """Encode the bodies of all channels that are opened from now on."""
+        self.encoder = Encoder(coder, rate_bps=lambda: self.lane.estimator.rate_bps, refresh=self._recoded)
+
+    def _new_codec(self, setting: Compression | None) -> ChannelCodec | None:
+        return None if self.encoder is None else ChannelCodec(setting)
 
     # --- bytes out ------------------------------------------------------------------------------------------------
 
@@ -336,6 +380,8 @@ class Sender(ABC):
             if out is None:
                 self._refresh(channel, now)
                 continue
+            if out.coding is Coding.RAW and channel.codec is not None and not self._encoded(channel, out, now):
+                continue
             priority = _class_of(channel, out)
             if frames and (
                 (served is not None and priority is not served)
@@ -402,7 +448,7 @@ class Sender(ABC):
             age_s = now - message.born_s
             error_s = message.error_s + wire.AGE_UNIT_S  # the age itself is cut to its unit
             head = wire.encode_data_first(
-                flags, channel.slot, out.seq, out.size, end, message.stamp_ns, age_s, 0, error_s
+                flags, channel.slot, out.seq, out.size, end, message.stamp_ns, age_s, message.codec, error_s
             )
         else:
             head = wire.encode_data_next(flags, channel.slot, out.seq, start, out.size, end - start)

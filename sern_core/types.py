@@ -81,6 +81,7 @@ class DropReason(StrEnum):
     DISCONNECTED = "disconnected"  # the peer went away for good
     SHUTDOWN = "shutdown"  # the daemon stopped before it was sent
     QUEUE_FULL = "queue_full"  # more waits for this client at the relay than its access rule allows
+    UNDECODABLE = "undecodable"  # its body cannot be decoded: damaged, above the limit, or a codec we do not have
 
 
 DROP_CODES: Final[dict[DropReason, int]] = {reason: code for code, reason in enumerate(DropReason, start=1)}

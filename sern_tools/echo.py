@@ -279,6 +279,9 @@ class Listener:
     def publication_refused(self, stream: StreamInfo, code: str, text: str) -> None:
         """We send nothing."""
 
+    def undecodable(self, stream: StreamInfo, problem: str) -> None:
+        self._printer.lost(stream, 1, f"undecodable: {problem}")
+
     def subscription_refused(self, code: str, text: str) -> None:
         self.problem = RefusedError(code, f"the relay refuses us: {text}")
 

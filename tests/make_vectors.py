@@ -255,6 +255,16 @@ def valid() -> list[Vector]:
         _data("data-age-error", "its age may be 3.2 ms too young", _frame(body=b"pose", age_error=41)),
         _data("data-replay", "a latched sample for a late joiner", _frame("REPLAY", body=b"map")),
         _data(
+            "data-lz4",
+            "120 bytes, `robot ` twenty times, as an LZ4 block",
+            _frame(body=bytes.fromhex("000000786f726f626f742006005a506f626f7420"), codec=1),
+        ),
+        _data(
+            "data-zstd",
+            "the same as a Zstandard frame",
+            _frame(body=bytes.fromhex("0000007828b52ffd20786d000030726f626f742001002f692902"), codec=2),
+        ),
+        _data(
             "data-tombstone",
             "stands for a message whose lifespan was over",
             _frame("TOMBSTONE", body=bytes([DROP_CODES[DropReason.LIFESPAN]])),

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from sern_core import wire
+from sern_core import codecs, wire
 from sern_core.announce import decode_announcement, encode_announcement
 from sern_core.errors import RemoteError
 from tests.make_vectors import DIRECTORY, FLAGS, decode, encode, files
@@ -47,6 +47,13 @@ def test_rejected(vector: dict[str, Any]) -> None:
 def test_announcement_means_what_it_says() -> None:
     envelope = load(DIRECTORY / "announce.json")["envelope"]
     assert encode_announcement(decode_announcement(envelope)) == envelope
+
+
+@pytest.mark.parametrize("name", ["data-lz4", "data-zstd"])
+def test_encoded_bodies_decode_to_what_they_say(name: str) -> None:
+    (frame,) = load(DIRECTORY / f"{name}.json")["frames"]
+    body = bytes.fromhex(frame["body"])
+    assert codecs.decode(frame["codec"], body, max_bytes=120) == b"robot " * 20
 
 
 def test_every_kind_frame_and_flag_has_a_vector() -> None:

@@ -12,6 +12,9 @@ from typing import NamedTuple
 from sern_core import wire
 from sern_core.access import AccessRule, AccessTable
 from sern_core.client import ClientCore
+from sern_core.codecs import Coder, Compression, Work, raw_size
+from sern_core.decoding import DecodeRequest
+from sern_core.encoding import EncodeRequest
 from sern_core.hub import Hub, HubParams
 from sern_core.hub_port import HubPort
 from sern_core.link import Link
@@ -45,6 +48,7 @@ def spec(
     retention_s: float = 600.0,
     max_queue_bytes: int = 32 * 2**20,
     many_writers: bool = False,
+    compression: Compression | None = None,
 ) -> TopicSpec:
     return TopicSpec(
         priority=priority,
@@ -57,6 +61,7 @@ def spec(
         retention_s=retention_s,
         max_queue_bytes=max_queue_bytes,
         many_writers=many_writers,
+        compression=compression,
     )
 
 
@@ -180,12 +185,22 @@ class SimClient:
     ups: list[bool] = field(default_factory=list)
     """Of each session, whether it was with the same relay process as the one before."""
     downs: list[str] = field(default_factory=list)
+    undecodables: list[tuple[str, str]] = field(default_factory=list)
     more_ports: list[Port] = field(default_factory=list)
     lanes_closed: int = 0
 
-    def start(self, *, boot: int, lossless: bool, link: LinkParams, scheduler: SchedulerParams) -> "SimClient":
+    def start(
+        self, *, boot: int, lossless: bool, link: LinkParams, scheduler: SchedulerParams, coder: Coder | None
+    ) -> "SimClient":
         self.core = ClientCore(
-            name=self.name, boot=boot, events=self, link=link, scheduler=scheduler, now=self.now, lossless=lossless
+            name=self.name,
+            boot=boot,
+            events=self,
+            link=link,
+            scheduler=scheduler,
+            now=self.now,
+            lossless=lossless,
+            coder=coder,
         )
         self.port = ClockedPort(self.core.link, self.clock)
         return self
@@ -252,6 +267,9 @@ class SimClient:
     def publication_refused(self, stream: StreamInfo, code: str, text: str) -> None:
         self.refusals.append((code, text))
 
+    def undecodable(self, stream: StreamInfo, problem: str) -> None:
+        self.undecodables.append((stream.id.topic, problem))
+
     def subscription_refused(self, code: str, text: str) -> None:
         self.denials.append((code, text))
 
@@ -287,6 +305,30 @@ class SimClient:
 
     def seqs(self, topic: str) -> list[int]:
         return [got.seq for got in self.got if got.topic == topic]
+
+
+class SimPool:
+    """One thread that encodes and decodes for a client, at so many bytes of raw body a second."""
+
+    def __init__(self, client: SimClient, bytes_per_s: float) -> None:
+        self.client = client
+        self.bytes_per_s = bytes_per_s
+        self.taken: list[Work] = []
+        self._free_s = 0.0
+
+    def take(self, work: Work) -> None:
+        network = self.client.world.network
+        self.taken.append(work)
+        nbytes = 0
+        if isinstance(work, EncodeRequest | DecodeRequest):
+            nbytes = raw_size(work.message.codec, work.message.body)
+        self._free_s = max(self._free_s, network.now) + nbytes / self.bytes_per_s
+
+        def done(_now: float) -> None:
+            work.run()
+            work.done(now=self.client.now)
+
+        network.after(self._free_s - network.now, done, node=self.client)
 
 
 class SimHub:
@@ -364,7 +406,12 @@ class World:
         lossless: bool = True,
         hub_params: HubParams | None = None,
         relay_clock: Clock | None = None,
+        encode_bytes_per_s: float | None = None,
+        compress: bool = False,
     ) -> None:
+        """`compress`: clients compress what they publish; `encode_bytes_per_s`: the speed of it for large bodies."""
+        self.compress = compress
+        self.encode_bytes_per_s = encode_bytes_per_s
         self.network = Network(seed)
         self.link = link or LinkParams()
         self.access = access
@@ -385,9 +432,11 @@ class World:
         return self._boots.getrandbits(63)
 
     def _process(self, name: str, clock: Clock, scheduler: SchedulerParams, patterns: Iterable[str]) -> SimClient:
-        client = SimClient(ClientName(name), self, clock).start(
-            boot=self._boot(), lossless=self.lossless, link=self.link, scheduler=scheduler
-        )
+        client = SimClient(ClientName(name), self, clock)
+        coder = Coder(max_bytes=self.link.max_message_bytes) if self.compress else None
+        if coder is not None and self.encode_bytes_per_s is not None:
+            coder.offload = SimPool(client, self.encode_bytes_per_s).take
+        client.start(boot=self._boot(), lossless=self.lossless, link=self.link, scheduler=scheduler, coder=coder)
         client.subscribe(*patterns)
         self.clients[name] = client
         return client

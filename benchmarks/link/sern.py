@@ -159,6 +159,9 @@ class End:
     def publication_refused(self, stream: StreamInfo, code: str, text: str) -> None:
         self.problems.append(text)
 
+    def undecodable(self, stream: StreamInfo, problem: str) -> None:
+        self.problems.append(problem)
+
     def subscription_refused(self, code: str, text: str) -> None:
         self.problems.append(text)
 

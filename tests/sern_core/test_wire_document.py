@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from sern_core import announce, wire
+from sern_core.codecs import Codec
 from sern_core.errors import WireError
 from sern_core.message import StreamId, StreamInfo, TopicInfo, TopicSpec
 from sern_core.types import DROP_CODES, ClientName, Encoding, TopicName
@@ -154,6 +155,8 @@ def test_kinds_flags_and_drop_codes() -> None:
     flags = {name: int(cells[0], 16) for name, cells in table(section("Frames")).items() if name.startswith("FLAG_")}
     assert flags == {name: value for name, value in vars(wire).items() if name.startswith("FLAG_")}
     assert sum(flags.values()) == wire.KNOWN_FLAGS
+    codecs = {name: int(cells[0]) for name, cells in table(section("Encoded bodies")).items()}
+    assert codecs == {codec.name: codec.value for codec in Codec}
     codes = {cells[0].strip("`"): int(code) for code, cells in table(section("Drop codes")).items()}
     assert codes == {reason.value: code for reason, code in DROP_CODES.items()}
 

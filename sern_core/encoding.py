@@ -1,0 +1,246 @@
+"""Encoding on the way out: in which mode, when, and where.
+
+A body is encoded when its message is chosen for the link, not when it is queued: what is dropped before costs nothing.
+Small ones on the spot; a larger one is withdrawn from the scheduler while other threads work on it (`EncodeRequest`),
+and others go first meanwhile. From then on it counts as begun, like one whose first fragment has been sent: a newer
+sample of its topic does not take its place, or a topic faster than its codec would never send anything. It still
+expires. At most `MAX_RUNNING` are encoded at a time; who comes later waits without having begun.
+"""
+
+from collections.abc import Callable
+from enum import IntEnum
+from typing import TYPE_CHECKING, Final
+
+from sern_core.codecs import (
+    LOSSLESS,
+    MIN_BYTES,
+    Codec,
+    CodecProfile,
+    Coder,
+    Compression,
+    Encoded,
+    Work,
+    blend,
+    quickest,
+)
+from sern_core.message import Message
+from sern_core.types import PriorityClass
+
+if TYPE_CHECKING:
+    from sern_core.queues import OutChannel, OutMessage
+
+PROBE_EVERY: Final = 50
+"""One message in so many is encoded in every mode, to know what each makes of the topic."""
+CHOOSE_INTERVAL_S: Final = 0.1
+"""How long a choice of `auto` stands."""
+MAX_RUNNING: Final = 2
+"""Bodies of one link that other threads encode at a time: what leaves next, and one behind it."""
+RATIO_GAIN: Final = 0.2
+
+
+class Coding(IntEnum):
+    """Where one body stands."""
+
+    RAW = 0  # nobody has looked at it yet
+    HELD = 1  # chosen, and waits for its turn to be encoded
+    RUNNING = 2  # another thread encodes it
+    DONE = 3  # goes as it is now
+
+
+class ChannelCodec:
+    """What one channel does with its bodies, and what it found out about them."""
+
+    __slots__ = (
+        "due_s",
+        "encoded_bytes",
+        "messages_to_probe",
+        "mode",
+        "probing",
+        "profiles",
+        "ratio",
+        "raw_bytes",
+        "setting",
+    )
+
+    def __init__(self, setting: Compression | None) -> None:
+        self.setting = setting
+        """The mode to use; None: whichever is quickest (`auto`)."""
+        self.mode = setting or Compression.NONE
+        """The mode in use."""
+        self.profiles: dict[Compression, CodecProfile] = {}
+        """What each mode makes of this topic, as measured; empty before the first message."""
+        self.ratio = 1.0
+        """What becomes of a body, by bytes, in recent messages: what is left of one that is not encoded yet."""
+        self.raw_bytes = 0
+        self.encoded_bytes = 0
+        """Bytes of all messages chosen so far, before and after, those that went as they were included."""
+        self.messages_to_probe = 0
+        self.probing = False
+        self.due_s = -float("inf")
+
+    def choose(self, nbytes: int, rate_bps: float | None, now: float) -> Compression:
+        """The mode for a body of `nbytes`. On a link that has never been full (rate None) nothing is to be gained."""
+        if now >= self.due_s:
+            self.due_s = now + CHOOSE_INTERVAL_S
+            if self.setting is not None:
+                self.mode = self.setting
+            elif rate_bps:
+                self.mode = quickest(self.profiles, LOSSLESS[1:], nbytes, rate_bps / 8)
+            else:
+                self.mode = Compression.NONE
+        return self.mode
+
+    def use(self, setting: Compression | None) -> None:
+        """Another mode from the next body on."""
+        self.setting = setting
+        self.due_s = -float("inf")
+        if setting is not None:
+            self.mode = setting
+            profile = self.profiles.get(setting)
+            if setting is Compression.NONE:
+                self.ratio = 1.0
+            elif profile is not None:
+                self.ratio = min(1.0, profile.ratio)
+
+    def measured(self, raw_bytes: int, encoded_bytes: int) -> None:
+        """A body went from `raw_bytes` to `encoded_bytes`."""
+        self.raw_bytes += raw_bytes
+        self.encoded_bytes += encoded_bytes
+        self.ratio += RATIO_GAIN * (encoded_bytes / raw_bytes - self.ratio)
+
+
+class EncodeRequest(Work):
+    """One body that another thread is to encode."""
+
+    __slots__ = ("channel", "encoder", "message", "mode", "out", "priority", "result")
+
+    def __init__(self, encoder: "Encoder", channel: "OutChannel", out: "OutMessage", mode: Compression) -> None:
+        self.encoder = encoder
+        self.channel = channel
+        self.out = out
+        self.message = out.message
+        self.mode = mode
+        self.priority = int(channel.spec.priority)
+        self.result: Encoded | None = None
+
+    def run(self) -> None:
+        self.result = self.encoder.coder.encode(self.mode, self.message.body)
+
+    def done(self, *, now: float) -> None:
+        self.encoder.encoded(self, now=now)
+
+
+class ProbeRequest(Work):
+    """One body that is encoded in every mode, to measure."""
+
+    __slots__ = ("body", "codec", "coder", "priority", "results")
+
+    def __init__(self, coder: Coder, codec: ChannelCodec, body: bytes) -> None:
+        self.coder = coder
+        self.codec = codec
+        self.body = body
+        self.priority = int(PriorityClass.BULK) + 1
+        self.results: dict[Compression, CodecProfile] = {}
+
+    def run(self) -> None:
+        size = len(self.body)
+        for mode in LOSSLESS[1:]:
+            encoded = self.coder.encode(mode, self.body)
+            speed = size / encoded.elapsed_s if encoded.elapsed_s > 0.0 else 0.0
+            self.results[mode] = CodecProfile(len(encoded.body) / size, speed)
+
+    def done(self, *, now: float) -> None:
+        codec = self.codec
+        codec.probing = False
+        codec.due_s = now
+        for mode, profile in self.results.items():
+            codec.profiles[mode] = blend(codec.profiles.get(mode), profile)
+
+
+class Encoder:
+    """The encoding of one link. `refresh` tells its scheduler that what a channel would send next has changed."""
+
+    def __init__(
+        self, coder: Coder, *, rate_bps: Callable[[], float | None], refresh: Callable[["OutChannel", float], None]
+    ) -> None:
+        self.coder = coder
+        self.running = 0
+        self._rate_bps = rate_bps
+        self._refresh = refresh
+        self._held: list[tuple[OutChannel, OutMessage]] = []
+
+    def ready(self, channel: "OutChannel", out: "OutMessage", codec: ChannelCodec, *, now: float) -> bool:
+        """The scheduler has chosen `out`, whose body nobody has looked at: may it go now? False: not yet."""
+        message = out.message
+        size = out.size
+        if size < MIN_BYTES or message.tombstone or message.codec:
+            out.coding = Coding.DONE
+            return True
+        if codec.messages_to_probe <= 0 and not codec.probing:
+            self._probe(codec, message.body)
+        mode = codec.choose(size, self._rate_bps(), now)
+        if mode is Compression.NONE:
+            self._apply(channel, out, codec, None, mode)
+            return True
+        coder = self.coder
+        if size <= coder.inline_bytes or coder.offload is None:
+            self._apply(channel, out, codec, coder.encode(mode, message.body), mode)
+            return True
+        if self.running >= MAX_RUNNING:
+            out.coding = Coding.HELD
+            self._held.append((channel, out))
+            return False
+        out.coding = Coding.RUNNING
+        self.running += 1
+        if not out.started:
+            channel.begin(out, now)
+        coder.offload(EncodeRequest(self, channel, out, mode))
+        return False
+
+    def _probe(self, codec: ChannelCodec, body: bytes) -> None:
+        codec.messages_to_probe = PROBE_EVERY
+        codec.probing = True
+        probe = ProbeRequest(self.coder, codec, body)
+        if len(body) <= self.coder.inline_bytes or self.coder.offload is None:
+            probe.run()
+            probe.done(now=-float("inf"))
+        else:
+            self.coder.offload(probe)
+
+    def _apply(
+        self, channel: "OutChannel", out: "OutMessage", codec: ChannelCodec, encoded: Encoded | None, mode: Compression
+    ) -> None:
+        """The body is what it will be. None: as it was."""
+        size = out.size
+        codec.messages_to_probe -= 1
+        out.coding = Coding.DONE
+        if encoded is not None:
+            self.coder.encoded[mode].add(size, len(encoded.body), encoded.elapsed_s)
+            if encoded.codec is not Codec.NONE:
+                old = out.message
+                new = Message(
+                    old.stream,
+                    old.seq,
+                    encoded.body,
+                    old.stamp_ns,
+                    old.born_s,
+                    0,
+                    old.replay,
+                    old.error_s,
+                    encoded.codec,
+                )
+                channel.recoded(out, new)
+        codec.measured(size, out.size)
+
+    def encoded(self, request: EncodeRequest, *, now: float) -> None:
+        """Another thread is through with a body. If the message was dropped meanwhile, it stays dropped."""
+        self.running -= 1
+        channel, out = request.channel, request.out
+        if out.coding is Coding.RUNNING and out.message is request.message and channel.codec is not None:
+            self._apply(channel, out, channel.codec, request.result, request.mode)
+        self._refresh(channel, now)
+        held, self._held = self._held, []
+        for other, waiting in held:
+            if waiting.coding is Coding.HELD:
+                waiting.coding = Coding.RAW
+                self._refresh(other, now)
