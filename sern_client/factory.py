@@ -8,6 +8,7 @@ from sern_client.endpoints.bag import BagEndpoint, BagOptions
 from sern_client.endpoints.base import Endpoint
 from sern_client.endpoints.composite import CompositeEndpoint
 from sern_client.endpoints.record import RecordEndpoint, RecordOptions
+from sern_client.endpoints.ros1 import Ros1Endpoint, Ros1Options
 from sern_client.endpoints.synthetic import SyntheticEndpoint, SyntheticOptions
 from sern_core.errors import UsageError
 from sern_runtime.config import endpoints as sections
@@ -19,8 +20,23 @@ Resolve = Callable[[str], Path]
 
 def make_endpoint(loaded: Loaded[ClientFile]) -> Endpoint:
     """The endpoint of a client: the one its file names, or several as one. Raises ConfigError."""
-    made = [_make(section, loaded.resolve) for section in loaded.model.endpoints]
+    made = [_make(section, loaded.resolve) for section in _named(loaded.model)]
     return made[0] if len(made) == 1 else CompositeEndpoint(made)
+
+
+def _named(model: ClientFile) -> list[sections.EndpointSection]:
+    """The sections, ROS nodes with the names that they get when the file gives none: no two of them the same, because
+    a master lets only the last node of a name live."""
+    named: list[sections.EndpointSection] = []
+    nodes = 0
+    for section in model.endpoints:
+        if isinstance(section, sections.Ros1Endpoint):
+            nodes += 1
+            if section.node_name is None:
+                name = f"sern_{model.name}" + (f"_{nodes}" if nodes > 1 else "")
+                section = section.model_copy(update={"node_name": name})
+        named.append(section)
+    return named
 
 
 def _make(section: sections.EndpointSection, resolve: Resolve) -> Endpoint:
@@ -49,6 +65,8 @@ def _make(section: sections.EndpointSection, resolve: Resolve) -> Endpoint:
             )
         case sections.SyntheticEndpoint():
             return SyntheticEndpoint(_synthetic(section, resolve))
+        case sections.Ros1Endpoint():
+            return Ros1Endpoint(Ros1Options(**{item.name: getattr(section, item.name) for item in fields(Ros1Options)}))
     raise UsageError(f"no endpoint for a section of type {type(section).__name__}")
 
 

@@ -4,13 +4,16 @@ To add a kind: write a section with `kind: Literal["name"]` and its settings, an
 schema and reference follow from there; `sern_client` makes the endpoint from the section.
 """
 
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Discriminator, Field, Tag
+from pydantic import AfterValidator, Discriminator, Field, Tag
 
 from sern_runtime.config.base import (
+    Bytes,
+    Count,
     FileProblem,
     HertzOrOff,
     NamespaceText,
@@ -20,6 +23,7 @@ from sern_runtime.config.base import (
     SecondsOrZero,
     Section,
     TopicText,
+    fault,
     resolve,
     unexpected,
 )
@@ -161,4 +165,51 @@ class RecordEndpoint(EndpointBase):
             yield FileProblem((*loc, "path"), f"{path.parent}: no such directory; create it first")
 
 
-EndpointSection = Annotated[BagEndpoint | SyntheticEndpoint | RecordEndpoint, Field(discriminator="kind")]
+def _check_uri(text: str) -> str:
+    if not re.fullmatch(r"http://[A-Za-z0-9_.-]{1,253}:[0-9]{1,5}/?", text):
+        raise fault("is not http://host:port, such as http://127.0.0.1:11311")
+    return text
+
+
+def _check_host(text: str) -> str:
+    if not re.fullmatch(r"[A-Za-z0-9_.-]{1,253}", text):
+        raise fault("is not a host name or an IPv4 address")
+    return text
+
+
+def _check_node(text: str) -> str:
+    if not re.fullmatch(r"/?[A-Za-z][A-Za-z0-9_]*(/[A-Za-z0-9_]+)*", text):
+        raise fault("is not the name of a ROS node, such as sern_robot1")
+    return text
+
+
+class Ros1Endpoint(EndpointBase):
+    """A node of a ROS 1 master; no ROS installation is needed. With several of these, several masters."""
+
+    kind: Literal["ros1"]
+    """A node of a ROS 1 master."""
+    master_uri: Annotated[str, AfterValidator(_check_uri)] | None = None
+    """The master, http://host:port; null: the environment's ROS_MASTER_URI, else http://localhost:11311."""
+    host: Annotated[str, AfterValidator(_check_host)] | None = None
+    """The name or address at which other nodes reach this one; null: the environment's ROS_HOSTNAME, else ROS_IP, else
+    what this machine has towards the master. A loopback address keeps our ports off the network."""
+    node_name: Annotated[str, AfterValidator(_check_node)] | None = None
+    """Our name at the master, which nobody else may have there; null: sern_ and the client's name."""
+    namespace: NamespaceText | None = None
+    """Put before the names of this master's topics and services, here and in rules; only what is below it is published
+    there, without it. For several masters that use the same names. null: names are as at the master."""
+    poll_hz: Annotated[float, Field(ge=0.5, le=20)] = 4.0
+    """How often the master is asked what there is: new topics are found within one period."""
+    queue_messages: Count = 1000
+    """Messages that may wait for one slow local subscriber; beyond, the oldest are dropped and counted."""
+    queue_bytes: Bytes = 64 * 2**20
+    """Bytes that may wait for one slow local subscriber; at least one message always may."""
+    max_message_bytes: Annotated[int, Field(ge=1000, le=1 << 30)] = 64 * 2**20
+    """Longer messages of local nodes are dropped and counted, longer service calls fail."""
+    tcp_nodelay: bool = True
+    """Ask local publishers to send small messages at once."""
+
+
+EndpointSection = Annotated[
+    BagEndpoint | SyntheticEndpoint | RecordEndpoint | Ros1Endpoint, Field(discriminator="kind")
+]

@@ -7,16 +7,23 @@ import pytest
 from sern_client.endpoints.bag import BagOptions
 from sern_client.endpoints.jackal import JACKAL
 from sern_client.endpoints.record import RecordOptions
+from sern_client.endpoints.ros1 import Ros1Options
 from sern_client.endpoints.synthetic import SyntheticOptions
 from sern_runtime.config.endpoints import (
     MAX_SYNTHETIC_TOPICS,
     BagEndpoint,
     EndpointBase,
     RecordEndpoint,
+    Ros1Endpoint,
     SyntheticEndpoint,
 )
 
-PAIRS = [(BagEndpoint, BagOptions), (SyntheticEndpoint, SyntheticOptions), (RecordEndpoint, RecordOptions)]
+PAIRS = [
+    (BagEndpoint, BagOptions),
+    (SyntheticEndpoint, SyntheticOptions),
+    (RecordEndpoint, RecordOptions),
+    (Ros1Endpoint, Ros1Options),
+]
 
 
 @pytest.mark.parametrize(("section", "options"), PAIRS, ids=lambda item: item.__name__)

@@ -1,0 +1,303 @@
+"""Which nodes there are and what they offer: the master's state, polled, and whether each node lives.
+
+The master's word is not enough. A node that crashed stays registered, so every node that offers something is watched
+by an idle connection to its API port: when that ends and the port refuses a new one, the node is dead, whatever the
+master says. It is looked for again, because a node that comes back under its name may have another port.
+
+The poll costs next to nothing while nothing changes: an answer that is the same in every byte is not read. What we
+registered and the master does not list (it was restarted) is registered again. While there is no master, what is
+connected stays so.
+"""
+
+import asyncio
+import logging
+from collections.abc import Awaitable, Callable, Iterable
+from contextlib import suppress
+from typing import Final, NamedTuple, Protocol
+
+from sern_client.endpoints.ros1.frames import keep_alive
+from sern_client.endpoints.ros1.master import Master, SystemState
+from sern_client.endpoints.ros1.xmlrpc import CallError, UnreachableError, split_uri
+
+CONNECT_S: Final = 2.0
+LOOK_AGAIN_S: Final = (0.25, 1.0)
+"""First and longest pause before a dead node is looked for again."""
+SHORT_WATCH_S: Final = 1.0
+"""A server that ends our idle connection sooner than this is asked again only after a pause."""
+MASTER_AGAIN_S: Final = 0.5
+GATHER_S: Final = 0.02
+"""The master tells of one change several times (once a topic); one poll answers all."""
+RUN_ID_S: Final = 1.0
+
+_log = logging.getLogger(__name__)
+
+
+class Member(Protocol):
+    """Something a node offers: a topic's source, or a service."""
+
+    def up(self, uri: str) -> None:
+        """The node lives; `uri` is its API. Said again when that changes."""
+
+    def down(self) -> None:
+        """The node is dead, or offers this no more."""
+
+
+class Registration(NamedTuple):
+    """One thing that we are registered for at the master. `kind`: publisher, subscriber or service."""
+
+    kind: str
+    name: str
+
+
+class Registrar(Protocol):
+    """What we are to be registered for, and how."""
+
+    def desired(self) -> Iterable[Registration]: ...
+
+    def register(self, registration: Registration) -> Awaitable[None]: ...
+
+    def unregister(self, registration: Registration) -> Awaitable[None]: ...
+
+
+class _Watch(asyncio.Protocol):
+    """An idle connection to a node's API port."""
+
+    def __init__(self) -> None:
+        self.closed = asyncio.get_running_loop().create_future()
+        self.transport: asyncio.BaseTransport | None = None
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        self.transport = transport
+        keep_alive(transport)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        del exc
+        self.transport = None
+        if not self.closed.done():
+            self.closed.set_result(None)
+
+
+class Node:
+    """Another node of this master, from when it offers something until it offers nothing."""
+
+    def __init__(self, name: str, master: Master) -> None:
+        self.name = name
+        self.uri = ""
+        self.alive = False
+        self.members: list[Member] = []
+        self._master = master
+        self._look = asyncio.Event()
+        self._transport: asyncio.BaseTransport | None = None
+        self._task = asyncio.create_task(self._run(), name=f"ros1 node {name}")
+
+    def add(self, member: Member) -> None:
+        self.members.append(member)
+        if self.alive:
+            member.up(self.uri)
+
+    def remove(self, member: Member) -> None:
+        self.members.remove(member)
+        member.down()
+
+    def look_again(self) -> None:
+        """Something suggests that it changed: ask the master where it is now."""
+        self._look.set()
+        if self._transport is not None:
+            self._transport.close()
+
+    def close(self) -> None:
+        self._task.cancel()
+        if self._transport is not None:
+            self._transport.close()
+
+    async def _run(self) -> None:
+        loop = asyncio.get_running_loop()
+        pause_s = LOOK_AGAIN_S[0]
+        while True:
+            with suppress(CallError):  # no master, or one that has not heard of it: where it was last is the best guess
+                self.uri = await self._master.node_uri(self.name)
+            began_s = loop.time()
+            try:
+                await self._watch()
+            except (CallError, OSError, TimeoutError):
+                self._dead()
+                await self._pause(pause_s)
+                pause_s = min(pause_s * 2, LOOK_AGAIN_S[1])
+                continue
+            pause_s = LOOK_AGAIN_S[0]
+            if loop.time() - began_s < SHORT_WATCH_S:
+                await self._pause(pause_s)
+
+    async def _watch(self) -> None:
+        host, port = split_uri(self.uri)
+        loop = asyncio.get_running_loop()
+        async with asyncio.timeout(CONNECT_S):
+            _, watch = await loop.create_connection(_Watch, host, port)
+        self._transport = watch.transport
+        try:
+            self.alive = True
+            for member in list(self.members):
+                member.up(self.uri)
+            await watch.closed
+        finally:
+            self._transport = None
+            if watch.transport is not None:
+                watch.transport.close()
+
+    def _dead(self) -> None:
+        if self.alive:
+            self.alive = False
+            for member in list(self.members):
+                member.down()
+
+    async def _pause(self, pause_s: float) -> None:
+        self._look.clear()
+        with suppress(TimeoutError):
+            async with asyncio.timeout(pause_s):
+                await self._look.wait()
+
+
+class Graph:
+    """Follows one master. `changed(state)` is called with every new state; it calls `attach` and `detach`.
+
+    `start` and `stop` once each. Nothing here raises because of a master or a node: it is tried again for ever.
+    """
+
+    def __init__(
+        self, master: Master, registrar: Registrar, changed: Callable[[SystemState], None], *, poll_s: float
+    ) -> None:
+        self.nodes: dict[str, Node] = {}
+        self.connected = False
+        """The master answered the last call."""
+        self._master = master
+        self._registrar = registrar
+        self._changed = changed
+        self._poll_s = poll_s
+        self._registered: set[Registration] = set()
+        self._refused: set[Registration] = set()
+        self._seen = b""
+        self._problem = ""
+        self._run_id: str | None = None
+        self._run_id_s = -RUN_ID_S
+        self._now = asyncio.Event()
+        self._task: asyncio.Task[None] | None = None
+
+    def start(self) -> None:
+        self._task = asyncio.create_task(self._run(), name=f"ros1 master {self._master.uri}")
+
+    async def stop(self, patience_s: float) -> None:
+        """Unregister as far as the master answers in time, and forget every node."""
+        task, self._task = self._task, None
+        if task is not None:
+            task.cancel()
+            await asyncio.wait([task])
+        for node in self.nodes.values():
+            node.close()
+        self.nodes.clear()
+        if self.connected:
+            with suppress(CallError, TimeoutError):
+                async with asyncio.timeout(patience_s):
+                    for registration in list(self._registered):
+                        await self._registrar.unregister(registration)
+        self._registered.clear()
+
+    def poll_now(self) -> None:
+        """Something changed, here or there."""
+        self._now.set()
+
+    def attach(self, node_name: str, member: Member) -> None:
+        node = self.nodes.get(node_name)
+        if node is None:
+            node = self.nodes[node_name] = Node(node_name, self._master)
+        node.add(member)
+
+    def detach(self, node_name: str, member: Member) -> None:
+        node = self.nodes[node_name]
+        node.remove(member)
+        if not node.members:
+            node.close()
+            del self.nodes[node_name]
+
+    async def _run(self) -> None:
+        while True:
+            self._now.clear()
+            try:
+                await self._register()
+                await self._poll()
+                self._found()
+                pause_s = self._poll_s
+            except UnreachableError as error:
+                self._lost(str(error))
+                pause_s = MASTER_AGAIN_S
+            except CallError as error:
+                self._lost(f"does not answer like a ROS master: {error}")
+                pause_s = MASTER_AGAIN_S
+            except Exception:  # noqa: BLE001  an error of ours must not end the following of the master
+                _log.exception("%s: a poll of the master failed", self._master.uri)
+                pause_s = MASTER_AGAIN_S
+            with suppress(TimeoutError):
+                async with asyncio.timeout(pause_s):
+                    await self._now.wait()
+                    await asyncio.sleep(GATHER_S)
+
+    def _found(self) -> None:
+        if not self.connected:
+            self.connected = True
+            self._problem = ""
+            _log.info("connected to the ROS master at %s", self._master.uri)
+
+    def _lost(self, problem: str) -> None:
+        if self.connected or not self._problem:
+            self._problem = problem
+            _log.warning("ROS master: %s; trying again until it works", problem)
+        self.connected = False
+        self._seen = b""
+        self._run_id_s = -RUN_ID_S
+
+    async def _register(self) -> None:
+        desired = list(dict.fromkeys(self._registrar.desired()))
+        for registration in desired:
+            if registration not in self._registered and registration not in self._refused:
+                try:
+                    await self._registrar.register(registration)
+                    self._registered.add(registration)
+                except UnreachableError:
+                    raise
+                except CallError as error:
+                    self._refused.add(registration)
+                    _log.error("%s: cannot be registered as %s: %s", registration.name, registration.kind, error)
+        for registration in self._registered.difference(desired):
+            with suppress(CallError):  # a master that has lost us has nothing to unregister
+                await self._registrar.unregister(registration)
+            self._registered.discard(registration)
+        self._refused.intersection_update(desired)
+
+    async def _poll(self) -> None:
+        await self._check_run_id()
+        answer = await self._master.state()
+        if answer == self._seen:
+            return
+        state = self._master.read_state(answer)
+        kinds = {"publisher": state.publishers, "subscriber": state.subscribers, "service": state.services}
+        missing = {r for r in self._registered if self._master.caller not in kinds[r.kind].get(r.name, ())}
+        if missing:
+            self._registered -= missing
+            self._now.set()
+        self._seen = answer
+        self._changed(state)
+
+    async def _check_run_id(self) -> None:
+        """Another run of the master knows nothing of us, even if its state looks the same."""
+        now = asyncio.get_running_loop().time()
+        if now - self._run_id_s < RUN_ID_S:
+            return
+        self._run_id_s = now
+        run_id = await self._master.run_id()
+        if self._run_id is not None and run_id != self._run_id:
+            _log.info("the ROS master at %s was restarted; registering again", self._master.uri)
+            self._registered.clear()
+            self._refused.clear()
+            self._now.set()
+            for node in self.nodes.values():
+                node.look_again()
+        self._run_id = run_id

@@ -1,0 +1,218 @@
+"""What this node publishes: a topic of the far side, for any number of local subscribers.
+
+Every subscriber has a bounded queue of its own: one that does not keep up loses its oldest messages, which is counted,
+and holds up nobody. What several streams of the link have in common by name (/tf_static of two robots) is one topic
+here: `Publication` joins them, and a late subscriber gets the last message of each, static transforms as one.
+"""
+
+import asyncio
+import logging
+from collections import deque
+from typing import TYPE_CHECKING, Final
+
+from sern_client.endpoints.ros1.frames import LENGTH
+from sern_client.endpoints.ros1.header import BRIDGE_FIELD
+from sern_client.tf_latch import TfLatch, is_static_tf
+from sern_core.errors import ConfigError
+from sern_core.message import TopicInfo
+from sern_core.types import DropReason, Encoding
+from sern_runtime import ros_types
+
+if TYPE_CHECKING:
+    from sern_client.endpoints.ros1.server import Inbound
+
+JOIN_BYTES: Final = 32 * 1024
+"""Up to this size a message and its length are joined: one copy is cheaper than two writes."""
+WRITE_BUFFER_BYTES: Final = 128 * 1024
+"""What may wait in the transport, where it cannot be overtaken; the rest waits in the queue."""
+
+_log = logging.getLogger(__name__)
+
+
+class Feed:
+    """The sending half of one subscriber's connection."""
+
+    def __init__(self, link: "Inbound", publication: "Publication", caller: str, number: int) -> None:
+        assert link.transport is not None
+        self.caller = caller
+        self.number = number
+        self.publication = publication
+        self.sent_bytes = 0
+        self.sent_messages = 0
+        self.dropped = 0
+        self._transport: asyncio.Transport | None = link.transport
+        self._queue: deque[bytes] = deque()
+        self._queued_bytes = 0
+        self._paused = False
+        link.transport.set_write_buffer_limits(high=WRITE_BUFFER_BYTES)
+
+    def send(self, body: bytes, frame: bytes | None) -> None:
+        """`frame` is the body with its length in front, where that was worth making."""
+        if self._transport is None or self._transport.is_closing():
+            return
+        if self._paused:
+            self._keep(body)
+            return
+        self._write(body, frame)
+
+    def _write(self, body: bytes, frame: bytes | None) -> None:
+        assert self._transport is not None
+        self.sent_messages += 1
+        self.sent_bytes += len(body) + 4
+        if frame is not None:
+            self._transport.write(frame)
+        else:
+            self._transport.writelines((LENGTH.pack(len(body)), body))
+
+    def _keep(self, body: bytes) -> None:
+        limits = self.publication.limits
+        self._queue.append(body)
+        self._queued_bytes += len(body)
+        while len(self._queue) > limits.messages or (self._queued_bytes > limits.bytes and len(self._queue) > 1):
+            self._queued_bytes -= len(self._queue.popleft())
+            if not self.dropped:
+                _log.warning("%s: %s is slower than its messages; the oldest are dropped",
+                             self.publication.topic, self.caller)  # fmt: skip
+            self.dropped += 1
+            limits.dropped[DropReason.QUEUE_FULL] = limits.dropped.get(DropReason.QUEUE_FULL, 0) + 1
+
+    def pause(self) -> None:
+        self._paused = True
+
+    def resume(self) -> None:
+        self._paused = False
+        while self._queue and not self._paused:
+            body = self._queue.popleft()
+            self._queued_bytes -= len(body)
+            self._write(body, None)
+
+    def ended(self) -> None:
+        """The connection is gone."""
+        self._transport = None
+        self._queue.clear()
+        self.publication.feeds.discard(self)
+
+    def close(self) -> None:
+        """What the transport has got already is still sent: the last of it may be a stop command."""
+        self._queue.clear()
+        if self._transport is not None:
+            self._transport.close()
+
+
+class Limits:
+    """How much may wait for one subscriber, and what was dropped, by reason, over the life of the endpoint."""
+
+    def __init__(self, messages: int, size_bytes: int) -> None:
+        self.messages = messages
+        self.bytes = size_bytes
+        self.dropped: dict[DropReason, int] = {}
+
+
+class Publication:
+    """One topic that this node publishes. `topic` is its name at the master."""
+
+    def __init__(self, topic: str, info: TopicInfo, caller: str, limits: Limits) -> None:
+        self.topic = topic
+        self.info = info
+        self.type_name = ros_types.ros1_name(info.type_name)
+        self.limits = limits
+        self.feeds: set[Feed] = set()
+        self.handles: list[Handle] = []
+        self.latched = info.latched or is_static_tf(topic, info.type_name)
+        self._static = TfLatch(Encoding.ROS1) if is_static_tf(topic, info.type_name) else None
+        self._last: dict[Handle, bytes] = {}
+        self._unreadable = False
+        self.answer = {
+            "callerid": caller,
+            "topic": topic,
+            "type": self.type_name,
+            "md5sum": info.type_hash,
+            "message_definition": info.definition,
+            "latching": "1" if self.latched else "0",
+            BRIDGE_FIELD: caller,
+        }
+
+    def refusal(self, fields: dict[str, str]) -> str | None:
+        """Why a subscriber with this header cannot be served; None when it can."""
+        md5, type_name = fields.get("md5sum", ""), fields.get("type", "*")
+        if md5 not in ("*", self.info.type_hash):
+            return (
+                f"{self.topic}: {fields.get('callerid', 'a subscriber')} expects {type_name} with md5sum {md5}, "
+                f"what arrives here is {self.type_name} with {self.info.type_hash}"
+            )
+        return None
+
+    def join(self, feed: Feed) -> None:
+        """A new subscriber: it gets what is latched."""
+        self.feeds.add(feed)
+        for body in self.kept():
+            feed.send(body, None)
+
+    def kept(self) -> list[bytes]:
+        """What a late subscriber gets."""
+        if self._static is not None and len(self._static):
+            merged = self._static.merged()
+            return [] if merged is None else [merged]
+        return list(self._last.values())
+
+    def publish(self, handle: "Handle", body: bytes) -> None:
+        if self.latched:
+            self._latch(handle, body)
+        frame = LENGTH.pack(len(body)) + body if len(body) <= JOIN_BYTES else None
+        for feed in self.feeds:
+            feed.send(body, frame)
+
+    def _latch(self, handle: "Handle", body: bytes) -> None:
+        if self._static is not None:
+            try:
+                self._static.add(handle, body)
+                return
+            except ConfigError as error:
+                if not self._unreadable:
+                    self._unreadable = True
+                    _log.warning("%s: cannot be merged for late subscribers: %s", self.topic, error)
+        self._last.pop(handle, None)
+        self._last[handle] = body
+
+    def leave(self, handle: "Handle") -> None:
+        """One of the streams has ended."""
+        self.handles.remove(handle)
+        self._last.pop(handle, None)
+        if self._static is not None:
+            self._static.drop(handle)
+
+    def close(self) -> None:
+        for feed in list(self.feeds):
+            feed.close()
+
+
+class Handle:
+    """The `Publisher` of one stream."""
+
+    def __init__(self, publication: Publication, ended: "Ended") -> None:
+        self._publication: Publication | None = publication
+        self._ended = ended
+        publication.handles.append(self)
+
+    def publish(self, body: bytes, stamp_ns: int) -> None:
+        del stamp_ns  # TCPROS carries no time beside the message
+        if self._publication is not None:
+            self._publication.publish(self, body)
+
+    def close(self) -> None:
+        publication, self._publication = self._publication, None
+        if publication is not None:
+            publication.leave(self)
+            self._ended(publication)
+
+
+class Ended:
+    """Called when a stream of a publication has ended; ends the publication with its last stream."""
+
+    def __init__(self, publications: dict[str, Publication]) -> None:
+        self._publications = publications
+
+    def __call__(self, publication: Publication) -> None:
+        if not publication.handles:
+            self._publications.pop(publication.topic, None)
+            publication.close()
