@@ -10,6 +10,8 @@ from sern_client.endpoints.composite import CompositeEndpoint
 from sern_client.endpoints.record import RecordEndpoint, RecordOptions
 from sern_client.endpoints.ros1 import Ros1Endpoint, Ros1Options
 from sern_client.endpoints.synthetic import SyntheticEndpoint, SyntheticOptions
+from sern_client.endpoints.zenoh.endpoint import ZenohEndpoint, ZenohOptions
+from sern_client.endpoints.zenoh.session import SessionOptions
 from sern_core.errors import UsageError
 from sern_runtime.config import endpoints as sections
 from sern_runtime.config.client import ClientFile
@@ -61,6 +63,19 @@ def _make(section: sections.EndpointSection, resolve: Resolve) -> Endpoint:
                     path=resolve(section.path),
                     overwrite=section.overwrite,
                     max_buffer_bytes=section.max_buffer_bytes,
+                )
+            )
+        case sections.ZenohEndpoint():
+            return ZenohEndpoint(
+                ZenohOptions(
+                    session=SessionOptions(
+                        connect=section.connect,
+                        listen=section.listen,
+                        config_file=None if section.config_file is None else resolve(section.config_file),
+                    ),
+                    domain=section.domain,
+                    node_name=section.node_name,
+                    type_paths=tuple(resolve(path) for path in section.type_paths),
                 )
             )
         case sections.SyntheticEndpoint():

@@ -210,6 +210,39 @@ class Ros1Endpoint(EndpointBase):
     """Ask local publishers to send small messages at once."""
 
 
+class ZenohEndpoint(EndpointBase):
+    """ROS 2 over zenoh, among nodes that run with rmw_zenoh. Needs `pip install 'sern[zenoh]'`, no ROS installation."""
+
+    kind: Literal["zenoh"]
+    """ROS 2 over zenoh (rmw_zenoh)."""
+    connect: Annotated[tuple[str, ...], Field(min_length=1)] = ("tcp/localhost:7447",)
+    """Zenoh locators of the router (rmw_zenohd) or of peers; it may start later than this."""
+    listen: tuple[str, ...] = ()
+    """Zenoh locators to listen on; empty: a free port of loopback."""
+    config_file: PathText | None = None
+    """A session configuration of zenoh (JSON5) in place of rmw_zenoh's defaults; null: those."""
+    domain: Annotated[int, Field(ge=0, le=232)] = 0
+    """ROS_DOMAIN_ID of the nodes."""
+    node_name: Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$", max_length=200)] = "sern"
+    """What it is called in `ros2 node list`."""
+    type_paths: tuple[PathText, ...] = ()
+    """Directories with .msg and .srv files of types beyond those of a ROS 2 install (searched at any depth)."""
+
+    def file_problems(self, base_dir: Path, loc: Loc) -> Iterator[FileProblem]:
+        if self.config_file is not None and not resolve(base_dir, self.config_file).is_file():
+            yield FileProblem((*loc, "config_file"), f"{resolve(base_dir, self.config_file)}: no such file")
+        yield from missing_directories(base_dir, self.type_paths, (*loc, "type_paths"))
+
+
+def missing_directories(base_dir: Path, paths: tuple[str, ...], loc: Loc) -> Iterator[FileProblem]:
+    """A problem for each of the paths that is no directory."""
+    for index, text in enumerate(paths):
+        path = resolve(base_dir, text)
+        if not path.is_dir():
+            yield FileProblem((*loc, index), f"{path}: no such directory")
+
+
 EndpointSection = Annotated[
-    BagEndpoint | SyntheticEndpoint | RecordEndpoint | Ros1Endpoint, Field(discriminator="kind")
+    BagEndpoint | SyntheticEndpoint | RecordEndpoint | Ros1Endpoint | ZenohEndpoint,
+    Field(discriminator="kind"),
 ]

@@ -1,0 +1,1 @@
+"""ROS 2 over zenoh (rmw_zenoh)."""

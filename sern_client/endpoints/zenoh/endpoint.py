@@ -1,0 +1,310 @@
+"""ROS 2 through zenoh, as rmw_zenoh does it: no ROS installation, bodies pass through as they are.
+
+The graph is what liveliness tokens say (`names`). A topic exists here while some other session has a publisher of it;
+services likewise. Our own session's entities are left out, so that what is published here does not come back.
+Publishers whose type or hash differs from the topic's first one are left out, with one line that names both.
+"""
+
+import asyncio
+import itertools
+import logging
+import secrets
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+from sern_client.endpoints.base import Publisher, Sink, Subscription, TopicEvents
+from sern_client.endpoints.zenoh import names
+from sern_client.endpoints.zenoh.names import Entity, Kind, Qos
+from sern_client.endpoints.zenoh.services import Services
+from sern_client.endpoints.zenoh.session import SessionOptions, ZenohSession
+from sern_core.errors import ConfigError, UsageError, WireError
+from sern_core.message import TopicInfo
+from sern_core.types import Encoding, TopicName
+from sern_runtime import ros_types
+from sern_runtime.ros_files import TypeFiles
+
+CDR: Final = "application/cdr"
+MAX_COMPLAINTS: Final = 256
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class ZenohOptions:
+    """`domain` is ROS_DOMAIN_ID, `node_name` how we appear in `ros2 node list`."""
+
+    session: SessionOptions = field(default_factory=SessionOptions)
+    domain: int = 0
+    node_name: str = "sern"
+    type_paths: tuple[Path, ...] = ()
+
+
+@dataclass(slots=True, eq=False)
+class _Topic:
+    """A topic of others: publishers by their key in the graph, the first one's type holds."""
+
+    dds_type: str
+    type_hash: str
+    publishers: dict[str, Qos] = field(default_factory=dict)
+
+
+class ZenohEndpoint(Services):
+    """An `Endpoint` and a `ServiceEndpoint`."""
+
+    def __init__(self, options: ZenohOptions) -> None:
+        super().__init__()
+        self.options = options
+        self.types = TypeFiles(options.type_paths)
+        self.session = ZenohSession(options.session)
+        self._events: TopicEvents | None = None
+        self._entities = itertools.count(1)
+        self._topics: dict[TopicName, _Topic] = {}
+        self._open: list[_Declared] = []
+        self._said: set[str] = set()
+
+    @property
+    def encoding(self) -> Encoding | None:
+        return Encoding.CDR
+
+    @property
+    def exhausted(self) -> bool:
+        return False
+
+    @property
+    def dropped(self) -> int:
+        """Messages lost between zenoh and the event loop, either way, because the other side was behind."""
+        return self.session.put_dropped + (self.session.handover.dropped if self._events else 0)
+
+    async def start(self, events: TopicEvents) -> None:
+        await self.session.open()
+        self._events = events
+        self._loop = asyncio.get_running_loop()
+        session = self.session.opened
+        self._zid = self.session.zid
+        self._node = session.liveliness().declare_token(
+            names.node_token(self.options.domain, self._zid, self.options.node_name)
+        )
+        # `history`: what is there already is told first.
+        self._graph = session.liveliness().declare_subscriber(
+            f"{names.SPACE}/{self.options.domain}/**", self._token, history=True
+        )
+
+    async def stop(self) -> None:
+        for declared in list(self._open):
+            declared.close()
+        await self.end_services()
+        await self.session.close()
+
+    def interest(self, name: TopicName, wanted: bool) -> None:
+        """A subscription costs nothing while nobody publishes."""
+
+    # --- topics of others -------------------------------------------------------------------------------------------
+
+    def subscribe(self, name: TopicName, sink: Sink) -> Subscription:
+        topic = self._topics.get(name)
+        if topic is None:
+            raise UsageError(f"{name}: no such topic was announced")
+        qos = _offered(topic)
+        key = names.data_key(self.options.domain, name, topic.dds_type, topic.type_hash)
+        session, zenoh = self.session, self.session.zenoh
+
+        def arrived(sample: Any) -> None:
+            body = sample.payload.to_bytes()
+            attachment = None if sample.attachment is None else sample.attachment.to_bytes()
+            session.handover.put(lambda: deliver(body, attachment), len(body))
+
+        def deliver(body: bytes, attachment: bytes | None) -> None:
+            if declared.closed:
+                return
+            try:
+                stamp_ns = time.time_ns() if attachment is None else names.unpack_attachment(attachment).stamp_ns
+            except WireError as error:
+                self._say_once(f"{name}: {error}; its messages are stamped on arrival")
+                stamp_ns = time.time_ns()
+            sink(body, stamp_ns)
+
+        if qos.transient_local:
+            history = zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=qos.depth)
+            subscriber = zenoh.ext.declare_advanced_subscriber(
+                session.opened, key, arrived, history=history, allowed_origin=zenoh.Locality.REMOTE
+            )
+        else:
+            subscriber = session.opened.declare_subscriber(key, arrived, allowed_origin=zenoh.Locality.REMOTE)
+        token = self._declare_token(Kind.SUBSCRIPTION, name, topic.dds_type, topic.type_hash, qos)
+        declared = _Declared(self, token, subscriber)
+        return declared
+
+    def advertise(self, info: TopicInfo) -> Publisher:
+        dds_name = names.dds_type(ros_types.canonical(info.type_name))
+        type_hash = info.type_hash or self._hash_of(info)
+        known = self._topics.get(info.name)
+        if known is not None and (known.dds_type, known.type_hash) != (dds_name, type_hash):
+            raise ConfigError(
+                f"{info.name}: what comes is {info.type_name} {type_hash}, "
+                f"nodes here publish {names.ros_type(known.dds_type)} {known.type_hash}"
+            )
+        qos = Qos(info.reliable is not False, info.latched)
+        zenoh = self.session.zenoh
+        key = names.data_key(self.options.domain, info.name, dds_name, type_hash)
+        blocking = zenoh.CongestionControl.BLOCK if qos.reliable else zenoh.CongestionControl.DROP
+        if info.latched:
+            publisher = zenoh.ext.declare_advanced_publisher(
+                self.session.opened, key, encoding=CDR, congestion_control=blocking,
+                cache=zenoh.ext.CacheConfig(max_samples=qos.depth), publisher_detection=True,
+            )  # fmt: skip
+        else:
+            publisher = self.session.opened.declare_publisher(key, encoding=CDR, congestion_control=blocking)
+        token = self._declare_token(Kind.PUBLISHER, info.name, dds_name, type_hash, qos)
+        return _ZenohPublisher(self, token, publisher)
+
+    def _hash_of(self, info: TopicInfo) -> str:
+        definition = info.definition or self.types.message(info.type_name)
+        if not definition:
+            raise ConfigError(
+                f"{info.name}: neither hash nor definition of {info.type_name} is known; "
+                "add the directory of its .msg file to type_paths"
+            )
+        return ros_types.hash_of(info.type_name, definition, Encoding.CDR)
+
+    # --- the graph --------------------------------------------------------------------------------------------------
+
+    def _token(self, sample: Any) -> None:
+        """In a thread of zenoh's."""
+        key, alive = str(sample.key_expr), sample.kind == self.session.zenoh.SampleKind.PUT
+        self.session.handover.put(lambda: self._token_changed(key, alive))
+
+    def _token_changed(self, key: str, alive: bool) -> None:
+        try:
+            entity = names.parse_token(key)
+            if entity.session == self._zid:
+                return
+            if entity.kind is Kind.PUBLISHER:
+                if alive:
+                    self._publisher_appeared(entity)
+                else:
+                    self._publisher_went(entity)
+            elif entity.kind is Kind.SERVER:
+                self.server_changed(entity, alive)
+        except (WireError, ConfigError) as error:
+            self._say_once(str(error))
+
+    def _publisher_appeared(self, entity: Entity) -> None:
+        assert self._events is not None
+        qos = Qos.decode(entity.qos)
+        type_name = names.ros_type(entity.dds_type)
+        topic = self._topics.get(entity.name)
+        if topic is None:
+            topic = self._topics[entity.name] = _Topic(entity.dds_type, entity.type_hash)
+        elif (topic.dds_type, topic.type_hash) != (entity.dds_type, entity.type_hash):
+            raise ConfigError(
+                f"{entity.name}: {entity.node} publishes {type_name} {entity.type_hash}, others "
+                f"{names.ros_type(topic.dds_type)} {topic.type_hash}; {entity.node} is left out"
+            )
+        first = not topic.publishers
+        topic.publishers[entity.key] = qos
+        if first:
+            self._events.topic_added(
+                TopicInfo(
+                    entity.name, type_name, Encoding.CDR, entity.type_hash, self._definition(entity, type_name),
+                    qos.transient_local, qos.reliable,
+                )
+            )  # fmt: skip
+
+    def _publisher_went(self, entity: Entity) -> None:
+        assert self._events is not None
+        topic = self._topics.get(entity.name)
+        if topic is None or topic.publishers.pop(entity.key, None) is None or topic.publishers:
+            return
+        del self._topics[entity.name]
+        self._events.topic_removed(entity.name)
+
+    def _definition(self, entity: Entity, type_name: str) -> str:
+        """Empty where unknown: bytes pass through all the same, only conversion needs it."""
+        definition = self.types.message(type_name)
+        if definition is None:
+            self._say_once(
+                f"{type_name}: its definition is not known; {entity.name} passes as it is and cannot be converted or "
+                "recorded; add the directory of its .msg file to type_paths"
+            )
+            return ""
+        mine = ros_types.hash_of(type_name, definition, Encoding.CDR)
+        if entity.type_hash.startswith("RIHS01_") and entity.type_hash != mine:
+            self._say_once(
+                f"{entity.name}: {entity.node} has {type_name} with hash {entity.type_hash}, here it is {mine}; "
+                "its definition is left out"
+            )
+            return ""
+        return definition
+
+    # --- for the parts of this package ------------------------------------------------------------------------------
+
+    def _declare_token(self, kind: Kind, name: TopicName, dds_name: str, type_hash: str, qos: Qos) -> Any:
+        return self.session.opened.liveliness().declare_token(
+            names.entity_token(
+                self.options.domain, self._zid, next(self._entities), kind, self.options.node_name,
+                name=name, dds_name=dds_name, type_hash=type_hash, qos=qos,
+            )
+        )  # fmt: skip
+
+    def _say_once(self, text: str) -> None:
+        if text not in self._said and len(self._said) < MAX_COMPLAINTS:
+            self._said.add(text)
+            _log.warning("%s", text)
+
+    def opened(self, declared: "_Declared") -> None:
+        self._open.append(declared)
+
+    def closed(self, declared: "_Declared") -> None:
+        if declared in self._open:
+            self._open.remove(declared)
+
+
+class _Declared:
+    """Something declared in the session, with its token."""
+
+    def __init__(self, owner: ZenohEndpoint, token: Any, thing: Any) -> None:
+        self.closed = False
+        self._owner = owner
+        self._token = token
+        self._thing = thing
+        owner.opened(self)
+
+    def close(self) -> None:
+        if self.closed:
+            return
+        self.closed = True
+        self._owner.closed(self)
+        token, thing = self._token, self._thing
+
+        def undeclare() -> None:
+            thing.undeclare()
+            token.undeclare()
+
+        self._owner.session.put(undeclare, 0)  # after what it has still to send
+
+
+class _ZenohPublisher(_Declared):
+    def __init__(self, owner: ZenohEndpoint, token: Any, publisher: Any) -> None:
+        super().__init__(owner, token, publisher)
+        self._publisher = publisher
+        self._gid = secrets.token_bytes(names.GID_BYTES)
+        self._seq = itertools.count(1)
+
+    def publish(self, body: bytes, stamp_ns: int) -> None:
+        attachment = names.pack_attachment(next(self._seq), stamp_ns, self._gid)
+        publisher = self._publisher
+        put: Callable[[], None] = lambda: publisher.put(body, attachment=attachment)  # noqa: E731
+        self._owner.session.put(put, len(body))
+
+
+def _offered(topic: _Topic) -> Qos:
+    """What to ask for: what any of the publishers offers."""
+    offers = topic.publishers.values()
+    return Qos(
+        any(qos.reliable for qos in offers),
+        any(qos.transient_local for qos in offers),
+        max((qos.depth for qos in offers), default=names.DEFAULT_DEPTH),
+    )

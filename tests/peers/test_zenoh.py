@@ -1,0 +1,367 @@
+"""The zenoh endpoint with a router and an independent ROS 2 implementation over zenoh, zenoh-ros2-sdk, as its peer."""
+
+import asyncio
+import json
+import sys
+from collections.abc import AsyncIterator
+from pathlib import Path
+from typing import Any, Self
+
+import pytest
+
+from sern_client.endpoints.base import Endpoint, ServiceEndpoint, ServiceInfo
+from sern_client.endpoints.zenoh.endpoint import ZenohEndpoint, ZenohOptions
+from sern_client.endpoints.zenoh.session import SessionOptions
+from sern_core.errors import ConfigError, ServiceError, UsageError
+from sern_core.message import TopicInfo
+from sern_core.types import Encoding, TopicName
+from sern_runtime import ros_services, ros_types
+from tests.daemons import Lab, bodies, free_ports, under, write_bag
+from tests.support import until
+
+zenoh = pytest.importorskip("zenoh", reason="the library eclipse-zenoh is missing: pip install 'sern[zenoh]'")
+pytest.importorskip("zenoh_ros2_sdk", reason="the peer zenoh-ros2-sdk is missing: pip install zenoh-ros2-sdk")
+
+DOMAIN = 7
+CHAT = TopicName("/robot/chatter")
+MODE = TopicName("/set_mode")
+
+
+def text(data: str) -> bytes:
+    return ros_types.serialise(
+        ros_types.new("std_msgs/msg/String", Encoding.CDR, data=data), "std_msgs/msg/String", Encoding.CDR
+    )
+
+
+def chat(**fields: Any) -> TopicInfo:
+    return ros_types.topic_info(CHAT, "std_msgs/msg/String", Encoding.CDR, **fields)
+
+
+class Router:
+    """What rmw_zenohd is for ROS 2 nodes: they find each other through it."""
+
+    def __init__(self) -> None:
+        self.port = free_ports(1)[0]
+        self.session: Any = None
+
+    def start(self) -> None:
+        config = zenoh.Config()
+        config.insert_json5("mode", '"router"')
+        config.insert_json5("listen/endpoints", f'["tcp/127.0.0.1:{self.port}"]')
+        config.insert_json5("scouting/multicast/enabled", "false")
+        self.session = zenoh.open(config)
+
+    def stop(self) -> None:
+        if self.session is not None:
+            self.session.close()
+            self.session = None
+
+    @property
+    def options(self) -> SessionOptions:
+        return SessionOptions(connect=(f"tcp/127.0.0.1:{self.port}",), listen=("tcp/127.0.0.1:0",))
+
+
+class Peer:
+    """The process of tests/peers/zenoh_peer.py."""
+
+    def __init__(self, process: asyncio.subprocess.Process) -> None:
+        self.process = process
+        self.got: list[tuple[str, str]] = []
+        self._answers: asyncio.Queue[dict[str, Any]] = asyncio.Queue()
+        self._reader = asyncio.create_task(self._read())
+
+    @classmethod
+    async def start(cls, port: int) -> Self:
+        program = Path(__file__).with_name("zenoh_peer.py")
+        return cls(
+            await asyncio.create_subprocess_exec(
+                sys.executable, str(program), str(port), str(DOMAIN),
+                stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE,
+            )
+        )  # fmt: skip
+
+    async def _read(self) -> None:
+        assert self.process.stdout is not None
+        async for line in self.process.stdout:
+            said = json.loads(line)
+            if "got" in said:
+                self.got.append((said["got"], said["data"]))
+            else:
+                await self._answers.put(said)
+        await self._answers.put({"done": False})
+
+    async def do(self, what: str, **order: Any) -> dict[str, Any]:
+        assert self.process.stdin is not None
+        self.process.stdin.write(json.dumps({"do": what, **order}).encode() + b"\n")
+        async with asyncio.timeout(60):
+            answer = await self._answers.get()
+        assert answer["done"], f"the peer ended with {self.process.returncode}"
+        return answer
+
+    async def sees(self, kind: str, name: str) -> None:
+        """Wait until the peer's own graph has it: it asks for what is latched, and calls services, only once."""
+        async with asyncio.timeout(60):
+            while not (await self.do("sees", kind=kind, name=name.replace("/", "%")))["sees"]:
+                pass
+
+    async def kill(self) -> None:
+        if self.process.returncode is None:
+            self.process.kill()
+        await self.process.wait()
+        await self._reader
+
+
+class Events:
+    def __init__(self) -> None:
+        self.topics: dict[TopicName, TopicInfo] = {}
+        self.services: dict[TopicName, ServiceInfo] = {}
+
+    def topic_added(self, info: TopicInfo) -> None:
+        self.topics[info.name] = info
+
+    def topic_removed(self, name: TopicName) -> None:
+        del self.topics[name]
+
+    def service_added(self, info: ServiceInfo) -> None:
+        self.services[info.name] = info
+
+    def service_removed(self, name: TopicName) -> None:
+        del self.services[name]
+
+
+@pytest.fixture
+async def router() -> AsyncIterator[Router]:
+    made = Router()
+    made.start()
+    yield made
+    made.stop()
+
+
+@pytest.fixture
+async def endpoint(router: Router) -> AsyncIterator[tuple[ZenohEndpoint, Events]]:
+    made, events = ZenohEndpoint(ZenohOptions(router.options, DOMAIN)), Events()
+    made.watch_services(events)
+    await made.start(events)
+    yield made, events
+    await made.stop()
+
+
+@pytest.fixture
+async def peer(router: Router) -> AsyncIterator[Peer]:
+    made = await Peer.start(router.port)
+    yield made
+    await made.kill()
+
+
+def test_is_an_endpoint_with_services() -> None:
+    endpoint: Endpoint = ZenohEndpoint(ZenohOptions())
+    assert isinstance(endpoint, ServiceEndpoint)
+
+
+async def test_a_node_is_heard_while_it_publishes(endpoint: tuple[ZenohEndpoint, Events], peer: Peer) -> None:
+    ours, events = endpoint
+    told = await peer.do("publisher", name=CHAT)
+    await until(lambda: CHAT in events.topics, "the topic is announced")
+    info = events.topics[CHAT]
+    assert info == chat(reliable=True), "name, type, definition, and the hash that the peer worked out by itself"
+    assert info.type_hash == told["hash"]
+
+    got: list[bytes] = []
+
+    def take(body: bytes, _stamp_ns: int) -> bool:
+        got.append(body)
+        return True
+
+    subscription = ours.subscribe(CHAT, take)
+
+    async def heard() -> None:
+        number = 0
+        while not got:  # until the subscription has reached the peer
+            await peer.do("publish", name=CHAT, data=f"hello {(number := number + 1)}")
+            await asyncio.sleep(0)
+        assert got[0].startswith(text("hello ")[:4])
+
+    await asyncio.wait_for(heard(), 20)
+    first = len(got)
+    for number in range(50):
+        await peer.do("publish", name=CHAT, data=f"number {number}")
+    await until(lambda: text("number 49") in got, "all arrive")
+    assert [body for body in got[first:] if b"number" in body] == [text(f"number {number}") for number in range(50)]
+
+    subscription.close()
+    await peer.do("close", thing="pub" + CHAT)
+    await until(lambda: CHAT not in events.topics, "the topic has ended")
+
+
+async def test_what_is_published_here_reaches_a_node(endpoint: tuple[ZenohEndpoint, Events], peer: Peer) -> None:
+    ours, events = endpoint
+    publisher = ours.advertise(chat())
+    await peer.do("subscriber", name=CHAT)
+
+    async def heard() -> None:
+        while not peer.got:
+            publisher.publish(text("hello"), 1)
+            await asyncio.sleep(0.01)
+
+    await asyncio.wait_for(heard(), 20)
+    for number in range(50):
+        publisher.publish(text(f"number {number}"), number)
+    await until(lambda: (CHAT, "number 49") in peer.got, "all arrive")
+    assert [data for _, data in peer.got if data.startswith("number")] == [f"number {number}" for number in range(50)]
+    assert events.topics == {}, "our own publisher is not announced to us"
+    publisher.close()
+    assert ours.dropped == 0
+
+
+async def test_late_joiners_get_what_is_latched(endpoint: tuple[ZenohEndpoint, Events], peer: Peer) -> None:
+    ours, events = endpoint
+    name = TopicName("/map")  # the peer looks for latched topics of one part only
+    publisher = ours.advertise(ros_types.topic_info(name, "std_msgs/msg/String", Encoding.CDR, latched=True))
+    publisher.publish(text("map"), 1)
+    static = TopicName("/static")
+    await peer.do("publisher", name=static, latched=True, depth=1)
+    await until(lambda: static in events.topics, "announced")
+    assert events.topics[static].latched and events.topics[static].reliable
+    await peer.sees("MP", name)
+    async with asyncio.timeout(60):
+        while (
+            not peer.got
+        ):  # it asks just once, when it is made, and its first direct connection to us may be under way
+            await peer.do("subscriber", name=name, latched=True)
+    assert set(peer.got) == {(name, "map")}
+    publisher.close()
+
+
+async def test_a_late_site_gets_what_another_site_latched(router: Router) -> None:
+    first, second = (ZenohEndpoint(ZenohOptions(router.options, DOMAIN)) for _ in range(2))
+    nothing, events = Events(), Events()
+    await first.start(nothing)
+    await second.start(events)
+    try:
+        publisher = first.advertise(chat(latched=True))
+        publisher.publish(text("one"), 7)
+        publisher.publish(text("two"), 8)
+        await until(lambda: CHAT in events.topics, "announced")
+        got: list[tuple[bytes, int]] = []
+
+        def take(body: bytes, stamp_ns: int) -> bool:
+            got.append((body, stamp_ns))
+            return True
+
+        second.subscribe(CHAT, take)
+        await until(lambda: len(got) == 2, "what was published before is there, with its stamps")
+        assert got == [(text("one"), 7), (text("two"), 8)]
+    finally:
+        await first.stop()
+        await second.stop()
+
+
+async def test_services_both_ways(endpoint: tuple[ZenohEndpoint, Events], peer: Peer) -> None:
+    ours, events = endpoint
+    told = await peer.do("server", name=MODE)
+    await until(lambda: MODE in events.services, "the service is announced")
+    info = events.services[MODE]
+    known = ros_services.resolve("std_srvs/srv/SetBool", "", Encoding.CDR).text
+    assert (info.type_name, info.definition) == ("std_srvs/srv/SetBool", known.definition)
+    assert info.type_hash == told["hash"]
+    request = b"\0\x01\0\0\x01"
+    answer = await ours.call(MODE, request, timeout_s=20)
+    assert answer[4:5] == b"\0" and b"as you say\0" in answer
+    with pytest.raises(ServiceError, match="no service /other"):
+        await ours.call(TopicName("/other"), request, timeout_s=1)
+    with pytest.raises(ConfigError, match="serves it already"):
+        ours.serve(info, lambda _request: asyncio.sleep(0, b""))
+
+    async def handler(asked: bytes) -> bytes:
+        if asked[4]:
+            return b"\0\x01\0\0\x01\0\0\0\x05\0\0\0sure\0"
+        raise ServiceError("never")
+
+    offered = ServiceInfo(TopicName("/ours"), info.type_name, Encoding.CDR, info.type_hash, info.definition)
+    server = ours.serve(offered, handler)
+    await peer.sees("SS", "/ours")
+    assert (await peer.do("call", name="/ours", hash=info.type_hash, data=True))["answer"] == [True, "sure"]
+    assert (await peer.do("call", name="/ours", hash=info.type_hash, data=False))["answer"] is None
+    server.close()
+    await peer.do("close", thing="server" + MODE)
+    await until(lambda: MODE not in events.services, "the service has ended")
+    assert "/ours" not in events.services
+
+
+async def test_a_node_that_dies_takes_its_topics_with_it(endpoint: tuple[ZenohEndpoint, Events], peer: Peer) -> None:
+    _, events = endpoint
+    await peer.do("publisher", name=CHAT)
+    await until(lambda: CHAT in events.topics, "announced")
+    await peer.kill()
+    await until(lambda: CHAT not in events.topics, "gone with its session")
+
+
+async def test_another_type_under_the_same_name_is_left_out(
+    endpoint: tuple[ZenohEndpoint, Events], peer: Peer, caplog: pytest.LogCaptureFixture
+) -> None:
+    ours, events = endpoint
+    await peer.do("publisher", name=CHAT)
+    await until(lambda: CHAT in events.topics, "announced")
+    first = events.topics[CHAT]
+    await peer.do("publisher", name=CHAT, type="std_msgs/msg/Bool", definition="bool data\n")
+    await until(lambda: "is left out" in caplog.text, "said")
+    (line,) = [record.message for record in caplog.records if "left out" in record.message]
+    assert "std_msgs/msg/Bool RIHS01_" in line and f"std_msgs/msg/String {first.type_hash}" in line
+    assert events.topics[CHAT] == first
+    with pytest.raises(
+        ConfigError, match=r"what comes is std_msgs/msg/Bool RIHS01_.* nodes here publish std_msgs/msg/String"
+    ):
+        ours.advertise(ros_types.topic_info(CHAT, "std_msgs/msg/Bool", Encoding.CDR))
+
+
+async def test_a_type_nobody_defines_passes_as_it_is(
+    endpoint: tuple[ZenohEndpoint, Events], peer: Peer, caplog: pytest.LogCaptureFixture
+) -> None:
+    ours, events = endpoint
+    await peer.do(
+        "publisher", name=CHAT, type="my_msgs/msg/Text", definition="string data\n", hash="RIHS01_" + "ab" * 32
+    )
+    await until(lambda: CHAT in events.topics, "announced")
+    assert events.topics[CHAT] == TopicInfo(
+        CHAT, "my_msgs/msg/Text", Encoding.CDR, "RIHS01_" + "ab" * 32, "", False, True
+    )
+    assert "type_paths" in caplog.text
+    with pytest.raises(UsageError, match="no such topic"):
+        ours.subscribe(TopicName("/nothing"), lambda _body, _stamp: True)
+
+
+async def test_the_router_may_come_later_and_go() -> None:
+    router = Router()
+    endpoint, events = ZenohEndpoint(ZenohOptions(router.options, DOMAIN)), Events()
+    await endpoint.start(events)
+    try:
+        router.start()
+        peer = await Peer.start(router.port)
+        try:
+            await peer.do("publisher", name=CHAT)
+            await until(lambda: CHAT in events.topics, "found through the router that came later", deadline_s=60)
+        finally:
+            await peer.kill()
+    finally:
+        await endpoint.stop()
+        router.stop()
+
+
+async def test_a_locator_that_is_none_is_one_line() -> None:
+    with pytest.raises(ConfigError, match=r"^zenoh does not accept this: [^\n]+$"):
+        ZenohEndpoint(ZenohOptions(SessionOptions(connect=("nonsense",))))
+
+
+async def test_from_a_ros_1_recording_to_a_ros_2_node(tmp_path: Path, router: Router, peer: Peer) -> None:
+    bag = write_bag(tmp_path / "in.bag", {"/chatter": 20})
+    async with Lab(tmp_path, "robot1", "site") as lab:
+        await lab.relay()
+        section = {
+            "kind": "zenoh", "connect": list(router.options.connect), "listen": ["tcp/127.0.0.1:0"], "domain": DOMAIN,
+        }  # fmt: skip
+        await lab.connected(lab.client_file("site", section, client={"namespace": "/"}, subscribe=["/robot1/.*"]))
+        await peer.do("subscriber", name="/robot1/chatter", latched=True, depth=100)
+        await lab.connected(lab.player_file("robot1", bag))
+        await until(lambda: len(peer.got) == 20, "all of the recording is there")
+    expected = [body[4:].decode() for body in under("robot1", bodies(bag))["/robot1/chatter"]]
+    assert [data for _, data in peer.got] == expected
