@@ -13,7 +13,6 @@ non-zero only if the benchmark could not run.
 import argparse
 import json
 import os
-import subprocess
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -24,8 +23,8 @@ from rich.console import Console
 from rich.table import Table
 
 from sern_core.errors import SernError
+from sern_tools.checkout import commit
 
-ROOT = Path(__file__).resolve().parent.parent
 REALTIME_PRIORITY = 10
 
 T = TypeVar("T")
@@ -113,20 +112,6 @@ def _number(value: float | None) -> str:
     if value is None:
         return ""
     return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.3g}"
-
-
-def commit() -> str:
-    """The checkout's short commit hash, with `-dirty` if tracked files differ; `unknown` outside a checkout."""
-    try:
-        hash_ = _git("rev-parse", "--short=12", "HEAD")
-        return hash_ + ("-dirty" if _git("status", "--porcelain", "--untracked-files=no") else "")
-    except (OSError, subprocess.CalledProcessError):
-        return "unknown"
-
-
-def _git(*words: str) -> str:
-    done = subprocess.run(["git", "-C", str(ROOT), *words], check=True, capture_output=True, text=True)
-    return done.stdout.strip()
 
 
 def pin_cpu(cpu: int | None = None) -> str:

@@ -22,7 +22,7 @@ Resolve = Callable[[str], Path]
 
 def make_endpoint(loaded: Loaded[ClientFile]) -> Endpoint:
     """The endpoint of a client: the one its file names, or several as one. Raises ConfigError."""
-    made = [_make(section, loaded.resolve) for section in _named(loaded.model)]
+    made = [make_section(section, loaded.resolve) for section in _named(loaded.model)]
     return made[0] if len(made) == 1 else CompositeEndpoint(made)
 
 
@@ -41,7 +41,8 @@ def _named(model: ClientFile) -> list[sections.EndpointSection]:
     return named
 
 
-def _make(section: sections.EndpointSection, resolve: Resolve) -> Endpoint:
+def make_section(section: sections.EndpointSection, resolve: Resolve) -> Endpoint:
+    """One of them."""
     match section:
         case sections.BagEndpoint():
             return BagEndpoint(
@@ -61,6 +62,7 @@ def _make(section: sections.EndpointSection, resolve: Resolve) -> Endpoint:
             return RecordEndpoint(
                 RecordOptions(
                     path=resolve(section.path),
+                    folder=section.path.endswith("/"),
                     overwrite=section.overwrite,
                     max_buffer_bytes=section.max_buffer_bytes,
                 )

@@ -75,7 +75,8 @@ class ObjectLimits:
 class XrObject:
     """One cross-reality object as it was when asked for.
 
-    `definition_hash` is the SHA-256 hex of the definition text unless its owner gave another (ROS 1 md5, RIHS01).
+    `definition_hash` is the SHA-256 hex of the definition text unless its owner gave another (ROS 1 md5, RIHS01);
+    empty where neither is known.
     `value` is the latest value, None when there is none or it is larger than the limit; then `value_bytes` and
     `value_sha256` still tell about it (`value_bytes` -1: nothing seen yet). `created_s` and `updated_s` are monotonic
     seconds of this host, `wall_ns` is the wall time at the origin, `ros_stamp_ns` the ROS stamp, untouched.
@@ -156,6 +157,11 @@ class _Entry:
         self.stream: StreamId | None = None
 
 
+def text_hash(definition: str) -> str:
+    """SHA-256 of a definition, hex; empty when there is none."""
+    return hashlib.sha256(_utf8(definition)).hexdigest() if definition else ""
+
+
 class ObjectRegistry:
     """See the module's text. `epoch` is this run's random number; a reader of another epoch is told to start over."""
 
@@ -218,7 +224,7 @@ class ObjectRegistry:
         entry.kind = kind
         entry.type_name = type_name
         entry.definition = definition
-        entry.definition_hash = definition_hash or hashlib.sha256(_utf8(definition)).hexdigest()
+        entry.definition_hash = definition_hash or text_hash(definition)
         entry.attributes = MappingProxyType(fields)
         if value is not None:
             self._set_value(entry, value)

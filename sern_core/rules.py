@@ -400,7 +400,8 @@ class FeedTopic:
 class FeedRole:
     """One pair of plain ZMQ sockets on the relay. `ingest_endpoint` None: nobody can publish through this role.
 
-    `types`: what goes on to the clients, first match wins; anything else stays within the feed.
+    `types`: what goes on to the clients, first match wins; anything else stays within the feed. The limits are for what
+    comes in, of all its programs together; None: unlimited.
     """
 
     name: str
@@ -410,6 +411,8 @@ class FeedRole:
     publish: tuple[re.Pattern[str], ...] = ()
     allow_control: bool = False
     types: tuple[FeedTopic, ...] = ()
+    max_rate_hz: float | None = None
+    max_bytes_per_s: float | None = None
 
     @property
     def owner(self) -> ClientName:

@@ -118,6 +118,7 @@ class RelayFeed:
                 ("received", fed.received),
                 ("forbidden", fed.forbidden),
                 ("malformed", fed.malformed),
+                ("limited", fed.limited),
                 ("injected", injected.injected),
                 ("untyped", injected.untyped),
                 ("dropped", injected.dropped),

@@ -13,7 +13,7 @@ from typing import Any
 
 from sern_core.errors import UsageError
 from sern_core.hub import Hub
-from sern_core.objects import changes_to_json, topic_object_id
+from sern_core.objects import changes_to_json, text_hash, topic_object_id
 from sern_core.types import ClientName, ObjectKind
 from sern_runtime.http import JsonQuery
 
@@ -39,12 +39,14 @@ def objects_view(hub: Hub) -> JsonQuery:
 
 
 def _defined(hub: Hub, answer: dict[str, Any], definitions: bool) -> dict[str, Any]:
-    """Put in the texts of streams, which the hub has once for all streams of a type."""
-    if definitions:
-        streams = [relayed.stream.stream for relayed in hub.relayed.values()]
-        digests = {topic_object_id(stream.id): stream.attributes.get("definition", "") for stream in streams}
-        for item in answer["objects"]:
-            item["definition"] = item["definition"] or hub.definitions.get(digests.get(item["id"], ""), "")
+    """Put in the texts of streams, which the hub has once for all streams of a type, and the hashes of these texts."""
+    streams = [relayed.stream.stream for relayed in hub.relayed.values()]
+    digests = {topic_object_id(stream.id): stream.attributes.get("definition", "") for stream in streams}
+    for item in answer["objects"]:
+        text = hub.definitions.get(digests.get(item["id"], ""), "")
+        item["definition_hash"] = item["definition_hash"] or text_hash(text)
+        if definitions:
+            item["definition"] = item["definition"] or text
     return answer
 
 

@@ -75,6 +75,7 @@ class RelayServer:
         )
         self.connections = ConnectionTable(raw, max_connections=max_connections, on_change=self._connections_changed)
         self.socket = RouterSocket(raw, self._received, on_writable=self._writable)
+        self.socket.on_refused = self._refused
 
     def close(self) -> None:
         for session in self._sessions.values():
@@ -105,6 +106,12 @@ class RelayServer:
             return
         self._after()
 
+    def _refused(self, why: str) -> None:
+        """What no SERN client sends: the message is dropped and counted, and the connection closed."""
+        details = self.socket.peer_details()
+        _log.warning("connection from %s closed: %s", details.address, why)
+        self.connections.cut(details.fd)
+
     def _received_express(self, routing_id: bytes, joined: Joined, user: str, data: bytes) -> None:
         if not self._insecure and user != joined.client:
             problem = f"its identity changed to {user!r}"
@@ -119,7 +126,7 @@ class RelayServer:
                 return
         _log.warning("connection of %s for class control closed: %s", joined.client, problem)
         self.express.left(routing_id)
-        self._cut_fd(joined.fd)
+        self.connections.cut(joined.fd)
 
     def _accept(self, routing_id: bytes, user: str, data: bytes) -> Session | None:
         """A connection speaks for the first time: find out whose it is."""
@@ -129,12 +136,12 @@ class RelayServer:
         except (WireError, UsageError) as error:
             self.bad_frames += 1
             _log.warning("connection from %s closed: bad frame: %s", details.address, error)
-            self._cut_fd(details.fd)
+            self.connections.cut(details.fd)
             return None
         if not self._admits(name):
             self.revoked += 1
             _log.warning("connection from %s closed: the key of %s is revoked", details.address, name)
-            self._cut_fd(details.fd)
+            self.connections.cut(details.fd)
             return None
         self.connections.bind_user(details.fd, name)
         connection = self.connections.by_fd(details.fd)
@@ -165,7 +172,7 @@ class RelayServer:
             _log.warning("connection of %s for class control closed: bad frame: %s", joined.client, error)
             older = joined
         if older is not None:
-            self._cut_fd(older.fd)
+            self.connections.cut(older.fd)
         self._after()
 
     @staticmethod
@@ -207,12 +214,7 @@ class RelayServer:
     def _cut(self, routing_id: bytes, session: Session, why: str) -> None:
         _log.warning("connection of %s closed: %s", session.port.client, why)
         self._gone(routing_id)
-        self._cut_fd(session.fd)
-
-    def _cut_fd(self, fd: int) -> None:
-        connection = self.connections.by_fd(fd)
-        if connection is not None and connection.handle is not None:
-            connection.handle.cut()
+        self.connections.cut(session.fd)
 
     def _gone(self, routing_id: bytes) -> None:
         session = self._sessions.pop(routing_id, None)

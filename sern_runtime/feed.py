@@ -32,6 +32,7 @@ from typing import Final, NamedTuple
 
 import zmq
 
+from sern_core.access import RateGuard
 from sern_core.rules import FeedRole
 from sern_core.types import CLASSES, PriorityClass, TopicName
 from sern_runtime.zmq_socket import (
@@ -108,6 +109,7 @@ class FeedCounters:
     received_bytes: int = 0
     forbidden: int = 0  # the role may not publish that topic, or not in that class
     malformed: int = 0
+    limited: int = 0  # more than the role's limits let in
 
 
 Accept = Callable[[FeedRole, TopicName], bool]
@@ -137,7 +139,9 @@ class Feed:
         keys: CurvePair | None = None,
         max_message_bytes: int = MAX_MESSAGE_BYTES,
         wall_ns: Callable[[], int] = time.time_ns,
+        clock: Callable[[], float] = time.monotonic,
     ) -> None:
+        self.clock = clock
         self.on_publish = on_publish
         self.on_interest = on_interest
         self.accept = accept
@@ -172,7 +176,7 @@ class Feed:
             else:
                 self._outlets[name] = _Outlet(self, role, self._bound(zmq.XPUB, role, role.publish_endpoint))
             if name in self._inlets:
-                self._inlets[name].role = role
+                self._inlets[name].adopt(role)
             elif role.ingest_endpoint is not None:
                 self._inlets[name] = _Inlet(self, role, self._bound(zmq.XSUB, role, role.ingest_endpoint))
         for outlet in self._outlets.values():
@@ -329,7 +333,14 @@ class _Inlet(DrainedSocket):
         self.verdicts: dict[bytes, _Verdict] = {}
         self.counters = feed.counters()[role.name]
         self._feed = feed
+        self._guard = _guard_of(role, feed.clock())
         socket.send(b"\1")  # everything: what the role may publish is decided here, by pattern and not by prefix
+
+    def adopt(self, role: FeedRole) -> None:
+        """Go by this role from now on; other limits than before begin with full buckets."""
+        before, self.role = self.role, role
+        if (before.max_rate_hz, before.max_bytes_per_s) != (role.max_rate_hz, role.max_bytes_per_s):
+            self._guard = _guard_of(role, self._feed.clock())
 
     def _received(self) -> int:
         return self.counters.received
@@ -339,6 +350,7 @@ class _Inlet(DrainedSocket):
         verdicts = self.verdicts
         counters = self.counters
         on_publish = self._feed.on_publish
+        guard = self._guard
         received = received_bytes = 0
         topic = b""
         used: set[_Outlet] = set()
@@ -358,6 +370,9 @@ class _Inlet(DrainedSocket):
                     header = self._second_look(verdict, header)
                     if not header:
                         continue
+                if guard is not None and not guard.admit(len(body), now=self._feed.clock()):
+                    counters.limited += 1
+                    continue
                 received += 1
                 received_bytes += len(body)
                 for outlet in verdict.outlets:
@@ -425,6 +440,13 @@ class _Inlet(DrainedSocket):
             self.counters.forbidden += 1
             return b""
         return parsed.pack()
+
+
+def _guard_of(role: FeedRole, now: float) -> RateGuard | None:
+    """What keeps a role to its limits; None: it has none, and pays nothing for them."""
+    if role.max_rate_hz is None and role.max_bytes_per_s is None:
+        return None
+    return RateGuard(max_bytes_per_s=role.max_bytes_per_s, max_rate_hz=role.max_rate_hz, now=now)
 
 
 class _Verdict(NamedTuple):

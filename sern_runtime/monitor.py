@@ -411,6 +411,15 @@ class ConnectionTable:
             connection.user = user
             self._not_half_open(fd, connection)
 
+    def cut(self, fd: int) -> None:
+        """End one connection; `fd` from a frame that came over it."""
+        connection = self._connections.get(fd)
+        if connection is None:  # the frame overtook its event
+            self._monitor.drain()
+            connection = self._connections.get(fd)
+        if connection is not None and connection.handle is not None:
+            connection.handle.cut()
+
     def handles_of(self, user: str) -> list[TcpHandle]:
         return [c.handle for c in self._connections.values() if c.user == user and c.handle is not None]
 

@@ -261,15 +261,17 @@ class RouterSocket(DrainedSocket):
     ) -> None:
         super().__init__(socket, on_writable=on_writable, batch=batch, tick_s=tick_s)
         self.on_message = on_message
+        self.on_refused: Callable[[str], None] | None = None
+        """Told why a message was dropped unread; `peer_details` says whose it was."""
         self.messages = 0
         self.refused_routing_ids = 0
         """Messages of peers that claimed a routing id of their own choice."""
         self._frame: zmq.Frame | None = None
 
     def peer_details(self) -> PeerDetails:
-        """Address and file descriptor of the sender; only inside `on_message`."""
+        """Address and file descriptor of the sender; only inside `on_message` and `on_refused`."""
         if self._frame is None:
-            raise UsageError("peer_details() is for use inside on_message")
+            raise UsageError("peer_details() is for use inside on_message and on_refused")
         return PeerDetails(_text(self._frame, "Peer-Address"), int(self._frame.get(zmq.SRCFD)))
 
     def send_to(self, routing_id: bytes, body: bytes) -> SendResult:
@@ -294,16 +296,22 @@ class RouterSocket(DrainedSocket):
                 routing_id = recv(_NOBLOCK)
                 frame = recv(_NOBLOCK, copy=False)  # a Frame knows `more` and User-Id; RCVMORE alone costs as much
                 self.messages += 1
+                self._frame = frame
                 if frame.more:
                     self._skip_rest(frame)
+                    self._refuse("a message of several frames")
                 elif len(routing_id) != AUTO_ROUTING_ID_BYTES or routing_id[0] != 0:
                     self.refused_routing_ids += 1
+                    self._refuse("a routing id of its own choice")
                 else:
-                    self._frame = frame
                     on_message(routing_id, user_of(frame), frame.bytes)
         finally:
             self._frame = None
         return True
+
+    def _refuse(self, why: str) -> None:
+        if self.on_refused is not None:
+            self.on_refused(why)
 
 
 class DealerSocket(DrainedSocket):

@@ -6,10 +6,8 @@ import json
 import math
 import os
 import platform
-import subprocess
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Final
 
 from rich.console import Console
@@ -19,11 +17,10 @@ from rich.text import Text
 from sern_core.types import CLASS_LABELS
 from sern_sim.profiles import LinkProfile
 from sern_tools import demo_charts
+from sern_tools.checkout import commit
 from sern_tools.demo_live import rate
 from sern_tools.demo_scenario import Scenario
 from sern_tools.summary import Result, Statistics, Verdict
-
-ROOT: Final = Path(__file__).resolve().parent.parent
 
 
 @dataclass(frozen=True)
@@ -51,20 +48,6 @@ class Report:
     @property
     def ok(self) -> bool:
         return all(verdict.ok for verdict in self.verdicts)
-
-
-def commit() -> str:
-    """The checkout's short commit hash, `-dirty` if tracked files differ; `unknown` outside a checkout."""
-    try:
-        hash_ = _git("rev-parse", "--short=12", "HEAD")
-        return hash_ + ("-dirty" if _git("status", "--porcelain", "--untracked-files=no") else "")
-    except (OSError, subprocess.CalledProcessError):
-        return "unknown"
-
-
-def _git(*words: str) -> str:
-    done = subprocess.run(["git", "-C", str(ROOT), *words], check=True, capture_output=True, text=True)
-    return done.stdout.strip()
 
 
 # JSON ----------------------------------------------------------------------------------------------------------------

@@ -6,12 +6,14 @@ children the way a supervisor does: SIGTERM, time to drain, SIGKILL.
 
 import asyncio
 import contextlib
+import ctypes
 import json
 import os
 import signal
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, Final, Self
 
@@ -23,6 +25,16 @@ ABORT_S: Final = 5.0
 """The same when the whole is being given up."""
 TAIL_LINES: Final = 3
 LINE_BYTES: Final = 2**20
+PR_SET_PDEATHSIG: Final = 1
+"""linux/prctl.h"""
+_libc: Final = ctypes.CDLL(None, use_errno=True)
+
+
+def _die_with(parent: int) -> None:
+    """In the child, before it becomes its program: SIGKILL when the parent ends, even by kill -9."""
+    _libc.prctl(PR_SET_PDEATHSIG, int(signal.SIGKILL))
+    if os.getppid() != parent:  # it ended meanwhile
+        os._exit(1)
 
 
 @dataclass(eq=False)
@@ -114,6 +126,7 @@ class Children:
                     stdout=pipe or stream,
                     stderr=stream,
                     start_new_session=True,
+                    preexec_fn=partial(_die_with, os.getpid()),
                     env={**os.environ, **(environment or {})},
                     limit=LINE_BYTES,
                 )

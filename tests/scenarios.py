@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 from sern_core.fragments import PARTIAL_IDLE_S
 from sern_core.message import StreamId, TopicSpec
 from sern_core.queues import OutChannel
-from sern_core.sending import SentPing
 from sern_core.types import DropReason, PriorityClass
 from sern_sim.models import Jitter, LinkModel, Window
 from tests.world import Clock, SimClient, World, spec
@@ -153,7 +152,7 @@ class Run:
         for stop in stops:
             stop()
         world.run(1.0)
-        world.until(self._quiet, within_s=DRAIN_S, what="everything has drained")
+        world.until(world.quiet, within_s=DRAIN_S, what="everything has drained")
         world.run(PARTIAL_IDLE_S + 1.0)
         world.validate()
         return self
@@ -177,18 +176,6 @@ class Run:
         else:
             self.steady.discard(self.site.name)
             world.clients["site"].subscribe()
-
-    def _quiet(self) -> bool:
-        """Everybody is connected, and nothing is left to send, to acknowledge or to confirm."""
-        for link in self.world.links():
-            if not link.established or link._control.retained:
-                return False
-            if any(type(item) is not SentPing for packet in link.lane.flight.packets.values() for item in packet.items):
-                return False
-            for channel in link.channels.values():
-                if channel.retained or (channel.wanted is not False and (channel.queue or channel.flying)):
-                    return False
-        return True
 
     # What must hold
 

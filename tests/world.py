@@ -21,6 +21,7 @@ from sern_core.link import Link
 from sern_core.message import Message, StreamId, StreamInfo, TopicInfo, TopicSpec
 from sern_core.params import LinkParams, SchedulerParams
 from sern_core.queues import OutChannel
+from sern_core.sending import SentPing
 from sern_core.types import (
     ClientName,
     DropReason,
@@ -486,6 +487,18 @@ class World:
     def links(self) -> Iterator[Link]:
         yield from (client.core.link for client in self.clients.values())
         yield from self.relay.links()
+
+    def quiet(self) -> bool:
+        """Everybody is connected, and nothing is left to send, to acknowledge or to confirm."""
+        for link in self.links():
+            if not link.established or link._control.retained:
+                return False
+            if any(type(item) is not SentPing for packet in link.lane.flight.packets.values() for item in packet.items):
+                return False
+            for channel in link.channels.values():
+                if channel.retained or (channel.wanted is not False and (channel.queue or channel.flying)):
+                    return False
+        return True
 
     def watch(self, period_s: float = 0.1) -> "World":
         """Validate everything again and again while the world runs."""

@@ -36,11 +36,13 @@ _SUFFIXES: Final = {Encoding.ROS1: ".bag", Encoding.CDR: ".mcap"}
 
 @dataclass(frozen=True, slots=True)
 class RecordOptions:
-    """Where to. `path`: a `.bag` or `.mcap` (the other encoding goes beside it under the same stem), an existing
-    folder (named by date), or a name without suffix. `max_buffer_bytes` bounds what waits for the disk.
+    """Where to. `path`: a `.bag` or `.mcap` (the other encoding goes beside it under the same stem), a folder (files
+    named by date) if it is one already or `folder` says so, or a name without suffix. `max_buffer_bytes` bounds what
+    waits for the disk.
     """
 
     path: Path
+    folder: bool = False
     overwrite: bool = False
     max_buffer_bytes: int = 64 * 2**20
 
@@ -170,7 +172,7 @@ class RecordEndpoint:
 
     def _resolve(self, path: Path) -> tuple[Path, tuple[Encoding, ...]]:
         """(stem without suffix, encodings whose file must not be in the way)."""
-        if path.is_dir():
+        if self.options.folder or path.is_dir():
             return path / time.strftime("sern_%Y-%m-%d-%H-%M-%S", time.gmtime()), tuple(_SUFFIXES)
         for encoding, suffix in _SUFFIXES.items():
             if path.suffix == suffix:

@@ -151,7 +151,8 @@ class RecordEndpoint(EndpointBase):
     kind: Literal["record"]
     """Records what arrives."""
     path: PathText
-    """A .bag or .mcap file (the other encoding goes beside it), a directory (files are named by date), or a stem."""
+    """A .bag or .mcap file (the other encoding goes beside it), a directory (files are named by date; with a slash at
+    the end it is made), or a stem."""
     overwrite: bool = False
     """Replace files that exist."""
     max_buffer_bytes: Annotated[int, Field(ge=1 << 20, le=1 << 36)] = 64 * 2**20

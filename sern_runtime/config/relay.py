@@ -193,6 +193,10 @@ class FeedRoleSection(Section):
     """Patterns of the global names this role may publish."""
     allow_control: bool = False
     """Let this role publish in class control (commands)."""
+    max_rate_hz: Hertz | None = None
+    """Messages a second taken through this role, of all its programs together; null: no limit."""
+    max_bytes_per_s: Annotated[float, Field(gt=0, le=1e12)] | None = None
+    """Bytes a second taken through this role; null: no limit."""
     types: tuple[FeedTypeSection, ...] = ()
     """What the topics are that go on to the clients, first match wins; a topic without stays within the feed."""
     insecure: bool = False
@@ -210,8 +214,9 @@ class FeedRoleSection(Section):
             raise fault("names no topic, so ingest_endpoint has no use", "publish")
         if self.allow_control and not self.publish:
             raise fault("has no use without publish", "allow_control")
-        if self.types and not self.publish:
-            raise fault("has no use without publish", "types")
+        for key in ("types", "max_rate_hz", "max_bytes_per_s"):
+            if getattr(self, key) and not self.publish:
+                raise fault("has no use without publish", key)
         for index, entry in enumerate(self.types):
             if entry.commands and not self.allow_control:
                 raise fault(f"{entry.type} commands a robot, which needs allow_control: true", "types", index)
@@ -226,6 +231,8 @@ class FeedRoleSection(Section):
             publish=tuple(compile_pattern(text) for text in self.publish),
             allow_control=self.allow_control,
             types=tuple(entry.topic() for entry in self.types),
+            max_rate_hz=self.max_rate_hz,
+            max_bytes_per_s=self.max_bytes_per_s,
         )
 
 

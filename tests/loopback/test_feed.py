@@ -3,6 +3,7 @@
 import re
 import socket as socketlib
 from collections.abc import AsyncIterator, Iterable
+from dataclasses import replace
 from functools import partial
 
 import pytest
@@ -185,6 +186,39 @@ async def test_what_may_not_come_in_is_refused_and_counted(world: World) -> None
     await until(lambda: world.came_in)
     assert [body for *_, body in world.came_in] == [b"fine"]
     assert feed.counters()["unity"].forbidden == 2
+
+
+@pytest.mark.parametrize(
+    ("rate_hz", "bytes_per_s", "taken"),
+    [(3.0, None, 3), (None, 40.0, 4), (100.0, 1e6, 8)],
+    ids=["messages", "bytes", "ample"],
+)
+async def test_a_role_is_kept_to_its_limits(
+    world: World, rate_hz: float | None, bytes_per_s: float | None, taken: int
+) -> None:
+    now = [100.0]
+    unity = role("unity", publish="/unity/.*")
+    limited = replace(unity, max_rate_hz=rate_hz, max_bytes_per_s=bytes_per_s)
+    feed = world.start([limited], clock=lambda: now[0])
+    subscriber = await world.subscriber(feed, "unity", b"")
+    publisher = await world.publisher(feed, "unity")
+    counters = feed.counters()["unity"]
+    for number in range(8):
+        publisher.send_multipart([b"/unity/head\0", HEADER.pack(), b"%010d" % number])
+    await until(lambda: counters.received + counters.limited == 8)
+    assert counters.received == taken
+    assert [body for *_, body in world.came_in] == [b"%010d" % number for number in range(taken)]
+    for number in range(taken):  # nor does the feed's own subscriber get more
+        assert (await received(subscriber))[2] == b"%010d" % number
+    assert not subscriber.poll(0)
+    now[0] += 10.0  # the buckets are full again, and roles that are read anew with the same limits keep them
+    feed.update([replace(limited)])
+    publisher.send_multipart([b"/unity/head\0", HEADER.pack(), b"later"])
+    await until(lambda: world.came_in[-1][3] == b"later")
+    feed.update([unity])
+    for _ in range(20):
+        publisher.send_multipart([b"/unity/head\0", HEADER.pack(), b"no limit"])
+    await until(lambda: counters.received == taken + 21)
 
 
 async def test_class_control_needs_a_rule_of_its_own(world: World) -> None:

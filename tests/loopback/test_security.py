@@ -183,6 +183,7 @@ async def test_a_claimed_routing_id_is_never_heard(tmp_path: Path, caplog: pytes
                 before = server.socket.refused_routing_ids
                 await impostor.send(hello("robot2"))
                 await until(lambda before=before: server.socket.refused_routing_ids > before)  # type: ignore[misc]
+                await impostor.cut()
                 assert impostor.received == []
 
 
@@ -262,6 +263,7 @@ async def test_oversize_and_multipart_messages_do_not_get_through(
         async with Stranger(world.lab, keys) as stranger:
             await stranger.send(*[hello("robot2")] * 20)
             await world.refused("multipart")
+            await stranger.cut()
             assert stranger.received == []
 
 

@@ -14,7 +14,6 @@ from sern_core.message import TopicSpec
 from sern_core.params import SchedulerParams
 from sern_core.queues import OutChannel
 from sern_core.scheduler import CREDIT_QUANTA, DEFAULT_QUANTUM_BYTES, Scheduler
-from sern_core.sending import SentPing
 from sern_core.types import CLASS_LABELS, ClientName, PriorityClass
 from sern_sim.events import SimulationTimeoutError
 from sern_sim.models import LinkModel
@@ -195,7 +194,7 @@ class Play:
         network = self.world.network
         end_s = network.elapsed_s + DRAIN_S
         while network.elapsed_s < end_s:
-            if self._quiet():
+            if self.world.quiet():
                 return True
             self.world.run(STEP_S)
         waiting = [
@@ -206,17 +205,6 @@ class Play:
         ]
         self.broken.append(f"not drained {DRAIN_S:g} s after the load: {waiting}")
         return False
-
-    def _quiet(self) -> bool:
-        for link in self.world.links():
-            if not link.established:
-                return False
-            if any(type(item) is not SentPing for packet in link.lane.flight.packets.values() for item in packet.items):
-                return False
-            for channel in link.channels.values():
-                if channel.retained or (channel.wanted is not False and (channel.queue or channel.flying)):
-                    return False
-        return True
 
     # --- the promises -----------------------------------------------------------------------------------------------
 

@@ -116,3 +116,39 @@ async def test_a_program_that_is_not_there(tmp_path: Path) -> None:
             await children.start("relay", ["/nowhere/relay"])
     with pytest.raises(SernError, match="sern-nothing is not installed"):
         program("sern-nothing")
+
+
+PARENT = """
+import asyncio, sys
+from pathlib import Path
+from sern_tools.processes import Children
+
+async def main():
+    async with Children(Path(sys.argv[1])) as children:
+        child = await children.start("patient", [sys.executable, "-c", sys.argv[2]], talks=True)
+        await child.read_object()
+        print(child.process.pid, flush=True)
+        await asyncio.Event().wait()
+
+asyncio.run(main())
+"""
+
+
+async def test_children_end_with_a_parent_that_is_killed(tmp_path: Path) -> None:
+    process = await asyncio.create_subprocess_exec(
+        *(sys.executable, "-c", PARENT, str(tmp_path), STUBBORN), stdout=asyncio.subprocess.PIPE
+    )
+    assert process.stdout is not None
+    child = int(await process.stdout.readline())
+    os.kill(child, 0)  # it runs
+    process.kill()
+    await process.wait()
+    await until(lambda: ended(child), "the child is gone")
+
+
+def ended(pid: int) -> bool:
+    """Gone, or dead and waiting for somebody to ask after it: orphans are left to whatever is process 1."""
+    try:
+        return (Path("/proc") / str(pid) / "stat").read_text().rpartition(")")[2].split()[0] == "Z"
+    except FileNotFoundError:
+        return True

@@ -14,10 +14,12 @@ from rosbags.interfaces import ConnectionExtRosbag1, ConnectionExtRosbag2, QosDu
 
 from sern_client.endpoints.bag import BagEndpoint, BagOptions
 from sern_client.endpoints.record import RecordEndpoint, RecordOptions
+from sern_client.factory import make_section
 from sern_core.errors import ConfigError, UsageError
 from sern_core.message import TopicInfo
 from sern_core.types import Encoding, TopicName
 from sern_runtime import ros_types
+from sern_runtime.config import endpoints as sections
 from sern_runtime.ros_types import topic_info
 
 Make = Callable[..., Path]
@@ -128,6 +130,24 @@ async def test_a_folder_gets_files_named_by_date(tmp_path: Path, events: Any) ->
     await recorder.stop()
     (path,) = tmp_path.iterdir()
     assert path.name.startswith("sern_") and path.suffix == ".bag" and len(read(path)) == 1
+
+
+@pytest.mark.parametrize("written", ["out/", "deeper/out/"])
+async def test_a_path_that_ends_in_a_slash_is_a_folder_to_be_made(tmp_path: Path, events: Any, written: str) -> None:
+    recorder = make_record(tmp_path, written)
+    await recorder.start(events)
+    recorder.advertise(unknown(Encoding.ROS1)).publish(bytes(17), START_NS)
+    await recorder.stop()
+    (path,) = (tmp_path / written).iterdir()
+    assert path.name.startswith("sern_") and len(read(path)) == 1
+
+
+def make_record(folder: Path, path: str) -> RecordEndpoint:
+    """As the configuration names it."""
+    section = sections.RecordEndpoint(kind="record", path=path)
+    endpoint = make_section(section, lambda name: folder / name)
+    assert isinstance(endpoint, RecordEndpoint)
+    return endpoint
 
 
 async def test_an_empty_recording_leaves_no_file(tmp_path: Path, events: Any) -> None:
