@@ -9,8 +9,8 @@ from typing import Final
 from sern_client.transport import Dialer, RelayTransport
 from sern_core.client import ClientCore
 from sern_core.errors import ConfigError, RemoteError
+from sern_core.lane_port import LanePort
 from sern_core.lanes import LANE_EXPRESS, LANE_ZMQ
-from sern_core.link import LanePort
 from sern_core.params import Redundancy
 from sern_runtime.express import CONNECTIONS, ExpressPaths
 from sern_runtime.monitor import TcpHandle

@@ -62,10 +62,10 @@ def make_section(section: sections.EndpointSection, resolve: Resolve) -> Endpoin
             return RecordEndpoint(
                 RecordOptions(
                     path=resolve(section.path),
-                    folder=section.path.endswith("/"),
                     overwrite=section.overwrite,
                     max_buffer_bytes=section.max_buffer_bytes,
-                )
+                ),
+                folder=section.path.endswith("/"),
             )
         case sections.ZenohEndpoint():
             return ZenohEndpoint(

@@ -8,8 +8,8 @@ from typing import Final
 from sern_core import wire
 from sern_core.client import ClientCore
 from sern_core.errors import RemoteError, SernError
+from sern_core.lane_port import LanePort
 from sern_core.lanes import LANE_UDP
-from sern_core.link import LanePort
 from sern_runtime.pump import Pump
 from sern_runtime.seal import SessionParameters, offered_ciphers
 from sern_runtime.udp_client import UdpClient

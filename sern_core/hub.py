@@ -19,13 +19,14 @@ from sern_core.access import AccessTable, RateGuard, compile_peer_pattern
 from sern_core.announce import Announcement
 from sern_core.bound import QueueBound
 from sern_core.errors import RefusedError, WireError
-from sern_core.fragments import InStream, Reassembly
+from sern_core.fragments import InStream
 from sern_core.hub_events import HubEvents, Relayed
+from sern_core.hub_local import LocalStreams
 from sern_core.hub_port import HubPort
 from sern_core.lanes import LANE_EXPRESS
 from sern_core.ledger import ReceiveLedger
 from sern_core.link import Link
-from sern_core.message import Message, StreamId, StreamInfo, TopicInfo, TopicSpec
+from sern_core.message import Message, StreamId, StreamInfo
 from sern_core.object_control import apply_object
 from sern_core.objects import ObjectRegistry
 from sern_core.params import LinkParams, SchedulerParams
@@ -42,7 +43,6 @@ ORPHAN_S: Final = 60.0
 blackout that is worth waiting for with keys in hand."""
 MAX_AWAITED_TOPICS: Final = 2048
 """Streams held for one client that has not come back yet; origins name them, so there must be an end to it."""
-MAX_LOCAL_SEQS: Final = 4096
 MAX_DENIED: Final = 64
 """Topics of one subscription that a client is told it may not have; a client has no use for a longer list."""
 
@@ -55,7 +55,7 @@ class HubParams:
     resume_s: float = 600.0
 
 
-class Hub:
+class Hub(LocalStreams):
     """See the module's text. `known` says whether a name is in the directory of clients."""
 
     def __init__(
@@ -74,6 +74,7 @@ class Hub:
         now: float,
         lossless: bool = True,
     ) -> None:
+        super().__init__()
         self.name = name
         self.boot = boot
         self.access = access
@@ -100,9 +101,6 @@ class Hub:
         self._heard: set[ClientName] = set()  # said what they want, to this run of the relay
         self._absent_since: dict[ClientName, float] = {}
         self._draining: list[tuple[Link, OutChannel]] = []  # streams that ended with reliable messages still owed
-        self.local_owners: set[ClientName] = set()
-        """Names under which the relay itself publishes; no client may have one of them."""
-        self._local_seqs: dict[StreamId, int] = {}  # of local streams that were closed: the last seq
         self.tap: Callable[[StreamInfo], bool] = lambda _stream: False
         """Whether the relay itself wants a stream (a subscriber of the feed); set by the shell."""
 
@@ -310,9 +308,7 @@ class Hub:
         if relayed.cache is not None:
             self.replays.close(relayed.cache)
         if relayed.source is None:
-            if len(self._local_seqs) >= MAX_LOCAL_SEQS:
-                self._local_seqs.clear()  # the far side has been told that they ended: they may begin anew
-            self._local_seqs[identity] = relayed.stream.delivered
+            self._closed_local(relayed)
         for link, channel in relayed.outs.values():
             if channel.reliable and channel.retained:
                 self._draining.append((link, channel))
@@ -330,58 +326,6 @@ class Hub:
         for _link, channel in relayed.outs.values():
             delivered = min(delivered, channel.watermark)
         source.confirm(stream, delivered)
-
-    # --- streams of the relay itself ------------------------------------------------------------------------------
-
-    def open_local(self, info: TopicInfo, spec: TopicSpec, owner: ClientName, *, now: float) -> Relayed:
-        """Publish a topic from here, under the name of `owner`, who then owns the topic's name like any client.
-
-        The answer is the handle for `inject` and `close_local`; opening again gives the same. Raises RefusedError like
-        `RoutingTable.announce`: the access rules must let `owner` publish it.
-        """
-        if owner in self.links:
-            raise RefusedError("name_taken", f"{owner} is the name of a client; give the feed's role another name")
-        self.local_owners.add(owner)
-        identity = StreamId(owner, self.boot, info.name)
-        held = self.relayed.get(identity)
-        stream = InStream(
-            StreamInfo(identity, info, spec),
-            Reassembly(0),
-            lambda _stream, _message: None,
-            lambda _stream, _reason, _nbytes, _seq: None,
-            first=self._local_seqs.get(identity, 0) + 1,
-        )
-        if held is not None:
-            stream.delivered = held.stream.delivered
-        return self._take(None, stream, now)
-
-    def close_local(self, handle: Relayed, *, now: float) -> None:
-        """End a local stream; nothing happens when it has ended already."""
-        if self.is_open(handle):
-            self._apply(self.routing.withdraw(handle.stream.stream.id), now)
-
-    def is_open(self, handle: Relayed) -> bool:
-        """Whether a local stream still is; access rules may have ended it."""
-        return self.relayed.get(handle.stream.stream.id) is handle
-
-    def inject(self, handle: Relayed, body: bytes, stamp_ns: int, *, now: float, age_s: float = 0.0) -> bool:
-        """A message of a local stream, `age_s` old. False: too old, refused (a reliable queue is full), or ended."""
-        if not self.is_open(handle):
-            return False
-        stream = handle.stream
-        spec = stream.stream.spec
-        counters = self.received.of(stream.stream)
-        if spec.lifespan_s is not None and age_s > spec.lifespan_s:
-            counters.drop_arrived(DropReason.LIFESPAN)
-            return False
-        if spec.reliable and not all(channel.has_room(len(body)) for _link, channel in handle.outs.values()):
-            counters.drop_arrived(DropReason.REFUSED)
-            return False
-        stream.delivered += 1
-        stream.confirmed = stream.delivered
-        counters.arrived(len(body), age_s, now)
-        self._forward(handle, Message(stream.stream.id, stream.delivered, body, stamp_ns, now - age_s), now)
-        return True
 
     # --- LinkHandler ----------------------------------------------------------------------------------------------
 

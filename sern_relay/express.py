@@ -8,8 +8,9 @@ from typing import Final, NamedTuple
 from sern_core import wire
 from sern_core.errors import WireError
 from sern_core.hub import Hub
+from sern_core.lane_port import LanePort
 from sern_core.lanes import LANE_EXPRESS
-from sern_core.link import LanePort, Link
+from sern_core.link import Link
 from sern_core.params import Redundancy
 from sern_core.types import ClientName
 from sern_runtime.express import CONNECTIONS, ExpressPaths

@@ -6,8 +6,8 @@ from collections.abc import Callable, Sequence
 
 from sern_core.errors import RefusedError, RemoteError
 from sern_core.hub import Hub
+from sern_core.lane_port import LanePort
 from sern_core.lanes import LANE_UDP
-from sern_core.link import LanePort
 from sern_core.types import ClientName
 from sern_runtime.config.base import split_tcp
 from sern_runtime.pump import Pump

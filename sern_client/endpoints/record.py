@@ -36,13 +36,11 @@ _SUFFIXES: Final = {Encoding.ROS1: ".bag", Encoding.CDR: ".mcap"}
 
 @dataclass(frozen=True, slots=True)
 class RecordOptions:
-    """Where to. `path`: a `.bag` or `.mcap` (the other encoding goes beside it under the same stem), a folder (files
-    named by date) if it is one already or `folder` says so, or a name without suffix. `max_buffer_bytes` bounds what
-    waits for the disk.
+    """Where to. `path`: a `.bag` or `.mcap` (the other encoding goes beside it under the same stem), an existing
+    folder (named by date), or a name without suffix. `max_buffer_bytes` bounds what waits for the disk.
     """
 
     path: Path
-    folder: bool = False
     overwrite: bool = False
     max_buffer_bytes: int = 64 * 2**20
 
@@ -76,10 +74,11 @@ class _Publisher:
 
 
 class RecordEndpoint:
-    """An `Endpoint` that takes everything and gives nothing."""
+    """An `Endpoint` that takes everything and gives nothing. `folder`: the path is a folder, to be made if need be."""
 
-    def __init__(self, options: RecordOptions) -> None:
+    def __init__(self, options: RecordOptions, *, folder: bool = False) -> None:
         self.options = options
+        self._folder = folder
         self.counters = RecordCounters()
         self.problem: str | None = None
         """The last thing that went wrong, in one line; None while all is well."""
@@ -172,7 +171,7 @@ class RecordEndpoint:
 
     def _resolve(self, path: Path) -> tuple[Path, tuple[Encoding, ...]]:
         """(stem without suffix, encodings whose file must not be in the way)."""
-        if self.options.folder or path.is_dir():
+        if self._folder or path.is_dir():
             return path / time.strftime("sern_%Y-%m-%d-%H-%M-%S", time.gmtime()), tuple(_SUFFIXES)
         for encoding, suffix in _SUFFIXES.items():
             if path.suffix == suffix:

@@ -8,8 +8,9 @@ differ.
 from collections.abc import Callable
 from itertools import pairwise
 
+from sern_core.lane_port import LanePort
 from sern_core.lanes import LANE_UDP
-from sern_core.link import LanePort, Link
+from sern_core.link import Link
 from sern_core.message import TopicSpec
 from sern_core.params import SchedulerParams
 from sern_core.queues import OutChannel

@@ -5,8 +5,9 @@ import pytest
 from sern_core import wire
 from sern_core.client import ClientCore
 from sern_core.errors import WireError
+from sern_core.lane_port import LanePort
 from sern_core.lanes import LANE_EXPRESS, LANE_ZMQ
-from sern_core.link import LanePort, Link
+from sern_core.link import Link
 from sern_core.types import ClientName, PriorityClass
 from sern_sim.models import LinkModel, Window
 from sern_sim.network import Hop

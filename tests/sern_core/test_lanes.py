@@ -1,8 +1,8 @@
 """Two lanes under one session: which carries data, what a lost lane costs, and how a session outlives its stream."""
 
 from sern_core.client import ClientCore
+from sern_core.lane_port import LanePort
 from sern_core.lanes import LANE_UDP, LANE_ZMQ
-from sern_core.link import LanePort
 from sern_core.params import LinkParams, Redundancy
 from sern_core.types import ClientName, PriorityClass
 from sern_sim.models import LinkModel, Window
