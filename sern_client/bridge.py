@@ -100,6 +100,7 @@ class Bridge:
         self._on_up = on_up
         self._on_down = on_down
         self._sources_stopped = False
+        self._closed = False
         self._core: ClientCore | None = None
         self._outgoing: dict[TopicName, Outgoing] = {}
         self._incoming: dict[StreamId, Incoming] = {}
@@ -124,6 +125,7 @@ class Bridge:
     def close(self) -> None:
         """Before the endpoint is stopped: a robot that is being commanded is told to stand still."""
         self.stop_sources()
+        self._closed = True
         self._outgoing.clear()
         self._timer.cancel()
         for incoming in self._incoming.values():
@@ -292,7 +294,7 @@ class Bridge:
     def send_dropped(self, stream: StreamInfo, seq: int, reason: DropReason) -> None:
         if self.services is not None:
             self.services.send_dropped(stream, seq, reason)
-        if stream.spec.reliable:
+        if stream.spec.reliable and not self._closed:  # what is left at the end was said in one line
             _log.warning("%s: our reliable message %d was dropped: %s", stream.id.topic, seq, reason)
 
     def publication_refused(self, stream: StreamInfo, code: str, text: str) -> None:

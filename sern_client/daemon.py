@@ -24,7 +24,7 @@ from sern_client.udp import ClientLane
 from sern_core.client import ClientCore
 from sern_core.errors import ConfigError
 from sern_core.trace import DecisionTrace
-from sern_core.types import CLASS_LABELS, ObjectKind
+from sern_core.types import CLASS_LABELS, DropReason, ObjectKind
 from sern_runtime.config.base import split_tcp
 from sern_runtime.config.client import ClientFile, ServicesSection, load_client
 from sern_runtime.config.load import Loaded
@@ -37,10 +37,11 @@ from sern_runtime.metrics import Metrics
 from sern_runtime.sdnotify import Notifier, Watchdog
 from sern_runtime.topics_view import TopicView, both_ways
 
-DRAIN_S: Final = 5.0
-"""How long a stopping client goes on sending what reliable topics still owe."""
 PATIENCE_S: Final = 2.0
-"""How long it waits for the next confirmation of what the relay has got already."""
+"""How long a stopping client waits, beside some round trips, for the next sign that what it still owes gets further."""
+STALL_PATIENCE_S: Final = 5.0
+"""The same while it has more to send and a session: a path that has stalled often comes back."""
+PATIENCE_RTTS: Final = 4.0
 TICK_S: Final = 0.5
 
 _log = logging.getLogger(__name__)
@@ -294,7 +295,8 @@ class ClientDaemon:
         return both_ways(self.core.link, self.core.received, now=time.monotonic())
 
     async def drain(self) -> None:
-        """Stop the sources, then go on sending for a while what is still owed. What arrives meanwhile is taken.
+        """Stop the sources, then go on sending what is owed while that gets anywhere, `link.drain_s` at most. What
+        arrives meanwhile is taken.
 
         The relay must get everything; whether all subscribers confirm it is waited for as long as confirmations come,
         because a subscriber that is away is the relay's to wait for.
@@ -302,18 +304,20 @@ class ClientDaemon:
         self._stopping = True
         self.bridge.stop_sources()
         link = self.core.link
-        now = changed_s = time.monotonic()
-        deadline_s = now + DRAIN_S
-        before = -1
-        while link.established and not link.lane.stalled and now < deadline_s:
+        now = moved_s = time.monotonic()
+        give_up_s = now + self.loaded.model.link.drain_s
+        before: tuple[int, ...] = ()
+        while now < give_up_s:
             channels = [channel for channel in link.channels.values() if channel.wanted is not False]
             unsent = sum(len(channel.queue) + len(channel.flying) for channel in channels)
             unconfirmed = sum(len(channel.retained) for channel in channels)
-            if not unsent and not unconfirmed:
+            if not unconfirmed and (not unsent or not link.established or link.lane.stalled):
                 break
-            if unsent + unconfirmed != before:
-                before, changed_s = unsent + unconfirmed, now
-            elif not unsent and now - changed_s > PATIENCE_S:
+            left = (unsent, unconfirmed, sum(nbytes for _messages, nbytes in link.queued().values()))
+            if left != before:
+                before, moved_s = left, now
+            patience_s = STALL_PATIENCE_S if unsent and link.established else PATIENCE_S
+            if now - moved_s > patience_s + PATIENCE_RTTS * link.lane.flight.rtt.srtt_s:
                 break
             self._kick()
             await asyncio.sleep(0.02)
@@ -322,16 +326,25 @@ class ClientDaemon:
         if unconfirmed:
             _log.warning("stopping with %d reliable messages that not everyone has confirmed", unconfirmed)
         if self._transport is not None:
-            self._transport.pump.run()  # what has arrived here is confirmed before we say goodbye
+            self._kick()
+            await asyncio.sleep(0.02)  # what has arrived here is confirmed before we say goodbye
+            self._transport.pump.run()
             link.close("client stops", now=time.monotonic())
             self._transport.pump.run()
             await asyncio.sleep(0.05)  # libzmq's thread takes it from here
+
+    def _give_up(self) -> None:
+        """Count what is left, so that every message has a fate."""
+        link = self.core.link
+        for channel in list(link.channels.values()):
+            link.close_channel(channel, DropReason.SHUTDOWN, now=time.monotonic())
 
     async def stop(self) -> None:
         """Ends whatever was started, the last first, also when a part of it fails."""
         async with AsyncExitStack() as stack:
             stack.callback(self.notifier.close)
             stack.callback(self._write_summary)
+            stack.callback(self._give_up)
             if self.message_log is not None:
                 stack.callback(self.message_log.close)
             if self._ctx is not None:

@@ -269,7 +269,9 @@ class InStream:
             self.delivered = seq
             if self._partials:
                 for stale in [s for s in self._partials if s <= seq]:
-                    self._lose(stale, DropReason.SUPERSEDED)
+                    self._lose(stale, DropReason.LOST)
+                    if 0 <= seq - 1 - stale < SEEN_BITS:
+                        self._seen |= 1 << (seq - 1 - stale)  # the rest of it is no news
             self._turn(message)
             return
         if seq == self.delivered + 1:
@@ -324,9 +326,8 @@ class InStream:
         lifespan_s = self.lifespan_s
         for seq, partial in list(self._partials.items()):
             since_s = partial.born_s if partial.born_s is not None else partial.touched_s
-            if lifespan_s is not None and now - since_s > lifespan_s:
-                self._lose(seq, DropReason.LIFESPAN)
-            elif seq != newest and now - max(partial.touched_s, up_since_s) > PARTIAL_IDLE_S:
+            too_old = lifespan_s is not None and now - since_s > lifespan_s
+            if too_old or (seq != newest and now - max(partial.touched_s, up_since_s) > PARTIAL_IDLE_S):
                 self._lose(seq, DropReason.LOST)
 
     def close(self) -> None:

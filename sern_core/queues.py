@@ -37,6 +37,7 @@ class OutMessage:
     __slots__ = (
         "coding",
         "counted",
+        "exposed",
         "fragments_inflight",
         "generation",
         "message",
@@ -56,6 +57,7 @@ class OutMessage:
         self.coding = Coding.RAW
         self.ranges: list[tuple[int, int]] | None = None  # None: untouched, send from 0
         self.generation = 0  # of the body: acknowledgements of an earlier one no longer count
+        self.exposed = False  # all of it has left here: the peer, or an earlier process there, may have it
         self.some_acked = False
         self.fragments_inflight = 0
         self.started = False
@@ -93,6 +95,7 @@ class OutMessage:
         self.size = 1
         self.coding = Coding.DONE
         self.restart()
+        self.exposed = False
         self.counted = True
 
 
@@ -228,6 +231,9 @@ class OutChannel:
         return out
 
     def _drop(self, out: OutMessage, reason: DropReason) -> None:
+        """Whatever the reason to give it up: one that may have arrived must not be counted as if it had not."""
+        if out.exposed:
+            reason = DropReason.UNCONFIRMED
         out.coding = Coding.DONE  # whatever another thread makes of it
         self.counters.drop(reason, out.offered_bytes)
         self.on_drop(out, reason)
@@ -355,6 +361,8 @@ class OutChannel:
         elif not out.ranges:
             self.active.remove(out)
         out.fragments_inflight += 1
+        if end == out.size:  # fragments leave in their order, so those before it have left as well
+            out.exposed = True
         return start, end
 
     def recoded(self, out: OutMessage, message: Message) -> None:

@@ -72,7 +72,9 @@ class DropReason(StrEnum):
     FORBIDDEN = "forbidden"  # access rules
     RETENTION = "retention"  # a reliable message was not delivered within its retention
     STALE = "stale"  # ordering `paper`: stale in the lowest class (Alg. prioritize, line 9)
-    LOST = "lost"  # a best-effort message lost fragments that are no longer wanted
+    LOST = (
+        "lost"  # a receiver has fragments of a best-effort message whose others did not come; its sender counts it too
+    )
     DUPLICATE = "duplicate"  # arrived more than once; not a loss
     TOO_LARGE = "too_large"  # above max_message_bytes
     UNKNOWN_CHANNEL = "unknown_channel"  # data for a stream that was never announced or was closed
@@ -82,6 +84,7 @@ class DropReason(StrEnum):
     SHUTDOWN = "shutdown"  # the daemon stopped before it was sent
     QUEUE_FULL = "queue_full"  # more waits for this client at the relay than its access rule allows
     UNDECODABLE = "undecodable"  # its body cannot be decoded: damaged, above the limit, or a codec we do not have
+    UNCONFIRMED = "unconfirmed"  # sent whole, given up without an acknowledgement: it may have arrived
 
 
 DROP_CODES: Final[dict[DropReason, int]] = {reason: code for code, reason in enumerate(DropReason, start=1)}

@@ -37,8 +37,8 @@ from sern_runtime.topics_view import link_summary, received_summary
 from sern_runtime.zap import TemporaryRefusal, ZapHandler, self_test
 
 ZAP_DOMAIN: Final = "sern"
-DRAIN_S: Final = 10.0
-"""How long a stopping relay goes on sending what it holds for clients that are connected."""
+PATIENCE_S: Final = 5.0
+"""How long a stopping relay waits for the next sign that what it holds for connected clients gets further."""
 SWEEP_S: Final = 1.0
 OTHER_CODE: Final = "other"
 REFUSAL_CODES: Final = frozenset({
@@ -68,9 +68,7 @@ async def run_relay(path: Path, shutdown: Shutdown) -> int:
 
 def _owes(link: Link, channel: OutChannel, last: int) -> bool:
     """Whether a connected client has yet to confirm messages up to `last`."""
-    if not link.established or link.lane.stalled:
-        return False
-    return bool(channel.retained) and channel.retained[0].seq <= last
+    return link.established and bool(channel.retained) and channel.retained[0].seq <= last
 
 
 class RelayDaemon:
@@ -339,8 +337,9 @@ class RelayDaemon:
         }
 
     async def drain(self) -> None:
-        """Go on for a while with what connected clients are owed, then end their sessions."""
-        deadline_s = time.monotonic() + DRAIN_S
+        """Go on with what connected clients are owed while that gets anywhere, then end their sessions."""
+        now = moved_s = time.monotonic()
+        give_up_s = now + self.loaded.model.link.drain_s
         # What comes in from now on its sources keep until the next relay confirms it.
         owed = [
             (link, channel, channel.next_seq - 1)
@@ -348,11 +347,21 @@ class RelayDaemon:
             for channel in link.channels.values()
             if channel.retained
         ]
-        while time.monotonic() < deadline_s:
+        before: tuple[int, int] | None = None
+        while now < give_up_s:
             owed = [item for item in owed if _owes(*item)]
             if not owed:
                 break
+            left = (
+                sum(len(channel.retained) for _link, channel, _last in owed),
+                sum(nbytes for link in self.hub.links.values() for _messages, nbytes in link.queued().values()),
+            )
+            if left != before:
+                before, moved_s = left, now
+            elif now - moved_s > PATIENCE_S:
+                break
             await asyncio.sleep(0.02)
+            now = time.monotonic()
         for link in self.hub.links.values():
             link.close("relay stops", now=time.monotonic())
         if self.server is not None:

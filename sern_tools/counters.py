@@ -11,7 +11,8 @@ from sern_core.errors import ConfigError
 
 @dataclass(frozen=True, slots=True)
 class Counters:
-    """The counters of one topic at one daemon. `direction`: send, receive, or relay."""
+    """The counters of one topic at one daemon. `direction`: send or receive; at the relay onward, to one of its
+    clients, or inward."""
 
     daemon: str
     direction: str
@@ -27,16 +28,16 @@ def read_counters(files: Iterable[Path]) -> dict[str, list[Counters]]:
     """The summaries of several daemons, by global topic. ConfigError, naming the file, for anything else.
 
     A client has one entry a topic, of direction `send` or `receive`. The relay has one for each client it sends the
-    topic to and one for what it received; both are of direction `relay`.
+    topic to (`onward`) and one for what it received (`inward`).
     """
     found: dict[str, list[Counters]] = {}
     for path in files:
         try:
             document = json.loads(path.read_text())
             if "relay" in document:
-                parts = [*document["links"].values(), document["received"]]
+                parts = [*(("onward", part) for part in document["links"].values()), ("inward", document["received"])]
                 entries = [
-                    (topic, document["relay"], "relay", values) for part in parts for topic, values in part.items()
+                    (topic, document["relay"], way, values) for way, part in parts for topic, values in part.items()
                 ]
             else:
                 topics = document["topics"].items()

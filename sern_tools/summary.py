@@ -106,7 +106,9 @@ class Result:
     first_fresh_pose_s: list[float]  # per blackout that ended in the run; inf when none came
     accounting_gap: int | None = None  # messages that no counter accounts for; None without counters
     accounting_notes: list[str] = field(default_factory=list)
-    given_up_but_arrived: int = 0  # counted as dropped by the sender, which had no acknowledgement, and delivered
+    given_up_but_arrived: int = (
+        0  # of those whose fate their sender or receiver could not know: accounted for elsewhere
+    )
 
     def arrivals(self, priority: str) -> tuple[Floats, Floats]:
         """(time of delivery, latency) of every delivery of a class, by time; both in seconds."""
@@ -241,19 +243,20 @@ def _first_fresh_pose(logs: Mapping[str, TopicLog], facts: RunFacts) -> list[flo
     return found
 
 
-UNCERTAIN: Final = frozenset({"lost", "disconnected", "shutdown", "retention"})
-"""A sender that gives a message up for one of these may not know that it did arrive: the acknowledgement is missing."""
-UNCERTAIN_SHARE: Final = 0.01
-"""So large a share of a topic may be taken for lost too early, be dropped for a newer one, and arrive all the same."""
-UNCERTAIN_PER_BREAK: Final = 64
-"""When the link breaks, so many messages of a topic may be in flight whose acknowledgement is lost with it. They wait
-again, may be dropped for any reason, and may have arrived: counted twice, which is no loss."""
+SENDER_UNSURE: Final = frozenset({"unconfirmed"})
+"""What a sender counts without knowing whether it arrived: the acknowledgement is missing."""
+RELIABLE_UNSURE: Final = SENDER_UNSURE | {"retention", "lifespan"}
+"""The same for the origin of a reliable stream, which waits for its subscribers and may miss their last word."""
+RECEIVER_UNSURE: Final = frozenset({"lost", "reassembly", "too_large", "unwanted", "disconnected"})
+"""What a receiver counts of which it had a part, or nobody to give it to: the sender may count it as well."""
+NO_LOSS: Final = frozenset({"duplicate", "refused"})
 
 
 def _account(result: Result, counters: Mapping[str, Sequence[Counters]]) -> None:
-    """offered = delivered + refused + dropped + still queued or in flight, per topic; and the logs say the same.
+    """Every message offered has one fate: delivered, refused, dropped for a reason, or still waiting; and the logs say
+    the same. None may be missing, none counted twice, except as the counters themselves say that nobody can know.
 
-    None may be missing. Messages whose fate the sender could not know may be counted twice.
+    Of a reliable stream its origin learns every drop, whoever drops, so its counters are the ones to add up.
     """
     result.accounting_gap = 0
     for name, log in sorted(result.logs.items()):
@@ -261,19 +264,23 @@ def _account(result: Result, counters: Mapping[str, Sequence[Counters]]) -> None
         senders = [c for c in entries if c.direction == "send"]
         offered = sum(c.offered for c in senders)
         delivered = sum(c.delivered for c in entries if c.direction == "receive")
-        drops = [
-            (reason, n) for c in entries for reason, n in c.dropped.items() if reason not in ("duplicate", "refused")
-        ]
-        in_flight = sum(c.in_flight for c in entries)
-        known = delivered + sum(c.refused for c in senders) + sum(c.in_queue for c in entries)
-        known += sum(n for _, n in drops)
-        result.topics[name].under_way = max(0, min(in_flight, offered - known)) + sum(c.in_queue for c in entries)
-        uncertain = in_flight + sum(n for reason, n in drops if reason in UNCERTAIN)
-        uncertain += UNCERTAIN_PER_BREAK * len(result.facts.blackouts) + int(UNCERTAIN_SHARE * offered)
-        result.given_up_but_arrived += max(0, known - offered)
+        reliable = name in result.facts.reliable_topics
+        holders = senders if reliable else [c for c in entries if c.direction in ("send", "onward")]
+        others = () if reliable else [c for c in entries if c.direction in ("receive", "inward")]
+        sure, unsure = 0, 0
+        for group, doubtful in ((holders, RELIABLE_UNSURE if reliable else SENDER_UNSURE), (others, RECEIVER_UNSURE)):
+            for reason, count in ((reason, n) for c in group for reason, n in c.dropped.items()):
+                if reason in doubtful:
+                    unsure += count
+                elif reason not in NO_LOSS:
+                    sure += count
+        in_flight, in_queue = sum(c.in_flight for c in holders), sum(c.in_queue for c in holders)
+        open_ = offered - delivered - sum(c.refused for c in senders) - sure - in_queue
+        result.topics[name].under_way = max(0, min(in_flight, open_)) + in_queue
+        result.given_up_but_arrived += max(0, unsure - max(0, open_))
         gaps = {
-            "offered and not accounted for": max(0, offered - known - in_flight),
-            "accounted for more than once": max(0, known + in_flight - offered - uncertain),
+            "offered and not accounted for": max(0, open_ - unsure - in_flight),
+            "accounted for more than once": max(0, -open_),
             "offered in the log but not in the counters": log.offered - offered,
             "delivered in the log but not in the counters": len(log.deliveries) - delivered,
         }
@@ -296,7 +303,9 @@ def judge(
     if sern.accounting_gap is not None:
         notes = sern.accounting_notes[:4]
         if sern.given_up_but_arrived:
-            notes.append(f"{sern.given_up_but_arrived} given up without an acknowledgement, and arrived all the same")
+            notes.append(
+                f"{sern.given_up_but_arrived} given up without an acknowledgement had arrived, or broke off there"
+            )
         verdicts.append(
             Verdict(
                 "uncounted_messages",

@@ -72,7 +72,8 @@ def test_a_lifespan_below_the_floor_of_the_path_is_counted_not_silent(profile: s
         )
         if counters is not None
     )
-    lost = command.counters.by_reason[DropReason.LOST] + command.counters.by_reason[DropReason.SUPERSEDED]
+    given_up = (DropReason.UNCONFIRMED, DropReason.SUPERSEDED)
+    lost = sum(command.counters.by_reason[reason] for reason in given_up)
     assert command.counters.offered == len(robot.sent) > 0
     assert too_old + lost >= len(robot.sent) and too_old > 0
     world.validate()

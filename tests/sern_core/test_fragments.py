@@ -184,7 +184,7 @@ def test_half_received_and_too_old_is_given_up() -> None:
     receiver = Receiver(lifespan_s=1.0)
     receiver.piece(1, 0, 50, 100)
     receiver.stream.sweep(2.0, 0.0)
-    assert receiver.drops == [(DropReason.LIFESPAN, 0)] and receiver.room.held_bytes == 0
+    assert receiver.drops == [(DropReason.LOST, 0)] and receiver.room.held_bytes == 0
 
 
 def test_skipping_delivers_what_waited_and_counts_the_rest() -> None:

@@ -82,7 +82,7 @@ def test_a_lost_sample_is_not_sent_again_behind_a_fresher_one() -> None:
     second = sender.take()
     assert first is not None and second is not None
     assert sender.channel.fragment_lost(first[0], first[1], 0, 100, now=0.1) is False
-    assert sender.drops == [(1, DropReason.SUPERSEDED)]
+    assert sender.drops == [(1, DropReason.UNCONFIRMED)]
     assert sender.channel.fragment_lost(second[0], second[1], 0, 100, now=0.1) is True, "the newest is"
     sender.check()
 
@@ -95,7 +95,7 @@ def test_a_lost_sample_of_a_queue_is_not_sent_again_once_a_newer_one_has_arrived
     assert sender.channel.fragment_lost(parts[0][0], parts[0][1], 0, 100, now=0.1) is True
     sender.channel.fragment_acked(parts[1][0], parts[1][1])
     head = sender.channel.head(0.1)
-    assert head is None and sender.drops == [(1, DropReason.SUPERSEDED)]
+    assert head is None and sender.drops == [(1, DropReason.UNCONFIRMED)]
     sender.check()
 
 
@@ -316,3 +316,15 @@ TestChannel = Channel.TestCase
 TestChannel.settings = settings(
     derandomize=True, database=None, deadline=None, max_examples=150, stateful_step_count=40
 )
+
+
+@pytest.mark.parametrize("reliable", [False, True])
+def test_at_the_end_what_may_have_arrived_is_told_from_what_was_never_sent(reliable: bool) -> None:
+    sender = Sender(spec(depth=10, reliable=reliable))
+    sender.submit(1)
+    sender.submit(1, 3000)
+    sender.submit(1)
+    assert sender.take() is not None and sender.take() is not None
+    sender.channel.clear(DropReason.SHUTDOWN)
+    assert sender.drops == [(1, DropReason.UNCONFIRMED), (2, DropReason.SHUTDOWN), (3, DropReason.SHUTDOWN)]
+    sender.check()

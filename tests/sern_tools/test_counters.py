@@ -30,7 +30,7 @@ def test_the_relay_counts_per_client_and_what_it_received(tmp_path: Path) -> Non
     links = {"site": {"/r/pose": SENT}, "other": {"/r/pose": SENT}}
     path.write_text(json.dumps({"relay": "hub", "links": links, "received": {"/r/pose": RECEIVED}}))
     entries = read_counters([path])["/r/pose"]
-    assert [entry.direction for entry in entries] == ["relay"] * 3
+    assert [entry.direction for entry in entries] == ["onward", "onward", "inward"]
     assert [entry.offered for entry in entries] == [9, 9, 0]
     assert {entry.daemon for entry in entries} == {"hub"}
 
