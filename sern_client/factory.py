@@ -7,6 +7,7 @@ from pathlib import Path
 from sern_client.endpoints.bag import BagEndpoint, BagOptions
 from sern_client.endpoints.base import Endpoint
 from sern_client.endpoints.composite import CompositeEndpoint
+from sern_client.endpoints.rclpy import RclpyEndpoint, RclpyOptions
 from sern_client.endpoints.record import RecordEndpoint, RecordOptions
 from sern_client.endpoints.ros1 import Ros1Endpoint, Ros1Options
 from sern_client.endpoints.synthetic import SyntheticEndpoint, SyntheticOptions
@@ -66,6 +67,15 @@ def make_section(section: sections.EndpointSection, resolve: Resolve) -> Endpoin
                     max_buffer_bytes=section.max_buffer_bytes,
                 ),
                 folder=section.path.endswith("/"),
+            )
+        case sections.RclpyEndpoint():
+            return RclpyEndpoint(
+                RclpyOptions(
+                    node_name=section.node_name,
+                    domain=section.domain,
+                    poll_hz=section.poll_hz,
+                    type_paths=tuple(resolve(path) for path in section.type_paths),
+                )
             )
         case sections.ZenohEndpoint():
             return ZenohEndpoint(

@@ -235,6 +235,24 @@ class ZenohEndpoint(EndpointBase):
         yield from missing_directories(base_dir, self.type_paths, (*loc, "type_paths"))
 
 
+class RclpyEndpoint(EndpointBase):
+    """ROS 2 through rclpy, where an installation is sourced; topics only. Kinds `dds` and `zenoh` need none."""
+
+    kind: Literal["rclpy"]
+    """ROS 2 through a sourced installation."""
+    node_name: Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$", max_length=200)] = "sern"
+    """What it is called in `ros2 node list`."""
+    domain: Annotated[int, Field(ge=0, le=232)] | None = None
+    """ROS_DOMAIN_ID of the nodes; null: the environment's."""
+    poll_hz: Annotated[float, Field(ge=0.5, le=20)] = 4.0
+    """How often the graph is asked what there is: new topics are found within one period."""
+    type_paths: tuple[PathText, ...] = ()
+    """Directories with .msg files of types beyond those of a ROS 2 install (searched at any depth)."""
+
+    def file_problems(self, base_dir: Path, loc: Loc) -> Iterator[FileProblem]:
+        yield from missing_directories(base_dir, self.type_paths, (*loc, "type_paths"))
+
+
 def missing_directories(base_dir: Path, paths: tuple[str, ...], loc: Loc) -> Iterator[FileProblem]:
     """A problem for each of the paths that is no directory."""
     for index, text in enumerate(paths):
@@ -244,6 +262,6 @@ def missing_directories(base_dir: Path, paths: tuple[str, ...], loc: Loc) -> Ite
 
 
 EndpointSection = Annotated[
-    BagEndpoint | SyntheticEndpoint | RecordEndpoint | Ros1Endpoint | ZenohEndpoint,
+    BagEndpoint | SyntheticEndpoint | RecordEndpoint | Ros1Endpoint | ZenohEndpoint | RclpyEndpoint,
     Field(discriminator="kind"),
 ]

@@ -1,0 +1,260 @@
+"""ROS 2 through rclpy, where a ROS 2 installation is sourced: bytes pass through as CDR, whatever its middleware is.
+
+Thin on purpose, and topics only: `dds` and `zenoh` need no installation and know services. Checked against a typed
+stub of rclpy's interface (`stubs/rclpy`) and a stand-in in the tests, not against an installation.
+"""
+
+import asyncio
+import logging
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from threading import Thread
+from typing import TYPE_CHECKING, Final
+
+from sern_client.endpoints.base import Publisher, Sink, Subscription, TopicEvents
+from sern_client.endpoints.handover import Handover
+from sern_core.errors import ConfigError, UsageError
+from sern_core.message import TopicInfo
+from sern_core.types import Encoding, TopicName
+from sern_runtime import ros_types
+from sern_runtime.entry import end_tasks
+from sern_runtime.ros_files import TypeFiles
+
+if TYPE_CHECKING:
+    from rclpy.node import Node
+    from rclpy.publisher import Publisher as RosPublisher
+    from rclpy.qos import QoSProfile
+    from rclpy.subscription import Subscription as RosSubscription
+
+DEPTH: Final = 100
+"""Of our subscriptions: what may wait while the executor's thread is behind."""
+LATCHED_DEPTH: Final = 10
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class RclpyOptions:
+    """`domain` None: ROS_DOMAIN_ID of the environment. `poll_hz`: how often the graph is asked what there is."""
+
+    node_name: str = "sern"
+    domain: int | None = None
+    poll_hz: float = 4.0
+    type_paths: tuple[Path, ...] = ()
+
+
+class RclpyEndpoint:
+    """An `Endpoint`. Its node spins in a thread of its own; `start` raises ConfigError where rclpy is not to be had."""
+
+    def __init__(self, options: RclpyOptions) -> None:
+        self.options = options
+        self.types = TypeFiles(options.type_paths)
+        self._announced: dict[TopicName, str] = {}  # to its type
+        self._said: set[str] = set()
+
+    @property
+    def encoding(self) -> Encoding | None:
+        return Encoding.CDR
+
+    @property
+    def exhausted(self) -> bool:
+        return False
+
+    @property
+    def dropped(self) -> int:
+        """Messages dropped because the event loop was behind."""
+        return self._handover.dropped
+
+    async def start(self, events: TopicEvents) -> None:
+        try:
+            import rclpy
+            from rclpy.context import Context
+            from rclpy.executors import SingleThreadedExecutor
+            from rclpy.node import Node
+        except ImportError:
+            raise ConfigError(
+                "endpoint rclpy needs a sourced ROS 2 installation (rclpy is not there); kinds dds and zenoh need none"
+            ) from None
+        self._events = events
+        self._handover = Handover(asyncio.get_running_loop())
+        self._context: Context = Context()
+        rclpy.init(args=[], context=self._context, domain_id=self.options.domain)
+        self._node: Node = Node(
+            self.options.node_name, context=self._context, enable_rosout=False, start_parameter_services=False
+        )
+        self._executor: SingleThreadedExecutor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self._node)
+        self._thread = Thread(target=self._spin, name="rclpy", daemon=True)
+        self._thread.start()
+        self._poll()
+        self._task = asyncio.create_task(self._watch(), name="rclpy-graph")
+
+    async def stop(self) -> None:
+        await end_tasks([self._task])
+        import rclpy
+
+        self._executor.shutdown()
+        rclpy.shutdown(context=self._context)
+        await asyncio.to_thread(self._thread.join)
+        self._handover.close()
+        self._node.destroy_node()
+
+    def interest(self, name: TopicName, wanted: bool) -> None:
+        """A subscription is made when the topic is offered, wanted or not."""
+
+    def subscribe(self, name: TopicName, sink: Sink) -> Subscription:
+        type_name = self._announced.get(name)
+        if type_name is None:
+            raise UsageError(f"{name}: no such topic was announced")
+        handover = self._handover
+
+        def arrived(body: bytes) -> None:
+            stamp_ns = time.time_ns()
+            handover.put(lambda: None if opened.closed else _offer(sink, body, stamp_ns), len(body))
+
+        message_type = self._message_type(name, type_name)
+        qos = self._qos(name)
+        opened = _Subscription(self._node, self._node.create_subscription(message_type, name, arrived, qos, raw=True))
+        return opened
+
+    def advertise(self, info: TopicInfo) -> Publisher:
+        message_type = self._message_type(info.name, info.type_name)
+        profile = _profile(reliable=info.reliable is not False, latched=info.latched, depth=LATCHED_DEPTH)
+        return _Publisher(self._node, self._node.create_publisher(message_type, info.name, profile))
+
+    def _message_type(self, name: TopicName, type_name: str) -> type[object]:
+        from rosidl_runtime_py.utilities import get_message
+
+        try:
+            return get_message(ros_types.canonical(type_name))
+        except (ModuleNotFoundError, AttributeError, ValueError) as error:
+            raise ConfigError(
+                f"{name}: {type_name} is not in this ROS 2 installation ({ros_types.one_line(error)}); "
+                "source the workspace that has it"
+            ) from None
+
+    def _qos(self, name: TopicName) -> "QoSProfile":
+        """What fits all publishers there are: reliable and latched only if each of them is."""
+        from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
+
+        offers = [info.qos_profile for info in self._node.get_publishers_info_by_topic(name)]
+        return _profile(
+            reliable=bool(offers) and all(offer.reliability is ReliabilityPolicy.RELIABLE for offer in offers),
+            latched=bool(offers) and all(offer.durability is DurabilityPolicy.TRANSIENT_LOCAL for offer in offers),
+            depth=DEPTH,
+        )
+
+    # --- the graph --------------------------------------------------------------------------------------------------
+
+    def _spin(self) -> None:
+        from rclpy.executors import ExternalShutdownException
+
+        try:
+            self._executor.spin()
+        except ExternalShutdownException:
+            _log.debug("the context of rclpy was shut down")
+
+    async def _watch(self) -> None:
+        while True:
+            await asyncio.sleep(1 / self.options.poll_hz)
+            self._poll()
+
+    def _poll(self) -> None:
+        """Announce what appeared, retract what went. Topics that only we publish are not there."""
+        from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
+
+        found: set[TopicName] = set()
+        for text, type_names in self._node.get_topic_names_and_types():
+            name = TopicName(text)
+            publishers = [
+                info
+                for info in self._node.get_publishers_info_by_topic(name)
+                if info.node_name != self._node.get_name() or info.node_namespace != self._node.get_namespace()
+            ]
+            if not publishers:
+                continue
+            if len(type_names) > 1:
+                self._say_once(f"{name} is published with several types ({', '.join(type_names)}); left out")
+                continue
+            found.add(name)
+            if name in self._announced:
+                continue
+            try:
+                self._message_type(name, type_names[0])
+            except ConfigError as error:
+                self._say_once(f"{error}; left out")
+                continue
+            self._announced[name] = type_names[0]
+            first = publishers[0].qos_profile
+            self._events.topic_added(
+                self._info(
+                    name,
+                    type_names[0],
+                    latched=first.durability is DurabilityPolicy.TRANSIENT_LOCAL,
+                    reliable=first.reliability is ReliabilityPolicy.RELIABLE,
+                )
+            )
+        for name in [name for name in self._announced if name not in found]:
+            del self._announced[name]
+            self._events.topic_removed(name)
+
+    def _info(self, name: TopicName, type_name: str, *, latched: bool, reliable: bool) -> TopicInfo:
+        definition = type_hash = ""
+        try:
+            definition = self.types.message(type_name) or ""
+            if definition:
+                type_hash = ros_types.hash_of(type_name, definition, Encoding.CDR)
+            else:
+                self._say_once(f"{type_name}: its definition is not known; add the directory of its file to type_paths")
+        except ConfigError as error:
+            self._say_once(str(error))
+        return TopicInfo(name, type_name, Encoding.CDR, type_hash, definition, latched, reliable)
+
+    def _say_once(self, text: str) -> None:
+        if text not in self._said:
+            self._said.add(text)
+            _log.warning("%s", text)
+
+
+class _Subscription:
+    def __init__(self, node: "Node", subscription: "RosSubscription") -> None:
+        self.closed = False
+        self._node = node
+        self._subscription = subscription
+
+    def close(self) -> None:
+        if not self.closed:
+            self.closed = True
+            self._node.destroy_subscription(self._subscription)
+
+
+class _Publisher:
+    def __init__(self, node: "Node", publisher: "RosPublisher") -> None:
+        self._node = node
+        self._publisher: RosPublisher | None = publisher
+
+    def publish(self, body: bytes, stamp_ns: int) -> None:
+        del stamp_ns  # rclpy stamps what it publishes itself
+        if self._publisher is not None:
+            self._publisher.publish(body)
+
+    def close(self) -> None:
+        publisher, self._publisher = self._publisher, None
+        if publisher is not None:
+            self._node.destroy_publisher(publisher)
+
+
+def _offer(sink: Sink, body: bytes, stamp_ns: int) -> None:
+    sink(body, stamp_ns)
+
+
+def _profile(*, reliable: bool, latched: bool, depth: int) -> "QoSProfile":
+    from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+
+    return QoSProfile(
+        history=HistoryPolicy.KEEP_LAST,
+        depth=depth,
+        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+    )
