@@ -1,0 +1,282 @@
+"""Who chooses the configuration: MMCF, and the policies it is measured against.
+
+MMCF takes argmin of the predicted cost over the feasible candidates (the paper's eq. (mmcf_argmin)) every interval,
+with hysteresis: it leaves the active configuration only for one that is clearly cheaper and after it has stood for a
+few intervals, or at once when it has become infeasible.
+"""
+
+from abc import ABC, abstractmethod
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Final
+
+from sern_core.errors import UsageError
+from sern_core.mmcf.cost import Ranges, Weights
+from sern_core.mmcf.model import (
+    NO_CODEC,
+    Candidate,
+    Configuration,
+    LinkState,
+    Measurement,
+    Prediction,
+    Situation,
+)
+from sern_core.mmcf.predict import Bounds, Grid, Predictions, Predictor
+from sern_core.mmcf.residuals import Residuals
+from sern_core.types import PriorityClass
+
+GAIN_TO_SWITCH: Final = 0.9
+"""A new configuration must cost less than this share of the active one."""
+INTERVALS_TO_STAND: Final = 3
+STEADY: Final = 0.25
+"""A capacity that changed by more within the interval makes its measurement a mixture nobody can learn from."""
+SWING: Final = 0.35
+"""A fall by this share is a drop, not noise."""
+
+SWINGS: Final = 2
+"""So many drops within the memory make a link that swings."""
+
+
+@dataclass(frozen=True, slots=True)
+class Decision:
+    """What was chosen for the next interval, what else there was, and why in words.
+
+    `index` is the place of the chosen one in `predictions`; None where nothing was predicted (capacity not known).
+    """
+
+    chosen: Configuration
+    reason: str
+    switched: bool
+    index: int | None = None
+    predictions: Predictions | None = field(default=None, repr=False)
+    active_cost: float | None = None
+    """Predicted cost of what was active before."""
+    planned_bps: float | None = None
+    """The capacity that was planned on."""
+
+    @property
+    def prediction(self) -> Prediction | None:
+        if self.predictions is None or self.index is None:
+            return None
+        return self.predictions.prediction(self.index)
+
+    def candidates(self, count: int | None = None) -> tuple[Candidate, ...]:
+        """The candidates, feasible ones first, cheapest first; all, or the first `count`."""
+        if self.predictions is None:
+            return ()
+        return tuple(self.predictions.candidate(index) for index in self.predictions.ranked()[:count])
+
+
+class Policy(ABC):
+    """Chooses a configuration every interval."""
+
+    name: str
+
+    @property
+    @abstractmethod
+    def active(self) -> Configuration:
+        """What is in force."""
+
+    @abstractmethod
+    def decide(self, situation: Situation, measurement: Measurement | None, *, now: float) -> Decision:
+        """Choose for the next interval. `measurement` is of the one that has just ended, None for the first."""
+
+
+class FixedPolicy(Policy):
+    """A hand-written configuration, kept whatever happens. It is predicted all the same, for people to compare."""
+
+    def __init__(
+        self, configuration: Configuration, predictor: Predictor | None = None, *, name: str = "fixed"
+    ) -> None:
+        self.name = name
+        self._configuration = configuration
+        self._predictor = predictor
+        if predictor is not None and configuration not in predictor.grid.index:
+            raise UsageError("FixedPolicy: the predictor's grid must hold the configuration")
+
+    @property
+    def active(self) -> Configuration:
+        return self._configuration
+
+    def decide(self, situation: Situation, measurement: Measurement | None, *, now: float) -> Decision:
+        reason = f"policy {self.name}"
+        if self._predictor is None or situation.link.capacity_bps is None or not situation.present:
+            return Decision(self._configuration, reason, switched=False)
+        predictions = self._predictor.predict(situation)
+        index = self._predictor.grid.index[self._configuration]
+        return Decision(
+            self._configuration,
+            reason,
+            switched=False,
+            index=index,
+            predictions=predictions,
+            active_cost=float(predictions.cost[index]),
+            planned_bps=situation.link.capacity_bps,
+        )
+
+
+def fixed_throughput(codecs: Sequence[str]) -> Configuration:
+    """The paper's baseline Fixed Throughput: everything is sent, compressed as far as it goes, nothing twice.
+
+    `codecs` from the fastest to the strongest.
+    """
+    return Configuration(queues=(1, 2, 2), codec=codecs[-1] if codecs else NO_CODEC, redundancy=0)
+
+
+def fixed_reliability(codecs: Sequence[str]) -> Configuration:
+    """The paper's baseline Fixed Reliability: everything is sent, hardly compressed, class control twice."""
+    del codecs
+    return Configuration(queues=(1, 4, 4), codec=NO_CODEC, redundancy=1)
+
+
+@dataclass(slots=True)
+class _Levels:
+    at_s: float
+    capacities_bps: tuple[float, ...]
+
+
+class CapacityPlan:
+    """Which capacities to plan for, with their shares.
+
+    The estimate alone, as long as the link holds still. A link that keeps dropping is planned for as a whole, with
+    the levels it had of late in their shares: following it would be late every time.
+    """
+
+    def __init__(self, memory_s: float) -> None:
+        self._memory_s = memory_s
+        self._levels: deque[_Levels] = deque()
+
+    def add(self, link: LinkState, *, now: float) -> None:
+        """Duty: the capacity is known."""
+        assert link.capacity_bps is not None
+        self._levels.append(_Levels(now, (*link.samples_bps, link.capacity_bps)))
+        while self._levels[0].at_s < now - self._memory_s:
+            self._levels.popleft()
+
+    @property
+    def steady(self) -> bool:
+        """Whether the estimates of the last interval agree."""
+        latest = self._levels[-1].capacities_bps
+        if len(latest) == 1 and len(self._levels) > 1:
+            latest = (self._levels[-2].capacities_bps[-1], latest[0])
+        return max(latest) - min(latest) <= 2.0 * STEADY * max(latest)
+
+    def _history(self) -> list[float]:
+        return [capacity_bps for levels in self._levels for capacity_bps in levels.capacities_bps]
+
+    def _drops(self, history: list[float]) -> int:
+        """How often the estimate fell from one level to another: by much, and not noise about a threshold."""
+        drops, high = 0, history[0]
+        low = high
+        for capacity_bps in history:
+            if capacity_bps < (1.0 - SWING) * high:
+                drops += 1
+                high = low = capacity_bps
+            else:
+                low = min(low, capacity_bps)
+                high = max(high, capacity_bps) if capacity_bps > (1.0 + SWING) * low else high
+        return drops
+
+    def planned(self) -> list[tuple[float, float]]:
+        """(share, capacity), the estimate first."""
+        history = self._history()
+        latest = history[-1]
+        if self._drops(history) < SWINGS:
+            return [(1.0, latest)]
+        others = [capacity_bps for capacity_bps in history if abs(capacity_bps - latest) > SWING * latest]
+        if not others:
+            return [(1.0, latest)]
+        share = len(others) / len(history)
+        return [(1.0 - share, latest), (share, sum(others) / len(others))]
+
+
+class Mmcf(Policy):
+    """argmin of the predicted cost, corrected by experience, with hysteresis."""
+
+    name = "mmcf"
+
+    def __init__(
+        self,
+        grid: Grid,
+        *,
+        weights: Weights,
+        ranges: Ranges,
+        bounds: Bounds | None = None,
+        initial: Configuration | None = None,
+        memory_s: float = 10.0,
+    ) -> None:
+        initial = initial or grid.configurations[0]
+        if initial not in grid.index:
+            grid = Grid([initial, *grid.configurations])
+        self.predictor = Predictor(grid, weights=weights, ranges=ranges, bounds=bounds)
+        self.residuals = Residuals()
+        self._plan = CapacityPlan(memory_s)
+        self._active = initial
+        self._stood = INTERVALS_TO_STAND
+        self._classes: frozenset[PriorityClass] = frozenset()
+
+    @property
+    def active(self) -> Configuration:
+        return self._active
+
+    def decide(self, situation: Situation, measurement: Measurement | None, *, now: float) -> Decision:
+        link = situation.link
+        if link.capacity_bps is None or not situation.present:
+            what = "the capacity is not known yet" if link.capacity_bps is None else "nothing is offered"
+            return Decision(self._active, f"kept: {what}", switched=False)
+        self._plan.add(link, now=now)
+        self._stood += 1
+        predictor, residuals = self.predictor, self.residuals
+        active = predictor.grid.index[self._active]
+        classes = frozenset(demand.priority for demand in situation.present)
+        if classes != self._classes:
+            self._classes = classes
+            residuals.reset()
+        elif measurement is not None:
+            residuals.learn_ratios(self._active.codec, situation, measurement)
+            if self._plan.steady:
+                bare = predictor.predict(situation, residuals.ratios)
+                residuals.learn(self._active.codec, bare.prediction(active), measurement)
+        predictions = self._predict(situation, saturated=measurement is not None and measurement.saturated)
+        return self._choose(predictions, active)
+
+    def _predict(self, situation: Situation, *, saturated: bool) -> Predictions:
+        predictor, residuals = self.predictor, self.residuals
+        factors = residuals.factors(predictor.grid.codecs, saturated=saturated)
+        parts = []
+        for share, capacity_bps in self._plan.planned():
+            case = replace(situation, link=replace(situation.link, capacity_bps=capacity_bps))
+            parts.append((share, predictor.corrected(predictor.predict(case, residuals.ratios), factors)))
+        return predictor.mixed(parts)
+
+    def _choose(self, predictions: Predictions, active: int) -> Decision:
+        best = predictions.best()
+        current_cost, best_cost = float(predictions.cost[active]), float(predictions.cost[best])
+        note = "" if (predictions.obstacle == 0).any() else "; nothing is feasible, this is the least bad"
+        if best == active:
+            return self._take(active, active, predictions, f"kept: nothing costs less{note}")
+        if not predictions.allowed[active]:
+            obstacle = predictions.candidate(active).obstacle
+            return self._take(best, active, predictions, f"switched: the active one is infeasible ({obstacle}){note}")
+        if best_cost >= GAIN_TO_SWITCH * current_cost:
+            saved = 100.0 * (1.0 - best_cost / current_cost) if current_cost > 0.0 else 0.0
+            return self._take(active, active, predictions, f"kept: the best saves {saved:.1f} %, less than 10 %{note}")
+        if self._stood < INTERVALS_TO_STAND:
+            return self._take(active, active, predictions, f"kept: chosen {self._stood} intervals ago{note}")
+        reason = f"switched: costs {best_cost:.3f} instead of {current_cost:.3f}{note}"
+        return self._take(best, active, predictions, reason)
+
+    def _take(self, index: int, active: int, predictions: Predictions, reason: str) -> Decision:
+        switched = index != active
+        if switched:
+            self._active = predictions.configurations[index]
+            self._stood = 0
+        return Decision(
+            self._active,
+            reason,
+            switched=switched,
+            index=index,
+            predictions=predictions,
+            active_cost=float(predictions.cost[active]),
+        )

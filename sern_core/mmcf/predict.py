@@ -1,0 +1,460 @@
+"""What each candidate configuration would do: queueing formulas, over all candidates at once.
+
+Only the active configuration can be measured, so the others are predicted. Per class i, in order of priority, with
+measured arrivals λ_i, body size s_i, codec profile (k, v), n_i = 1 + h copies for protected classes, and C the planned
+capacity:
+
+    S_i = (s_i·k + 60·f_i)·n_i     bytes on the wire, f_i fragments       X_i = 8·S_i/C     ρ_i = r_i·λ_i·X_i
+    u_i = ρ_i/(1 − σ_{i−1})        load of what is left                   σ_i = σ_{i−1} + ρ_i·(1 − d_i)
+    d_i = (1 − u)·u^K/(1 − u^{K+1})  dropped for want of room
+    W_i = W0_i/((1 − σ_{i−1})(1 − σ_i))  Cobham's wait (1954), at most what the queue limit allows
+    late_i = min(1, σ_i)·exp(−slack_i/W_i),  slack_i = D_i − RTT/2 − X_i/(1 − σ_{i−1}) − s_i/v
+    ℓ_i = W_i + X_i/(1 − σ_{i−1}) + RTT/2 + s_i/v
+    on_i = r_i·(1 − d_i)·(1 − late_i)·(1 − p^{n_i·m_i})^{f_i},  m_i sendings that fit into the slack
+
+    1 − R = Σ ω_i·max(0, 1 − on_i/needed_i)   ℓ = Σ ω_i·ℓ_i
+    τ = Σ r_i·λ_i·(c_ser + (1 − d_i)·s_i/v)   b = Σ 8·r_i·λ_i·S_i·(1 − d_i)
+
+Where this is more than the textbook: a less urgent class delays a more urgent one by a fragment at most, not by a
+message (W0_i holds whole messages of classes up to i and fragments of the others); queues keep the newest, so that
+a message waits no longer than its queue takes to be overrun; streams that tick are not Poisson, so K and W0 are scaled
+by (c_a² + c_s²)/2 (Allen and Cunneen's correction; 1 for M/M).
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sern_core.errors import UsageError
+from sern_core.lanes import DATAGRAM_BYTES, OVERHEAD_BYTES
+from sern_core.mmcf.cost import Ranges, Weights, class_weights
+from sern_core.mmcf.model import (
+    Candidate,
+    ClassDemand,
+    ClassPrediction,
+    Configuration,
+    LinkState,
+    Prediction,
+    Situation,
+    Terms,
+)
+from sern_core.types import CLASSES, PriorityClass
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+PLANNED_SHARE: Final = 0.9
+"""Of the estimated capacity: the predictions are worst near full load."""
+CONTROL_SHARE_MAX: Final = 0.5
+"""Of the link for class control; its token bucket holds it there in any case."""
+SERIALISE_S: Final = 100e-6
+"""CPU time of a message outside its codec, until measured."""
+FRAGMENT_BODY_BYTES: Final = DATAGRAM_BYTES - 31
+REPAIR_S: Final = 0.02
+"""Beyond a round trip, until a lost fragment is sent again."""
+MIN_VARIABILITY: Final = 0.25
+MIN_SHARE: Final = 1e-3
+OBSTACLES: Final = ("", "rate below the class's minimum", "control above half the link", "CPU", "more than the link")
+
+
+@dataclass(frozen=True, slots=True)
+class Bounds:
+    """What makes a configuration feasible, the paper's C_feas.
+
+    `min_rates` by class; `compute_max` CPU seconds a second; `load_max` offered load over planned capacity, inf for
+    none: what does not fit is dropped by class, freshest kept, and the cost says so.
+    """
+
+    min_rates: tuple[float, ...] = (0.0, 0.0, 0.0)
+    compute_max: float = 1.0
+    load_max: float = float("inf")
+
+
+@dataclass(slots=True)
+class ClassArrays:
+    """Per candidate, for one class."""
+
+    demand: ClassDemand
+    load: Floats
+    drop: Floats
+    late: Floats
+    latency_s: Floats
+    on_time: Floats
+    bandwidth_bps: Floats
+
+
+@dataclass(slots=True)
+class Predictions:
+    """Arrays over the candidates, in the order of the grid. `obstacle` indexes OBSTACLES, 0: feasible."""
+
+    configurations: tuple[Configuration, ...]
+    latency_s: Floats
+    unreliability: Floats
+    compute: Floats
+    bandwidth_bps: Floats
+    cost: Floats
+    terms: tuple[Floats, Floats, Floats, Floats]
+    obstacle: NDArray[np.int64]
+    load: Floats  # offered, over planned capacity
+    excess: Floats  # by how much bounds are broken, in shares of the link and of the CPU
+    classes: tuple[ClassArrays, ...] = ()
+
+    @property
+    def allowed(self) -> Bools:
+        """The feasible candidates; where there are none, those that break the bounds by least: the safe ones."""
+        feasible = self.obstacle == 0
+        return feasible if feasible.any() else np.asarray(self.excess <= self.excess.min() + 1e-9)
+
+    def best(self) -> int:
+        """The cheapest of those that are allowed (eq. (mmcf_argmin)); the first of equals."""
+        return int(np.argmin(np.where(self.allowed, self.cost, np.inf)))
+
+    def prediction(self, index: int) -> Prediction:
+        return Prediction(
+            float(self.latency_s[index]),
+            float(self.unreliability[index]),
+            float(self.compute[index]),
+            float(self.bandwidth_bps[index]),
+            float(self.cost[index]),
+            Terms(*(float(term[index]) for term in self.terms)),
+            tuple(
+                ClassPrediction(
+                    c.demand.priority,
+                    float(c.load[index]),
+                    float(c.drop[index]),
+                    float(c.late[index]),
+                    float(c.latency_s[index]),
+                    float(c.on_time[index]),
+                    float(c.bandwidth_bps[index]),
+                )
+                for c in self.classes
+            ),
+        )
+
+    def candidate(self, index: int) -> Candidate:
+        return Candidate(self.configurations[index], self.prediction(index), OBSTACLES[int(self.obstacle[index])])
+
+    def ranked(self) -> list[int]:
+        """Indices, feasible ones first, each part by cost."""
+        order = np.lexsort((self.cost, self.obstacle != 0))
+        return [int(index) for index in order]
+
+
+@dataclass(frozen=True, slots=True)
+class Factors:
+    """What experience multiplies predictions by. `compute` is an array over the grid's codec modes."""
+
+    latency: float
+    unreliability: float
+    compute: Floats
+    bandwidth: float
+
+
+class Grid:
+    """A finite set of configurations, as arrays."""
+
+    def __init__(self, configurations: Sequence[Configuration]) -> None:
+        if not configurations:
+            raise UsageError("Grid: there must be at least one configuration")
+        self.configurations = tuple(configurations)
+        self.index = {configuration: i for i, configuration in enumerate(self.configurations)}
+        self.rates: Floats = np.array([c.rates for c in configurations], dtype=np.float64)
+        self.queues: Floats = np.array([c.queues for c in configurations], dtype=np.float64)
+        self.codecs = tuple(dict.fromkeys(c.codec for c in configurations))
+        self.codec: NDArray[np.int64] = np.array([self.codecs.index(c.codec) for c in configurations], dtype=np.int64)
+        self.redundancy: Floats = np.array([c.redundancy for c in configurations], dtype=np.float64)
+
+    def __len__(self) -> int:
+        return len(self.configurations)
+
+    @classmethod
+    def of(
+        cls,
+        *,
+        rates: Sequence[Sequence[float]],
+        queues: Sequence[Sequence[int]],
+        codecs: Sequence[str],
+        redundancy: Sequence[int],
+    ) -> "Grid":
+        """Every combination; `rates` and `queues` have one list of choices a class."""
+        if len(rates) != len(CLASSES) or len(queues) != len(CLASSES):
+            raise UsageError("Grid.of: one list of choices per class for rates and for queues")
+        return cls(
+            [
+                Configuration((r0, r1, r2), (q0, q1, q2), codec, copies)
+                for r0 in rates[0]
+                for r1 in rates[1]
+                for r2 in rates[2]
+                for q0 in queues[0]
+                for q1 in queues[1]
+                for q2 in queues[2]
+                for codec in codecs
+                for copies in redundancy
+            ]
+        )
+
+
+class Predictor:
+    """The formulas above, for one grid, one set of ranges and weights."""
+
+    def __init__(
+        self,
+        grid: Grid,
+        *,
+        weights: Weights,
+        ranges: Ranges,
+        bounds: Bounds | None = None,
+        serialise_s: float = SERIALISE_S,
+    ) -> None:
+        self.grid = grid
+        self.weights = weights
+        self.ranges = ranges
+        self.bounds = bounds or Bounds()
+        self.serialise_s = serialise_s
+
+    def predict(
+        self, situation: Situation, ratios: Mapping[tuple[PriorityClass, str], float] | None = None
+    ) -> Predictions:
+        """The bare formulas; `ratios` corrects the compression ratios of (class, mode). Duty: the capacity is known."""
+        grid, link = self.grid, situation.link
+        if link.capacity_bps is None:
+            raise UsageError("Predictor.predict: the capacity is not known")
+        capacity_bps = max(PLANNED_SHARE * link.capacity_bps, 1.0)
+        fragment_s = 8.0 * (DATAGRAM_BYTES + OVERHEAD_BYTES) / capacity_bps
+        demands = situation.present
+        omega = class_weights(demand.priority for demand in demands)
+        shape = len(grid)
+        parts = [self._service(demand, capacity_bps, link, ratios or {}) for demand in demands]
+        offered_load = sum((part.load for part in parts), np.zeros(shape))
+
+        sigma = np.zeros(shape)  # carried by the classes so far
+        work = np.zeros(shape)  # Σ λ X² (c_a² + c_s²) of the classes so far
+        longest_s = np.zeros(shape)
+        latency_s, unreliability = np.zeros(shape), np.zeros(shape)
+        compute, bandwidth_bps = np.zeros(shape), np.zeros(shape)
+        control_load = np.zeros(shape)
+        classes = []
+        for number, part in enumerate(parts):
+            demand, x_s = part.demand, part.x_s
+            left = np.maximum(1.0 - sigma, MIN_SHARE)
+            places = grid.queues[:, demand.priority] * demand.topics
+            variability = max(MIN_VARIABILITY, demand.arrival_cv2 + demand.cv2)
+            # Topics that tick are out of step with each other: together they come almost at random.
+            together = 1.0 + demand.cv2 if demand.topics > 1 else variability
+            drop = _overflow(part.load / left, (places + 1.0) * (2.0 / variability))
+            carried = np.minimum(part.load * (1.0 - drop), np.maximum(1.0 - sigma, 0.0))
+            drop = 1.0 - carried / np.maximum(part.load, 1e-12)
+            before, sigma = sigma, np.minimum(sigma + carried, 1.0)
+            work = work + part.rate_hz * (1.0 - drop) * x_s * x_s * together
+            longest_s = np.maximum(longest_s, x_s)
+            others = sum((later.load for later in parts[number + 1 :]), np.zeros(shape))
+            w0_s = np.minimum(0.5 * work, longest_s) + 0.5 * fragment_s * np.minimum(others, 1.0 - sigma)
+            service_s = x_s / left
+            wait_s = w0_s / (np.maximum(1.0 - before, MIN_SHARE) * np.maximum(1.0 - sigma, MIN_SHARE))
+            # A queue that keeps the newest is overrun: its oldest message is between q − 1 and q periods old.
+            period_s = demand.topics / np.maximum(part.rate_hz, 1e-9)
+            oldest_s = grid.queues[:, demand.priority] * period_s
+            overrun_s = np.minimum(oldest_s - 0.5 * period_s, places * service_s) + fragment_s
+            overrun = wait_s >= overrun_s
+            wait_s = np.minimum(wait_s, overrun_s)
+            fixed_s = link.rtt_s / 2.0 + part.encode_s
+            slack_s = demand.deadline_s - fixed_s - service_s
+            tail = np.minimum(sigma, 1.0) * np.exp(-np.maximum(slack_s, 0.0) / np.maximum(wait_s, 1e-9))
+            late = np.where(overrun, np.clip((oldest_s - slack_s) / period_s, 0.0, 1.0), tail)
+            late = np.where(oldest_s + fragment_s <= slack_s, 0.0, late)
+            late = np.maximum(late, _too_long(service_s, demand.deadline_s - fixed_s, demand.cv2))
+            arrives, repair_s = _arrives(part, link, np.maximum(slack_s - wait_s, 0.0))
+            own_s = np.minimum(
+                wait_s + service_s + link.rtt_s / 2.0 + part.encode_s + repair_s, self.ranges.latency_max_s
+            )
+            on_time = part.kept * (1.0 - drop) * (1.0 - late) * arrives
+            own_bps = carried * capacity_bps
+            latency_s += omega[demand.priority] * own_s
+            unreliability += omega[demand.priority] * np.maximum(0.0, 1.0 - on_time / demand.needed)
+            compute += part.rate_hz * (self.serialise_s + (1.0 - drop) * part.encode_s)
+            bandwidth_bps += own_bps
+            if demand.priority is PriorityClass.CONTROL:
+                control_load = part.load
+            classes.append(ClassArrays(demand, part.load, drop, late, own_s, on_time, own_bps))
+
+        excess = np.maximum(control_load - CONTROL_SHARE_MAX, 0.0)
+        excess += np.maximum(offered_load - self.bounds.load_max, 0.0)
+        excess += np.maximum(np.array(self.bounds.min_rates) - grid.rates, 0.0).sum(axis=1)
+        obstacle = np.zeros(shape, dtype=np.int64)
+        obstacle[offered_load > self.bounds.load_max] = 4
+        obstacle[control_load > CONTROL_SHARE_MAX] = 2
+        obstacle[(grid.rates < np.array(self.bounds.min_rates)).any(axis=1)] = 1
+        return self._costed(
+            latency_s,
+            unreliability,
+            compute,
+            bandwidth_bps,
+            obstacle,
+            excess,
+            load=offered_load,
+            classes=tuple(classes),
+        )
+
+    def corrected(self, raw: Predictions, factors: Factors) -> Predictions:
+        """The same, multiplied by what experience says."""
+        return self._costed(
+            np.minimum(raw.latency_s * factors.latency, self.ranges.latency_max_s),
+            np.minimum(raw.unreliability * factors.unreliability, 1.0),
+            raw.compute * factors.compute[self.grid.codec],
+            raw.bandwidth_bps * factors.bandwidth,
+            raw.obstacle,
+            raw.excess,
+            load=raw.load,
+            classes=raw.classes,
+        )
+
+    def mixed(self, parts: Sequence[tuple[float, Predictions]]) -> Predictions:
+        """The expectation over several situations: (probability, predictions). Obstacles are those of the first."""
+        if len(parts) == 1:
+            return parts[0][1]
+        first = parts[0][1]
+
+        def mean(name: str) -> Floats:
+            total = np.zeros(len(self.grid))
+            for share, part in parts:
+                total += share * getattr(part, name)
+            return total
+
+        return self._costed(
+            mean("latency_s"),
+            mean("unreliability"),
+            mean("compute"),
+            mean("bandwidth_bps"),
+            first.obstacle,
+            first.excess,
+            load=first.load,
+            classes=first.classes,
+        )
+
+    def _costed(
+        self,
+        latency_s: Floats,
+        unreliability: Floats,
+        compute: Floats,
+        bandwidth_bps: Floats,
+        obstacle: NDArray[np.int64],
+        excess: Floats,
+        *,
+        load: Floats,
+        classes: tuple[ClassArrays, ...],
+    ) -> Predictions:
+        terms = self._terms(latency_s, unreliability, compute, bandwidth_bps)
+        weights = self.weights
+        cost = (
+            weights.latency * terms[0]
+            + weights.reliability * terms[1]
+            + weights.compute * terms[2]
+            + weights.bandwidth * terms[3]
+        )
+        busy = (obstacle == 0) & (compute > self.bounds.compute_max)
+        obstacle = np.where(busy, np.int64(3), obstacle)
+        return Predictions(
+            self.grid.configurations,
+            latency_s,
+            unreliability,
+            compute,
+            bandwidth_bps,
+            cost,
+            terms,
+            obstacle,
+            load,
+            excess + np.maximum(compute - self.bounds.compute_max, 0.0),
+            classes,
+        )
+
+    def _terms(
+        self, latency_s: Floats, unreliability: Floats, compute: Floats, bandwidth_bps: Floats
+    ) -> tuple[Floats, Floats, Floats, Floats]:
+        ranges = self.ranges
+        span_s = ranges.latency_max_s - ranges.latency_min_s
+        return (
+            np.clip((latency_s - ranges.latency_min_s) / span_s, 0.0, 1.0),
+            np.clip(unreliability, 0.0, 1.0),
+            np.clip(compute / ranges.compute_max, 0.0, 1.0),
+            np.clip(bandwidth_bps / ranges.bandwidth_max_bps, 0.0, 1.0),
+        )
+
+    def _service(
+        self,
+        demand: ClassDemand,
+        capacity_bps: float,
+        link: LinkState,
+        ratios: Mapping[tuple[PriorityClass, str], float],
+    ) -> "_Service":
+        grid = self.grid
+        profiles = [demand.codec(name) for name in grid.codecs]
+        ratio = np.array(
+            [
+                profile.ratio * ratios.get((demand.priority, name), 1.0)
+                for name, profile in zip(grid.codecs, profiles, strict=True)
+            ]
+        )
+        encode_s = np.array([demand.mean_bytes / profile.speed_bytes_per_s for profile in profiles])[grid.codec]
+        encoded_bytes = demand.mean_bytes * ratio[grid.codec]
+        fragments = np.maximum(1.0, np.ceil(encoded_bytes / FRAGMENT_BODY_BYTES))
+        copies = 1.0 + grid.redundancy if demand.protected else np.ones(len(grid))
+        wire_bytes = (encoded_bytes + OVERHEAD_BYTES * fragments) * copies
+        if demand.repaired:
+            wire_bytes = wire_bytes / max(1.0 - link.loss, 0.1)
+        kept = 1.0 - demand.thinnable * (1.0 - grid.rates[:, demand.priority])
+        rate_hz = kept * demand.rate_hz
+        x_s = 8.0 * wire_bytes / capacity_bps
+        return _Service(demand, kept, rate_hz, x_s, rate_hz * x_s, encode_s, fragments, copies)
+
+
+@dataclass(slots=True)
+class _Service:
+    """What one class asks of the link, per candidate."""
+
+    demand: ClassDemand
+    kept: Floats
+    rate_hz: Floats
+    x_s: Floats
+    load: Floats
+    encode_s: Floats
+    fragments: Floats
+    copies: Floats
+
+
+def _overflow(u: Floats, k: Floats) -> Floats:
+    """Share dropped by a queue of k places at load u, in a form that neither overflows nor divides by zero."""
+    safe = np.where(np.abs(u - 1.0) < 1e-6, 1.0 + 1e-6, u)
+    log_u = np.log(np.maximum(safe, 1e-12))
+    # (1−u)·u^k/(1−u^{k+1}); above 1 both are divided by u^{k+1}.
+    below = (1.0 - safe) * np.exp(np.minimum(k * log_u, 0.0)) / (1.0 - np.exp(np.minimum((k + 1.0) * log_u, -1e-12)))
+    above = (1.0 - 1.0 / np.maximum(safe, 1.0)) / (1.0 - np.exp(np.minimum(-(k + 1.0) * log_u, -1e-12)))
+    return np.asarray(np.clip(np.where(safe < 1.0, below, above), 0.0, 1.0))
+
+
+def _too_long(mean_s: Floats, limit_s: Floats, cv2: float) -> Floats:
+    """Share of messages whose size alone takes longer than the limit, sizes log-normal about their mean."""
+    if cv2 < 0.01:
+        return np.asarray(np.where(mean_s > limit_s, 1.0, 0.0))
+    sigma2 = np.log1p(cv2)
+    ratio = np.log(np.maximum(limit_s, 1e-9) / np.maximum(mean_s, 1e-9)) + 0.5 * sigma2
+    # The logistic curve is within 0.01 of the normal one.
+    share = 1.0 / (1.0 + np.exp(np.clip(1.702 * ratio / np.sqrt(sigma2), -50.0, 50.0)))
+    return np.asarray(np.where(limit_s <= 0.0, 1.0, share))
+
+
+def _arrives(part: _Service, link: LinkState, slack_s: Floats) -> tuple[Floats, Floats]:
+    """Share of messages that arrive whole in time, and what repairs add to the mean latency."""
+    if link.loss <= 0.0:
+        return np.ones_like(slack_s), np.zeros_like(slack_s)
+    demand = part.demand
+    round_s = link.rtt_s + REPAIR_S
+    # A lost message of one fragment is not repaired once its topic has a fresher one.
+    period_s = demand.topics / np.maximum(part.rate_hz, 1e-9)
+    repairable = demand.repaired & ((part.fragments > 1.0) | (period_s > round_s))
+    sendings = np.where(repairable, 1.0 + np.floor(slack_s / round_s), 1.0)
+    arrives = (1.0 - link.loss ** (part.copies * sendings)) ** part.fragments
+    first = (1.0 - link.loss**part.copies) ** part.fragments
+    return arrives, np.where(repairable, (1.0 - first) * round_s, 0.0)
