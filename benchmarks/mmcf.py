@@ -32,7 +32,6 @@ RANGES = Ranges()
 SAME = 1.002
 """Two policies that chose the same configuration all along differ by nothing; this close they count as equal."""
 REGRET_LIMITS = {"step": 0.15, "wave": 0.15, "fades": 0.35}
-SETTLED = 1.15
 
 
 @dataclass(frozen=True)
@@ -81,17 +80,13 @@ def job(arguments: tuple[str, int]) -> list[Result]:
 
 
 def _settled(result: Run, trace: Trace, *, rises: bool) -> float | None:
-    """Intervals after a step until the cost stays within 15 % of its final level; None without such a step."""
+    """Intervals after a step until the configuration changes no more before the next; None without such a step."""
     found = None
     for at_s, rise in trace.steps:
-        if rise is not rises:
-            continue
-        end_s = min([later for later, _ in trace.steps if later > at_s], default=trace.duration_s)
-        costs = [interval.cost for interval in result.intervals if at_s <= interval.at_s < end_s]
-        final = median(costs[len(costs) // 2 :])
-        smooth = [median(costs[max(0, i - 1) : i + 2]) for i in range(len(costs))]
-        outside = [i for i, value in enumerate(smooth) if value > SETTLED * final]
-        found = float(outside[-1] + 1 if outside else 0)
+        if rise is rises:
+            end_s = min([later for later, _ in trace.steps if later > at_s], default=trace.duration_s)
+            switched = [i.at_s + 1 - at_s for i in result.intervals if i.switched and at_s <= i.at_s < end_s]
+            found = max([found or 0.0, *switched])
     return found
 
 

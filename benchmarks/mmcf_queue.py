@@ -14,7 +14,8 @@ from math import ceil, inf
 from random import Random
 from typing import Final
 
-from sern_core.mmcf.model import NO_CODEC, ClassOutcome, CodecProfile, Configuration
+from sern_core.codecs import CodecProfile
+from sern_core.mmcf.model import NO_CODEC, ClassOutcome, Configuration
 from sern_core.types import CLASSES, PriorityClass
 
 FRAGMENT_BYTES: Final = 1140

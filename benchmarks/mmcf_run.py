@@ -9,8 +9,9 @@ from typing import Final
 
 from benchmarks.mmcf_queue import Queues, arrivals, slowed
 from benchmarks.mmcf_traces import NEEDED, Trace
+from sern_core.codecs import CodecProfile
 from sern_core.mmcf.cost import Ranges, Weights, cost, measure
-from sern_core.mmcf.model import ClassDemand, CodecProfile, Configuration, LinkState, Measurement, Situation, Terms
+from sern_core.mmcf.model import ClassDemand, Configuration, LinkState, Measurement, Situation, Terms
 from sern_core.mmcf.policy import Decision, Policy
 from sern_core.types import CLASSES
 
@@ -119,7 +120,7 @@ class Observer:
             body += size
             encoded += size * (profile.ratio if profile else 1.0)
             seconds += size / slowed(profile, slowdown).speed_bytes_per_s if profile else 0.0
-        return CodecProfile(encoded / body * self._random.gauss(1.0, 0.03), body / seconds if seconds else float("inf"))
+        return CodecProfile(encoded / body * self._random.gauss(1.0, 0.03), body / seconds if seconds else 0.0)
 
 
 def _ticking(times: list[float]) -> float:

@@ -6,7 +6,7 @@ from random import Random
 from typing import Final
 
 from benchmarks.mmcf_queue import Path, Topic
-from sern_core.mmcf.model import CodecProfile
+from sern_core.codecs import CodecProfile
 from sern_core.mmcf.predict import Grid
 from sern_core.types import PriorityClass
 

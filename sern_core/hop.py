@@ -137,7 +137,9 @@ class Hop(Sender):
         for packet in packets:
             for item in packet.items:
                 if type(item) is SentData:
-                    item.channel.fragment_acked(item.out, item.generation)
+                    whole = item.channel.fragment_acked(item.out, item.generation)
+                    if whole and self.on_arrived is not None:
+                        self.on_arrived(item.channel, item.out, now)
         control = self._control
         if control.retained:
             control.settle()

@@ -63,6 +63,8 @@ class Lane:
         """Share of recent packets that were lost."""
         self.copies: deque[tuple[float, int, bytes]] = deque()
         """Second copies to send: when, of which packet, the datagram."""
+        self.copies_wanted: bool | None = None
+        """What the adaptation says of them, where the configuration leaves it open (`auto`); None: the loss decides."""
         self._redundancy = params.redundancy
         self.fragment_bytes = self._fragment_bytes(None)
 
@@ -112,7 +114,9 @@ class Lane:
         """Whether class control is sent twice here; the express lane's connections see to that themselves."""
         if self.lossless or self.id == LANE_EXPRESS or self._redundancy is Redundancy.OFF:
             return False
-        return self._redundancy is Redundancy.ALWAYS or self.loss > COPY_LOSS
+        if self._redundancy is Redundancy.ALWAYS:
+            return True
+        return self.loss > COPY_LOSS if self.copies_wanted is None else self.copies_wanted
 
     def due_copy(self, now: float) -> bytes | None:
         """A second copy whose time has come and whose packet nobody has acknowledged yet."""

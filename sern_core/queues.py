@@ -122,6 +122,13 @@ class OutChannel:
         self.next_seq = first  # the next seq expected from `submit`
         self.last_sent_s: float | None = None
         self._next_allowed_s: float | None = None
+        self.share = 1.0
+        """Share of the messages that are let in (`adapt`)."""
+        self.depth = stream.spec.depth
+        """Messages that may wait, at most the topic's own depth (`adapt`)."""
+        self.thinned = 0
+        """Messages that `share` left out."""
+        self._owed_share = 0.0
         self.wanted: bool | None = None  # None until the peer has answered
         self.ready = False  # announced in this session
         self.gaps: deque[tuple[int, int]] = deque()  # reliable: after this seq, the next that will come
@@ -164,7 +171,11 @@ class OutChannel:
             if self.spec.max_rate_hz is not None and not forced and not self._rate_allows(now):
                 counters.drop(DropReason.RATE_CAP, size)
                 return True
-            if len(self.queue) >= self.spec.depth:
+            if self.share < 1.0 and not self._share_allows():
+                self.thinned += 1
+                counters.drop(DropReason.RATE_CAP, size)
+                return True
+            while len(self.queue) >= self.depth:
                 self._drop(self._pop_queue(), DropReason.SUPERSEDED)
             out = OutMessage(message)
         self._keep(out)
@@ -224,6 +235,26 @@ class OutChannel:
             return False
         self._next_allowed_s = period_s + (now if allowed_s is None or now > allowed_s + period_s else allowed_s)
         return True
+
+    def _share_allows(self) -> bool:
+        """Let `share` of the messages through, evenly spread."""
+        self._owed_share += self.share
+        if self._owed_share < 1.0:
+            return False
+        self._owed_share -= 1.0
+        return True
+
+    @property
+    def thinnable(self) -> bool:
+        """Whether messages may be left out: only the newest one counts, and none is kept for late joiners."""
+        return not self.reliable and not self.spec.latched
+
+    def adapt(self, *, share: float, depth_max: int) -> None:
+        """What the adaptation allows from the next message on: a share of the messages in (0, 1], and a queue limit
+        below the topic's own. Nothing that waits is dropped for it, and what may not be thinned is not."""
+        if self.thinnable:
+            self.share = share
+            self.depth = min(self.spec.depth, depth_max)
 
     def _pop_queue(self) -> OutMessage:
         out = self.queue.popleft()
@@ -377,9 +408,10 @@ class OutChannel:
 
     # --- outcomes -----------------------------------------------------------------------------------------------
 
-    def fragment_acked(self, out: OutMessage, generation: int) -> None:
+    def fragment_acked(self, out: OutMessage, generation: int) -> bool:
+        """The peer has a fragment. True: with it, it has the whole message."""
         if out.generation != generation:
-            return
+            return False
         out.fragments_inflight -= 1
         out.some_acked = True
         if out.fragments_inflight <= 0 and not out.has_unsent and self.flying.get(out.seq) is out:
@@ -388,6 +420,8 @@ class OutChannel:
                 self.counters.deliver(out.offered_bytes)
                 if out.seq > self.acked_seq:
                     self.acked_seq = out.seq
+            return True
+        return False
 
     def fragment_lost(self, out: OutMessage, generation: int, start: int, end: int, *, now: float) -> bool:
         """A fragment did not arrive. True: it will be sent again; False: the message is no longer wanted."""

@@ -6,6 +6,7 @@ class.
 """
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from typing import Final, NamedTuple
 
 from sern_core import wire
@@ -106,6 +107,10 @@ class Sender(ABC):
         """Counters of what goes out, by topic."""
         self.encoder: Encoder | None = None
         """Encodes bodies on their way out; None: they go as they come."""
+        self.on_arrived: Callable[[OutChannel, OutMessage, float], None] | None = None
+        """Called when the peer has a message whole: channel, message, now."""
+        self.wire_bytes = 0
+        """Bytes of numbered datagrams sent so far, second copies and headers included."""
         self.strays = 0  # fragments of streams that are unknown here (drop reason `unknown_channel`)
         self.channels: dict[int, OutChannel] = {}
         self.incoming: dict[int, InStream] = {}
@@ -174,9 +179,12 @@ class Sender(ABC):
             self.reject(channel, message, DropReason.TOO_LARGE, now=now)
             return True
         backlog = channel.offered
+        capped = channel.counters.by_reason[DropReason.RATE_CAP]
         accepted = channel.submit(message, now=now, forced=forced)
         if self.trace.enabled:
             event = TraceEvent.QUEUED if accepted else TraceEvent.REFUSED
+            if channel.counters.by_reason[DropReason.RATE_CAP] > capped:
+                event = TraceEvent.RATE_CAPPED
             self.trace.record(now, message.stream.topic, event, seq=message.seq, peer=self.peer)
         if not backlog or channel.coalesced:
             self._refresh(channel, now)
@@ -269,6 +277,7 @@ class Sender(ABC):
         self._now = now
         if lane.copies and (copy := lane.due_copy(now)) is not None:
             self.scheduler.charge(PriorityClass.CONTROL, len(copy), now=now)
+            self.wire_bytes += len(copy) + OVERHEAD_BYTES
             return copy
         frames: list[bytes] = []
         items: list[SentData | SentWatermark | SentPing] = []
@@ -308,6 +317,7 @@ class Sender(ABC):
         flight.sent(now=now, nbytes=nbytes, items=items, app_limited=app_limited)
         estimator.on_sent(now=now, nbytes=nbytes, inflight_bytes=inflight_bytes)
         lane.pacer.sent(now=now, nbytes=nbytes, pacing_bps=estimator.pacing_bps)
+        self.wire_bytes += nbytes
         lane.ping_due_s = now + PING_INTERVAL_S
         self.dirty = len(self.lanes) > 1 or self._sendable(lane, now)
         if lane.redundant and any(type(item) is SentData and _urgent(item.channel) for item in items):

@@ -8,30 +8,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
+from sern_core.codecs import RAW_PROFILE, CodecProfile
 from sern_core.errors import UsageError
 from sern_core.types import CLASS_LABELS, CLASSES, PriorityClass, TopicName
 
 NO_CODEC: Final = "none"
 CLASS_WEIGHTS: Final = (0.6, 0.3, 0.1)
 """ω: what a class counts in latency and unreliability; spread over the classes that have traffic."""
-
-
-@dataclass(frozen=True, slots=True)
-class CodecProfile:
-    """What a compression mode does to the bodies of one class, measured on the class's own messages.
-
-    `ratio` is encoded bytes over body bytes; `speed_bytes_per_s` is body bytes encoded a second, inf for no work.
-    """
-
-    ratio: float
-    speed_bytes_per_s: float
-
-    def __post_init__(self) -> None:
-        if not (0.0 < self.ratio < float("inf") and self.speed_bytes_per_s > 0.0):
-            raise UsageError(f"CodecProfile: ratio {self.ratio!r} and speed {self.speed_bytes_per_s!r} must be above 0")
-
-
-UNCOMPRESSED: Final = CodecProfile(1.0, float("inf"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +58,12 @@ class ClassDemand:
                 raise UsageError(f"ClassDemand: {name} = {getattr(self, name)!r} is out of range")
 
     def codec(self, mode: str) -> CodecProfile:
-        return self.codecs.get(mode, UNCOMPRESSED)
+        return self.codecs.get(mode, RAW_PROFILE)
+
+    def encode_s(self, mode: str) -> float:
+        """Time to encode a message of mean size."""
+        speed = self.codec(mode).speed_bytes_per_s
+        return self.mean_bytes / speed if speed > 0.0 else 0.0
 
 
 @dataclass(frozen=True, slots=True)

@@ -397,7 +397,7 @@ class Predictor:
                 for name, profile in zip(grid.codecs, profiles, strict=True)
             ]
         )
-        encode_s = np.array([demand.mean_bytes / profile.speed_bytes_per_s for profile in profiles])[grid.codec]
+        encode_s = np.array([demand.encode_s(name) for name in grid.codecs])[grid.codec]
         encoded_bytes = demand.mean_bytes * ratio[grid.codec]
         fragments = np.maximum(1.0, np.ceil(encoded_bytes / FRAGMENT_BODY_BYTES))
         copies = 1.0 + grid.redundancy if demand.protected else np.ones(len(grid))

@@ -1,0 +1,337 @@
+"""The adaptation of one hop: measures its link, asks a policy, applies what it says. Pure.
+
+The owner calls `sample` about ten times an interval and `step` once an interval. What is applied changes nothing that
+waits or is under way: rates and queue limits act on the next message of a best-effort topic, a codec mode on the next
+body to be encoded, redundancy on the next datagram. Topics that appear are taken in by the next `step`.
+"""
+
+from collections import deque
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from math import isfinite
+from typing import Final
+
+from sern_core.codecs import LOSSLESS, RAW_PROFILE, CodecProfile, Coder, Compression
+from sern_core.link import Link
+from sern_core.mmcf.cost import Ranges, Weights, cost, measure
+from sern_core.mmcf.model import (
+    NO_CODEC,
+    ClassDemand,
+    ClassOutcome,
+    Configuration,
+    LinkState,
+    Measurement,
+    Situation,
+    Terms,
+)
+from sern_core.mmcf.policy import Decision, Policy
+from sern_core.mmcf.predict import SERIALISE_S
+from sern_core.queues import OutChannel, OutMessage
+from sern_core.types import CLASSES, DropReason, PriorityClass, TopicName
+
+INTERVAL_S: Final = 1.0
+"""T_cfg of the paper's section "Multi-Metric Cost Function"."""
+SAMPLES: Final = 10
+"""Readings of the capacity an interval."""
+MEMORY: Final = 3
+"""Intervals that demand is told from."""
+FULL: Final = 0.5
+"""A link with a backlog at so many of its samples is called saturated."""
+ARRIVAL_CV2: Final = 0.1
+"""Topics of robots tick; what is left is jitter."""
+
+
+@dataclass(frozen=True, slots=True)
+class AdapterParams:
+    """What the owner decides. By class: control, state, bulk."""
+
+    ranges: Ranges = field(default_factory=Ranges)
+    weights: Weights = field(default_factory=lambda: Weights(0.45, 0.30, 0.10, 0.15))
+    """To cost what was measured; those of the policy."""
+    interval_s: float = INTERVAL_S
+    deadlines_s: tuple[float, ...] = (0.3, 0.5, 1.0)
+    """Messages that arrive later do not count as delivered; a shorter lifespan of the topic counts instead."""
+    needed: tuple[float, ...] = (1.0, 1.0, 0.4)
+    """Share of the offered messages that the other side needs."""
+    modes: tuple[str, ...] = tuple(LOSSLESS)
+    """Codec modes that may be set; only `none` where bodies are forwarded as they are."""
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """One interval: what was measured while it ran, what that cost, and what was decided at its end."""
+
+    now: float
+    situation: Situation
+    measurement: Measurement | None
+    terms: Terms | None
+    cost: float | None
+    in_force: Configuration
+    """What was in force while it was measured."""
+    decision: Decision
+
+
+class _TopicStats:
+    """Totals of one topic at the last step, and what came since, interval by interval."""
+
+    __slots__ = ("encoded_bytes", "history", "nbytes", "offered", "raw_bytes", "thinned")
+
+    def __init__(self) -> None:
+        self.offered = self.nbytes = self.thinned = self.raw_bytes = self.encoded_bytes = 0
+        self.history: deque[tuple[int, int]] = deque(maxlen=MEMORY)  # (messages, bytes) an interval
+
+
+@dataclass(slots=True)
+class _ClassCount:
+    offered: int = 0
+    admitted: int = 0
+    delivered: int = 0
+    on_time: int = 0
+    latency_s: float = 0.0
+    raw_bytes: int = 0
+    encoded_bytes: int = 0
+
+
+class HopAdapter:
+    """Measures, decides and applies for what goes out over one link.
+
+    `coder` is the encoder of this process, None where bodies are not encoded here.
+    """
+
+    def __init__(self, link: Link, policy: Policy, params: AdapterParams, *, coder: Coder | None, now: float) -> None:
+        self.link = link
+        self.policy = policy
+        self.params = params
+        self.last: Step | None = None
+        self.switches = 0
+        self._coder = coder
+        self._since_s = now
+        self._wire_bytes = link.wire_bytes
+        self._encode_s = self._coder_s()
+        self._topics: dict[TopicName, _TopicStats] = {}
+        self._arrived: dict[PriorityClass, _ClassCount] = {priority: _ClassCount() for priority in CLASSES}
+        self._samples: deque[float] = deque(maxlen=SAMPLES)
+        self._busy: deque[bool] = deque(maxlen=SAMPLES)
+        self._measured: Measurement | None = None
+        link.on_arrived = self._note_arrival
+
+    def close(self) -> None:
+        """Give every topic back what its rule says."""
+        self.link.on_arrived = None
+        for channel in self.link.channels.values():
+            channel.adapt(share=1.0, depth_max=channel.spec.depth)
+        for lane in self.link.lanes.values():
+            lane.copies_wanted = None
+
+    # --- measuring ------------------------------------------------------------------------------------------------
+
+    def _note_arrival(self, channel: OutChannel, out: OutMessage, now: float) -> None:
+        message = out.message
+        if message.replay or message.tombstone:
+            return
+        count = self._arrived[channel.spec.priority]
+        rtt_s = self._rtt_s()
+        latency_s = max(0.0, now - message.born_s - rtt_s / 2.0)  # the acknowledgement took half a round trip
+        count.delivered += 1
+        count.latency_s += latency_s
+        count.on_time += latency_s <= self._deadline_s(channel)
+
+    def _deadline_s(self, channel: OutChannel) -> float:
+        deadline_s = self.params.deadlines_s[channel.spec.priority]
+        lifespan_s = channel.spec.lifespan_s
+        return deadline_s if lifespan_s is None else min(deadline_s, lifespan_s)
+
+    def _rtt_s(self) -> float:
+        rtt_s = self.link.lane.estimator.rtprop_s
+        return rtt_s if rtt_s is not None and isfinite(rtt_s) else self.link.lane.flight.rtt.srtt_s or 0.0
+
+    def _coder_s(self) -> float:
+        return sum(counters.elapsed_s for counters in self._coder.encoded.values()) if self._coder is not None else 0.0
+
+    def sample(self) -> None:
+        """Read the capacity and whether anything waits; about ten times an interval."""
+        link = self.link
+        capacity_bps = self._capacity_bps()
+        if capacity_bps is not None:
+            self._samples.append(capacity_bps)
+        self._busy.append(any(link.scheduler.pending(priority) for priority in CLASSES))
+
+    def _capacity_bps(self) -> float | None:
+        """A link that was never full can carry what the ranges call a full one, as far as anybody knows."""
+        lane = self.link.lane
+        if lane.stalled or not self.link.established:
+            return None
+        rate_bps = lane.estimator.rate_bps
+        return self.params.ranges.bandwidth_max_bps if rate_bps is None else rate_bps
+
+    def _channels(self) -> list[OutChannel]:
+        """Those that somebody wants."""
+        return [channel for channel in self.link.channels.values() if channel.wanted and channel.ready]
+
+    def _count(self, channels: Iterable[OutChannel]) -> dict[PriorityClass, _ClassCount]:
+        """What the interval brought, by class; the arrivals since the last call are in it."""
+        counts, self._arrived = self._arrived, {priority: _ClassCount() for priority in CLASSES}
+        by_topic: dict[TopicName, list[OutChannel]] = {}
+        for channel in channels:
+            by_topic.setdefault(channel.counters.topic, []).append(channel)
+        for gone in self._topics.keys() - by_topic.keys():
+            del self._topics[gone]
+        for topic, mine in by_topic.items():
+            counters, count = mine[0].counters, counts[mine[0].spec.priority]
+            stats = self._topics.get(topic)
+            fresh = stats is None
+            if stats is None:
+                stats = self._topics[topic] = _TopicStats()
+            thinned = sum(channel.thinned for channel in mine)
+            dropped = counters.by_reason
+            # What its own max_rate_hz leaves out was never meant to be sent, nor what nobody wanted.
+            others = dropped[DropReason.RATE_CAP] - thinned + dropped[DropReason.UNWANTED]
+            offered, nbytes = counters.offered - others, counters.offered_bytes
+            raw_bytes = sum(channel.codec.raw_bytes for channel in mine if channel.codec is not None)
+            encoded_bytes = sum(channel.codec.encoded_bytes for channel in mine if channel.codec is not None)
+            if not fresh:
+                messages = max(0, offered - stats.offered)
+                new_bytes = max(0, nbytes - stats.nbytes)
+                stats.history.append((messages, new_bytes))
+                count.offered += messages
+                count.admitted += max(0, messages - max(0, thinned - stats.thinned))
+                if channel_mode(mine[0]) is None:
+                    count.raw_bytes += max(0, raw_bytes - stats.raw_bytes)
+                    count.encoded_bytes += max(0, encoded_bytes - stats.encoded_bytes)
+            stats.offered, stats.nbytes, stats.thinned = offered, nbytes, thinned
+            stats.raw_bytes, stats.encoded_bytes = raw_bytes, encoded_bytes
+        return counts
+
+    def _demands(self, channels: Iterable[OutChannel], elapsed_s: float) -> tuple[ClassDemand, ...]:
+        groups: dict[PriorityClass, list[OutChannel]] = {}
+        for channel in channels:
+            groups.setdefault(channel.spec.priority, []).append(channel)
+        found = []
+        for priority in CLASSES:
+            weighed = [
+                (channel, messages / len(history), nbytes / messages)
+                for channel in groups.get(priority, ())
+                if (history := self._topics[channel.counters.topic].history)
+                and (messages := sum(part[0] for part in history)) > 0
+                and (nbytes := sum(part[1] for part in history)) >= 0
+            ]
+            rate = sum(per_interval for _, per_interval, _ in weighed)
+            if not rate:
+                continue
+            mean_bytes = sum(per_interval * size for _, per_interval, size in weighed) / rate
+            spread = sum(per_interval * (size - mean_bytes) ** 2 for _, per_interval, size in weighed) / rate
+            found.append(
+                ClassDemand(
+                    priority,
+                    rate / elapsed_s,
+                    mean_bytes,
+                    sum(per_interval * self._deadline_s(channel) for channel, per_interval, _ in weighed) / rate,
+                    cv2=spread / mean_bytes**2 if mean_bytes > 0.0 else 0.0,
+                    arrival_cv2=ARRIVAL_CV2,
+                    topics=len(weighed),
+                    needed=self.params.needed[priority],
+                    thinnable=sum(per_interval for channel, per_interval, _ in weighed if channel.thinnable) / rate,
+                    protected=priority is PriorityClass.CONTROL and not self.link.lane.lossless,
+                    codecs={mode: _class_profile(mode, weighed) for mode in self.params.modes if mode != NO_CODEC},
+                )
+            )
+        return tuple(found)
+
+    # --- deciding -------------------------------------------------------------------------------------------------
+
+    def step(self, *, now: float) -> Step:
+        """The interval is over: measure it, decide for the next one, apply that."""
+        link, params = self.link, self.params
+        elapsed_s = max(now - self._since_s, 1e-3)
+        channels = self._channels()
+        counts = self._count(channels)
+        demands = self._demands(channels, elapsed_s)
+        situation = Situation(
+            demands, LinkState(self._capacity_bps(), self._rtt_s(), link.lane.loss, tuple(self._samples))
+        )
+        in_force = self.policy.active
+        measurement, terms, value = None, None, None
+        if link.established and any(count.offered for count in counts.values()):
+            measurement = self._measure(counts, demands, elapsed_s)
+            terms = params.ranges.terms(
+                latency_s=measurement.latency_s,
+                unreliability=measurement.unreliability,
+                compute=measurement.compute,
+                bandwidth_bps=measurement.bandwidth_bps,
+            )
+            value = cost(params.weights, terms)
+        self._measured = measurement
+        self._since_s, self._wire_bytes, self._encode_s = now, link.wire_bytes, self._coder_s()
+        self._samples.clear()
+        self._busy.clear()
+        decision = self.policy.decide(situation, measurement, now=now)
+        self.switches += decision.switched
+        self.apply(decision.chosen, now=now)
+        self.last = Step(now, situation, measurement, terms, value, in_force, decision)
+        return self.last
+
+    def _measure(
+        self, counts: dict[PriorityClass, _ClassCount], demands: tuple[ClassDemand, ...], elapsed_s: float
+    ) -> Measurement:
+        wire_bytes = self.link.wire_bytes - self._wire_bytes
+        cpu_s = self._coder_s() - self._encode_s + SERIALISE_S * sum(count.admitted for count in counts.values())
+        return measure(
+            demands,
+            [
+                ClassOutcome(
+                    priority,
+                    count.offered,
+                    count.admitted,
+                    min(count.on_time, count.offered),
+                    count.delivered,
+                    count.latency_s,
+                    # Classes share datagrams: all bytes are counted under the first.
+                    float(wire_bytes) if priority is PriorityClass.CONTROL else 0.0,
+                    float(count.raw_bytes),
+                    float(count.encoded_bytes),
+                )
+                for priority, count in counts.items()
+            ],
+            interval_s=elapsed_s,
+            cpu_s=cpu_s,
+            saturated=sum(self._busy) > FULL * len(self._busy) if self._busy else False,
+            ranges=self.params.ranges,
+            previous=self._measured,
+        )
+
+    # --- applying -------------------------------------------------------------------------------------------------
+
+    def apply(self, configuration: Configuration, *, now: float) -> None:
+        """Bring every channel and lane in line. Idempotent; what waits or is under way is left as it is."""
+        link = self.link
+        mode = Compression(configuration.codec) if self._coder is not None else None
+        for channel in link.channels.values():
+            priority = channel.spec.priority
+            channel.adapt(share=configuration.rates[priority], depth_max=configuration.queues[priority])
+            codec = channel.codec
+            if mode is not None and codec is not None and channel_mode(channel) is None and codec.setting is not mode:
+                link.set_compression(channel, mode, now=now)
+        for lane in link.lanes.values():
+            lane.copies_wanted = bool(configuration.redundancy)
+
+
+def channel_mode(channel: OutChannel) -> Compression | None:
+    """The mode that the topic's own rule demands; None: free to choose."""
+    return channel.spec.compression
+
+
+def _class_profile(mode: str, weighed: list[tuple[OutChannel, float, float]]) -> CodecProfile:
+    """By bytes over the topics of a class: what `mode` would make of them."""
+    body = encoded = seconds = 0.0
+    for channel, per_interval, size in weighed:
+        demanded = channel_mode(channel)
+        profile = RAW_PROFILE
+        if channel.codec is not None:
+            profile = channel.codec.profiles.get(Compression(mode) if demanded is None else demanded, RAW_PROFILE)
+        nbytes = per_interval * size
+        body += nbytes
+        encoded += nbytes * min(profile.ratio, 1.0)
+        seconds += nbytes / profile.speed_bytes_per_s if profile.speed_bytes_per_s > 0.0 else 0.0
+    if body <= 0.0:
+        return RAW_PROFILE
+    return CodecProfile(encoded / body, body / seconds if seconds > 0.0 else 0.0)
