@@ -25,13 +25,14 @@ from sern_core.client import ClientCore
 from sern_core.errors import ConfigError
 from sern_core.trace import DecisionTrace
 from sern_core.types import CLASS_LABELS, DropReason, ObjectKind
+from sern_runtime.codec_pool import CodecPool, make_coder
 from sern_runtime.config.base import split_tcp
 from sern_runtime.config.client import ClientFile, ServicesSection, load_client
 from sern_runtime.config.load import Loaded
 from sern_runtime.entry import blamed_on, end_tasks, log_warnings, serve
 from sern_runtime.http import Health, HttpServer
 from sern_runtime.keys import load_public, load_secret
-from sern_runtime.link_metrics import register_links, register_received
+from sern_runtime.link_metrics import register_codecs, register_links, register_received
 from sern_runtime.loop import Shutdown
 from sern_runtime.metrics import Metrics
 from sern_runtime.sdnotify import Notifier, Watchdog
@@ -83,6 +84,7 @@ class ClientDaemon:
             on_down=self._link_down,
         )
         now = time.monotonic()
+        self.codecs = CodecPool(after=self._kick)
         self.core = ClientCore(
             name=model.name,
             boot=secrets.randbits(63),
@@ -91,6 +93,7 @@ class ClientDaemon:
             scheduler=model.scheduler.params(),
             trace=DecisionTrace(),
             now=now,
+            coder=make_coder(model.link.params(), self.codecs),
         )
         self.bridge.attach(self.core)
         self.core.subscribe(model.subscribe_patterns(), now=now)
@@ -232,6 +235,7 @@ class ClientDaemon:
         link = self.core.link
         register_links(metrics, lambda: [link])
         register_received(metrics, self.core.received, self.bridge.ages)
+        register_codecs(metrics, self.core.coder)
         metrics.counter(
             "sern_command_lease_expired_total",
             "Times a command topic went quiet and the stop command was published.",
@@ -362,6 +366,7 @@ class ClientDaemon:
                 stack.callback(self._express.close)
             if self._lane is not None:
                 stack.callback(self._lane.closed)
+            stack.callback(self.codecs.close)
             stack.push_async_callback(end_tasks, self.tasks)
 
     def _write_summary(self) -> None:

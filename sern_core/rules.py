@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 from enum import Enum, StrEnum
 from typing import Final
 
+from sern_core.codecs import Compression
 from sern_core.errors import ConfigError, UsageError
 from sern_core.message import (
     DEFAULT_COMMAND_LIFESPAN_S,
@@ -190,6 +191,7 @@ class TopicRule:
     many_writers: bool | None = None
     remap: TopicName | None = None
     lease: Lease | None = None
+    compression: Compression | None = None
 
     @property
     def plain_name(self) -> TopicName | None:
@@ -330,6 +332,7 @@ class RuleSet:
             retention_s=self.retention_s if rule.retention_s is None else rule.retention_s,
             max_queue_bytes=rule.max_queue_bytes,
             many_writers=many_writers if rule.many_writers is None else rule.many_writers,
+            compression=rule.compression,
         )
         return ResolvedTopic(spec, rule.direction, rule.remap or local_name, rule.lease, index)
 

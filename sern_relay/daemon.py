@@ -13,23 +13,26 @@ import zmq
 from prometheus_client import CollectorRegistry
 
 from sern_core.access import AccessTable
+from sern_core.decoding import Decoder
 from sern_core.errors import ConfigError
 from sern_core.hub import Hub, HubParams
+from sern_core.ledger import MAX_TOPICS
 from sern_core.link import Link
 from sern_core.message import Message, StreamInfo
 from sern_core.queues import OutChannel
-from sern_core.types import ClientName
+from sern_core.types import ClientName, DropReason, TopicName
 from sern_relay.feed import RelayFeed
 from sern_relay.objects_view import objects_view
 from sern_relay.server import RelayServer
 from sern_relay.transforms import TransformObjects
 from sern_relay.udp import RelayLanes
+from sern_runtime.codec_pool import CodecPool, make_coder
 from sern_runtime.config.load import Loaded
 from sern_runtime.config.relay import RelayFile, load_relay
 from sern_runtime.entry import blamed_on, end_tasks, log_warnings, serve
 from sern_runtime.http import Health, HttpServer
 from sern_runtime.keys import KeyDirectory, KeyStatus, load_secret
-from sern_runtime.link_metrics import AgeHistograms, register_links, register_received
+from sern_runtime.link_metrics import AgeHistograms, register_codecs, register_links, register_received
 from sern_runtime.loop import Shutdown
 from sern_runtime.metrics import Metrics
 from sern_runtime.sdnotify import Notifier, Watchdog
@@ -94,6 +97,10 @@ class RelayDaemon:
             wall_ns=lambda _now: time.time_ns(),
             now=time.monotonic(),
         )
+        self.codecs = CodecPool(after=self._after)
+        self.coder = make_coder(model.link.params(), self.codecs)
+        self._decoder = Decoder[StreamInfo](self.coder, lambda stream: stream, self._deliver, self._undecodable)
+        self._told: set[TopicName] = set()
         self.zap: ZapHandler | None = None
         self.server: RelayServer | None = None
         self.feed: RelayFeed | None = None
@@ -256,6 +263,7 @@ class RelayDaemon:
         metrics = Metrics(registry)
         register_links(metrics, lambda: list(self.hub.links.values()))
         register_received(metrics, self.hub.received, self.ages)
+        register_codecs(metrics, self.coder)
         metrics.gauge("sern_relay_clients", "Clients with a session.",
                       read=lambda: [((), float(self._clients_up()))])  # fmt: skip
         metrics.gauge("sern_relay_streams", "Streams announced by clients.",
@@ -381,6 +389,7 @@ class RelayDaemon:
                     stack.callback(part.close)
             if self._http is not None:
                 stack.push_async_callback(self._http.stop)
+            stack.callback(self.codecs.close)
             stack.callback(self._cancel_flush)
             stack.push_async_callback(end_tasks, self.tasks)
 
@@ -421,6 +430,7 @@ class RelayDaemon:
 
     def stream_removed(self, stream: StreamInfo) -> None:
         _log.info("%s of %s has ended", stream.id.topic, stream.id.origin)
+        self._decoder.forget(stream.id, now=time.monotonic())
         if self.transforms is not None:
             self.transforms.stream_removed(stream)
         if self.feed is not None:
@@ -428,6 +438,24 @@ class RelayDaemon:
 
     def message(self, stream: StreamInfo, message: Message, *, now: float) -> None:
         self.ages.observe(stream.spec.priority, now - message.born_s)
+        if message.codec and not self._reads(stream):
+            return  # it goes on as it is
+        self._decoder.message(stream, message, now=now)
+
+    def _reads(self, stream: StreamInfo) -> bool:
+        """Whether anything here, beside the clients' links, wants the stream's messages."""
+        if self.transforms is not None and self.transforms.reads(stream):
+            return True
+        return self.feed is not None and self.feed.feed.wants(stream.id.topic)
+
+    def _undecodable(self, stream: StreamInfo, message: Message, reason: DropReason, problem: str, now: float) -> None:
+        topic = stream.id.topic
+        if reason is DropReason.UNDECODABLE and topic not in self._told and len(self._told) < MAX_TOPICS:
+            self._told.add(topic)
+            _log.error("%s of %s cannot be decoded for the feed or the registry: %s", topic, stream.id.origin, problem)
+
+    def _deliver(self, stream: StreamInfo, message: Message, now: float) -> None:
+        """A message in its turn, decoded, for what reads messages at the relay itself."""
         if self.transforms is not None:
             self.transforms.message(stream, message, now=now)
         if self.feed is not None:

@@ -71,11 +71,15 @@ class TransformObjects:
     def close(self) -> None:
         self._timer.cancel()
 
+    def reads(self, stream: StreamInfo) -> bool:
+        """Whether it is a stream of transforms."""
+        return plain_type(stream.info.type_name) in _STREAMS and stream.info.encoding is not Encoding.RAW
+
     def message(self, stream: StreamInfo, message: Message, *, now: float) -> None:
         """Any message of any stream."""
         known = self._streams.get(stream.id)
         if known is None:
-            if plain_type(stream.info.type_name) not in _STREAMS or stream.info.encoding is Encoding.RAW:
+            if not self.reads(stream):
                 return
             known = self._streams[stream.id] = _Stream(stream)
         if len(message.body) > MAX_BODY_BYTES:

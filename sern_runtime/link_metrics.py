@@ -4,6 +4,7 @@ import math
 import time
 from collections.abc import Callable, Collection, Iterable
 
+from sern_core.codecs import Coder
 from sern_core.ledger import ReceiveLedger
 from sern_core.link import Link
 from sern_core.types import CLASS_LABELS
@@ -98,6 +99,30 @@ def register_links(metrics: Metrics, links: Callable[[], Collection[Link]]) -> N
     counter("sern_messages_dropped_total", "Messages dropped, by reason.", (*topic, "reason"), drops)
     counter("sern_stray_fragments_total", "Fragments of streams that were not announced.", peer,
             per_link(lambda link: float(link.strays)))  # fmt: skip
+
+
+def register_codecs(metrics: Metrics, coder: Coder) -> None:
+    """What was compressed and decompressed here, and what it took."""
+
+    def encoded(read: str) -> Callable[[], list[tuple[Labels, float]]]:
+        return lambda: [((str(mode),), float(getattr(counters, read))) for mode, counters in coder.encoded.items()]
+
+    def decoded(read: str) -> Callable[[], list[tuple[Labels, float]]]:
+        return lambda: [((c.name.lower(),), float(getattr(counters, read))) for c, counters in coder.decoded.items()]
+
+    counter = metrics.counter
+    mode, codec = ("mode",), ("codec",)
+    counter("sern_encoded_messages_total", "Message bodies encoded, those that gained nothing included.", mode,
+            encoded("messages"))  # fmt: skip
+    counter("sern_encoded_raw_bytes_total", "Bytes of bodies before encoding.", mode, encoded("raw_bytes"))
+    counter("sern_encoded_bytes_total", "Bytes of the same bodies after it.", mode, encoded("encoded_bytes"))
+    counter("sern_encode_seconds_total", "Time spent encoding.", mode, encoded("elapsed_s"))
+    counter("sern_decoded_messages_total", "Message bodies decoded.", codec, decoded("messages"))
+    counter("sern_decoded_raw_bytes_total", "Bytes of bodies after decoding.", codec, decoded("raw_bytes"))
+    counter("sern_decoded_bytes_total", "Bytes of the same bodies before it.", codec, decoded("encoded_bytes"))
+    counter("sern_decode_seconds_total", "Time spent decoding.", codec, decoded("elapsed_s"))
+    counter("sern_undecodable_total", "Message bodies that could not be decoded.",
+            read=lambda: [((), float(coder.undecodable))])  # fmt: skip
 
 
 def register_received(metrics: Metrics, received: ReceiveLedger, ages: AgeHistograms) -> None:

@@ -1,7 +1,9 @@
 """Counters of topics as JSON: for /api/topics, the summaries written at exit, and the tools that read them."""
 
+from dataclasses import asdict
 from typing import Any
 
+from sern_core.encoding import ChannelCodec
 from sern_core.ledger import ReceiveLedger
 from sern_core.link import Link
 from sern_core.types import CLASS_LABELS
@@ -14,6 +16,7 @@ def link_summary(link: Link, *, direction: str) -> dict[str, TopicView]:
     """What was offered to a link and what became of it: offered = delivered + dropped + in_queue + in_flight."""
     held: dict[str, list[int]] = {}
     wanted: dict[str, bool] = {}
+    codecs = {channel.stream.id.topic: channel.codec for channel in link.channels.values()}
     for channel in link.channels.values():
         cell = held.setdefault(channel.stream.id.topic, [0, 0])
         queued, _queued_bytes, flying, _flying_bytes = channel.held()
@@ -36,8 +39,25 @@ def link_summary(link: Link, *, direction: str) -> dict[str, TopicView]:
             "in_flight": in_flight,
             "bytes_offered": counters.offered_bytes,
             "bytes_delivered": counters.delivered_bytes,
+            **_codec_view(codecs.get(topic)),
         }
     return result
+
+
+def _codec_view(codec: ChannelCodec | None) -> TopicView:
+    """How a topic is compressed here: the mode in use, what it makes of the messages, and what each mode would."""
+    if codec is None:
+        return {}
+    return {
+        "compression": {
+            "setting": "auto" if codec.setting is None else str(codec.setting),
+            "mode": str(codec.mode),
+            "bytes_raw": codec.raw_bytes,
+            "bytes_encoded": codec.encoded_bytes,
+            "ratio": codec.encoded_bytes / codec.raw_bytes if codec.raw_bytes else None,
+            "profiles": {str(mode): asdict(profile) for mode, profile in codec.profiles.items()},
+        }
+    }
 
 
 def received_summary(received: ReceiveLedger, *, now: float) -> dict[str, TopicView]:

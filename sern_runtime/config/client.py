@@ -7,6 +7,7 @@ from typing import Annotated, Any, Final, Literal
 from pydantic import Discriminator, Field, Tag, model_validator
 
 from sern_core.access import compile_peer_pattern
+from sern_core.codecs import Compression
 from sern_core.errors import RefusedError
 from sern_core.message import DEFAULT_RELIABLE_QUEUE_BYTES
 from sern_core.rules import (
@@ -174,6 +175,9 @@ class TopicSection(Section):
     max_queue_bytes: Bytes = DEFAULT_RELIABLE_QUEUE_BYTES
     """Undelivered reliable messages kept at most, each counted with 256 bytes beside its own; beyond, new ones are
     refused to their publisher."""
+    compression: Literal["auto", "none", "lz4", "zstd", "zstd_strong"] = "auto"
+    """How bodies from here are compressed, without loss; `auto`: whichever gets a message there soonest, by what each
+    makes of the topic and what the link carries. A body that gains less than 3 % is sent as it is."""
     many_writers: bool | None = None
     """Several clients may publish this global name; null: only /tf and /tf_static."""
     remap: TopicText | None = None
@@ -220,6 +224,7 @@ class TopicSection(Section):
             max_queue_bytes=self.max_queue_bytes,
             many_writers=self.many_writers,
             remap=None if self.remap is None else TopicName(self.remap),
+            compression=None if self.compression == "auto" else Compression(self.compression),
             lease=None if loss is None else Lease(publish=loss.publish, after_s=loss.after_s),
         )
 

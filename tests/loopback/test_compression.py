@@ -1,0 +1,154 @@
+"""Compression with the real daemons: real recordings arrive byte for byte, and nobody in between unpacks them."""
+
+import asyncio
+import threading
+from pathlib import Path
+
+import zmq
+
+from sern_core.codecs import Coder, Compression, Work
+from sern_core.params import LinkParams
+from sern_core.types import TopicName
+from sern_runtime.codec_pool import CodecPool, make_coder
+from tests.daemons import HOST, Lab, bodies, free_ports, recording, under
+from tests.support import until
+
+CLOUDS = TopicName("/robot1/points")
+
+
+def rule(match: str, compression: str) -> dict[str, object]:
+    return {"match": match, "class": "state", "reliability": "reliable", "compression": compression}
+
+
+async def test_a_recorded_drive_arrives_byte_for_byte(tmp_path: Path) -> None:
+    bag = recording("jackal_imu_odom.bag")
+    sent = {TopicName(name): content for name, content in under("robot1", bodies(bag)).items()}
+    topics = [rule(".*/odom", "zstd"), rule("/imu/data", "lz4"), rule(".*", "none")]
+    async with Lab(tmp_path, "robot1", "site") as lab:
+        relay = await lab.relay()
+        site = await lab.connected(lab.recorder_file("site", "/robot1/.*"))
+        robot = await lab.connected(lab.player_file("robot1", bag, topics=topics))
+        arrived = site.core.received.topics
+        await until(
+            lambda: all(name in arrived and arrived[name].delivered >= len(sent[name]) for name in sent),
+            "everything arrives",
+            deadline_s=60.0,
+        )
+        views = robot.topics()
+        passed = relay.hub.received.topics
+        for daemon in (robot, site, relay):
+            await lab.end(daemon)
+    assert bodies(tmp_path / "site.bag") == sent
+    odom, imu = TopicName("/robot1/jackal_velocity_controller/odom"), TopicName("/robot1/imu/data")
+    for name, mode, most in ((odom, "zstd", 0.25), (imu, "lz4", 0.6)):
+        view = views[name]["compression"]
+        raw_bytes = sum(map(len, sent[name]))
+        assert view["setting"] == view["mode"] == mode
+        assert view["bytes_raw"] == raw_bytes
+        assert view["ratio"] < most
+        assert set(view["profiles"]) == {"lz4", "zstd", "zstd_strong"}
+        assert all(profile["speed_bytes_per_s"] > 0 for profile in view["profiles"].values())
+        assert passed[name].delivered_bytes == view["bytes_encoded"] < most * raw_bytes
+        assert arrived[name].delivered_bytes == raw_bytes
+
+
+async def test_scans_are_unpacked_at_the_site_and_for_the_feed_alone(tmp_path: Path) -> None:
+    endpoint = {
+        "kind": "synthetic",
+        "role": "robot",
+        "topics": ["/points"],
+        "cloud_files": [str(recording("lidar_scan_a.ply")), str(recording("lidar_scan_b.ply"))],
+        "cloud_rate_hz": 10.0,
+        "encoding": "ros1",
+    }
+    feed = f"tcp://{HOST}:{free_ports(1)[0]}"
+    role = {"name": "viewer", "publish_endpoint": feed, "subscribe": ["/robot1/.*"]}
+    async with Lab(tmp_path, "robot1", "site") as lab:
+        relay = await lab.relay(lab.relay_file(feed={"roles": [role]}))
+        site = await lab.connected(lab.recorder_file("site", "/robot1/points"))
+        robot = await lab.connected(lab.client_file("robot1", endpoint, topics=[rule("/points", "zstd")]))
+        arrived = site.core.received.topics
+        await until(lambda: CLOUDS in arrived and arrived[CLOUDS].delivered >= 4)
+        assert sum(c.messages for c in relay.coder.decoded.values()) == 0, "the relay unpacked what nobody there reads"
+        seen: list[list[bytes]] = []
+        with zmq.Context() as ctx, ctx.socket(zmq.SUB) as sub:
+            sub.linger = 0
+            sub.subscribe(b"")
+            sub.connect(feed)
+
+            def received() -> bool:
+                while sub.poll(0):
+                    seen.append(sub.recv_multipart())
+                return len(seen) >= 4
+
+            await until(received)
+        await until(lambda: arrived[CLOUDS].delivered >= 12)
+        assert robot.core.coder.encoded[Compression.ZSTD].elapsed_s > 0.0
+        for daemon in (robot, site, relay):
+            await lab.end(daemon)
+    recorded = bodies(tmp_path / "site.bag")[CLOUDS]
+    assert len(recorded) >= 12
+    assert {parts[2] for parts in seen} <= set(recorded)
+    passed = relay.hub.received.topics[CLOUDS]
+    assert passed.delivered_bytes < 0.8 * passed.delivered * min(map(len, recorded))
+
+
+class Job(Work):
+    """Notes where it ran; the first waits until it may."""
+
+    def __init__(self, priority: int, done: list[int], gate: threading.Event | None = None) -> None:
+        self.priority = priority
+        self.thread = 0
+        self._done = done
+        self._gate = gate
+
+    def run(self) -> None:
+        self.thread = threading.get_ident()
+        if self._gate is not None:
+            assert self._gate.wait(20.0)
+
+    def done(self, *, now: float) -> None:
+        assert threading.get_ident() != self.thread
+        self._done.append(self.priority)
+
+
+class Fault(Job):
+    def run(self) -> None:
+        raise MemoryError
+
+
+async def test_urgent_work_goes_first_and_a_fault_ends_nothing() -> None:
+    done: list[int] = []
+    gate = threading.Event()
+    after: list[int] = []
+    pool = CodecPool(after=lambda: after.append(len(done)), workers=1)
+    try:
+        pool.take(Job(9, done, gate))
+        for job in (Job(2, done), Fault(1, done), Job(0, done)):
+            pool.take(job)
+        gate.set()
+        await until(lambda: len(done) == 4)
+    finally:
+        pool.close()
+    assert done == [9, 0, 1, 2]
+    assert after == [1, 2, 3, 4]
+    pool.close()
+
+
+async def test_work_that_ends_after_the_pool_is_forgotten() -> None:
+    done: list[int] = []
+    pool = CodecPool(after=lambda: None)
+    pool.take(Job(0, done))
+    pool.close()
+    await asyncio.sleep(0)
+    await asyncio.sleep(0)
+    assert done == []
+
+
+async def test_the_coder_of_a_daemon_measures_time() -> None:
+    pool = CodecPool(after=lambda: None)
+    try:
+        coder: Coder = make_coder(LinkParams(), pool)
+        assert coder.encode(Compression.ZSTD, b"robot " * 10_000).elapsed_s > 0.0
+    finally:
+        pool.close()
