@@ -4,13 +4,14 @@ VENV   ?= .venv
 BIN    := $(VENV)/bin
 PACKAGES := sern_core sern_runtime sern_relay sern_client sern_sim sern_tools benchmarks tests
 
-.PHONY: help setup lint format types test lab bench demo schemas clean
+.PHONY: help setup lint format types test lab bench performance demo schemas clean
 
 help:
 	@echo "make setup    create $(VENV) with pinned dependencies"
 	@echo "make demo     relay, robot and site over a bad link, on this machine, next to plain ZMQ"
 	@echo "make test     every test;  make lint, make types: static checks"
 	@echo "make lab      the longer runs over tc netem, which need root, and the whole matrix of bad links"
+	@echo "make performance   as root: measure docs/performance.md anew, 20 minutes of a machine that does nothing else"
 	@echo "make bench    the quick benchmarks;  make schemas: regenerate schemas/ and the configuration reference"
 
 $(VENV)/.ready: pyproject.toml constraints.txt
@@ -41,6 +42,12 @@ lab: setup
 bench: setup
 	$(BIN)/python -m benchmarks.scheduler --quick
 	$(BIN)/python -m benchmarks.relay --quick
+
+performance: setup
+	mkdir -p build
+	$(BIN)/python -m benchmarks.link --plots docs/images --json build/link.json
+	$(BIN)/python -m benchmarks.robots --figure docs/images/perf-robots.png --json build/robots.json
+	$(BIN)/python -m benchmarks.document build/link.json build/robots.json
 
 demo: setup
 	$(BIN)/sern demo

@@ -4,10 +4,11 @@
 
     {"benchmark": NAME, "commit": HASH,
      "rows":  [{"case": ..., "system": ..., "<metric>_<unit>": number, ...}, ...],
-     "reach": [{"name": ..., "value": number, "limit": number, "ok": bool}, ...]}
+     "reach": [{"name": ..., "value": number, "limit": number, "at_least": bool, "ok": bool}, ...],
+     "notes": [...]}
 
-A reach is a figure the project set out to keep. Missing one is printed plainly and is not an error: the exit code is
-non-zero only if the benchmark could not run.
+`benchmarks.document` puts such a file into docs/performance.md. A reach is a figure the project set out to keep.
+Missing one is printed plainly and is not an error: the exit code is non-zero only if the benchmark could not run.
 """
 
 import argparse
@@ -83,7 +84,11 @@ class Report:
             "benchmark": self.benchmark,
             "commit": commit(),
             "rows": [{"case": row.case, "system": row.system, **row.metrics} for row in self.rows],
-            "reach": [{"name": r.name, "value": r.value, "limit": r.limit, "ok": r.ok} for r in self.reaches],
+            "reach": [
+                {"name": r.name, "value": r.value, "limit": r.limit, "at_least": r.at_least, "ok": r.ok}
+                for r in self.reaches
+            ],
+            "notes": self.notes,
         }
 
     def print(self, console: Console) -> None:

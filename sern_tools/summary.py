@@ -297,9 +297,10 @@ def judge(
     overtaken_share_limits: Mapping[str, float],
     baseline_factor: float = 10.0,
     fresh_limit_s: float = 3.0,
+    late_log_s: float = LATE_LOG_S,
 ) -> list[Verdict]:
     """The promises of a run. A promise that the run could not put to the test is not in the list."""
-    verdicts = [_reliable(sern), _intact(sern), *_order(sern, overtaken_share_limits), *_commands(sern)]
+    verdicts = [_reliable(sern), _intact(sern), *_order(sern, overtaken_share_limits), *_commands(sern, late_log_s)]
     if sern.accounting_gap is not None:
         notes = sern.accounting_notes[:4]
         if sern.given_up_but_arrived:
@@ -395,14 +396,14 @@ def _order(result: Result, limits: Mapping[str, float]) -> list[Verdict]:
     return verdicts
 
 
-def _commands(result: Result) -> list[Verdict]:
+def _commands(result: Result, late_log_s: float) -> list[Verdict]:
     late, worst_s, total = 0, 0.0, 0
     for name, lifespan_s in result.facts.command_lifespans_s.items():
         log = result.logs.get(name)
         for delivery in log.deliveries if log else ():
             total += 1
             worst_s = max(worst_s, delivery.latency_s - lifespan_s)
-            late += delivery.latency_s > lifespan_s + LATE_LOG_S
+            late += delivery.latency_s > lifespan_s + late_log_s
     if not result.facts.command_lifespans_s:
         return []
     return [

@@ -11,7 +11,7 @@ from benchmarks.link.sern import SAMPLE_COLUMNS
 from sern_core.errors import ConfigError
 
 SIZE_INCHES: Final = (7.5, 3.6)
-DPI: Final = 90
+DPI: Final = 110
 COLOURS: Final = {
     "sern-udp": "#0b6e4f",
     "sern-zmq": "#6bbf59",
@@ -32,8 +32,8 @@ def check() -> None:
     matplotlib.use("Agg")
 
 
-def latency(path: Path, title: str, outcomes: Sequence[Outcome]) -> None:
-    """Each pose that arrived: when it was sent, and how long it took."""
+def latency(path: Path, title: str, outcomes: Sequence[Outcome], floor_s: float | None) -> None:
+    """Each pose that arrived: when it was sent, and how long it took; the floor as a line."""
     from matplotlib import pyplot
 
     figure, axes = pyplot.subplots(figsize=SIZE_INCHES)
@@ -42,13 +42,15 @@ def latency(path: Path, title: str, outcomes: Sequence[Outcome]) -> None:
         at_s = (rows[:, figures.STAMP] - outcome.start_ns) / 1e9
         took_ms = (rows[:, figures.AT] - rows[:, figures.STAMP]) / 1e6
         axes.plot(at_s, took_ms, ".", markersize=2.5, label=outcome.system, color=COLOURS.get(outcome.system))
+    if floor_s is not None:
+        axes.axhline(1000 * floor_s, color="black", linewidth=0.8, linestyle=":", label="floor (idle link)")
     axes.set_yscale("log")
     axes.set_xlabel("time of sending [s]")
     axes.set_ylabel("latency of a pose [ms]")
     axes.set_title(title, fontsize=10)
     _mark(axes, outcomes[0])
     handles, labels = axes.get_legend_handles_labels()
-    axes.legend(handles[::-1], labels[::-1], fontsize=7, markerscale=4, loc="upper right")
+    axes.legend(handles[::-1], labels[::-1], fontsize=7, markerscale=4, loc="center left", bbox_to_anchor=(1.0, 0.5))
     _save(figure, path)
 
 
@@ -78,8 +80,12 @@ def window(path: Path, title: str, outcome: Outcome) -> None:
 
 
 def _mark(axes: Any, outcome: Outcome) -> None:
-    for asked_ns, _done_ns in outcome.events.values():
-        axes.axvline((asked_ns - outcome.start_ns) / 1e9, color="grey", linewidth=0.7, linestyle="--")
+    """The script: a blackout as a grey span, any other event as a line."""
+    at_s = {name: (asked_ns - outcome.start_ns) / 1e9 for name, (asked_ns, _done_ns) in outcome.events.items()}
+    if {"gone", "back"} <= at_s.keys():
+        axes.axvspan(at_s.pop("gone"), at_s.pop("back"), color="grey", alpha=0.25, linewidth=0, label="blackout")
+    for time_s in at_s.values():
+        axes.axvline(time_s, color="grey", linewidth=0.7, linestyle="--")
     axes.grid(alpha=0.3)
 
 

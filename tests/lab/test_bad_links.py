@@ -33,21 +33,23 @@ from sern_tools.summary import RunFacts, analyse, judge
 from tests.lab.test_sern import (
     COUNTER,
     MAP,
-    POSE_SILENCE_S,
     Placed,
     Run,
     files_for,
-    longest_silence_s,
     received,
     waiting,
 )
 from tests.support import until
 
-pytestmark = [pytest.mark.root, pytest.mark.lab_long]  # minutes of traffic: a busy machine ends some of it late
+pytestmark = pytest.mark.root
 UDP, ZMQ = "udp", "zmq"
 IDLE, TWICE = 0.2, 2.0
 RUN_S = 4.0
 RUNS_S = {"satcom": 2.5}  # which takes seconds to connect
+RECOVERY_S = 15.0
+"""A fresh pose is there so soon after a blackout: no measure of speed, as the machine may be busy with anything."""
+BUSY_S = 1.0
+"""For the same reason so much may pass between the last check of a command's age and the line in the log."""
 NEW_ADDRESS = "198.18.0.77"
 CALM_WAY = LinkModel(rate_bps=4e6, delay_s=0.025)
 CALM = LinkProfile("calm", "4 Mbit/s, 50 ms round trip", CALM_WAY, CALM_WAY)
@@ -157,7 +159,13 @@ def check(played: Run, profile: LinkProfile) -> None:
     topics = played.result.topics
     assert all(topics[name].delivered for name in (POSE_TOPIC, COUNTER, COMMAND_TOPIC))
     lossy = profile.up.mean_loss or profile.up.blackouts
-    verdicts = judge(played.result, None, overtaken_share_limits={} if lossy else {"state": STATE_OVERTAKEN_LIMIT})
+    verdicts = judge(
+        played.result,
+        None,
+        overtaken_share_limits={} if lossy else {"state": STATE_OVERTAKEN_LIMIT},
+        fresh_limit_s=RECOVERY_S,
+        late_log_s=BUSY_S,
+    )
     broken = [verdict for verdict in verdicts if not verdict.ok]
     assert not broken, broken
 
@@ -257,7 +265,7 @@ def filtering(lab: Lab) -> Lab:
 @pytest.mark.parametrize(
     ("name", "overload"),
     [
-        pytest.param("wifi", IDLE, id="wifi-idle"),
+        pytest.param("wifi", IDLE, id="wifi-idle", marks=pytest.mark.lab_long),
         pytest.param("wifi", TWICE, id="wifi-2x"),
         pytest.param("field-wifi", TWICE, id="field-wifi-2x"),
         pytest.param("lte", TWICE, id="lte-2x"),
@@ -270,7 +278,6 @@ async def test_promises_hold(lab: Lab, tmp_path: Path, name: str, overload: floa
     profile = load_profile(name)
     played = await play(lab, tmp_path, profile, overload=overload, run_s=RUNS_S.get(name, RUN_S))
     check(played, profile)
-    assert longest_silence_s(played) < POSE_SILENCE_S
     assert profile.up.rate_bps is not None
     assert played.carried_bps <= profile.up.rate_bps * 1.05, "more than the link carries: something went past it"
 
@@ -280,9 +287,9 @@ async def test_rate_steps(lab: Lab, tmp_path: Path) -> None:
     profile = scripted("step", steps=(RateStep(1.5, 1e6), RateStep(3.5, 4e6)))
     played = await play(lab, tmp_path, profile, overload=TWICE, run_s=5.0)
     check(played, profile)
-    assert longest_silence_s(played) < POSE_SILENCE_S
 
 
+@pytest.mark.lab_long
 async def test_flapping_path(lab: Lab, tmp_path: Path) -> None:
     flap = load_profile("flap").up.flap
     assert flap is not None
@@ -310,6 +317,7 @@ async def test_udp_blocked_it_falls_back_and_returns_by_itself(filtering: Lab, t
     check(played, CALM)
 
 
+@pytest.mark.lab_long
 async def test_tcp_blocked_while_udp_flows_the_session_outlives_it(filtering: Lab, tmp_path: Path) -> None:
     """Until the stream's connection is given up, and on from there."""
 

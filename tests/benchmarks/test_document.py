@@ -1,0 +1,70 @@
+"""Benchmarks write their figures into the documentation themselves."""
+
+import json
+
+import pytest
+
+from benchmarks.common import Report
+from benchmarks.document import DOCUMENT, insert, render
+from benchmarks.link.figures import NEVER_S
+from sern_core.errors import ConfigError
+
+
+def report() -> Report:
+    found = Report("link")
+    found.row("4 Mbit/s, 2x", "sern-udp", pose_p50_ms=28.44, goodput_Mbps=3.612, relay_cpu_percent=5.0)
+    found.row("4 Mbit/s, 2x", "tcpros", pose_p50_ms=9672.0, goodput_Mbps=3.7)
+    found.row("blackout", "sern-udp", fresh_s=0.246)
+    found.row("blackout", "tcpros", fresh_s=NEVER_S)
+    found.reach("p50, times the floor", 1.13, 1.10)
+    found.reach("goodput, share", 0.99, 0.97, at_least=True)
+    found.note("lab: native")
+    return found
+
+
+def test_a_table_for_each_case_and_the_limits() -> None:
+    written = json.loads(json.dumps(report().as_json()))
+    text = render(written)
+    assert "| system | pose p50, ms | goodput, Mbit/s | relay CPU, % |" in text
+    assert "| tcpros | 9,672 | 3.70 | – |" in text
+    assert "| sern-udp | 28.4 | 3.61 | 5.0 |" in text
+    assert "| tcpros | never |" in text and "| sern-udp | 0.25 |" in text
+    assert "| p50, times the floor | 1.13 | ≤ 1.1 | **missed** |" in text
+    assert "| goodput, share | 0.99 | ≥ 0.97 | reached |" in text
+    assert "lab: native" in text
+
+
+def test_one_system_gets_one_table() -> None:
+    fleet = Report("robots")
+    fleet.row("1 robots", "sern", control_p99_ms=2.0, relay_cpu_us=99.0)
+    fleet.row("50 robots", "sern", control_p99_ms=3.0, relay_cpu_us=88.0)
+    lines = render(fleet.as_json()).splitlines()
+    assert lines[2:] == [
+        "| case | control p99, ms | relay CPU a message, µs |",
+        "| --- | --- | --- |",
+        "| 1 robots | 2.0 | 99.0 |",
+        "| 50 robots | 3.0 | 88.0 |",
+    ]
+
+
+@pytest.mark.parametrize("name", ["link", "robots"])
+def test_the_document_has_a_place_for_them_and_keeps_the_rest(name: str) -> None:
+    text = DOCUMENT.read_text(encoding="utf-8")
+    once = insert(text, name, "figures")
+    assert insert(once, name, "figures") == once
+    assert f"<!-- {name} begin -->\nfigures\n<!-- {name} end -->" in once
+    before, _, rest = text.partition(f"<!-- {name} begin -->")
+    assert once.startswith(before) and once.endswith(rest.partition(f"<!-- {name} end -->")[2])
+
+
+def test_pictures_of_the_document_are_there() -> None:
+    text = DOCUMENT.read_text(encoding="utf-8")
+    pictures = [part.partition(")")[0] for part in text.split("](images/")[1:]]
+    assert pictures
+    assert [name for name in pictures if not (DOCUMENT.parent / "images" / name).exists()] == []
+
+
+@pytest.mark.parametrize("text", ["", "<!-- x begin -->", "<!-- x end --><!-- x begin -->"])
+def test_a_document_without_the_marks_is_refused(text: str) -> None:
+    with pytest.raises(ConfigError, match="no place for the figures of x"):
+        insert(text, "x", "y")
