@@ -184,8 +184,14 @@ class RosLab:
         return endpoint, events
 
     def lines(self, name: str) -> list[Any]:
-        """The JSON lines that a script has printed."""
-        return [json.loads(line) for line in self.printed(name).splitlines() if line.startswith(("{", "["))]
+        """The JSON lines that a script has printed; its last line may be under way."""
+        complete = self.printed(name).rpartition("\n")[0]
+        return [json.loads(line) for line in complete.splitlines() if line.startswith(("{", "["))]
+
+    def line_count(self, name: str) -> int:
+        """How many lines it has printed, which is quicker to tell."""
+        path = self.directory / f"{name}.txt"
+        return path.read_bytes().count(b"\n") if path.exists() else 0
 
 
 def publisher(topic: str, type_name: str, body: str, *, rate_hz: float = 20, latch: bool = False) -> str:
@@ -204,12 +210,13 @@ def publisher(topic: str, type_name: str, body: str, *, rate_hz: float = 20, lat
 
 
 SUBSCRIBER: Final = """
-import sys, json, zlib, rospy
+import os, sys, json, zlib, rospy
 rospy.init_node(sys.argv[1], disable_rosout=True)
 def got(message, topic):
     header = message._connection_header
-    print(json.dumps({"topic": topic, "crc": zlib.crc32(message._buff), "bytes": len(message._buff),
-                      "hex": message._buff[:200].hex(), "md5sum": header["md5sum"], "type": header["type"]}))
+    line = json.dumps({"topic": topic, "crc": zlib.crc32(message._buff), "bytes": len(message._buff),
+                      "hex": message._buff[:64].hex(), "md5sum": header["md5sum"], "type": header["type"]})
+    os.write(1, line.encode() + b"\\n")  # at once: every topic has a thread of its own
 for topic in sys.argv[2:]:
     rospy.Subscriber(topic, rospy.AnyMsg, got, topic, queue_size=None, tcp_nodelay=True)
 print("ready")

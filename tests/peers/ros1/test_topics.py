@@ -277,7 +277,7 @@ async def test_plays_a_real_bag_through_rosbag_play(tmp_path: Path) -> None:
     async with RosLab(tmp_path) as ros:
         endpoint, events = await ros.started()
         play = ros.spawn(
-            "play", "/usr/lib/rosbag/play", "--pause", "--wait-for-subscribers", "-r", "100", "-d", "0", str(bag),
+            "play", "/usr/lib/rosbag/play", "--pause", "--queue", "100000", "-r", "100", "-d", "0", str(bag),
             stdin=subprocess.PIPE,
         )  # fmt: skip
         await until(lambda: expected.keys() <= events.topics.keys(), "the topics are announced")
