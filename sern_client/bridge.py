@@ -1,6 +1,7 @@
 """Joins an endpoint to the client core: discovery, names, rules, leases; what comes in goes out on the other side."""
 
 import logging
+import re
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -11,7 +12,10 @@ from sern_client.endpoints.base import Endpoint, Publisher, Subscription
 from sern_client.endpoints.composite import CompositeEndpoint
 from sern_client.frames import FramePrefixer, Rewrite
 from sern_client.message_log import MessageLog
+from sern_client.rebuild import Rebuilds
 from sern_client.services import ServiceBridge
+from sern_client.summarise import Send, Source, Summaries
+from sern_client.tf_merge import LatchedTransforms, MergedTransforms
 from sern_client.udp import ClientLane
 from sern_core import wire
 from sern_core.client import ClientCore
@@ -19,9 +23,10 @@ from sern_core.errors import ConfigError, UsageError
 from sern_core.lease import CommandLease
 from sern_core.message import Message, StreamId, StreamInfo, TopicInfo
 from sern_core.queues import OutChannel
-from sern_core.rules import Discovery, RuleSet, to_global
+from sern_core.rules import Discovery, ResolvedTopic, RuleSet, to_global
 from sern_core.services import parse as parse_service
-from sern_core.types import DropReason, TopicName
+from sern_core.summaries.transforms import is_static
+from sern_core.types import DropReason, Encoding, TopicName
 from sern_runtime import ros_types
 from sern_runtime.link_metrics import AgeHistograms
 from sern_runtime.loop import Timer
@@ -32,24 +37,26 @@ _log = logging.getLogger(__name__)
 
 
 class Outgoing:
-    """A local topic that is offered to the link."""
+    """A local topic that is offered to the link; `source` makes something else of it before."""
 
-    __slots__ = ("channel", "subscription")
+    __slots__ = ("channel", "source", "subscription")
 
-    def __init__(self, channel: OutChannel, subscription: Subscription) -> None:
+    def __init__(self, channel: OutChannel, subscription: Subscription, source: Source | None) -> None:
         self.channel = channel
         self.subscription = subscription
+        self.source = source
 
 
 class Incoming:
-    """A stream from elsewhere that is published here. `stop` is the body that a lost link makes us publish."""
+    """A stream from elsewhere that is published here. `stop` is the body that a lost link makes us publish.
+    `publisher` None: it is of use to another stream only."""
 
     __slots__ = ("lease", "local", "publisher", "rewrite", "stop")
 
     def __init__(
         self,
         local: TopicName,
-        publisher: Publisher,
+        publisher: Publisher | None,
         lease: CommandLease | None,
         stop: bytes | None,
         rewrite: Rewrite | None,
@@ -106,6 +113,9 @@ class Bridge:
         self._incoming: dict[StreamId, Incoming] = {}
         self._last_arrival_s: dict[StreamId, float] = {}
         self._timer = Timer(self._leases_due)
+        self.summaries = Summaries(self._sender)
+        self.rebuilds = Rebuilds()
+        self._asked: tuple[str, ...] | None = None  # the patterns we were started with
 
     def attach(self, core: ClientCore) -> None:
         self._core = core
@@ -122,10 +132,19 @@ class Bridge:
         for outgoing in self._outgoing.values():
             outgoing.subscription.close()
 
+    @property
+    def pending(self) -> int:
+        """Messages that something else is being made of, and that are not offered to the link yet."""
+        return sum(outgoing.source.pending for outgoing in self._outgoing.values() if outgoing.source is not None)
+
     def close(self) -> None:
         """Before the endpoint is stopped: a robot that is being commanded is told to stand still."""
         self.stop_sources()
         self._closed = True
+        for outgoing in self._outgoing.values():
+            if outgoing.source is not None:
+                outgoing.source.close()
+        self.summaries.close()
         self._outgoing.clear()
         self._timer.cancel()
         for incoming in self._incoming.values():
@@ -136,9 +155,12 @@ class Bridge:
         """No more commands will come from there: the last one must not stand."""
         if incoming.lease is not None and incoming.stop is not None and incoming.lease.deadline() is not None:
             self._publish(incoming, incoming.stop, time.time_ns())
-        incoming.publisher.close()
+        if incoming.publisher is not None:
+            incoming.publisher.close()
 
     def _publish(self, incoming: Incoming, body: bytes, stamp_ns: int) -> None:
+        if incoming.publisher is None:
+            return
         try:
             incoming.publisher.publish(body, stamp_ns)
         except Exception:  # noqa: BLE001  (a fault of one topic; the link below must finish what it was doing)
@@ -162,35 +184,67 @@ class Bridge:
             return
         name = to_global(resolved.name, self.namespace)
         try:
-            channel = self.core.publish(replace(info, name=name), resolved.spec, now=time.monotonic())
+            channel, source = self._offer(info, resolved, name)
         except UsageError as error:
             _log.error("%s cannot be offered as %s: %s", info.name, name, error)
             return
-        subscription = self.endpoint.subscribe(info.name, self._sink(channel, self.frames.outgoing(info)))
-        self._outgoing[info.name] = Outgoing(channel, subscription)
+        sink = self._sink(channel, self.frames.outgoing(info)) if source is None else source.sink
+        self._outgoing[info.name] = Outgoing(channel, self.endpoint.subscribe(info.name, sink), source)
         self._kick()
+
+    def _offer(self, info: TopicInfo, resolved: ResolvedTopic, name: TopicName) -> tuple[OutChannel, Source | None]:
+        """Offer a topic to the link, with what its rule makes of it. UsageError when it cannot be."""
+        core, spec = self.core, resolved.spec
+        if resolved.rule is not None and resolved.summaries:
+            opened = self.summaries.open(core, info, resolved, self.rules.rules[resolved.rule], name)
+            if opened is not None:
+                return opened
+        merge = resolved.merge_tf and info.encoding is not Encoding.RAW
+        static = info.latched or is_static(info.name)
+        capped_hz = spec.max_rate_hz
+        if merge:
+            # A message of all static transforms replaces the ones before; every other one counts.
+            spec = replace(spec, max_rate_hz=None, depth=1 if static else spec.depth)
+        channel = core.publish(replace(info, name=name), spec, now=time.monotonic())
+        if not merge:
+            return channel, None
+        send = self._sender(channel, info)
+        if static:
+            return channel, LatchedTransforms(core, channel, send, info.name, info.encoding)
+        return channel, MergedTransforms(core, channel, send, info.name, info.encoding, max_rate_hz=capped_hz)
 
     def topic_removed(self, name: TopicName) -> None:
         outgoing = self._outgoing.pop(name, None)
         if outgoing is not None:
             outgoing.subscription.close()
+            if outgoing.source is not None:
+                outgoing.source.close()
+                self.summaries.forget(outgoing.source)
             self.core.unpublish(outgoing.channel, now=time.monotonic())
             self._kick()
 
     def _sink(self, channel: OutChannel, rewrite: Rewrite | None) -> Callable[[bytes, int], bool]:
+        send = self._send(channel, rewrite)
+        return lambda body, stamp_ns: send(body, stamp_ns, None)
+
+    def _sender(self, channel: OutChannel, info: TopicInfo) -> Send:
+        """What puts bodies of the type `info` into a channel; for topics of which something else is made."""
+        return self._send(channel, self.frames.outgoing(info))
+
+    def _send(self, channel: OutChannel, rewrite: Rewrite | None) -> Callable[[bytes, int, float | None], bool]:
         core, kick, log, stream = self.core, self._kick, self._log, channel.stream
 
-        def sink(body: bytes, stamp_ns: int) -> bool:
+        def send(body: bytes, stamp_ns: int, born_s: float | None) -> bool:
             seq = channel.next_seq
             if rewrite is not None:
                 body = rewrite(body)
-            accepted = core.send(channel, body, stamp_ns, now=time.monotonic())
+            accepted = core.send(channel, body, stamp_ns, born_s=born_s, now=time.monotonic())
             if log is not None:
                 log.offered(stream, seq, body, stamp_ns, accepted=accepted)
             kick()
             return accepted
 
-        return sink
+        return send
 
     # --- ClientEvents: from the link --------------------------------------------------------------------------------
 
@@ -227,7 +281,9 @@ class Bridge:
             resolved = self.rules.resolve(info, local_name=local)
             if not resolved.direction.receives:
                 raise ConfigError(f"{local} is only sent from here (direction: send); not received")
-            publisher = self.converter.advertise(self.endpoint, info)
+            publisher = None
+            if self._published_here(stream):
+                publisher = self.converter.advertise(self.endpoint, info)
         except ConfigError as error:
             _log.error("%s from %s is not received: %s", stream.id.topic, stream.id.origin, error)
             raise
@@ -238,10 +294,34 @@ class Bridge:
                 _log.error("%s is %s: on_link_loss cannot stop it; no lease", local, info.type_name)
             else:
                 lease = CommandLease(resolved.lease.after_s)
-        self._incoming[stream.id] = Incoming(local, publisher, lease, stop, self.frames.incoming(info))
+        incoming = Incoming(local, publisher, lease, stop, self.frames.incoming(info))
+        self._incoming[stream.id] = incoming
+        updates = self.rebuilds.opened(stream, lambda body, stamp_ns: self._show(incoming, body, stamp_ns))
+        if updates is not None:
+            self._ask_for(updates)
         _log.info("receiving %s from %s as %s", stream.id.topic, stream.id.origin, local)
 
+    def _published_here(self, stream: StreamInfo) -> bool:
+        """Of patches, the updates are only taken to make whole grids of, unless somebody here has asked for them."""
+        if not self.rebuilds.is_updates(stream) or self._asked is None:
+            return True
+        return any(re.fullmatch(pattern, stream.id.topic) for pattern in self._asked)
+
+    def _ask_for(self, topic: TopicName) -> None:
+        """Subscribe to one more topic, unless our patterns have it already."""
+        patterns = self.core.patterns
+        if self._asked is None:
+            self._asked = patterns
+        if not any(re.fullmatch(pattern, topic) for pattern in patterns):
+            self.core.subscribe((*patterns, re.escape(topic)), now=time.monotonic())
+            self._kick()
+
+    def _show(self, incoming: Incoming, body: bytes, stamp_ns: int) -> None:
+        """Publish what was put together here."""
+        self._publish(incoming, body if incoming.rewrite is None else incoming.rewrite(body), stamp_ns)
+
     def stream_closed(self, stream: StreamInfo) -> None:
+        self.rebuilds.closed(stream)
         if self.services is not None:
             self.services.stream_closed(stream)
         incoming = self._incoming.pop(stream.id, None)
@@ -257,8 +337,8 @@ class Bridge:
                 self.services.message(stream, message)
             return
         age_s = now - message.born_s
-        body = message.body if incoming.rewrite is None else incoming.rewrite(message.body)
-        self._publish(incoming, body, message.stamp_ns)
+        if not self.rebuilds.message(stream, message):
+            self._show(incoming, message.body, message.stamp_ns)
         self.ages.observe(stream.spec.priority, age_s)
         if stream.spec.deadline_s is not None:
             self._check_deadline(stream, now)
@@ -287,11 +367,20 @@ class Bridge:
 
     def wanted(self, stream: StreamInfo, wanted: bool) -> None:
         for local, outgoing in self._outgoing.items():
+            source = outgoing.source
+            if source is not None and (source.owns(stream.id) or outgoing.channel.stream.id == stream.id):
+                if wanted:
+                    source.audience_changed()
+                self.endpoint.interest(local, source.wanted)
+                break
             if outgoing.channel.stream.id == stream.id:
                 self.endpoint.interest(local, wanted)
                 break
 
     def send_dropped(self, stream: StreamInfo, seq: int, reason: DropReason) -> None:
+        for outgoing in self._outgoing.values():
+            if outgoing.source is not None:
+                outgoing.source.lost(stream.id)
         if self.services is not None:
             self.services.send_dropped(stream, seq, reason)
         if stream.spec.reliable and not self._closed:  # what is left at the end was said in one line

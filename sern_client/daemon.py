@@ -313,7 +313,7 @@ class ClientDaemon:
         before: tuple[int, ...] = ()
         while now < give_up_s:
             channels = [channel for channel in link.channels.values() if channel.wanted is not False]
-            unsent = sum(len(channel.queue) + len(channel.flying) for channel in channels)
+            unsent = sum(len(channel.queue) + len(channel.flying) for channel in channels) + self.bridge.pending
             unconfirmed = sum(len(channel.retained) for channel in channels)
             if not unconfirmed and (not unsent or not link.established or link.lane.stalled):
                 break

@@ -125,14 +125,17 @@ class ClientCore:
 
     # --- publishing -----------------------------------------------------------------------------------------------
 
-    def publish(self, info: TopicInfo, spec: TopicSpec, *, now: float) -> OutChannel:
+    def publish(
+        self, info: TopicInfo, spec: TopicSpec, *, attributes: dict[str, str] | None = None, now: float
+    ) -> OutChannel:
         """Offer a topic under its global name. Offering it again after `unpublish` goes on counting where it ended.
+        `attributes` travel with its announcement.
 
         Raises UsageError if it is offered already, or no relay would accept it.
         """
         identity = StreamId(self.name, self.boot, info.name)
         first = self._generations.get(identity, 0) + 1
-        stream = StreamInfo(identity, info, spec)
+        stream = StreamInfo(identity, info, spec, dict(attributes or {}))
         check_stream(stream)
         channel = self.link.open_channel(stream, first=first, now=now)
         if spec.latched:
@@ -144,9 +147,10 @@ class ClientCore:
         self._latched.pop(channel.stream.id, None)
         self.link.close_channel(channel, DropReason.SHUTDOWN, now=now)
 
-    def send(self, channel: OutChannel, body: bytes, stamp_ns: int, *, now: float) -> bool:
-        """Offer one message. False: refused, the reliable queue is full; offer it again later or count it lost."""
-        message = Message(channel.stream.id, channel.next_seq, body, stamp_ns, now)
+    def send(self, channel: OutChannel, body: bytes, stamp_ns: int, *, born_s: float | None = None, now: float) -> bool:
+        """Offer one message. False: refused, the reliable queue is full; offer it again later or count it lost.
+        `born_s`: when it was taken, if that was before `now`."""
+        message = Message(channel.stream.id, channel.next_seq, body, stamp_ns, now if born_s is None else born_s)
         accepted = self.link.submit(channel, message, now=now)
         if accepted and channel.spec.latched:
             self._latched[channel.stream.id].add(message)
@@ -159,6 +163,12 @@ class ClientCore:
     def codec_profiles(self, channel: OutChannel) -> dict[Compression, CodecProfile]:
         """What each mode makes of this channel's messages, as measured so far."""
         return {} if channel.codec is None else dict(channel.codec.profiles)
+
+    def drop(self, channel: OutChannel, size_bytes: int, reason: DropReason, *, now: float) -> None:
+        """Count a message of this channel that was given up before it was offered to the link."""
+        channel.counters.offer(size_bytes)
+        channel.counters.drop(reason, size_bytes)
+        self.trace.record(now, channel.stream.id.topic, TraceEvent.DROPPED, reason=reason)
 
     # --- receiving ------------------------------------------------------------------------------------------------
 

@@ -99,6 +99,27 @@ class OutMessage:
         self.counted = True
 
 
+class RateCap:
+    """At most `max_rate_hz` samples a second; None: all."""
+
+    __slots__ = ("_next_allowed_s", "max_rate_hz")
+
+    def __init__(self, max_rate_hz: float | None) -> None:
+        self.max_rate_hz = max_rate_hz
+        self._next_allowed_s: float | None = None
+
+    def allows(self, now: float) -> bool:
+        """Whether a sample may pass now; it is taken to pass."""
+        if self.max_rate_hz is None:
+            return True
+        period_s = 1.0 / self.max_rate_hz
+        allowed_s = self._next_allowed_s
+        if allowed_s is not None and now < allowed_s - RATE_CAP_SLACK * period_s:
+            return False
+        self._next_allowed_s = period_s + (now if allowed_s is None or now > allowed_s + period_s else allowed_s)
+        return True
+
+
 class OutChannel:
     """One stream towards one peer. The link serves it through `head` and `sent`; `slot` is its scheduler slot."""
 
@@ -121,7 +142,6 @@ class OutChannel:
         self.begun_seq = 0
         self.next_seq = first  # the next seq expected from `submit`
         self.last_sent_s: float | None = None
-        self._next_allowed_s: float | None = None
         self.share = 1.0
         """Share of the messages that are let in (`adapt`)."""
         self.depth = stream.spec.depth
@@ -129,6 +149,7 @@ class OutChannel:
         self.thinned = 0
         """Messages that `share` left out."""
         self._owed_share = 0.0
+        self._cap = RateCap(stream.spec.max_rate_hz)
         self.wanted: bool | None = None  # None until the peer has answered
         self.ready = False  # announced in this session
         self.gaps: deque[tuple[int, int]] = deque()  # reliable: after this seq, the next that will come
@@ -168,7 +189,7 @@ class OutChannel:
             if self.wanted is False:
                 counters.drop(DropReason.UNWANTED, size)
                 return True
-            if self.spec.max_rate_hz is not None and not forced and not self._rate_allows(now):
+            if not forced and not self._cap.allows(now):
                 counters.drop(DropReason.RATE_CAP, size)
                 return True
             if self.share < 1.0 and not self._share_allows():
@@ -226,15 +247,6 @@ class OutChannel:
             self.retained_bytes += out.size
         self.queue.append(out)
         self.queued_bytes += out.size
-
-    def _rate_allows(self, now: float) -> bool:
-        assert self.spec.max_rate_hz is not None
-        period_s = 1.0 / self.spec.max_rate_hz
-        allowed_s = self._next_allowed_s
-        if allowed_s is not None and now < allowed_s - RATE_CAP_SLACK * period_s:
-            return False
-        self._next_allowed_s = period_s + (now if allowed_s is None or now > allowed_s + period_s else allowed_s)
-        return True
 
     def _share_allows(self) -> bool:
         """Let `share` of the messages through, evenly spread."""

@@ -25,6 +25,8 @@ from sern_core.message import (
     TopicInfo,
     TopicSpec,
 )
+from sern_core.summaries.spec import SummarySpec
+from sern_core.summaries.transforms import TF_TYPES, is_static
 from sern_core.types import ClientName, Durability, Encoding, PriorityClass, Reliability, TopicName
 
 NAME_MAX_CHARS: Final = 255
@@ -192,6 +194,8 @@ class TopicRule:
     remap: TopicName | None = None
     lease: Lease | None = None
     compression: Compression | None = None
+    summaries: tuple[SummarySpec, ...] = ()
+    merge_tf: bool | None = None
 
     @property
     def plain_name(self) -> TopicName | None:
@@ -211,7 +215,8 @@ class TopicRule:
 class ResolvedTopic:
     """What the rules say about one topic. `rule` is the index of the rule, None when no rule matched.
 
-    `name` is the local name after `remap`: the one to give to `to_global`.
+    `name` is the local name after `remap`: the one to give to `to_global`. `merge_tf`: it carries transforms, to be
+    merged on their way out.
     """
 
     spec: TopicSpec
@@ -219,6 +224,8 @@ class ResolvedTopic:
     name: TopicName
     lease: Lease | None
     rule: int | None
+    summaries: tuple[SummarySpec, ...] = ()
+    merge_tf: bool = False
 
 
 class RuleError(UsageError):
@@ -284,7 +291,8 @@ class RuleSet:
         - reliability, durability: the publisher's; a publisher that does not say (ROS 1) is reliable if it latches;
         - depth: 10 if reliable, else 1;
         - lifespan: 0.3 s for a velocity command in class control; for ever if reliable or latched; else 1 s;
-        - weight κ: by class; many_writers: true for `/tf` and `/tf_static`.
+        - weight κ: by class; many_writers: true for `/tf` and `/tf_static`;
+        - merge_tf: for transforms in class state, and for `/tf_static` and other latched ones with or without a rule.
 
         Raises ConfigError when the rule has `on_link_loss` and the type is known to be no velocity command, and when
         the topic has the name that `remap` gave to another one.
@@ -292,6 +300,8 @@ class RuleSet:
         index = self.find(info.type_name, local_name)
         durability = Durability.TRANSIENT_LOCAL if info.latched else Durability.VOLATILE
         many_writers = local_name in MANY_WRITER_TOPICS
+        transforms = plain_type(info.type_name) in TF_TYPES
+        static = transforms and (info.latched or is_static(local_name))
         if local_name in self._inward and (index is None or self.rules[index].remap is None):
             raise ConfigError(
                 f"{local_name} is a local topic and also the new name that `remap` gives to {self._inward[local_name]}"
@@ -303,7 +313,7 @@ class RuleSet:
                 many_writers=many_writers,
                 retention_s=self.retention_s,
             )
-            return ResolvedTopic(spec, Direction.BOTH, local_name, None, None)
+            return ResolvedTopic(spec, Direction.BOTH, local_name, None, None, merge_tf=static)
         rule = self.rules[index]
         command = plain_type(info.type_name) in COMMAND_TYPES
         if rule.lease is not None and info.type_name and not command:
@@ -334,7 +344,11 @@ class RuleSet:
             many_writers=many_writers if rule.many_writers is None else rule.many_writers,
             compression=rule.compression,
         )
-        return ResolvedTopic(spec, rule.direction, rule.remap or local_name, rule.lease, index)
+        merge_tf = static or (transforms and rule.priority is PriorityClass.STATE)
+        if rule.merge_tf is not None:
+            merge_tf = transforms and rule.merge_tf
+        name = rule.remap or local_name
+        return ResolvedTopic(spec, rule.direction, name, rule.lease, index, rule.summaries, merge_tf)
 
     def outward(self, info: TopicInfo, *, local_name: TopicName, namespace: str) -> TopicName:
         """The global name of a local topic: `remap`, then the namespace."""

@@ -83,7 +83,7 @@ class DropReason(StrEnum):
     DISCONNECTED = "disconnected"  # the peer went away for good
     SHUTDOWN = "shutdown"  # the daemon stopped before it was sent
     QUEUE_FULL = "queue_full"  # more waits for this client at the relay than its access rule allows
-    UNDECODABLE = "undecodable"  # its body cannot be decoded: damaged, above the limit, or a codec we do not have
+    UNDECODABLE = "undecodable"  # its body cannot be decoded: damaged, above the limit, of another layout or codec
     UNCONFIRMED = "unconfirmed"  # sent whole, given up without an acknowledgement: it may have arrived
 
 

@@ -20,6 +20,11 @@ MAX_TRANSFORMS: Final = 4096
 """In one message, and frames that are kept."""
 
 
+def is_static(topic: str) -> bool:
+    """Whether a topic holds transforms for ever by its name: /tf_static, in any namespace."""
+    return topic.endswith("/tf_static")
+
+
 @dataclass(frozen=True, slots=True)
 class Transform:
     """geometry_msgs/TransformStamped: of `child` in the frame `header.frame_id`."""
@@ -31,7 +36,8 @@ class Transform:
 
     @property
     def pair(self) -> tuple[str, str]:
-        return self.header.frame_id, self.child
+        """Parent and child; a leading slash means nothing to tf2."""
+        return self.header.frame_id.removeprefix("/"), self.child.removeprefix("/")
 
 
 def read_transforms(body: bytes, encoding: Encoding) -> list[Transform]:
@@ -106,13 +112,17 @@ class StaticTransforms:
     def add(self, body: bytes) -> bytes | None:
         """A message of everything, once `body` is in; None when `body` said nothing new. BodyError."""
         transforms = read_transforms(body, self._encoding)
-        merged = self._by_child | {transform.child: transform for transform in transforms}
+        merged = self._by_child | {transform.pair[1]: transform for transform in transforms}
         if len(merged) > MAX_TRANSFORMS:
             raise BodyError(f"more than {MAX_TRANSFORMS} frames")
         if all(_same(merged[child], self._by_child.get(child)) for child in merged):
             return None
         self._by_child = merged
-        return write_transforms(list(merged.values()), self._encoding)
+        return self.body()
+
+    def body(self) -> bytes:
+        """A message of everything."""
+        return write_transforms(list(self._by_child.values()), self._encoding)
 
 
 def _same(one: Transform, other: Transform | None) -> bool:

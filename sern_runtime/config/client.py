@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Final, Literal
 
 from pydantic import Discriminator, Field, Tag, model_validator
 
@@ -22,6 +22,7 @@ from sern_core.rules import (
     RuleSet,
     TopicRule,
     compile_pattern,
+    name_problem,
     normal_namespace,
 )
 from sern_core.services import ServiceRule, subscriptions
@@ -57,6 +58,7 @@ from sern_runtime.config.shared import (
     public_key_problems,
     secret_key_problems,
 )
+from sern_runtime.config.summaries import OneOrMoreSummaries, one_or_list, specs
 
 
 class ClientSection(Section):
@@ -184,6 +186,28 @@ class TopicSection(Section):
     """Another name for this topic outside this site, before the namespace; needs a plain name in `match`."""
     on_link_loss: LossSection | None = None
     """For topics of type geometry_msgs/Twist or TwistStamped that come in: what to publish when commands stop."""
+    summary: OneOrMoreSummaries = ()
+    """Send something smaller in place of heavy messages, or beside them: one mapping, or a list of them. `kind`
+    selects what it is."""
+    merge_tf: bool | None = None
+    """For tf2_msgs/TFMessage: many messages become one with the newest transform of each pair of frames, at most
+    `max_rate_hz` (20) a second, of /tf_static one with all there are; null: in class state, and /tf_static always."""
+
+    @model_validator(mode="after")
+    def _summaries_fit(self) -> "TopicSection":
+        found = specs(self.summary)
+        if len(found) > 1 and any(spec.shares_topic for spec in found):
+            raise fault(
+                "patches and in_place voxels take the topic for themselves; give no other beside them", "summary"
+            )
+        names = [spec.topic("") for spec in found]
+        if len(set(names)) < len(names):
+            raise fault("gives two summaries one name; use `as`", "summary")
+        if any(spec.name is not None and spec.name.startswith("/") for spec in found) and name_problem(self.match):
+            raise fault("`as` is a whole topic name, which needs a plain name in `match`", "summary")
+        if found and self.direction is Direction.RECEIVE:
+            raise fault("is made where messages leave; direction is receive", "summary")
+        return self
 
     @model_validator(mode="after")
     def _consistent(self) -> "TopicSection":
@@ -226,6 +250,8 @@ class TopicSection(Section):
             remap=None if self.remap is None else TopicName(self.remap),
             compression=None if self.compression == "auto" else Compression(self.compression),
             lease=None if loss is None else Lease(publish=loss.publish, after_s=loss.after_s),
+            summaries=specs(self.summary),
+            merge_tf=self.merge_tf,
         )
 
 
@@ -325,10 +351,6 @@ class ActionsSection(Section):
         return tuple(section.under(part) for section in self.use for part in ("result", ACTION_STATE))
 
 
-def _one_or_list(value: Any) -> str:
-    return "<list>" if isinstance(value, (list, tuple)) else "<one>"
-
-
 class ClientFile(FileModel):
     """Configuration of one client daemon."""
 
@@ -339,7 +361,7 @@ class ClientFile(FileModel):
     endpoint: Annotated[
         Annotated[EndpointSection, Tag("<one>")]
         | Annotated[tuple[EndpointSection, ...], Field(min_length=1), Tag("<list>")],
-        Discriminator(_one_or_list),
+        Discriminator(one_or_list),
     ]
     """Where messages come from and go to: one mapping, or a list of them. `kind` selects what it is."""
     discovery: DiscoverySection = DiscoverySection()

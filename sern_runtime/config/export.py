@@ -15,7 +15,6 @@ from pydantic import TypeAdapter
 
 from sern_runtime.config.base import FileModel, Section
 from sern_runtime.config.client import ClientFile
-from sern_runtime.config.endpoints import EndpointBase
 from sern_runtime.config.load import models_in
 from sern_runtime.config.relay import RelayFile
 from sern_runtime.keys import PublicKeyFile, SecretKeyFile
@@ -85,7 +84,7 @@ def _sections(model: type[Section], path: tuple[str, ...]) -> Iterator[str]:
     for name, field in model.model_fields.items():
         for inner in dict.fromkeys(models_in(field.annotation)):
             inner_path = (*path, field.alias or name)
-            kind = f", kind `{_kind_of(inner)}`" if issubclass(inner, EndpointBase) else ""
+            kind = f", kind `{_kind_of(inner)}`" if "kind" in inner.model_fields else ""
             yield f"### `{'.'.join(inner_path)}`{kind}\n\n{_prose(inner)}\n"
             yield from _sections(inner, inner_path)
 

@@ -1,0 +1,86 @@
+"""What a topic rule says about summaries, as plain data."""
+
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Final
+
+from sern_core.summaries.clouds import CLOUD_TYPE
+from sern_core.summaries.grids import GRID_TYPE
+from sern_core.summaries.mask import MaskParams
+from sern_core.summaries.patches import PatchParams
+from sern_core.summaries.scan import SCAN_TYPE, ScanParams
+from sern_core.summaries.voxel import VoxelPoint
+from sern_core.types import PriorityClass
+
+BEST_EFFORT_KEYFRAME_S: Final = 10.0
+"""How often a changed grid is repeated whole where patches can be lost without a word."""
+
+
+class SummaryKind(StrEnum):
+    VOXEL = "voxel"
+    SCAN = "scan"
+    OCCUPANCY_MASK = "occupancy_mask"
+    PATCHES = "patches"
+
+    @property
+    def source_type(self) -> str:
+        return GRID_TYPE if self is SummaryKind.PATCHES else CLOUD_TYPE
+
+    @property
+    def result_type(self) -> str:
+        """What is published in place of the raw message; patches come together as whole grids again."""
+        return {SummaryKind.VOXEL: CLOUD_TYPE, SummaryKind.SCAN: SCAN_TYPE}.get(self, GRID_TYPE)
+
+
+class SummaryLevel(StrEnum):
+    RAW = "raw"  # messages as they come
+    SUMMARY = "summary"
+
+
+@dataclass(frozen=True, slots=True)
+class VoxelParams:
+    """`fields`: only these beside x, y and z; None: all. `in_place`: under the topic's own name."""
+
+    voxel_m: float = 0.1
+    point: VoxelPoint = VoxelPoint.CENTROID
+    fields: tuple[str, ...] | None = None
+    in_place: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class SummarySpec:
+    """One summary of a topic. `name`: what is put behind the topic's name, or a whole name if it begins with `/`;
+    None: its kind's. `priority` None: state for scans and masks, else as the topic. `beside`: the raw topic is sent as
+    well, whatever the level."""
+
+    params: VoxelParams | ScanParams | MaskParams | PatchParams = field(default_factory=VoxelParams)
+    level: SummaryLevel = SummaryLevel.SUMMARY
+    name: str | None = None
+    priority: PriorityClass | None = None
+    beside: bool = False
+
+    @property
+    def kind(self) -> SummaryKind:
+        match self.params:
+            case VoxelParams():
+                return SummaryKind.VOXEL
+            case ScanParams():
+                return SummaryKind.SCAN
+            case MaskParams():
+                return SummaryKind.OCCUPANCY_MASK
+            case PatchParams():
+                return SummaryKind.PATCHES
+
+    @property
+    def shares_topic(self) -> bool:
+        """Whether raw messages and summaries are messages of one stream."""
+        return isinstance(self.params, PatchParams) or (isinstance(self.params, VoxelParams) and self.params.in_place)
+
+    def topic(self, topic: str) -> str:
+        """What the summary of `topic` is called; of patches, the stream of the updates."""
+        if isinstance(self.params, PatchParams):
+            return topic + "_updates"
+        if self.shares_topic:
+            return topic
+        name = self.name or {SummaryKind.OCCUPANCY_MASK: "mask"}.get(self.kind, str(self.kind))
+        return name if name.startswith("/") else f"{topic}/{name}"
