@@ -177,7 +177,7 @@ class TopicSummary:
                 self._take(job._replace(level=SummaryLevel.SUMMARY, probe=True))
             return not self.shares_topic or self._take(job)
         if self.channel.wanted is False and not self.channel.spec.latched:
-            self._core.drop(self.channel, len(body), DropReason.UNWANTED, now=now)
+            self._drop(job, DropReason.UNWANTED)
             return True
         return self._take(job)
 
@@ -206,7 +206,8 @@ class TopicSummary:
         return self._maker is None or not any(channel.queue for channel in self._channels)
 
     def _drop(self, job: Job, reason: DropReason) -> None:
-        self._core.drop(self.channel, len(job.body), reason, now=time.monotonic())
+        """A grid that is given up is counted with the whole grids, a cloud with what would have been made of it."""
+        self._core.drop(self._channels[0], len(job.body), reason, now=time.monotonic())
 
     # --- work -------------------------------------------------------------------------------------------------------
 
