@@ -13,7 +13,7 @@ from sern_client.endpoints.ros1 import Ros1Endpoint, Ros1Options
 from sern_client.endpoints.synthetic import SyntheticEndpoint, SyntheticOptions
 from sern_client.endpoints.zenoh.endpoint import ZenohEndpoint, ZenohOptions
 from sern_client.endpoints.zenoh.session import SessionOptions
-from sern_core.errors import UsageError
+from sern_core.errors import ConfigError, UsageError
 from sern_runtime.config import endpoints as sections
 from sern_runtime.config.client import ClientFile
 from sern_runtime.config.load import Loaded
@@ -90,11 +90,41 @@ def make_section(section: sections.EndpointSection, resolve: Resolve) -> Endpoin
                     type_paths=tuple(resolve(path) for path in section.type_paths),
                 )
             )
+        case sections.DdsEndpoint():
+            return _dds(section, resolve)
         case sections.SyntheticEndpoint():
             return SyntheticEndpoint(_synthetic(section, resolve))
         case sections.Ros1Endpoint():
             return Ros1Endpoint(Ros1Options(**{item.name: getattr(section, item.name) for item in fields(Ros1Options)}))
     raise UsageError(f"no endpoint for a section of type {type(section).__name__}")
+
+
+def _dds(section: sections.DdsEndpoint, resolve: Resolve) -> Endpoint:
+    try:
+        from sern_client.endpoints.dds.domain import DomainOptions, environment_domain
+        from sern_client.endpoints.dds.endpoint import DdsEndpoint, DdsOptions
+    except ImportError as error:
+        raise ConfigError(f"endpoint kind dds needs Cyclone DDS: pip install 'sern[dds]' ({error})") from None
+    return DdsEndpoint(
+        DdsOptions(
+            DomainOptions(
+                domain=environment_domain() if section.domain is None else section.domain,
+                interface=section.interface,
+                peers=section.peers,
+                multicast=section.multicast,
+                localhost_only=section.localhost_only,
+                fragment_bytes=section.fragment_bytes,
+                receive_buffer_bytes=section.receive_buffer_bytes,
+                lease_s=section.lease_s,
+            ),
+            node_name=section.node_name,
+            type_paths=tuple(resolve(path) for path in section.type_paths),
+            queue_depth=section.queue_depth,
+            max_buffer_bytes=section.max_buffer_bytes,
+            offer_lifespan=section.offer_lifespan,
+            heed_sern=section.heed_sern,
+        )
+    )
 
 
 def _synthetic(section: sections.SyntheticEndpoint, resolve: Resolve) -> SyntheticOptions:

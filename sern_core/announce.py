@@ -146,6 +146,9 @@ def decode_announcement(envelope: wire.Envelope) -> Announcement:
         type_hash=wire.take_str(envelope, "hash", max_length=MAX_HASH_CHARS),
         latched=latched,
         reliable=spec.reliable,
+        depth=spec.depth,
+        lifespan_s=spec.lifespan_s,
+        deadline_s=spec.deadline_s,
     )
     origin = ClientName(wire.take_str(envelope, "or", max_length=64))
     return Announcement(

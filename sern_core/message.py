@@ -70,7 +70,10 @@ class TopicInfo:
     type_hash: str = ""
     definition: str = ""
     latched: bool = False
-    reliable: bool | None = None  # what the publisher offers; None where the middleware does not say
+    reliable: bool | None = None  # what the publisher offers; None where the middleware does not say, as below
+    depth: int | None = None
+    lifespan_s: float | None = None
+    deadline_s: float | None = None
 
 
 class StreamId(NamedTuple):

@@ -290,6 +290,7 @@ class RuleSet:
         the rule says nothing:
         - reliability, durability: the publisher's; a publisher that does not say (ROS 1) is reliable if it latches;
         - depth: 10 if reliable, else 1;
+        - lifespan and deadline: the publisher's, where it has any (DDS); else no deadline, and
         - lifespan: 0.3 s for a velocity command in class control; for ever if reliable or latched; else 1 s;
         - weight κ: by class; many_writers: true for `/tf` and `/tf_static`;
         - merge_tf: for transforms in class state, and for `/tf_static` and other latched ones with or without a rule.
@@ -326,6 +327,8 @@ class RuleSet:
         reliable = reliability is Reliability.RELIABLE
         if rule.lifespan_s is not AUTO:
             lifespan_s = rule.lifespan_s
+        elif info.lifespan_s is not None:
+            lifespan_s = info.lifespan_s
         elif command and rule.priority is PriorityClass.CONTROL:
             lifespan_s = DEFAULT_COMMAND_LIFESPAN_S
         else:
@@ -337,7 +340,7 @@ class RuleSet:
             durability=durability,
             depth=rule.depth or (DEFAULT_RELIABLE_DEPTH if reliable else DEFAULT_BEST_EFFORT_DEPTH),
             lifespan_s=lifespan_s,
-            deadline_s=rule.deadline_s,
+            deadline_s=info.deadline_s if rule.deadline_s is None else rule.deadline_s,
             max_rate_hz=rule.max_rate_hz,
             retention_s=self.retention_s if rule.retention_s is None else rule.retention_s,
             max_queue_bytes=rule.max_queue_bytes,

@@ -235,6 +235,47 @@ class ZenohEndpoint(EndpointBase):
         yield from missing_directories(base_dir, self.type_paths, (*loc, "type_paths"))
 
 
+class DdsEndpoint(EndpointBase):
+    """ROS 2 over DDS, among nodes of rmw_fastrtps, rmw_cyclonedds and others. Needs `pip install 'sern[dds]'`, no ROS
+    installation. Services work with nodes of rmw_cyclonedds only."""
+
+    kind: Literal["dds"]
+    """ROS 2 over DDS."""
+    domain: Annotated[int, Field(ge=0, le=232)] | None = None
+    """ROS_DOMAIN_ID of the nodes; null: the environment's, else 0."""
+    node_name: Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$", max_length=200)] = "sern"
+    """What it is called in `ros2 node list`."""
+    interface: Annotated[str, AfterValidator(_check_host)] | None = None
+    """The network interface to use, by name or address; null: as Cyclone DDS chooses, or CYCLONEDDS_URI says."""
+    peers: tuple[Annotated[str, AfterValidator(_check_host)], ...] = ()
+    """Hosts to look for participants on, where multicast does not reach them."""
+    multicast: bool | None = None
+    """Find others by multicast; null: where the interface can. With false, name `peers`."""
+    localhost_only: bool = False
+    """Speak to nodes on this host only, over loopback, without multicast, in large datagrams."""
+    fragment_bytes: Annotated[int, Field(ge=1000, le=65_000)] | None = None
+    """The largest piece of a message in one datagram; null: 62000 with `localhost_only`, else as Cyclone DDS has it."""
+    receive_buffer_bytes: Annotated[int, Field(ge=1 << 16, le=1 << 30)] | None = None
+    """Receive buffer to ask the system for; null: 4 MiB with `localhost_only`, else as Cyclone DDS has it."""
+    lease_s: Annotated[float, Field(ge=1, le=3600)] | None = None
+    """After so long without a sign of us others take us for gone; null: as Cyclone DDS has it (10 s)."""
+    type_paths: tuple[PathText, ...] = ()
+    """Directories with .msg and .srv files of types beyond those of a ROS 2 install (searched at any depth)."""
+    queue_depth: Count = 100
+    """Messages of one topic that may wait for the link; beyond, the oldest are dropped and counted."""
+    max_buffer_bytes: Bytes = 64 * 2**20
+    """Bytes that may wait for the link, of all topics together."""
+    offer_lifespan: bool = False
+    """Offer what is published here with its lifespan: readers then drop what is older, by their own clocks, which must
+    agree with this host's."""
+    heed_sern: bool = False
+    """Take what other SERN endpoints publish in this domain for this site's own. For a chain of two links with the
+    domain in the middle; with two of them side by side it makes a loop."""
+
+    def file_problems(self, base_dir: Path, loc: Loc) -> Iterator[FileProblem]:
+        yield from missing_directories(base_dir, self.type_paths, (*loc, "type_paths"))
+
+
 class RclpyEndpoint(EndpointBase):
     """ROS 2 through rclpy, where an installation is sourced; topics only. Kinds `dds` and `zenoh` need none."""
 
@@ -262,6 +303,6 @@ def missing_directories(base_dir: Path, paths: tuple[str, ...], loc: Loc) -> Ite
 
 
 EndpointSection = Annotated[
-    BagEndpoint | SyntheticEndpoint | RecordEndpoint | Ros1Endpoint | ZenohEndpoint | RclpyEndpoint,
+    BagEndpoint | SyntheticEndpoint | RecordEndpoint | Ros1Endpoint | DdsEndpoint | ZenohEndpoint | RclpyEndpoint,
     Field(discriminator="kind"),
 ]

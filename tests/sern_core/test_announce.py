@@ -48,7 +48,17 @@ def announcements(draw: st.DrawFn) -> Announcement:
         many_writers=draw(st.booleans()),
     )
     topic = TopicName(draw(TOPICS))
-    info = TopicInfo(topic, draw(PRINTABLE), draw(st.sampled_from(Encoding)), draw(PRINTABLE), "", latched, reliable)
+    info = TopicInfo(
+        topic,
+        draw(PRINTABLE),
+        draw(st.sampled_from(Encoding)),
+        draw(PRINTABLE),
+        latched=latched,
+        reliable=reliable,
+        depth=spec.depth,
+        lifespan_s=spec.lifespan_s,
+        deadline_s=spec.deadline_s,
+    )
     identity = StreamId(ClientName(draw(NAMES)), draw(st.integers(0, 2**63 - 1)), topic)
     return Announcement(
         channel=draw(st.integers(1, 0xFFFF)),

@@ -1,0 +1,518 @@
+"""The `dds` endpoint: what a ROS 2 domain publishes goes to the link, what comes from the link is published there.
+
+What another SERN endpoint publishes in the same domain came over a link already and is not offered again, so that two
+of them beside each other make no loop; they know each other by the USER_DATA of their participants. `heed_sern` turns
+that off, for a chain of two links with a domain in the middle.
+"""
+
+import asyncio
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Final
+from uuid import UUID
+from weakref import WeakValueDictionary
+
+from cyclonedds.core import DDSException, Policy, Qos
+from cyclonedds.domain import DomainParticipant
+from cyclonedds.pub import DataWriter, Publisher
+from cyclonedds.sub import DataReader, Subscriber
+from cyclonedds.topic import Topic
+
+from sern_client.endpoints.base import ServiceEvents, ServiceHandler, ServiceInfo, Sink, TopicEvents
+from sern_client.endpoints.dds import names, node_info, raw
+from sern_client.endpoints.dds.definitions import Definitions
+from sern_client.endpoints.dds.domain import DomainOptions, close_domain, open_domain
+from sern_client.endpoints.dds.graph import Graph, Local, Participant, Remote
+from sern_client.endpoints.dds.idl import TypeMaker
+from sern_client.endpoints.dds.names import DISCOVERY_TOPIC, SERN_KEY, RosName, user_data
+from sern_client.endpoints.dds.qos import (
+    INFINITE_NS,
+    EndpointQos,
+    mismatches,
+    reader_for,
+    to_policies,
+    writer_for,
+)
+from sern_client.endpoints.dds.services import DdsServices
+from sern_client.endpoints.dds.worker import Inbox, Sample, Worker
+from sern_core.errors import ConfigError, UsageError
+from sern_core.message import TopicInfo
+from sern_core.types import Encoding, TopicName
+from sern_runtime import ros_types
+from sern_runtime.ros_types import ResolvedType
+
+_INFO_QOS: Final = EndpointQos(reliable=True, durability=1)
+_INFO_DEPTH: Final = 64
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class DdsOptions:
+    """`queue_depth`: messages of one topic that may wait for the event loop; `max_buffer_bytes`: of all together.
+    `offer_lifespan`: readers drop what is older than the stream's lifespan, by their own clocks."""
+
+    domain: DomainOptions = field(default_factory=DomainOptions)
+    node_name: str = "sern"
+    type_paths: tuple[Path, ...] = ()
+    queue_depth: int = 100
+    max_buffer_bytes: int = 64 * 2**20
+    offer_lifespan: bool = False
+    heed_sern: bool = False
+
+
+@dataclass(slots=True)
+class DdsCounters:
+    """Messages by fate. Dropped: the event loop was too slow (`overrun`), the link refused it (`refused`), or slow
+    reliable readers left a writer no room (`blocked`)."""
+
+    received: int = 0
+    overrun: int = 0
+    refused: int = 0
+    written: int = 0
+    blocked: int = 0
+
+
+class _Subscription:
+    """One topic on its way to the link. The reader is made anew when writers appear that it would not match."""
+
+    def __init__(self, endpoint: "DdsEndpoint", info: TopicInfo, dds_topic: str, sink: Sink) -> None:
+        self._endpoint = endpoint
+        self.info = info
+        self.dds_topic = dds_topic
+        self._sink = sink
+        self._reader: _Reader | None = None
+        self.closed = False
+        self.wanted = True
+
+    def refresh(self) -> None:
+        """Have a reader that matches all writers there are now, or none while nobody wants the topic."""
+        if self.closed:
+            return
+        if not self.wanted and not self.info.latched:
+            self._drop()
+            return
+        writers = [writer.qos for writer in self._endpoint.graph.writers(self.dds_topic)]
+        if self._reader is not None and not any(mismatches(offer, self._reader.qos) for offer in writers):
+            return
+        self._drop()
+        asked = replace(reader_for(writers), type_hash=self.info.type_hash)
+        resolved = ros_types.resolve(self.info.type_name, self.info.definition, Encoding.CDR)
+        self._reader = self._endpoint.open_reader(self.dds_topic, resolved, asked, self._deliver)
+
+    def _deliver(self, sample: Sample) -> None:
+        self._endpoint.counters.received += 1
+        if not self._sink(sample.body, sample.stamp_ns):
+            self._endpoint.counters.refused += 1
+
+    def _drop(self) -> None:
+        if self._reader is not None:
+            self._reader.close()
+            self._reader = None
+
+    def close(self) -> None:
+        if not self.closed:
+            self.closed = True
+            self._drop()
+            self._endpoint.forget(self)
+
+
+class _Reader:
+    """A reader in use: its samples come to `deliver` on the event loop until it is closed."""
+
+    def __init__(self, endpoint: "DdsEndpoint", guid: UUID, qos: EndpointQos, inbox: Inbox, number: int) -> None:
+        self._endpoint = endpoint
+        self.guid = guid
+        self.qos = qos
+        self._inbox = inbox
+        self._number = number
+
+    @property
+    def dropped(self) -> int:
+        return self._inbox.dropped
+
+    def close(self) -> None:
+        self._inbox.closed = True
+        self._endpoint.close_reader(self, self._number)
+
+
+class _Writer:
+    """A writer in use. Also the `Publisher` of a stream that comes in."""
+
+    def __init__(self, endpoint: "DdsEndpoint", writer: DataWriter[Any], guid: UUID, *, stamped: bool) -> None:
+        self._endpoint = endpoint
+        self._writer: DataWriter[Any] | None = writer
+        self.guid = guid
+        self._stamped = stamped
+
+    @property
+    def matched(self) -> int:
+        """How many readers it has."""
+        return 0 if self._writer is None else len(self._writer.get_matched_subscriptions())
+
+    def publish(self, body: bytes, stamp_ns: int) -> None:
+        if self._writer is None:
+            return
+        # A lifespan is judged by the time stamp: only one of this host says how old a sample is here.
+        result = raw.write(self._writer, body, stamp_ns if self._stamped else None)
+        if result == raw.RETCODE_TIMEOUT:
+            self._endpoint.counters.blocked += 1
+        elif result < 0:
+            raise OSError(f"Cyclone DDS did not take a message of {len(body)} bytes (return code {result})")
+        else:
+            self._endpoint.counters.written += 1
+
+    def close(self) -> None:
+        writer, self._writer = self._writer, None
+        if writer is not None:
+            self._endpoint.close_writer(self, writer)
+
+
+@dataclass(slots=True)
+class _Joined:
+    """What there is while the endpoint is in its domain."""
+
+    participant: DomainParticipant
+    publisher: Publisher
+    subscriber: Subscriber
+    worker: Worker
+
+
+class DdsEndpoint:
+    """An `Endpoint` and `ServiceEndpoint` for one DDS domain."""
+
+    def __init__(self, options: DdsOptions) -> None:
+        self.options = options
+        self.counters = DdsCounters()
+        self.graph = Graph(UUID(int=0), self, heed_sern=options.heed_sern)
+        self.types = Definitions(options.type_paths)
+        self.services = DdsServices(self)
+        self._events: TopicEvents | None = None
+        self._maker = TypeMaker()
+        self._joined: _Joined | None = None
+        self._topics: WeakValueDictionary[str, Topic[Any]] = WeakValueDictionary()
+        self._announced: dict[TopicName, TopicInfo] = {}
+        self._subscriptions: dict[TopicName, list[_Subscription]] = {}
+        self._readers: dict[UUID, _Reader] = {}
+        self._writers: dict[UUID, _Writer] = {}
+        self._info_writer: _Writer | None = None
+        self._info_due = False
+        self._said: set[str] = set()
+
+    # Life cycle
+
+    async def start(self, events: TopicEvents) -> None:
+        """ConfigError when the domain cannot be joined with these settings."""
+        options = self.options
+        open_domain(options.domain)
+        try:
+            said = user_data(enclave="/", **{SERN_KEY: options.node_name})
+            qos = Qos(Policy.EntityName(options.node_name), Policy.Userdata(said))
+            participant = DomainParticipant(options.domain.domain, qos)
+        except DDSException as error:
+            close_domain(options.domain.domain)
+            raise ConfigError(
+                f"DDS domain {options.domain.domain} cannot be joined ({error.msg}); "
+                "too many participants on this host, or no such interface"
+            ) from None
+        self._events = events
+        self.graph.own = participant.guid
+        worker = Worker(participant, self, max_buffer_bytes=options.max_buffer_bytes)
+        self._joined = _Joined(participant, Publisher(participant), Subscriber(participant), worker)
+        info = ros_types.resolve(node_info.TYPE, "", Encoding.CDR)
+        self.open_reader(DISCOVERY_TOPIC, info, _INFO_QOS, self._heed_nodes, depth=_INFO_DEPTH)
+        self._info_writer = self.open_writer(DISCOVERY_TOPIC, info, _INFO_QOS, depth=1)
+        self._tell_nodes()
+
+    async def stop(self) -> None:
+        """Leaves the domain; no thread and no socket stays behind."""
+        if self._joined is None:
+            return
+        await self.services.stop()
+        for subscriptions in list(self._subscriptions.values()):
+            for subscription in list(subscriptions):
+                subscription.close()
+        for reader in list(self._readers.values()):
+            reader.close()
+        for writer in list(self._writers.values()):
+            writer.close()
+        self._events = None
+        await self._joined.worker.stop()
+        self._info_writer = None
+        self._topics.clear()
+        # Leaving tells everybody, which may take a moment.
+        left = [self._joined]
+        self._joined = None
+        await asyncio.get_running_loop().run_in_executor(None, left.clear)
+        await asyncio.get_running_loop().run_in_executor(None, close_domain, self.options.domain.domain)
+
+    @property
+    def encoding(self) -> Encoding:
+        return Encoding.CDR
+
+    @property
+    def exhausted(self) -> bool:
+        """Always false: a domain never has nothing more to say."""
+        return False
+
+    # Topics
+
+    def subscribe(self, name: TopicName, sink: Sink) -> _Subscription:
+        info = self._announced.get(name)
+        if info is None:
+            raise UsageError(f"{name}: no such topic was announced")
+        subscription = _Subscription(self, info, names.to_dds(name), sink)
+        self._subscriptions.setdefault(name, []).append(subscription)
+        try:
+            subscription.refresh()
+        except ConfigError as error:
+            _log.error("%s is not taken: %s", name, error)
+        return subscription
+
+    def advertise(self, info: TopicInfo) -> _Writer:
+        """ConfigError for another encoding than CDR, a type nobody defines, or one with another hash than here."""
+        resolved = self._resolve(info)
+        offered = replace(writer_for(info, lifespan=self.options.offer_lifespan), type_hash=resolved.text.type_hash)
+        depth = info.depth or (10 if offered.reliable else 1)
+        return self.open_writer(names.to_dds(info.name), resolved, offered, depth=depth)
+
+    def _resolve(self, info: TopicInfo) -> ResolvedType:
+        if info.encoding is not Encoding.CDR:
+            raise ConfigError(f"{info.name}: {info.encoding} bodies cannot be published in ROS 2")
+        type_name = ros_types.canonical(info.type_name)
+        definition = info.definition or self.types.message(type_name, info.type_hash).definition
+        resolved = ros_types.resolve(type_name, definition, Encoding.CDR)
+        if info.type_hash and info.type_hash != resolved.text.type_hash:
+            raise ConfigError(
+                f"{info.name}: {type_name} came with hash {info.type_hash}, but its definition has "
+                f"{resolved.text.type_hash}; both sides need the same version of the type"
+            )
+        return resolved
+
+    def interest(self, name: TopicName, wanted: bool) -> None:
+        """Nobody wants it: nothing is received either, unless the topic is latched."""
+        for subscription in self._subscriptions.get(name, ()):
+            subscription.wanted = wanted
+            self._refresh(subscription)
+
+    def _refresh(self, subscription: _Subscription) -> None:
+        try:
+            subscription.refresh()
+        except ConfigError as error:
+            self.say_once(f"{subscription.info.name} is not taken: {error}")
+
+    def forget(self, subscription: _Subscription) -> None:
+        found = self._subscriptions.get(subscription.info.name, [])
+        if subscription in found:
+            found.remove(subscription)
+
+    # Services
+
+    def watch_services(self, events: ServiceEvents) -> None:
+        self.services.watch(events)
+
+    async def call(self, name: TopicName, request: bytes, *, timeout_s: float) -> bytes:
+        return await self.services.call(name, request, timeout_s=timeout_s)
+
+    def serve(self, info: ServiceInfo, handler: ServiceHandler) -> Any:
+        return self.services.serve(info, handler)
+
+    # Readers and writers, for the parts of this package
+
+    def open_reader(
+        self,
+        topic: str,
+        resolved: ResolvedType,
+        qos: EndpointQos,
+        deliver: Callable[[Sample], None],
+        *,
+        depth: int | None = None,
+        header: bool = False,
+        id_key: str = "clientid",
+    ) -> _Reader:
+        """With `header`, of requests or replies, which other SERN endpoints send as well.
+
+        ConfigError when the topic is in use here with another type, or DDS cannot have the type.
+        """
+        depth = depth or self.options.queue_depth
+        policies = to_policies(qos, depth=depth, writer=False, id_key=id_key)
+        joined = self._alive()
+        ignored = self.graph.ignored
+
+        def checked(sample: Sample) -> None:
+            if header or sample.handle not in ignored:
+                deliver(sample)
+
+        dds_topic = self._topic(topic, resolved, header=header)
+        try:
+            entity: DataReader[Any] = DataReader(joined.subscriber, dds_topic, policies)
+        except DDSException as error:
+            raise ConfigError(f"{topic}: no reader ({error.msg})") from None
+        inbox = Inbox(depth, checked)
+        reader = _Reader(self, entity.guid, qos, inbox, joined.worker.watch(entity, inbox))
+        self._readers[reader.guid] = reader
+        self.graph.local_added(Local(reader.guid, False, topic, names.type_to_dds(resolved.name), qos))
+        self._info_changed()
+        return reader
+
+    def open_writer(
+        self,
+        topic: str,
+        resolved: ResolvedType,
+        qos: EndpointQos,
+        *,
+        depth: int,
+        header: bool = False,
+        id_key: str = "clientid",
+    ) -> _Writer:
+        """ConfigError as `open_reader`."""
+        policies = to_policies(qos, depth=depth, writer=True, id_key=id_key)
+        joined = self._alive()
+        dds_topic = self._topic(topic, resolved, header=header)
+        try:
+            entity: DataWriter[Any] = DataWriter(joined.publisher, dds_topic, policies)
+        except DDSException as error:
+            raise ConfigError(f"{topic}: no writer ({error.msg})") from None
+        writer = _Writer(self, entity, entity.guid, stamped=qos.lifespan_ns >= INFINITE_NS)
+        self._writers[writer.guid] = writer
+        self.graph.local_added(Local(writer.guid, True, topic, names.type_to_dds(resolved.name), qos))
+        self._info_changed()
+        return writer
+
+    def close_reader(self, reader: _Reader, number: int) -> None:
+        if self._readers.pop(reader.guid, None) is None:
+            return
+        self.counters.overrun += reader.dropped
+        self.graph.local_removed(reader.guid)
+        self._alive().worker.unwatch(number)
+        self._info_changed()
+
+    def close_writer(self, writer: _Writer, entity: DataWriter[Any]) -> None:
+        if self._writers.pop(writer.guid, None) is None:
+            return
+        self.graph.local_removed(writer.guid)
+        self._alive().worker.let_go(entity)
+        self._info_changed()
+
+    def _alive(self) -> "_Joined":
+        if self._joined is None:
+            raise UsageError("the dds endpoint is not running")
+        return self._joined
+
+    def _topic(self, name: str, resolved: ResolvedType, *, header: bool) -> "Topic[Any]":
+        made = self._maker.make(resolved, header=header)
+        known = self._topics.get(name)
+        if known is not None:
+            if known.data_type is made or known.data_type.__idl_typename__ == made.__idl_typename__:
+                return known
+            raise ConfigError(
+                f"{name} is in use here with type {known.data_type.__idl_typename__}, so it cannot be "
+                f"{made.__idl_typename__}; rename one of them (`remap`)"
+            )
+        try:
+            topic: Topic[Any] = Topic(self._alive().participant, name, made)
+        except DDSException as error:
+            raise ConfigError(f"{name}: no topic of type {resolved.name} ({error.msg})") from None
+        self._topics[name] = topic
+        return topic
+
+    def overruns(self) -> int:
+        """Messages dropped because the event loop was too slow, of all readers there are and were."""
+        return self.counters.overrun + sum(reader.dropped for reader in self._readers.values())
+
+    def say_once(self, line: str) -> None:
+        """What a person has to know and do something about; each line once."""
+        if line not in self._said:
+            self._said.add(line)
+            _log.error("%s", line)
+
+    # Discovery: told by the worker
+
+    def participant_added(self, participant: Participant) -> None:
+        self.graph.participant_added(participant)
+
+    def participant_removed(self, guid: UUID) -> None:
+        self.graph.participant_removed(guid)
+
+    def remote_added(self, remote: Remote) -> None:
+        self.graph.remote_added(remote)
+
+    def remote_removed(self, guid: UUID) -> None:
+        self.graph.remote_removed(guid)
+
+    # Discovery: told by the graph
+
+    def writers_changed(self, name: RosName, topic: str) -> None:
+        if self._events is None:
+            return
+        writers = self.graph.writers(topic)
+        known = self._announced.get(name.name)
+        if known is not None and not any(names.type_from_dds(w.type_name) == known.type_name for w in writers):
+            del self._announced[name.name]
+            self._events.topic_removed(name.name)
+            known = None
+        if known is None:
+            info = self._describe(name.name, writers)
+            if info is not None:
+                self._announced[name.name] = info
+                self._events.topic_added(info)
+            return
+        for subscription in self._subscriptions.get(name.name, ()):
+            self._refresh(subscription)
+
+    def services_changed(self, name: TopicName) -> None:
+        self.services.changed(name)
+
+    def _describe(self, name: TopicName, writers: list[Remote]) -> TopicInfo | None:
+        """The topic as the first of its writers has it whose type is known here."""
+        for writer in writers:
+            type_name = names.type_from_dds(writer.type_name)
+            if type_name is None:
+                self.say_once(f"{name} has the type {writer.type_name}, which is not of ROS 2; it is left alone")
+                continue
+            try:
+                text = self.types.message(type_name, writer.qos.type_hash)
+            except ConfigError as error:
+                self.say_once(f"{name} of {self.graph.owner(writer)} is left alone: {error}")
+                continue
+            offered = [other.qos for other in writers if other.type_name == writer.type_name]
+            common = reader_for(offered)
+            lifespan_ns = max(offer.lifespan_ns for offer in offered)
+            deadline_ns = max(offer.deadline_ns for offer in offered)
+            return TopicInfo(
+                name,
+                type_name,
+                Encoding.CDR,
+                text.type_hash,
+                text.definition,
+                latched=common.transient_local,
+                reliable=common.reliable,
+                lifespan_s=None if lifespan_ns >= INFINITE_NS else lifespan_ns / 1e9,
+                deadline_s=None if deadline_ns >= INFINITE_NS else deadline_ns / 1e9,
+            )
+        return None
+
+    # Nodes
+
+    def _heed_nodes(self, sample: Sample) -> None:
+        found = node_info.decode(sample.body)
+        if found is not None and found[0] != self.graph.own:
+            self.graph.nodes_of(*found)
+
+    def _info_changed(self) -> None:
+        """Tell the others of our node's readers and writers, once for all that changed in this turn of the loop."""
+        if self._info_writer is not None and not self._info_due and self._events is not None:
+            self._info_due = True
+            asyncio.get_running_loop().call_soon(self._tell_nodes)
+
+    def _tell_nodes(self) -> None:
+        self._info_due = False
+        if self._info_writer is None or self._joined is None:
+            return
+        hidden = {self._info_writer.guid}
+        writers = [guid for guid in self._writers if guid not in hidden]
+        readers = [local.guid for local in self.graph.locals.values() if not local.writer]
+        body = node_info.encode(self.graph.own, self.options.node_name, readers, writers)
+        self._info_writer.publish(body, 0)

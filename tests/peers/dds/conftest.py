@@ -1,0 +1,91 @@
+"""Peers, endpoints and recorders for the tests of ROS 2 over DDS."""
+
+from collections.abc import AsyncIterator, Callable, Coroutine
+from contextlib import AsyncExitStack
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("cyclonedds", reason="the dds endpoint needs cyclonedds: pip install 'sern[dds]'")
+
+from sern_client.endpoints.base import ServiceInfo
+from sern_client.endpoints.dds.domain import DomainOptions
+from sern_client.endpoints.dds.endpoint import DdsEndpoint, DdsOptions
+from sern_core.message import TopicInfo
+from sern_core.types import TopicName
+from tests.peers.dds.peer import Peer, build_peer, free_domain
+
+
+class Recorder:
+    """`TopicEvents`, `ServiceEvents` and a sink that keep everything."""
+
+    def __init__(self) -> None:
+        self.infos: dict[TopicName, TopicInfo] = {}
+        self.services: dict[TopicName, ServiceInfo] = {}
+        self.removed: list[TopicName] = []
+        self.got: list[tuple[bytes, int]] = []
+        self.accepts = True
+
+    def topic_added(self, info: TopicInfo) -> None:
+        assert info.name not in self.infos
+        self.infos[info.name] = info
+
+    def topic_removed(self, name: TopicName) -> None:
+        del self.infos[name]
+        self.removed.append(name)
+
+    def service_added(self, info: ServiceInfo) -> None:
+        self.services[info.name] = info
+
+    def service_removed(self, name: TopicName) -> None:
+        del self.services[name]
+
+    def sink(self, body: bytes, stamp_ns: int) -> bool:
+        self.got.append((body, stamp_ns))
+        return self.accepts
+
+
+MakePeer = Callable[[int], Coroutine[Any, Any, Peer]]
+MakeEndpoint = Callable[..., Coroutine[Any, Any, tuple[DdsEndpoint, Recorder]]]
+
+
+@pytest.fixture(scope="session")
+def peer_program() -> Path:
+    return build_peer()
+
+
+@pytest.fixture
+def domain() -> int:
+    return free_domain()
+
+
+@pytest.fixture
+async def stack() -> AsyncIterator[AsyncExitStack]:
+    async with AsyncExitStack() as stack:
+        yield stack
+
+
+@pytest.fixture
+def make_peer(peer_program: Path, stack: AsyncExitStack) -> MakePeer:
+    """`await make_peer(domain)`: a peer that ends with the test."""
+
+    async def make(domain: int) -> Peer:
+        return await stack.enter_async_context(Peer(peer_program, domain))
+
+    return make
+
+
+@pytest.fixture
+def make_endpoint(stack: AsyncExitStack) -> MakeEndpoint:
+    """`await make_endpoint(domain, **options)`: a started endpoint and its recorder."""
+
+    async def make(domain: int, **options: Any) -> tuple[DdsEndpoint, Recorder]:
+        settings = DomainOptions(domain, localhost_only=True, lease_s=3.0)
+        endpoint, recorder = DdsEndpoint(DdsOptions(settings, **options)), Recorder()
+        endpoint.watch_services(recorder)
+        await endpoint.start(recorder)
+        stack.push_async_callback(endpoint.stop)
+        return endpoint, recorder
+
+    return make
