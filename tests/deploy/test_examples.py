@@ -1,0 +1,98 @@
+"""The ready-made configurations: each is accepted, and treats the topics of its robot as its comments say."""
+
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import pytest
+
+from sern_core.access import AccessTable
+from sern_core.message import TopicInfo
+from sern_core.rules import Direction, to_global
+from sern_core.types import ClientName, Encoding, PriorityClass, TopicName
+from sern_runtime.config.client import ClientFile, load_client
+from sern_runtime.config.relay import load_relay
+
+EXAMPLES: Final = Path(__file__).resolve().parents[2] / "deploy" / "examples"
+CLIENTS: Final = sorted(path.name for path in EXAMPLES.glob("*.yaml") if path.name != "relay.yaml")
+CONTROL, STATE, BULK = PriorityClass.CONTROL, PriorityClass.STATE, PriorityClass.BULK
+NOETIC: Final = ("jackal-noetic.yaml", "husky-noetic.yaml")
+
+
+class Treated(NamedTuple):
+    """What becomes of a topic: None where it stays at the robot."""
+
+    priority: PriorityClass
+    direction: Direction
+    reliable: bool
+    summaries: tuple[str, ...] = ()
+
+
+def client(name: str) -> ClientFile:
+    return load_client(EXAMPLES / name, files=False).model
+
+
+def treated(
+    model: ClientFile, topic: str, type_name: str, encoding: Encoding, *, latched: bool = False
+) -> Treated | None:
+    name = TopicName(topic)
+    info = TopicInfo(name, type_name, encoding, latched=latched)
+    rules = model.rules()
+    if not model.discovery.filter().wants(name, listed=rules.find(type_name, name) is not None):
+        return None
+    resolved = rules.resolve(info, local_name=name)
+    kinds = tuple(type(summary.params).__name__ for summary in resolved.summaries)
+    return Treated(resolved.spec.priority, resolved.direction, resolved.spec.reliable, kinds)
+
+
+@pytest.mark.parametrize("name", CLIENTS)
+def test_is_accepted(name: str) -> None:
+    model = client(name)
+    assert model.relay.endpoint == "tcp://relay.example:5555"
+    assert model.http.listen is not None and model.http.listen.startswith("127.0.0.1:")
+
+
+@pytest.mark.parametrize("name", NOETIC)
+def test_topics_of_a_noetic_robot(name: str) -> None:
+    model = client(name)
+    robot = name.partition("-")[0]
+
+    def of(topic: str, type_name: str, *, latched: bool = False) -> Treated | None:
+        return treated(model, topic, type_name, Encoding.ROS1, latched=latched)
+
+    send = Direction.SEND
+    assert of("/cmd_vel", "geometry_msgs/Twist") == Treated(CONTROL, Direction.RECEIVE, False)
+    assert of("/odometry/filtered", "nav_msgs/Odometry") == Treated(CONTROL, send, False)
+    assert of(f"/{robot}_velocity_controller/odom", "nav_msgs/Odometry") == Treated(STATE, send, False)
+    assert of("/imu/data", "sensor_msgs/Imu") == Treated(STATE, send, False)
+    assert of("/tf", "tf2_msgs/TFMessage") == Treated(STATE, send, False)
+    assert of("/tf_static", "tf2_msgs/TFMessage", latched=True) == Treated(STATE, send, True)
+    assert of("/map", "nav_msgs/OccupancyGrid", latched=True) == Treated(STATE, send, True, ("PatchParams",))
+    assert of("/mid/points", "sensor_msgs/PointCloud2") == Treated(BULK, send, False, ("ScanParams", "VoxelParams"))
+    assert of("/front/scan", "sensor_msgs/LaserScan") == Treated(STATE, send, False)
+    assert of("/move_base/goal", "move_base_msgs/MoveBaseActionGoal") == Treated(CONTROL, Direction.RECEIVE, True)
+    assert of("/move_base/result", "move_base_msgs/MoveBaseActionResult") == Treated(STATE, send, True)
+    assert of("/rosout", "rosgraph_msgs/Log") is None
+    assert of("/joy_teleop/cmd_vel", "geometry_msgs/Twist") is None
+
+
+@pytest.mark.parametrize("name", [name for name in CLIENTS if name not in {"robot.yaml", "site.yaml"}])
+def test_the_relay_lets_through_what_a_client_needs(name: str) -> None:
+    """What the client sends under its own or a robot's name, and what it subscribes to."""
+    rules = load_relay(EXAMPLES / "relay.yaml", files=False).model.access_rules()
+    table = AccessTable(rules)
+    model = client(name)
+    own = ClientName(model.name)
+    if name.startswith("site"):
+        robot = "/jackal1"
+        for topic in ("/cmd_vel", "/move_base/goal", "/dock/_call/site1"):
+            assert table.may_publish(own, TopicName(robot + topic)), topic
+        assert not table.may_publish(own, TopicName(robot + "/odometry/filtered"))
+        assert not table.may_publish(own, TopicName(robot + "/dock/_call/jackal1"))
+        assert table.may_subscribe(own, TopicName(robot + "/map"))
+        return
+    for topic in ("/odom", "/map", "/points/scan"):
+        assert table.may_publish(own, to_global(TopicName(topic), model.namespace))
+    assert not table.may_publish(own, TopicName("/other1/odom"))
+    for topic in ("/cmd_vel", "/move_base/goal", "/dock/_call/site1"):
+        assert table.may_subscribe(own, to_global(TopicName(topic), model.namespace))
+    assert not table.may_subscribe(own, TopicName("/other1/cmd_vel"))
