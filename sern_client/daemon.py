@@ -25,6 +25,7 @@ from sern_core.client import ClientCore
 from sern_core.errors import ConfigError
 from sern_core.trace import DecisionTrace
 from sern_core.types import CLASS_LABELS, DropReason, ObjectKind
+from sern_runtime.adaptation import Adaptation
 from sern_runtime.codec_pool import CodecPool, make_coder
 from sern_runtime.config.base import split_tcp
 from sern_runtime.config.client import ClientFile, ServicesSection, load_client
@@ -98,6 +99,7 @@ class ClientDaemon:
         self.bridge.attach(self.core)
         self.core.subscribe(model.subscribe_patterns(), now=now)
         self._serve_services(endpoint)
+        self.adaptation = self._make_adaptation()
         self.reason = "not connected yet"
         self._said: set[str] = set()  # since the last session: an attempt that fails as before is no news
         self._ctx: zmq.Context[zmq.Socket[bytes]] | None = None
@@ -108,6 +110,14 @@ class ClientDaemon:
         self.tasks: list[asyncio.Task[None]] = []
         self._endpoint_started = False
         self._stopping = False
+
+    def _make_adaptation(self) -> Adaptation | None:
+        section = self.loaded.model.adaptation
+        if section is None:
+            return None
+        coder = self.core.coder if self.core.link.encoder is not None else None
+        with blamed_on(self.loaded.path, "adaptation"):
+            return Adaptation(section, lambda: [self.core.link], coder=coder, kick=self._kick)
 
     def _serve_services(self, endpoint: Endpoint) -> None:
         """Where the file has service rules, an endpoint must know services."""
@@ -171,6 +181,8 @@ class ClientDaemon:
                 kick=self._kick,
             )
         self.tasks.append(asyncio.create_task(self._tick(), name="client-tick"))
+        if self.adaptation is not None:
+            self.tasks.append(asyncio.create_task(self.adaptation.run(), name="adaptation"))
         self.notifier.ready(f"{model.name} -> {relay.endpoint}")
         _log.info("client %s started, relay %s", model.name, relay.endpoint)
 
@@ -236,6 +248,9 @@ class ClientDaemon:
         register_links(metrics, lambda: [link])
         register_received(metrics, self.core.received, self.bridge.ages)
         register_codecs(metrics, self.core.coder)
+        adaptation = self.adaptation
+        if adaptation is not None:
+            adaptation.register(metrics)
         metrics.counter(
             "sern_command_lease_expired_total",
             "Times a command topic went quiet and the stop command was published.",
@@ -282,6 +297,7 @@ class ClientDaemon:
                 "/api/link": lambda: [link.snapshot()],
                 "/api/topics": self.topics,
                 "/api/trace": self.core.trace.to_json,
+                **({} if adaptation is None else {"/api/mmcf": adaptation.to_json}),
             },
         )
 

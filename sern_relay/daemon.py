@@ -26,6 +26,7 @@ from sern_relay.objects_view import objects_view
 from sern_relay.server import RelayServer
 from sern_relay.transforms import TransformObjects
 from sern_relay.udp import RelayLanes
+from sern_runtime.adaptation import Adaptation
 from sern_runtime.codec_pool import CodecPool, make_coder
 from sern_runtime.config.load import Loaded
 from sern_runtime.config.relay import RelayFile, load_relay
@@ -101,6 +102,12 @@ class RelayDaemon:
         self.coder = make_coder(model.link.params(), self.codecs)
         self._decoder = Decoder[StreamInfo](self.coder, lambda stream: stream, self._deliver, self._undecodable)
         self._told: set[TopicName] = set()
+        self.adaptation: Adaptation | None = None
+        if model.adaptation is not None:
+            with blamed_on(loaded.path, "adaptation"):
+                self.adaptation = Adaptation(
+                    model.adaptation, lambda: list(self.hub.links.values()), coder=None, kick=self._after
+                )
         self.zap: ZapHandler | None = None
         self.server: RelayServer | None = None
         self.feed: RelayFeed | None = None
@@ -160,6 +167,8 @@ class RelayDaemon:
             with blamed_on(self.loaded.path, "feed", "roles"):
                 self.feed = RelayFeed(self._ctx, self.hub, model.feed_roles(), after=self._after, refused=self.refused)
         self.tasks.append(asyncio.create_task(self._tick(), name="relay-tick"))
+        if self.adaptation is not None:
+            self.tasks.append(asyncio.create_task(self.adaptation.run(), name="adaptation"))
         self._ready = True
         self.notifier.ready(f"{model.name} on {', '.join(relay.listen)}")
         _log.info("relay %s listens on %s", model.name, ", ".join(relay.listen))
@@ -264,6 +273,9 @@ class RelayDaemon:
         register_links(metrics, lambda: list(self.hub.links.values()))
         register_received(metrics, self.hub.received, self.ages)
         register_codecs(metrics, self.coder)
+        adaptation = self.adaptation
+        if adaptation is not None:
+            adaptation.register(metrics)
         metrics.gauge("sern_relay_clients", "Clients with a session.",
                       read=lambda: [((), float(self._clients_up()))])  # fmt: skip
         metrics.gauge("sern_relay_streams", "Streams announced by clients.",
@@ -298,6 +310,7 @@ class RelayDaemon:
                 "/api/link": lambda: [link.snapshot() for link in self.hub.links.values()],
                 "/api/objects": objects_view(self.hub),
                 "/api/topics": self.topics,
+                **({} if adaptation is None else {"/api/mmcf": adaptation.to_json}),
             },
         )
 

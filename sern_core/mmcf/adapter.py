@@ -9,13 +9,14 @@ from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from math import isfinite
-from typing import Final
+from typing import Final, NamedTuple
 
 from sern_core.codecs import LOSSLESS, RAW_PROFILE, CodecProfile, Coder, Compression
 from sern_core.link import Link
 from sern_core.mmcf.cost import Ranges, Weights, cost, measure
 from sern_core.mmcf.model import (
     NO_CODEC,
+    NO_LIMIT,
     ClassDemand,
     ClassOutcome,
     Configuration,
@@ -35,8 +36,8 @@ SAMPLES: Final = 10
 """Readings of the capacity an interval."""
 MEMORY: Final = 3
 """Intervals that demand is told from."""
-FULL: Final = 0.5
-"""A link with a backlog at so many of its samples is called saturated."""
+FULL: Final = 0.85
+"""A link of which such a share was used is called saturated."""
 ARRIVAL_CV2: Final = 0.1
 """Topics of robots tick; what is left is jitter."""
 
@@ -71,14 +72,30 @@ class Step:
     decision: Decision
 
 
+class _Totals(NamedTuple):
+    """Of one topic: messages, bytes, messages thinned, bytes before and after encoding."""
+
+    offered: int
+    nbytes: int
+    thinned: int
+    raw_bytes: int
+    encoded_bytes: int
+
+
 class _TopicStats:
     """Totals of one topic at the last step, and what came since, interval by interval."""
 
-    __slots__ = ("encoded_bytes", "history", "nbytes", "offered", "raw_bytes", "thinned")
+    __slots__ = ("history", "totals")
 
     def __init__(self) -> None:
-        self.offered = self.nbytes = self.thinned = self.raw_bytes = self.encoded_bytes = 0
+        self.totals = _Totals(0, 0, 0, 0, 0)
         self.history: deque[tuple[int, int]] = deque(maxlen=MEMORY)  # (messages, bytes) an interval
+
+    def update(self, *totals: int) -> _Totals:
+        """The difference to the totals before; a channel that was opened anew begins at zero again."""
+        new = _Totals._make(max(0, now - before) for now, before in zip(totals, self.totals, strict=True))
+        self.totals = _Totals._make(totals)
+        return new
 
 
 @dataclass(slots=True)
@@ -103,6 +120,8 @@ class HopAdapter:
         self.policy = policy
         self.params = params
         self.last: Step | None = None
+        self.prediction_error: float | None = None
+        """Cost of the last interval less what was predicted for it."""
         self.switches = 0
         self._coder = coder
         self._since_s = now
@@ -111,7 +130,6 @@ class HopAdapter:
         self._topics: dict[TopicName, _TopicStats] = {}
         self._arrived: dict[PriorityClass, _ClassCount] = {priority: _ClassCount() for priority in CLASSES}
         self._samples: deque[float] = deque(maxlen=SAMPLES)
-        self._busy: deque[bool] = deque(maxlen=SAMPLES)
         self._measured: Measurement | None = None
         link.on_arrived = self._note_arrival
 
@@ -149,20 +167,21 @@ class HopAdapter:
         return sum(counters.elapsed_s for counters in self._coder.encoded.values()) if self._coder is not None else 0.0
 
     def sample(self) -> None:
-        """Read the capacity and whether anything waits; about ten times an interval."""
-        link = self.link
+        """Read the capacity; about ten times an interval."""
         capacity_bps = self._capacity_bps()
         if capacity_bps is not None:
             self._samples.append(capacity_bps)
-        self._busy.append(any(link.scheduler.pending(priority) for priority in CLASSES))
 
     def _capacity_bps(self) -> float | None:
-        """A link that was never full can carry what the ranges call a full one, as far as anybody knows."""
+        """A link that was never full can carry what the ranges call a full one, as far as anybody knows: until then the
+        estimate says what was offered."""
         lane = self.link.lane
         if lane.stalled or not self.link.established:
             return None
         rate_bps = lane.estimator.rate_bps
-        return self.params.ranges.bandwidth_max_bps if rate_bps is None else rate_bps
+        if rate_bps is not None and self.link.was_full:
+            return rate_bps
+        return max(rate_bps or 0.0, self.params.ranges.bandwidth_max_bps)
 
     def _channels(self) -> list[OutChannel]:
         """Those that somebody wants."""
@@ -175,31 +194,25 @@ class HopAdapter:
         for channel in channels:
             by_topic.setdefault(channel.counters.topic, []).append(channel)
         for gone in self._topics.keys() - by_topic.keys():
-            del self._topics[gone]
+            self._topics[gone].history.clear()
         for topic, mine in by_topic.items():
             counters, count = mine[0].counters, counts[mine[0].spec.priority]
-            stats = self._topics.get(topic)
-            fresh = stats is None
-            if stats is None:
-                stats = self._topics[topic] = _TopicStats()
+            stats = self._topics.setdefault(topic, _TopicStats())
             thinned = sum(channel.thinned for channel in mine)
-            dropped = counters.by_reason
             # What its own max_rate_hz leaves out was never meant to be sent, nor what nobody wanted.
-            others = dropped[DropReason.RATE_CAP] - thinned + dropped[DropReason.UNWANTED]
-            offered, nbytes = counters.offered - others, counters.offered_bytes
+            dropped = counters.by_reason
+            offered = counters.offered - dropped[DropReason.RATE_CAP] + thinned - dropped[DropReason.UNWANTED]
             raw_bytes = sum(channel.codec.raw_bytes for channel in mine if channel.codec is not None)
             encoded_bytes = sum(channel.codec.encoded_bytes for channel in mine if channel.codec is not None)
-            if not fresh:
-                messages = max(0, offered - stats.offered)
-                new_bytes = max(0, nbytes - stats.nbytes)
-                stats.history.append((messages, new_bytes))
-                count.offered += messages
-                count.admitted += max(0, messages - max(0, thinned - stats.thinned))
-                if channel_mode(mine[0]) is None:
-                    count.raw_bytes += max(0, raw_bytes - stats.raw_bytes)
-                    count.encoded_bytes += max(0, encoded_bytes - stats.encoded_bytes)
-            stats.offered, stats.nbytes, stats.thinned = offered, nbytes, thinned
-            stats.raw_bytes, stats.encoded_bytes = raw_bytes, encoded_bytes
+            new = stats.update(offered, counters.offered_bytes, thinned, raw_bytes, encoded_bytes)
+            if self.last is None:
+                continue  # totals of who knows how long
+            stats.history.append((new.offered, new.nbytes))
+            count.offered += new.offered
+            count.admitted += max(0, new.offered - new.thinned)
+            if channel_mode(mine[0]) is None:
+                count.raw_bytes += new.raw_bytes
+                count.encoded_bytes += new.encoded_bytes
         return counts
 
     def _demands(self, channels: Iterable[OutChannel], elapsed_s: float) -> tuple[ClassDemand, ...]:
@@ -229,6 +242,9 @@ class HopAdapter:
                     cv2=spread / mean_bytes**2 if mean_bytes > 0.0 else 0.0,
                     arrival_cv2=ARRIVAL_CV2,
                     topics=len(weighed),
+                    depth=max(
+                        1, round(sum(per_interval * _depth(channel) for channel, per_interval, _ in weighed) / rate)
+                    ),
                     needed=self.params.needed[priority],
                     thinnable=sum(per_interval for channel, per_interval, _ in weighed if channel.thinnable) / rate,
                     protected=priority is PriorityClass.CONTROL and not self.link.lane.lossless,
@@ -263,7 +279,8 @@ class HopAdapter:
         self._measured = measurement
         self._since_s, self._wire_bytes, self._encode_s = now, link.wire_bytes, self._coder_s()
         self._samples.clear()
-        self._busy.clear()
+        foreseen = self.last.decision.prediction if self.last is not None else None
+        self.prediction_error = None if value is None or foreseen is None else value - foreseen.cost
         decision = self.policy.decide(situation, measurement, now=now)
         self.switches += decision.switched
         self.apply(decision.chosen, now=now)
@@ -294,7 +311,7 @@ class HopAdapter:
             ],
             interval_s=elapsed_s,
             cpu_s=cpu_s,
-            saturated=sum(self._busy) > FULL * len(self._busy) if self._busy else False,
+            saturated=8.0 * wire_bytes / elapsed_s > FULL * sum(self._samples) / max(1, len(self._samples)),
             ranges=self.params.ranges,
             previous=self._measured,
         )
@@ -318,6 +335,11 @@ class HopAdapter:
 def channel_mode(channel: OutChannel) -> Compression | None:
     """The mode that the topic's own rule demands; None: free to choose."""
     return channel.spec.compression
+
+
+def _depth(channel: OutChannel) -> int:
+    """Messages that may wait; what may not be left out waits until it is sent."""
+    return channel.spec.depth if channel.thinnable else NO_LIMIT
 
 
 def _class_profile(mode: str, weighed: list[tuple[OutChannel, float, float]]) -> CodecProfile:

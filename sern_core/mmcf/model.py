@@ -13,6 +13,8 @@ from sern_core.errors import UsageError
 from sern_core.types import CLASS_LABELS, CLASSES, PriorityClass, TopicName
 
 NO_CODEC: Final = "none"
+NO_LIMIT: Final = 1000
+"""A queue of so many messages is as good as one without a limit."""
 CLASS_WEIGHTS: Final = (0.6, 0.3, 0.1)
 """ω: what a class counts in latency and unreliability; spread over the classes that have traffic."""
 
@@ -23,11 +25,11 @@ class ClassDemand:
 
     `rate_hz` messages offered a second before any thinning, `mean_bytes` of their bodies, `cv2` the squared coefficient
     of variation of the sizes, `arrival_cv2` that of the times between arrivals of one topic (1: Poisson, 0: it ticks).
-    `topics` each have a queue of their own. `needed` is the share of the offered messages that must arrive within
-    `deadline_s` for the class to count as reliable: sending less than that counts as unreliability. `thinnable` is the
-    share of the messages that a rate cap may drop (best-effort topics). `protected` classes are sent `1 + h` times.
-    `repaired`: lost fragments are sent again while the message is wanted. `codecs` by mode; modes that are not named do
-    nothing to this class.
+    `topics` each have a queue of their own of at most `depth` messages. `needed` is the share of the offered messages
+    that must arrive within `deadline_s` for the class to count as reliable: sending less than that counts as
+    unreliability. `thinnable` is the share of the messages that a rate cap may drop (best-effort topics). `protected`
+    classes are sent `1 + h` times. `repaired`: lost fragments are sent again while the message is wanted. `codecs` by
+    mode; modes that are not named do nothing to this class.
     """
 
     priority: PriorityClass
@@ -37,6 +39,7 @@ class ClassDemand:
     cv2: float = 0.0
     arrival_cv2: float = 1.0
     topics: int = 1
+    depth: int = NO_LIMIT
     needed: float = 1.0
     thinnable: float = 1.0
     protected: bool = False
@@ -51,6 +54,7 @@ class ClassDemand:
             ("cv2", self.cv2 >= 0.0),
             ("arrival_cv2", self.arrival_cv2 >= 0.0),
             ("topics", self.topics >= 1),
+            ("depth", self.depth >= 1),
             ("needed", 0.0 < self.needed <= 1.0),
             ("thinnable", 0.0 <= self.thinnable <= 1.0),
         ):

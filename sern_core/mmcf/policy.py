@@ -82,6 +82,11 @@ class Policy(ABC):
     def decide(self, situation: Situation, measurement: Measurement | None, *, now: float) -> Decision:
         """Choose for the next interval. `measurement` is of the one that has just ended, None for the first."""
 
+    @property
+    def corrections(self) -> dict[str, float]:
+        """What predictions are multiplied by, for people to see."""
+        return {}
+
 
 class FixedPolicy(Policy):
     """A hand-written configuration, kept whatever happens. It is predicted all the same, for people to compare."""
@@ -219,6 +224,10 @@ class Mmcf(Policy):
     @property
     def active(self) -> Configuration:
         return self._active
+
+    @property
+    def corrections(self) -> dict[str, float]:
+        return self.residuals.snapshot()
 
     def decide(self, situation: Situation, measurement: Measurement | None, *, now: float) -> Decision:
         link = situation.link

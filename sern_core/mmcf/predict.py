@@ -240,7 +240,8 @@ class Predictor:
         for number, part in enumerate(parts):
             demand, x_s = part.demand, part.x_s
             left = np.maximum(1.0 - sigma, MIN_SHARE)
-            places = grid.queues[:, demand.priority] * demand.topics
+            limit = np.minimum(grid.queues[:, demand.priority], demand.depth)
+            places = limit * demand.topics
             variability = max(MIN_VARIABILITY, demand.arrival_cv2 + demand.cv2)
             # Topics that tick are out of step with each other: together they come almost at random.
             together = 1.0 + demand.cv2 if demand.topics > 1 else variability
@@ -256,7 +257,7 @@ class Predictor:
             wait_s = w0_s / (np.maximum(1.0 - before, MIN_SHARE) * np.maximum(1.0 - sigma, MIN_SHARE))
             # A queue that keeps the newest is overrun: its oldest message is between q − 1 and q periods old.
             period_s = demand.topics / np.maximum(part.rate_hz, 1e-9)
-            oldest_s = grid.queues[:, demand.priority] * period_s
+            oldest_s = limit * period_s
             overrun_s = np.minimum(oldest_s - 0.5 * period_s, places * service_s) + fragment_s
             overrun = wait_s >= overrun_s
             wait_s = np.minimum(wait_s, overrun_s)

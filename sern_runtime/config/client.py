@@ -27,6 +27,7 @@ from sern_core.rules import (
 )
 from sern_core.services import ServiceRule, subscriptions
 from sern_core.types import ClientName, Durability, PriorityClass, Reliability, TopicName
+from sern_runtime.config.adaptation import AdaptationSection
 from sern_runtime.config.base import (
     Bytes,
     ClientText,
@@ -376,6 +377,8 @@ class ClientFile(FileModel):
     """Actions offered to other sites and used from them."""
     scheduler: SchedulerSection = SchedulerSection()
     """Which message the link carries next."""
+    adaptation: AdaptationSection | None = None
+    """Choose rates, queue limits, compression and redundancy by their predicted cost; null: leave them as they are."""
     link: LinkSection = LinkSection()
     """The link to the relay."""
     http: HttpSection = HttpSection()

@@ -12,6 +12,7 @@ from sern_core.objects import COMMAND_OBJECT_TYPES
 from sern_core.rules import AUTO, FeedRole, FeedTopic, TopicRule, compile_pattern, plain_type
 from sern_core.types import ClientName, Durability, Encoding, PriorityClass, Reliability
 from sern_runtime import ros_types
+from sern_runtime.config.adaptation import AdaptationSection
 from sern_runtime.config.base import (
     BindEndpoint,
     Bytes,
@@ -265,6 +266,9 @@ class RelayFile(FileModel):
     """What is kept for clients that come late or come back."""
     scheduler: SchedulerSection = SchedulerSection()
     """Which message each client's link carries next."""
+    adaptation: AdaptationSection | None = None
+    """Choose rates, queue limits and redundancy of each client's link by their predicted cost; null: leave them as they
+    are. Bodies are forwarded unchanged, so `codecs` does not count here."""
     link: LinkSection = LinkSection()
     """The links to the clients."""
     http: RelayHttpSection = RelayHttpSection()

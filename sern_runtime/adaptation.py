@@ -1,0 +1,183 @@
+"""Runs the adaptation of one or many links on the event loop, and tells what it does: /api/mmcf and metrics."""
+
+import asyncio
+import logging
+import time
+from collections import deque
+from collections.abc import Callable, Collection
+from typing import Any, Final
+
+from sern_core.codecs import Coder
+from sern_core.link import Link
+from sern_core.mmcf.adapter import SAMPLES, HopAdapter
+from sern_core.mmcf.report import adapter_json, step_json
+from sern_core.types import CLASS_LABELS
+from sern_runtime.config.adaptation import AdaptationSection
+from sern_runtime.metrics import Labels, Metrics
+
+HISTORY: Final = 60
+"""Intervals that /api/mmcf tells of."""
+TERMS: Final = ("latency", "unreliability", "compute", "bandwidth")
+
+_log = logging.getLogger(__name__)
+
+
+class Adaptation:
+    """One `HopAdapter` a link that is there. `links` names them; `kick` is called after each decision."""
+
+    def __init__(
+        self,
+        section: AdaptationSection,
+        links: Callable[[], Collection[Link]],
+        *,
+        coder: Coder | None,
+        kick: Callable[[], None],
+    ) -> None:
+        encodes = coder is not None
+        self._section = section
+        self._links = links
+        self._coder = coder
+        self._kick = kick
+        self._params = section.params(encodes=encodes)
+        self._make_policy = section.make_policy(encodes=encodes)
+        self._adapters: dict[Link, HopAdapter] = {}
+        self._history: dict[Link, deque[dict[str, Any]]] = {}
+
+    async def run(self) -> None:
+        """Until cancelled. An interval that comes late is a longer one; none is made up for."""
+        count = 0
+        while True:
+            await asyncio.sleep(self._params.interval_s / SAMPLES)
+            count += 1
+            self.tick(step=count % SAMPLES == 0)
+
+    def tick(self, *, step: bool) -> None:
+        now = time.monotonic()
+        links = self._links()
+        for gone in self._adapters.keys() - set(links):
+            del self._adapters[gone]
+            self._history.pop(gone, None)
+        for link in links:
+            adapter = self._adapters.get(link)
+            if adapter is None:
+                adapter = HopAdapter(link, self._make_policy(), self._params, coder=self._coder, now=now)
+                self._adapters[link] = adapter
+            adapter.sample()
+            if step:
+                self._step(adapter, now)
+        if step and links:
+            self._kick()
+
+    def _step(self, adapter: HopAdapter, now: float) -> None:
+        done = adapter.step(now=now)
+        self._history.setdefault(adapter.link, deque(maxlen=HISTORY)).append(step_json(done))
+        if done.decision.switched:
+            _log.info("%s: %s (%s)", adapter.link.peer, done.decision.chosen, done.decision.reason)
+
+    def to_json(self) -> dict[str, Any]:
+        """For /api/mmcf: what is in force, and the last intervals of each link, the oldest first."""
+        weights, ranges = self._params.weights, self._params.ranges
+        return {
+            "policy": self._section.policy,
+            "profile": self._section.profile if self._section.weights is None else "weights",
+            "weights": dict(zip(TERMS, weights, strict=True)),
+            "ranges": {
+                "latency_max_s": ranges.latency_max_s,
+                "compute_max": ranges.compute_max,
+                "bandwidth_max_bps": ranges.bandwidth_max_bps,
+            },
+            "interval_s": self._params.interval_s,
+            "now_s": time.monotonic(),
+            "links": [
+                {**adapter_json(adapter), "history": list(self._history.get(link, ()))}
+                for link, adapter in self._adapters.items()
+            ],
+        }
+
+    def _by_peer(self) -> list[tuple[str, HopAdapter]]:
+        return [(link.peer, adapter) for link, adapter in self._adapters.items()]
+
+    # --- metrics ----------------------------------------------------------------------------------------------------
+
+    def register(self, metrics: Metrics) -> None:
+        """Every term of the cost, measured and predicted, and what is in force."""
+
+        def measured() -> list[tuple[Labels, float]]:
+            return [
+                ((peer, name), value)
+                for peer, adapter in self._by_peer()
+                if adapter.last is not None and adapter.last.terms is not None
+                for name, value in zip(TERMS, adapter.last.terms, strict=True)
+            ]
+
+        def predicted() -> list[tuple[Labels, float]]:
+            return [
+                ((peer, name), value)
+                for peer, adapter in self._by_peer()
+                if adapter.last is not None and (found := adapter.last.decision.prediction) is not None
+                for name, value in zip(TERMS, found.terms, strict=True)
+            ]
+
+        def costs() -> list[tuple[Labels, float]]:
+            return [
+                ((peer,), adapter.last.cost)
+                for peer, adapter in self._by_peer()
+                if adapter.last is not None and adapter.last.cost is not None
+            ]
+
+        def predicted_costs() -> list[tuple[Labels, float]]:
+            return [
+                ((peer,), found.cost)
+                for peer, adapter in self._by_peer()
+                if adapter.last is not None and (found := adapter.last.decision.prediction) is not None
+            ]
+
+        def errors() -> list[tuple[Labels, float]]:
+            return [
+                ((peer,), adapter.prediction_error)
+                for peer, adapter in self._by_peer()
+                if adapter.prediction_error is not None
+            ]
+
+        def shares() -> list[tuple[Labels, float]]:
+            return [
+                ((peer, label), share)
+                for peer, adapter in self._by_peer()
+                for label, share in zip(CLASS_LABELS, adapter.policy.active.rates, strict=True)
+            ]
+
+        def limits() -> list[tuple[Labels, float]]:
+            return [
+                ((peer, label), float(limit))
+                for peer, adapter in self._by_peer()
+                for label, limit in zip(CLASS_LABELS, adapter.policy.active.queues, strict=True)
+            ]
+
+        def modes() -> list[tuple[Labels, float]]:
+            return [
+                ((peer, mode), float(adapter.policy.active.codec == mode))
+                for peer, adapter in self._by_peer()
+                for mode in self._params.modes
+            ]
+
+        def copies() -> list[tuple[Labels, float]]:
+            return [((peer,), float(a.policy.active.redundancy)) for peer, a in self._by_peer()]
+
+        def switches() -> list[tuple[Labels, float]]:
+            return [((peer,), float(a.switches)) for peer, a in self._by_peer()]
+
+        gauge = metrics.gauge
+        gauge("sern_mmcf_cost", "Cost of the last interval, 0 to 1.", ("peer",), costs)
+        gauge(
+            "sern_mmcf_term", "A term of the cost as measured, 0 to 1, before its weight.", ("peer", "term"), measured
+        )
+        gauge("sern_mmcf_predicted_cost", "Cost predicted for the interval that runs.", ("peer",), predicted_costs)
+        gauge("sern_mmcf_predicted_term", "A term predicted for the interval that runs.", ("peer", "term"), predicted)
+        gauge("sern_mmcf_prediction_error", "Measured less predicted cost of the last interval.", ("peer",), errors)
+        gauge(
+            "sern_mmcf_rate_share", "Share of a class's best-effort messages that is let in.", ("peer", "class"), shares
+        )
+        gauge("sern_mmcf_queue_limit_messages", "Queue limit of a class, a topic.", ("peer", "class"), limits)
+        gauge("sern_mmcf_codec", "1 for the compression mode in force.", ("peer", "mode"), modes)
+        gauge("sern_mmcf_redundancy", "1 while class control may be sent twice.", ("peer",), copies)
+        metrics.counter("sern_mmcf_switches_total", "Times another configuration was chosen.", ("peer",), switches)

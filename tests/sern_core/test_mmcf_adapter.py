@@ -1,0 +1,222 @@
+"""The adaptation on real links in virtual time: what it measures, what it applies, and that it harms nothing."""
+
+import itertools
+from dataclasses import dataclass, field
+from random import Random
+
+import pytest
+
+from sern_core.codecs import Compression
+from sern_core.mmcf.adapter import SAMPLES, AdapterParams, HopAdapter, Step
+from sern_core.mmcf.cost import Ranges, profile
+from sern_core.mmcf.model import Configuration
+from sern_core.mmcf.policy import FixedPolicy, Mmcf, Policy
+from sern_core.mmcf.predict import Grid
+from sern_core.mmcf.report import adapter_json, step_json
+from sern_core.params import LinkParams, Redundancy
+from sern_core.queues import OutChannel
+from sern_core.types import DropReason, PriorityClass
+from sern_sim.models import LinkModel, RateStep
+from tests.world import SimClient, World, spec
+
+CONTROL, STATE, BULK = PriorityClass
+WEIGHTS = profile("teleoperation")
+MODES = ("none", "lz4", "zstd")
+GRID = Grid.of(
+    rates=[(1.0,), (1.0, 0.5), (1.0, 0.4, 0.1)],
+    queues=[(10,), (1, 10), (1, 10)],
+    codecs=MODES,
+    redundancy=(0, 1),
+)
+_RANDOM = Random(1)
+TEXT = bytes(_RANDOM.randrange(24) for _ in range(60_000))  # compresses to about 0.6
+
+
+@dataclass
+class Rig:
+    """A robot with an adaptation behind a link, a site that wants everything of it."""
+
+    world: World
+    robot: SimClient
+    site: SimClient
+    adapter: HopAdapter
+    steps: list[Step] = field(default_factory=list)
+
+    def feed(self, channel: OutChannel, rate_hz: float, size: int, *, until_s: float = 1e9) -> None:
+        world = self.world
+
+        def send(now: float) -> None:
+            if world.network.elapsed_s < until_s and channel.slot in self.robot.core.link.channels:
+                self.robot.core.send(channel, TEXT[:size], 0, now=now)
+
+        # Off the beat of the intervals, as sources are.
+        world.network.after(
+            0.003 + 0.37 / rate_hz, lambda _now: world.network.every(1.0 / rate_hz, send, node=self.robot)
+        )
+
+    def at(self, at_s: float) -> Step:
+        """The interval that ended at about `at_s`."""
+        return min(self.steps, key=lambda step: abs(step.now - self.world.network.start_s - at_s))
+
+
+def rig(
+    policy: Policy | None = None,
+    model: LinkModel | None = None,
+    *,
+    lossless: bool = True,
+    link: LinkParams | None = None,
+) -> Rig:
+    world = World(lossless=lossless, compress=True, link=link)
+    model = model or LinkModel(rate_bps=4e6, delay_s=0.025)
+    robot = world.client("robot", model.as_stream() if lossless else model)
+    site = world.client("site", patterns=["/robot/.*"])
+    policy = policy or Mmcf(GRID, weights=WEIGHTS, ranges=Ranges(), initial=Configuration(queues=(10, 10, 10)))
+    params = AdapterParams(weights=WEIGHTS, modes=MODES)
+    adapter = HopAdapter(robot.core.link, policy, params, coder=robot.core.coder, now=world.now)
+    found = Rig(world, robot, site, adapter)
+    world.network.every(1.0 / SAMPLES, lambda _now: adapter.sample(), node=robot)
+    world.network.every(1.0, lambda now: found.steps.append(adapter.step(now=now)), node=robot)
+    return found
+
+
+def test_it_measures_what_is_offered_and_foresees_what_comes_of_it() -> None:
+    r = rig()
+    pose = r.robot.publish("/robot/pose", spec(CONTROL, lifespan_s=1.0))
+    scan = r.robot.publish("/robot/scan", spec(STATE, lifespan_s=1.0))
+    cloud = r.robot.publish("/robot/points", spec(BULK, lifespan_s=1.0))
+    r.feed(pose, 50.0, 120)
+    r.feed(scan, 10.0, 2200)
+    r.feed(cloud, 5.0, 60_000)
+    r.world.run(12.0)
+    last = r.steps[-1]
+    offered = {demand.priority: (demand.rate_hz, demand.mean_bytes) for demand in last.situation.classes}
+    assert offered[CONTROL] == pytest.approx((50.0, 120.0), rel=0.05)
+    assert offered[STATE] == pytest.approx((10.0, 2200.0), rel=0.05)
+    assert offered[BULK] == pytest.approx((5.0, 60_000.0), rel=0.05)
+    assert last.situation.link.rtt_s == pytest.approx(0.05, abs=0.03)
+    assert last.measurement is not None and last.cost is not None
+    assert last.measurement.unreliability < 0.05
+    assert r.adapter.prediction_error == pytest.approx(0.0, abs=0.02)
+    ratio = last.situation.classes[2].codec("zstd").ratio
+    assert 0.5 < ratio < 0.7
+    r.world.validate()
+
+
+def test_a_drop_of_the_link_is_followed_and_nothing_reliable_is_lost_or_reordered() -> None:
+    """Rates, queue limits and modes change under traffic: reliable messages arrive whole, once, in order; of the others
+    each has one fate, and never goes back."""
+    steps = (RateStep(8.0, 0.5e6), RateStep(16.0, 4e6))
+    r = rig(model=LinkModel(rate_bps=4e6, delay_s=0.025, rate_steps=steps))
+    pose = r.robot.publish("/robot/pose", spec(CONTROL, lifespan_s=1.0))
+    log = r.robot.publish("/robot/log", spec(STATE, reliable=True))
+    cloud = r.robot.publish("/robot/points", spec(BULK, lifespan_s=1.0, depth=4))
+    r.feed(pose, 50.0, 120, until_s=24.0)
+    r.feed(log, 5.0, 800, until_s=24.0)
+    r.feed(cloud, 5.0, 60_000, until_s=24.0)
+    r.world.network.every(0.25, lambda _now: r.world.validate())
+    r.world.run(30.0)
+    assert {str(step.decision.chosen) for step in r.steps} > {str(r.steps[0].decision.chosen)}
+    assert r.site.seqs("/robot/log") == list(range(1, log.next_seq))
+    for topic in ("/robot/pose", "/robot/points"):
+        seqs = r.site.seqs(topic)
+        assert seqs == sorted(set(seqs))
+    counters = cloud.counters
+    assert counters.offered == counters.delivered + counters.dropped
+    assert cloud.thinned == counters.by_reason[DropReason.RATE_CAP] > 0
+    assert log.thinned == 0
+    assert len(r.site.seqs("/robot/pose")) > 0.9 * (pose.next_seq - 1)
+
+
+def test_the_configuration_reaches_channels_lanes_and_codecs() -> None:
+    asked = Configuration((1.0, 0.5, 0.25), (10, 2, 3), "zstd", 1)
+    r = rig(FixedPolicy(asked), lossless=False)
+    scan = r.robot.publish("/robot/scan", spec(STATE, lifespan_s=1.0, depth=5))
+    cloud = r.robot.publish("/robot/points", spec(BULK, lifespan_s=1.0, depth=2))
+    raw = r.robot.publish("/robot/raw", spec(BULK, lifespan_s=1.0, compression=Compression.NONE))
+    latched = r.robot.publish("/robot/map", spec(STATE, reliable=True, latched=True, depth=5))
+    r.feed(scan, 10.0, 1000)
+    r.feed(cloud, 8.0, 5000)
+    r.feed(raw, 8.0, 5000)
+    r.world.run(6.0)
+    assert (scan.share, scan.depth) == (0.5, 2)
+    assert (cloud.share, cloud.depth) == (0.25, 2)  # its own depth is less
+    assert (latched.share, latched.depth) == (1.0, 5)
+    assert scan.codec is not None and scan.codec.setting is Compression.ZSTD
+    assert raw.codec is not None and raw.codec.setting is Compression.NONE  # its rule says so
+    assert r.robot.core.link.lane.redundant
+    assert cloud.thinned == pytest.approx(0.75 * 8.0 * 5.0, abs=6)
+    r.adapter.close()
+    assert (cloud.share, cloud.depth) == (1.0, 2) and scan.depth == 5
+    assert not r.robot.core.link.lane.redundant
+
+
+def test_redundancy_is_left_to_the_configuration_file_where_it_decides() -> None:
+    r = rig(FixedPolicy(Configuration(redundancy=1)), lossless=False, link=LinkParams(redundancy=Redundancy.OFF))
+    r.world.run(3.0)
+    assert not r.robot.core.link.lane.redundant
+    r = rig(FixedPolicy(Configuration(redundancy=0)), lossless=False, link=LinkParams(redundancy=Redundancy.ALWAYS))
+    r.world.run(3.0)
+    assert r.robot.core.link.lane.redundant
+
+
+def test_a_class_that_appears_is_taken_in_within_one_interval_and_nothing_else_is_disturbed() -> None:
+    r = rig(model=LinkModel(rate_bps=3e6, delay_s=0.025))
+    pose = r.robot.publish("/robot/pose", spec(CONTROL, lifespan_s=1.0))
+    r.feed(pose, 50.0, 120)
+    r.world.run(6.0)
+    assert [demand.priority for demand in r.steps[-1].situation.classes] == [CONTROL]
+    cloud = r.robot.publish("/robot2/points", spec(BULK, lifespan_s=1.0))
+    r.site.subscribe("/robot.*/.*")
+    began_s = r.world.network.elapsed_s
+    r.feed(cloud, 5.0, 60_000)
+    r.world.until(lambda: r.site.on("/robot2/points"), within_s=2.0)
+    assert r.world.network.elapsed_s - began_s < 1.0
+    r.world.run(1.2)
+    known = [
+        step.now - r.world.network.start_s
+        for step in r.steps
+        if any(demand.priority is BULK for demand in step.situation.classes)
+    ]
+    assert known and known[0] - began_s <= 1.1
+    r.world.run(4.0)
+    assert cloud.share == r.adapter.policy.active.rates[BULK]
+    gone_s = r.world.network.elapsed_s
+    r.robot.core.unpublish(cloud, now=r.robot.now)
+    r.world.run(2.2)
+    assert [demand.priority for demand in r.at(gone_s + 2.0).situation.classes] == [CONTROL]
+    poses = [got for got in r.site.on("/robot/pose") if got.at_s - r.world.network.start_s > 1.0]
+    gaps = [b.at_s - a.at_s for a, b in itertools.pairwise(poses)]
+    assert max(gaps) < 0.2  # the first cloud finds a link that has never been full
+    r.world.validate()
+
+
+def test_while_the_link_is_down_nothing_is_decided() -> None:
+    r = rig()
+    pose = r.robot.publish("/robot/pose", spec(CONTROL, lifespan_s=1.0))
+    r.feed(pose, 50.0, 120)
+    r.world.run(5.0)
+    r.world.hops["robot"].break_connection(reconnect_s=4.0)
+    before = r.adapter.policy.active
+    r.world.run(3.0)
+    assert r.steps[-1].measurement is None
+    assert "not known" in r.steps[-1].decision.reason
+    assert r.adapter.policy.active == before
+    r.world.run(8.0)
+    assert r.steps[-1].measurement is not None
+
+
+def test_the_report_has_every_term_the_candidates_and_the_reason() -> None:
+    r = rig()
+    pose = r.robot.publish("/robot/pose", spec(CONTROL, lifespan_s=1.0))
+    r.feed(pose, 50.0, 120)
+    r.world.run(6.0)
+    told = step_json(r.steps[-1])
+    assert set(told["measured"]["terms"]) == {"latency", "unreliability", "compute", "bandwidth"}
+    assert told["predicted"]["classes"][0]["class"] == "control"
+    assert told["weighed"] == len(GRID) + (Configuration(queues=(10, 10, 10)) not in GRID.index)
+    costs = [candidate["cost"] for candidate in told["candidates"] if not candidate["obstacle"]]
+    assert len(costs) >= 2 and costs[0] == min(costs)
+    assert told["reason"]
+    state = adapter_json(r.adapter)
+    assert state["policy"] == "mmcf" and state["configuration"]["text"] == str(r.adapter.policy.active)
+    assert any(name.startswith("latency/") for name in state["corrections"])
