@@ -1,12 +1,12 @@
 """The section `adaptation`: what the multi-metric cost function may choose from and what it is to weigh."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
 from sern_core.codecs import LOSSLESS, Compression
-from sern_core.errors import ConfigError
 from sern_core.mmcf.adapter import AdapterParams
 from sern_core.mmcf.cost import SUM_TOLERANCE, Ranges, Weights, profile
 from sern_core.mmcf.model import NO_CODEC, Configuration
@@ -183,6 +183,8 @@ class AdaptationSection(Section):
             count *= len(choices)
         if count > MAX_CANDIDATES:
             raise fault(f"gives {count} configurations to choose from, more than {MAX_CANDIDATES}; name fewer")
+        if self.policy == "fixed" and self.fixed.codec not in self.codecs:
+            raise fault(f"{self.fixed.codec} is not among codecs: {', '.join(self.codecs)}", "fixed", "codec")
         return self
 
     def cost_weights(self) -> Weights:
@@ -200,7 +202,7 @@ class AdaptationSection(Section):
         )
 
     def make_policy(self, *, encodes: bool) -> Callable[[], Policy]:
-        """A maker of policies, one a link. Raises ConfigError."""
+        """A maker of policies, one a link."""
         params = self.params(encodes=encodes)
         bounds = Bounds(self.limits.min_rates.values(), self.limits.compute_max)
         if self.policy == "mmcf":
@@ -218,8 +220,8 @@ class AdaptationSection(Section):
             "fixed_reliability": fixed_reliability(params.modes),
             "fixed": self.fixed.configuration(),
         }[self.policy]
-        if fixed.codec not in params.modes:
-            raise ConfigError(f"codec {fixed.codec} is not among codecs: {', '.join(params.modes)}", key="fixed.codec")
+        if not encodes:
+            fixed = replace(fixed, codec=NO_CODEC)
         grid = Grid([fixed])
         name = self.policy
         return lambda: FixedPolicy(
