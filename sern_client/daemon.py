@@ -19,6 +19,7 @@ from sern_client.express import ClientExpress
 from sern_client.factory import make_endpoint
 from sern_client.message_log import MessageLog
 from sern_client.services import ServiceBridge
+from sern_client.summarise import register_summaries
 from sern_client.transport import RelayTransport
 from sern_client.udp import ClientLane
 from sern_core.client import ClientCore
@@ -248,6 +249,12 @@ class ClientDaemon:
         register_links(metrics, lambda: [link])
         register_received(metrics, self.core.received, self.bridge.ages)
         register_codecs(metrics, self.core.coder)
+        register_summaries(metrics, self.bridge.summaries)
+        metrics.counter(
+            "sern_patch_gaps_total",
+            "Times a grid of patches could not go on, and waited for the next whole one.",
+            read=lambda: [((), float(self.bridge.rebuilds.gaps))],
+        )
         adaptation = self.adaptation
         if adaptation is not None:
             adaptation.register(metrics)

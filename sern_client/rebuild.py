@@ -47,12 +47,13 @@ class Rebuilds:
 
     def __init__(self) -> None:
         self.undecodable = 0
+        self._gaps = 0  # of grids that have ended
         self._grids: dict[StreamId, _Grid] = {}
 
     @property
     def gaps(self) -> int:
         """How often a grid could not go on because something was missing."""
-        return sum(grid.rebuilder.gaps for grid in self._grids.values())
+        return self._gaps + sum(grid.rebuilder.gaps for grid in self._grids.values())
 
     def opened(self, stream: StreamInfo, show: Show | None) -> TopicName | None:
         """A stream has begun; `show` if it is published here. Returns the topic of the updates to ask for, if any."""
@@ -72,7 +73,8 @@ class Rebuilds:
 
     def closed(self, stream: StreamInfo) -> None:
         """The whole grids have ended: what was known of them is forgotten."""
-        self._grids.pop(stream.id, None)
+        grid = self._grids.pop(stream.id, None)
+        self._gaps += 0 if grid is None else grid.rebuilder.gaps
 
     def message(self, stream: StreamInfo, message: Message) -> bool:
         """A message of any stream. True: it was a whole grid, and is published from here if it is to be."""

@@ -36,6 +36,7 @@ from sern_core.summaries.voxel import thin_cloud
 from sern_core.types import DropReason, Durability, Encoding, PriorityClass, Reliability, TopicName
 from sern_runtime import ros_types
 from sern_runtime.loop import Timer
+from sern_runtime.metrics import Labels, Metrics
 
 INLINE_BYTES: Final = 64 * 2**10
 """Smaller bodies are worked on where they come in: it takes less than a millisecond."""
@@ -114,6 +115,9 @@ class TopicSummary:
         self.level = spec.level
         self.profile = SummaryProfile()
         self.undecodable = 0
+        self.bytes_in = 0
+        self.bytes_out = 0
+        self.cpu_s = 0.0
         self.beside = spec.beside
         self.shares_topic = spec.shares_topic
         self._channels = channels
@@ -285,7 +289,11 @@ class TopicSummary:
 
     def _measure(self, job: Job, result: Result) -> None:
         old, size = self.profile, len(job.body)
-        ratio = sum(len(body) for _, body in result.bodies) / max(size, 1)
+        made = sum(len(body) for _, body in result.bodies)
+        self.bytes_in += size
+        self.bytes_out += made
+        self.cpu_s += result.cpu_s
+        ratio = made / max(size, 1)
         part = _SMOOTHING if old.messages else 1.0
         span_s = self._arrivals_s[-1] - self._arrivals_s[0] if len(self._arrivals_s) > 1 else 0.0
         self.profile = SummaryProfile(
@@ -553,3 +561,27 @@ class Summaries:
         """What is being worked on comes to nothing; waits for it to end, which takes milliseconds."""
         self._topics.clear()
         self._executor.shutdown(wait=True, cancel_futures=True)
+
+
+def register_summaries(metrics: Metrics, summaries: Summaries) -> None:
+    """What the summaries of a client cost and save, by topic (local name) and kind."""
+
+    def per_topic(read: Callable[[TopicSummary], float]) -> Callable[[], list[tuple[Labels, float]]]:
+        return lambda: [((item.topic, str(item.kind)), read(item)) for item in summaries.topics]
+
+    labels = ("topic", "kind")
+    counters: tuple[tuple[str, str, Callable[[TopicSummary], float]], ...] = (
+        ("messages", "Messages of which a summary was made.", lambda item: item.profile.messages),
+        ("raw_bytes", "Bytes of those messages.", lambda item: item.bytes_in),
+        ("bytes", "Bytes of their summaries.", lambda item: item.bytes_out),
+        ("cpu_seconds", "Processor time of making them.", lambda item: item.cpu_s),
+        ("undecodable", "Messages of which none could be made.", lambda item: item.undecodable),
+    )
+    for name, text, read in counters:
+        metrics.counter(f"sern_summary_{name}_total", text, labels, per_topic(read))
+    metrics.gauge(
+        "sern_summary_level",
+        "1 while summaries are sent, 0 while messages go as they come.",
+        labels,
+        per_topic(lambda item: float(item.level is SummaryLevel.SUMMARY)),
+    )

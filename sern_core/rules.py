@@ -293,7 +293,8 @@ class RuleSet:
         - lifespan and deadline: the publisher's, where it has any (DDS); else no deadline, and
         - lifespan: 0.3 s for a velocity command in class control; for ever if reliable or latched; else 1 s;
         - weight κ: by class; many_writers: true for `/tf` and `/tf_static`;
-        - merge_tf: for transforms in class state, and for `/tf_static` and other latched ones with or without a rule.
+        - merge_tf: for transforms in class state unless the rule makes them reliable, and for `/tf_static` and other
+          latched ones with or without a rule.
 
         Raises ConfigError when the rule has `on_link_loss` and the type is known to be no velocity command, and when
         the topic has the name that `remap` gave to another one.
@@ -347,7 +348,8 @@ class RuleSet:
             many_writers=many_writers if rule.many_writers is None else rule.many_writers,
             compression=rule.compression,
         )
-        merge_tf = static or (transforms and rule.priority is PriorityClass.STATE)
+        every_one_counts = rule.reliability is Reliability.RELIABLE
+        merge_tf = static or (transforms and rule.priority is PriorityClass.STATE and not every_one_counts)
         if rule.merge_tf is not None:
             merge_tf = transforms and rule.merge_tf
         name = rule.remap or local_name

@@ -192,7 +192,8 @@ class TopicSection(Section):
     selects what it is."""
     merge_tf: bool | None = None
     """For tf2_msgs/TFMessage: many messages become one with the newest transform of each pair of frames, at most
-    `max_rate_hz` (20) a second, of /tf_static one with all there are; null: in class state, and /tf_static always."""
+    `max_rate_hz` (20) a second, of /tf_static one with all there are; null: /tf_static always, others in class state
+    unless `reliability` is reliable."""
 
     @model_validator(mode="after")
     def _summaries_fit(self) -> "TopicSection":

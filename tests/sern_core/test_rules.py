@@ -1,6 +1,7 @@
 """Names, patterns and topic rules: first match wins, namespaces go round, defaults follow the publisher."""
 
 import re
+from typing import Any
 
 import pytest
 from hypothesis import given, settings
@@ -323,3 +324,28 @@ def test_feed_roles_deny_by_default() -> None:
     assert not role.may_publish(TopicName("/a"), PriorityClass.BULK)
     commander = FeedRole("c", "x", "y", publish=(re.compile("/a"),), allow_control=True)
     assert commander.may_publish(TopicName("/a"), PriorityClass.CONTROL)
+
+
+@pytest.mark.parametrize(
+    ("name", "type_name", "rule", "merged"),
+    [
+        ("/tf", "tf2_msgs/msg/TFMessage", None, False),
+        ("/tf_static", "tf2_msgs/msg/TFMessage", None, True),
+        ("/robot1/tf_static", "tf/msg/tfMessage", {"priority": PriorityClass.BULK}, True),
+        ("/tf_static", "tf2_msgs/msg/TFMessage", {"merge_tf": False}, False),
+        ("/tf", "tf2_msgs/msg/TFMessage", {"priority": PriorityClass.STATE}, True),
+        ("/tf", "tf2_msgs/msg/TFMessage", {"priority": PriorityClass.CONTROL}, False),
+        ("/tf", "tf2_msgs/msg/TFMessage", {"priority": PriorityClass.CONTROL, "merge_tf": True}, True),
+        (
+            "/tf",
+            "tf2_msgs/msg/TFMessage",
+            {"priority": PriorityClass.STATE, "reliability": Reliability.RELIABLE},
+            False,
+        ),
+        ("/odom", "nav_msgs/msg/Odometry", {"priority": PriorityClass.STATE, "merge_tf": True}, False),
+    ],
+)
+def test_which_transforms_are_merged(name: str, type_name: str, rule: dict[str, Any] | None, merged: bool) -> None:
+    rules = RuleSet(() if rule is None else (TopicRule(re.compile(".*"), **rule),))
+    info = TopicInfo(TopicName(name), type_name, Encoding.CDR)
+    assert rules.resolve(info, local_name=info.name).merge_tf is merged
