@@ -7,7 +7,7 @@ import pytest
 
 from sern_core.access import AccessTable
 from sern_core.message import TopicInfo
-from sern_core.rules import Direction, to_global
+from sern_core.rules import Direction
 from sern_core.types import ClientName, Encoding, PriorityClass, TopicName
 from sern_runtime.config.client import ClientFile, load_client
 from sern_runtime.config.relay import load_relay
@@ -75,6 +75,31 @@ def test_topics_of_a_noetic_robot(name: str) -> None:
     assert of("/joy_teleop/cmd_vel", "geometry_msgs/Twist") is None
 
 
+@pytest.mark.parametrize("name", ["jackal-jazzy.yaml", "husky-jazzy.yaml"])
+def test_topics_of_a_jazzy_robot(name: str) -> None:
+    model = client(name)
+
+    def of(topic: str, type_name: str, *, latched: bool = False) -> Treated | None:
+        return treated(model, f"/{model.name}{topic}", type_name, Encoding.CDR, latched=latched)
+
+    send = Direction.SEND
+    assert of("/cmd_vel", "geometry_msgs/msg/TwistStamped") == Treated(CONTROL, Direction.RECEIVE, False)
+    assert of("/platform/emergency_stop", "std_msgs/msg/Bool") == Treated(CONTROL, send, True)
+    assert of("/platform/odom/filtered", "nav_msgs/msg/Odometry") == Treated(CONTROL, send, False)
+    assert of("/platform/odom", "nav_msgs/msg/Odometry") == Treated(STATE, send, False)
+    assert of("/tf", "tf2_msgs/msg/TFMessage") == Treated(STATE, send, False)
+    assert of("/tf_static", "tf2_msgs/msg/TFMessage", latched=True) == Treated(STATE, send, True)
+    assert of("/map", "nav_msgs/msg/OccupancyGrid", latched=True) == Treated(STATE, send, True, ("PatchParams",))
+    points = of("/sensors/lidar3d_0/points", "sensor_msgs/msg/PointCloud2")
+    assert points == Treated(BULK, send, False, ("ScanParams", "VoxelParams"))
+    feedback = of("/navigate_to_pose/_action/feedback", "nav2_msgs/action/NavigateToPose_FeedbackMessage")
+    assert feedback == Treated(STATE, send, False)
+    assert of("/rosout", "rcl_interfaces/msg/Log") is None
+    rules = model.rules()
+    frames = TopicInfo(TopicName(f"/{model.name}/tf"), "tf2_msgs/msg/TFMessage", Encoding.CDR)
+    assert rules.resolve(frames, local_name=frames.name).merge_tf
+
+
 @pytest.mark.parametrize("name", [name for name in CLIENTS if name not in {"robot.yaml", "site.yaml"}])
 def test_the_relay_lets_through_what_a_client_needs(name: str) -> None:
     """What the client sends under its own or a robot's name, and what it subscribes to."""
@@ -90,9 +115,10 @@ def test_the_relay_lets_through_what_a_client_needs(name: str) -> None:
         assert not table.may_publish(own, TopicName(robot + "/dock/_call/jackal1"))
         assert table.may_subscribe(own, TopicName(robot + "/map"))
         return
+    robot = f"/{own}"
     for topic in ("/odom", "/map", "/points/scan"):
-        assert table.may_publish(own, to_global(TopicName(topic), model.namespace))
+        assert table.may_publish(own, TopicName(robot + topic))
     assert not table.may_publish(own, TopicName("/other1/odom"))
     for topic in ("/cmd_vel", "/move_base/goal", "/dock/_call/site1"):
-        assert table.may_subscribe(own, to_global(TopicName(topic), model.namespace))
+        assert table.may_subscribe(own, TopicName(robot + topic))
     assert not table.may_subscribe(own, TopicName("/other1/cmd_vel"))
