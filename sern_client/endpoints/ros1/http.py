@@ -46,11 +46,11 @@ class HttpReader:
         self._buffer += data
         if self._headers is None and not self._read_head():
             return None
-        if len(self._buffer) > self._max_body_bytes:
-            raise WireError(f"HTTP body above {self._max_body_bytes} bytes")
-        if self._length is None or len(self._buffer) < self._length:
+        if self._length is None:
+            if len(self._buffer) > self._max_body_bytes:
+                raise WireError(f"HTTP body above {self._max_body_bytes} bytes")
             return None
-        return self._take(self._length)
+        return self._take(self._length) if len(self._buffer) >= self._length else None
 
     def finish(self) -> HttpMessage | None:
         """At the end of the connection: the answer that only this ends, if there is one."""
