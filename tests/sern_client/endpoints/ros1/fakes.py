@@ -9,7 +9,7 @@ from sern_client.endpoints.ros1 import Ros1Endpoint, Ros1Options
 from sern_client.endpoints.ros1.frames import LENGTH
 from sern_client.endpoints.ros1.header import decode_header, encode_header
 from sern_client.endpoints.ros1.xmlrpc import XmlRpcServer
-from sern_core.types import Encoding
+from sern_core.types import Encoding, TopicName
 from sern_runtime import ros_types
 from tests.sern_client.endpoints.conftest import Events
 from tests.support import until
@@ -26,6 +26,19 @@ def text(data: str) -> bytes:
 
 def frame(body: bytes) -> bytes:
     return LENGTH.pack(len(body)) + body
+
+
+def collect(endpoint: Ros1Endpoint, name: str = "/chat") -> list[bytes]:
+    """Subscribes; what has come so far."""
+    got: list[bytes] = []
+
+    def sink(body: bytes, stamp_ns: int) -> bool:
+        assert stamp_ns > 10**18
+        got.append(body)
+        return True
+
+    endpoint.subscribe(TopicName(name), sink)
+    return got
 
 
 class FakeMaster:

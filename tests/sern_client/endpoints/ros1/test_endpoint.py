@@ -20,6 +20,7 @@ from tests.sern_client.endpoints.ros1.fakes import (
     STRING,
     FakeMaster,
     FakePublisher,
+    collect,
     frame,
     listening,
     running,
@@ -34,8 +35,7 @@ async def test_announces_what_the_header_says_and_passes_bytes_on(master: FakeMa
     async with running(master) as (endpoint, events), FakePublisher(master, latching="1") as talker:
         await until(lambda: CHAT in events.infos)
         assert events.infos[CHAT] == replace(STRING, latched=True)
-        got: list[bytes] = []
-        endpoint.subscribe(CHAT, lambda body, _: got.append(body) is None)
+        got = collect(endpoint)
         await until(lambda: any(not writer.transport.is_closing() for writer in talker.writers))
         stream = b"".join(frame(text(f"{n}" * n)) for n in range(50))
         for at in range(0, len(stream), 13):
@@ -49,8 +49,7 @@ async def test_announces_what_the_header_says_and_passes_bytes_on(master: FakeMa
 async def test_a_publisher_that_hangs_up_is_connected_again(master: FakeMaster) -> None:
     async with running(master) as (endpoint, events), FakePublisher(master) as talker:
         await until(lambda: CHAT in events.infos)
-        got: list[bytes] = []
-        endpoint.subscribe(CHAT, lambda body, _: got.append(body) is None)
+        got = collect(endpoint)
         for number in range(3):
             connections = len(talker.requests)
 
@@ -60,7 +59,11 @@ async def test_a_publisher_that_hangs_up_is_connected_again(master: FakeMaster) 
 
             await until(sent)
             talker.hang_up()
-            await until(lambda connections=connections: len(talker.requests) > connections)
+
+            def returned(connections: int = connections) -> bool:
+                return len(talker.requests) > connections
+
+            await until(returned)
         assert events.removed == []  # the node lives, so its topic stays
 
 
@@ -94,8 +97,7 @@ async def test_hostile_publishers_are_not_announced_and_disturb_nobody(master: F
     ):
         evil.greeting = greeting
         await until(lambda: CHAT in events.infos and evil.requests)
-        got: list[bytes] = []
-        endpoint.subscribe(CHAT, lambda body, _: got.append(body) is None)
+        got = collect(endpoint)
 
         def sent() -> bool:
             evil.send(frame(text("evil")))
