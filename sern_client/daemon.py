@@ -24,6 +24,7 @@ from sern_client.transport import RelayTransport
 from sern_client.udp import ClientLane
 from sern_core.client import ClientCore
 from sern_core.errors import ConfigError
+from sern_core.lossy import missing
 from sern_core.trace import DecisionTrace
 from sern_core.types import CLASS_LABELS, DropReason, ObjectKind
 from sern_runtime.adaptation import Adaptation
@@ -86,6 +87,9 @@ class ClientDaemon:
             on_down=self._link_down,
         )
         now = time.monotonic()
+        for index, section in enumerate(model.topics):
+            for problem in filter(None, map(missing, section.lossy)):
+                raise ConfigError(problem, file=str(loaded.path), key=f"topics.{index}.lossy")
         self.codecs = CodecPool(after=self._kick)
         self.core = ClientCore(
             name=model.name,

@@ -23,7 +23,10 @@ from typing import Final, NamedTuple
 
 import lz4.block
 
+from sern_core import lossy
 from sern_core.errors import CodecError
+from sern_core.lossy import LossyParams
+from sern_core.types import Encoding
 
 if sys.version_info >= (3, 14):
     from compression import zstd
@@ -65,6 +68,8 @@ class Compression(StrEnum):
     LZ4 = "lz4"
     ZSTD = "zstd"
     ZSTD_STRONG = "zstd_strong"
+    VOXEL_DRACO = "voxel_draco"  # lossy, for point clouds
+    JPEG = "jpeg"  # lossy, for images
 
 
 CODEC_OF: Final = {
@@ -72,8 +77,12 @@ CODEC_OF: Final = {
     Compression.LZ4: Codec.LZ4,
     Compression.ZSTD: Codec.ZSTD,
     Compression.ZSTD_STRONG: Codec.ZSTD,
+    Compression.VOXEL_DRACO: Codec.DRACO,
+    Compression.JPEG: Codec.JPEG,
 }
 LOSSLESS: Final = (Compression.NONE, Compression.LZ4, Compression.ZSTD, Compression.ZSTD_STRONG)
+LOSSY: Final = {Compression.VOXEL_DRACO: lossy.CLOUD_TYPE, Compression.JPEG: lossy.IMAGE_TYPE}
+"""Modes that lose something, and the type of message (ROS 1 spelling) that each is for."""
 KNOWN_CODECS: Final = frozenset(Codec)
 
 
@@ -85,11 +94,31 @@ class Encoded(NamedTuple):
     elapsed_s: float
 
 
-def encode(mode: Compression, body: bytes) -> tuple[Codec, bytes]:
-    """`body` encoded by `mode`; (Codec.NONE, body) where that does not make it at least 3 % smaller."""
+@dataclass(frozen=True, slots=True)
+class LossyTopic:
+    """The lossy modes that a topic allows, and what they need to know of it."""
+
+    modes: tuple[Compression, ...]
+    encoding: Encoding
+    params: LossyParams
+
+
+def encode(mode: Compression, body: bytes, topic: LossyTopic | None = None) -> tuple[Codec, bytes]:
+    """`body` encoded by `mode`; (Codec.NONE, body) where that does not make it at least 3 % smaller.
+
+    CodecError for a lossy mode that `topic` does not allow, that is not installed, or that cannot take this body.
+    """
     size = len(body)
     if size < MIN_BYTES or mode is Compression.NONE:
         return Codec.NONE, body
+    if mode in LOSSY:
+        if topic is None or mode not in topic.modes:
+            raise CodecError(f"{mode} loses something, and the topic does not allow it")
+        pack = lossy.encode_cloud if mode is Compression.VOXEL_DRACO else lossy.encode_image
+        out_bytes, packed = pack(body, topic.encoding, topic.params)
+        if SIZE.size + len(packed) > MAX_GAIN * size:
+            return Codec.NONE, body
+        return CODEC_OF[mode], SIZE.pack(out_bytes) + packed
     if mode is Compression.LZ4:
         packed = lz4.block.compress(body, store_size=False)
     else:
@@ -159,6 +188,8 @@ def _unpack_zstd(packed: memoryview, size: int) -> bytes:
 _DECODERS: Final[dict[int, Callable[[memoryview, int], bytes]]] = {
     Codec.LZ4: _unpack_lz4,
     Codec.ZSTD: _unpack_zstd,
+    Codec.DRACO: lossy.decode_cloud,
+    Codec.JPEG: lossy.decode_image,
 }
 
 
@@ -247,10 +278,17 @@ class Coder:
         self.encoded: dict[Compression, CodecCounters] = {mode: CodecCounters() for mode in list(Compression)[1:]}
         self.decoded: dict[Codec, CodecCounters] = {codec: CodecCounters() for codec in list(Codec)[1:]}
         self.undecodable = 0
+        self.unencodable = 0
+        """Bodies that a lossy mode could not take; they were sent as they were."""
 
-    def encode(self, mode: Compression, body: bytes) -> Encoded:
+    def encode(self, mode: Compression, body: bytes, topic: LossyTopic | None = None) -> Encoded:
+        """What cannot be encoded in a lossy mode comes back as it was."""
         start_s = self.clock()
-        codec, encoded = encode(mode, body)
+        try:
+            codec, encoded = encode(mode, body, topic)
+        except CodecError:
+            self.unencodable += 1
+            codec, encoded = Codec.NONE, body
         return Encoded(codec, encoded, self.clock() - start_s)
 
     def decode(self, codec: int, body: bytes) -> tuple[bytes, float]:

@@ -19,10 +19,12 @@ from sern_core.codecs import (
     Coder,
     Compression,
     Encoded,
+    LossyTopic,
     Work,
     blend,
     quickest,
 )
+from sern_core.errors import UsageError
 from sern_core.message import Message
 from sern_core.types import PriorityClass
 
@@ -55,14 +57,20 @@ class ChannelCodec:
         "encoded_bytes",
         "messages_to_probe",
         "mode",
+        "modes",
         "probing",
         "profiles",
         "ratio",
         "raw_bytes",
         "setting",
+        "topic",
     )
 
-    def __init__(self, setting: Compression | None) -> None:
+    def __init__(self, setting: Compression | None, topic: LossyTopic | None = None) -> None:
+        self.topic = topic
+        """The lossy modes that are allowed; None: none."""
+        self.modes = LOSSLESS[1:] if topic is None else (*LOSSLESS[1:], *topic.modes)
+        """What there is to choose from, beside `none`."""
         self.setting = setting
         """The mode to use; None: whichever is quickest (`auto`)."""
         self.mode = setting or Compression.NONE
@@ -85,13 +93,15 @@ class ChannelCodec:
             if self.setting is not None:
                 self.mode = self.setting
             elif rate_bps:
-                self.mode = quickest(self.profiles, LOSSLESS[1:], nbytes, rate_bps / 8)
+                self.mode = quickest(self.profiles, self.modes, nbytes, rate_bps / 8)
             else:
                 self.mode = Compression.NONE
         return self.mode
 
     def use(self, setting: Compression | None) -> None:
-        """Another mode from the next body on."""
+        """Another mode from the next body on. UsageError for a lossy one that the topic does not allow."""
+        if setting is not None and setting is not Compression.NONE and setting not in self.modes:
+            raise UsageError(f"{setting} loses something, and the topic does not allow it (`lossy`)")
         self.setting = setting
         self.due_s = -float("inf")
         if setting is not None:
@@ -112,7 +122,7 @@ class ChannelCodec:
 class EncodeRequest(Work):
     """One body that another thread is to encode."""
 
-    __slots__ = ("channel", "encoder", "message", "mode", "out", "priority", "result")
+    __slots__ = ("channel", "encoder", "message", "mode", "out", "priority", "result", "topic")
 
     def __init__(self, encoder: "Encoder", channel: "OutChannel", out: "OutMessage", mode: Compression) -> None:
         self.encoder = encoder
@@ -120,11 +130,12 @@ class EncodeRequest(Work):
         self.out = out
         self.message = out.message
         self.mode = mode
+        self.topic = None if channel.codec is None else channel.codec.topic
         self.priority = int(channel.spec.priority)
         self.result: Encoded | None = None
 
     def run(self) -> None:
-        self.result = self.encoder.coder.encode(self.mode, self.message.body)
+        self.result = self.encoder.coder.encode(self.mode, self.message.body, self.topic)
 
     def done(self, *, now: float) -> None:
         self.encoder.encoded(self, now=now)
@@ -144,8 +155,8 @@ class ProbeRequest(Work):
 
     def run(self) -> None:
         size = len(self.body)
-        for mode in LOSSLESS[1:]:
-            encoded = self.coder.encode(mode, self.body)
+        for mode in self.codec.modes:
+            encoded = self.coder.encode(mode, self.body, self.codec.topic)
             speed = size / encoded.elapsed_s if encoded.elapsed_s > 0.0 else 0.0
             self.results[mode] = CodecProfile(len(encoded.body) / size, speed)
 
@@ -184,7 +195,7 @@ class Encoder:
             return True
         coder = self.coder
         if size <= coder.inline_bytes or coder.offload is None:
-            self._apply(channel, out, codec, coder.encode(mode, message.body), mode)
+            self._apply(channel, out, codec, coder.encode(mode, message.body, codec.topic), mode)
             return True
         if self.running >= MAX_RUNNING:
             out.coding = Coding.HELD

@@ -184,7 +184,7 @@ class Link(Session):
         channel = OutChannel(slot, stream, counters, self._reporter(slot), first=first)
         channel.owed = owed
         channel.wanted = wanted
-        channel.codec = self._new_codec(stream.spec.compression)
+        channel.codec = self._new_codec(stream)
         channel.prime(replays, now=now)
         self.channels[slot] = channel
         self.by_stream[stream.id] = channel

@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
 from sern_core.codecs import Codec, Compression
+from sern_core.lossy import DEFAULT_LOSSY, LossyParams
 from sern_core.types import (
     DROP_REASONS,
     ClientName,
@@ -46,6 +47,8 @@ class TopicSpec:
     max_queue_bytes: int = DEFAULT_RELIABLE_QUEUE_BYTES
     many_writers: bool = False  # several clients may own this global name, e.g. /tf
     compression: Compression | None = None  # None: whatever is quickest; for the origin alone, never on the wire
+    lossy: tuple[Compression, ...] = ()  # modes that may lose something; for the origin alone
+    lossy_params: LossyParams = DEFAULT_LOSSY
 
     @property
     def reliable(self) -> bool:

@@ -16,6 +16,7 @@ from typing import Final
 
 from sern_core.codecs import Compression
 from sern_core.errors import ConfigError, UsageError
+from sern_core.lossy import DEFAULT_LOSSY, LossyParams
 from sern_core.message import (
     DEFAULT_COMMAND_LIFESPAN_S,
     DEFAULT_LIFESPAN_S,
@@ -196,6 +197,8 @@ class TopicRule:
     compression: Compression | None = None
     summaries: tuple[SummarySpec, ...] = ()
     merge_tf: bool | None = None
+    lossy: tuple[Compression, ...] = ()
+    lossy_params: LossyParams = DEFAULT_LOSSY
 
     @property
     def plain_name(self) -> TopicName | None:
@@ -347,6 +350,8 @@ class RuleSet:
             max_queue_bytes=rule.max_queue_bytes,
             many_writers=many_writers if rule.many_writers is None else rule.many_writers,
             compression=rule.compression,
+            lossy=rule.lossy,
+            lossy_params=rule.lossy_params,
         )
         every_one_counts = rule.reliability is Reliability.RELIABLE
         merge_tf = static or (transforms and rule.priority is PriorityClass.STATE and not every_one_counts)

@@ -11,7 +11,7 @@ from typing import Final, NamedTuple
 
 from sern_core import wire
 from sern_core.clocksync import ClockSync
-from sern_core.codecs import Coder, Compression
+from sern_core.codecs import LOSSY, Coder, Compression, LossyTopic
 from sern_core.encoding import ChannelCodec, Coding, Encoder
 from sern_core.flight import ACK_DELAY_S
 from sern_core.fragments import InStream, Reassembly
@@ -27,6 +27,7 @@ from sern_core.ledger import SendCounters, SendLedger
 from sern_core.message import Message, StreamId, StreamInfo, TopicInfo, TopicSpec
 from sern_core.params import LinkParams, SchedulerParams
 from sern_core.queues import OutChannel, OutMessage
+from sern_core.rules import plain_type
 from sern_core.scheduler import Scheduler
 from sern_core.trace import DecisionTrace, TraceEvent
 from sern_core.types import (
@@ -267,8 +268,15 @@ class Sender(ABC):
         """Encode the bodies of all channels that are opened from now on."""
         self.encoder = Encoder(coder, rate_bps=lambda: self.lane.estimator.rate_bps, refresh=self._recoded)
 
-    def _new_codec(self, setting: Compression | None) -> ChannelCodec | None:
-        return None if self.encoder is None else ChannelCodec(setting)
+    def _new_codec(self, stream: StreamInfo) -> ChannelCodec | None:
+        if self.encoder is None:
+            return None
+        spec, info = stream.spec, stream.info
+        modes = tuple(mode for mode in spec.lossy if LOSSY[mode] == plain_type(info.type_name))
+        setting = spec.compression
+        if setting in LOSSY and setting not in modes:
+            setting = None  # of a rule for several types
+        return ChannelCodec(setting, LossyTopic(modes, info.encoding, spec.lossy_params) if modes else None)
 
     # --- bytes out ------------------------------------------------------------------------------------------------
 

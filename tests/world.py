@@ -18,6 +18,7 @@ from sern_core.encoding import EncodeRequest
 from sern_core.hub import Hub, HubParams
 from sern_core.hub_port import HubPort
 from sern_core.link import Link
+from sern_core.lossy import DEFAULT_LOSSY, LossyParams
 from sern_core.message import Message, StreamId, StreamInfo, TopicInfo, TopicSpec
 from sern_core.params import LinkParams, SchedulerParams
 from sern_core.queues import OutChannel
@@ -50,6 +51,8 @@ def spec(
     max_queue_bytes: int = 32 * 2**20,
     many_writers: bool = False,
     compression: Compression | None = None,
+    lossy: tuple[Compression, ...] = (),
+    lossy_params: LossyParams = DEFAULT_LOSSY,
 ) -> TopicSpec:
     return TopicSpec(
         priority=priority,
@@ -63,6 +66,8 @@ def spec(
         max_queue_bytes=max_queue_bytes,
         many_writers=many_writers,
         compression=compression,
+        lossy=lossy,
+        lossy_params=lossy_params,
     )
 
 
@@ -275,8 +280,10 @@ class SimClient:
         self.denials.append((code, text))
 
     # helpers
-    def publish(self, topic: str, topic_spec: TopicSpec, definition: str = "") -> OutChannel:
-        info = TopicInfo(TopicName(topic), "std_msgs/msg/String", Encoding.CDR, "RIHS01_0", definition)
+    def publish(
+        self, topic: str, topic_spec: TopicSpec, definition: str = "", *, type_name: str = "std_msgs/msg/String"
+    ) -> OutChannel:
+        info = TopicInfo(TopicName(topic), type_name, Encoding.CDR, "RIHS01_0", definition)
         return self.core.publish(info, topic_spec, now=self.now)
 
     def send(self, channel: OutChannel, body: bytes) -> bool:

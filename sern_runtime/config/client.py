@@ -9,6 +9,7 @@ from pydantic import Discriminator, Field, Tag, model_validator
 from sern_core.access import compile_peer_pattern
 from sern_core.codecs import Compression
 from sern_core.errors import RefusedError
+from sern_core.lossy import DEFAULT_LOSSY, LossyParams
 from sern_core.message import DEFAULT_RELIABLE_QUEUE_BYTES
 from sern_core.rules import (
     AUTO,
@@ -178,9 +179,17 @@ class TopicSection(Section):
     max_queue_bytes: Bytes = DEFAULT_RELIABLE_QUEUE_BYTES
     """Undelivered reliable messages kept at most, each counted with 256 bytes beside its own; beyond, new ones are
     refused to their publisher."""
-    compression: Literal["auto", "none", "lz4", "zstd", "zstd_strong"] = "auto"
-    """How bodies from here are compressed, without loss; `auto`: whichever gets a message there soonest, by what each
-    makes of the topic and what the link carries. A body that gains less than 3 % is sent as it is."""
+    compression: Literal["auto", "none", "lz4", "zstd", "zstd_strong", "voxel_draco", "jpeg"] = "auto"
+    """How bodies from here are compressed; `auto`: whichever gets a message there soonest, by what each makes of the
+    topic and what the link carries, among the lossless ones and those in `lossy`. A body that gains less than 3 % is
+    sent as it is."""
+    lossy: tuple[Literal["voxel_draco", "jpeg"], ...] = ()
+    """Modes that may lose something: `voxel_draco` thins point clouds (x, y and z survive), `jpeg` is for images of
+    8-bit colour or grey. Both ends need the extra `lossy`."""
+    voxel_m: Annotated[float, Field(gt=0, le=1000)] = DEFAULT_LOSSY.voxel_m
+    """Of `voxel_draco`: edge of a voxel; each becomes one point, exact to a twentieth of it."""
+    jpeg_quality: Annotated[int, Field(ge=1, le=95)] = DEFAULT_LOSSY.jpeg_quality
+    """Of `jpeg`."""
     many_writers: bool | None = None
     """Several clients may publish this global name; null: only /tf and /tf_static."""
     remap: TopicText | None = None
@@ -218,6 +227,8 @@ class TopicSection(Section):
                 compile_peer_pattern(self.match)
             except RefusedError as error:
                 raise fault(str(error), "match") from error
+        if self.compression in ("voxel_draco", "jpeg") and self.compression not in self.lossy:
+            raise fault(f"{self.compression} loses something; name it in lossy as well", "compression")
         if self.on_link_loss is not None:
             if self.direction is Direction.SEND:
                 raise fault("acts where commands arrive; direction is send", "on_link_loss")
@@ -251,6 +262,8 @@ class TopicSection(Section):
             many_writers=self.many_writers,
             remap=None if self.remap is None else TopicName(self.remap),
             compression=None if self.compression == "auto" else Compression(self.compression),
+            lossy=tuple(Compression(mode) for mode in self.lossy),
+            lossy_params=LossyParams(self.voxel_m, self.jpeg_quality),
             lease=None if loss is None else Lease(publish=loss.publish, after_s=loss.after_s),
             summaries=specs(self.summary),
             merge_tf=self.merge_tf,

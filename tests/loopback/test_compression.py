@@ -4,12 +4,21 @@ import asyncio
 import threading
 from pathlib import Path
 
+import numpy as np
+import pytest
 import zmq
 
+from sern_client.daemon import ClientDaemon
+from sern_client.endpoints.clouds import read_ply
+from sern_core import lossy
 from sern_core.codecs import Coder, Compression, Work
+from sern_core.errors import ConfigError
 from sern_core.params import LinkParams
-from sern_core.types import TopicName
+from sern_core.summaries.voxel import thin_rows
+from sern_core.types import Encoding, TopicName
+from sern_runtime import ros_types
 from sern_runtime.codec_pool import CodecPool, make_coder
+from sern_runtime.config.client import load_client
 from tests.daemons import HOST, Lab, bodies, free_ports, recording, under
 from tests.support import until
 
@@ -91,6 +100,51 @@ async def test_scans_are_unpacked_at_the_site_and_for_the_feed_alone(tmp_path: P
     assert {parts[2] for parts in seen} <= set(recorded)
     passed = relay.hub.received.topics[CLOUDS]
     assert passed.delivered_bytes < 0.8 * passed.delivered * min(map(len, recorded))
+
+
+async def test_a_topic_that_allows_it_loses_points_and_stays_a_cloud(tmp_path: Path) -> None:
+    pytest.importorskip("DracoPy", reason="the Python package DracoPy (extra lossy) is not installed")
+    endpoint = {
+        "kind": "synthetic",
+        "role": "robot",
+        "topics": ["/points"],
+        "cloud_files": [str(recording("lidar_scan_a.ply"))],
+        "cloud_rate_hz": 10.0,
+        "encoding": "cdr",
+    }
+    topic = rule("/points", "voxel_draco") | {"lossy": ["voxel_draco", "jpeg"], "voxel_m": 0.2}
+    async with Lab(tmp_path, "robot1", "site") as lab:
+        relay = await lab.relay()
+        site = await lab.connected(lab.recorder_file("site", "/robot1/points"))
+        robot = await lab.connected(lab.client_file("robot1", endpoint, topics=[topic]))
+        arrived = site.core.received.topics
+        await until(lambda: CLOUDS in arrived and arrived[CLOUDS].delivered >= 5)
+        assert "voxel_draco" in robot.topics()[CLOUDS]["compression"]["profiles"]
+        passed = relay.hub.received.topics[CLOUDS]
+        assert passed.delivered_bytes < 30_000 * passed.delivered
+        for daemon in (robot, site, relay):
+            await lab.end(daemon)
+    scan = read_ply(recording("lidar_scan_a.ply"))
+    wanted = thin_rows(scan[:, :3], 0.2)[1]
+    assert wanted is not None
+    for body in bodies(tmp_path / "site.mcap")[CLOUDS]:
+        cloud = ros_types.deserialise(body, "sensor_msgs/msg/PointCloud2", Encoding.CDR)
+        assert cloud.header.frame_id == "velodyne"
+        points = cloud.data.view("<f4").reshape(-1, 3)
+        assert 0.95 * len(wanted) <= len(points) == cloud.width <= len(wanted)
+        assert np.allclose(points.min(axis=0), wanted.min(axis=0), atol=0.0101)
+        assert np.allclose(points.max(axis=0), wanted.max(axis=0), atol=0.0101)
+
+
+async def test_an_absent_library_is_said_before_anything_starts(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(lossy, "find_spec", lambda _name: None)
+    topic = rule("/points", "auto") | {"lossy": ["voxel_draco"]}
+    lab = Lab(tmp_path, "robot1")
+    path = lab.client_file("robot1", {"kind": "synthetic", "role": "robot"}, topics=[topic])
+    with pytest.raises(ConfigError, match=r"topics.0.lossy: .*pip install 'sern\[lossy\]'"):
+        ClientDaemon(load_client(path))
 
 
 class Job(Work):
