@@ -2,11 +2,11 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Annotated, Literal
+from typing import Annotated, Final, Literal
 
 from pydantic import Field, model_validator
 
-from sern_core.codecs import LOSSLESS, Compression
+from sern_core.codecs import Compression
 from sern_core.mmcf.adapter import AdapterParams
 from sern_core.mmcf.cost import SUM_TOLERANCE, Ranges, Weights, profile
 from sern_core.mmcf.model import NO_CODEC, Configuration
@@ -20,6 +20,15 @@ Share = Annotated[float, Field(gt=0, le=1)]
 ShareOrZero = Annotated[float, Field(ge=0, le=1)]
 QueueLimit = Annotated[int, Field(ge=1, le=10_000)]
 MAX_CANDIDATES = 2000
+
+
+LosslessMode = Literal[Compression.NONE, Compression.LZ4, Compression.ZSTD, Compression.ZSTD_STRONG]
+_LOSSLESS: Final[tuple[LosslessMode, ...]] = (
+    Compression.NONE,
+    Compression.LZ4,
+    Compression.ZSTD,
+    Compression.ZSTD_STRONG,
+)
 
 
 class WeightsSection(Section):
@@ -134,7 +143,7 @@ class FixedSection(Section):
     """Share of the messages of each class."""
     queue_limit: QueueLimit = 10
     """Messages that may wait a topic."""
-    codec: Compression = Compression.NONE
+    codec: LosslessMode = Compression.NONE
     """How bodies are compressed: `none`, `lz4`, `zstd` or `zstd_strong`."""
     redundancy: bool = False
     """Class control sent twice over the datagram lane."""
@@ -166,7 +175,7 @@ class AdaptationSection(Section):
     """Shares of the messages to choose from, r."""
     queues: QueuesSection = QueuesSection()
     """Queue limits to choose from, q."""
-    codecs: Annotated[tuple[Compression, ...], Field(min_length=1)] = tuple(LOSSLESS)
+    codecs: Annotated[tuple[LosslessMode, ...], Field(min_length=1)] = _LOSSLESS
     """Compression modes to choose from, z, for topics whose rule leaves it open; a relay forwards bodies unchanged."""
     redundancy: Annotated[tuple[bool, ...], Field(min_length=1)] = (False, True)
     """Whether class control may be sent twice, h, where `link.redundancy` is `auto`."""
