@@ -219,7 +219,7 @@ async def test_what_cannot_be_read_is_counted_and_said_once(tmp_path: Path, capl
     rules = [
         {"match": "/points", "reliability": "reliable", "summary": {"kind": "voxel"}},
         {"match": "/map", "reliability": "reliable", "summary": {"kind": "patches"}},
-        {"match": "/tf", "class": "state", "reliability": "reliable"},
+        {"match": "/tf", "class": "state", "reliability": "reliable", "merge_tf": True},
         {"match": "/odom", "summary": {"kind": "scan"}},
     ]
     async with Lab(tmp_path, "robot1", "site") as lab:
