@@ -138,8 +138,12 @@ class Hop(Sender):
             for item in packet.items:
                 if type(item) is SentData:
                     whole = item.channel.fragment_acked(item.out, item.generation)
-                    if whole and self.on_arrived is not None:
-                        self.on_arrived(item.channel, item.out, now)
+                    if whole:
+                        if self.on_arrived is not None:
+                            self.on_arrived(item.channel, item.out, now)
+                        if self.trace.enabled and item.channel.slot != CONTROL_CHANNEL:
+                            topic = item.out.message.stream.topic
+                            self.trace.record(now, topic, TraceEvent.ACKED, seq=item.out.seq, peer=self.peer)
         control = self._control
         if control.retained:
             control.settle()

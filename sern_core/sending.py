@@ -182,13 +182,18 @@ class Sender(ABC):
             self.reject(channel, message, DropReason.TOO_LARGE, now=now)
             return True
         backlog = channel.offered
-        capped = channel.counters.by_reason[DropReason.RATE_CAP]
+        capped, thinned = channel.counters.by_reason[DropReason.RATE_CAP], channel.thinned
         accepted = channel.submit(message, now=now, forced=forced)
         if self.trace.enabled:
             event = TraceEvent.QUEUED if accepted else TraceEvent.REFUSED
-            if channel.counters.by_reason[DropReason.RATE_CAP] > capped:
-                event = TraceEvent.RATE_CAPPED
-            self.trace.record(now, message.stream.topic, event, seq=message.seq, peer=self.peer)
+            if channel.thinned > thinned:
+                why = f"the adaptation lets {channel.share:.0%} of the messages in"
+                self.trace.record(now, message.stream.topic, TraceEvent.RATE_CAPPED, seq=message.seq, reason=why)
+            elif channel.counters.by_reason[DropReason.RATE_CAP] > capped:
+                why = "max_rate_hz"
+                self.trace.record(now, message.stream.topic, TraceEvent.RATE_CAPPED, seq=message.seq, reason=why)
+            else:
+                self.trace.record(now, message.stream.topic, event, seq=message.seq, peer=self.peer)
         if not backlog or channel.coalesced:
             self._refresh(channel, now)
         return accepted

@@ -67,7 +67,7 @@ _VERDICTS: Final[Mapping[TraceEvent, str]] = {
     TraceEvent.DROPPED: "was dropped",
     TraceEvent.REFUSED: "was refused",
     TraceEvent.REPLAYED: "was replayed",
-    TraceEvent.RATE_CAPPED: "was dropped: the topic's rate cap",
+    TraceEvent.RATE_CAPPED: "was left out by a rate cap",
 }
 """How a story ends, by the message's last event. Events that decide nothing about a message are not here."""
 

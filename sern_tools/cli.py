@@ -5,6 +5,7 @@ import typer
 from sern_tools import check, keygen
 from sern_tools.demo import demo
 from sern_tools.echo import echo
+from sern_tools.explain import explain
 from sern_tools.lab.cli import app as lab_app
 from sern_tools.topics import topics
 
@@ -21,6 +22,7 @@ app.add_typer(lab_app, name="lab")
 app.command("check")(check.check_command)
 app.command()(topics)
 app.command()(echo)
+app.command()(explain)
 
 
 def main() -> None:

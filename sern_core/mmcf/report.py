@@ -4,10 +4,12 @@ from typing import Any, Final
 
 from sern_core.mmcf.adapter import HopAdapter, Step
 from sern_core.mmcf.model import Candidate, Configuration, Prediction, Terms
+from sern_core.mmcf.policy import Decision
 from sern_core.types import CLASS_LABELS
 
 CANDIDATES: Final = 6
-"""So many of the best candidates are told, beside the one in force."""
+"""So many of the best candidates are told, the chosen one among them. Of those that are predicted to come to the same,
+one."""
 
 
 def configuration_json(configuration: Configuration) -> dict[str, Any]:
@@ -58,15 +60,32 @@ def candidate_json(candidate: Candidate) -> dict[str, Any]:
     }
 
 
+def _distinct(decision: Decision, count: int) -> list[Candidate]:
+    """The cheapest candidates that differ in what they come to, and the chosen one, cheapest first."""
+    predictions = decision.predictions
+    if predictions is None or decision.index is None:
+        return []
+    chosen = predictions.candidate(decision.index)
+    shown = [chosen]
+    seen = {_key(chosen)}
+    for index in predictions.ranked():
+        if len(shown) >= count:
+            break
+        candidate = predictions.candidate(index)
+        if _key(candidate) not in seen:
+            seen.add(_key(candidate))
+            shown.append(candidate)
+    return sorted(shown, key=lambda candidate: (bool(candidate.obstacle), candidate.prediction.cost))
+
+
+def _key(candidate: Candidate) -> tuple[float, ...]:
+    return tuple(round(term, 3) for term in candidate.prediction.terms)
+
+
 def step_json(step: Step, *, candidates: int = CANDIDATES) -> dict[str, Any]:
     """One interval: what was measured in it, and what was decided at its end for the next one."""
     decision, link, measurement = step.decision, step.situation.link, step.measurement
-    shown = list(decision.candidates(candidates))
-    index = decision.index
-    if decision.predictions is not None and index is not None:
-        active = decision.predictions.candidate(index)
-        if all(candidate.configuration != active.configuration for candidate in shown):
-            shown.append(active)
+    shown = _distinct(decision, candidates)
     return {
         "now_s": step.now,
         "link": {
