@@ -209,6 +209,9 @@ class Ros1Endpoint(EndpointBase):
     """Longer messages of local nodes are dropped and counted, longer service calls fail."""
     tcp_nodelay: bool = True
     """Ask local publishers to send small messages at once."""
+    heed_sern: bool = False
+    """Take what other SERN endpoints publish and serve at this master for its own nodes'. For a chain of two links with
+    the master in the middle; with two of them side by side it makes a loop."""
 
 
 class ZenohEndpoint(EndpointBase):

@@ -6,7 +6,8 @@ them. What comes from the far side is published at the master, and subscribers c
 
 No loops. A SERN endpoint says in every connection header that it is one. Publishers and services that say so are
 never announced, by this or any other SERN endpoint, on this host or another one, whatever their names are: what came
-over a link does not go back to it. Where local nodes publish on a topic too, only theirs goes out.
+over a link does not go back to it. Where local nodes publish on a topic too, only theirs goes out. `heed_sern` lifts
+that, for a chain of two links through one master.
 
 Simulated time (/clock, use_sim_time) is carried like any topic. Time stamps given to the link are wall time, and ages
 are counted on monotonic clocks, so a stopped or fast simulation expires nothing.
@@ -64,6 +65,7 @@ class Ros1Options:
     queue_bytes: int = 64 * 2**20
     max_message_bytes: int = 64 * 2**20
     tcp_nodelay: bool = True
+    heed_sern: bool = False
 
 
 class Ros1Endpoint:
@@ -87,6 +89,7 @@ class Ros1Endpoint:
         self.counters = ReceiveCounters()
         self.max_message_bytes = options.max_message_bytes
         self.tcp_nodelay = options.tcp_nodelay
+        self.heed_sern = options.heed_sern
         self.problem: str | None = None
         """Why this node has left the master for good, in one line; None while all is well."""
         self._prefix = "" if options.namespace in (None, "/") else "/" + str(options.namespace).strip("/")
@@ -102,7 +105,9 @@ class Ros1Endpoint:
         self._master = Master(self.master_uri, self.caller)
         self._host_of_services = ServiceHost(self.caller)
         self._graph = Graph(self._master, self, self._graph_changed, poll_s=1 / options.poll_hz)
-        self._services = ServiceWatch(self._master, self._graph, self._local, options.max_message_bytes)
+        self._services = ServiceWatch(
+            self._master, self._graph, self._local, options.max_message_bytes, heed_sern=options.heed_sern
+        )
         self._tcpros = TcprosServer(
             self.caller, self._publications, self._host_of_services, max_frame_bytes=options.max_message_bytes
         )

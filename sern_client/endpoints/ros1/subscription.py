@@ -52,6 +52,7 @@ class Owner(Protocol):
     counters: ReceiveCounters
     max_message_bytes: int
     tcp_nodelay: bool
+    heed_sern: bool
 
     def next_number(self) -> int:
         """A connection's id for the tools."""
@@ -218,7 +219,8 @@ class Source:
         if "error" in fields:
             raise WireError(f"refused: {' '.join(fields['error'].split())[:300]}")
         self.fields = fields
-        self.info = None if BRIDGE_FIELD in fields else self._describe(fields)
+        ours = BRIDGE_FIELD in fields and not self.topic.owner.heed_sern
+        self.info = None if ours else self._describe(fields)
         self.topic.sources_changed()
         if not self.topic.connects(self):
             link.close()

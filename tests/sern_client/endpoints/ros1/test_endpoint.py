@@ -144,6 +144,19 @@ async def test_what_another_sern_endpoint_publishes_is_not_announced(master: Fak
         await until(lambda: events.removed == [CHAT])
 
 
+async def test_a_chain_of_two_links_heeds_sern(master: FakeMaster) -> None:
+    async with running(master, heed_sern=True) as (_, events), FakePublisher(master, **{BRIDGE_FIELD: "/x"}):
+        await until(lambda: CHAT in events.infos)
+
+
+async def test_without_a_host_we_can_be_reached(master: FakeMaster) -> None:
+    async with running(master, host=None) as (endpoint, _):
+        endpoint.advertise(STRING)
+        async with listening(endpoint, topic="/chat") as listener:
+            assert (await listener.header())["md5sum"] == STRING.type_hash
+        assert endpoint.host and endpoint._master.caller_api.startswith(f"http://{endpoint.host}:")
+
+
 async def test_a_slow_subscriber_loses_its_oldest_messages_and_holds_up_nobody(master: FakeMaster) -> None:
     async with running(master, queue_messages=5) as (endpoint, _):
         stream = endpoint.advertise(STRING)
