@@ -33,7 +33,7 @@ from sern_core.summaries.grids import (
 )
 from sern_core.types import Encoding
 
-MAX_RECTANGLES: Final = 16
+MAX_RECTANGLES: Final = 8
 RECTANGLE_BYTES: Final = 128
 """What another rectangle costs: its own fields and its share of a datagram. A split must save more cells than that."""
 MAX_WAITING: Final = 1024
@@ -107,7 +107,7 @@ class PatchParams:
     since; None: never for that reason (reliable streams need no repetition).
     """
 
-    keyframe_updates: int = 128
+    keyframe_updates: int = 512
     keyframe_part: float = 0.5
     keyframe_s: float | None = None
 
