@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from math import isfinite
 from typing import Final, NamedTuple
 
-from sern_core.codecs import LOSSLESS, RAW_PROFILE, CodecProfile, Coder, Compression
+from sern_core.codecs import LOSSLESS, LOSSY, RAW_PROFILE, CodecProfile, Coder, Compression
 from sern_core.link import Link
 from sern_core.mmcf.cost import Ranges, Weights, cost, measure
 from sern_core.mmcf.model import (
@@ -38,6 +38,11 @@ MEMORY: Final = 3
 """Intervals that demand is told from."""
 FULL: Final = 0.85
 """A link of which such a share was used is called saturated."""
+PRESSED: Final = 0.3
+"""A link behind whose window more waits for such a share of its datagrams is full."""
+MIN_DATAGRAMS: Final = 5
+LOSSY_MODE: Final = "lossy"
+"""z: what each topic allows to be lost is (point clouds through Draco, images as JPEG), the others Zstandard."""
 ARRIVAL_CV2: Final = 0.1
 """Topics of robots tick; what is left is jitter."""
 
@@ -54,7 +59,7 @@ class AdapterParams:
     """Messages that arrive later do not count as delivered; a shorter lifespan of the topic counts instead."""
     needed: tuple[float, ...] = (1.0, 1.0, 0.4)
     """Share of the offered messages that the other side needs."""
-    modes: tuple[str, ...] = tuple(LOSSLESS)
+    modes: tuple[str, ...] = (*LOSSLESS, LOSSY_MODE)
     """Codec modes that may be set; only `none` where bodies are forwarded as they are."""
 
 
@@ -126,6 +131,8 @@ class HopAdapter:
         self._coder = coder
         self._since_s = now
         self._wire_bytes = link.wire_bytes
+        self._datagrams, self._pressed = link.datagrams, link.pressed
+        self._believed_bps = params.ranges.bandwidth_max_bps
         self._encode_s = self._coder_s()
         self._topics: dict[TopicName, _TopicStats] = {}
         self._arrived: dict[PriorityClass, _ClassCount] = {priority: _ClassCount() for priority in CLASSES}
@@ -173,15 +180,22 @@ class HopAdapter:
             self._samples.append(capacity_bps)
 
     def _capacity_bps(self) -> float | None:
-        """A link that was never full can carry what the ranges call a full one, as far as anybody knows: until then the
-        estimate says what was offered."""
-        lane = self.link.lane
-        if lane.stalled or not self.link.established:
+        """What the path can carry, as far as anybody knows.
+
+        While the link is pressed, the estimate; else it says what was offered, and counts only where it is above what
+        was last believed. A link that was never pressed can carry what the ranges call a full one.
+        """
+        link = self.link
+        if link.lane.stalled or not link.established:
             return None
-        rate_bps = lane.estimator.rate_bps
-        if rate_bps is not None and self.link.was_full:
-            return rate_bps
-        return max(rate_bps or 0.0, self.params.ranges.bandwidth_max_bps)
+        datagrams, pressed = link.datagrams - self._datagrams, link.pressed - self._pressed
+        rate_bps = link.lane.estimator.rate_bps
+        if rate_bps is not None:
+            if datagrams >= MIN_DATAGRAMS and pressed >= PRESSED * datagrams:
+                self._believed_bps = rate_bps
+            else:
+                self._believed_bps = max(self._believed_bps, rate_bps)
+        return self._believed_bps
 
     def _channels(self) -> list[OutChannel]:
         """Those that somebody wants."""
@@ -210,7 +224,7 @@ class HopAdapter:
             stats.history.append((new.offered, new.nbytes))
             count.offered += new.offered
             count.admitted += max(0, new.offered - new.thinned)
-            if channel_mode(mine[0]) is None:
+            if mine[0].spec.compression is None:
                 count.raw_bytes += new.raw_bytes
                 count.encoded_bytes += new.encoded_bytes
         return counts
@@ -278,6 +292,7 @@ class HopAdapter:
             value = cost(params.weights, terms)
         self._measured = measurement
         self._since_s, self._wire_bytes, self._encode_s = now, link.wire_bytes, self._coder_s()
+        self._datagrams, self._pressed = link.datagrams, link.pressed
         self._samples.clear()
         foreseen = self.last.decision.prediction if self.last is not None else None
         self.prediction_error = None if value is None or foreseen is None else value - foreseen.cost
@@ -321,20 +336,25 @@ class HopAdapter:
     def apply(self, configuration: Configuration, *, now: float) -> None:
         """Bring every channel and lane in line. Idempotent; what waits or is under way is left as it is."""
         link = self.link
-        mode = Compression(configuration.codec) if self._coder is not None else None
         for channel in link.channels.values():
             priority = channel.spec.priority
             channel.adapt(share=configuration.rates[priority], depth_max=configuration.queues[priority])
-            codec = channel.codec
-            if mode is not None and codec is not None and channel_mode(channel) is None and codec.setting is not mode:
-                link.set_compression(channel, mode, now=now)
+            if self._coder is not None and channel.codec is not None:
+                mode = channel_mode(channel, configuration.codec)
+                if channel.codec.setting is not mode:
+                    link.set_compression(channel, mode, now=now)
         for lane in link.lanes.values():
             lane.copies_wanted = bool(configuration.redundancy)
 
 
-def channel_mode(channel: OutChannel) -> Compression | None:
-    """The mode that the topic's own rule demands; None: free to choose."""
-    return channel.spec.compression
+def channel_mode(channel: OutChannel, mode: str) -> Compression:
+    """What the mode z means for one topic: its rule's own setting, if any; of LOSSY_MODE what it allows."""
+    if channel.spec.compression is not None:
+        return channel.spec.compression
+    if mode != LOSSY_MODE:
+        return Compression(mode)
+    allowed = channel.codec.modes if channel.codec is not None else ()
+    return next((found for found in allowed if found in LOSSY), Compression.ZSTD)
 
 
 def _depth(channel: OutChannel) -> int:
@@ -346,10 +366,9 @@ def _class_profile(mode: str, weighed: list[tuple[OutChannel, float, float]]) ->
     """By bytes over the topics of a class: what `mode` would make of them."""
     body = encoded = seconds = 0.0
     for channel, per_interval, size in weighed:
-        demanded = channel_mode(channel)
         profile = RAW_PROFILE
         if channel.codec is not None:
-            profile = channel.codec.profiles.get(Compression(mode) if demanded is None else demanded, RAW_PROFILE)
+            profile = channel.codec.profiles.get(channel_mode(channel, mode), RAW_PROFILE)
         nbytes = per_interval * size
         body += nbytes
         encoded += nbytes * min(profile.ratio, 1.0)

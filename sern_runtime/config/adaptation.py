@@ -2,11 +2,10 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Annotated, Final, Literal
+from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from sern_core.codecs import Compression
 from sern_core.mmcf.adapter import AdapterParams
 from sern_core.mmcf.cost import SUM_TOLERANCE, Ranges, Weights, profile
 from sern_core.mmcf.model import NO_CODEC, Configuration
@@ -19,16 +18,11 @@ _PARAMS = AdapterParams()
 Share = Annotated[float, Field(gt=0, le=1)]
 ShareOrZero = Annotated[float, Field(ge=0, le=1)]
 QueueLimit = Annotated[int, Field(ge=1, le=10_000)]
+CodecWord = Literal["none", "lz4", "zstd", "zstd_strong", "lossy"]
 MAX_CANDIDATES = 2000
 
 
-LosslessMode = Literal[Compression.NONE, Compression.LZ4, Compression.ZSTD, Compression.ZSTD_STRONG]
-_LOSSLESS: Final[tuple[LosslessMode, ...]] = (
-    Compression.NONE,
-    Compression.LZ4,
-    Compression.ZSTD,
-    Compression.ZSTD_STRONG,
-)
+CodecWord = Literal["none", "lz4", "zstd", "zstd_strong", "lossy"]
 
 
 class WeightsSection(Section):
@@ -143,13 +137,13 @@ class FixedSection(Section):
     """Share of the messages of each class."""
     queue_limit: QueueLimit = 10
     """Messages that may wait a topic."""
-    codec: LosslessMode = Compression.NONE
+    codec: CodecWord = "none"
     """How bodies are compressed: `none`, `lz4`, `zstd` or `zstd_strong`."""
     redundancy: bool = False
     """Class control sent twice over the datagram lane."""
 
     def configuration(self) -> Configuration:
-        return Configuration(self.rates.values(), (self.queue_limit,) * 3, str(self.codec), int(self.redundancy))
+        return Configuration(self.rates.values(), (self.queue_limit,) * 3, self.codec, int(self.redundancy))
 
 
 class AdaptationSection(Section):
@@ -168,15 +162,17 @@ class AdaptationSection(Section):
     ranges: RangesSection = RangesSection()
     """What counts as 1 in each term of the cost."""
     needed: NeededSection = NeededSection()
-    """Share of the offered messages that must arrive in time."""
+    """Share of the offered messages that must arrive in time. A relay that is not told otherwise needs all: what its
+    clients did not need they have left out."""
     deadlines_s: DeadlinesSection = DeadlinesSection()
     """What in time means, by class."""
     rates: RatesSection = RatesSection()
     """Shares of the messages to choose from, r."""
     queues: QueuesSection = QueuesSection()
     """Queue limits to choose from, q."""
-    codecs: Annotated[tuple[LosslessMode, ...], Field(min_length=1)] = _LOSSLESS
-    """Compression modes to choose from, z, for topics whose rule leaves it open; a relay forwards bodies unchanged."""
+    codecs: Annotated[tuple[CodecWord, ...], Field(min_length=1)] = ("none", "lz4", "zstd", "zstd_strong", "lossy")
+    """Compression modes to choose from, z, for topics whose rule leaves it open. `lossy`: as far as a topic allows
+    (`lossy` in its rule), else `zstd`. A relay forwards bodies unchanged."""
     redundancy: Annotated[tuple[bool, ...], Field(min_length=1)] = (False, True)
     """Whether class control may be sent twice, h, where `link.redundancy` is `auto`."""
     limits: LimitsSection = LimitsSection()
@@ -206,8 +202,8 @@ class AdaptationSection(Section):
             weights=self.cost_weights(),
             interval_s=self.interval_s,
             deadlines_s=self.deadlines_s.values(),
-            needed=self.needed.values(),
-            modes=tuple(str(mode) for mode in self.codecs) if encodes else (NO_CODEC,),
+            needed=self.needed.values() if encodes or "needed" in self.model_fields_set else (1.0, 1.0, 1.0),
+            modes=self.codecs if encodes else (NO_CODEC,),
         )
 
     def make_policy(self, *, encodes: bool) -> Callable[[], Policy]:

@@ -44,7 +44,7 @@ async def test_client_and_relay_adapt_and_tell_of_it(tmp_path: Path) -> None:
                 assert re.search(f"^sern_mmcf_{name}", metrics, re.MULTILINE), name
         assert robot.json("/api/mmcf")["profile"] == "mapping"
         modes = {line for line in robot.get("/metrics")[1].splitlines() if line.startswith("sern_mmcf_codec{")}
-        assert len(modes) == 4  # the robot encodes
+        assert len(modes) == 5  # the robot encodes
         modes = {line for line in relay.get("/metrics")[1].splitlines() if line.startswith("sern_mmcf_codec{")}
         assert all('mode="none"' in line for line in modes)  # the relay forwards
 

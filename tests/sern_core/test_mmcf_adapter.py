@@ -1,13 +1,13 @@
 """The adaptation on real links in virtual time: what it measures, what it applies, and that it harms nothing."""
 
 import itertools
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from random import Random
 
 import pytest
 
 from sern_core.codecs import Compression
-from sern_core.mmcf.adapter import SAMPLES, AdapterParams, HopAdapter, Step
+from sern_core.mmcf.adapter import LOSSY_MODE, SAMPLES, AdapterParams, HopAdapter, Step
 from sern_core.mmcf.cost import Ranges, profile
 from sern_core.mmcf.model import Configuration
 from sern_core.mmcf.policy import FixedPolicy, Mmcf, Policy
@@ -148,6 +148,19 @@ def test_the_configuration_reaches_channels_lanes_and_codecs() -> None:
     r.adapter.close()
     assert (cloud.share, cloud.depth) == (1.0, 2) and scan.depth == 5
     assert not r.robot.core.link.lane.redundant
+
+
+def test_lossy_means_what_each_topic_allows() -> None:
+    r = rig(FixedPolicy(Configuration(codec=LOSSY_MODE)))
+    cloud = r.robot.publish(
+        "/robot/points",
+        replace(spec(BULK), lossy=(Compression.VOXEL_DRACO,)),
+        type_name="sensor_msgs/msg/PointCloud2",
+    )
+    grid = r.robot.publish("/robot/grid", spec(STATE))
+    r.world.run(3.0)
+    assert cloud.codec is not None and cloud.codec.setting is Compression.VOXEL_DRACO
+    assert grid.codec is not None and grid.codec.setting is Compression.ZSTD
 
 
 def test_redundancy_is_left_to_the_configuration_file_where_it_decides() -> None:
