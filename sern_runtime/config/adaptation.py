@@ -22,9 +22,6 @@ CodecWord = Literal["none", "lz4", "zstd", "zstd_strong", "lossy"]
 MAX_CANDIDATES = 2000
 
 
-CodecWord = Literal["none", "lz4", "zstd", "zstd_strong", "lossy"]
-
-
 class WeightsSection(Section):
     """w_l, w_r, w_c, w_b of J = w_l·latency + w_r·(1 − reliability) + w_c·CPU + w_b·bandwidth; their sum is 1."""
 
