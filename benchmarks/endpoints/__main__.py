@@ -1,6 +1,7 @@
 """Endpoints beside what their middleware offers for the same work: added latency and CPU of a bridge.
 
 ros1   from one ROS 1 system to another, beside topic_tools relay and a bridge written with rospy
+dds    from one DDS domain to another, between Fast DDS peers
 """
 
 import argparse
@@ -9,9 +10,12 @@ from collections.abc import Callable
 from typing import Final
 
 from benchmarks import common
-from benchmarks.endpoints import ros1
+from benchmarks.endpoints import dds, ros1
 
-PARTS: Final[dict[str, Callable[[argparse.Namespace, common.Report], None]]] = {"ros1": ros1.bench}
+PARTS: Final[dict[str, Callable[[argparse.Namespace, common.Report], None]]] = {
+    "ros1": ros1.bench,
+    "dds": dds.bench,
+}
 
 
 def _arguments(parser: argparse.ArgumentParser) -> None:

@@ -23,12 +23,15 @@ MAX_LINE_BYTES: Final = 64 * 2**20
 HEADER: Final = Path("/usr/include/fastdds/dds/domain/DomainParticipant.hpp")
 
 
+def missing_packages() -> list[str]:
+    """The Debian packages that the peer cannot be built without."""
+    missing = [program for program in ("fastddsgen", "g++") if shutil.which(program) is None]
+    return missing if HEADER.exists() else [*missing, "libfastrtps-dev"]
+
+
 def build_peer() -> Path:
     """The peer program, compiled unless that was done before. Skips the test and names what is missing."""
-    missing = [program for program in ("fastddsgen", "g++") if shutil.which(program) is None]
-    if not HEADER.exists():
-        missing.append("libfastrtps-dev")
-    if missing:
+    if missing := missing_packages():
         pytest.skip(f"no independent DDS peer: apt-get install {' '.join(missing)}")
     sources = [SOURCES / "Peer.idl", SOURCES / "peer.cpp"]
     digest = hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()[:16]
