@@ -24,7 +24,7 @@ from sern_client.endpoints.base import ServiceEvents, ServiceHandler, ServiceInf
 from sern_client.endpoints.dds import names, node_info, raw
 from sern_client.endpoints.dds.definitions import Definitions
 from sern_client.endpoints.dds.domain import DomainOptions, close_domain, open_domain
-from sern_client.endpoints.dds.graph import Graph, Local, Participant, Remote
+from sern_client.endpoints.dds.graph import MAX_COMPLAINTS, Graph, Local, Participant, Remote
 from sern_client.endpoints.dds.idl import TypeMaker
 from sern_client.endpoints.dds.names import DISCOVERY_TOPIC, SERN_KEY, RosName, user_data
 from sern_client.endpoints.dds.qos import (
@@ -45,6 +45,9 @@ from sern_runtime.ros_types import ResolvedType
 
 _INFO_QOS: Final = EndpointQos(reliable=True, durability=1)
 _INFO_DEPTH: Final = 64
+READER_HISTORY: Final = 1000
+"""What DDS may hold until the worker takes it, usually within a millisecond. What overflows there nobody could count,
+so the bound that counts is the inbox behind it."""
 
 _log = logging.getLogger(__name__)
 
@@ -337,7 +340,7 @@ class DdsEndpoint:
         ConfigError when the topic is in use here with another type, or DDS cannot have the type.
         """
         depth = depth or self.options.queue_depth
-        policies = to_policies(qos, depth=depth, writer=False, id_key=id_key)
+        policies = to_policies(qos, depth=max(depth, READER_HISTORY), writer=False, id_key=id_key)
         joined = self._alive()
         ignored = self.graph.ignored
 
@@ -424,7 +427,7 @@ class DdsEndpoint:
 
     def say_once(self, line: str) -> None:
         """What a person has to know and do something about; each line once."""
-        if line not in self._said:
+        if line not in self._said and len(self._said) < MAX_COMPLAINTS:
             self._said.add(line)
             _log.error("%s", line)
 

@@ -12,6 +12,7 @@ from typing import Final, NamedTuple
 from sern_client.endpoints.zenoh.names import dds_type as type_to_dds
 from sern_client.endpoints.zenoh.names import ros_type
 from sern_core.errors import WireError
+from sern_core.rules import name_problem
 from sern_core.types import TopicName
 
 __all__ = ["DISCOVERY_TOPIC", "SERN_KEY", "Role", "RosName", "from_dds", "read_user_data", "to_dds", "type_from_dds"]
@@ -46,7 +47,7 @@ def to_dds(name: str, role: Role = Role.TOPIC) -> str:
 
 
 def from_dds(topic: str) -> RosName | None:
-    """None for a topic that is not of ROS 2."""
+    """None for a topic that is not of ROS 2, or has a name that ROS does not allow."""
     prefix, slash, rest = topic.partition("/")
     if not slash or prefix not in set(Role):
         return None
@@ -54,7 +55,8 @@ def from_dds(topic: str) -> RosName | None:
     suffix = _SUFFIX[role]
     if not rest.endswith(suffix) or len(rest) == len(suffix):
         return None
-    return RosName(role, TopicName("/" + rest.removesuffix(suffix)))
+    name = TopicName("/" + rest.removesuffix(suffix))
+    return None if name_problem(name) else RosName(role, name)
 
 
 def type_from_dds(type_name: str) -> str | None:

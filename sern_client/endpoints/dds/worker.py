@@ -23,9 +23,11 @@ from sern_client.endpoints.dds import raw
 from sern_client.endpoints.dds.graph import Participant, Remote
 from sern_client.endpoints.dds.names import SERN_KEY, read_user_data
 from sern_client.endpoints.dds.qos import read_qos
+from sern_runtime.ros_types import one_line
 
 TAKE_AT_ONCE: Final = 64
 """Samples taken from one reader before the next has its turn."""
+MAX_FAULTS_SAID: Final = 10
 _WAKE, _PARTICIPANTS, _WRITERS, _READERS, _FIRST = 1, 2, 3, 4, 5
 
 _log = logging.getLogger(__name__)
@@ -88,6 +90,7 @@ class Worker:
         self._taken_bytes = 0
         self._done_bytes = 0
         self._known_writers: set[int] = set()
+        self.faults = 0
         self._stopping = False
         self._thread = threading.Thread(target=self._run, name="sern-dds", daemon=True)
         self._thread.start()
@@ -135,19 +138,28 @@ class Worker:
 
     def _drain(self) -> None:
         self._drain_due = False
-        for _ in range(len(self._ready)):  # what comes meanwhile has its own turn
-            item = self._ready.popleft()
-            if not isinstance(item, Inbox):
-                item()
-                continue
-            for _ in range(len(item.samples)):
-                try:
-                    sample = item.samples.popleft()
-                except IndexError:
-                    break  # the thread dropped it for a newer one
-                self._done_bytes += len(sample.body)
-                if not item.closed:
-                    item.deliver(sample)
+        try:
+            for _ in range(len(self._ready)):  # what comes meanwhile has its own turn
+                item = self._ready.popleft()
+                if isinstance(item, Inbox):
+                    self._empty(item)
+                else:
+                    item()
+        finally:
+            # A fault in one of them is reported by the loop; the others must not wait for the next event.
+            if self._ready and not self._drain_due and not self._stopping:
+                self._drain_due = True
+                self._loop.call_soon(self._drain)
+
+    def _empty(self, inbox: Inbox) -> None:
+        for _ in range(len(inbox.samples)):
+            try:
+                sample = inbox.samples.popleft()
+            except IndexError:
+                return  # the thread dropped it for a newer one
+            self._done_bytes += len(sample.body)
+            if not inbox.closed:
+                inbox.deliver(sample)
 
     # On the thread
 
@@ -156,18 +168,24 @@ class Worker:
             numbers = self._waiter.wait()
             self._guard.take()
             while self._jobs:
-                try:
-                    self._jobs.popleft()()
-                except (DDSException, OSError) as error:
-                    _log.error("DDS: %s", error)
+                self._try(self._jobs.popleft())
             for number in sorted(numbers):
                 if number >= _FIRST:
-                    self._take(number)
+                    self._try(partial(self._take, number))
                 elif number != _WAKE:
-                    self._discover(number)
+                    self._try(partial(self._discover, number))
         self._waiter.close()
         self._inboxes.clear()
         self._jobs.clear()
+
+    def _try(self, step: Callable[[], None]) -> None:
+        """What one peer says or one reader does must not end the thread for all."""
+        try:
+            step()
+        except (DDSException, OSError, ValueError, TypeError, AttributeError) as error:
+            self.faults += 1
+            if self.faults <= MAX_FAULTS_SAID:
+                _log.exception("a fault in reading from DDS: %s", one_line(error))
 
     def _discover(self, number: int) -> None:
         reader = {_PARTICIPANTS: self._participants, _WRITERS: self._writers, _READERS: self._readers}[number]

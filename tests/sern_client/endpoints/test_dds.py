@@ -1,0 +1,327 @@
+"""The parts of the dds endpoint that need no peer: names, policies, the graph, settings, and its queues."""
+
+import asyncio
+import logging
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+from uuid import UUID
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+pytest.importorskip("cyclonedds", reason="the dds endpoint needs cyclonedds: pip install 'sern[dds]'")
+
+from cyclonedds.core import Policy, Qos
+
+from sern_client.endpoints.dds import names, node_info
+from sern_client.endpoints.dds.definitions import Definitions
+from sern_client.endpoints.dds.domain import DomainOptions, close_domain, environment_domain, open_domain
+from sern_client.endpoints.dds.graph import Graph, Local, Participant, Remote, puts_header
+from sern_client.endpoints.dds.names import Role, RosName
+from sern_client.endpoints.dds.qos import (
+    INFINITE_NS,
+    EndpointQos,
+    mismatches,
+    read_qos,
+    reader_for,
+    to_policies,
+    writer_for,
+)
+from sern_client.endpoints.dds.services import new_service_id
+from sern_core.errors import ConfigError
+from sern_core.message import TopicInfo
+from sern_core.types import Encoding, TopicName
+from sern_runtime.ros_types import topic_info
+
+STEADY = settings(max_examples=100, deadline=None, derandomize=True, database=None)
+QOS = st.builds(
+    EndpointQos,
+    reliable=st.booleans(),
+    durability=st.integers(0, 3),
+    deadline_ns=st.sampled_from([10**8, 10**9, INFINITE_NS]),
+    lifespan_ns=st.sampled_from([10**8, INFINITE_NS]),
+    liveliness=st.integers(0, 2),
+    lease_ns=st.sampled_from([10**9, INFINITE_NS]),
+    exclusive=st.booleans(),
+)
+
+
+@pytest.mark.parametrize(
+    ("topic", "name"),
+    [
+        ("rt/odom", RosName(Role.TOPIC, TopicName("/odom"))),
+        ("rt/a/b/c", RosName(Role.TOPIC, TopicName("/a/b/c"))),
+        ("rq/ns/set_boolRequest", RosName(Role.REQUEST, TopicName("/ns/set_bool"))),
+        ("rr/set_boolReply", RosName(Role.REPLY, TopicName("/set_bool"))),
+    ],
+)
+def test_topic_names(topic: str, name: RosName) -> None:
+    assert names.from_dds(topic) == name
+    assert names.to_dds(name.name, name.role) == topic
+
+
+@pytest.mark.parametrize(
+    "topic", ["odom", "ros_discovery_info", "rx/odom", "rt", "rt/", "rq/Request", "rq/odom", "rr/odomRequest", "rt/a b"]
+)
+def test_topics_that_are_not_of_ros(topic: str) -> None:
+    assert names.from_dds(topic) is None
+
+
+def test_type_names() -> None:
+    assert names.type_to_dds("nav_msgs/msg/Odometry") == "nav_msgs::msg::dds_::Odometry_"
+    assert names.type_from_dds("nav_msgs::msg::dds_::Odometry_") == "nav_msgs/msg/Odometry"
+    assert names.type_from_dds("nav_msgs::msg::Odometry") is None
+
+
+@given(st.binary(max_size=60))
+@STEADY
+def test_user_data_is_whatever_it_is(data: bytes) -> None:
+    pairs = names.read_user_data(data)
+    assert all(isinstance(key, str) and "=" not in key for key in pairs)
+
+
+def test_user_data() -> None:
+    data = names.user_data(typehash="RIHS01_00", clientid="1.2")
+    assert data == b"typehash=RIHS01_00;clientid=1.2;"
+    assert names.read_user_data(data + b"odd;;x") == {"typehash": "RIHS01_00", "clientid": "1.2"}
+
+
+@given(offered=QOS, asked=QOS)
+@STEADY
+def test_what_is_asked_for_because_of_writers_matches_them(offered: EndpointQos, asked: EndpointQos) -> None:
+    both = [replace(offered, exclusive=False), replace(asked, exclusive=False)]
+    common = reader_for(both)
+    assert all(not mismatches(writer, common) for writer in both)
+    assert common.reliable == (offered.reliable and asked.reliable)
+    assert mismatches(offered, offered) == []
+
+
+@given(QOS)
+@STEADY
+def test_policies_are_read_as_they_are_written(qos: EndpointQos) -> None:
+    wanted = replace(qos, durability=min(qos.durability, 1), liveliness=0, lease_ns=INFINITE_NS, type_hash="RIHS01_1")
+    assert read_qos(to_policies(wanted, depth=3, writer=True)) == wanted
+
+
+def test_policies_of_others() -> None:
+    policies = Qos(
+        Policy.Reliability.BestEffort,
+        Policy.Durability.Persistent,
+        Policy.Liveliness.ManualByTopic(10**9),
+        Policy.Deadline(5),
+        Policy.Partition(["a", "b"]),
+        Policy.Userdata(b"serviceid=1.2;"),
+    )
+    qos = read_qos(policies)
+    assert (qos.reliable, qos.durability, qos.liveliness, qos.lease_ns, qos.deadline_ns) == (False, 3, 2, 10**9, 5)
+    assert qos.partitions == ("a", "b") and qos.service_id == "1.2"
+    assert mismatches(qos, EndpointQos()) == ["partition"]
+    asked = replace(qos, partitions=())
+    assert [line.split(" (")[0] for line in mismatches(EndpointQos(), asked)] == [
+        "durability", "deadline", "liveliness", "liveliness lease",
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("reliable", "latched", "offered"),
+    [(None, False, True), (True, False, True), (False, False, False), (None, True, True)],
+)
+def test_what_a_stream_is_offered_with(reliable: bool | None, latched: bool, offered: bool) -> None:
+    info = TopicInfo(TopicName("/x"), "a/msg/B", Encoding.CDR, latched=latched, reliable=reliable, lifespan_s=1.0)
+    qos = writer_for(info, lifespan=False)
+    assert (qos.reliable, qos.transient_local, qos.lifespan_ns) == (offered, latched, INFINITE_NS)
+    assert writer_for(info, lifespan=True).lifespan_ns == 10**9
+
+
+class Heard:
+    def __init__(self) -> None:
+        self.topics: list[str] = []
+        self.services: list[str] = []
+
+    def writers_changed(self, name: RosName, topic: str) -> None:
+        self.topics.append(name.name)
+
+    def services_changed(self, name: TopicName) -> None:
+        self.services.append(name)
+
+
+OWN, OTHER, SERN = (UUID(int=number) for number in (1, 2, 3))
+STRING = "std_msgs::msg::dds_::String_"
+
+
+def remote(number: int, participant: UUID = OTHER, topic: str = "rt/chat", **changed: Any) -> Remote:
+    return replace(Remote(UUID(int=number), participant, True, topic, STRING, EndpointQos(), number), **changed)
+
+
+@pytest.mark.parametrize("heed_sern", [False, True])
+def test_the_graph_counts_what_is_of_this_site(heed_sern: bool) -> None:
+    heard = Heard()
+    graph = Graph(OWN, heard, heed_sern=heed_sern)
+    graph.participant_added(Participant(OTHER, "robot"))
+    graph.participant_added(Participant(SERN, "bridge", "sern_two"))
+    for number, participant in ((10, OWN), (11, OTHER), (12, SERN)):
+        graph.remote_added(remote(number, participant))
+        graph.remote_added(remote(number, participant))
+    graph.remote_added(remote(13, topic="not_ros"))
+    graph.remote_added(remote(14, topic="rq/set_boolRequest", writer=False))
+    found = [writer.handle for writer in graph.writers("rt/chat")]
+    assert found == ([11, 12] if heed_sern else [11])
+    assert graph.ignored == (set() if heed_sern else {12})
+    assert heard.topics == ["/chat"] * len(found) and heard.services == ["/set_bool"]
+    graph.participant_removed(SERN)
+    graph.participant_removed(OTHER)
+    assert graph.writers("rt/chat") == [] and graph.ignored == set() and graph.remotes == {}
+    graph.remote_removed(UUID(int=99))
+
+
+def test_mismatches_are_said_once_and_forgotten_with_their_cause(caplog: pytest.LogCaptureFixture) -> None:
+    graph = Graph(OWN, Heard())
+    graph.participant_added(Participant(OTHER, "robot"))
+    graph.nodes_of(OTHER, [("/ns/talker", [UUID(int=11)])])
+    with caplog.at_level(logging.WARNING):
+        graph.remote_added(remote(11))
+        graph.local_added(Local(UUID(int=20), False, "rt/chat", STRING, EndpointQos(reliable=True)))
+        graph.remote_added(remote(12, type_name="std_msgs::msg::dds_::Int32_", qos=EndpointQos(reliable=True)))
+        hashed = EndpointQos(reliable=True, type_hash="RIHS01_b")
+        graph.local_added(Local(UUID(int=21), True, "rt/back", STRING, replace(hashed, type_hash="RIHS01_a")))
+        graph.remote_added(remote(13, topic="rt/back", writer=False, qos=hashed))
+    assert [record.message for record in caplog.records] == [
+        "/chat: the publisher of node /ns/talker and we do not match: "
+        "reliability (offered best_effort, asked for reliable)",
+        f"/chat: the publisher of participant robot ({OTHER.hex[:24]}) and we do not match: "
+        f"type (std_msgs::msg::dds_::Int32_ there, {STRING} here)",
+        f"/back: the subscriber of participant robot ({OTHER.hex[:24]}) and we do not match: "
+        "version of the type (RIHS01_b there, RIHS01_a here)",
+    ]
+    graph.remote_removed(UUID(int=11))
+    graph.local_removed(UUID(int=21))
+    assert len(graph.complaints) == 1
+
+
+def test_who_puts_the_number_of_a_call_into_its_messages() -> None:
+    fast = UUID(bytes=b"\x01\x0f" + bytes(14))
+    assert puts_header(remote(5))
+    assert not puts_header(remote(5, guid=fast))
+    assert puts_header(remote(5, guid=fast, qos=EndpointQos(service_id="1.2")))
+    assert len(new_service_id().split(".")) == 16
+
+
+def test_node_information() -> None:
+    body = node_info.encode(OWN, "sern", [UUID(int=5)], [UUID(int=6)])
+    assert node_info.decode(body) == (OWN, [("/sern", [UUID(int=5), UUID(int=6)])])
+    for length in range(len(body) - 4):
+        assert node_info.decode(body[:length]) is None
+
+
+def test_settings_become_xml() -> None:
+    assert "<Interfaces>" not in DomainOptions().to_xml()
+    text = DomainOptions(localhost_only=True, lease_s=2.5).to_xml()
+    for part in ('name="lo"', "<AllowMulticast>false", '<Peer address="127.0.0.1"/>', "62000B", "2500ms", "4194304B"):
+        assert part in text
+    text = DomainOptions(interface="10.0.0.5", peers=("robot", "a&b"), multicast=True, fragment_bytes=1400).to_xml()
+    for part in ('address="10.0.0.5"', "<AllowMulticast>true", '"robot"', '"a&amp;b"', "1400B"):
+        assert part in text
+
+
+def test_one_domain_has_one_configuration(domain_id: int) -> None:
+    options = DomainOptions(domain_id, localhost_only=True)
+    open_domain(options)
+    open_domain(options)
+    with pytest.raises(ConfigError, match="used twice with different settings"):
+        open_domain(replace(options, lease_s=3.0))
+    close_domain(domain_id)
+    close_domain(domain_id)
+    open_domain(replace(options, lease_s=3.0))
+    close_domain(domain_id)
+
+
+def test_settings_that_cyclone_dds_refuses(
+    domain_id: int, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("CYCLONEDDS_URI", "<Domain><General><NoSuchThing>1</NoSuchThing></General></Domain>")
+    with pytest.raises(ConfigError, match=f"DDS domain {domain_id} cannot be opened.*CYCLONEDDS_URI") as caught:
+        open_domain(DomainOptions(domain_id))
+    assert "\n" not in str(caught.value)
+    assert "NoSuchThing" in capfd.readouterr().err
+
+
+@pytest.fixture
+def domain_id() -> int:
+    from tests.peers.dds.peer import free_domain
+
+    return free_domain()
+
+
+@pytest.mark.parametrize(("text", "number"), [("", 0), ("7", 7), (" 42 ", 42), ("232", 232)])
+def test_the_environment_names_a_domain(text: str, number: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ROS_DOMAIN_ID", text)
+    assert environment_domain() == number
+
+
+@pytest.mark.parametrize("text", ["-1", "233", "x", "1.5"])
+def test_the_environment_names_no_domain(text: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ROS_DOMAIN_ID", text)
+    with pytest.raises(ConfigError, match="ROS_DOMAIN_ID"):
+        environment_domain()
+
+
+def test_definitions_by_hash(tmp_path: Path) -> None:
+    folder = tmp_path / "share" / "std_msgs"
+    (folder / "msg").mkdir(parents=True)
+    (folder / "msg" / "String.msg").write_text("string data\nint8 more\n")
+    known = topic_info("/x", "std_msgs/msg/String", Encoding.CDR)
+    types = Definitions([tmp_path])
+    own = types.message("std_msgs/msg/String")
+    assert own.definition == "string data\nint8 more\n"
+    assert types.message("std_msgs/msg/String", own.type_hash) == own
+    assert types.message("std_msgs/msg/String", known.type_hash).definition == known.definition
+    with pytest.raises(ConfigError, match=f"RIHS01_0, but the definition known here has {own.type_hash} and RIHS01"):
+        types.message("std_msgs/msg/String", "RIHS01_0")
+    with pytest.raises(ConfigError, match="unknown here"):
+        types.service("no_srvs/srv/Such")
+    assert types.service("std_srvs/srv/Trigger").definition.startswith("---\n")
+
+
+async def test_a_loop_that_is_too_slow_loses_the_oldest(domain_id: int) -> None:
+    """Writer and reader in two domain participants of this process; the loop does not run while they are busy."""
+    from sern_client.endpoints.dds.endpoint import DdsEndpoint, DdsOptions
+    from tests.support import until
+
+    class Silent:
+        def topic_added(self, info: TopicInfo) -> None: ...
+
+        def topic_removed(self, name: TopicName) -> None: ...
+
+    domain = DomainOptions(domain_id, localhost_only=True)
+    one = DdsEndpoint(DdsOptions(domain))
+    two = DdsEndpoint(DdsOptions(domain, heed_sern=True, queue_depth=5))
+    await one.start(Silent())
+    await two.start(Silent())
+    try:
+        info = topic_info("/chat", "std_msgs/msg/String", Encoding.CDR, reliable=True)
+        publisher = one.advertise(replace(info, depth=200))
+        await until(lambda: two.graph.writers("rt/chat"))
+        got: list[bytes] = []
+
+        def sink(body: bytes, stamp_ns: int) -> bool:
+            got.append(body)
+            return True
+
+        subscription = two.subscribe(info.name, sink)
+        await until(lambda: publisher.matched == 1)
+        bodies = [b"\0\x01\0\0\x04\0\0\0" + b"%03d\0" % number for number in range(100)]
+        give_up_s = asyncio.get_running_loop().time() + 20
+        for body in bodies:
+            publisher.publish(body, 1)
+        while two.overruns() < 50 and asyncio.get_running_loop().time() < give_up_s:
+            pass  # the loop is busy with something else
+        await until(lambda: bodies[-1] in got)
+        assert two.overruns() + len(got) == 100 and two.overruns() >= 50
+        assert got == sorted(got)
+        subscription.close()
+        assert two.overruns() >= 50
+    finally:
+        await two.stop()
+        await one.stop()
