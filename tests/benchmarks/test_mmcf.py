@@ -1,0 +1,82 @@
+"""The adaptation's benchmark: its model of the link is deterministic, can be cloned, and loses no message."""
+
+from benchmarks.mmcf_queue import Path, Queues, arrivals
+from benchmarks.mmcf_replay import reconfigure
+from benchmarks.mmcf_run import Run, controlled, fixed, oracle, run
+from benchmarks.mmcf_traces import CODECS, GRID, Trace, robot
+from sern_core.mmcf.cost import Ranges, profile
+from sern_core.mmcf.model import Configuration
+from sern_core.mmcf.policy import Mmcf, fixed_reliability, fixed_throughput
+
+RANGES = Ranges()
+WEIGHTS = profile("teleoperation")
+SHORT = Trace("short", robot(), Path(((0.0, 4e6), (5.0, 0.6e6))), 12.0)
+
+
+def queues(path: Path = SHORT.path) -> Queues:
+    return Queues(robot(), path, arrivals(robot(), 12.0, 1), seed=1)
+
+
+def told(model: Queues) -> list[object]:
+    return [*model.outcomes(), model.cpu_s, model.idle_s, model.packets]
+
+
+def test_the_model_is_deterministic_and_a_clone_leaves_it_alone() -> None:
+    one, two = queues(), queues()
+    for model in (one, two):
+        model.apply(Configuration(queues=(1, 1, 3), codec="zstd"))
+        model.run(3.0)
+    assert told(one) == told(two)
+    copy = one.clone()
+    copy.apply(Configuration(rates=(1.0, 0.5, 0.1), codec="none", redundancy=1))
+    copy.run(6.0)
+    before = told(one)
+    assert told(one) == before
+    one.run(6.0)
+    two.run(6.0)
+    assert told(one) == told(two) != told(copy)
+
+
+def test_on_an_idle_link_everything_arrives_in_time() -> None:
+    model = queues(Path(((0.0, 1e9),)))
+    model.run(5.0)
+    for outcome in model.outcomes():
+        assert outcome.offered > 0
+        assert outcome.offered - outcome.delivered <= 1  # one may be on its way
+        assert outcome.on_time == outcome.delivered
+
+
+def test_loss_hits_what_cannot_be_repaired_and_copies_help() -> None:
+    path = Path(((0.0, 8e6),), loss=lambda _t: 0.2, rtt_s=lambda _t: 0.2)
+    shares = []
+    for redundancy in (0, 1):
+        model = queues(path)
+        model.apply(Configuration(queues=(1, 1, 1), codec="draco", redundancy=redundancy))
+        model.run(8.0)
+        control = model.outcomes()[0]
+        shares.append(control.delivered / control.offered)
+    assert shares[0] < 0.87 and shares[1] > 0.93
+
+
+def cost(policy: str) -> Run:
+    choose = {
+        "throughput": fixed(fixed_throughput(CODECS)),
+        "reliability": fixed(fixed_reliability(CODECS)),
+        "mmcf": controlled(Mmcf(GRID, weights=WEIGHTS, ranges=RANGES), SHORT, seed=1),
+        "oracle": oracle(GRID.configurations[::4], ranges=RANGES, weights=WEIGHTS),
+    }[policy]
+    return run(SHORT, policy, choose, seed=1, ranges=RANGES, weights=WEIGHTS)
+
+
+def test_mmcf_costs_less_than_the_papers_fixed_policies() -> None:
+    mmcf = cost("mmcf")
+    assert mmcf.cost < cost("throughput").cost < cost("reliability").cost
+    assert cost("oracle").cost < 1.1 * mmcf.cost
+    assert mmcf.switches_per_minute <= 20
+
+
+def test_a_robot_that_appears_is_taken_in_within_an_interval_and_disturbs_nobody() -> None:
+    found = reconfigure()
+    assert found.first_s < 1.0
+    assert found.known_s <= 1.0 and found.gone_s <= 1.0
+    assert found.gap_s < 0.15
