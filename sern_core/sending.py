@@ -329,7 +329,10 @@ class Sender(ABC):
         nbytes = len(datagram) + OVERHEAD_BYTES
         estimator = lane.estimator
         inflight_bytes = flight.inflight_bytes + nbytes
-        app_limited = inflight_bytes < estimator.window_bytes and not (lane is self.lane and self._backlog)
+        # What could be picked if window and pacer let it is held back by them; ordering `paper` holds back by itself.
+        app_limited = inflight_bytes < estimator.window_bytes and not (
+            lane is self.lane and (self._control_waits or self._pick(now, window_open=True) is not None)
+        )
         flight.sent(now=now, nbytes=nbytes, items=items, app_limited=app_limited)
         estimator.on_sent(now=now, nbytes=nbytes, inflight_bytes=inflight_bytes)
         lane.pacer.sent(now=now, nbytes=nbytes, pacing_bps=estimator.pacing_bps)
@@ -352,21 +355,24 @@ class Sender(ABC):
         if self._watermarks:
             return True
         window_open = lane.open_at(now)
-        if window_open and (self._control.queue or self._control.active):
+        if window_open and self._control_waits:
             return True
         return self._pick(now, window_open=window_open) is not None
 
     @property
     def _backlog(self) -> bool:
         """Whether more could be sent if the window allowed it."""
-        control, pending = self._control, self.scheduler.pending
+        pending = self.scheduler.pending
         return bool(
-            control.queue
-            or control.active
+            self._control_waits
             or pending(PriorityClass.BULK)
             or pending(PriorityClass.STATE)
             or pending(PriorityClass.CONTROL)
         )
+
+    @property
+    def _control_waits(self) -> bool:
+        return bool(self._control.queue or self._control.active)
 
     def _compose(
         self, lane: Lane, frames: list[bytes], items: list[SentData | SentWatermark | SentPing], now: float
@@ -389,7 +395,7 @@ class Sender(ABC):
             channel = self.channels[chosen] if chosen is not None else None
             rides = served is PriorityClass.CONTROL and not window_open and not express
             if (
-                (control.queue or control.active)
+                self._control_waits
                 and (rides or (window_open and (channel is None or channel.spec.priority is not PriorityClass.CONTROL)))
                 and (order := control.head(now)) is not None
             ):

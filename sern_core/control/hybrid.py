@@ -6,10 +6,13 @@ Theory of operation
     Small and large packets are told apart, for a large one takes longer to serialise. Once an *epoch* (a round trip,
     at least 40 ms) the 20th percentile is compared with its least value of the last ten seconds: the queue q.
     *Rate.* Bytes received between two stamps of the receiver, over a round trip and at least 120 ms; the capacity B is
-    the greatest of the recent ones while there was more to send.
+    the greatest of the recent ones while there was more to send. While q stays above `hi` the link is never idle, so
+    that what arrives in 120 ms is all it can do now: a link that got slower is known by then, a faster one by growth.
     *Window.* The queue is W − B·RTT, so an error of q is corrected as what it is in bytes: W += γ·B·(q* − q). While
     the path looks empty the step doubles every epoch, up to a quarter of W. A queue above `hi` cuts W to what the
     receiver saw; one far above for longer than a moment does it at once (the link got slower).
+    *Pacing.* On a path without jitter a little below B while something queues: the window bounds, the pace keeps the
+    queue short. B does not follow what our own pacing made of it.
     *Start-up.* The first packets leave in a train: its dispersion shows the capacity one round trip later, and the
     window goes there in steps of at most `STARTUP_GAIN`.
     *Draining.* When no empty queue was seen for a while, one round trip at 0.6 of the product shows it. A queue that
@@ -19,12 +22,11 @@ Theory of operation
 """
 
 from collections import deque
-from collections.abc import Iterable
-from itertools import pairwise
 from math import inf
 from typing import Final
 
 from sern_core.capacity import AckSample, CapacityEstimator
+from sern_core.control.parts import BaseDelay, Cubic, one_gap
 
 MIN_EPOCH_S: Final = 0.040
 MIN_EPOCH_SAMPLES: Final = 4
@@ -39,9 +41,9 @@ BURST_RATE_SPAN_S: Final = 0.150
 MARK_SPACING_S: Final = 0.020
 TARGET_S: Final = 0.0002
 TARGET_PACKETS: Final = 0.32
-FAST_PACKETS: Final = 2.0
+FAST_PACKETS: Final = 2.5
 FAST_S: Final = 0.002
-"""Where a packet takes less than this, up to two more: they cost little, and flows share more fairly."""
+"""Where a packet takes less than this, up to so many more: they cost little, and flows share more fairly."""
 GAIN: Final = 0.35
 PATIENT_EPOCHS: Final = 2
 """The effect of a step is seen two epochs later; only then may the next one be larger."""
@@ -51,11 +53,21 @@ FIRST_GROWTH: Final = 0.02
 MAX_GROWTH: Final = 0.25
 CUT: Final = 0.95
 EMERGENCY_CUT: Final = 0.9
+SLOWER: Final = 0.8
+"""Less than this share of the known rate through a queue that stays: the link got slower."""
 EMERGENCY_S: Final = 0.050
 STARTUP_GAIN: Final = 4.0
 STARTUP_PACING: Final = 4.0
 STARTUP_AIM: Final = 0.9
 PACING_GAIN: Final = 1.03
+CALM_PACING: Final = 0.985
+CALM_PACKETS: Final = 0.2
+"""Instead of `PACING_GAIN` and `TARGET_PACKETS` where there is no jitter and a packet takes little: by jitter the rate
+would drift down unseen, and of long packets an epoch has too few."""
+CALM_SHARE: Final = 0.05
+"""So much faster is the pace of who has none of the link: shares meet."""
+CALM_NOISE_S: Final = 0.0005
+CALM_PACKET_S: Final = 0.003
 DRAIN_PACING: Final = 0.98
 TRAIN_BYTES: Final = 8 * 1200
 INITIAL_WINDOW_BYTES: Final = 12_600
@@ -72,76 +84,12 @@ STALL_S: Final = 0.1
 LOSS_MEMORY_S: Final = 3.0
 RIVAL_MEMORY_S: Final = 30.0
 COMPETE_MAX_S: Final = 30.0
+COMPETE_QUEUE_S: Final = 1.0
+"""A stream never loses a packet: its queue would grow without end."""
 NOISE: Final = 1.0
 """The least of many epochs lies so many times their spread below the usual one, though no queue ever was."""
 PEAK_DECAY: Final = 0.02
 """Share of the peak rate that is forgotten each second."""
-CUBIC_C: Final = 0.4
-CUBIC_BETA: Final = 0.7
-CUBIC_RENO: Final = 3 * (1 - CUBIC_BETA) / (1 + CUBIC_BETA)
-
-
-def _one_gap(train: Iterable[tuple[float, int]], gap_s: float) -> bool:
-    """Whether two packets of a train are further apart than `gap_s`."""
-    return any(later - earlier > gap_s for (earlier, _), (later, _) in pairwise(train))
-
-
-class _Base:
-    """The least forward delay of one size of packets over a sliding window."""
-
-    __slots__ = ("before_s", "epoch", "least")
-
-    def __init__(self) -> None:
-        self.before_s: float | None = None
-        self.least: deque[tuple[float, float]] = deque()  # (time, delay), both rising
-        self.epoch: list[float] = []
-
-    @property
-    def value_s(self) -> float | None:
-        return self.least[0][1] if self.least else None
-
-    def note(self, now: float, delay_s: float, window_s: float) -> None:
-        # Two epochs must agree: one may have had few packets, and all of them early.
-        before_s, self.before_s = self.before_s, delay_s
-        if before_s is not None and before_s > delay_s:
-            delay_s = before_s
-        least = self.least
-        while least and least[-1][1] >= delay_s:
-            least.pop()
-        least.append((now, delay_s))
-        while least[0][0] < now - window_s:
-            least.popleft()
-
-
-class _Cubic:
-    """The window of CUBIC (RFC 9438, section 4) in bytes, from the time somebody else was found to keep the queue."""
-
-    __slots__ = ("began_s", "cut_s", "from_bytes", "k_s", "most_bytes", "since_s")
-
-    def __init__(self, now: float, window: float, fragment: float) -> None:
-        self.began_s = now
-        self.cut_s = now
-        self.most_bytes = window
-        self._from(now, window, fragment)
-
-    def _from(self, now: float, window: float, fragment: float) -> None:
-        self.since_s = now
-        self.from_bytes = window
-        self.k_s: float = (max(0.0, self.most_bytes - window) / fragment / CUBIC_C) ** (1 / 3)
-
-    def window(self, now: float, rtt_s: float, fragment: float) -> float:
-        t = now - self.since_s
-        cubic: float = self.most_bytes + CUBIC_C * fragment * (t + rtt_s - self.k_s) ** 3
-        reno = self.from_bytes + CUBIC_RENO * fragment * t / rtt_s
-        return cubic if cubic > reno else reno
-
-    def cut(self, now: float, window: float, fragment: float) -> float:
-        """A loss: the new window. Fast convergence (4.7) lets others have what they lack."""
-        self.cut_s = now
-        self.most_bytes = window if window >= self.most_bytes else window * (1 + CUBIC_BETA) / 2
-        window *= CUBIC_BETA
-        self._from(now, window, fragment)
-        return window
 
 
 class HybridWindow(CapacityEstimator):
@@ -155,11 +103,14 @@ class HybridWindow(CapacityEstimator):
     def _begin(self) -> None:
         self._window = float(self._initial_bytes)
         self._fragment = float(self._first_fragment_bytes)
-        self._rate: float | None = None  # bytes/s, the capacity
+        self._rate: float | None = None  # bytes/s, the capacity, or what was offered if there was never more to send
+        self._saturated = False  # there was: it is the capacity
         self._peak = 0.0  # bytes/s, the greatest rate of the last minute or so
         self._rates: deque[tuple[float, float]] = deque()  # (time, bytes/s), the greatest first
         self._pacing: float | None = None  # bytes/s
-        self._small, self._large = _Base(), _Base()
+        self._capped = False  # it keeps below the capacity
+        self._calm = False
+        self._small, self._large = BaseDelay(), BaseDelay()
         self._queue_s = 0.0  # 20th percentile of the epoch
         self._queue_most_s = 0.0  # 80th
         self._serialise_s = 0.0
@@ -169,7 +120,7 @@ class HybridWindow(CapacityEstimator):
         self._high_s = inf
         self._rtt_s: float | None = None  # with our own queue on the way out empty
         self._startup = True
-        self._cubic: _Cubic | None = None  # while somebody else keeps the queue
+        self._cubic: Cubic | None = None  # while somebody else keeps the queue
         self._loss_floor = 0.0
         self._lost_s = -inf
         self._restart()
@@ -180,10 +131,13 @@ class HybridWindow(CapacityEstimator):
         self._samples: list[tuple[float, float]] = []  # (queue, way back) of the epoch
         self._limited = 0
         self._lost_bytes = self._acked_bytes = 0
+        self._inflight = 0
         self._small.epoch.clear()
         self._large.epoch.clear()
         self._mark: tuple[float, int] | None = None
         self._span_limited = False
+        self._faster_rate: float | None = None  # before the link seemed to get slower
+        self._full: tuple[float, int] | None = None  # (time, bytes) at the receiver since which a queue never went
         self._marks: deque[tuple[float, int]] = deque(maxlen=16)
         self._busy_s: float | None = None
         self._high_since_s: float | None = None
@@ -220,7 +174,8 @@ class HybridWindow(CapacityEstimator):
 
     @property
     def rate_bps(self) -> float | None:
-        return 8 * self._rate if self._rate is not None else None
+        """None until there was more to send than the link took: what little was offered is no capacity."""
+        return 8 * self._rate if self._rate is not None and self._saturated else None
 
     @property
     def pacing_bps(self) -> float | None:
@@ -243,6 +198,8 @@ class HybridWindow(CapacityEstimator):
 
     def on_sent(self, *, now: float, nbytes: int, inflight_bytes: int) -> None:
         if nbytes > self._fragment:
+            if self._peak:
+                self._large.shift((nbytes - self._fragment) / self._peak)
             self._fragment = float(nbytes)
         if 2 * inflight_bytes >= self._window or self._busy_s is None:
             self._busy_s = now
@@ -261,14 +218,23 @@ class HybridWindow(CapacityEstimator):
             delay_s = rtt_s
         else:
             delay_s = receiver_s - sent_s
+        back_s = rtt_s - delay_s
         base = self._large if nbytes == 0 or 2 * nbytes >= self._fragment else self._small
+        if base is self._large and 0 < nbytes < self._fragment:
+            # As if it had been a full one: else the least delay would be that of shorter ones.
+            if self._peak:
+                delay_s += (self._fragment - nbytes) / self._peak
+            elif 10 * nbytes < 9 * self._fragment:
+                base = self._small
         base.epoch.append(delay_s)
         least = base.least
         queue_s = delay_s - least[0][1] if least else 0.0
-        self._samples.append((queue_s, rtt_s - delay_s))
+        self._samples.append((queue_s, back_s))
         if not sample.app_limited:
             self._limited += 1
+            self._busy_s = now  # the pacer may hold back what the window would let go
         self._acked_bytes += sample.acked_bytes
+        self._inflight = sample.inflight_bytes
         marks = self._marks
         if not marks or receiver_s >= marks[-1][0] + MARK_SPACING_S:
             marks.append((receiver_s, cum_bytes))
@@ -284,6 +250,7 @@ class HybridWindow(CapacityEstimator):
                 self._emergency(now, queue_s)
         else:
             self._high_since_s = None
+        self._measure_full(sample, queue_s)
         self._measure_rate(now, receiver_s, cum_bytes, sample.app_limited)
         if self._epoch_s is None:
             self._epoch_s = now
@@ -303,10 +270,50 @@ class HybridWindow(CapacityEstimator):
             return
         rate = (cum_bytes - mark[1]) / span_s
         # What was sent while draining or with nothing more to send only shows a lower bound.
-        if rate > (self._rate or 0.0) or not (self._span_limited or self._draining(now)):
+        bound = self._span_limited or self._draining(now)
+        self._saturated = self._saturated or not bound
+        if rate > (self._rate or 0.0) or not (bound or (self._capped and self._queue_s <= self._target_s)):
             self._note_rate(now, rate)
         self._mark = (receiver_s, cum_bytes)
-        self._span_limited = False
+        self._span_limited = app_limited  # nothing more was there when this packet left: the next span begins idle
+
+    def _measure_full(self, sample: AckSample, queue_s: float) -> None:
+        """While a queue stays the link is never idle: what arrives is all it can do, whatever was seen before."""
+        if queue_s <= self._high_s or sample.app_limited or self._cubic is not None:
+            self._full = None
+            return
+        full = self._full
+        if full is None:
+            self._full = (sample.receiver_s, sample.cum_bytes)
+            return
+        span_s = sample.receiver_s - full[0]
+        if span_s < MIN_RATE_SPAN_S:
+            return
+        rate = (sample.cum_bytes - full[1]) / span_s
+        self._full = (sample.receiver_s, sample.cum_bytes)
+        if self._rate is not None and 0.0 < rate < SLOWER * self._rate:
+            self._slower(sample.now, rate)
+
+    def _slower(self, now: float, rate: float) -> None:
+        """The link got slower, or somebody else has his share of it."""
+        self._forget_rate(now, rate)
+        self._mark = None
+        self._saved_window = min(self._saved_window, rate * (self._rtt_s or 0.0) + self._fragment)
+
+    def _forget_rate(self, now: float, rate: float) -> None:
+        if self._faster_rate is None and self._rate is not None and self._rate >= self._peak / 2:
+            self._faster_rate = self._rate  # we had most of the link
+        self._rates.clear()
+        self._note_rate(now, rate)
+
+    def _emptied_slower(self) -> None:
+        """The queue went as we made way, so it was ours, and the link is slower: what a packet takes on it is none."""
+        faster, rate = self._faster_rate, self._rate
+        self._faster_rate = None
+        if faster is None or rate is None or rate >= faster:
+            return
+        self._peak = rate
+        self._large.shift(self._fragment / rate - self._fragment / faster)
 
     def _draining(self, now: float) -> bool:
         """Whether what arrives now may have been sent while draining."""
@@ -352,7 +359,7 @@ class HybridWindow(CapacityEstimator):
         if cum_bytes - nbytes < TRAIN_BYTES:
             return
         span_s = receiver_s - at_s
-        if span_s > STALL_S and _one_gap(train, 0.6 * span_s):
+        if span_s > STALL_S and one_gap(train, 0.6 * span_s):
             train.clear()  # a stream stood still for a lost segment: that says nothing about its rate
             return
         rate = (cum_bytes - nbytes) / span_s if span_s > 1e-5 else inf
@@ -411,10 +418,13 @@ class HybridWindow(CapacityEstimator):
         own_s = self._fragment / self._rate if self._rate else 0.0
         noise_s = NOISE * max(0.0, self._jitter_s - serialise_s)
         # A slower flow wants a longer queue than a faster one, so that their shares meet.
-        packets = TARGET_PACKETS + FAST_PACKETS * max(0.0, 1 - serialise_s / FAST_S)
+        self._calm = noise_s <= CALM_NOISE_S and serialise_s <= CALM_PACKET_S
+        packets = (CALM_PACKETS if self._calm else TARGET_PACKETS) + FAST_PACKETS * max(0.0, 1 - serialise_s / FAST_S)
         self._target_s = TARGET_S + packets * min(own_s, 4 * serialise_s) + noise_s
         self._high_s = max(0.010, 0.1 * rtt_s) + serialise_s + 1.5 * noise_s
         self._recent.append(queue_s)
+        if self._faster_rate is not None and queue_s <= self._high_s:
+            self._emptied_slower()
         if self._judging and self._drain_until_s is None:
             self._judging = False
             self._judge(now, queue_s, rtt_s)
@@ -435,7 +445,8 @@ class HybridWindow(CapacityEstimator):
         elif limited:
             if self._cubic is not None:
                 window = self._cubic.window(now, rtt_s + queue_s, self._fragment)
-                self._window = min(max(window, MIN_WINDOW_FRAGMENTS * self._fragment), 1.5 * self._window)
+                most = 1.5 * self._window if queue_s < COMPETE_QUEUE_S else self._window
+                self._window = min(max(window, MIN_WINDOW_FRAGMENTS * self._fragment), most)
             else:
                 self._steer(now, queue_s, rtt_s)
             stuck = self._cubic is None and (self._above_epochs >= STUCK_EPOCHS or self._pinned(now, queue_s))
@@ -462,9 +473,8 @@ class HybridWindow(CapacityEstimator):
             self._above_epochs += 1
             if now >= self._hold_until_s:
                 recent = self._recent_rate() or rate
-                if self._above_epochs >= 2:
-                    self._rates.clear()
-                    self._note_rate(now, recent)
+                if self._above_epochs >= 2 and self._faster_rate is None:
+                    self._forget_rate(now, recent)
                 window = min(window, CUT * min(recent, rate) * rtt_s + self._fragment)
                 self._hold_until_s = now + rtt_s
         else:
@@ -489,6 +499,7 @@ class HybridWindow(CapacityEstimator):
 
     def _pace(self) -> None:
         rtt_s = self._rtt_s
+        self._capped = False
         if rtt_s is None:
             return
         if self._startup:
@@ -502,7 +513,10 @@ class HybridWindow(CapacityEstimator):
         self._pacing = PACING_GAIN * self._window / rtt_s
         rate = self._rate
         if rate is not None and self._queue_s >= 0.25 * self._target_s:
-            gain = PACING_GAIN if self._queue_s < 2 * self._target_s + self._serialise_s else DRAIN_PACING
+            gain = DRAIN_PACING
+            if self._queue_s < 2 * self._target_s + self._serialise_s:
+                gain = CALM_PACING + CALM_SHARE * max(0.0, 1 - rate / self._peak) if self._calm else PACING_GAIN
+            self._capped = self._calm and gain * rate < self._pacing
             self._pacing = max(min(self._pacing, gain * rate), 1.0)
 
     def _drain(self, now: float, rtt_s: float) -> None:
@@ -548,12 +562,17 @@ class HybridWindow(CapacityEstimator):
         return now > self._pinned_s + PINNED_S and self._pinned_most_s - self._pinned_least_s > swing_s
 
     def _own(self, queue_s: float) -> bool:
-        """Whether the least that we have under way, and class 0 beside it, may be all that queues: on a thin link."""
-        return self._window <= 2 * self._fragment and queue_s * self._peak < self._window + 2 * self._fragment
+        """Whether all that queues may be ours: class 0, which passes the window, what left before the window was cut,
+        or the least that we have under way on a thin link."""
+        room = 2 * self._fragment
+        return self._inflight > self._window + room or (
+            self._window <= room and queue_s * self._peak < self._window + room
+        )
 
     def _compete(self, now: float, rtt_s: float) -> None:
+        self._faster_rate = None
         window = max(self._window, self._calm_window, (self._recent_rate() or 0.0) * rtt_s)
-        self._cubic = _Cubic(now, window, self._fragment)
+        self._cubic = Cubic(now, window, self._fragment)
         self._window = window
         self._above_epochs = 0
 
@@ -577,8 +596,7 @@ class HybridWindow(CapacityEstimator):
         rate = self._recent_rate()
         if rtt_s is None or rate is None:
             return
-        self._rates.clear()
-        self._note_rate(now, rate)
+        self._forget_rate(now, rate)
         self._mark = None
         self._drain_until_s = None
         self._window = min(self._window, max(EMERGENCY_CUT * rate * rtt_s, MIN_WINDOW_FRAGMENTS * self._fragment))

@@ -45,9 +45,9 @@ def run(model: LinkModel, until_s: float, *, seed: int = 1, tick_s: float = 0.0,
 def test_a_saturated_link_hardly_delays_a_pose(seed: int, tick_s: float) -> None:
     world = run(link(4e6, 0.05), 20.0, seed=seed, tick_s=tick_s)
     poses, floor = world.poses_ms(5.0), floor_ms(4e6, 0.05)
-    assert at(poses, 0.5) < 1.13 * floor
+    assert at(poses, 0.5) < 1.10 * floor
     assert at(poses, 0.99) < 1.25 * floor
-    assert world.goodput_bps(5.0, 20.0) > 0.955 * carries_bps(4e6)
+    assert world.goodput_bps(5.0, 20.0) > 0.97 * carries_bps(4e6)
     assert world.hop.forward.stats.queue_drops == 0
 
 
@@ -94,12 +94,15 @@ def test_links_of_all_kinds(rate_bps: float, rtt_s: float) -> None:
     assert at(world.poses_ms(begin_s), 0.99) - floor_ms(rate_bps, rtt_s) < 1.15 * limit_ms
 
 
-def test_the_estimate_follows_the_capacity() -> None:
+@pytest.mark.parametrize("off_s", [0.0, 0.013, 0.37])
+@pytest.mark.parametrize("tick_s", [0.0, 0.001])
+def test_the_estimate_follows_the_capacity(off_s: float, tick_s: float) -> None:
+    down_s, up_s = 6.0 + off_s, 12.0 + off_s
     model = LinkModel(
-        rate_bps=8e6, delay_s=0.025, overhead_bytes=60, rate_steps=(RateStep(6.0, 1e6), RateStep(12.0, 4e6))
+        rate_bps=8e6, delay_s=0.025, overhead_bytes=60, rate_steps=(RateStep(down_s, 1e6), RateStep(up_s, 4e6))
     )
-    world = run(model, 18.0)
-    for from_s, to_s, rate_bps, within_s in ((6.0, 12.0, 1e6, 0.5), (12.0, 18.0, 4e6, 1.3)):
+    world = run(model, 18.0, tick_s=tick_s)
+    for from_s, to_s, rate_bps, within_s in ((down_s, up_s, 1e6, 0.5), (up_s, 18.0, 4e6, 1.0)):
         off = [t for t, rate in world.rates() if from_s <= t < to_s and not 0.75 * rate_bps <= rate <= 1.25 * rate_bps]
         assert off[-1] - from_s < within_s
 
