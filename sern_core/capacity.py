@@ -42,6 +42,11 @@ class CapacityEstimator(ABC):
         """Estimated capacity in bits per second; None while unknown."""
 
     @property
+    def bound_bps(self) -> float | None:
+        """What the path has carried at least, bits per second: known before there was enough to send to fill it."""
+        return self.rate_bps
+
+    @property
     @abstractmethod
     def rtprop_s(self) -> float | None:
         """Round-trip time of the empty path; None while unknown."""

@@ -196,7 +196,8 @@ class Hop(Sender):
 
     def _rate_known(self, now: float) -> None:
         self._rate_due_s = now + RATE_INTERVAL_S
-        self.scheduler.set_rate(self.lane.rate_changed() or None, now=now)
+        known = self.lane.estimator.rate_bps is not None
+        self.scheduler.set_rate(self.lane.rate_changed() or None, now=now, full=known)
 
     def _find_losses(self, lane: Lane, now: float) -> None:
         gone = lane.flight.lost(now=now)

@@ -76,8 +76,8 @@ class Lane:
         return int(min(max(FRAGMENT_TIME_S * rate_bps / 8, MIN_FRAGMENT_BYTES), self.fragment_bytes_max))
 
     def rate_changed(self) -> float | None:
-        """Adopt the estimator's capacity; returns it."""
-        rate_bps = self.estimator.rate_bps
+        """Adopt the rate that the path carries at least; returns it."""
+        rate_bps = self.estimator.bound_bps
         self.fragment_bytes = self._fragment_bytes(rate_bps)
         return rate_bps
 

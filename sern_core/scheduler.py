@@ -390,8 +390,11 @@ class Scheduler:
                 limit = 0.0
         self._bulk_credit = credit if credit < limit else limit
 
-    def set_rate(self, rate_bps: float | None, *, now: float) -> None:
+    def set_rate(self, rate_bps: float | None, *, now: float, full: bool = True) -> None:
         """The link's capacity B; None when unknown, which leaves class 0 and the interval's budget unlimited.
+
+        `full` False: it carries that much, and there was never enough to send to see more. Class 0's share is of what
+        is known; the interval's budget is no limit then, or little traffic would keep it little.
 
         Raises UsageError if it is negative or not finite.
         """
@@ -399,7 +402,9 @@ class Scheduler:
             raise UsageError(f"Scheduler.set_rate: rate_bps = {rate_bps!r} must be 0 or above, or None")
         self._bucket.set_rate(rate_bps, now)
         if self._interval is not None:
-            self._interval.budget_bytes = _INF if rate_bps is None else rate_bps * self.params.interval_s / 8.0
+            self._interval.budget_bytes = (
+                _INF if rate_bps is None or not full else rate_bps * self.params.interval_s / 8.0
+            )
 
     def class0_tokens_bytes(self, *, now: float) -> float:
         """Bytes class 0 may send ahead of others; infinite while the capacity is unknown, negative in debt."""

@@ -178,6 +178,10 @@ class HybridWindow(CapacityEstimator):
         return 8 * self._rate if self._rate is not None and self._saturated else None
 
     @property
+    def bound_bps(self) -> float | None:
+        return 8 * self._rate if self._rate is not None else None
+
+    @property
     def pacing_bps(self) -> float | None:
         return 8 * self._pacing if self._pacing is not None else None
 

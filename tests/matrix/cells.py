@@ -116,6 +116,11 @@ IMPOSSIBLE: tuple[tuple[Callable[[Cell], bool], str, str], ...] = (
         "each lost segment stalls a stream for a round trip and 0.2 s; of what it carries then, the share that is left "
         "to class bulk may bring no cloud across within its lifespan of 3 s",
     ),
+    (
+        lambda cell: cell.lanes is Lanes.STREAM and cell.load is Load.THIRTEEN and cell.fault is Fault.BURST,
+        "/robot/costmap",
+        "bursts of loss leave a stream as little as 150 kbit/s, of which a costmap of 100 kB within 3 s would be more",
+    ),
 )
 """What may not work: in which cells, of which topic nothing may arrive, and the reason. It is still promised there that
 each drop is counted, and everything else."""
