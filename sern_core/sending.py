@@ -390,7 +390,7 @@ class Sender(ABC):
             size = self._put_watermarks(frames, items, size)
         control = self._control
         served: PriorityClass | None = None
-        while size < limit - MIN_SHARE_BYTES:
+        while size <= limit - wire.DATA_FIRST_BYTES - MIN_SHARE_BYTES:
             chosen = self.scheduler.pick_control(now=now) if express else self._pick(now, window_open=window_open)
             channel = self.channels[chosen] if chosen is not None else None
             rides = served is PriorityClass.CONTROL and not window_open and not express

@@ -115,7 +115,7 @@ def topic_lines(trace: DecisionTrace, topics: Mapping[str, Mapping[str, Any]]) -
             continue
         verdict = trace.story(topic)[-1]
         counts = topics.get(topic)
-        lines.append(f"{topic}: {verdict}"[:WIDTH])
+        lines += [topic, f"    {verdict}"[:WIDTH]]
         if counts is not None:
             dropped = ", ".join(f"{count} {reason}" for reason, count in counts["dropped"].items())
             lines.append(

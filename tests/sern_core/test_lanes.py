@@ -2,8 +2,9 @@
 
 from sern_core.client import ClientCore
 from sern_core.lane_port import LanePort
-from sern_core.lanes import LANE_UDP, LANE_ZMQ
+from sern_core.lanes import DATAGRAM_BYTES, LANE_UDP, LANE_ZMQ
 from sern_core.params import LinkParams, Redundancy
+from sern_core.queues import OutChannel
 from sern_core.types import ClientName, PriorityClass
 from sern_sim.models import LinkModel, Window
 from sern_sim.network import Hop
@@ -144,3 +145,24 @@ def test_second_copies_save_poses_from_loss() -> None:
     assert 0.02 < without < 0.08  # a fresher pose is there before a lost one could be sent again
     assert _poses_lost(Redundancy.ALWAYS) < without / 5
     assert _poses_lost(Redundancy.AUTO) < without / 3
+
+
+def test_no_datagram_is_larger_than_the_lane_takes() -> None:
+    """Announcements, watermarks and messages of all sizes share datagrams; none may grow by its last fragment."""
+    world = World(lossless=False)
+    path = LinkModel(rate_bps=RATE_BPS, delay_s=0.02)
+    robot = world.client("robot", path)
+    world.client("site", path, patterns=["/robot/.*"])
+    sizes: list[int] = []
+    for port in (robot.port, *world.relay.sides.values()):
+        port.sent = lambda data, _now: sizes.append(len(data))
+    for number in range(40):
+        channel = robot.publish(f"/robot/{'name' * 8}{number}", spec(PriorityClass(number % 3)), definition="x" * 300)
+        body = b"x" * (30 + 37 * number)
+
+        def send(now: float, channel: OutChannel = channel, body: bytes = body) -> None:
+            robot.core.send(channel, body, 0, now=now)
+
+        world.network.every(0.02 + 0.001 * number, send, node=robot)
+    world.run(4.0)
+    assert DATAGRAM_BYTES - 60 < max(sizes) <= DATAGRAM_BYTES

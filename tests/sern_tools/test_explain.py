@@ -39,7 +39,7 @@ def test_a_recording_is_explained_interval_by_interval(tmp_path: Path) -> None:
     assert intervals == pytest.approx(range(9))
     assert text.count("  weighed   ") == 2
     assert "      ->   " in text and "  chosen    " in text and "  came to   " in text
-    assert "/chat: message" in text and "offered" in text
+    assert "/chat\n    message" in text and "offered" in text
     assert "/_sern/" not in text
 
 
