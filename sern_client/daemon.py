@@ -14,7 +14,7 @@ import zmq
 from prometheus_client import CollectorRegistry
 
 from sern_client.bridge import Bridge
-from sern_client.endpoints.base import Endpoint, ServiceEndpoint
+from sern_client.endpoints.base import CountingEndpoint, Endpoint, ServiceEndpoint
 from sern_client.express import ClientExpress
 from sern_client.factory import make_endpoint
 from sern_client.message_log import MessageLog
@@ -259,6 +259,14 @@ class ClientDaemon:
             "Times a grid of patches could not go on, and waited for the next whole one.",
             read=lambda: [((), float(self.bridge.rebuilds.gaps))],
         )
+        endpoint = self.bridge.endpoint
+        if isinstance(endpoint, CountingEndpoint):
+            metrics.counter(
+                "sern_endpoint_dropped_total",
+                "Messages that were dropped between this site's nodes and its endpoint.",
+                ("reason",),
+                lambda: [((str(reason),), float(count)) for reason, count in endpoint.drops.items()],
+            )
         adaptation = self.adaptation
         if adaptation is not None:
             adaptation.register(metrics)

@@ -5,12 +5,12 @@ its business. All calls happen on the event-loop thread; an endpoint with thread
 `call_soon_threadsafe`.
 """
 
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 from sern_core.message import TopicInfo
-from sern_core.types import Encoding, TopicName
+from sern_core.types import DropReason, Encoding, TopicName
 
 Sink = Callable[[bytes, int], bool]
 """`sink(body, stamp_ns) -> accepted`. False: refused (a reliable queue is full); the endpoint may hold the message
@@ -66,6 +66,16 @@ class Endpoint(Protocol):
     @property
     def exhausted(self) -> bool:
         """True when a finite source (a bag without loop) has offered all it has and all of it was accepted."""
+        ...
+
+
+@runtime_checkable
+class CountingEndpoint(Protocol):
+    """An endpoint that may drop messages on this site's side, before the link has them or after."""
+
+    @property
+    def drops(self) -> Mapping[DropReason, int]:
+        """Messages it has dropped so far, by reason."""
         ...
 
 

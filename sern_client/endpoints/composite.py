@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 from sern_client.conversion import Converter, serve
 from sern_client.endpoints.base import (
+    CountingEndpoint,
     Endpoint,
     Publisher,
     ServiceEndpoint,
@@ -19,7 +20,7 @@ from sern_client.endpoints.base import (
 )
 from sern_core.errors import ConfigError, ServiceError, UsageError
 from sern_core.message import TopicInfo
-from sern_core.types import TopicName
+from sern_core.types import DropReason, TopicName
 
 _LOG = logging.getLogger(__name__)
 
@@ -163,6 +164,16 @@ class CompositeEndpoint:
     def encoding(self) -> None:
         """Each member says for itself."""
         return None
+
+    @property
+    def drops(self) -> dict[DropReason, int]:
+        """Those of all members."""
+        total: dict[DropReason, int] = {}
+        for member in self._members:
+            if isinstance(member, CountingEndpoint):
+                for reason, count in member.drops.items():
+                    total[reason] = total.get(reason, 0) + count
+        return total
 
     @property
     def exhausted(self) -> bool:

@@ -145,14 +145,14 @@ class Ros1Endpoint:
         await self._tcpros.stop()
         self._publications.clear()
         await self._api.stop()
-        dropped = self.dropped
+        dropped = self.drops
         if dropped:
             _log.warning("%s: messages dropped: %s", self.master_uri,
                          ", ".join(f"{number} {why}" for why, number in sorted(dropped.items())))  # fmt: skip
 
     @property
-    def dropped(self) -> dict[DropReason, int]:
-        """Messages that went no further here, either way, by reason."""
+    def drops(self) -> dict[DropReason, int]:
+        """Messages dropped between local nodes and us, either way, by reason."""
         total = dict(self.counters.dropped)
         for why, number in self._limits.dropped.items():
             total[why] = total.get(why, 0) + number

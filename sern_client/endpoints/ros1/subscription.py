@@ -37,6 +37,8 @@ class ReceiveCounters:
 
     received: int = 0
     accepted: int = 0
+    refused: int = 0
+    """Offered to the link, which counts them, and answered with no."""
     dropped: dict[DropReason, int] = field(default_factory=dict)
     mismatches: int = 0
     """Publishers that were refused because they mean another type."""
@@ -385,7 +387,7 @@ class Topic:
             if subscription.sink(body, stamp_ns):
                 counters.accepted += 1
             else:
-                counters.drop(DropReason.REFUSED)
+                counters.refused += 1
 
     def close(self) -> None:
         for source in list(self.sources.values()):

@@ -167,3 +167,16 @@ async def test_services_across_the_link(tmp_path: Path) -> None:
         await until(lambda: any(row[0] == "/robot1/lamp" for row in site_ros.call("getSystemState")[2]), "it is served")
         assert "lamp is on" in await site_ros.tool("rosservice", "call", "/robot1/lamp", "true")
         assert (await site_ros.tool("rosservice", "type", "/robot1/lamp")).strip() == "std_srvs/SetBool"
+
+
+async def test_drops_are_in_the_metrics(tmp_path: Path) -> None:
+    async with RosLab(tmp_path) as ros, Lab(tmp_path, "site") as lab:
+        await lab.process(lab.relay_file()).ready()
+        site = await lab.process(lab.client_file("site", endpoint(ros) | {"max_message_bytes": 1000})).ready()
+        # Latched, so that it is wanted although nobody subscribes at the far side.
+        ros.python("talker", publisher("/chat", "std_msgs/String", "m.String('x' * 2000)", latch=True), "talker")
+
+        def counted() -> bool:
+            return 'sern_endpoint_dropped_total{reason="too_large"}' in site.get("/metrics")[1]
+
+        await until(counted, "they are counted")

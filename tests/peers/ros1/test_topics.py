@@ -94,7 +94,7 @@ async def test_publishes_to_rospy_and_the_tools_byte_for_byte(tmp_path: Path) ->
         got = [line["crc"] for line in ros.lines("listener") if line["topic"] == "/chat"]
         assert got == [zlib.crc32(body) for body in sent]
         assert events.topics == {}  # what we publish is not announced
-        assert endpoint.dropped == {}
+        assert endpoint.drops == {}
 
         info = await ros.tool("rosnode", "info", "/sern_test")
         assert "/chat [std_msgs/String]" in info and "/map_name [std_msgs/String]" in info and "to: /listener" in info
@@ -344,5 +344,5 @@ async def test_large_messages_are_dropped_and_counted(tmp_path: Path) -> None:
         ros.python("talker", publisher("/chat", "std_msgs/String", body), "talker")
         await until(lambda: "/chat" in events.topics, "the topic is announced")
         got = collect(endpoint, "/chat")
-        await until(lambda: len(got) > 3 and endpoint.dropped.get(DropReason.TOO_LARGE, 0) > 3, "half is dropped")
+        await until(lambda: len(got) > 3 and endpoint.drops.get(DropReason.TOO_LARGE, 0) > 3, "half is dropped")
         assert set(got) == {text("x" * 10)}

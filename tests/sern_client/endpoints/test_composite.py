@@ -23,7 +23,7 @@ from sern_client.endpoints.record import RecordEndpoint, RecordOptions
 from sern_client.endpoints.synthetic import SyntheticEndpoint, SyntheticOptions
 from sern_core.errors import ConfigError, ServiceError, UsageError
 from sern_core.message import TopicInfo
-from sern_core.types import Encoding, TopicName
+from sern_core.types import DropReason, Encoding, TopicName
 from sern_runtime.ros_types import topic_info
 from tests.fake_services import Services
 
@@ -261,3 +261,14 @@ def test_services_need_a_member_that_knows_them() -> None:
 
     with pytest.raises(ConfigError, match="none of the endpoints has services"):
         CompositeEndpoint([Fake()]).watch_services(Nobody())
+
+
+def test_drops_are_those_of_all_members() -> None:
+    class Counting(Fake):
+        def __init__(self, drops: dict[DropReason, int]) -> None:
+            super().__init__()
+            self.drops = drops
+
+    one = Counting({DropReason.QUEUE_FULL: 2, DropReason.TOO_LARGE: 1})
+    composite = CompositeEndpoint([one, Fake(), Counting({DropReason.QUEUE_FULL: 3})])
+    assert composite.drops == {DropReason.QUEUE_FULL: 5, DropReason.TOO_LARGE: 1}

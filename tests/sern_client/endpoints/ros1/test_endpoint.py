@@ -168,13 +168,13 @@ async def test_a_slow_subscriber_loses_its_oldest_messages_and_holds_up_nobody(m
             for body in sent:
                 stream.publish(body, 0)
                 assert await quick.frame() == body
-            assert endpoint.dropped[DropReason.QUEUE_FULL] > 0
+            assert endpoint.drops[DropReason.QUEUE_FULL] > 0
             got: list[bytes] = []
             while not got or got[-1] != sent[-1]:
                 got.append(await slow.frame())
             assert got == [body for body in sent if body in got]  # in order, each once
             assert got[-5:] == sent[-5:]
-            assert len(got) + endpoint.dropped[DropReason.QUEUE_FULL] == len(sent)
+            assert len(got) + endpoint.drops[DropReason.QUEUE_FULL] == len(sent)
 
 
 async def test_late_subscribers_get_the_last_message_of_every_stream(master: FakeMaster) -> None:
