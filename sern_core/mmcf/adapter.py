@@ -277,7 +277,10 @@ class HopAdapter:
         counts = self._count(channels)
         demands = self._demands(channels, elapsed_s)
         situation = Situation(
-            demands, LinkState(self._capacity_bps(), self._rtt_s(), link.lane.loss, tuple(self._samples))
+            demands,
+            LinkState(
+                self._capacity_bps(), self._rtt_s(), link.lane.loss, tuple(self._samples), stream=link.lane.lossless
+            ),
         )
         in_force = self.policy.active
         measurement, terms, value = None, None, None

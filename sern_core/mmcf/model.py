@@ -82,6 +82,8 @@ class LinkState:
     rtt_s: float
     loss: float = 0.0
     samples_bps: tuple[float, ...] = ()
+    stream: bool = False
+    """TCP: what is offered beyond the capacity waits in the kernel, where it delays every class."""
 
     def __post_init__(self) -> None:
         if not (

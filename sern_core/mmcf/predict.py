@@ -65,7 +65,8 @@ class Bounds:
     """What makes a configuration feasible, the paper's C_feas.
 
     `min_rates` by class; `compute_max` CPU seconds a second; `load_max` offered load over planned capacity, inf for
-    none: what does not fit is dropped by class, freshest kept, and the cost says so.
+    none: what does not fit is dropped by class, freshest kept, and the cost says so. Over a stream it is 1 at most:
+    there the kernel's queue knows no classes.
     """
 
     min_rates: tuple[float, ...] = (0.0, 0.0, 0.0)
@@ -281,11 +282,12 @@ class Predictor:
                 control_load = part.load
             classes.append(ClassArrays(demand, part.load, drop, late, own_s, on_time, own_bps))
 
+        load_max = min(self.bounds.load_max, 1.0) if link.stream else self.bounds.load_max
         excess = np.maximum(control_load - CONTROL_SHARE_MAX, 0.0)
-        excess += np.maximum(offered_load - self.bounds.load_max, 0.0)
+        excess += np.maximum(offered_load - load_max, 0.0)
         excess += np.maximum(np.array(self.bounds.min_rates) - grid.rates, 0.0).sum(axis=1)
         obstacle = np.zeros(shape, dtype=np.int64)
-        obstacle[offered_load > self.bounds.load_max] = 4
+        obstacle[offered_load > load_max] = 4
         obstacle[control_load > CONTROL_SHARE_MAX] = 2
         obstacle[(grid.rates < np.array(self.bounds.min_rates)).any(axis=1)] = 1
         return self._costed(

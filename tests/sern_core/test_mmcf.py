@@ -267,6 +267,19 @@ def test_candidates_come_feasible_first_and_cheapest_first() -> None:
     assert feasible[0].prediction.cost <= predicted(decision).cost
 
 
+def test_over_a_stream_no_more_is_offered_than_it_carries() -> None:
+    """Its queue knows no classes: bulk that does not fit would delay control. Over datagrams it costs nothing."""
+    offered = {}
+    for stream in (False, True):
+        whole = situation(0.8e6)
+        mmcf = controller(Weights(0.0, 1.0, 0.0, 0.0))
+        case = Situation(whole.classes, replace(whole.link, stream=stream))
+        decision = mmcf.decide(case, None, now=0.0)
+        assert decision.predictions is not None and decision.index is not None
+        offered[stream] = float(decision.predictions.load[decision.index])
+    assert offered[True] <= 1.0 < offered[False]
+
+
 def test_where_nothing_is_feasible_the_least_bad_is_taken_without_copies() -> None:
     decision = controller(initial=Configuration(redundancy=1)).decide(situation(1e5), None, now=0.0)
     assert "nothing is feasible" in decision.reason
