@@ -105,6 +105,11 @@ class _Subscription:
         resolved = ros_types.resolve(self.info.type_name, self.info.definition, Encoding.CDR)
         self._reader = self._endpoint.open_reader(self.dds_topic, resolved, asked, self._deliver)
 
+    @property
+    def matched(self) -> int:
+        """How many writers it is connected with."""
+        return 0 if self._reader is None else self._reader.matched
+
     def _deliver(self, sample: Sample) -> None:
         self._endpoint.counters.received += 1
         if not self._sink(sample.body, sample.stamp_ns):
@@ -125,12 +130,20 @@ class _Subscription:
 class _Reader:
     """A reader in use: its samples come to `deliver` on the event loop until it is closed."""
 
-    def __init__(self, endpoint: "DdsEndpoint", guid: UUID, qos: EndpointQos, inbox: Inbox, number: int) -> None:
+    def __init__(
+        self, endpoint: "DdsEndpoint", entity: DataReader[Any], qos: EndpointQos, inbox: Inbox, number: int
+    ) -> None:
         self._endpoint = endpoint
-        self.guid = guid
+        self._entity: DataReader[Any] | None = entity
+        self.guid: UUID = entity.guid
         self.qos = qos
         self._inbox = inbox
         self._number = number
+
+    @property
+    def matched(self) -> int:
+        """How many writers it has."""
+        return 0 if self._entity is None else len(self._entity.get_matched_publications())
 
     @property
     def dropped(self) -> int:
@@ -138,6 +151,7 @@ class _Reader:
 
     def close(self) -> None:
         self._inbox.closed = True
+        self._entity = None  # the worker is the last to hold it, and lets go on its own thread
         self._endpoint.close_reader(self, self._number)
 
 
@@ -354,7 +368,7 @@ class DdsEndpoint:
         except DDSException as error:
             raise ConfigError(f"{topic}: no reader ({error.msg})") from None
         inbox = Inbox(depth, checked)
-        reader = _Reader(self, entity.guid, qos, inbox, joined.worker.watch(entity, inbox))
+        reader = _Reader(self, entity, qos, inbox, joined.worker.watch(entity, inbox))
         self._readers[reader.guid] = reader
         self.graph.local_added(Local(reader.guid, False, topic, names.type_to_dds(resolved.name), qos))
         self._info_changed()

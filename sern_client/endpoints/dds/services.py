@@ -32,6 +32,8 @@ DEPTH: Final = 10
 """History of requests and replies: what ROS 2 has by default for services."""
 MATCH_POLL_S: Final = 0.005
 """How often a call that waits for its server looks whether it is there."""
+SETTLE_S: Final = 0.1
+"""The pause before the first call of a new client."""
 REPLY_WAIT_S: Final = 1.0
 """How long a reply waits for the reader of a client that has just appeared."""
 MAX_CALLS: Final = 100
@@ -68,22 +70,22 @@ def new_service_id() -> str:
     return ".".join(f"{byte:x}" for byte in secrets.token_bytes(16))
 
 
-async def _matched(writer: "_Out") -> None:
-    """Wait until the writer has a reader."""
-    while not writer.matched:  # noqa: ASYNC110  DDS says so by status only
+async def _matched(side: "_Side") -> None:
+    """Wait until a writer has a reader, or a reader a writer."""
+    while not side.matched:  # noqa: ASYNC110  DDS says so by status only
         await asyncio.sleep(MATCH_POLL_S)
 
 
 class _Side(Protocol):
-    """A reader or writer, as far as it matters here."""
+    """A reader or writer, as far as it matters here. `matched`: how many of others it is connected with."""
+
+    @property
+    def matched(self) -> int: ...
 
     def close(self) -> None: ...
 
 
 class _Out(_Side, Protocol):
-    @property
-    def matched(self) -> int: ...
-
     def publish(self, body: bytes, stamp_ns: int) -> None: ...
 
 
@@ -95,6 +97,7 @@ class _Client:
     reader: _Side
     waiting: dict[int, asyncio.Future[bytes]]
     number: int = 0
+    met_s: float | None = None
 
     def close(self) -> None:
         self.writer.close()
@@ -224,13 +227,26 @@ class DdsServices:
         client.waiting[number] = future
         try:
             async with asyncio.timeout(timeout_s):
-                await _matched(client.writer)
+                await self._met(client)
                 client.writer.publish(Wrapped.join(request, client.ident, number), 0)
                 return await future
         except TimeoutError:
             raise ServiceError(f"{name}: no answer within {timeout_s:g} s") from None
         finally:
             client.waiting.pop(number, None)
+
+    async def _met(self, client: _Client) -> None:
+        """Wait until a new client and its server know each other.
+
+        That the server has found our reader too, nothing tells us; its answer would be lost. So there is a pause after
+        the first match.
+        """
+        await _matched(client.writer)
+        await _matched(client.reader)
+        loop = asyncio.get_running_loop()
+        if client.met_s is None:
+            client.met_s = loop.time()
+        await asyncio.sleep(max(0.0, client.met_s + SETTLE_S - loop.time()))
 
     def _open(self, info: ServiceInfo) -> _Client:
         client_id = secrets.randbits(64)

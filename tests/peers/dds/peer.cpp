@@ -194,6 +194,12 @@ struct Side : DataReaderListener, DataWriterListener {
         response.seq(request->seq());
         response.success(request->data());
         response.message(request->data() ? "yes" : "no");
+        // A server of rmw_cyclonedds waits for the reader of a client that has just appeared, too.
+        PublicationMatchedStatus matched;
+        for (int i = 0; i < 1000 && replies->writer->get_publication_matched_status(matched) == ReturnCode_t::RETCODE_OK
+                 && matched.current_count == 0; ++i) {
+            std::this_thread::sleep_for(std::chrono::milliseconds(1));
+        }
         replies->writer->write(&response);
     }
 

@@ -10,11 +10,13 @@ from xmlrpc.client import ServerProxy
 from rosbags.highlevel import AnyReader
 
 from sern_client.conversion import converted
+from sern_client.daemon import ClientDaemon
+from sern_client.endpoints.dds.endpoint import DdsEndpoint
 from sern_core.message import TopicInfo
-from sern_core.types import Encoding
+from sern_core.types import Encoding, TopicName
 from sern_runtime import ros_types
 from sern_runtime.ros_types import topic_info
-from tests.daemons import HOST, RELIABLE, Lab, recording
+from tests.daemons import HOST, RELIABLE, Lab, endpoint_of, recording
 from tests.peers.dds.conftest import MakePeer
 from tests.peers.dds.test_topics import ODOMETRY, same
 from tests.peers.ros1.lab import SUBSCRIBER, RosLab, need
@@ -76,7 +78,7 @@ async def test_ros2_reaches_rospy(tmp_path: Path, domain: int, make_peer: MakePe
     ]
     async with RosLab(tmp_path, "site_ros") as ros, Lab(tmp_path, "robot1", "site") as lab:
         await lab.relay()
-        await lab.connected(lab.client_file("robot1", dds(domain), topics=list(RELIABLE)))
+        robot = await lab.connected(lab.client_file("robot1", dds(domain), topics=list(RELIABLE)))
         site = {"kind": "ros1", "master_uri": ros.uri, "host": HOST}
         await lab.connected(
             lab.client_file(
@@ -88,12 +90,18 @@ async def test_ros2_reaches_rospy(tmp_path: Path, domain: int, make_peer: MakePe
         await until(lambda: ros.line_count("listener") >= 1, "rospy is there")
         await _connected(ros)
         await peer.line("matched odom 1")
+        await until(lambda: _subscription(robot).matched == 1, "the robot's client hears it")
         for body in bodies:
             await peer.do(f"write odom {body.hex()}")
         await until(lambda: ros.line_count("listener") >= 1 + len(bodies), "all of them arrive")
         got = [line["crc"] for line in ros.lines("listener")]
     _, convert = converted(topic_info("/robot1/odom", ODOM, Encoding.CDR), Encoding.ROS1)
     assert got == [zlib.crc32(convert(body)) for body in bodies]
+
+
+def _subscription(robot: ClientDaemon) -> Any:
+    (subscription,) = endpoint_of(robot, DdsEndpoint)._subscriptions[TopicName("/odom")]
+    return subscription
 
 
 async def _connected(ros: RosLab) -> None:

@@ -73,6 +73,7 @@ async def test_they_call_our_server(domain: int, make_peer: MakePeer, make_endpo
     await peer.do(f"pub calls rq/set_boolRequest {REQUEST} reliable userdata=clientid=7.8;")
     await peer.line("matched answers 1")
     await peer.line("matched calls 1")
+    await until(lambda: server.reader is not None and server.reader.matched == 1)
     for number, value in enumerate((1, 0, 1)):
         await peer.do(f"write calls {(HEAD + struct.pack('<Qq', 99, number) + bytes([value])).hex()}")
     await peer.line("got answers ", 1)

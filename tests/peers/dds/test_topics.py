@@ -57,6 +57,7 @@ async def test_from_ros2_to_the_link(
     assert info == known
     subscription = endpoint.subscribe(info.name, recorder.sink)
     await peer.line("matched a 1")
+    await until(lambda: subscription.matched == 1)  # each side finds the other by itself
     bodies = [body_of(dds_type, seed) for seed in range(10)]
     for body in bodies:
         await peer.do(f"write a {body.hex()}")
@@ -100,11 +101,11 @@ async def test_large_messages_arrive_whole(domain: int, make_peer: MakePeer, mak
     await peer.do(f"pub a rt/points {CLOUD} reliable")
     await peer.do(f"sub b rt/echo {CLOUD} reliable")
     await until(lambda: bool(recorder.infos))
-    endpoint.subscribe(TopicName("/points"), recorder.sink)
+    subscription = endpoint.subscribe(TopicName("/points"), recorder.sink)
     publisher = endpoint.advertise(topic_info("/echo", TYPES[CLOUD], CDR, reliable=True))
     await peer.line("matched a 1")
     await peer.line("matched b 1")
-    await until(lambda: publisher.matched == 1)
+    await until(lambda: publisher.matched == subscription.matched == 1)
     body = cloud(1_000_000)
     await peer.do(f"write a {body.hex()}")
     await until(lambda: len(recorder.got) == 1)
@@ -181,10 +182,11 @@ async def test_a_reader_stoops_to_the_least_of_its_writers(
     await until(lambda: bool(recorder.infos))
     info = recorder.infos[TopicName("/chat")]
     assert (info.reliable, info.latched, info.lifespan_s, info.deadline_s) == (True, True, 5.0, 2.0)
-    endpoint.subscribe(info.name, recorder.sink)
+    subscription = endpoint.subscribe(info.name, recorder.sink)
     await peer.line("matched a 1")
     await peer.do(f"pub b rt/chat {STRING}")
     await peer.line("matched b 1")
+    await until(lambda: subscription.matched == 2)
     await peer.do(f"write b {body_of(STRING, 2).hex()}")
     await until(lambda: any(same(body, body_of(STRING, 2)) for body, _ in recorder.got))
     await peer.until(lambda: len(peer.lines("matched a 1")) == 2)
@@ -215,11 +217,15 @@ async def test_two_sern_endpoints_beside_each_other_make_no_loop(
         await until(lambda recorder=recorder: TopicName("/tf") in recorder.infos)  # type: ignore[misc]
     publisher = one.advertise(topic_info("/tf", "std_msgs/msg/String", CDR, reliable=True))
     only_ours = one.advertise(topic_info("/only/ours", "std_msgs/msg/String", CDR, reliable=True))
-    for endpoint, recorder in ((one, heard_one), (two, heard_two), (chain, heard_chain)):
+    subscriptions = [
         endpoint.subscribe(TopicName("/tf"), recorder.sink)
+        for endpoint, recorder in ((one, heard_one), (two, heard_two), (chain, heard_chain))
+    ]
     await peer.do(f"sub b rt/tf {STRING} reliable")
     await until(lambda: publisher.matched == 3)  # the peer, and the readers of the other two
     await peer.line("matched a 3")
+    # Our own writer is not among those of `one`; the others' readers have the peer's and that one.
+    await until(lambda: [subscription.matched for subscription in subscriptions] == [1, 2, 2])
     await until(lambda: TopicName("/only/ours") in heard_chain.infos)
     publisher.publish(body_of(STRING, 1), 1)
     await peer.do(f"write a {body_of(STRING, 2).hex()}")
@@ -243,9 +249,10 @@ async def test_several_domains_in_one_process(make_peer: MakePeer, make_endpoint
     await until(lambda: list(heard_one.infos) == [TopicName("/first")])
     await until(lambda: list(heard_two.infos) == [TopicName("/second")])
     publisher = two.advertise(topic_info("/first", "std_msgs/msg/String", CDR))
-    one.subscribe(TopicName("/first"), heard_one.sink)
+    subscription = one.subscribe(TopicName("/first"), heard_one.sink)
     publisher.publish(body_of(STRING), 1)
     await peer_one.line("matched a 1")
+    await until(lambda: subscription.matched == 1)
     await peer_one.do(f"write a {body_of(STRING, 4).hex()}")
     await until(lambda: len(heard_one.got) == 1)
     assert same(heard_one.got[0][0], body_of(STRING, 4))
@@ -283,8 +290,9 @@ async def test_refusals_are_counted(domain: int, make_peer: MakePeer, make_endpo
     recorder.accepts = False
     await peer.do(f"pub a rt/chat {STRING} reliable")
     await until(lambda: bool(recorder.infos))
-    endpoint.subscribe(TopicName("/chat"), recorder.sink)
+    subscription = endpoint.subscribe(TopicName("/chat"), recorder.sink)
     await peer.line("matched a 1")
+    await until(lambda: subscription.matched == 1)
     await peer.do(f"write a {body_of(STRING).hex()}")
     await until(lambda: endpoint.counters.refused == 1)
 
