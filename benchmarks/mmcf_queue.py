@@ -57,14 +57,6 @@ class Path:
         index = bisect_right(self.rates, (t, inf))
         return self.rates[index][0] if index < len(self.rates) else inf
 
-    def mean_bps(self, a: float, b: float) -> float:
-        total, t = 0.0, a
-        while t < b:
-            until = min(b, self.next_change_s(t))
-            total += self.rate_bps(t) * (until - t)
-            t = until
-        return total / (b - a)
-
 
 def arrivals(topics: list[Topic], duration_s: float, seed: int) -> list[tuple[float, int, float]]:
     """(time, topic index, body bytes) of a whole run, in order."""

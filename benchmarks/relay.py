@@ -20,7 +20,6 @@ import multiprocessing
 import random
 import re
 import signal
-import socket
 import statistics
 import sys
 import tempfile
@@ -54,6 +53,7 @@ from sern_runtime.config.relay import load_relay
 from sern_runtime.feed import Feed, FeedHeader, topic_frame
 from sern_runtime.loop import Shutdown, run
 from sern_runtime.pump import Pump
+from sern_tools.demo_link import free_ports
 
 SIZES: Final = {"100 B": 100, "1 kB": 1000, "64 kB": 64_000, "1 MB": 1_000_000}
 IN_FLIGHT_MESSAGES: Final = 500
@@ -398,11 +398,6 @@ class Sample(NamedTuple):
     relay_cpu_us: float  # of the relay process, a message
 
 
-def free_ports() -> Ports:
-    with socket.create_server(("127.0.0.1", 0)) as first, socket.create_server(("127.0.0.1", 0)) as second:
-        return Ports(first.getsockname()[1], second.getsockname()[1])
-
-
 def _relay_main(system: System, ports: Ports, ready: Any) -> None:
     system.relay(ports, ready.set)
 
@@ -410,7 +405,7 @@ def _relay_main(system: System, ports: Ports, ready: Any) -> None:
 def measure(system: System, size_bytes: int, duration_s: float) -> Sample:
     """Start the three processes, wait until messages flow, and look at both ends of `duration_s`."""
     processes = multiprocessing.get_context("spawn")
-    ports, flow, ready = free_ports(), Flow(size_bytes), processes.Event()
+    ports, flow, ready = Ports(*free_ports(2)), Flow(size_bytes), processes.Event()
     relay = processes.Process(target=_relay_main, args=(system, ports, ready), daemon=True)
     ends = [
         processes.Process(target=end, args=(ports, flow), daemon=True) for end in (system.subscriber, system.publisher)

@@ -33,7 +33,7 @@ import uvloop
 import zmq
 
 from benchmarks import common
-from benchmarks.relay import IdleSite, cpu_s, end_process, free_ports
+from benchmarks.relay import IdleSite, cpu_s, end_process
 from sern_client.transport import RelayTransport
 from sern_core.client import ClientCore
 from sern_core.errors import ConfigError, SernError
@@ -46,6 +46,7 @@ from sern_runtime import logs
 from sern_runtime.config.relay import load_relay
 from sern_runtime.keys import PublicKey, PublicKeys, generate, load_public, load_secret, write_public, write_secret
 from sern_runtime.loop import Shutdown, run
+from sern_tools.demo_link import free_ports
 
 FLEETS: Final = (1, 5, 10, 20, 50)
 HOSTS: Final = 2
@@ -228,7 +229,7 @@ def _prepare(folder: Path, robots: int, port: int) -> None:
 def measure(robots: int, duration_s: float) -> Sample:
     """Start a fleet, wait until the site has every stream, and measure for `duration_s`."""
     processes = multiprocessing.get_context("spawn")
-    shared, ready, port = Shared(), processes.Event(), free_ports().ingest
+    shared, ready, port = Shared(), processes.Event(), free_ports(1)[0]
     ours, theirs = processes.Pipe(duplex=False)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)

@@ -13,34 +13,22 @@ Theory of operation
   the references held reach `max_held_bytes`, further large bodies are not kept and show no hash.
 - Topic objects are named `<topic>@<client>`; ids that end in `@<client>` are reserved for that client. Other ids
   belong to whoever puts them first.
-
-JSON shape (`to_json`, served at /api/objects)
-
-    {"epoch": 7, "version": 120, "objects": [{
-        "id": "/jackal1/odom@jackal1", "owner": "jackal1", "kind": "topic", "type": "nav_msgs/Odometry",
-        "definition": "...", "definition_hash": "<64 hex digits>", "attributes": {"class": "control"},
-        "version": 119, "seq": 42, "created_s": 12.5, "updated_s": 99.0,       monotonic seconds of the registry's host
-        "ros_stamp_ns": null or int, "wall_ns": int,                           nanoseconds
-        "value": {"bytes": 720, "base64": "..."}                               up to 4 KiB
-              or {"bytes": 1000000, "sha256": "<64 hex digits>" or null}       larger
-              or null                                                          nothing seen yet
-    }]}
 """
 
-import base64
 import hashlib
 import re
 from collections import OrderedDict, deque
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 from sern_core.codecs import Codec, decode
 from sern_core.errors import CodecError, RefusedError
 from sern_core.message import StreamId, StreamInfo
 from sern_core.rules import COMMAND_TYPES, plain_type
 from sern_core.types import ClientName, ObjectKind, PriorityClass
+from sern_core.xr_object import ObjectChanges, XrObject, object_to_json
 
 COMMAND_OBJECT_TYPES: Final = COMMAND_TYPES | {
     "ackermann_msgs/AckermannDrive",
@@ -69,45 +57,6 @@ class ObjectLimits:
     max_attribute_bytes: int = 4_096
     max_id_chars: int = 512
     deletions: int = 4_096  # length of the deletion log
-
-
-@dataclass(frozen=True, slots=True)
-class XrObject:
-    """One cross-reality object as it was when asked for.
-
-    `definition_hash` is the SHA-256 hex of the definition text unless its owner gave another (ROS 1 md5, RIHS01);
-    empty where neither is known.
-    `value` is the latest value, None when there is none or it is larger than the limit; then `value_bytes` and
-    `value_sha256` still tell about it (`value_bytes` -1: nothing seen yet). `created_s` and `updated_s` are monotonic
-    seconds of this host, `wall_ns` is the wall time at the origin, `ros_stamp_ns` the ROS stamp, untouched.
-    """
-
-    id: str
-    owner: ClientName
-    kind: ObjectKind
-    type_name: str
-    definition: str
-    definition_hash: str
-    attributes: Mapping[str, str]
-    value: bytes | None
-    value_bytes: int
-    value_sha256: str | None
-    seq: int
-    ros_stamp_ns: int | None
-    wall_ns: int
-    created_s: float
-    updated_s: float
-    version: int
-
-
-class ObjectChanges(NamedTuple):
-    """What changed since a version. With `resync`, forget everything and take `updated` as the whole registry."""
-
-    epoch: int
-    version: int
-    resync: bool
-    updated: tuple[XrObject, ...]  # oldest change first
-    deleted: tuple[str, ...]  # ids, oldest first, without those that exist again
 
 
 class _Entry:
@@ -372,7 +321,7 @@ class ObjectRegistry:
     def to_json(
         self, *, kind: ObjectKind | None = None, owner: ClientName | None = None, definitions: bool = True
     ) -> dict[str, Any]:
-        """The module's JSON shape; without `definitions` the texts are left out and the hashes stay."""
+        """The JSON shape of `sern_core.xr_object`; without `definitions` the texts are left out and the hashes stay."""
         return {
             "epoch": self.epoch,
             "version": self._version,
@@ -558,45 +507,3 @@ def kind_of(stream: StreamInfo) -> ObjectKind:
     if type_name in PATCH_TYPES:
         return ObjectKind.PATCH
     return ObjectKind.TOPIC
-
-
-def changes_to_json(
-    changes: ObjectChanges, *, kind: ObjectKind | None = None, owner: ClientName | None = None, definitions: bool = True
-) -> dict[str, Any]:
-    """What `since` gave, of a kind and an owner (None: any); ids of deleted objects are all there."""
-    return {
-        "epoch": changes.epoch,
-        "version": changes.version,
-        "resync": changes.resync,
-        "objects": [
-            object_to_json(item, definition=definitions)
-            for item in changes.updated
-            if kind in (None, item.kind) and owner in (None, item.owner)
-        ],
-        "deleted": list(changes.deleted),
-    }
-
-
-def object_to_json(item: XrObject, *, definition: bool = True) -> dict[str, Any]:
-    """One element of `objects` in the module's JSON shape."""
-    value: dict[str, Any] | None = None
-    if item.value is not None:
-        value = {"bytes": item.value_bytes, "base64": base64.b64encode(item.value).decode("ascii")}
-    elif item.value_bytes >= 0:
-        value = {"bytes": item.value_bytes, "sha256": item.value_sha256}
-    return {
-        "id": item.id,
-        "owner": item.owner,
-        "kind": item.kind.value,
-        "type": item.type_name,
-        **({"definition": item.definition} if definition else {}),
-        "definition_hash": item.definition_hash,
-        "attributes": dict(item.attributes),
-        "version": item.version,
-        "seq": item.seq,
-        "created_s": item.created_s,
-        "updated_s": item.updated_s,
-        "ros_stamp_ns": item.ros_stamp_ns,
-        "wall_ns": item.wall_ns,
-        "value": value,
-    }

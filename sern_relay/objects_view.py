@@ -13,8 +13,9 @@ from typing import Any
 
 from sern_core.errors import UsageError
 from sern_core.hub import Hub
-from sern_core.objects import changes_to_json, text_hash, topic_object_id
+from sern_core.objects import text_hash, topic_object_id
 from sern_core.types import ClientName, ObjectKind
+from sern_core.xr_object import changes_to_json
 from sern_runtime.http import JsonQuery
 
 

@@ -6,7 +6,6 @@ compares the inode of the duplicate, acts on it and closes it. No duplicate is k
 open after libzmq closed it.
 """
 
-import asyncio
 import errno
 import logging
 import os
@@ -485,21 +484,3 @@ class ConnectionTable:
             self._half_open_by_source[connection.source] -= 1
             if not self._half_open_by_source[connection.source]:
                 del self._half_open_by_source[connection.source]
-
-
-async def wait_for_event(
-    socket: "zmq.Socket[bytes]", wanted: Callable[[MonitorEvent], bool], *, timeout_s: float
-) -> MonitorEvent:
-    """The next event that `wanted` accepts. TimeoutError when none comes. For checks at start and for tests."""
-    found: asyncio.Future[MonitorEvent] = asyncio.get_running_loop().create_future()
-
-    def on_event(event: MonitorEvent) -> None:
-        if not found.done() and wanted(event):
-            found.set_result(event)
-
-    monitor = SocketMonitor(socket, on_event)
-    try:
-        async with asyncio.timeout(timeout_s):
-            return await found
-    finally:
-        monitor.close()

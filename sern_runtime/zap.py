@@ -85,9 +85,6 @@ class ZapHandler:
             raise UsageError("an empty ZAP domain is never asked about: libzmq would let anyone in")
         self._lookups[domain.encode()] = lookup
 
-    def remove_domain(self, domain: str) -> None:
-        self._lookups.pop(domain.encode(), None)
-
     def expect_refusal(self, public_key: str) -> None:
         """Count the refusal of this key as a probe, so that the self-test raises no alarm."""
         self._expected.add(public_key)

@@ -8,7 +8,6 @@ import http.client
 import json
 import os
 import signal
-import socket
 import subprocess
 import sys
 from collections import defaultdict
@@ -30,6 +29,7 @@ from sern_relay.daemon import RelayDaemon
 from sern_runtime.config.client import load_client
 from sern_runtime.config.relay import load_relay
 from sern_runtime.keys import PublicKey, PublicKeys, SecretKey, generate, write_public, write_secret
+from sern_tools.demo_link import free_ports
 from tests.support import until
 
 HOST: Final = "127.0.0.1"
@@ -47,18 +47,6 @@ def recording(name: str) -> Path:
     if not path.exists():
         pytest.skip(f"the recording {name} is not beside this checkout")
     return path.resolve()
-
-
-def free_ports(count: int) -> list[int]:
-    """TCP ports of loopback that nobody listens on now."""
-    sockets = [socket.socket() for _ in range(count)]
-    try:
-        for sock in sockets:
-            sock.bind((HOST, 0))
-        return [sock.getsockname()[1] for sock in sockets]
-    finally:
-        for sock in sockets:
-            sock.close()
 
 
 def write_bag(path: Path, topics: Mapping[str, int], *, latched: Iterable[str] = (), start: int = 1) -> Path:

@@ -1,9 +1,13 @@
-"""Waiting by polling a condition, for tests with real sockets."""
+"""Waiting by polling a condition, and what an endpoint announces, for tests with real sockets."""
 
 import asyncio
 import time
 from collections.abc import Callable
 from typing import Final
+
+from sern_client.endpoints.base import ServiceInfo
+from sern_core.message import TopicInfo
+from sern_core.types import TopicName
 
 DEADLINE_S: Final = 20.0
 """Long enough for a busy machine; reached only when something is broken."""
@@ -17,3 +21,29 @@ async def until(condition: Callable[[], object], what: str = "", *, deadline_s: 
         if time.monotonic() > give_up_s:
             raise AssertionError(f"not within {deadline_s:g} s: {what or condition}")
         await asyncio.sleep(_POLL_S)
+
+
+class Events:
+    """`TopicEvents` and `ServiceEvents` that keep what an endpoint announces."""
+
+    def __init__(self) -> None:
+        self.infos: dict[TopicName, TopicInfo] = {}
+        self.services: dict[TopicName, ServiceInfo] = {}
+        self.added: list[TopicName] = []
+        self.removed: list[TopicName] = []
+
+    def topic_added(self, info: TopicInfo) -> None:
+        assert info.name not in self.infos, f"{info.name} is announced twice"
+        self.infos[info.name] = info
+        self.added.append(info.name)
+
+    def topic_removed(self, name: TopicName) -> None:
+        del self.infos[name]
+        self.removed.append(name)
+
+    def service_added(self, info: ServiceInfo) -> None:
+        assert info.name not in self.services, f"{info.name} is announced twice"
+        self.services[info.name] = info
+
+    def service_removed(self, name: TopicName) -> None:
+        del self.services[name]

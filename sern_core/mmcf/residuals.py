@@ -21,7 +21,6 @@ KEEP: Final = 0.7
 CLIP: Final = 0.5
 RATIO_KEEP: Final = 0.4
 """Ratios are measured, not inferred: they are believed sooner."""
-METRICS: Final = ("latency", "unreliability", "compute", "bandwidth")
 FLOORS: Final = {"latency": 1e-3, "unreliability": 0.02, "compute": 1e-3, "bandwidth": 1e3}
 """Added on both sides: nobody cares whether 0.1 % was predicted where 0.2 % came."""
 

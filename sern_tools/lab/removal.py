@@ -19,7 +19,7 @@ from sern_tools.lab.host import NETNS_DIR, LabError, run
 RUN_DIR: Final = Path("/run/sern-lab")
 """Locks and control sockets; for root alone."""
 LAB_NAME: Final = r"(?P<lab>(?P<pid>[1-9][0-9]*)(?:\.[1-9][0-9]*)?)"
-_NAMESPACE: Final = re.compile(rf"sern-{LAB_NAME}-(?P<node>[a-z0-9-]+)")
+_NAMESPACE: Final = re.compile(rf"sern-{LAB_NAME}-[a-z0-9-]+")
 _RUN_FILE: Final = re.compile(rf"{LAB_NAME}\.(?:lock|sock)")
 GONE_S: Final = 10.0
 """A killed process is gone by then."""
@@ -27,12 +27,6 @@ GONE_S: Final = 10.0
 
 def namespace_name(lab: str, node: str) -> str:
     return f"sern-{lab}-{node}"
-
-
-def node_of(namespace: str) -> str | None:
-    """The node that a namespace of a lab is for; None when it is not one of ours."""
-    match = _NAMESPACE.fullmatch(namespace)
-    return match["node"] if match else None
 
 
 def lock(lab: str) -> int:

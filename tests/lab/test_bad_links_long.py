@@ -13,12 +13,9 @@ THIRTEEN = 13.0
 RUN_S = 15.0
 IDLE_LAN = 2e-4
 PROFILES = load_profiles()
-TOO_FAST = {
-    "lan": "twice a gigabit is more than this machine's guest and two processors carry; played idle only",
-    "wifi": "thirteen times 50 Mbit/s is more than the machine composes; played idle and overloaded twice",
-}
-"""Profiles that are not overloaded as much as the others, and why."""
 LOADS = {"lan": (IDLE_LAN,), "wifi": (IDLE, TWICE)}
+"""Profiles that are overloaded less than the others: twice a gigabit is more than two processors carry, and thirteen
+times 50 Mbit/s more than they compose."""
 RUNS = [(name, load) for name in PROFILES for load in LOADS.get(name, (IDLE, TWICE, THIRTEEN))]
 
 

@@ -19,7 +19,8 @@ from sern_core.types import Encoding, TopicName
 from sern_runtime import ros_types
 from sern_runtime.codec_pool import CodecPool, make_coder
 from sern_runtime.config.client import load_client
-from tests.daemons import HOST, Lab, bodies, free_ports, recording, under
+from sern_tools.demo_link import free_ports
+from tests.daemons import HOST, Lab, bodies, recording, under
 from tests.support import until
 
 CLOUDS = TopicName("/robot1/points")

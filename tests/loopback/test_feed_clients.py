@@ -17,7 +17,8 @@ from sern_relay.daemon import RelayDaemon
 from sern_relay.feed import InjectCounters, RelayFeed
 from sern_runtime import ros_types
 from sern_runtime.feed import HEADER, FeedHeader
-from tests.daemons import Lab, endpoint_of, free_ports
+from sern_tools.demo_link import free_ports
+from tests.daemons import Lab, endpoint_of
 from tests.support import until
 
 TWIST = struct.Struct("<6d")

@@ -11,7 +11,8 @@ from typing import Final
 import pytest
 
 from sern_client.daemon import ClientDaemon
-from tests.daemons import HOST, Lab, bodies, free_ports, under, write_bag
+from sern_tools.demo_link import free_ports
+from tests.daemons import HOST, Lab, bodies, under, write_bag
 from tests.support import until
 
 INSIDE: Final = "127.0.0.2"

@@ -16,8 +16,9 @@ from sern_core.errors import ConfigError, ServiceError, UsageError
 from sern_core.message import TopicInfo
 from sern_core.types import Encoding, TopicName
 from sern_runtime import ros_services, ros_types
-from tests.daemons import Lab, bodies, free_ports, under, write_bag
-from tests.support import until
+from sern_tools.demo_link import free_ports
+from tests.daemons import Lab, bodies, under, write_bag
+from tests.support import Events, until
 
 zenoh = pytest.importorskip("zenoh", reason="the library eclipse-zenoh is missing: pip install 'sern[zenoh]'")
 pytest.importorskip("zenoh_ros2_sdk", reason="the peer zenoh-ros2-sdk is missing: pip install zenoh-ros2-sdk")
@@ -111,24 +112,6 @@ class Peer:
         await self._reader
 
 
-class Events:
-    def __init__(self) -> None:
-        self.topics: dict[TopicName, TopicInfo] = {}
-        self.services: dict[TopicName, ServiceInfo] = {}
-
-    def topic_added(self, info: TopicInfo) -> None:
-        self.topics[info.name] = info
-
-    def topic_removed(self, name: TopicName) -> None:
-        del self.topics[name]
-
-    def service_added(self, info: ServiceInfo) -> None:
-        self.services[info.name] = info
-
-    def service_removed(self, name: TopicName) -> None:
-        del self.services[name]
-
-
 @pytest.fixture
 async def router() -> AsyncIterator[Router]:
     made = Router()
@@ -161,8 +144,8 @@ def test_is_an_endpoint_with_services() -> None:
 async def test_a_node_is_heard_while_it_publishes(endpoint: tuple[ZenohEndpoint, Events], peer: Peer) -> None:
     ours, events = endpoint
     told = await peer.do("publisher", name=CHAT)
-    await until(lambda: CHAT in events.topics, "the topic is announced")
-    info = events.topics[CHAT]
+    await until(lambda: CHAT in events.infos, "the topic is announced")
+    info = events.infos[CHAT]
     assert info == chat(reliable=True), "name, type, definition, and the hash that the peer worked out by itself"
     assert info.type_hash == told["hash"]
 
@@ -190,7 +173,7 @@ async def test_a_node_is_heard_while_it_publishes(endpoint: tuple[ZenohEndpoint,
 
     subscription.close()
     await peer.do("close", thing="pub" + CHAT)
-    await until(lambda: CHAT not in events.topics, "the topic has ended")
+    await until(lambda: CHAT not in events.infos, "the topic has ended")
 
 
 async def test_what_is_published_here_reaches_a_node(endpoint: tuple[ZenohEndpoint, Events], peer: Peer) -> None:
@@ -208,7 +191,7 @@ async def test_what_is_published_here_reaches_a_node(endpoint: tuple[ZenohEndpoi
         publisher.publish(text(f"number {number}"), number)
     await until(lambda: (CHAT, "number 49") in peer.got, "all arrive")
     assert [data for _, data in peer.got if data.startswith("number")] == [f"number {number}" for number in range(50)]
-    assert events.topics == {}, "our own publisher is not announced to us"
+    assert events.infos == {}, "our own publisher is not announced to us"
     publisher.close()
     assert ours.dropped == 0
 
@@ -220,8 +203,8 @@ async def test_late_joiners_get_what_is_latched(endpoint: tuple[ZenohEndpoint, E
     publisher.publish(text("map"), 1)
     static = TopicName("/static")
     await peer.do("publisher", name=static, latched=True, depth=1)
-    await until(lambda: static in events.topics, "announced")
-    assert events.topics[static].latched and events.topics[static].reliable
+    await until(lambda: static in events.infos, "announced")
+    assert events.infos[static].latched and events.infos[static].reliable
     await peer.sees("MP", name)
     async with asyncio.timeout(60):
         while (
@@ -241,7 +224,7 @@ async def test_a_late_site_gets_what_another_site_latched(router: Router) -> Non
         publisher = first.advertise(chat(latched=True))
         publisher.publish(text("one"), 7)
         publisher.publish(text("two"), 8)
-        await until(lambda: CHAT in events.topics, "announced")
+        await until(lambda: CHAT in events.infos, "announced")
         got: list[tuple[bytes, int]] = []
 
         def take(body: bytes, stamp_ns: int) -> bool:
@@ -291,9 +274,9 @@ async def test_services_both_ways(endpoint: tuple[ZenohEndpoint, Events], peer: 
 async def test_a_node_that_dies_takes_its_topics_with_it(endpoint: tuple[ZenohEndpoint, Events], peer: Peer) -> None:
     _, events = endpoint
     await peer.do("publisher", name=CHAT)
-    await until(lambda: CHAT in events.topics, "announced")
+    await until(lambda: CHAT in events.infos, "announced")
     await peer.kill()
-    await until(lambda: CHAT not in events.topics, "gone with its session")
+    await until(lambda: CHAT not in events.infos, "gone with its session")
 
 
 async def test_another_type_under_the_same_name_is_left_out(
@@ -301,13 +284,13 @@ async def test_another_type_under_the_same_name_is_left_out(
 ) -> None:
     ours, events = endpoint
     await peer.do("publisher", name=CHAT)
-    await until(lambda: CHAT in events.topics, "announced")
-    first = events.topics[CHAT]
+    await until(lambda: CHAT in events.infos, "announced")
+    first = events.infos[CHAT]
     await peer.do("publisher", name=CHAT, type="std_msgs/msg/Bool", definition="bool data\n")
     await until(lambda: "is left out" in caplog.text, "said")
     (line,) = [record.message for record in caplog.records if "left out" in record.message]
     assert "std_msgs/msg/Bool RIHS01_" in line and f"std_msgs/msg/String {first.type_hash}" in line
-    assert events.topics[CHAT] == first
+    assert events.infos[CHAT] == first
     with pytest.raises(
         ConfigError, match=r"what comes is std_msgs/msg/Bool RIHS01_.* nodes here publish std_msgs/msg/String"
     ):
@@ -321,8 +304,8 @@ async def test_a_type_nobody_defines_passes_as_it_is(
     await peer.do(
         "publisher", name=CHAT, type="my_msgs/msg/Text", definition="string data\n", hash="RIHS01_" + "ab" * 32
     )
-    await until(lambda: CHAT in events.topics, "announced")
-    assert events.topics[CHAT] == TopicInfo(
+    await until(lambda: CHAT in events.infos, "announced")
+    assert events.infos[CHAT] == TopicInfo(
         CHAT, "my_msgs/msg/Text", Encoding.CDR, "RIHS01_" + "ab" * 32, "", False, True
     )
     assert "type_paths" in caplog.text
@@ -339,7 +322,7 @@ async def test_the_router_may_come_later_and_go() -> None:
         peer = await Peer.start(router.port)
         try:
             await peer.do("publisher", name=CHAT)
-            await until(lambda: CHAT in events.topics, "found through the router that came later", deadline_s=60)
+            await until(lambda: CHAT in events.infos, "found through the router that came later", deadline_s=60)
         finally:
             await peer.kill()
     finally:

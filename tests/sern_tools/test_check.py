@@ -27,7 +27,7 @@ def deployed(tmp_path: Path) -> Path:
     shutil.copytree(EXAMPLES, tmp_path, dirs_exist_ok=True)
     (tmp_path / "clients").mkdir()
     run_keygen("relay", "relay", out=tmp_path)
-    for name in ("jackal1", "site1"):
+    for name in ("jackal1", "husky1", "j100_0000", "a200_0000", "site1"):
         run_keygen("client", name, out=tmp_path)
         shutil.copy(tmp_path / f"{name}.pub", tmp_path / "clients")
     return tmp_path
@@ -61,7 +61,7 @@ def test_summary_names_what_matters(deployed: Path) -> None:
     assert "subscribes to /jackal1(?:/cmd_vel)" in out
     _, out, _ = ran(deployed / "relay.yaml")
     assert "listens on tcp://0.0.0.0:5555 (CURVE)" in out
-    assert "jackal[0-9]+" in out
+    assert "(jackal|husky)[0-9]+" in out
 
 
 @pytest.mark.parametrize(

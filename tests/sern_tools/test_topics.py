@@ -2,7 +2,6 @@
 
 import json
 import re
-import socket
 import threading
 from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler, HTTPServer
@@ -17,6 +16,7 @@ from typer.testing import CliRunner
 from sern_core.errors import SernError, UsageError
 from sern_tools import api
 from sern_tools.cli import app
+from sern_tools.demo_link import free_ports
 from sern_tools.topics import (
     Counts,
     Identity,
@@ -190,15 +190,9 @@ def test_an_address_must_be_one(text: str) -> None:
         api.checked_api(text)
 
 
-def free_port() -> int:
-    with socket.socket() as sock:
-        sock.bind(("127.0.0.1", 0))
-        return int(sock.getsockname()[1])
-
-
 def test_exit_codes() -> None:
     runner = CliRunner()
-    nobody = runner.invoke(app, ["topics", "--api", f"http://127.0.0.1:{free_port()}"])
+    nobody = runner.invoke(app, ["topics", "--api", f"http://127.0.0.1:{free_ports(1)[0]}"])
     assert nobody.exit_code == 1
     assert nobody.stderr.count("\n") == 1
     assert "is the daemon running" in nobody.stderr

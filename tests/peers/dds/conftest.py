@@ -9,37 +9,19 @@ import pytest
 
 pytest.importorskip("cyclonedds", reason="the dds endpoint needs cyclonedds: pip install 'sern[dds]'")
 
-from sern_client.endpoints.base import ServiceInfo
 from sern_client.endpoints.dds.domain import DomainOptions
 from sern_client.endpoints.dds.endpoint import DdsEndpoint, DdsOptions
-from sern_core.message import TopicInfo
-from sern_core.types import TopicName
 from tests.peers.dds.peer import Peer, build_peer, free_domain
+from tests.support import Events
 
 
-class Recorder:
-    """`TopicEvents`, `ServiceEvents` and a sink that keep everything."""
+class Recorder(Events):
+    """And a sink that keeps everything."""
 
     def __init__(self) -> None:
-        self.infos: dict[TopicName, TopicInfo] = {}
-        self.services: dict[TopicName, ServiceInfo] = {}
-        self.removed: list[TopicName] = []
+        super().__init__()
         self.got: list[tuple[bytes, int]] = []
         self.accepts = True
-
-    def topic_added(self, info: TopicInfo) -> None:
-        assert info.name not in self.infos
-        self.infos[info.name] = info
-
-    def topic_removed(self, name: TopicName) -> None:
-        del self.infos[name]
-        self.removed.append(name)
-
-    def service_added(self, info: ServiceInfo) -> None:
-        self.services[info.name] = info
-
-    def service_removed(self, name: TopicName) -> None:
-        del self.services[name]
 
     def sink(self, body: bytes, stamp_ns: int) -> bool:
         self.got.append((body, stamp_ns))

@@ -14,12 +14,10 @@ from xmlrpc.client import ServerProxy
 
 import pytest
 
-from sern_client.endpoints.base import ServiceInfo
 from sern_client.endpoints.ros1 import Ros1Endpoint, Ros1Options
-from sern_core.message import TopicInfo
-from sern_core.types import TopicName
-from tests.daemons import HOST, free_ports
-from tests.support import until
+from sern_tools.demo_link import free_ports
+from tests.daemons import HOST
+from tests.support import Events, until
 
 PACKAGES: Final = {
     "/usr/bin/rosmaster": "python3-rosmaster",
@@ -43,29 +41,6 @@ def need(*paths: str) -> None:
     for path in paths:
         if not Path(path).exists():
             pytest.skip(f"needs {path}: install the Debian package {PACKAGES[path]}")
-
-
-class Events:
-    """Keeps what an endpoint announces, topics and services."""
-
-    def __init__(self) -> None:
-        self.topics: dict[str, TopicInfo] = {}
-        self.history: list[str] = []
-        self.services: dict[str, ServiceInfo] = {}
-
-    def topic_added(self, info: TopicInfo) -> None:
-        self.topics[info.name] = info
-        self.history.append(f"+{info.name}")
-
-    def topic_removed(self, name: TopicName) -> None:
-        self.topics.pop(name, None)
-        self.history.append(f"-{name}")
-
-    def service_added(self, info: ServiceInfo) -> None:
-        self.services[info.name] = info
-
-    def service_removed(self, name: TopicName) -> None:
-        self.services.pop(name, None)
 
 
 class RosLab:

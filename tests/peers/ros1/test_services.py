@@ -55,7 +55,7 @@ async def test_finds_and_calls_services_of_rospy(tmp_path: Path) -> None:
         endpoint.watch_services(events)
         server = ros.python("server", SERVER, "server")
         await until(lambda: {"/lamp", "/broken", "/slow"} <= events.services.keys(), "they are announced")
-        assert events.services["/lamp"] == SET_BOOL
+        assert events.services[TopicName("/lamp")] == SET_BOOL
         lamp = TopicName("/lamp")
         assert await endpoint.call(lamp, b"\x01", timeout_s=10) == answer(True, "lamp on")
         several = await asyncio.gather(*(endpoint.call(lamp, bytes([n % 2]), timeout_s=10) for n in range(6)))

@@ -12,8 +12,8 @@ from sern_core.errors import ConfigError
 from sern_core.types import DropReason, Encoding, TopicName
 from sern_runtime import ros_types
 from tests.daemons import bodies, recording
-from tests.peers.ros1.lab import SUBSCRIBER, Events, RosLab, need, publisher
-from tests.support import until
+from tests.peers.ros1.lab import SUBSCRIBER, RosLab, need, publisher
+from tests.support import Events, until
 
 STRING = "std_msgs/msg/String"
 
@@ -38,8 +38,8 @@ async def test_receives_from_rospy(tmp_path: Path) -> None:
     async with RosLab(tmp_path) as ros:
         endpoint, events = await ros.started()
         ros.python("talker", publisher("/chat", "std_msgs/String", "m.String(f'hello {n}')"), "talker")
-        await until(lambda: "/chat" in events.topics, "the topic is announced")
-        info = events.topics["/chat"]
+        await until(lambda: "/chat" in events.infos, "the topic is announced")
+        info = events.infos[TopicName("/chat")]
         known = ros_types.topic_info("/chat", STRING, Encoding.ROS1)
         assert (info.type_name, info.type_hash, info.encoding) == (STRING, known.type_hash, Encoding.ROS1)
         assert info.definition.strip() == "string data" and not info.latched
@@ -55,24 +55,24 @@ async def test_a_publisher_that_unregisters_or_crashes_is_gone_and_others_go_on(
         endpoint, events = await ros.started()
         ros.python("other", publisher("/other", "std_msgs/String", "m.String(f'x {n}')", rate_hz=100), "other")
         first = ros.python("first", publisher("/chat", "std_msgs/String", "m.String('one')"), "first")
-        await until(lambda: {"/chat", "/other"} <= events.topics.keys(), "both are announced")
+        await until(lambda: {"/chat", "/other"} <= events.infos.keys(), "both are announced")
         other, chat = collect(endpoint, "/other"), collect(endpoint, "/chat")
         await until(lambda: chat and other, "both give")
         first.terminate()
-        await until(lambda: "/chat" not in events.topics, "the one that said goodbye is gone")
+        await until(lambda: "/chat" not in events.infos, "the one that said goodbye is gone")
         crash = ros.python("second", publisher("/chat", "std_msgs/String", "m.String('two')"), "second")
-        await until(lambda: "/chat" in events.topics, "it is back")
+        await until(lambda: "/chat" in events.infos, "it is back")
         ros.kill(crash)
-        await until(lambda: "/chat" not in events.topics, "the one that crashed is gone")
+        await until(lambda: "/chat" not in events.infos, "the one that crashed is gone")
         assert ros.publishers("/chat") == ["/second"]  # as far as the master knows
         # Under the same name, at another port, while the dead one is still registered.
         ros.python("second_again", publisher("/chat", "std_msgs/String", "m.String('three')"), "second")
-        await until(lambda: "/chat" in events.topics, "the node that came back is found")
+        await until(lambda: "/chat" in events.infos, "the node that came back is found")
         again = collect(endpoint, "/chat")
         await until(lambda: text("three") in again, "and gives messages")
         numbers = [int(body[4:].split()[1]) for body in other]
         assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
-        assert events.history.count("+/other") == 1 and "-/other" not in events.history
+        assert events.added.count(TopicName("/other")) == 1 and "/other" not in events.removed
 
 
 async def test_publishes_to_rospy_and_the_tools_byte_for_byte(tmp_path: Path) -> None:
@@ -93,7 +93,7 @@ async def test_publishes_to_rospy_and_the_tools_byte_for_byte(tmp_path: Path) ->
         await until(lambda: len(ros.lines("listener")) == 201, "all messages come")
         got = [line["crc"] for line in ros.lines("listener") if line["topic"] == "/chat"]
         assert got == [zlib.crc32(body) for body in sent]
-        assert events.topics == {}  # what we publish is not announced
+        assert events.infos == {}  # what we publish is not announced
         assert endpoint.drops == {}
 
         info = await ros.tool("rosnode", "info", "/sern_test")
@@ -139,7 +139,7 @@ async def test_a_second_publisher_of_another_type_is_reported_with_both_hashes(
     async with RosLab(tmp_path) as ros:
         endpoint, events = await ros.started()
         ros.python("right", publisher("/chat", "std_msgs/String", "m.String('a')"), "right")
-        await until(lambda: "/chat" in events.topics, "the first is announced")
+        await until(lambda: "/chat" in events.infos, "the first is announced")
         got = collect(endpoint, "/chat")
         ros.python("wrong", publisher("/chat", "std_msgs/Int32", "m.Int32(7)"), "wrong")
         await until(lambda: endpoint.counters.mismatches == 1, "the second is refused")
@@ -156,7 +156,7 @@ async def test_messages_are_fetched_only_while_they_are_wanted(tmp_path: Path) -
         endpoint, events = await ros.started()
         script = publisher("/chat", "std_msgs/String", "m.String(str(p.get_num_connections()))", rate_hz=50)
         ros.python("talker", script, "talker")
-        await until(lambda: "/chat" in events.topics, "the topic is announced")
+        await until(lambda: "/chat" in events.infos, "the topic is announced")
         got = collect(endpoint, "/chat")
         await until(lambda: len(got) > 3, "messages come")
         endpoint.interest(TopicName("/chat"), False)
@@ -167,7 +167,7 @@ async def test_messages_are_fetched_only_while_they_are_wanted(tmp_path: Path) -
         seen = len(got)
         endpoint.interest(TopicName("/chat"), True)
         await until(lambda: len(got) > seen, "messages come again")
-        assert "-/chat" not in events.history
+        assert "/chat" not in events.removed
 
 
 async def test_restarted_master_is_told_everything_again(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -176,7 +176,7 @@ async def test_restarted_master_is_told_everything_again(tmp_path: Path, caplog:
         stream = endpoint.advertise(ros_types.topic_info("/back", STRING, Encoding.ROS1, latched=True))
         stream.publish(text("here"), 0)
         ros.python("talker", publisher("/chat", "std_msgs/String", "m.String('a')"), "talker")
-        await until(lambda: "/chat" in events.topics, "the topic is announced")
+        await until(lambda: "/chat" in events.infos, "the topic is announced")
         got = collect(endpoint, "/chat")
         await until(lambda: ros.publishers("/back") and ros.subscribers("/chat"), "all is registered")
         assert ros.master is not None
@@ -201,7 +201,7 @@ async def test_a_master_that_is_not_there_yet_is_waited_for(tmp_path: Path) -> N
         await ros.start_master()
         await until(lambda: endpoint.connected, "the master is found")
         assert "early" in await ros.tool("rostopic", "echo", "-n", "1", "/back")
-        assert events.history == [] or "+/back" not in events.history
+        assert "/back" not in events.added
 
 
 async def test_two_masters_in_one_process_with_namespaces(tmp_path: Path) -> None:
@@ -212,7 +212,7 @@ async def test_two_masters_in_one_process_with_namespaces(tmp_path: Path) -> Non
         await second.start(events)
         one.python("talker", publisher("/chat", "std_msgs/String", "m.String('one')"), "talker")
         two.python("talker", publisher("/chat", "std_msgs/String", "m.String('two')"), "talker")
-        await until(lambda: {"/robot1/chat", "/robot2/chat"} <= events.topics.keys(), "both are announced")
+        await until(lambda: {"/robot1/chat", "/robot2/chat"} <= events.infos.keys(), "both are announced")
         got1, got2 = collect(first, "/robot1/chat"), collect(second, "/robot2/chat")
         await until(lambda: got1 and got2, "both give")
         assert set(got1) == {text("one")} and set(got2) == {text("two")}
@@ -232,7 +232,7 @@ async def test_what_a_sern_endpoint_publishes_is_no_source_for_another(tmp_path:
         await until(lambda: ros.publishers("/shared") == ["/left"], "it is registered")
         # A local publisher of the same topic is a source, for both, and only its messages are.
         ros.python("local", publisher("/shared", "std_msgs/String", "m.String('local')"), "local")
-        await until(lambda: "/shared" in seen_by_first.topics and "/shared" in seen_by_second.topics, "local is seen")
+        await until(lambda: "/shared" in seen_by_first.infos and "/shared" in seen_by_second.infos, "local is seen")
         got1, got2 = collect(first, "/shared"), collect(second, "/shared")
         await until(lambda: len(got1) > 3 and len(got2) > 3, "its messages come")
         stream.publish(text("again"), 0)
@@ -253,8 +253,8 @@ async def test_static_transforms_of_several_publishers_reach_every_late_joiner(t
         for child in ("lidar", "camera", "imu"):
             script = publisher("/tf_static", "tf2_msgs/TFMessage", body.format(child=child), latch=True)
             robot.python(child, script, f"static_{child}")
-        await until(lambda: "/tf_static" in events.topics, "it is announced")
-        info = events.topics["/tf_static"]
+        await until(lambda: "/tf_static" in events.infos, "it is announced")
+        info = events.infos[TopicName("/tf_static")]
         assert info.latched
         stream = target.advertise(info)
 
@@ -280,7 +280,7 @@ async def test_plays_a_real_bag_through_rosbag_play(tmp_path: Path) -> None:
             "play", "/usr/lib/rosbag/play", "--pause", "--queue", "100000", "-r", "100", "-d", "0", str(bag),
             stdin=subprocess.PIPE,
         )  # fmt: skip
-        await until(lambda: expected.keys() <= events.topics.keys(), "the topics are announced")
+        await until(lambda: expected.keys() <= events.infos.keys(), "the topics are announced")
         got = {topic: collect(endpoint, topic) for topic in expected}
         await until(lambda: len(endpoint.bus_links()) == len(expected), "all are connected")
         assert play.stdin is not None
@@ -299,7 +299,7 @@ async def test_topic_tools_relay_between_us_and_a_listener(tmp_path: Path) -> No
         ros.spawn("relay", "/usr/lib/topic_tools/relay", "/chat", "/chat_copy", "__name:=relay")
         stream.publish(text("copy me"), 0)
         # The copy is a local node's own topic: it is announced.
-        await until(lambda: "/chat_copy" in events.topics, "the copy is announced")
+        await until(lambda: "/chat_copy" in events.infos, "the copy is announced")
         got = collect(endpoint, "/chat_copy")
 
         def came() -> bool:
@@ -319,7 +319,7 @@ async def test_simulated_time_is_carried_and_expires_nothing(tmp_path: Path) -> 
             "r = rospy.Rate(20)", "import time\nclass R:\n def sleep(self): time.sleep(0.05)\nr = R()"
         )
         ros.python("clock", script, "clock")
-        await until(lambda: "/clock" in events.topics, "the clock is announced")
+        await until(lambda: "/clock" in events.infos, "the clock is announced")
         got = collect(endpoint, "/clock")  # checks that stamps are wall time
         await until(lambda: len(got) > 3, "it ticks")
         assert int.from_bytes(got[0][4:8], "little") == 5
@@ -330,9 +330,9 @@ async def test_rosnode_kill_ends_the_node_alone(tmp_path: Path, caplog: pytest.L
         endpoint, events = await ros.started()
         endpoint.advertise(ros_types.topic_info("/back", STRING, Encoding.ROS1))
         ros.python("talker", publisher("/chat", "std_msgs/String", "m.String('a')"), "talker")
-        await until(lambda: "/chat" in events.topics and ros.publishers("/back"), "all is registered")
+        await until(lambda: "/chat" in events.infos and ros.publishers("/back"), "all is registered")
         await ros.tool("rosnode", "kill", "/sern_test")
-        await until(lambda: "/chat" not in events.topics, "its topics end")
+        await until(lambda: "/chat" not in events.infos, "its topics end")
         await until(lambda: not ros.publishers("/back"), "it leaves the master")
         assert endpoint.problem is not None and "told to shut down" in endpoint.problem
 
@@ -342,7 +342,7 @@ async def test_large_messages_are_dropped_and_counted(tmp_path: Path) -> None:
         endpoint, events = await ros.started(max_message_bytes=1000)
         body = "m.String('x' * (100_000 if n % 2 else 10))"
         ros.python("talker", publisher("/chat", "std_msgs/String", body), "talker")
-        await until(lambda: "/chat" in events.topics, "the topic is announced")
+        await until(lambda: "/chat" in events.infos, "the topic is announced")
         got = collect(endpoint, "/chat")
         await until(lambda: len(got) > 3 and endpoint.drops.get(DropReason.TOO_LARGE, 0) > 3, "half is dropped")
         assert set(got) == {text("x" * 10)}

@@ -10,28 +10,13 @@ from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 
-from sern_core.message import TopicInfo
-from sern_core.types import Encoding, TopicName
+from sern_core.types import Encoding
 from sern_runtime import ros_types
+from tests.support import Events
 
 START_NS = 1_700_000_000_000_000_000
 STEP_NS = 10_000_000
 DATA = Path(__file__).resolve().parents[3] / "../shared/data"
-
-
-class Events:
-    """Keeps what an endpoint announced."""
-
-    def __init__(self) -> None:
-        self.infos: dict[TopicName, TopicInfo] = {}
-        self.removed: list[TopicName] = []
-
-    def topic_added(self, info: TopicInfo) -> None:
-        self.infos[info.name] = info
-
-    def topic_removed(self, name: TopicName) -> None:
-        self.removed.append(name)
-        self.infos.pop(name, None)
 
 
 class VirtualClock:

@@ -18,7 +18,7 @@ from sern_core.errors import ConfigError, UsageError
 from sern_core.message import TopicInfo
 from sern_core.types import Encoding, TopicName
 from sern_runtime import ros_types
-from tests.support import until
+from tests.support import Events, until
 
 CHAT = TopicName("/chatter")
 STRING = "std_msgs/msg/String"
@@ -143,23 +143,12 @@ def graph(monkeypatch: pytest.MonkeyPatch) -> Graph:
     return made
 
 
-class Events:
-    def __init__(self) -> None:
-        self.topics: dict[TopicName, TopicInfo] = {}
-
-    def topic_added(self, info: TopicInfo) -> None:
-        self.topics[info.name] = info
-
-    def topic_removed(self, name: TopicName) -> None:
-        del self.topics[name]
-
-
 async def test_topics_of_others_come_and_go_and_bytes_pass(graph: Graph) -> None:
     endpoint: Endpoint = RclpyEndpoint(RclpyOptions(poll_hz=20))
     events = Events()
     graph.offer(CHAT, latched=True)
     await endpoint.start(events)
-    assert events.topics == {CHAT: ros_types.topic_info(CHAT, STRING, Encoding.CDR, latched=True, reliable=True)}
+    assert events.infos == {CHAT: ros_types.topic_info(CHAT, STRING, Encoding.CDR, latched=True, reliable=True)}
 
     got: list[bytes] = []
 
@@ -178,9 +167,9 @@ async def test_topics_of_others_come_and_go_and_bytes_pass(graph: Graph) -> None
     assert graph.subscriptions == {}
 
     graph.offer("/late")
-    await until(lambda: "/late" in events.topics, "found by the next look")
+    await until(lambda: "/late" in events.infos, "found by the next look")
     del graph.publishers[CHAT]
-    await until(lambda: CHAT not in events.topics, "gone")
+    await until(lambda: CHAT not in events.infos, "gone")
     await endpoint.stop()
     assert graph.ended.is_set() and graph.destroyed
 
@@ -193,8 +182,8 @@ async def test_what_we_publish_is_not_announced_to_us(graph: Graph) -> None:
     assert graph.published == [(CHAT, b"one")]
     assert graph.profiles[CHAT].durability is Durability.TRANSIENT_LOCAL
     graph.offer("/marker")
-    await until(lambda: "/marker" in events.topics, "the graph was looked at")
-    assert CHAT not in events.topics
+    await until(lambda: "/marker" in events.infos, "the graph was looked at")
+    assert CHAT not in events.infos
     publisher.close()
     publisher.publish(b"two", 2)
     assert graph.published == [(CHAT, b"one")]
@@ -207,7 +196,7 @@ async def test_a_type_that_is_not_installed_is_one_line(graph: Graph, caplog: py
     graph.offer("/two")
     graph.offer("/two", "std_msgs/msg/Bool")
     await endpoint.start(events)
-    assert events.topics == {}
+    assert events.infos == {}
     assert "/chatter: my_msgs/msg/Thing is not in this ROS 2 installation" in caplog.text
     assert "/two is published with several types (std_msgs/msg/Bool, std_msgs/msg/String)" in caplog.text
     with pytest.raises(ConfigError, match=r"/chatter: my_msgs/msg/Thing is not in this ROS 2 installation"):

@@ -11,8 +11,7 @@ from sern_client.endpoints.ros1.header import decode_header, encode_header
 from sern_client.endpoints.ros1.xmlrpc import XmlRpcServer
 from sern_core.types import Encoding, TopicName
 from sern_runtime import ros_types
-from tests.sern_client.endpoints.conftest import Events
-from tests.support import until
+from tests.support import Events, until
 
 HOST: Final = "127.0.0.1"
 STRING: Final = ros_types.topic_info("/chat", "std_msgs/msg/String", Encoding.ROS1)
