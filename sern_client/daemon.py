@@ -260,13 +260,17 @@ class ClientDaemon:
             read=lambda: [((), float(self.bridge.rebuilds.gaps))],
         )
         endpoint = self.bridge.endpoint
-        if isinstance(endpoint, CountingEndpoint):
-            metrics.counter(
-                "sern_endpoint_dropped_total",
-                "Messages that were dropped between this site's nodes and its endpoint.",
-                ("reason",),
-                lambda: [((str(reason),), float(count)) for reason, count in endpoint.drops.items()],
-            )
+
+        def endpoint_drops() -> list[tuple[tuple[str], float]]:
+            drops = endpoint.drops if isinstance(endpoint, CountingEndpoint) else {}
+            return [((str(reason),), float(count)) for reason, count in drops.items()]
+
+        metrics.counter(
+            "sern_endpoint_dropped_total",
+            "Messages that were dropped between this site's nodes and its endpoint.",
+            ("reason",),
+            endpoint_drops,
+        )
         adaptation = self.adaptation
         if adaptation is not None:
             adaptation.register(metrics)

@@ -16,7 +16,7 @@ from sern_client.endpoints.base import Publisher, Sink, Subscription, TopicEvent
 from sern_client.endpoints.handover import Handover
 from sern_core.errors import ConfigError, UsageError
 from sern_core.message import TopicInfo
-from sern_core.types import Encoding, TopicName
+from sern_core.types import DropReason, Encoding, TopicName
 from sern_runtime import ros_types
 from sern_runtime.entry import end_tasks
 from sern_runtime.ros_files import TypeFiles
@@ -62,9 +62,10 @@ class RclpyEndpoint:
         return False
 
     @property
-    def dropped(self) -> int:
+    def drops(self) -> dict[DropReason, int]:
         """Messages dropped because the event loop was behind."""
-        return self._handover.dropped
+        dropped = self._handover.dropped
+        return {DropReason.QUEUE_FULL: dropped} if dropped else {}
 
     async def start(self, events: TopicEvents) -> None:
         try:

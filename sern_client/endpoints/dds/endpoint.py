@@ -39,7 +39,7 @@ from sern_client.endpoints.dds.services import DdsServices
 from sern_client.endpoints.dds.worker import Inbox, Sample, Worker
 from sern_core.errors import ConfigError, UsageError
 from sern_core.message import TopicInfo
-from sern_core.types import Encoding, TopicName
+from sern_core.types import DropReason, Encoding, TopicName
 from sern_runtime import ros_types
 from sern_runtime.ros_types import ResolvedType
 
@@ -434,6 +434,15 @@ class DdsEndpoint:
             raise ConfigError(f"{name}: no topic of type {resolved.name} ({error.msg})") from None
         self._topics[name] = topic
         return topic
+
+    @property
+    def drops(self) -> dict[DropReason, int]:
+        """Messages dropped between this domain's nodes and us, by reason."""
+        counted = {
+            DropReason.QUEUE_FULL: self.overruns() + self.counters.blocked,
+            DropReason.REFUSED: self.counters.refused,
+        }
+        return {reason: count for reason, count in counted.items() if count}
 
     def overruns(self) -> int:
         """Messages dropped because the event loop was too slow, of all readers there are and were."""

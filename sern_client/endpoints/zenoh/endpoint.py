@@ -22,7 +22,7 @@ from sern_client.endpoints.zenoh.services import Services
 from sern_client.endpoints.zenoh.session import SessionOptions, ZenohSession
 from sern_core.errors import ConfigError, UsageError, WireError
 from sern_core.message import TopicInfo
-from sern_core.types import Encoding, TopicName
+from sern_core.types import DropReason, Encoding, TopicName
 from sern_runtime import ros_types
 from sern_runtime.ros_files import TypeFiles
 
@@ -74,9 +74,10 @@ class ZenohEndpoint(Services):
         return False
 
     @property
-    def dropped(self) -> int:
-        """Messages lost between zenoh and the event loop, either way, because the other side was behind."""
-        return self.session.put_dropped + (self.session.handover.dropped if self._events else 0)
+    def drops(self) -> dict[DropReason, int]:
+        """Messages dropped between zenoh and the event loop, either way, because the other side was behind."""
+        dropped = self.session.put_dropped + (self.session.handover.dropped if self._events else 0)
+        return {DropReason.QUEUE_FULL: dropped} if dropped else {}
 
     async def start(self, events: TopicEvents) -> None:
         await self.session.open()

@@ -35,7 +35,7 @@ def build_peer() -> Path:
         pytest.skip(f"no independent DDS peer: apt-get install {' '.join(missing)}")
     sources = [SOURCES / "Peer.idl", SOURCES / "peer.cpp"]
     digest = hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()[:16]
-    cache = Path(tempfile.gettempdir()) / f"sern-dds-peer-{os.getuid()}-{digest}"
+    cache = SOURCES.parents[2] / "build" / f"dds-peer-{digest}"
     program = cache / "peer"
     if program.exists():
         return program
@@ -46,7 +46,7 @@ def build_peer() -> Path:
         _run(["fastddsgen", "-replace", "-cs", "Peer.idl"], folder)
         units = ["peer.cpp", "Peer.cxx", "PeerPubSubTypes.cxx"]
         _run(["g++", "-O1", "-std=c++17", "-o", "peer", *units, "-lfastrtps", "-lfastcdr", "-lpthread"], folder)
-        cache.mkdir(mode=0o700, exist_ok=True)
+        cache.mkdir(parents=True, exist_ok=True)
         # Complete under its final name or not there at all: another session may build it too.
         shutil.copy2(folder / "peer", cache / f"peer.{os.getpid()}")
         (cache / f"peer.{os.getpid()}").replace(program)
