@@ -30,6 +30,8 @@ PACKAGES: Final = {
     "/usr/lib/python3/dist-packages/rospy": "python3-rospy",
     "/usr/lib/python3/dist-packages/std_srvs": "python3-std-srvs",
     "/usr/lib/python3/dist-packages/nav_msgs": "python3-nav-msgs",
+    "/usr/lib/python3/dist-packages/sensor_msgs": "python3-sensor-msgs",
+    "/usr/lib/python3/dist-packages/actionlib": "python3-actionlib",
     "/usr/lib/python3/dist-packages/tf2_msgs": "python3-tf2-msgs",
 }
 PYTHON: Final = "/usr/bin/python3"
@@ -99,6 +101,8 @@ class RosLab:
         if process.poll() is None:
             process.kill()
         process.wait()
+        if process.stdin is not None:
+            process.stdin.close()
 
     async def start_master(self) -> None:
         self.master = self.spawn("master", "/usr/bin/rosmaster", "--core", "-p", str(self.port), "-w", "3")
