@@ -18,7 +18,15 @@ from rosbags.interfaces import Nodetype
 from rosbags.interfaces.typing import FieldDesc
 from rosbags.serde import SerdeError
 
-from sern_client.endpoints.base import Endpoint, Publisher, ServiceEndpoint, ServiceHandler, ServiceInfo, ServiceServer
+from sern_client.endpoints.base import (
+    Endpoint,
+    KnowsServiceTypes,
+    Publisher,
+    ServiceEndpoint,
+    ServiceHandler,
+    ServiceInfo,
+    ServiceServer,
+)
 from sern_core.errors import ConfigError, ServiceError
 from sern_core.message import TopicInfo
 from sern_core.types import Encoding
@@ -116,6 +124,8 @@ def serve(endpoint: ServiceEndpoint, info: ServiceInfo, handler: ServiceHandler)
     wanted = endpoint.encoding
     if wanted is None or wanted is info.encoding:
         return endpoint.serve(info, handler)
+    if not info.definition and isinstance(endpoint, KnowsServiceTypes):  # ROS 1 says it of no service
+        info = replace(info, definition=endpoint.service_definition(info.type_name, info.encoding) or "")
     other, request_back, response_on = converted_service(info, wanted)
 
     async def convert(request: bytes) -> bytes:

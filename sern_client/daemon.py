@@ -297,7 +297,7 @@ class ClientDaemon:
         )
         metrics.counter(
             "sern_service_calls_total",
-            "Calls from here of services of other sites, by outcome: ok, error, timeout.",
+            "Calls from here of services of other sites, by outcome: ok, error, timeout, cancelled.",
             ("service", "outcome"),
             self._service_calls,
         )

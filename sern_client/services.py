@@ -35,6 +35,8 @@ from sern_core.services import (
 from sern_core.types import DropReason, Durability, PriorityClass, Reliability, TopicName
 
 MAX_ERROR_CHARS: Final = 512
+MAX_SERVED: Final = 1000
+"""Services of other sites that are served here at most: each site may offer what it likes."""
 
 _OFFER_SPEC: Final = TopicSpec(
     PriorityClass.STATE,
@@ -46,23 +48,38 @@ _OFFER_SPEC: Final = TopicSpec(
 _log = logging.getLogger(__name__)
 
 
+def one_line(text: str) -> str:
+    """An error text as a caller may be shown it, whoever wrote it: one line, bounded, nothing that moves a cursor."""
+    plain = "".join(character if character.isprintable() else " " for character in text[: 4 * MAX_ERROR_CHARS])
+    return " ".join(plain.split())[:MAX_ERROR_CHARS]
+
+
 @dataclass(slots=True, eq=False)
 class _Offered:
-    """A service of this site."""
+    """A service of this site, since `since_s` on our monotonic clock."""
 
     info: ServiceInfo
     rule: ServiceRule
     channel: OutChannel
+    since_s: float
+
+    @property
+    def refused(self) -> bool:
+        """The relay does not let us offer it, usually because another site does: calls of it are not meant for us."""
+        return self.channel.wanted is False  # a latched stream that a relay takes is always wanted
 
 
 @dataclass(slots=True, eq=False)
 class _Used:
-    """A service of another site that is served here."""
+    """A service of another site that is served here. The stream of our calls is opened with the first one: most of what
+    is offered is never called, and every stream costs bytes in every session."""
 
     name: TopicName
+    offer: StreamInfo
     rule: ServiceRule
-    channel: OutChannel
     server: ServiceServer | None = None
+    calls: OutChannel | None = None
+    gone: str = ""  # why it is served no more
     waiting: dict[int, asyncio.Future[bytes]] = field(default_factory=dict)
     numbers: dict[int, int] = field(default_factory=dict)  # seq -> call
 
@@ -95,7 +112,8 @@ class ServiceBridge:
         kick: Callable[[], None],
     ) -> None:
         self.outcomes: dict[tuple[TopicName, str], int] = defaultdict(int)
-        """Calls that ended, by global service name and outcome (`ok`, `error`, `timeout`), as their caller saw them."""
+        """Calls that ended, by global service name and outcome (`ok`, `error`, `timeout`, `cancelled`), as their caller
+        saw them."""
         self._core = core
         self._endpoint = endpoint
         self._offer = offer
@@ -103,9 +121,11 @@ class ServiceBridge:
         self._namespace = namespace
         self._kick = kick
         self._next = secrets.randbits(63)  # answers to an earlier process of ours must not fit a call of this one
-        self._offered: dict[TopicName, _Offered] = {}  # by global name
-        self._used: dict[StreamId, _Used] = {}  # by the stream that announced it
-        self._callers: dict[StreamId, _Caller] = {}  # by the stream of its calls
+        self.offered: dict[TopicName, _Offered] = {}  # by global name
+        self.used: dict[TopicName, _Used] = {}  # by global name, which has one owner at the relay
+        self._calling: dict[StreamId, _Used] = {}  # by the stream of our calls
+        self.callers: dict[StreamId, _Caller] = {}  # by the stream of its calls
+        self._said_full = False
         self._closed = False
         endpoint.watch_services(self)
 
@@ -114,7 +134,7 @@ class ServiceBridge:
     def service_added(self, info: ServiceInfo) -> None:
         name = to_global(info.name, self._namespace)
         rule = find(self._offer, info.name)
-        if rule is None or name in self._offered or self._closed:
+        if rule is None or name in self.offered or self._closed:
             return
         topic = TopicInfo(
             offer_name(name), info.type_name, info.encoding, info.type_hash, info.definition, latched=True
@@ -124,12 +144,12 @@ class ServiceBridge:
         except UsageError as error:
             _log.error("service %s cannot be offered: %s", info.name, error)
             return
-        self._offered[name] = _Offered(info, rule, channel)
+        self.offered[name] = _Offered(info, rule, channel, time.monotonic())
         _log.info("offering service %s (%s) as %s", info.name, info.type_name, name)
         self._kick()
 
     def service_removed(self, name: TopicName) -> None:
-        offered = self._offered.pop(to_global(name, self._namespace), None)
+        offered = self.offered.pop(to_global(name, self._namespace), None)
         if offered is not None:
             self._core.unpublish(offered.channel, now=time.monotonic())
             _log.info("service %s has ended", name)
@@ -145,50 +165,53 @@ class ServiceBridge:
         if parts.kind == "service":
             self._remote_offered(parts.service, stream)
         elif parts.kind == "call":
-            if parts.caller != stream.id.origin or parts.service not in self._offered:
+            offered = self.offered.get(parts.service)
+            if parts.caller != stream.id.origin or offered is None or offered.refused:
                 raise ConfigError(f"{stream.id.topic} from {stream.id.origin} calls nothing that is offered here")
             self._caller_appeared(parts.service, stream)
         elif parts.caller != self._core.name or find(self._use, parts.service) is None:
             raise ConfigError(f"{stream.id.topic} is for another site")
 
     def stream_closed(self, stream: StreamInfo) -> None:
-        used = self._used.pop(stream.id, None)
-        if used is not None:
+        parts = parse(stream.id.topic)
+        used = None if parts is None else self.used.get(parts.service)
+        if used is not None and used.offer.id == stream.id:
             self._withdraw(used, f"service {used.name} is gone")
-        caller = self._callers.pop(stream.id, None)
+        caller = self.callers.pop(stream.id, None)
         if caller is not None:
             self._dismiss(caller)
 
     def message(self, stream: StreamInfo, message: Message) -> None:
-        caller = self._callers.get(stream.id)
+        caller = self.callers.get(stream.id)
         if caller is not None:
             self._called(caller, stream, message)
             return
         parts = parse(stream.id.topic)
-        if parts is not None and parts.kind == "reply":
-            self._replied(parts.service, message.body)
+        used = None if parts is None else self.used.get(parts.service)
+        if used is not None and used.offer.id.origin == stream.id.origin:  # nobody else answers for it
+            self._replied(used, message.body)
 
     def send_dropped(self, stream: StreamInfo, seq: int, reason: DropReason) -> None:
         """A message of ours was dropped, here or on its way: if it was a call, nobody will answer it."""
-        for used in self._used.values():
-            if used.channel.stream.id == stream.id:
-                number = used.numbers.pop(seq, None)
-                future = None if number is None else used.waiting.get(number)
-                if future is not None and not future.done():
-                    future.set_exception(ServiceError(f"the call of {used.name} was dropped on its way: {reason}"))
+        used = self._calling.get(stream.id)
+        number = None if used is None else used.numbers.pop(seq, None)
+        if used is None or number is None:
+            return
+        future = used.waiting.get(number)
+        if future is not None and not future.done():
+            future.set_exception(ServiceError(f"the call of {used.name} was dropped on its way: {reason}"))
 
     async def stop(self) -> None:
         """Withdraw what is served here, end the calls that others have under way."""
         self._closed = True
-        for used in self._used.values():
+        for used in list(self.used.values()):
             self._withdraw(used, "this site stops", unpublish=False)
-        self._used.clear()
-        tasks = [task for caller in self._callers.values() for task in caller.tasks]
+        tasks = [task for caller in self.callers.values() for task in caller.tasks]
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
-        self._callers.clear()
-        self._offered.clear()
+        self.callers.clear()
+        self.offered.clear()
 
     # --- the caller's side ------------------------------------------------------------------------------------------
 
@@ -196,21 +219,16 @@ class ServiceBridge:
         rule = find(self._use, service)
         if rule is None:
             raise ConfigError(f"service {service} is not in services.use")
-        spec = TopicSpec(
-            rule.priority,
-            reliability=Reliability.RELIABLE,
-            depth=MAX_CALLS,
-            lifespan_s=rule.timeout_s,
-            retention_s=rule.timeout_s,
-        )
+        earlier = self.used.get(service)
+        if earlier is not None:
+            # The relay lets one site own a name: whoever announced it before is gone, though we may hear of it later.
+            self._withdraw(earlier, f"service {service} is gone")
+        if len(self.used) >= MAX_SERVED:
+            self._complain_full(service, stream)
+            raise ConfigError(f"{MAX_SERVED} services are served here already; name those that are needed in use")
         info = stream.info
-        calls = TopicInfo(call_name(service, self._core.name), info.type_name, info.encoding)
         local = to_local(service, self._namespace)
-        try:
-            channel = self._core.publish(calls, spec, now=time.monotonic())
-        except UsageError as error:
-            raise ConfigError(f"service {service} cannot be called from here: {error}") from None
-        used = _Used(service, rule, channel)
+        used = _Used(service, stream, rule)
 
         async def handler(request: bytes) -> bytes:
             return await self._call(used, request)
@@ -222,70 +240,113 @@ class ServiceBridge:
                 handler,
             )
         except ConfigError as error:
-            self._core.unpublish(channel, now=time.monotonic())
             _log.error("service %s of %s cannot be served here: %s", service, stream.id.origin, error)
             raise
-        self._used[stream.id] = used
+        self.used[service] = used
         _log.info("serving %s of %s as %s", service, stream.id.origin, local)
-        self._kick()
+
+    def _complain_full(self, service: TopicName, stream: StreamInfo) -> None:
+        if not self._said_full:
+            self._said_full = True
+            _log.error(
+                "%s of %s and others are not served here: %d services are; name those that are needed in services.use",
+                service, stream.id.origin, MAX_SERVED,
+            )  # fmt: skip
+
+    def _open(self, used: _Used) -> OutChannel:
+        """The stream of our calls of a service. ServiceError when there cannot be one."""
+        if used.gone:
+            raise ServiceError(used.gone)
+        if used.calls is None:
+            spec = TopicSpec(
+                used.rule.priority,
+                reliability=Reliability.RELIABLE,
+                depth=MAX_CALLS,
+                lifespan_s=used.rule.timeout_s,
+                retention_s=used.rule.timeout_s,
+            )
+            info = used.offer.info
+            calls = TopicInfo(call_name(used.name, self._core.name), info.type_name, info.encoding)
+            try:
+                used.calls = self._core.publish(calls, spec, owed=(used.offer.id.origin,), now=time.monotonic())
+            except UsageError as error:
+                raise ServiceError(f"{used.name} cannot be called from here: {error}") from None
+            self._calling[used.calls.stream.id] = used
+        return used.calls
 
     async def _call(self, used: _Used, request: bytes) -> bytes:
         """One call, from here to the far side and back. ServiceError in every case but an answer."""
+        outcome = "cancelled"
+        try:
+            response = await self._ask(used, request)
+            outcome = "ok"
+        except TimeoutError:
+            outcome = "timeout"
+            raise ServiceError(f"{used.name} did not answer within {used.rule.timeout_s:g} s") from None
+        except ServiceError:
+            outcome = "error"
+            raise
+        finally:
+            self.outcomes[used.name, outcome] += 1
+        return response
+
+    async def _ask(self, used: _Used, request: bytes) -> bytes:
+        """TimeoutError when there is no answer in time."""
+        calls = self._open(used)
+        if len(used.waiting) >= MAX_CALLS:
+            raise ServiceError(f"{MAX_CALLS} calls of {used.name} are under way already")
         future: asyncio.Future[bytes] = asyncio.get_running_loop().create_future()
         number = self._next
         self._next = (self._next + 1) % (1 << 64)
-        seq = used.channel.next_seq
+        seq = calls.next_seq
         used.waiting[number] = future
         used.numbers[seq] = number
         try:
-            if len(used.waiting) > MAX_CALLS:
-                raise ServiceError(f"{MAX_CALLS} calls of {used.name} are under way already")
-            body = CALL.pack(number) + request
-            if not self._core.send(used.channel, body, time.time_ns(), now=time.monotonic()):
+            if not self._core.send(calls, CALL.pack(number) + request, time.time_ns(), now=time.monotonic()):
                 raise ServiceError(f"{used.name}: too much waits for the link")
             self._kick()
             async with asyncio.timeout(used.rule.timeout_s):
-                response = await future
-        except TimeoutError:
-            self.outcomes[used.name, "timeout"] += 1
-            raise ServiceError(f"{used.name} did not answer within {used.rule.timeout_s:g} s") from None
-        except ServiceError:
-            self.outcomes[used.name, "error"] += 1
+                return await future
+        except asyncio.CancelledError:
+            if not used.gone:  # its caller is gone: if the call still waits here, it is not made
+                used.numbers.pop(seq, None)
+                self._core.link.shed(calls, DropReason.UNWANTED, seq=seq, now=time.monotonic())
             raise
         finally:
             used.waiting.pop(number, None)
             used.numbers.pop(seq, None)
-        self.outcomes[used.name, "ok"] += 1
-        return response
 
-    def _replied(self, service: TopicName, body: bytes) -> None:
+    def _replied(self, used: _Used, body: bytes) -> None:
         if len(body) < REPLY.size:
-            _log.warning("an answer of %s is too short to be one", service)
+            _log.warning("an answer of %s is too short to be one", used.name)
             return
         number, failed = REPLY.unpack_from(body)
-        for used in self._used.values():
-            future = used.waiting.get(number)
-            if used.name != service or future is None or future.done():
-                continue
-            rest = body[REPLY.size :]
-            if failed:
-                text = rest[: 4 * MAX_ERROR_CHARS].decode(errors="replace")
-                future.set_exception(ServiceError(text))
-            else:
-                future.set_result(rest)
+        future = used.waiting.get(number)
+        if future is None or future.done():
+            return  # nobody waits for it any more
+        rest = body[REPLY.size :]
+        if failed:
+            text = one_line(rest[: 4 * MAX_ERROR_CHARS].decode(errors="replace"))
+            future.set_exception(ServiceError(text or f"{used.name} failed, without saying why"))
+        else:
+            future.set_result(rest)
 
     def _withdraw(self, used: _Used, why: str, *, unpublish: bool = True) -> None:
+        del self.used[used.name]
+        used.gone = why
+        used.fail(why)  # before the endpoint ends its calls: they shall hear why
         if used.server is not None:
             used.server.close()
-        used.fail(why)
-        if unpublish:
-            self._core.unpublish(used.channel, now=time.monotonic())
-            self._kick()
+        if used.calls is not None:
+            del self._calling[used.calls.stream.id]
+            if unpublish:
+                self._core.unpublish(used.calls, now=time.monotonic())
+                self._kick()
 
     # --- the side that has the service ------------------------------------------------------------------------------
 
     def _caller_appeared(self, service: TopicName, stream: StreamInfo) -> None:
-        offered = self._offered[service]
+        offered = self.offered[service]
         lifespan_s = min(offered.rule.timeout_s, stream.spec.lifespan_s or offered.rule.timeout_s)
         spec = TopicSpec(
             offered.rule.priority,
@@ -301,14 +362,14 @@ class ServiceBridge:
             channel = self._core.publish(replies, spec, now=time.monotonic())
         except UsageError as error:
             raise ConfigError(f"{stream.id.origin} cannot be answered: {error}") from None
-        self._callers[stream.id] = _Caller(service, channel)
+        self.callers[stream.id] = _Caller(service, channel)
         self._kick()
 
     def _release_name(self, replies: TopicName) -> None:
         """The same site as a new process: the stream of its earlier one ends only later."""
-        for identity, caller in list(self._callers.items()):
+        for identity, caller in list(self.callers.items()):
             if caller.replies.stream.id.topic == replies:
-                del self._callers[identity]
+                del self.callers[identity]
                 self._dismiss(caller)
 
     def _dismiss(self, caller: _Caller) -> None:
@@ -322,9 +383,15 @@ class ServiceBridge:
             _log.warning("a call of %s from %s is too short to be one", caller.service, stream.id.origin)
             return
         (number,) = CALL.unpack_from(message.body)
-        offered = self._offered.get(caller.service)
+        offered = self.offered.get(caller.service)
         if offered is None:
             self._answer(caller, number, f"service {caller.service} is gone".encode(), failed=True)
+            return
+        if offered.refused:
+            return
+        if message.born_s + message.error_s < offered.since_s:
+            # It was meant for an earlier process of ours, which may have executed it.
+            self._answer(caller, number, f"{caller.service} has started anew; call again".encode(), failed=True)
             return
         if len(caller.tasks) >= MAX_CALLS:
             self._answer(caller, number, f"{MAX_CALLS} calls are under way already".encode(), failed=True)
@@ -344,7 +411,7 @@ class ServiceBridge:
             response = await self._endpoint.call(offered.info.name, request, timeout_s=max(left_s, 0.001))
         except ServiceError as error:
             failed = True
-            response = str(error)[:MAX_ERROR_CHARS].encode()
+            response = one_line(str(error)).encode(errors="replace")
         except Exception as error:  # noqa: BLE001  (a fault of one service; its caller must hear of it all the same)
             _log.exception("service %s failed", offered.info.name)
             failed = True
@@ -352,6 +419,13 @@ class ServiceBridge:
         self._answer(caller, number, response, failed=failed)
 
     def _answer(self, caller: _Caller, number: int, response: bytes, *, failed: bool) -> None:
+        limit_bytes = self._core.link.params.max_message_bytes - REPLY.size
+        if len(response) > limit_bytes:
+            failed = True
+            response = (
+                f"the response of {caller.service} has {len(response)} bytes, above link.max_message_bytes of the "
+                f"site that has it ({limit_bytes + REPLY.size})"
+            ).encode()
         body = REPLY.pack(number, failed) + response
         if not self._core.send(caller.replies, body, time.time_ns(), now=time.monotonic()):
             _log.warning("an answer of %s was lost: too much waits for the link", caller.service)

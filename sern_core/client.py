@@ -126,10 +126,17 @@ class ClientCore:
     # --- publishing -----------------------------------------------------------------------------------------------
 
     def publish(
-        self, info: TopicInfo, spec: TopicSpec, *, attributes: dict[str, str] | None = None, now: float
+        self,
+        info: TopicInfo,
+        spec: TopicSpec,
+        *,
+        attributes: dict[str, str] | None = None,
+        owed: tuple[ClientName, ...] = (),
+        now: float,
     ) -> OutChannel:
         """Offer a topic under its global name. Offering it again after `unpublish` goes on counting where it ended.
-        `attributes` travel with its announcement.
+        `attributes` travel with its announcement. `owed`: of a reliable topic, clients that it is for: a relay that has
+        not heard of them yet keeps it for them.
 
         Raises UsageError if it is offered already, or no relay would accept it.
         """
@@ -137,7 +144,7 @@ class ClientCore:
         first = self._generations.get(identity, 0) + 1
         stream = StreamInfo(identity, info, spec, dict(attributes or {}))
         check_stream(stream)
-        channel = self.link.open_channel(stream, first=first, now=now)
+        channel = self.link.open_channel(stream, first=first, owed=owed, now=now)
         if spec.latched:
             self._latched[identity] = LatchedCache(spec.depth, spec.max_queue_bytes)
         return channel

@@ -346,9 +346,9 @@ class OutChannel:
         else:
             self._drop(self._pop_queue(), reason)
 
-    def shed(self, reason: DropReason) -> int:
-        """Give up one message that has not been begun: the oldest, of a reliable stream the newest, whose tombstone
-        goes on. Returns the bytes that are free now, 0 when there is none."""
+    def shed(self, reason: DropReason, *, seq: int | None = None) -> int:
+        """Give up one message that has not been begun: the oldest, of a reliable stream the newest (or number `seq`),
+        whose tombstone goes on. Returns the bytes that are free now, 0 when there is none."""
         if not self.reliable:
             if not self.queue:
                 return 0
@@ -357,7 +357,7 @@ class OutChannel:
             return out.size
         for out in reversed(self.queue):
             size = out.size
-            if not out.message.tombstone:
+            if not out.message.tombstone and seq in (None, out.seq):
                 self._entomb(out, reason)
                 return size - out.size
         return 0

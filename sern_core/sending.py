@@ -206,10 +206,11 @@ class Sender(ABC):
         self.trace.record(now, message.stream.topic, TraceEvent.DROPPED, seq=message.seq, reason=reason)
         self._refresh(channel, now)
 
-    def shed(self, channel: OutChannel, reason: DropReason, *, now: float) -> int:
-        """Give up one message that waits and has not been begun; returns the bytes that are free now, 0: none."""
+    def shed(self, channel: OutChannel, reason: DropReason, *, seq: int | None = None, now: float) -> int:
+        """Give up one message that waits and has not been begun (of a reliable stream, number `seq` if given); returns
+        the bytes that are free now, 0: none."""
         self._now = now
-        freed_bytes = channel.shed(reason)
+        freed_bytes = channel.shed(reason, seq=seq)
         self._refresh(channel, now)
         return freed_bytes
 

@@ -89,7 +89,10 @@ def _halves(name: str, definition: str, encoding: Encoding) -> list[tuple[str, s
     text = definition
     if not text:
         if name not in _KNOWN:
-            raise ConfigError(f"service type {name} is unknown here, and its definition did not come with it")
+            raise ConfigError(
+                f"service type {name} is unknown here, and its definition did not come with it; add the directory of "
+                "its .srv file to type_paths of the ROS 2 endpoint"
+            )
         text = _KNOWN[name]
     own, *others = text.split(_SEPARATOR)
     lines = own.splitlines()

@@ -19,7 +19,8 @@ from rich.table import Table
 from rich.text import Text
 
 from sern_core.errors import SernError, UsageError
-from sern_core.types import CLASS_LABELS
+from sern_core.services import parse as parse_service
+from sern_core.types import CLASS_LABELS, TopicName
 from sern_tools.api import DEFAULT_API, NotFoundError, checked_api, drop_output, get_json, is_stream, say
 
 MIN_INTERVAL_S: Final = 0.1
@@ -148,11 +149,13 @@ class Watcher:
         api: str,
         pattern: re.Pattern[str] | None = None,
         *,
+        services: bool = False,
         get: Callable[[str, str], Any] = get_json,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.api = api
         self._pattern = pattern
+        self._services = services or pattern is not None  # who asks for a name gets it
         self._get = get
         self._clock = clock
         self._identities: dict[str, Identity] = {}
@@ -168,6 +171,8 @@ class Watcher:
             self._identities |= parse_identities(answer)
         if self._pattern is not None:
             topics = {name: counts for name, counts in topics.items() if self._pattern.fullmatch(name)}
+        if not self._services:
+            topics = {name: counts for name, counts in topics.items() if parse_service(TopicName(name)) is None}
         return at_s, topics
 
     def rows(self) -> list[Row]:
@@ -244,6 +249,7 @@ def run_topics(
     watch: bool,
     as_json: bool,
     interval_s: float,
+    services: bool = False,
     out: Console | None = None,
     pause: Callable[[float], None] = time.sleep,
 ) -> None:
@@ -255,7 +261,7 @@ def run_topics(
         compiled = None if pattern is None else re.compile(pattern)
     except re.error as error:
         raise UsageError(f"{pattern!r} is not a regular expression: {error}") from None
-    watcher = Watcher(checked_api(api), compiled)
+    watcher = Watcher(checked_api(api), compiled, services=services)
     if not watch:
         pause(interval_s)
         rows = watcher.rows()
@@ -289,6 +295,9 @@ def topics(
         str, typer.Option("--api", help="HTTP address of a relay or a client (http.listen in its file).")
     ] = DEFAULT_API,
     watch: Annotated[bool, typer.Option("--watch", "-w", help="Again and again, until Ctrl-C.")] = False,
+    services: Annotated[
+        bool, typer.Option("--services", help="Also the streams of services: offers, calls, replies.")
+    ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="JSON; with --watch one line a look.")] = False,
     interval_s: Annotated[
         float, typer.Option("--interval", min=MIN_INTERVAL_S, help="Seconds between two looks.")
@@ -299,7 +308,7 @@ def topics(
     Exit code 0 when listed (or ended by Ctrl-C), 1 when there is no daemon or no topic, 2 for wrong usage.
     """
     try:
-        run_topics(api, pattern, watch=watch, as_json=as_json, interval_s=interval_s)
+        run_topics(api, pattern, watch=watch, as_json=as_json, interval_s=interval_s, services=services)
     except KeyboardInterrupt:
         raise typer.Exit(0) from None
     except BrokenPipeError:

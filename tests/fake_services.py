@@ -35,6 +35,7 @@ class Services:
         self.calls: list[tuple[TopicName, bytes]] = []
         self.answer: Callable[[bytes], Awaitable[bytes]] = self.echo
         self.refuse = ""
+        self.definitions: dict[str, str] = {}
         self.exhausted = False
         self.encoding: Encoding | None = None
         self.events: ServiceEvents | None = None
@@ -59,6 +60,10 @@ class Services:
 
     def watch_services(self, events: ServiceEvents) -> None:
         self.events = events
+
+    def service_definition(self, type_name: str, encoding: Encoding) -> str | None:
+        del encoding
+        return self.definitions.get(type_name)
 
     async def call(self, name: TopicName, request: bytes, *, timeout_s: float) -> bytes:
         self.calls.append((name, request))

@@ -125,3 +125,12 @@ class ServiceEndpoint(Protocol):
     async def call(self, name: TopicName, request: bytes, *, timeout_s: float) -> bytes: ...
 
     def serve(self, info: ServiceInfo, handler: ServiceHandler) -> ServiceServer: ...
+
+
+@runtime_checkable
+class KnowsServiceTypes(Protocol):
+    """An endpoint that may know definitions that do not come with a service (`type_paths`)."""
+
+    def service_definition(self, type_name: str, encoding: Encoding) -> str | None:
+        """Its .srv text and the types it uses, as they are in `encoding`; None where unknown. ConfigError for files
+        that cannot be read."""

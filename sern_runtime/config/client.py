@@ -1,6 +1,7 @@
 """The file of a client daemon (`sern-client`): who it is, its relay, its endpoints, and what to do with which topic."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Final, Literal
 
@@ -313,7 +314,8 @@ class ActionSection(Section):
     match: Pattern
     """Regular expression for the whole action name: the local name in `offer`, the global name in `use`."""
     timeout_s: Annotated[float, Field(gt=0, le=86_400)] = 600.0
-    """How long a goal may take: asking for its result (ROS 2) fails after it."""
+    """How long a goal may take: asking for its result (ROS 2) fails after it. A goal or its cancelling is dropped when
+    it waits for the link longer than this and 5 s; cancelling in ROS 1 waits for `link.retention_s`."""
 
     @model_validator(mode="after")
     def _simple(self) -> "ActionSection":
@@ -339,10 +341,14 @@ class ActionSection(Section):
         """ROS 1: goal and cancel one way, status, feedback and result the other; ROS 2: status and feedback."""
         there, back = (Direction.RECEIVE, Direction.SEND) if offered else (Direction.SEND, Direction.BOTH)
         reliable = Reliability.RELIABLE
+        goal, cancel = (
+            TopicRule(compile_pattern(self.under(part)), None, PriorityClass.CONTROL, there, None, reliable)
+            for part in ("goal", "cancel")
+        )
         return (
-            TopicRule(
-                compile_pattern(self.under("(?:goal|cancel)")), None, PriorityClass.CONTROL, there, None, reliable
-            ),
+            # As with ROS 2: a robot must not set off long after it was told to. To stop it is never too late.
+            replace(goal, lifespan_s=min(self.timeout_s, SERVICE_TIMEOUT_S)),
+            cancel,
             TopicRule(compile_pattern(self.under("result")), None, PriorityClass.STATE, back, None, reliable),
             TopicRule(compile_pattern(self.under(ACTION_STATE)), None, PriorityClass.STATE, back),
         )

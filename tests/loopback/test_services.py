@@ -1,19 +1,23 @@
 """Services across relay and clients as their user runs them; the endpoints hold services of their own."""
 
 import asyncio
+import re
 import time
+from collections.abc import Awaitable, Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
+from ruamel.yaml import YAML
 
 from sern_client import daemon as client_daemon
 from sern_client.daemon import ClientDaemon
 from sern_client.endpoints.base import ServiceHandler, ServiceInfo
-from sern_client.services import ServiceBridge
+from sern_client.services import MAX_ERROR_CHARS, ServiceBridge
 from sern_core.errors import ConfigError, ServiceError
-from sern_core.message import TopicInfo, TopicSpec
-from sern_core.services import CALL, call_name
+from sern_core.message import Message, StreamId, StreamInfo, TopicInfo, TopicSpec
+from sern_core.services import CALL, REPLY, call_name, reply_name
 from sern_core.types import ClientName, Encoding, TopicName
 from sern_runtime.config.client import load_client
 from tests.daemons import Lab
@@ -29,6 +33,10 @@ INFO = ServiceInfo(
     "09fb03525b03e7ea1fd3992bafd87e16",
     "bool data\n---\nbool success\nstring message\n",
 )
+
+
+ENDPOINT = {"kind": "synthetic", "role": "operator"}
+"""Any that the configuration accepts: the tests put their own in its place."""
 
 
 class Sites:
@@ -47,18 +55,15 @@ class Sites:
     def site(self) -> Services:
         return self.ends["site"]
 
-    async def start_robot(self, **rule: Any) -> ClientDaemon:
-        rules = {"offer": [{"match": "/set_.*", **rule}]}
-        return await self.lab.connected(
-            self.lab.client_file("robot1", {"kind": "synthetic", "role": "robot"}, services=rules)
-        )
+    async def start_robot(self, **sections: Any) -> ClientDaemon:
+        rules = {"offer": [{"match": "/set_.*"}]}
+        return await self.lab.connected(self.lab.client_file("robot1", ENDPOINT, services=rules, **sections))
 
     async def start_site(
-        self, *, name: str = "site", match: str = "/robot1/.*", timeout_s: float = 30.0
+        self, *, name: str = "site", match: str = "/robot1/.*", timeout_s: float = 30.0, **sections: Any
     ) -> ClientDaemon:
         rules = {"use": [{"match": match, "timeout_s": timeout_s, "class": "control"}]}
-        endpoint = {"kind": "synthetic", "role": "operator"}
-        return await self.lab.connected(self.lab.client_file(name, endpoint, services=rules))
+        return await self.lab.connected(self.lab.client_file(name, ENDPOINT, services=rules, **sections))
 
     def offer(self) -> None:
         assert self.robot.events is not None
@@ -70,9 +75,7 @@ class Sites:
 
 
 def outcomes(daemon: ClientDaemon) -> dict[tuple[TopicName, str], int]:
-    services = daemon.bridge.services
-    assert isinstance(services, ServiceBridge)
-    return dict(services.outcomes)
+    return dict(bridge(daemon).outcomes)
 
 
 async def test_a_call_goes_there_and_its_answer_comes_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -230,7 +233,8 @@ async def test_only_what_a_rule_names_is_offered_and_used(tmp_path: Path, monkey
             sites.robot.events.service_added(
                 ServiceInfo(TopicName(name), INFO.type_name, INFO.encoding, INFO.type_hash)
             )
-        await sites.served()
+        handler = await sites.served()
+        assert await handler(b"") == b"re: "
         expected = {"/robot1/set_speed/_service", "/robot1/set_mode/_service", "/robot1/set_mode/_reply/site"}
         await until(lambda: {stream.topic for stream in robot.core.link.by_stream} == expected, "offered and answered")
         assert list(sites.site.served) == [GLOBAL]
@@ -272,6 +276,305 @@ async def test_nobody_calls_in_the_name_of_another_site(tmp_path: Path, monkeypa
             "/robot1/set_mode/_service",
             "/robot1/set_mode/_reply/rogue",
         ]
+
+
+def bridge(daemon: ClientDaemon) -> ServiceBridge:
+    services = daemon.bridge.services
+    assert isinstance(services, ServiceBridge)
+    return services
+
+
+def stream_of(name: TopicName, origin: str) -> StreamInfo:
+    return StreamInfo(
+        StreamId(ClientName(origin), 1, name), TopicInfo(name, INFO.type_name, INFO.encoding), TopicSpec()
+    )
+
+
+async def test_nobody_else_answers_for_a_service(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    async with Lab(tmp_path, "robot1", "site") as lab:
+        sites = Sites(lab, monkeypatch)
+        await lab.relay()
+        await sites.start_robot()
+        services = bridge(await sites.start_site())
+        sites.offer()
+        handler = await sites.served()
+        sites.robot.answer, started, release = hold()
+        pending = asyncio.ensure_future(handler(b"one"))
+        await started.wait()
+        (number,) = services.used[GLOBAL].waiting
+        forged = stream_of(reply_name(GLOBAL, ClientName("site")), "rogue")
+        services.message(forged, Message(forged.id, 1, REPLY.pack(number, False) + b"forged", 0, time.monotonic()))
+        release.set()
+        assert await pending == b"one"
+
+
+def hold() -> tuple[Callable[[bytes], Awaitable[bytes]], asyncio.Event, asyncio.Event]:
+    """A service that tells when it begins and ends when it is let."""
+    started, release = asyncio.Event(), asyncio.Event()
+
+    async def answer(request: bytes) -> bytes:
+        started.set()
+        await release.wait()
+        return request
+
+    return answer, started, release
+
+
+async def test_a_call_whose_caller_leaves_is_not_made_later(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    async with Lab(tmp_path, "robot1", "site") as lab:
+        sites = Sites(lab, monkeypatch)
+        relay = await lab.relay()
+        await sites.start_robot()
+        site = await sites.start_site(timeout_s=30.0)
+        sites.offer()
+        handler = await sites.served()
+        assert await handler(b"before") == b"re: before"
+        await lab.drop(relay)
+        await until(lambda: not site.core.link.established or site.core.link.lane.stalled, "the link is lost")
+        leaves, stays = (asyncio.ensure_future(handler(body)) for body in (b"leaves", b"stays"))
+        await until(lambda: len(bridge(site).used[GLOBAL].waiting) == 2, "both wait for the link")
+        leaves.cancel()
+        await asyncio.gather(leaves, return_exceptions=True)
+        await lab.relay(tmp_path / "relay.yaml")
+        assert await stays == b"re: stays"
+        assert [body for _, body in sites.robot.calls] == [b"before", b"stays"]
+        assert outcomes(site) == {(GLOBAL, "ok"): 2, (GLOBAL, "cancelled"): 1}
+
+
+async def test_a_call_for_an_earlier_process_of_the_robot_is_not_executed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async with Lab(tmp_path, "robot1", "site") as lab:
+        sites = Sites(lab, monkeypatch)
+        await lab.relay()
+        robot = await sites.start_robot()
+        await sites.start_site()
+        sites.offer()
+        handler = await sites.served()
+        assert await handler(b"now") == b"re: now"
+        (identity,) = bridge(robot).callers
+        calls = StreamInfo(identity, TopicInfo(identity.topic, INFO.type_name, INFO.encoding), TopicSpec())
+        early_s = bridge(robot).offered[GLOBAL].since_s - 0.01
+        bridge(robot).message(calls, Message(identity, 2, CALL.pack(1) + b"early", 0, early_s))
+        assert await handler(b"later") == b"re: later"
+        assert [body for _, body in sites.robot.calls] == [b"now", b"later"]
+
+
+@pytest.mark.parametrize(
+    ("raised", "shown"),
+    [
+        ("two\nlines, \x1b[2J and \udc80", "two lines, [2J and"),
+        ("x" * 5000, "x" * MAX_ERROR_CHARS),
+        ("", "/robot1/set_mode failed, without saying why"),
+    ],
+)
+async def test_error_texts_are_one_bounded_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, raised: str, shown: str
+) -> None:
+    async def fail(request: bytes) -> bytes:
+        raise ServiceError(raised)
+
+    async with Lab(tmp_path, "robot1", "site") as lab:
+        sites = Sites(lab, monkeypatch)
+        await lab.relay()
+        await sites.start_robot()
+        await sites.start_site()
+        sites.offer()
+        handler = await sites.served()
+        sites.robot.answer = fail
+        with pytest.raises(ServiceError) as caught:
+            await handler(b"")
+        assert str(caught.value) == shown
+
+
+async def test_what_is_too_large_is_said_to_the_caller(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    async def long(request: bytes) -> bytes:
+        return bytes(200_000)
+
+    async with Lab(tmp_path, "robot1", "site") as lab:
+        sites = Sites(lab, monkeypatch)
+        await lab.relay()
+        await sites.start_robot(link={"max_message_bytes": 100_000})
+        await sites.start_site(link={"max_message_bytes": 100_000})
+        sites.offer()
+        handler = await sites.served()
+        with pytest.raises(ServiceError, match="dropped on its way: too_large"):
+            await handler(bytes(100_001))
+        sites.robot.answer = long
+        with pytest.raises(ServiceError, match=r"has 200000 bytes, above link\.max_message_bytes of the site .*100000"):
+            await handler(b"")
+        sites.robot.answer = sites.robot.echo
+        assert await handler(b"small") == b"re: small"
+
+
+async def test_a_robot_that_comes_back_with_another_relay_is_served_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The site still knows the stream of the robot's earlier process, which no relay can tell it of any more."""
+    async with Lab(tmp_path, "robot1", "site") as lab:
+        sites = Sites(lab, monkeypatch)
+        relay = await lab.relay()
+        robot = await sites.start_robot()
+        await sites.start_site()
+        sites.offer()
+        first = await sites.served()
+        assert await first(b"one") == b"re: one"
+        await lab.drop(relay)
+        await lab.drop(robot)
+        sites.ends["robot1"] = Services()
+        await lab.relay(tmp_path / "relay.yaml")
+        await sites.start_robot()
+        sites.offer()
+        await until(lambda: GLOBAL in sites.site.served and sites.site.served[GLOBAL].handler is not first, "again")
+        assert await sites.site.served[GLOBAL].handler(b"two") == b"re: two"
+        with pytest.raises(ServiceError, match="is gone"):
+            await first(b"three")
+
+
+async def test_two_sites_that_offer_one_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    async with Lab(tmp_path, "robot1", "other", "site") as lab:
+        sites = Sites(lab, monkeypatch)
+        sites.ends["other"] = Services()
+        await lab.relay()
+        await sites.start_robot()
+        offer = {"offer": [{"match": "/set_.*"}]}
+        other = lab.client_file("other", ENDPOINT, services=offer, client={"namespace": "/robot1"})
+        await lab.connected(other)
+        await sites.start_site()
+        sites.offer()
+        handler = await sites.served()
+        events = sites.ends["other"].events
+        assert events is not None
+        events.service_added(INFO)
+        await until(lambda: "robot1 owns that name" in caplog.text, "the second is refused by name")
+        assert await handler(b"mine") == b"re: mine"
+        assert sites.ends["other"].calls == []
+
+
+async def test_services_that_come_and_go_leave_nothing_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    async with Lab(tmp_path, "robot1", "site") as lab:
+        sites = Sites(lab, monkeypatch)
+        await lab.relay()
+        robot = await sites.start_robot()
+        site = await sites.start_site()
+        assert sites.robot.events is not None
+        for number in range(30):
+            sites.offer()
+            handler = await sites.served()
+            assert await handler(b"%d" % number) == b"re: %d" % number
+            sites.robot.events.service_removed(SERVICE)
+            await until(lambda: not sites.site.served, "withdrawn")
+        await until(lambda: not robot.core.link.by_stream and not site.core.link.by_stream, "no streams are left")
+        for services in (bridge(robot), bridge(site)):
+            assert not services.offered
+            assert not services.used
+            assert not services.callers
+
+
+async def test_many_services_cost_a_stream_each_until_they_are_called(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    count = 300
+    async with Lab(tmp_path, "robot1", "site") as lab:
+        sites = Sites(lab, monkeypatch)
+        await lab.relay()
+        robot = await sites.start_robot()
+        site = await sites.start_site()
+        assert sites.robot.events is not None
+        for number in range(count):
+            sites.robot.events.service_added(replace(INFO, name=TopicName(f"/set_{number}")))
+        await until(lambda: len(sites.site.served) == count, "all are served")
+        assert (len(robot.core.link.by_stream), len(site.core.link.by_stream)) == (count, 0)
+        handler = sites.site.served[TopicName("/robot1/set_7")].handler
+        assert await handler(b"seven") == b"re: seven"
+        assert (len(robot.core.link.by_stream), len(site.core.link.by_stream)) == (count + 1, 1)
+
+
+async def test_a_site_serves_only_so_many(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr("sern_client.services.MAX_SERVED", 3)
+    async with Lab(tmp_path, "robot1", "site") as lab:
+        sites = Sites(lab, monkeypatch)
+        await lab.relay()
+        await sites.start_robot()
+        site = await sites.start_site()
+        assert sites.robot.events is not None
+        for number in range(6):
+            sites.robot.events.service_added(replace(INFO, name=TopicName(f"/set_{number}")))
+        await until(lambda: len(site.core.link.streams) == 6 and len(sites.site.served) == 3, "all are known")
+        assert len(sites.site.served) == 3
+        assert caplog.text.count("name those that are needed in services.use") == 1
+
+
+CUSTOM = ServiceInfo(SERVICE, "my_robot/srv/SetMode", Encoding.ROS1, "")
+
+
+async def test_a_type_that_nobody_defines_is_named_with_what_to_do(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    async with Lab(tmp_path, "robot1", "site") as lab:
+        sites = Sites(lab, monkeypatch)
+        sites.site.encoding = Encoding.CDR
+        await lab.relay()
+        await sites.start_robot()
+        await sites.start_site()
+        assert sites.robot.events is not None
+        sites.robot.events.service_added(CUSTOM)
+        await until(lambda: "cannot be served here" in caplog.text, "it is said")
+        (line,) = [record.message for record in caplog.records if "cannot be served here" in record.message]
+        assert "/robot1/set_mode of robot1" in line and "my_robot/srv/SetMode" in line and "type_paths" in line
+        assert "\n" not in line
+
+
+async def test_a_definition_that_does_not_come_with_a_service_is_looked_up(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def answer(request: bytes) -> bytes:
+        assert request == b"\x07"
+        return b"\x01"
+
+    async with Lab(tmp_path, "robot1", "site") as lab:
+        sites = Sites(lab, monkeypatch)
+        sites.site.encoding = Encoding.CDR
+        sites.site.definitions["my_robot/srv/SetMode"] = "uint8 mode\n---\nbool success\n"
+        await lab.relay()
+        await sites.start_robot()
+        await sites.start_site()
+        sites.robot.answer = answer
+        assert sites.robot.events is not None
+        sites.robot.events.service_added(CUSTOM)
+        handler = await sites.served()
+        assert (await handler(b"\0\x01\0\0\x07"))[:5] == b"\0\x01\0\0\x01"
+
+
+async def test_the_access_rules_of_the_documentation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    text = (Path(__file__).parents[2] / "docs" / "operations.md").read_text()
+    section = text.partition("## Services and actions\n")[2].partition("\n## ")[0]
+    (example,) = re.findall(r"```yaml\n(access:.*?)```", section, re.DOTALL)
+    access = YAML(typ="safe", pure=True).load(example)["access"]
+    robot, laptop, other = "jackal1", "laptop", "visitor"
+    service = TopicName("/jackal1/set_mode")
+    async with Lab(tmp_path, robot, laptop, other) as lab:
+        sites = Sites(lab, monkeypatch)
+        sites.ends = {name: Services() for name in (robot, laptop, other)}
+        await lab.relay(lab.relay_file(access=access))
+        offer = {"offer": [{"match": "/.*"}]}
+        await lab.connected(lab.client_file(robot, ENDPOINT, services=offer))
+        use = {"use": [{"match": "/jackal1/.*"}]}
+        for name in (laptop, other):
+            await lab.connected(lab.client_file(name, ENDPOINT, services=use))
+        events = sites.ends[robot].events
+        assert events is not None
+        for name in ("/reboot", "/set_mode"):
+            events.service_added(replace(INFO, name=TopicName(name)))
+        served = sites.ends[laptop].served
+        await until(lambda: service in served, "it is served")
+        assert await served[service].handler(b"auto") == b"re: auto"
+        assert list(served) == [service]
+        assert not sites.ends[other].served
 
 
 async def test_an_endpoint_without_services_is_named(tmp_path: Path) -> None:

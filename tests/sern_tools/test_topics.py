@@ -133,6 +133,20 @@ def test_the_registry_is_read_when_a_name_is_new() -> None:
     assert asked.count("/api/objects") == 1
 
 
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [({}, ["/r/odom"]), ({"services": True}, ["/r/go/_call/a", "/r/odom"]), ({"pattern": re.compile(".*go.*")}, None)],
+)
+def test_streams_of_services_are_shown_when_asked_for(options: dict[str, Any], expected: list[str] | None) -> None:
+    def get(_api: str, path: str) -> Any:
+        answer = {"links": {}, "received": {"/r/odom": arrived(1), "/r/go/_call/a": arrived(1)}}
+        return OBJECTS if path == "/api/objects" else answer
+
+    clock = iter((0.0, 1.0))
+    watcher = Watcher(URL, get=get, clock=lambda: next(clock), **options)
+    assert [row.topic for row in watcher.rows()] == (expected or ["/r/go/_call/a"])
+
+
 def text_of(rows: list[Row], width: int) -> str:
     out = StringIO()
     Console(file=out, width=width).print(table(rows, width))

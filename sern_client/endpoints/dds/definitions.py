@@ -30,6 +30,10 @@ class Definitions:
             found.append((known, known.type_hash))
         return _choose(type_name, type_hash, found)
 
+    def service_in(self, type_name: str, encoding: Encoding) -> str | None:
+        """The definition text of a service as it is in `encoding`; None where it is unknown."""
+        return self._files.service(type_name, encoding)
+
     def service(self, type_name: str, request_hash: str = "") -> TypeText:
         """As `message`, of a service, which DDS tells from others by the hash of its request."""
         found: list[tuple[TypeText, str]] = []

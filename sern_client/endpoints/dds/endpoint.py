@@ -330,6 +330,10 @@ class DdsEndpoint:
     def watch_services(self, events: ServiceEvents) -> None:
         self.services.watch(events)
 
+    def service_definition(self, type_name: str, encoding: Encoding) -> str | None:
+        """As `KnowsServiceTypes`."""
+        return self.types.service_in(type_name, encoding)
+
     async def call(self, name: TopicName, request: bytes, *, timeout_s: float) -> bytes:
         return await self.services.call(name, request, timeout_s=timeout_s)
 

@@ -66,6 +66,10 @@ class Services(ABC):
             if gone is not None and self._service_events is not None:
                 self._service_events.service_removed(entity.name)
 
+    def service_definition(self, type_name: str, encoding: Encoding) -> str | None:
+        """As `KnowsServiceTypes`."""
+        return self.types.service(type_name, encoding)
+
     async def call(self, name: TopicName, request: bytes, *, timeout_s: float) -> bytes:
         servers = self._servers.get(name)
         if not servers:
