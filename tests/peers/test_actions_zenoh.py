@@ -15,8 +15,8 @@ from sern_client.endpoints.zenoh.endpoint import ZenohEndpoint, ZenohOptions
 from sern_core.message import TopicInfo
 from sern_core.types import Encoding, TopicName
 from tests.daemons import Lab
-from tests.peers.test_zenoh import Events, Router
-from tests.support import until
+from tests.peers.test_zenoh import Router
+from tests.support import Events, until
 
 pytest.importorskip("zenoh", reason="the library eclipse-zenoh is missing: pip install 'sern[zenoh]'")
 
@@ -101,14 +101,14 @@ async def test_an_action_of_ros_2_across_the_link(tmp_path: Path) -> None:
             await client.start(events)
             action = "/robot1/fibonacci"
             await until(lambda: set(events.services) == {name(action, part) for part in SERVICES}, "services")
-            await until(lambda: set(events.topics) == {name(action, part) for part in ("feedback", "status")}, "topics")
+            await until(lambda: set(events.infos) == {name(action, part) for part in ("feedback", "status")}, "topics")
             for part in SERVICES:
                 info = events.services[name(action, part)]
                 assert (info.type_name, info.type_hash) == (PARTS[part], HASHES[part])
             for part in ("feedback", "status"):
-                found = events.topics[name(action, part)]
+                found = events.infos[name(action, part)]
                 assert (found.type_name, found.type_hash) == (PARTS[part], HASHES[part])
-            assert events.topics[name(action, "status")].latched
+            assert events.infos[name(action, "status")].latched
 
             got: dict[str, list[bytes]] = {"feedback": [], "status": []}
             for part, bodies in got.items():
