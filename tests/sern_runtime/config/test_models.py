@@ -98,6 +98,11 @@ def test_services_and_actions_become_rules_and_subscriptions() -> None:
     assert treated("/dock/goal") == (Direction.RECEIVE, PriorityClass.CONTROL, True)
     assert treated("/dock/result") == (Direction.SEND, PriorityClass.STATE, True)
     assert treated("/dock/_action/feedback") == (Direction.SEND, PriorityClass.STATE, False)
+    goal, cancel = (
+        rules.resolve(TopicInfo(TopicName(name), "a/B", Encoding.ROS1), local_name=TopicName(name)).spec
+        for name in ("/dock/goal", "/dock/cancel")
+    )
+    assert (goal.lifespan_s, cancel.lifespan_s) == (5.0, None), "nothing sets off late, and to stop is never too late"
     assert treated("/docks/goal") == (Direction.BOTH, PriorityClass.BULK, False)
     patterns = [re.compile(text) for text in robot.subscribe_patterns()]
 
