@@ -247,8 +247,9 @@ SENDER_UNSURE: Final = frozenset({"unconfirmed"})
 """What a sender counts without knowing whether it arrived: the acknowledgement is missing."""
 RELIABLE_UNSURE: Final = SENDER_UNSURE | {"retention", "lifespan"}
 """The same for the origin of a reliable stream, which waits for its subscribers and may miss their last word."""
-RECEIVER_UNSURE: Final = frozenset({"lost", "reassembly", "too_large", "unwanted", "disconnected"})
-"""What a receiver counts of which it had a part, or nobody to give it to: the sender may count it as well."""
+RECEIVER_UNSURE: Final = frozenset({"lost", "reassembly", "too_large", "unwanted", "disconnected", "superseded"})
+"""What a receiver counts of which it had a part (`superseded`: one that came after a newer message), or nobody to give
+it to: the sender may count it as well."""
 NO_LOSS: Final = frozenset({"duplicate", "refused"})
 
 
