@@ -47,7 +47,8 @@ performance: setup
 	mkdir -p build
 	$(BIN)/python -m benchmarks.link --plots docs/images --json build/link.json
 	$(BIN)/python -m benchmarks.robots --figure docs/images/perf-robots.png --json build/robots.json
-	$(BIN)/python -m benchmarks.document build/link.json build/robots.json
+	$(BIN)/python -m benchmarks.mmcf_lab --json build/mmcf_lab.json
+	$(BIN)/python -m benchmarks.document build/link.json build/robots.json build/mmcf_lab.json
 
 demo: setup
 	$(BIN)/sern demo

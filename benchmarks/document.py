@@ -24,14 +24,19 @@ TITLES: Final = {
     "fresh_s": "first fresh pose, s",
     "messages_hz": "messages/s",
     "relay_cpu_us": "relay CPU a message, µs",
+    "cost_1": "cost J",
 }
 """Of columns whose metric's name does not say it well."""
+PURE: Final = "1"
+"""The unit of a number without one."""
 UNITS: Final = {"percent": "%", "Mbps": "Mbit/s", "us": "µs"}
 FIXED: Final = ("case", "system")
 
 
 def _title(metric: str) -> str:
     quantity, _, unit = metric.rpartition("_")
+    if unit == PURE:
+        return TITLES.get(metric, quantity)
     return TITLES.get(metric) or f"{quantity.replace('_', ' ').replace('cpu', 'CPU')}, {UNITS.get(unit, unit)}"
 
 
@@ -42,6 +47,8 @@ def _cell(metric: str, value: float | None) -> str:
         return "never"
     if abs(value) >= 1000:
         return f"{value:,.0f}"
+    if metric.endswith(f"_{PURE}"):
+        return f"{value:.3f}"
     return f"{value:.2f}" if metric.endswith(("_s", "_Mbps")) else f"{value:.1f}"
 
 

@@ -9,7 +9,7 @@ wire. Then the paper's section "Runtime Reconfiguration Evaluation": two robots'
 
 import argparse
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import pairwise
@@ -23,6 +23,7 @@ from sern_client.endpoints.clouds import CLOUD_TYPE, cloud_body, read_ply
 from sern_core.codecs import Coder
 from sern_core.message import TopicInfo, TopicSpec
 from sern_core.mmcf.adapter import SAMPLES, HopAdapter, Step
+from sern_core.mmcf.cost import cost
 from sern_core.mmcf.model import Terms
 from sern_core.queues import OutChannel
 from sern_core.types import Encoding, PriorityClass, TopicName
@@ -38,6 +39,8 @@ SETTLE_S = 1.0
 CLOUD_HZ = 5.0
 EVERY_NTH_POINT = 8
 """8,700 points a scan, about what a 16-beam LiDAR gives in a tenth of a second."""
+REAL = tuple(DATA / name for name in ("husky_gps_imu_odom.bag", "lidar_scan_a.ply", "lidar_scan_b.ply"))
+"""A drive of a Husky, and two scans."""
 POLICIES = ("fixed_throughput", "fixed_reliability", "mmcf")
 PROFILES = ("teleoperation", "mapping")
 LINKS = ("step", "field-wifi", "mesh-radio")
@@ -58,7 +61,7 @@ def _spec(priority: PriorityClass) -> TopicSpec:
 
 
 def _scans() -> list[bytes]:
-    files = [DATA / "lidar_scan_a.ply", DATA / "lidar_scan_b.ply"]
+    files = REAL[1:]
     if all(path.exists() for path in files):
         return [cloud_body(read_ply(path)[::EVERY_NTH_POINT], 0, "velodyne", Encoding.ROS1) for path in files]
     random = Random(1)
@@ -67,7 +70,7 @@ def _scans() -> list[bytes]:
 
 def recorded(duration_s: float) -> Load:
     """The Husky's recording with scans beside it, or something like it."""
-    load, bag = Load(), DATA / "husky_gps_imu_odom.bag"
+    load, bag = Load(), REAL[0]
     if bag.exists():
         infos, messages = read_bag(bag, duration_s)
         load.note = "the Husky's recording with LiDAR scans"
@@ -112,17 +115,26 @@ def tables(report: Report, duration_s: float, links: tuple[str, ...]) -> None:
     """Policy by profile, with the four terms, over the links."""
     load = recorded(duration_s)
     report.note(f"{load.note}, {duration_s:g} s on each of {', '.join(links)}; means over intervals of 1 s")
+
+    def intervals(section: AdaptationSection) -> list[Terms]:
+        steps = [step for name in links for step in run(load, load_profile(name), section, duration_s)]
+        return [step.terms for step in steps if step.terms is not None]
+
+    tabulate(report, intervals)
+
+
+def tabulate(report: Report, intervals: Callable[[AdaptationSection], list[Terms]]) -> None:
+    """Policy by profile: the means of the terms over the intervals of a run, and what they cost.
+
+    The cost is linear in the terms, so that of their means is the mean of the intervals'.
+    """
     report.note("terms: 1 is 0.5 s of latency, no reliability, a quarter of a core, 8 Mbit/s")
     for profile in PROFILES:
         means: dict[str, float] = {}
         for policy in POLICIES:
-            steps: list[Step] = []
-            for name in links:
-                section = AdaptationSection.model_validate({"policy": policy, "profile": profile})
-                steps += run(load, load_profile(name), section, duration_s)
-            costs = [step.cost for step in steps if step.cost is not None]
-            terms = Terms(*(fmean(v) for v in zip(*(s.terms for s in steps if s.terms is not None), strict=True)))
-            means[policy] = fmean(costs)
+            section = AdaptationSection.model_validate({"policy": policy, "profile": profile})
+            terms = Terms(*(fmean(values) for values in zip(*intervals(section), strict=True)))
+            means[policy] = cost(section.cost_weights(), terms)
             report.row(
                 profile,
                 policy,

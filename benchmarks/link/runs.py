@@ -122,13 +122,13 @@ def run(
             _await_ready(running.ends[role], directory / f"{role}.log", f"{system}, {role}")
         start_ns = time.monotonic_ns() + int(LEAD_S * 1e9)
         _say(running.ends["robot"], f"go {start_ns}\n")
-        _sleep_until(start_ns)
+        sleep_until(start_ns)
         wire_before, cpu_before = lab.traffic()[0], running.cpu_s()
         psutil.cpu_percent()
         events = _play(lab, start_ns, script)
-        _sleep_until(start_ns + int(duration_s * 1e9))
+        sleep_until(start_ns + int(duration_s * 1e9))
         cpu_after, wire_after, busy = running.cpu_s(), lab.traffic()[0], psutil.cpu_percent()
-        _sleep_until(time.monotonic_ns() + int(DRAIN_S * 1e9))
+        sleep_until(time.monotonic_ns() + int(DRAIN_S * 1e9))
         _finish(running)
     finally:
         running.stop()
@@ -258,14 +258,15 @@ def _finish(running: Running) -> None:
 def _play(lab: Lab, start_ns: int, script: Sequence[Step]) -> dict[str, tuple[int, int]]:
     events: dict[str, tuple[int, int]] = {}
     for step in script:
-        _sleep_until(start_ns + int(step.at_s * 1e9))
+        sleep_until(start_ns + int(step.at_s * 1e9))
         asked_ns = time.monotonic_ns()
         step.action(lab)
         events[step.name] = (asked_ns, time.monotonic_ns())
     return events
 
 
-def _sleep_until(at_ns: int) -> None:
+def sleep_until(at_ns: int) -> None:
+    """By the monotonic clock."""
     while (left_ns := at_ns - time.monotonic_ns()) > 0:
         time.sleep(left_ns / 1e9)
 

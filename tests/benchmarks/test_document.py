@@ -47,7 +47,16 @@ def test_one_system_gets_one_table() -> None:
     ]
 
 
-@pytest.mark.parametrize("name", ["link", "robots"])
+def test_numbers_without_a_unit_have_three_places() -> None:
+    tables = Report("mmcf_lab")
+    tables.row("mapping", "mmcf", cost_1=0.07851, latency_1=0.1)
+    tables.row("mapping", "fixed_throughput", cost_1=0.18, latency_1=0.2)
+    text = render(tables.as_json())
+    assert "| system | cost J | latency |" in text
+    assert "| mmcf | 0.079 | 0.100 |" in text
+
+
+@pytest.mark.parametrize("name", ["link", "robots", "mmcf_lab"])
 def test_the_document_has_a_place_for_them_and_keeps_the_rest(name: str) -> None:
     text = DOCUMENT.read_text(encoding="utf-8")
     once = insert(text, name, "figures")

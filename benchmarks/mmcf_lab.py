@@ -1,0 +1,352 @@
+"""The paper's two policy tables on a real link: a Husky's recording and LiDAR scans over `tc netem` in the lab.
+
+Robot, relay and site are the daemons as their user runs them, robot on one side of the link, relay and site on the
+other; the robot alone adapts. Nothing of what is reported comes from the controller: messages are counted and timed
+by the logs that robot and site write, bytes by netem, processor time of the robot by the kernel. Only what the robot
+left out is its own count, so that a class of which nothing was sent is not taken for a lost one. Needs root.
+"""
+
+import argparse
+import json
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from bisect import bisect_right
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+
+from benchmarks.common import Report, main, try_realtime
+from benchmarks.link.runs import DRAIN_S, START_S, STOP_S, Running, make_keys, sleep_until, start_relay
+from benchmarks.link.sern import RELAY_PORT
+from benchmarks.mmcf_replay import CLOUD_HZ, EVERY_NTH_POINT, REAL, recorded, tabulate
+from sern_client.endpoints.clouds import read_ply
+from sern_core.errors import SernError
+from sern_core.message import TopicSpec
+from sern_core.mmcf.adapter import AdapterParams
+from sern_core.mmcf.cost import measure as measure_cost
+from sern_core.mmcf.model import ClassDemand, ClassOutcome, Terms
+from sern_core.types import CLASS_LABELS, CLASSES, DropReason
+from sern_runtime.config.adaptation import AdaptationSection
+from sern_sim.models import LinkModel
+from sern_tools.api import get_json
+from sern_tools.lab.lab import Lab, Node
+from sern_tools.message_log import TopicLog, read_logs
+
+ROBOT, SITE = "robot", "site"
+HTTP_PORT: Final = 8080
+API: Final = f"http://127.0.0.1:{HTTP_PORT}"
+LINK: Final = LinkModel(rate_bps=4e6, delay_s=0.025, loss=0.01)
+THIN_BPS: Final = 1e6
+"""The rate in the second third of a run."""
+RUN_S, QUICK_S = 36, 9
+WARM_S: Final = 3.0
+"""Not counted: the load begins, and a controller finds out what the link carries."""
+POLL_S: Final = 0.1
+
+
+class Edge(NamedTuple):
+    """What had come together by the end of an interval. `left_out`: messages that the adaptation did not let in."""
+
+    wall_ns: int
+    wire_bytes: int
+    cpu_s: float
+    left_out: Mapping[str, int]
+
+
+def intervals(logs: Mapping[str, TopicLog], edges: Sequence[Edge], params: AdapterParams) -> list[Terms]:
+    """The terms of the cost, one for each interval between two `edges`, by what the far end saw.
+
+    A message belongs to the interval in which it was offered, and is on time by its topic's deadline; what never came
+    is not. Raises SernError when the logs hold no message of the time.
+    """
+    starts_ns = [edge.wall_ns for edge in edges[:-1]]
+    count = len(starts_ns)
+    offered, delivered, on_time = ([Counter[str]() for _ in range(count)] for _ in range(3))
+    nbytes: Counter[str] = Counter()
+    latency_s = [dict.fromkeys(CLASS_LABELS, 0.0) for _ in range(count)]
+    deadlines_s = dict(zip(CLASS_LABELS, params.deadlines_s, strict=True))
+    for log in logs.values():
+        arrived = {delivery.seq: delivery for delivery in reversed(log.deliveries)}
+        for offer in log.offers.values():
+            if not edges[0].wall_ns <= offer.wall_ns < edges[-1].wall_ns:
+                continue
+            at = bisect_right(starts_ns, offer.wall_ns) - 1
+            offered[at][log.priority] += 1
+            nbytes[log.priority] += offer.size_bytes
+            delivery = arrived.get(offer.seq)
+            if delivery is not None:
+                delivered[at][log.priority] += 1
+                latency_s[at][log.priority] += delivery.latency_s
+                on_time[at][log.priority] += delivery.latency_s <= deadlines_s[log.priority]
+    totals = sum(offered, Counter[str]())
+    if not totals:
+        raise SernError("nothing was offered during the run; look at the daemons' logs (--traces)")
+    seconds = (edges[-1].wall_ns - edges[0].wall_ns) / 1e9
+    labels = list(zip(CLASSES, CLASS_LABELS, strict=True))
+    demands = [
+        ClassDemand(
+            priority,
+            totals[label] / seconds,
+            nbytes[label] / totals[label],
+            deadlines_s[label],
+            needed=params.needed[priority],
+        )
+        for priority, label in labels
+        if totals[label]
+    ]
+    found: list[Terms] = []
+    before = None
+    for at, (begin, end) in enumerate(pairwise(edges)):
+        left_out: Counter[str] = Counter()
+        for topic, log in logs.items():
+            left_out[log.priority] += end.left_out.get(topic, 0) - begin.left_out.get(topic, 0)
+        before = measure_cost(
+            demands,
+            [
+                ClassOutcome(
+                    priority,
+                    offered[at][label],
+                    max(0, offered[at][label] - left_out[label]),
+                    on_time[at][label],
+                    delivered[at][label],
+                    latency_s[at][label],
+                    # Classes share datagrams: all bytes are counted under the first.
+                    wire_bytes=float(end.wire_bytes - begin.wire_bytes) if label == CLASS_LABELS[0] else 0.0,
+                )
+                for priority, label in labels
+            ],
+            interval_s=(end.wall_ns - begin.wall_ns) / 1e9,
+            cpu_s=end.cpu_s - begin.cpu_s,
+            saturated=False,
+            ranges=params.ranges,
+            previous=before,
+        )
+        found.append(
+            params.ranges.terms(
+                latency_s=before.latency_s,
+                unreliability=before.unreliability,
+                compute=before.compute,
+                bandwidth_bps=before.bandwidth_bps,
+            )
+        )
+    return found
+
+
+def thin_scan(source: Path, into: Path, every: int) -> None:
+    """Every so many points of a `.ply` scan as another one."""
+    points = read_ply(source)[::every]
+    names = ("x", "y", "z", "intensity")[: points.shape[1]]
+    head = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}"]
+    head += [*(f"property float {name}" for name in names), "end_header", ""]
+    into.write_bytes("\n".join(head).encode() + np.ascontiguousarray(points, dtype="<f4").tobytes())
+
+
+def client_file(
+    directory: Path, name: str, address: str, endpoint: Sequence[Mapping[str, Any]], **sections: Any
+) -> Path:
+    """A client's configuration; `address` is the relay's."""
+    content = {
+        "client": {"name": name, **sections.pop("client", {})},
+        "relay": {
+            "endpoint": f"tcp://{address}:{RELAY_PORT}",
+            "server_key_file": "relay.pub",
+            "secret_key_file": f"{name}.key",
+        },
+        "endpoint": list(endpoint),
+        "message_log": f"{name}.csv",
+        "http": {"listen": None},
+        "log": {"level": "warning"},
+        **sections,
+    }
+    path = directory / f"{name}.yaml"
+    path.write_text(json.dumps(content, indent=1))  # JSON is YAML
+    return path
+
+
+def robot_file(
+    directory: Path, address: str, specs: Mapping[str, TopicSpec], section: AdaptationSection, scans: Sequence[Path]
+) -> Path:
+    """The robot: the recording from its beginning and, beside it, the scans; its topics by `specs`."""
+    rules = [
+        {
+            "match": name,
+            "class": CLASS_LABELS[spec.priority],
+            "direction": "send",
+            "reliability": "best_effort",
+            "weight": spec.weight,
+            "lifespan_s": spec.lifespan_s,
+        }
+        for name, spec in specs.items()
+    ]
+    bag = {"kind": "bag", "path": str(REAL[0].resolve()), "loop": True}
+    clouds = {
+        "kind": "synthetic",
+        "role": "robot",
+        "topics": ["/points"],
+        "cloud_rate_hz": CLOUD_HZ,
+        "cloud_files": [str(path) for path in scans],
+    }
+    return client_file(
+        directory,
+        ROBOT,
+        address,
+        [bag, clouds],
+        topics=rules,
+        adaptation=section.model_dump(mode="json", exclude_unset=True),
+        http={"listen": f"127.0.0.1:{HTTP_PORT}"},
+    )
+
+
+def site_file(directory: Path, address: str) -> Path:
+    """The site: records all that the robot sends."""
+    record = {"kind": "record", "path": str(directory / "site"), "overwrite": True}
+    return client_file(directory, SITE, address, [record], client={"namespace": "/"}, subscribe=[f"/{ROBOT}/.*"])
+
+
+# --- in the lab -------------------------------------------------------------------------------------------------------
+
+
+def _ask(node: Node, path: str) -> Any:
+    return node.inside(lambda: get_json(API, path))
+
+
+def _start(lab: Lab, node: Node, config: Path) -> "subprocess.Popen[bytes]":
+    command = [sys.executable, "-P", "-m", "sern_client.cli", "--config", str(config)]
+    with config.with_suffix(".log").open("wb") as log:
+        return lab.popen(
+            node,
+            command,
+            stdin=subprocess.DEVNULL,
+            stdout=log,
+            stderr=log,
+            cwd=config.parent,
+            start_new_session=True,
+        )
+
+
+def _connected(robot: Node, topics: int) -> bool:
+    """Over the datagram lane, and all of the topics have reached somebody."""
+    try:
+        link = _ask(robot, "/api/link")
+        sent = [entry for entry in _ask(robot, "/api/topics").values() if entry["direction"] == "send"]
+    except SernError:
+        return False  # it does not listen yet
+    parts = link if isinstance(link, list) else [link]
+    lanes = [part["lane"] for part in parts]
+    return lanes == ["udp"] and sum(entry["delivered"] > 0 for entry in sent) == topics
+
+
+def _await_connected(running: Running, robot: Node, topics: int, directory: Path) -> None:
+    give_up_s = time.monotonic() + START_S
+    while not _connected(robot, topics):
+        for role, process in running.ends.items():
+            if process.poll() is not None:
+                lines = (directory / f"{role}.log").read_text(errors="replace").strip().splitlines()
+                raise SernError(f"{role} ended: {lines[-1] if lines else 'it said nothing'}")
+        if time.monotonic() > give_up_s:
+            raise SernError(f"not every topic of the robot got through within {START_S:g} s")
+        time.sleep(POLL_S)
+
+
+def _edge(lab: Lab, running: Running) -> Edge:
+    topics = _ask(lab.a, "/api/topics")
+    left_out = {
+        name: int(entry["dropped"].get(DropReason.RATE_CAP, 0))
+        for name, entry in topics.items()
+        if entry["direction"] == "send"
+    }
+    return Edge(time.time_ns(), lab.traffic()[0].bytes, running.cpu_s()[ROBOT], left_out)
+
+
+def _stop(running: Running) -> None:
+    """The robot first, so that nothing is offered any more; then who listens, then the relay."""
+    for role in (ROBOT, SITE, "relay"):
+        process = running.ends[role]
+        process.send_signal(signal.SIGTERM)
+        try:
+            code = process.wait(STOP_S)
+        except subprocess.TimeoutExpired as error:
+            raise SernError(f"{role} does not end") from error
+        if code:
+            raise SernError(f"{role} ended with {code}")
+
+
+def run(lab: Lab, directory: Path, section: AdaptationSection, scans: Sequence[Path], duration_s: int) -> list[Terms]:
+    """One run over a link that is thin in its second third; intervals of 1 s. `directory` must be empty."""
+    make_keys(directory)
+    load = recorded(1.0)
+    specs = {name: spec for name, (_, spec) in load.specs.items()}
+    robot = robot_file(directory, lab.b.address, specs, section, scans)
+    site = site_file(directory, lab.b.address)
+    lab.reset()
+    lab.link(LINK, LINK)
+    running = Running()
+    try:
+        running.ends["relay"] = start_relay(lab, directory, udp=True)
+        running.ends[SITE] = _start(lab, lab.b, site)
+        running.ends[ROBOT] = _start(lab, lab.a, robot)
+        _await_connected(running, lab.a, len(specs), directory)
+        start_ns = time.monotonic_ns() + int(WARM_S * 1e9)
+        changes = {duration_s // 3: THIN_BPS, 2 * duration_s // 3: LINK.rate_bps}
+        edges = []
+        for second in range(duration_s + 1):
+            sleep_until(start_ns + second * 1_000_000_000)
+            edges.append(_edge(lab, running))
+            if second in changes:
+                lab.change(rate_bps=changes[second])
+        (directory / "mmcf.json").write_text(json.dumps(_ask(lab.a, "/api/mmcf")))
+        sleep_until(time.monotonic_ns() + int(DRAIN_S * 1e9))
+        _stop(running)
+    finally:
+        running.stop()
+    params = section.params(encodes=True)
+    logs = read_logs([(role, directory / f"{role}.csv") for role in (ROBOT, SITE)])
+    return intervals(logs, edges, params)
+
+
+def _runner(lab: Lab, directory: Path, duration_s: int) -> Callable[[AdaptationSection], list[Terms]]:
+    scans = [directory / path.name for path in REAL[1:]]
+    for source, scan in zip(REAL[1:], scans, strict=True):
+        thin_scan(source, scan, EVERY_NTH_POINT)
+
+    def intervals_of(section: AdaptationSection) -> list[Terms]:
+        mine = directory / f"{section.profile}-{section.policy}"
+        mine.mkdir()
+        return run(lab, mine, section, scans, duration_s)
+
+    return intervals_of
+
+
+def measure(options: argparse.Namespace, report: Report) -> None:
+    if missing := [path.name for path in REAL if not path.exists()]:
+        raise SernError(f"the recordings are not beside the checkout: {', '.join(missing)}; see benchmarks.mmcf_replay")
+    note = try_realtime()  # all that is started inherits the priority
+    duration_s = QUICK_S if options.quick else RUN_S
+    with tempfile.TemporaryDirectory(prefix="sern-mmcf-") as temporary, Lab() as lab:
+        directory = Path(temporary)
+        if options.traces is not None:
+            options.traces.mkdir(parents=True, exist_ok=True)
+            directory = Path(tempfile.mkdtemp(prefix="run-", dir=options.traces)).resolve()
+        tabulate(report, _runner(lab, directory, duration_s))
+        report.note(f"lab: {lab.backend}; {note}; {duration_s} s a run, means over intervals of 1 s")
+
+
+def _arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--traces", type=Path, metavar="DIR", help="keep logs and /api/mmcf in a new folder there")
+
+
+if __name__ == "__main__":
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that everything is stopped then, too
+    about = __doc__.splitlines()[0] if __doc__ else None
+    try:
+        sys.exit(main("mmcf_lab", measure, description=about, arguments=_arguments))
+    except KeyboardInterrupt:
+        print("benchmarks.mmcf_lab: interrupted", file=sys.stderr)
+        sys.exit(130)

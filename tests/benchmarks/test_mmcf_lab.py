@@ -1,0 +1,109 @@
+"""What the adaptation's benchmark in the lab reckons and writes, without a lab."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("psutil")
+
+from benchmarks.link.runs import make_keys
+from benchmarks.mmcf_lab import ROBOT, Edge, intervals, robot_file, site_file, thin_scan
+from benchmarks.mmcf_replay import REAL
+from sern_client.endpoints.clouds import read_ply
+from sern_core.errors import SernError
+from sern_core.message import TopicSpec
+from sern_core.mmcf.adapter import AdapterParams
+from sern_core.types import PriorityClass
+from sern_runtime.config.adaptation import AdaptationSection
+from sern_runtime.config.client import load_client
+from sern_tools.message_log import Delivery, Offer, TopicLog
+from tests.daemons import recording
+
+S = 1_000_000_000
+POSE, CLOUD = "/robot/odom", "/robot/points"
+PARAMS = AdapterParams()
+
+
+def log(topic: str, priority: str, messages: list[tuple[float, float | None]]) -> TopicLog:
+    """Messages as (offered at, latency or None for one that never came), in seconds."""
+    found = TopicLog(topic, priority, ROBOT)
+    for seq, (at_s, latency_s) in enumerate(messages, start=1):
+        at_ns = int(at_s * S)
+        found.offers[seq] = Offer(at_ns, seq, 1000, 0)
+        if latency_s is not None:
+            found.deliveries.append(Delivery(at_ns + int(latency_s * S), seq, 1000, 0, at_ns, None))
+    return found
+
+
+def edges(*left_out: int, wire_bytes: int = 100_000, cpu_s: float = 0.05) -> list[Edge]:
+    """One a second; by each, so many clouds had been left out."""
+    return [Edge(n * S, n * wire_bytes, n * cpu_s, {CLOUD: count}) for n, count in enumerate(left_out)]
+
+
+def test_terms_are_by_what_arrived_and_by_what_was_used() -> None:
+    poses = log(POSE, "control", [(0.1, 0.05), (0.3, 0.15), (0.5, 0.4), (0.7, None), (2.5, 0.1)])
+    (terms,) = intervals({POSE: poses}, edges(0, 0)[:2], PARAMS)
+    assert terms.latency == pytest.approx(0.2 / 0.5)
+    assert terms.unreliability == pytest.approx(0.5), "one never came, one came after its deadline of 0.3 s"
+    assert terms.compute == pytest.approx(0.05 / 0.25)
+    assert terms.bandwidth == pytest.approx(8e5 / 8e6)
+
+
+def test_a_message_belongs_to_the_interval_in_which_it_was_offered() -> None:
+    poses = log(POSE, "control", [(0.9, 0.25), (1.1, 0.05), (2.0, None), (-0.1, None)])
+    first, second = intervals({POSE: poses}, edges(0, 0, 0), PARAMS)
+    assert [first.latency, second.latency] == pytest.approx([0.5, 0.1])
+    assert first.unreliability == second.unreliability == 0.0, "what was offered before and after does not count"
+
+
+def test_what_was_left_out_is_unreliable_and_what_was_lost_is_late_as_well() -> None:
+    poses = log(POSE, "control", [(0.5, 0.0), (1.5, 0.0)])
+    clouds = log(CLOUD, "bulk", [(0.5, None), (1.5, None)])
+    logs = {POSE: poses, CLOUD: clouds}
+    share = 0.1 / 0.7  # of class bulk beside control
+    out, lost = intervals(logs, edges(0, 1, 1), PARAMS)
+    assert [out.latency, out.unreliability] == pytest.approx([0.0, share])
+    assert [lost.latency, lost.unreliability] == pytest.approx([share, share])
+
+
+def test_a_share_of_the_clouds_is_enough_and_a_second_copy_counts_once() -> None:
+    clouds = log(CLOUD, "bulk", [(0.1, 0.1), (0.3, 0.1), (0.5, None), (0.7, None), (0.9, None)])
+    (terms,) = intervals({CLOUD: clouds}, edges(0, 3), PARAMS)
+    assert terms.unreliability == 0.0
+    clouds.deliveries.append(clouds.deliveries[0]._replace(wall_ns=5 * S))
+    assert intervals({CLOUD: clouds}, edges(0, 3), PARAMS) == [terms]
+
+
+def test_a_run_without_messages_is_an_error() -> None:
+    with pytest.raises(SernError, match="nothing was offered"):
+        intervals({POSE: log(POSE, "control", [(9.0, 0.1)])}, edges(0, 0), PARAMS)
+
+
+@pytest.mark.parametrize("columns", [3, 4])
+def test_a_thinned_scan_holds_every_nth_point(tmp_path: Path, columns: int) -> None:
+    points = np.arange(10 * columns, dtype=np.float32).reshape(10, columns)
+    names = ("x", "y", "z", "intensity")[:columns]
+    source, into = tmp_path / "scan.ply", tmp_path / "thin.ply"
+    head = ["ply", "format ascii 1.0", "element vertex 10", *(f"property float {name}" for name in names), "end_header"]
+    source.write_text("\n".join([*head, *(" ".join(map(str, row)) for row in points)]) + "\n")
+    thin_scan(source, into, 4)
+    assert read_ply(into).tolist() == points[::4].tolist()
+
+
+def test_the_files_are_configurations_of_clients(tmp_path: Path) -> None:
+    recording(REAL[0].name)
+    make_keys(tmp_path)
+    scan = tmp_path / "scan.ply"
+    thin_scan(recording(REAL[1].name), scan, 1000)
+    section = AdaptationSection.model_validate({"policy": "fixed_reliability", "profile": "mapping"})
+    specs = {"/odom": TopicSpec(priority=PriorityClass.CONTROL), "/points": TopicSpec(lifespan_s=2.0)}
+    robot = load_client(robot_file(tmp_path, "198.18.1.1", specs, section, [scan])).model
+    assert robot.adaptation == section
+    assert [(rule.match, rule.priority, rule.lifespan_s) for rule in robot.topics] == [
+        ("/odom", "control", specs["/odom"].lifespan_s),
+        ("/points", "bulk", 2.0),
+    ]
+    assert robot.relay.udp
+    site = load_client(site_file(tmp_path, "198.18.1.1")).model
+    assert site.adaptation is None and site.subscribe == (f"/{ROBOT}/.*",)
