@@ -121,16 +121,19 @@ def regret(results: Sequence[Result]) -> float:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--plots", type=Path, metavar="DIR", help="draw the step and the fades into DIR")
     parser.add_argument("--seeds", type=int, default=0, metavar="N", help="seeds a trace (default 5, quick 1)")
+    parser.add_argument("--first-seed", type=int, default=1, metavar="N", help="the first of them (default 1)")
 
 
 def measure(options: argparse.Namespace, report: Report) -> None:
-    seeds = options.seeds or (1 if options.quick else 5)
+    first, seeds = options.first_seed, options.seeds or (1 if options.quick else 5)
     names = [trace.name for trace in traces(1)]
     count, milliseconds = decision_ms()
     with ProcessPoolExecutor() as pool:
-        batches = pool.map(job, [(name, seed) for name in names for seed in range(1, seeds + 1)])
+        batches = pool.map(job, [(name, seed) for name in names for seed in range(first, first + seeds)])
         results = [result for batch in batches for result in batch]
-    report.note(f"{seeds} seeds a trace, {len(GRID)} candidates; terms and costs are means over the intervals")
+    report.note(
+        f"seeds {first} to {first + seeds - 1}, {len(GRID)} candidates; terms and costs are means over the intervals"
+    )
     report.note("terms: 1 is 0.5 s of latency, no reliability, a quarter of a core, 8 Mbit/s")
     for profile_name in PROFILES:
         for name in names:

@@ -122,7 +122,14 @@ class ClientDaemon:
             return None
         coder = self.core.coder if self.core.link.encoder is not None else None
         with blamed_on(self.loaded.path, "adaptation"):
-            return Adaptation(section, lambda: [self.core.link], coder=coder, kick=self._kick)
+            return Adaptation(
+                section,
+                lambda: [self.core.link],
+                coder=coder,
+                kick=self._kick,
+                rules=self.bridge.rules.rules,
+                summaries=lambda: self.bridge.summaries.topics,
+            )
 
     def _serve_services(self, endpoint: Endpoint) -> None:
         """Where the file has service rules, an endpoint must know services."""

@@ -19,7 +19,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Final, NamedTuple, Protocol
 
 from sern_core.client import ClientCore
@@ -31,7 +31,14 @@ from sern_core.summaries.grids import UPDATE_TYPE
 from sern_core.summaries.mask import MaskMaker, MaskParams
 from sern_core.summaries.patches import PatchMaker, PatchParams
 from sern_core.summaries.scan import ScanMaker, ScanParams
-from sern_core.summaries.spec import BEST_EFFORT_KEYFRAME_S, SummaryKind, SummaryLevel, SummarySpec, VoxelParams
+from sern_core.summaries.spec import (
+    BEST_EFFORT_KEYFRAME_S,
+    SummaryKind,
+    SummaryLevel,
+    SummaryProfile,
+    SummarySpec,
+    VoxelParams,
+)
 from sern_core.summaries.voxel import thin_cloud
 from sern_core.types import DropReason, Durability, Encoding, PriorityClass, Reliability, TopicName
 from sern_runtime import ros_types
@@ -55,22 +62,6 @@ _log = logging.getLogger(__name__)
 
 Send = Callable[[bytes, int, float], bool]
 """`send(body, stamp_ns, born_s) -> accepted` into one stream."""
-
-
-@dataclass(frozen=True, slots=True)
-class SummaryProfile:
-    """What a summary costs and saves, measured; smoothed over about five messages. Zero until something came."""
-
-    messages: int = 0
-    """Messages summarised."""
-    rate_hz: float = 0.0
-    """Raw messages a second, over the last 20."""
-    raw_bytes: float = 0.0
-    """Size of a raw message."""
-    bytes_ratio: float = 0.0
-    """Size of what is sent for one, as a part of it."""
-    seconds_per_message: float = 0.0
-    """Processor time of making it."""
 
 
 class Job(NamedTuple):
@@ -106,13 +97,18 @@ class TopicSummary:
         *,
         core: ClientCore,
         executor: ThreadPoolExecutor,
+        source: OutChannel,
         maker: PatchMaker | None = None,
     ) -> None:
-        """`channels` and `sends` are the streams that `work` names by index; the last one is the summary's own."""
+        """`channels` and `sends` are the streams that `work` names by index; the last one is the summary's own.
+        `source` is that of raw messages."""
         self.topic = topic
         """The topic's local name."""
         self.kind = spec.kind
-        self.level = spec.level
+        self.level = self.level_by_rule = spec.level
+        self.adapt = spec.adapt
+        """Whether the adaptation may choose the level."""
+        self.source = source
         self.profile = SummaryProfile()
         self.undecodable = 0
         self.bytes_in = 0
@@ -177,7 +173,9 @@ class TopicSummary:
         self._offers += 1
         job = Job(body, stamp_ns, now, self.level)
         if self.level is SummaryLevel.RAW:
-            if self._offers % PROBE_EVERY == 0 and self._maker is None:
+            # To be weighed against the raw messages a summary must have been seen.
+            unknown = self.adapt and not self.profile.messages and not self.undecodable
+            if (unknown or self._offers % PROBE_EVERY == 0) and self._maker is None:
                 self._take(job._replace(level=SummaryLevel.SUMMARY, probe=True))
             return not self.shares_topic or self._take(job)
         if self.channel.wanted is False and not self.channel.spec.latched:
@@ -537,6 +535,7 @@ class Summaries:
                     work_of(item, info.encoding, maker),
                     core=core,
                     executor=self._executor,
+                    source=channel,
                     maker=maker,
                 )
             )

@@ -112,9 +112,6 @@ class Sender(ABC):
         """Called when the peer has a message whole: channel, message, now."""
         self.wire_bytes = 0
         """Bytes of numbered datagrams sent so far, second copies and headers included."""
-        self.datagrams = self.pressed = 0
-        """Numbered datagrams sent so far, and those of them behind which more waited for the window: only while there
-        are such is the estimate of the rate that of the path, and not of what was offered."""
         self.strays = 0  # fragments of streams that are unknown here (drop reason `unknown_channel`)
         self.channels: dict[int, OutChannel] = {}
         self.incoming: dict[int, InStream] = {}
@@ -338,8 +335,6 @@ class Sender(ABC):
         estimator.on_sent(now=now, nbytes=nbytes, inflight_bytes=inflight_bytes)
         lane.pacer.sent(now=now, nbytes=nbytes, pacing_bps=estimator.pacing_bps)
         self.wire_bytes += nbytes
-        self.datagrams += 1
-        self.pressed += not app_limited
         lane.ping_due_s = now + PING_INTERVAL_S
         self.dirty = len(self.lanes) > 1 or self._sendable(lane, now)
         if lane.redundant and any(type(item) is SentData and _urgent(item.channel) for item in items):

@@ -4,14 +4,16 @@ import asyncio
 import logging
 import time
 from collections import deque
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterable, Sequence
 from typing import Any, Final
 
 from sern_core.codecs import Coder
 from sern_core.link import Link
 from sern_core.mmcf.adapter import SAMPLES, HopAdapter
+from sern_core.mmcf.levels import Summarised
 from sern_core.mmcf.report import adapter_json, step_json
-from sern_core.types import CLASS_LABELS
+from sern_core.rules import TopicRule
+from sern_core.types import CLASS_LABELS, CLASSES
 from sern_runtime.config.adaptation import AdaptationSection
 from sern_runtime.metrics import Labels, Metrics
 
@@ -32,14 +34,20 @@ class Adaptation:
         *,
         coder: Coder | None,
         kick: Callable[[], None],
+        rules: Iterable[TopicRule] = (),
+        summaries: Callable[[], Sequence[Summarised]] = list,
     ) -> None:
+        """`rules` say of which classes summaries may be chosen, `summaries` are those there are now."""
         encodes = coder is not None
         self._section = section
         self._links = links
         self._coder = coder
         self._kick = kick
         self._params = section.params(encodes=encodes)
-        self._make_policy = section.make_policy(encodes=encodes)
+        self._summaries = summaries
+        classes = {rule.priority for rule in rules if any(spec.adapt for spec in rule.summaries)}
+        self._summarised = tuple(priority for priority in CLASSES if priority in classes)
+        self._make_policy = section.make_policy(encodes=encodes, summarised=self._summarised)
         self._adapters: dict[Link, HopAdapter] = {}
         self._history: dict[Link, deque[dict[str, Any]]] = {}
 
@@ -60,7 +68,9 @@ class Adaptation:
         for link in links:
             adapter = self._adapters.get(link)
             if adapter is None:
-                adapter = HopAdapter(link, self._make_policy(), self._params, coder=self._coder, now=now)
+                adapter = HopAdapter(
+                    link, self._make_policy(), self._params, coder=self._coder, now=now, summaries=self._summaries
+                )
                 self._adapters[link] = adapter
             adapter.sample()
             if step:
@@ -163,6 +173,14 @@ class Adaptation:
         def copies() -> list[tuple[Labels, float]]:
             return [((peer,), float(a.policy.active.redundancy)) for peer, a in self._by_peer()]
 
+        def levels() -> list[tuple[Labels, float]]:
+            return [
+                ((peer, CLASS_LABELS[priority]), float(chosen[priority]))
+                for peer, adapter in self._by_peer()
+                if (chosen := adapter.policy.active.summaries) is not None
+                for priority in self._summarised
+            ]
+
         def switches() -> list[tuple[Labels, float]]:
             return [((peer,), float(a.switches)) for peer, a in self._by_peer()]
 
@@ -180,4 +198,10 @@ class Adaptation:
         gauge("sern_mmcf_queue_limit_messages", "Queue limit of a class, a topic.", ("peer", "class"), limits)
         gauge("sern_mmcf_codec", "1 for the compression mode in force.", ("peer", "mode"), modes)
         gauge("sern_mmcf_redundancy", "1 while class control may be sent twice.", ("peer",), copies)
+        gauge(
+            "sern_mmcf_summarised",
+            "1 while topics of a class that may be are sent as summaries.",
+            ("peer", "class"),
+            levels,
+        )
         metrics.counter("sern_mmcf_switches_total", "Times another configuration was chosen.", ("peer",), switches)

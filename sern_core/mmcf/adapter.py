@@ -2,11 +2,12 @@
 
 The owner calls `sample` about ten times an interval and `step` once an interval. What is applied changes nothing that
 waits or is under way: rates and queue limits act on the next message of a best-effort topic, a codec mode on the next
-body to be encoded, redundancy on the next datagram. Topics that appear are taken in by the next `step`.
+body to be encoded, redundancy on the next datagram, a summary's level on the next message of its topic. Topics that
+appear are taken in by the next `step`.
 """
 
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from math import isfinite
 from typing import Final, NamedTuple
@@ -14,6 +15,7 @@ from typing import Final, NamedTuple
 from sern_core.codecs import LOSSLESS, LOSSY, RAW_PROFILE, CodecProfile, Coder, Compression
 from sern_core.link import Link
 from sern_core.mmcf.cost import Ranges, Weights, cost, measure
+from sern_core.mmcf.levels import Offer, RawProbe, Summarised, apply_levels, chosen, level_of, offers_by_level
 from sern_core.mmcf.model import (
     NO_CODEC,
     NO_LIMIT,
@@ -38,9 +40,6 @@ MEMORY: Final = 3
 """Intervals that demand is told from."""
 FULL: Final = 0.85
 """A link of which such a share was used is called saturated."""
-PRESSED: Final = 0.3
-"""A link behind whose window more waits for such a share of its datagrams is full."""
-MIN_DATAGRAMS: Final = 5
 LOSSY_MODE: Final = "lossy"
 """z: what each topic allows to be lost is (point clouds through Draco, images as JPEG), the others Zstandard."""
 ARRIVAL_CV2: Final = 0.1
@@ -117,10 +116,20 @@ class _ClassCount:
 class HopAdapter:
     """Measures, decides and applies for what goes out over one link.
 
-    `coder` is the encoder of this process, None where bodies are not encoded here.
+    `coder` is the encoder of this process, None where bodies are not encoded here. `summaries` are what the topics'
+    rules make of them, as it is now.
     """
 
-    def __init__(self, link: Link, policy: Policy, params: AdapterParams, *, coder: Coder | None, now: float) -> None:
+    def __init__(
+        self,
+        link: Link,
+        policy: Policy,
+        params: AdapterParams,
+        *,
+        coder: Coder | None,
+        now: float,
+        summaries: Callable[[], Sequence[Summarised]] = list,
+    ) -> None:
         self.link = link
         self.policy = policy
         self.params = params
@@ -129,10 +138,10 @@ class HopAdapter:
         """Cost of the last interval less what was predicted for it."""
         self.switches = 0
         self._coder = coder
+        self._summaries = summaries
+        self._probe = RawProbe(params.interval_s)
         self._since_s = now
         self._wire_bytes = link.wire_bytes
-        self._datagrams, self._pressed = link.datagrams, link.pressed
-        self._believed_bps = params.ranges.bandwidth_max_bps
         self._encode_s = self._coder_s()
         self._topics: dict[TopicName, _TopicStats] = {}
         self._arrived: dict[PriorityClass, _ClassCount] = {priority: _ClassCount() for priority in CLASSES}
@@ -145,6 +154,7 @@ class HopAdapter:
         self.link.on_arrived = None
         for channel in self.link.channels.values():
             channel.adapt(share=1.0, depth_max=channel.spec.depth)
+        apply_levels(self._summaries(), Configuration())
         for lane in self.link.lanes.values():
             lane.copies_wanted = None
 
@@ -171,31 +181,29 @@ class HopAdapter:
         return rtt_s if rtt_s is not None and isfinite(rtt_s) else self.link.lane.flight.rtt.srtt_s or 0.0
 
     def _coder_s(self) -> float:
-        return sum(counters.elapsed_s for counters in self._coder.encoded.values()) if self._coder is not None else 0.0
+        """Processor time of encoding and of making summaries, of all time."""
+        made_s = sum(item.cpu_s for item in self._summaries() if item.adapt)
+        if self._coder is None:
+            return made_s
+        return made_s + sum(counters.elapsed_s for counters in self._coder.encoded.values())
 
     def sample(self) -> None:
         """Read the capacity; about ten times an interval."""
+        self._probe.finish()
         capacity_bps = self._capacity_bps()
         if capacity_bps is not None:
             self._samples.append(capacity_bps)
 
     def _capacity_bps(self) -> float | None:
-        """What the path can carry, as far as anybody knows.
-
-        While the link is pressed, the estimate; else it says what was offered, and counts only where it is above what
-        was last believed. A link that was never pressed can carry what the ranges call a full one.
-        """
+        """What the path can carry, as far as anybody knows: the estimate, and while there was never enough to send to
+        tell it, what the ranges call a full link, or what was carried where that is more."""
         link = self.link
         if link.lane.stalled or not link.established:
             return None
-        datagrams, pressed = link.datagrams - self._datagrams, link.pressed - self._pressed
-        rate_bps = link.lane.estimator.rate_bps
-        if rate_bps is not None:
-            if datagrams >= MIN_DATAGRAMS and pressed >= PRESSED * datagrams:
-                self._believed_bps = rate_bps
-            else:
-                self._believed_bps = max(self._believed_bps, rate_bps)
-        return self._believed_bps
+        estimator = link.lane.estimator
+        if estimator.rate_bps is not None:
+            return estimator.rate_bps
+        return max(self.params.ranges.bandwidth_max_bps, estimator.bound_bps or 0.0)
 
     def _channels(self) -> list[OutChannel]:
         """Those that somebody wants."""
@@ -229,40 +237,46 @@ class HopAdapter:
                 count.encoded_bytes += new.encoded_bytes
         return counts
 
-    def _demands(self, channels: Iterable[OutChannel], elapsed_s: float) -> tuple[ClassDemand, ...]:
-        groups: dict[PriorityClass, list[OutChannel]] = {}
-        for channel in channels:
-            groups.setdefault(channel.spec.priority, []).append(channel)
+    def _offers(self, channels: Iterable[OutChannel]) -> list[Offer]:
+        return [
+            Offer(channel, messages / len(history), nbytes / messages)
+            for channel in channels
+            if (history := self._topics[channel.counters.topic].history)
+            and (messages := sum(part[0] for part in history)) > 0
+            and (nbytes := sum(part[1] for part in history)) >= 0
+        ]
+
+    def _demands(self, offers: Iterable[Offer], elapsed_s: float) -> tuple[ClassDemand, ...]:
+        groups: dict[PriorityClass, list[Offer]] = {}
+        for offer in offers:
+            groups.setdefault(offer.channel.spec.priority, []).append(offer)
         found = []
         for priority in CLASSES:
-            weighed = [
-                (channel, messages / len(history), nbytes / messages)
-                for channel in groups.get(priority, ())
-                if (history := self._topics[channel.counters.topic].history)
-                and (messages := sum(part[0] for part in history)) > 0
-                and (nbytes := sum(part[1] for part in history)) >= 0
-            ]
-            rate = sum(per_interval for _, per_interval, _ in weighed)
+            weighed = groups.get(priority, [])
+            rate = sum(offer.per_interval for offer in weighed)
             if not rate:
                 continue
-            mean_bytes = sum(per_interval * size for _, per_interval, size in weighed) / rate
-            spread = sum(per_interval * (size - mean_bytes) ** 2 for _, per_interval, size in weighed) / rate
+
+            def mean(of: Callable[[Offer], float], weighed: list[Offer] = weighed, rate: float = rate) -> float:
+                return sum(offer.per_interval * of(offer) for offer in weighed) / rate
+
+            mean_bytes = mean(lambda offer: offer.mean_bytes)
+            spread = sum(offer.per_interval * (offer.mean_bytes - mean_bytes) ** 2 for offer in weighed) / rate
             found.append(
                 ClassDemand(
                     priority,
                     rate / elapsed_s,
                     mean_bytes,
-                    sum(per_interval * self._deadline_s(channel) for channel, per_interval, _ in weighed) / rate,
+                    mean(lambda offer: self._deadline_s(offer.channel)),
                     cv2=spread / mean_bytes**2 if mean_bytes > 0.0 else 0.0,
                     arrival_cv2=ARRIVAL_CV2,
                     topics=len(weighed),
-                    depth=max(
-                        1, round(sum(per_interval * _depth(channel) for channel, per_interval, _ in weighed) / rate)
-                    ),
+                    depth=max(1, round(mean(lambda offer: _depth(offer.channel)))),
                     needed=self.params.needed[priority],
-                    thinnable=sum(per_interval for channel, per_interval, _ in weighed if channel.thinnable) / rate,
+                    thinnable=mean(lambda offer: float(offer.channel.thinnable)),
                     protected=priority is PriorityClass.CONTROL and not self.link.lane.lossless,
                     codecs={mode: _class_profile(mode, weighed) for mode in self.params.modes if mode != NO_CODEC},
+                    prepare_s=mean(lambda offer: offer.prepare_s),
                 )
             )
         return tuple(found)
@@ -275,12 +289,17 @@ class HopAdapter:
         elapsed_s = max(now - self._since_s, 1e-3)
         channels = self._channels()
         counts = self._count(channels)
-        demands = self._demands(channels, elapsed_s)
+        self._probe.abort()
+        offers = self._offers(channels)
+        demands = self._demands(offers, elapsed_s)
+        items = chosen(self._summaries())
+        levels = {level: self._demands(offered, elapsed_s) for level, offered in offers_by_level(offers, items)}
         situation = Situation(
-            demands,
+            levels.get(level_of(items), demands),
             LinkState(
                 self._capacity_bps(), self._rtt_s(), link.lane.loss, tuple(self._samples), stream=link.lane.lossless
             ),
+            levels if items else {},
         )
         in_force = self.policy.active
         measurement, terms, value = None, None, None
@@ -295,13 +314,16 @@ class HopAdapter:
             value = cost(params.weights, terms)
         self._measured = measurement
         self._since_s, self._wire_bytes, self._encode_s = now, link.wire_bytes, self._coder_s()
-        self._datagrams, self._pressed = link.datagrams, link.pressed
         self._samples.clear()
         foreseen = self.last.decision.prediction if self.last is not None else None
         self.prediction_error = None if value is None or foreseen is None else value - foreseen.cost
         decision = self.policy.decide(situation, measurement, now=now)
         self.switches += decision.switched
         self.apply(decision.chosen, now=now)
+        if decision.predictions is not None:
+            apply_levels(self._summaries(), decision.chosen)
+            if decision.chosen.summaries is not None:
+                self._probe.start(items, situation.link.capacity_bps, now=now)
         self.last = Step(now, situation, measurement, terms, value, in_force, decision)
         return self.last
 
@@ -365,10 +387,10 @@ def _depth(channel: OutChannel) -> int:
     return channel.spec.depth if channel.thinnable else NO_LIMIT
 
 
-def _class_profile(mode: str, weighed: list[tuple[OutChannel, float, float]]) -> CodecProfile:
+def _class_profile(mode: str, weighed: list[Offer]) -> CodecProfile:
     """By bytes over the topics of a class: what `mode` would make of them."""
     body = encoded = seconds = 0.0
-    for channel, per_interval, size in weighed:
+    for channel, per_interval, size, _ in weighed:
         profile = RAW_PROFILE
         if channel.codec is not None:
             profile = channel.codec.profiles.get(channel_mode(channel, mode), RAW_PROFILE)

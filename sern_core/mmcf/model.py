@@ -1,7 +1,7 @@
 """What the adaptation measures, chooses and reports: plain frozen data, units in the names.
 
 A configuration is the paper's vector c = [r_1..r_q, q_1..q_q, z, h] (eq. (config_vector)): a rate cap and a queue limit
-per priority class, a compression mode, redundancy; and a summary level for topics that have one.
+per priority class, a compression mode, redundancy; and by class whether topics that may be are sent as summaries.
 """
 
 from collections.abc import Mapping
@@ -10,7 +10,7 @@ from typing import Final, NamedTuple
 
 from sern_core.codecs import RAW_PROFILE, CodecProfile
 from sern_core.errors import UsageError
-from sern_core.types import CLASS_LABELS, CLASSES, PriorityClass, TopicName
+from sern_core.types import CLASS_LABELS, CLASSES, PriorityClass
 
 NO_CODEC: Final = "none"
 NO_LIMIT: Final = 1000
@@ -29,7 +29,8 @@ class ClassDemand:
     that must arrive within `deadline_s` for the class to count as reliable: sending less than that counts as
     unreliability. `thinnable` is the share of the messages that a rate cap may drop (best-effort topics). `protected`
     classes are sent `1 + h` times. `repaired`: lost fragments are sent again while the message is wanted. `codecs` by
-    mode; modes that are not named do nothing to this class.
+    mode; modes that are not named do nothing to this class. `prepare_s` is the processor time of making a message
+    (a summary) before anything is thinned or encoded.
     """
 
     priority: PriorityClass
@@ -45,6 +46,7 @@ class ClassDemand:
     protected: bool = False
     repaired: bool = True
     codecs: Mapping[str, CodecProfile] = field(default_factory=dict)
+    prepare_s: float = 0.0
 
     def __post_init__(self) -> None:
         for name, ok in (
@@ -57,6 +59,7 @@ class ClassDemand:
             ("depth", self.depth >= 1),
             ("needed", 0.0 < self.needed <= 1.0),
             ("thinnable", 0.0 <= self.thinnable <= 1.0),
+            ("prepare_s", self.prepare_s >= 0.0),
         ):
             if not ok:
                 raise UsageError(f"ClassDemand: {name} = {getattr(self, name)!r} is out of range")
@@ -92,11 +95,8 @@ class LinkState:
             raise UsageError(f"LinkState: {self!r} is out of range")
 
 
-class SummaryLevel(NamedTuple):
-    """How strongly one topic is reduced to its compact equivalent; 0: not at all."""
-
-    topic: TopicName
-    level: int
+Levels = tuple[bool, ...]
+"""By class (control, state, bulk): whether topics of it that may be are sent as their summaries."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,19 +104,21 @@ class Configuration:
     """The paper's c: `rates` and `queues` by class (control, state, bulk), codec mode z, redundancy h.
 
     A rate is the share of the offered best-effort messages that is sent, in (0, 1]. A queue limit is messages a topic.
+    `summaries` None: not chosen, every topic is as its rule says.
     """
 
     rates: tuple[float, ...] = (1.0, 1.0, 1.0)
     queues: tuple[int, ...] = (1, 1, 1)
     codec: str = NO_CODEC
     redundancy: int = 0
-    summaries: tuple[SummaryLevel, ...] = ()
+    summaries: Levels | None = None
 
     def __post_init__(self) -> None:
         for name, ok in (
             ("rates", len(self.rates) == len(CLASSES) and all(0.0 < rate <= 1.0 for rate in self.rates)),
             ("queues", len(self.queues) == len(CLASSES) and all(limit >= 1 for limit in self.queues)),
             ("redundancy", self.redundancy in (0, 1)),
+            ("summaries", self.summaries is None or len(self.summaries) == len(CLASSES)),
         ):
             if not ok:
                 raise UsageError(f"Configuration: {name} = {getattr(self, name)!r} is out of range")
@@ -125,7 +127,10 @@ class Configuration:
         rates = "/".join(f"{rate:.3g}" for rate in self.rates)
         queues = "/".join(str(limit) for limit in self.queues)
         text = f"r {rates}  q {queues}  z {self.codec}  h {self.redundancy}"
-        return text + "".join(f"  {topic} level {level}" for topic, level in self.summaries if level)
+        if self.summaries is None:
+            return text
+        summarised = [label for label, yes in zip(CLASS_LABELS, self.summaries, strict=True) if yes]
+        return f"{text}  s {'/'.join(summarised) or 'raw'}"
 
 
 class Terms(NamedTuple):
@@ -214,17 +219,25 @@ class Measurement:
 
 @dataclass(frozen=True, slots=True)
 class Situation:
-    """Everything a policy may look at."""
+    """Everything a policy may look at. `levels` is what would be offered with other topics summarised, for every level
+    there is to choose; empty where there is nothing to summarise."""
 
     classes: tuple[ClassDemand, ...]
     link: LinkState
+    levels: Mapping[Levels, tuple[ClassDemand, ...]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        order = [demand.priority for demand in self.classes]
-        if order != sorted(set(order)):
-            raise UsageError(f"Situation: classes must be in order and named once, not {order!r}")
+        for classes in (self.classes, *self.levels.values()):
+            order = [demand.priority for demand in classes]
+            if order != sorted(set(order)):
+                raise UsageError(f"Situation: classes must be in order and named once, not {order!r}")
+
+    def at(self, level: Levels | None) -> tuple[ClassDemand, ...]:
+        """Classes that have traffic at a level, None: as it is now."""
+        classes = self.classes if level is None else self.levels.get(level, self.classes)
+        return tuple(demand for demand in classes if demand.rate_hz > 0.0)
 
     @property
     def present(self) -> tuple[ClassDemand, ...]:
         """Classes that have traffic."""
-        return tuple(demand for demand in self.classes if demand.rate_hz > 0.0)
+        return self.at(None)

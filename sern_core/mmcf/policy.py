@@ -3,6 +3,10 @@
 MMCF takes argmin of the predicted cost over the feasible candidates (the paper's eq. (mmcf_argmin)) every interval,
 with hysteresis: it leaves the active configuration only for one that is clearly cheaper and after it has stood for a
 few intervals, or at once when it has become infeasible.
+
+The cost does not know what a summary leaves out (the paper defines no such term), so raw messages come first: a class
+is summarised only where the cheapest configuration that sends it raw does not bring what is needed of it, and where the
+summary costs less than GAIN_TO_SWITCH of that. Back it goes when raw fits with room to spare, whatever that costs.
 """
 
 from abc import ABC, abstractmethod
@@ -10,6 +14,8 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Final
+
+import numpy as np
 
 from sern_core.errors import UsageError
 from sern_core.mmcf.cost import Ranges, Weights
@@ -22,9 +28,9 @@ from sern_core.mmcf.model import (
     Prediction,
     Situation,
 )
-from sern_core.mmcf.predict import Bounds, Grid, Predictions, Predictor
+from sern_core.mmcf.predict import RAW_FIRST, Bounds, Grid, Predictions, Predictor
 from sern_core.mmcf.residuals import Residuals
-from sern_core.types import PriorityClass
+from sern_core.types import CLASSES, PriorityClass
 
 GAIN_TO_SWITCH: Final = 0.9
 """A new configuration must cost less than this share of the active one."""
@@ -33,6 +39,12 @@ STEADY: Final = 0.25
 """A capacity that changed by more within the interval makes its measurement a mixture nobody can learn from."""
 SWING: Final = 0.35
 """A fall by this share is a drop, not noise."""
+
+RAW_SERVED: Final = 0.9
+"""Of what is needed of a class; raw messages of which so many arrive in time fit."""
+RAW_BACK_SERVED: Final = 0.95
+RAW_BACK_LOAD: Final = 0.8
+"""Before a class that is summarised goes back to raw: of what is needed, and the load of the planned capacity."""
 
 SWINGS: Final = 2
 """So many drops within the memory make a link that swings."""
@@ -238,12 +250,13 @@ class Mmcf(Policy):
         self._stood += 1
         predictor, residuals = self.predictor, self.residuals
         active = predictor.grid.index[self._active]
-        classes = frozenset(demand.priority for demand in situation.present)
+        demands = situation.at(self._active.summaries)
+        classes = frozenset(demand.priority for demand in demands)
         if classes != self._classes:
             self._classes = classes
             residuals.reset()
         elif measurement is not None:
-            residuals.learn_ratios(self._active.codec, situation, measurement)
+            residuals.learn_ratios(self._active.codec, demands, measurement)
             if self._plan.steady:
                 bare = predictor.predict(situation, residuals.ratios)
                 residuals.learn(self._active.codec, bare.prediction(active), measurement)
@@ -259,7 +272,42 @@ class Mmcf(Policy):
             parts.append((share, predictor.corrected(predictor.predict(case, residuals.ratios), factors)))
         return predictor.mixed(parts)
 
+    def _prefer_raw(self, predictions: Predictions, active: int) -> None:
+        """Mark the summaries that raw messages come before. One class at a time, the others' levels being equal."""
+        now_summarised = predictions.configurations[active].summaries or (False,) * len(CLASSES)
+        for level, places in self.predictor.grid.places.items():
+            for priority in CLASSES:
+                if level is None or not level[priority]:
+                    continue
+                raw = self.predictor.grid.places[(*level[:priority], False, *level[priority + 1 :])]
+                allowed = predictions.allowed
+                if not allowed[raw].any():
+                    continue
+                best = int(raw[np.argmin(np.where(allowed[raw], predictions.cost[raw], np.inf))])
+                if now_summarised[priority]:
+                    first = self._stood >= INTERVALS_TO_STAND and self._served(predictions, best, priority, back=True)
+                else:
+                    # Where nothing keeps to the bounds the summary may be the only thing left to do.
+                    costs = np.where(allowed[places], predictions.cost[places], np.inf)
+                    first = self._served(predictions, best, priority, back=False)
+                    first = first or float(costs.min()) >= GAIN_TO_SWITCH * float(predictions.cost[best])
+                if first:
+                    marked = places[predictions.obstacle[places] == 0]
+                    predictions.obstacle[marked] = RAW_FIRST
+                    predictions.excess[marked] = np.inf
+
+    def _served(self, predictions: Predictions, index: int, priority: PriorityClass, *, back: bool) -> bool:
+        """Whether a candidate brings what is needed of a class; `back`: and the link has room to spare."""
+        mine = next((found for found in predictions.classes if found.priority is priority), None)
+        if mine is None or predictions.obstacle[index] != 0:
+            return False
+        load = sum(float(found.load[index]) for found in predictions.classes if not np.isnan(found.load[index]))
+        if back and load > RAW_BACK_LOAD:
+            return False
+        return bool(mine.on_time[index] >= (RAW_BACK_SERVED if back else RAW_SERVED) * mine.needed[index])
+
     def _choose(self, predictions: Predictions, active: int) -> Decision:
+        self._prefer_raw(predictions, active)
         best = predictions.best()
         current_cost, best_cost = float(predictions.cost[active]), float(predictions.cost[best])
         note = "" if (predictions.obstacle == 0).any() else "; nothing is feasible, this is the least bad"

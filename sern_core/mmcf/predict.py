@@ -18,12 +18,14 @@ capacity:
 Where this is more than the textbook: a less urgent class delays a more urgent one by a fragment at most, not by a
 message (W0_i holds whole messages of classes up to i and fragments of the others); queues keep the newest, so that
 a message waits no longer than its queue takes to be overrun; streams that tick are not Poisson, so K and W0 are scaled
-by (c_a² + c_s²)/2 (Allen and Cunneen's correction; 1 for M/M).
+by (c_a² + c_s²)/2 (Allen and Cunneen's correction; 1 for M/M). A level of the summaries has demands of its own; making
+a summary takes time before the rest, and processor time for every offered message.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final
+from itertools import product
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +38,7 @@ from sern_core.mmcf.model import (
     ClassDemand,
     ClassPrediction,
     Configuration,
+    Levels,
     LinkState,
     Prediction,
     Situation,
@@ -57,7 +60,18 @@ REPAIR_S: Final = 0.02
 """Beyond a round trip, until a lost fragment is sent again."""
 MIN_VARIABILITY: Final = 0.25
 MIN_SHARE: Final = 1e-3
-OBSTACLES: Final = ("", "rate below the class's minimum", "control above half the link", "CPU", "more than the link")
+OBSTACLES: Final = (
+    "",
+    "rate below the class's minimum",
+    "control above half the link",
+    "CPU",
+    "more than the link",
+    "nothing to summarise",
+    "raw comes first",
+)
+CLASS_ARRAYS: Final = ("load", "drop", "late", "latency_s", "on_time", "needed", "bandwidth_bps")
+NOTHING_TO_SUMMARISE: Final = 5
+RAW_FIRST: Final = 6
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,14 +90,15 @@ class Bounds:
 
 @dataclass(slots=True)
 class ClassArrays:
-    """Per candidate, for one class."""
+    """Per candidate, for one class; NaN where its level has no such class."""
 
-    demand: ClassDemand
+    priority: PriorityClass
     load: Floats
     drop: Floats
     late: Floats
     latency_s: Floats
     on_time: Floats
+    needed: Floats
     bandwidth_bps: Floats
 
 
@@ -123,7 +138,7 @@ class Predictions:
             Terms(*(float(term[index]) for term in self.terms)),
             tuple(
                 ClassPrediction(
-                    c.demand.priority,
+                    c.priority,
                     float(c.load[index]),
                     float(c.drop[index]),
                     float(c.late[index]),
@@ -132,6 +147,7 @@ class Predictions:
                     float(c.bandwidth_bps[index]),
                 )
                 for c in self.classes
+                if not np.isnan(c.load[index])
             ),
         )
 
@@ -167,6 +183,18 @@ class Grid:
         self.codecs = tuple(dict.fromkeys(c.codec for c in configurations))
         self.codec: NDArray[np.int64] = np.array([self.codecs.index(c.codec) for c in configurations], dtype=np.int64)
         self.redundancy: Floats = np.array([c.redundancy for c in configurations], dtype=np.float64)
+        places: dict[Levels | None, list[int]] = {}
+        for i, configuration in enumerate(self.configurations):
+            places.setdefault(configuration.summaries, []).append(i)
+        self.places: dict[Levels | None, NDArray[np.int64]] = {
+            level: np.array(found, dtype=np.int64) for level, found in places.items()
+        }
+        """Where in the grid each level of the summaries is."""
+        self.parts: dict[Levels | None, Grid] = (
+            dict.fromkeys(places, self)
+            if len(places) == 1
+            else {level: Grid([self.configurations[i] for i in found]) for level, found in places.items()}
+        )
 
     def __len__(self) -> int:
         return len(self.configurations)
@@ -179,13 +207,18 @@ class Grid:
         queues: Sequence[Sequence[int]],
         codecs: Sequence[str],
         redundancy: Sequence[int],
+        summarised: Collection[PriorityClass] = (),
     ) -> "Grid":
-        """Every combination; `rates` and `queues` have one list of choices a class."""
+        """Every combination; `rates` and `queues` have one list of choices a class. `summarised` are the classes that
+        have topics whose rule lets them be sent as summaries; without any, levels are not chosen."""
         if len(rates) != len(CLASSES) or len(queues) != len(CLASSES):
             raise UsageError("Grid.of: one list of choices per class for rates and for queues")
+        choices = [(False, True) if priority in summarised else (False,) for priority in CLASSES]
+        levels: list[Levels | None] = list(product(*choices)) if summarised else [None]
         return cls(
             [
-                Configuration((r0, r1, r2), (q0, q1, q2), codec, copies)
+                Configuration((r0, r1, r2), (q0, q1, q2), codec, copies, level)
+                for level in levels
                 for r0 in rates[0]
                 for r1 in rates[1]
                 for r2 in rates[2]
@@ -220,15 +253,75 @@ class Predictor:
         self, situation: Situation, ratios: Mapping[tuple[PriorityClass, str], float] | None = None
     ) -> Predictions:
         """The bare formulas; `ratios` corrects the compression ratios of (class, mode). Duty: the capacity is known."""
-        grid, link = self.grid, situation.link
-        if link.capacity_bps is None:
+        grid = self.grid
+        if situation.link.capacity_bps is None:
             raise UsageError("Predictor.predict: the capacity is not known")
+        parts = {
+            level: self._predict(part, situation.at(level), situation.link, ratios or {})
+            for level, part in grid.parts.items()
+        }
+        if len(parts) == 1:
+            return next(iter(parts.values()))
+        found = self._joined(parts)
+        for level, places in grid.places.items():
+            if level is not None and any(level) and level not in situation.levels:
+                found.obstacle[places] = NOTHING_TO_SUMMARISE
+                found.excess[places] = np.inf
+        return found
+
+    def _joined(self, parts: Mapping[Levels | None, Predictions]) -> Predictions:
+        """The predictions of all levels in the order of the grid."""
+        grid = self.grid
+
+        def whole(read: Callable[[Predictions], NDArray[Any]]) -> NDArray[Any]:
+            first = read(next(iter(parts.values())))
+            joined = np.empty(len(grid), dtype=first.dtype)
+            for level, part in parts.items():
+                joined[grid.places[level]] = read(part)
+            return joined
+
+        def of_class(priority: PriorityClass, name: str) -> Floats:
+            joined = np.full(len(grid), np.nan)
+            for level, part in parts.items():
+                for mine in part.classes:
+                    if mine.priority is priority:
+                        joined[grid.places[level]] = getattr(mine, name)
+            return joined
+
+        seen = {mine.priority for part in parts.values() for mine in part.classes}
+        return Predictions(
+            grid.configurations,
+            latency_s=whole(lambda part: part.latency_s),
+            unreliability=whole(lambda part: part.unreliability),
+            compute=whole(lambda part: part.compute),
+            bandwidth_bps=whole(lambda part: part.bandwidth_bps),
+            cost=whole(lambda part: part.cost),
+            terms=(
+                whole(lambda part: part.terms[0]),
+                whole(lambda part: part.terms[1]),
+                whole(lambda part: part.terms[2]),
+                whole(lambda part: part.terms[3]),
+            ),
+            obstacle=whole(lambda part: part.obstacle),
+            load=whole(lambda part: part.load),
+            excess=whole(lambda part: part.excess),
+            classes=tuple(ClassArrays(p, *(of_class(p, name) for name in CLASS_ARRAYS)) for p in CLASSES if p in seen),
+        )
+
+    def _predict(
+        self,
+        grid: Grid,
+        demands: Sequence[ClassDemand],
+        link: LinkState,
+        ratios: Mapping[tuple[PriorityClass, str], float],
+    ) -> Predictions:
+        """One level of the summaries."""
+        assert link.capacity_bps is not None
         capacity_bps = max(PLANNED_SHARE * link.capacity_bps, 1.0)
         fragment_s = 8.0 * (DATAGRAM_BYTES + OVERHEAD_BYTES) / capacity_bps
-        demands = situation.present
         omega = class_weights(demand.priority for demand in demands)
         shape = len(grid)
-        parts = [self._service(demand, capacity_bps, link, ratios or {}) for demand in demands]
+        parts = [self._service(grid, demand, capacity_bps, link, ratios) for demand in demands]
         offered_load = sum((part.load for part in parts), np.zeros(shape))
 
         sigma = np.zeros(shape)  # carried by the classes so far
@@ -262,25 +355,25 @@ class Predictor:
             overrun_s = np.minimum(oldest_s - 0.5 * period_s, places * service_s) + fragment_s
             overrun = wait_s >= overrun_s
             wait_s = np.minimum(wait_s, overrun_s)
-            fixed_s = link.rtt_s / 2.0 + part.encode_s
+            fixed_s = link.rtt_s / 2.0 + part.encode_s + demand.prepare_s
             slack_s = demand.deadline_s - fixed_s - service_s
             tail = np.minimum(sigma, 1.0) * np.exp(-np.maximum(slack_s, 0.0) / np.maximum(wait_s, 1e-9))
             late = np.where(overrun, np.clip((oldest_s - slack_s) / period_s, 0.0, 1.0), tail)
             late = np.where(oldest_s + fragment_s <= slack_s, 0.0, late)
             late = np.maximum(late, _too_long(service_s, demand.deadline_s - fixed_s, demand.cv2))
             arrives, repair_s = _arrives(part, link, np.maximum(slack_s - wait_s, 0.0))
-            own_s = np.minimum(
-                wait_s + service_s + link.rtt_s / 2.0 + part.encode_s + repair_s, self.ranges.latency_max_s
-            )
+            own_s = np.minimum(wait_s + service_s + fixed_s + repair_s, self.ranges.latency_max_s)
             on_time = part.kept * (1.0 - drop) * (1.0 - late) * arrives
             own_bps = carried * capacity_bps
             latency_s += omega[demand.priority] * own_s
             unreliability += omega[demand.priority] * np.maximum(0.0, 1.0 - on_time / demand.needed)
             compute += part.rate_hz * (self.serialise_s + (1.0 - drop) * part.encode_s)
+            compute += demand.rate_hz * demand.prepare_s
             bandwidth_bps += own_bps
             if demand.priority is PriorityClass.CONTROL:
                 control_load = part.load
-            classes.append(ClassArrays(demand, part.load, drop, late, own_s, on_time, own_bps))
+            needed = np.full(shape, demand.needed)
+            classes.append(ClassArrays(demand.priority, part.load, drop, late, own_s, on_time, needed, own_bps))
 
         load_max = min(self.bounds.load_max, 1.0) if link.stream else self.bounds.load_max
         excess = np.maximum(control_load - CONTROL_SHARE_MAX, 0.0)
@@ -291,6 +384,7 @@ class Predictor:
         obstacle[control_load > CONTROL_SHARE_MAX] = 2
         obstacle[(grid.rates < np.array(self.bounds.min_rates)).any(axis=1)] = 1
         return self._costed(
+            grid,
             latency_s,
             unreliability,
             compute,
@@ -304,6 +398,7 @@ class Predictor:
     def corrected(self, raw: Predictions, factors: Factors) -> Predictions:
         """The same, multiplied by what experience says."""
         return self._costed(
+            self.grid,
             np.minimum(raw.latency_s * factors.latency, self.ranges.latency_max_s),
             np.minimum(raw.unreliability * factors.unreliability, 1.0),
             raw.compute * factors.compute[self.grid.codec],
@@ -321,12 +416,13 @@ class Predictor:
         first = parts[0][1]
 
         def mean(name: str) -> Floats:
-            total = np.zeros(len(self.grid))
-            for share, part in parts:
-                total += share * getattr(part, name)
-            return total
+            return np.asarray(sum(share * getattr(part, name) for share, part in parts))
+
+        def of_class(number: int, name: str) -> Floats:
+            return np.asarray(sum(share * getattr(part.classes[number], name) for share, part in parts))
 
         return self._costed(
+            self.grid,
             mean("latency_s"),
             mean("unreliability"),
             mean("compute"),
@@ -334,11 +430,15 @@ class Predictor:
             first.obstacle,
             first.excess,
             load=first.load,
-            classes=first.classes,
+            classes=tuple(
+                ClassArrays(mine.priority, *(of_class(number, name) for name in CLASS_ARRAYS))
+                for number, mine in enumerate(first.classes)
+            ),
         )
 
     def _costed(
         self,
+        grid: Grid,
         latency_s: Floats,
         unreliability: Floats,
         compute: Floats,
@@ -360,7 +460,7 @@ class Predictor:
         busy = (obstacle == 0) & (compute > self.bounds.compute_max)
         obstacle = np.where(busy, np.int64(3), obstacle)
         return Predictions(
-            self.grid.configurations,
+            grid.configurations,
             latency_s,
             unreliability,
             compute,
@@ -387,12 +487,12 @@ class Predictor:
 
     def _service(
         self,
+        grid: Grid,
         demand: ClassDemand,
         capacity_bps: float,
         link: LinkState,
         ratios: Mapping[tuple[PriorityClass, str], float],
     ) -> "_Service":
-        grid = self.grid
         profiles = [demand.codec(name) for name in grid.codecs]
         ratio = np.array(
             [

@@ -18,6 +18,9 @@ def configuration_json(configuration: Configuration) -> dict[str, Any]:
         "queues": dict(zip(CLASS_LABELS, configuration.queues, strict=True)),
         "codec": configuration.codec,
         "redundancy": configuration.redundancy,
+        "summaries": None
+        if configuration.summaries is None
+        else dict(zip(CLASS_LABELS, configuration.summaries, strict=True)),
         "text": str(configuration),
     }
 

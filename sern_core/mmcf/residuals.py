@@ -8,12 +8,13 @@ A compression ratio is seen directly when its mode is active: what the profile p
 mode before the queueing formulas are asked, since a wrong size is wrong in all of them.
 """
 
+from collections.abc import Iterable
 from math import exp, log
 from typing import Final
 
 import numpy as np
 
-from sern_core.mmcf.model import Measurement, Prediction, Situation
+from sern_core.mmcf.model import ClassDemand, Measurement, Prediction
 from sern_core.mmcf.predict import Factors
 from sern_core.types import PriorityClass
 
@@ -35,9 +36,9 @@ class Residuals:
     def reset(self) -> None:
         self._logs.clear()
 
-    def learn_ratios(self, mode: str, situation: Situation, measurement: Measurement) -> None:
-        """Compare the profiles' ratios with what the codec did."""
-        for demand in situation.present:
+    def learn_ratios(self, mode: str, demands: Iterable[ClassDemand], measurement: Measurement) -> None:
+        """Compare the profiles' ratios with what the codec did to what was offered."""
+        for demand in demands:
             measured = measurement.ratios.get(demand.priority)
             if measured is None or mode not in demand.codecs:
                 continue

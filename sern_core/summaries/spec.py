@@ -38,6 +38,22 @@ class SummaryLevel(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
+class SummaryProfile:
+    """What a summary costs and saves, measured; smoothed over about five messages. Zero until something came."""
+
+    messages: int = 0
+    """Messages summarised."""
+    rate_hz: float = 0.0
+    """Raw messages a second, over the last 20."""
+    raw_bytes: float = 0.0
+    """Size of a raw message."""
+    bytes_ratio: float = 0.0
+    """Size of what is sent for one, as a part of it."""
+    seconds_per_message: float = 0.0
+    """Processor time of making it."""
+
+
+@dataclass(frozen=True, slots=True)
 class VoxelParams:
     """`fields`: only these beside x, y and z; None: all. `in_place`: under the topic's own name."""
 
@@ -51,13 +67,14 @@ class VoxelParams:
 class SummarySpec:
     """One summary of a topic. `name`: what is put behind the topic's name, or a whole name if it begins with `/`;
     None: its kind's. `priority` None: state for scans and masks, else as the topic. `beside`: the raw topic is sent as
-    well, whatever the level."""
+    well, whatever the level. `adapt`: the adaptation may choose the level."""
 
     params: VoxelParams | ScanParams | MaskParams | PatchParams = field(default_factory=VoxelParams)
     level: SummaryLevel = SummaryLevel.SUMMARY
     name: str | None = None
     priority: PriorityClass | None = None
     beside: bool = False
+    adapt: bool = False
 
     @property
     def kind(self) -> SummaryKind:

@@ -1,6 +1,6 @@
 """The section `adaptation`: what the multi-metric cost function may choose from and what it is to weigh."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import replace
 from typing import Annotated, Literal
 
@@ -11,6 +11,7 @@ from sern_core.mmcf.cost import SUM_TOLERANCE, Ranges, Weights, profile
 from sern_core.mmcf.model import NO_CODEC, Configuration
 from sern_core.mmcf.policy import FixedPolicy, Mmcf, Policy, fixed_reliability, fixed_throughput
 from sern_core.mmcf.predict import Bounds, Grid, Predictor
+from sern_core.types import CLASSES, PriorityClass
 from sern_runtime.config.base import Section, fault
 
 _RANGES = Ranges()
@@ -144,8 +145,9 @@ class FixedSection(Section):
 
 
 class AdaptationSection(Section):
-    """Chooses rates, queue limits, compression and redundancy again every interval by their predicted cost (the paper's
-    multi-metric cost function, eq. (mmcf_argmin)). Without the section nothing is adapted."""
+    """Chooses rates, queue limits, compression, redundancy and, for topics whose summary has `adapt`, raw or summary,
+    again every interval by their predicted cost (the paper's multi-metric cost function, eq. (mmcf_argmin)). Without
+    the section nothing is adapted."""
 
     policy: Literal["mmcf", "fixed_throughput", "fixed_reliability", "fixed"] = "mmcf"
     """`mmcf`: the cheapest configuration by prediction; `fixed_throughput`, `fixed_reliability`: the paper's baselines;
@@ -203,8 +205,8 @@ class AdaptationSection(Section):
             modes=self.codecs if encodes else (NO_CODEC,),
         )
 
-    def make_policy(self, *, encodes: bool) -> Callable[[], Policy]:
-        """A maker of policies, one a link."""
+    def make_policy(self, *, encodes: bool, summarised: Collection[PriorityClass] = ()) -> Callable[[], Policy]:
+        """A maker of policies, one a link. `summarised`: classes of topics whose summaries may be chosen."""
         params = self.params(encodes=encodes)
         bounds = Bounds(self.limits.min_rates.values(), self.limits.compute_max)
         if self.policy == "mmcf":
@@ -214,8 +216,13 @@ class AdaptationSection(Section):
                 queues=(queues.control, queues.state, queues.bulk),
                 codecs=params.modes,
                 redundancy=tuple(int(flag) for flag in self.redundancy),
+                summarised=summarised,
             )
-            initial = Configuration(queues=(max(queues.control), max(queues.state), max(queues.bulk)), codec=NO_CODEC)
+            initial = Configuration(
+                queues=(max(queues.control), max(queues.state), max(queues.bulk)),
+                codec=NO_CODEC,
+                summaries=(False,) * len(CLASSES) if summarised else None,
+            )
             return lambda: Mmcf(grid, weights=params.weights, ranges=params.ranges, bounds=bounds, initial=initial)
         fixed = {
             "fixed_throughput": fixed_throughput(params.modes),

@@ -217,6 +217,8 @@ class TopicSection(Section):
             raise fault("gives two summaries one name; use `as`", "summary")
         if any(spec.name is not None and spec.name.startswith("/") for spec in found) and name_problem(self.match):
             raise fault("`as` is a whole topic name, which needs a plain name in `match`", "summary")
+        if len({spec.adapt for spec in found}) > 1:
+            raise fault("sends all its summaries or none: give every one of them the same `adapt`", "summary")
         if found and self.direction is Direction.RECEIVE:
             raise fault("is made where messages leave; direction is receive", "summary")
         return self

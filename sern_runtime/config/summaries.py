@@ -49,6 +49,9 @@ class SummaryBase(Section):
 class BesideBase(SummaryBase):
     """A summary that is a topic of its own."""
 
+    adapt: bool = False
+    """Let the section `adaptation` choose the level: the messages as they come where the link carries what is needed
+    of them, else the summary. Both topics must be subscribed to at the other side."""
     name: Annotated[SummaryName | None, Field(alias="as")] = None
     """What is put behind the topic's name, or another topic name (with a plain name in `match`); null: `voxel`,
     `scan` or `mask`, such as /points/scan."""
@@ -56,6 +59,12 @@ class BesideBase(SummaryBase):
     """Its urgency; null: `state` for scan and mask, else that of the topic."""
     beside: bool = False
     """Send the topic itself as well."""
+
+    @model_validator(mode="after")
+    def _either(self) -> "BesideBase":
+        if self.adapt and self.beside:
+            raise fault("chooses between the topic and its summary; leave `beside` out", "adapt")
+        return self
 
 
 class BandBase(BesideBase):
@@ -109,7 +118,7 @@ class VoxelSummary(BesideBase):
 
     def spec(self) -> SummarySpec:
         params = VoxelParams(self.voxel_m, self.point, self.fields, self.in_place)
-        return SummarySpec(params, self.level, self.name, self.priority_class(), self.beside)
+        return SummarySpec(params, self.level, self.name, self.priority_class(), self.beside, self.adapt)
 
 
 class ScanSummary(BandBase):
@@ -122,7 +131,7 @@ class ScanSummary(BandBase):
 
     def spec(self) -> SummarySpec:
         params = ScanParams(self.band(), self.beams)
-        return SummarySpec(params, self.level, self.name, self.priority_class(), self.beside)
+        return SummarySpec(params, self.level, self.name, self.priority_class(), self.beside, self.adapt)
 
 
 class MaskSummary(BandBase):
@@ -143,7 +152,7 @@ class MaskSummary(BandBase):
 
     def spec(self) -> SummarySpec:
         params = MaskParams(self.band(), self.size_m, self.resolution_m)
-        return SummarySpec(params, self.level, self.name, self.priority_class(), self.beside)
+        return SummarySpec(params, self.level, self.name, self.priority_class(), self.beside, self.adapt)
 
 
 class PatchesSummary(SummaryBase):

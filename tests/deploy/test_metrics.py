@@ -51,12 +51,14 @@ def metrics(tmp_path_factory: pytest.TempPathFactory) -> dict[str, set[str]]:
             relay = lab.process(lab.relay_file())
             site = lab.process(lab.recorder_file("site", "/robot1/.*"))
             bag = write_bag(directory / "a.bag", {"/text": 20})
-            robot = lab.process(lab.player_file("robot1", bag, play={"rate": 1.0, "loop": True}))
+            adaptation = {"interval_s": 0.2}
+            robot = lab.process(lab.player_file("robot1", bag, play={"rate": 1.0, "loop": True}, adaptation=adaptation))
             for process in (relay, site, robot):
                 await process.ready()
             known = 'sern_link_rtt_seconds{peer="site"}'
             await site.until(lambda: "sern_topic_age_seconds{" in site.get("/metrics")[1], "receives")
             await relay.until(lambda: known in relay.get("/metrics")[1], "knows the link")
+            await robot.until(lambda: "sern_mmcf_predicted_term{" in robot.get("/metrics")[1], "adapts")
             return [process.get("/metrics")[1] for process in (relay, site, robot)]
 
     found: dict[str, set[str]] = {}

@@ -92,6 +92,7 @@ class Bench:
             work or self.work,
             core=self.core,
             executor=self.executor,
+            source=channels[0],
             maker=maker,
         )
         self.made.append(made)

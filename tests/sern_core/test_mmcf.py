@@ -3,6 +3,7 @@
 import itertools
 from dataclasses import replace
 from math import exp
+from random import Random
 
 import numpy as np
 import pytest
@@ -493,3 +494,97 @@ def test_impossible_values_are_refused() -> None:
 
 def test_a_configuration_reads_as_the_papers_vector() -> None:
     assert str(Configuration((1.0, 0.5, 0.25), (1, 1, 3), "zstd", 1)) == "r 1/0.5/0.25  q 1/1/3  z zstd  h 1"
+
+
+# --- summaries --------------------------------------------------------------------------------------------------------
+
+RAW, THIN = (False, False, False), (False, False, True)
+WITH_LEVELS = Grid.of(
+    rates=[(1.0,), (1.0, 0.5), (1.0, 0.6, 0.4, 0.25, 0.1)],
+    queues=[(1,), (1,), (1, 3)],
+    codecs=("none", "lz4", "zstd"),
+    redundancy=(0, 1),
+    summarised=(BULK,),
+)
+
+
+def with_summaries(capacity_bps: float, *, ratio: float = 0.05, prepare_s: float = 0.005) -> Situation:
+    """The clouds of `situation`, or summaries of them."""
+    base = situation(capacity_bps)
+    cloud = base.classes[2]
+    thin = replace(cloud, mean_bytes=ratio * cloud.mean_bytes, prepare_s=prepare_s)
+    return replace(base, levels={RAW: base.classes, THIN: (*base.classes[:2], thin)})
+
+
+def levels_chosen(
+    capacities_bps: list[float], *, grid: Grid = WITH_LEVELS, weights: str = "teleoperation"
+) -> list[bool]:
+    """Whether bulk is summarised, interval by interval."""
+    mmcf = controller(profile(weights), grid=grid)
+    found = []
+    for second, capacity_bps in enumerate(capacities_bps):
+        chosen = mmcf.decide(with_summaries(capacity_bps), None, now=float(second)).chosen
+        assert chosen.summaries is not None
+        found.append(chosen.summaries[BULK])
+    return found
+
+
+def test_a_summary_is_predicted_by_its_size_its_rate_and_what_it_takes_to_make() -> None:
+    predictor = Predictor(WITH_LEVELS, weights=profile("balanced"), ranges=RANGES)
+    asked = with_summaries(4e6, ratio=0.05, prepare_s=0.02)
+    found = predictor.predict(asked)
+    raw = WITH_LEVELS.index[replace(GRID.configurations[0], summaries=RAW)]
+    thin = WITH_LEVELS.index[replace(GRID.configurations[0], summaries=THIN)]
+    plain = Predictor(GRID, weights=profile("balanced"), ranges=RANGES).predict(situation(4e6))
+    assert found.prediction(raw) == plain.prediction(0)
+    assert found.bandwidth_bps[thin] < 0.3 * found.bandwidth_bps[raw]
+    made_s = 10.0 * 0.02
+    assert found.compute[thin] - found.compute[raw] == pytest.approx(made_s, abs=0.01)
+    (mine,) = [part for part in found.prediction(thin).classes if part.priority is BULK]
+    assert mine.latency_s > 0.02
+
+
+def test_a_summary_may_be_of_another_class() -> None:
+    base = situation(4e6)
+    only_clouds = (base.classes[0], base.classes[2])
+    asked = Situation(only_clouds, base.link, {RAW: only_clouds, THIN: base.classes[:2]})
+    found = Predictor(WITH_LEVELS, weights=profile("balanced"), ranges=RANGES).predict(asked)
+    raw = found.prediction(WITH_LEVELS.index[replace(GRID.configurations[0], summaries=RAW)])
+    thin = found.prediction(WITH_LEVELS.index[replace(GRID.configurations[0], summaries=THIN)])
+    assert [part.priority for part in raw.classes] == [CONTROL, BULK]
+    assert [part.priority for part in thin.classes] == [CONTROL, STATE]
+
+
+@pytest.mark.parametrize("weights", ["teleoperation", "mapping"])
+def test_raw_wins_where_it_fits_and_the_summary_where_it_does_not(weights: str) -> None:
+    """Though a summary always costs less bandwidth."""
+    assert not any(levels_chosen([8e6] * 6, weights=weights))
+    assert levels_chosen([0.7e6] * 6, weights=weights)[-1]
+
+
+def test_raw_wins_when_the_summary_saves_next_to_nothing() -> None:
+    mmcf = controller(grid=WITH_LEVELS)
+    for second in range(6):
+        chosen = mmcf.decide(with_summaries(0.7e6, ratio=0.98, prepare_s=0.0), None, now=float(second)).chosen
+        assert chosen.summaries == RAW
+
+
+def test_the_level_follows_the_link_there_and_back() -> None:
+    found = levels_chosen([8e6] * 5 + [0.7e6] * 8 + [8e6] * 12)
+    assert not any(found[:5]) and all(found[7:13]) and not found[-1]
+
+
+def test_the_level_does_not_flap_about_the_limit() -> None:
+    """Whatever the capacity: 10 % of noise changes it no more than once."""
+    random = Random(3)
+    for step in range(12):
+        middle_bps = 0.3e6 * 1.3**step
+        found = levels_chosen([middle_bps * random.uniform(0.9, 1.1) for _ in range(40)])
+        assert sum(a != b for a, b in itertools.pairwise(found)) <= 1, middle_bps
+
+
+def test_without_a_summary_there_is_nothing_to_choose() -> None:
+    mmcf = controller(grid=WITH_LEVELS)
+    decision = mmcf.decide(situation(0.35e6), None, now=0.0)
+    assert decision.chosen.summaries == RAW
+    assert {c.obstacle for c in decision.candidates() if c.configuration.summaries == THIN} == {"nothing to summarise"}

@@ -15,6 +15,7 @@ from sern_core.mmcf.predict import Grid
 from sern_core.mmcf.report import adapter_json, step_json
 from sern_core.params import LinkParams, Redundancy
 from sern_core.queues import OutChannel
+from sern_core.summaries.spec import SummaryLevel, SummaryProfile
 from sern_core.types import DropReason, PriorityClass
 from sern_sim.models import LinkModel, RateStep
 from tests.world import SimClient, World, spec
@@ -59,12 +60,41 @@ class Rig:
         return min(self.steps, key=lambda step: abs(step.now - self.world.network.start_s - at_s))
 
 
+@dataclass
+class Thinned:
+    """A topic whose summary is the first part of it; a `Summarised`."""
+
+    robot: SimClient
+    source: OutChannel
+    channel: OutChannel
+    part: float = 0.1
+    adapt: bool = True
+    level: SummaryLevel = SummaryLevel.RAW
+    level_by_rule: SummaryLevel = SummaryLevel.RAW
+    cpu_s: float = 0.0
+    profile: SummaryProfile = field(default_factory=SummaryProfile)
+    changes: list[tuple[float, SummaryLevel]] = field(default_factory=list)
+
+    def set_level(self, level: SummaryLevel) -> None:
+        self.level = level
+        self.changes.append((self.robot.world.network.elapsed_s, level))
+
+    def offer(self, body: bytes, now: float) -> None:
+        self.profile = SummaryProfile(self.profile.messages + 1, 5.0, len(body), self.part, 0.002)
+        if self.level is SummaryLevel.RAW:
+            self.robot.core.send(self.source, body, 0, now=now)
+        else:
+            self.cpu_s += 0.002
+            self.robot.core.send(self.channel, body[: round(self.part * len(body))], 0, now=now)
+
+
 def rig(
     policy: Policy | None = None,
     model: LinkModel | None = None,
     *,
     lossless: bool = True,
     link: LinkParams | None = None,
+    summaries: list[Thinned] | None = None,
 ) -> Rig:
     world = World(lossless=lossless, compress=True, link=link)
     model = model or LinkModel(rate_bps=4e6, delay_s=0.025)
@@ -72,7 +102,10 @@ def rig(
     site = world.client("site", patterns=["/robot/.*"])
     policy = policy or Mmcf(GRID, weights=WEIGHTS, ranges=Ranges(), initial=Configuration(queues=(10, 10, 10)))
     params = AdapterParams(weights=WEIGHTS, modes=MODES)
-    adapter = HopAdapter(robot.core.link, policy, params, coder=robot.core.coder, now=world.now)
+    items = summaries if summaries is not None else []
+    adapter = HopAdapter(
+        robot.core.link, policy, params, coder=robot.core.coder, now=world.now, summaries=lambda: items
+    )
     found = Rig(world, robot, site, adapter)
     world.network.every(1.0 / SAMPLES, lambda _now: adapter.sample(), node=robot)
     world.network.every(1.0, lambda now: found.steps.append(adapter.step(now=now)), node=robot)
@@ -233,3 +266,85 @@ def test_the_report_has_every_term_the_candidates_and_the_reason() -> None:
     state = adapter_json(r.adapter)
     assert state["policy"] == "mmcf" and state["configuration"]["text"] == str(r.adapter.policy.active)
     assert any(name.startswith("latency/") for name in state["corrections"])
+
+
+LEVELS = Grid.of(
+    rates=[(1.0,), (1.0, 0.5), (1.0, 0.4, 0.1)],
+    queues=[(10,), (1, 10), (1, 10)],
+    codecs=MODES,
+    redundancy=(0, 1),
+    summarised=(BULK,),
+)
+ALL_RAW = (False, False, False)
+
+
+@pytest.mark.parametrize("lossless", [False, True])
+@pytest.mark.parametrize("in_place", [False, True])
+def test_a_cloud_goes_to_its_summary_while_the_link_is_thin_and_comes_back(*, in_place: bool, lossless: bool) -> None:
+    steps = (RateStep(10.0, 0.3e6), RateStep(40.0, 6e6))
+    items: list[Thinned] = []
+    initial = Configuration(queues=(10, 10, 10), summaries=ALL_RAW)
+    policy = Mmcf(LEVELS, weights=WEIGHTS, ranges=Ranges(), initial=initial)
+    model = LinkModel(rate_bps=6e6, delay_s=0.025, rate_steps=steps)
+    r = rig(policy, model, lossless=lossless, summaries=items)
+    pose = r.robot.publish("/robot/pose", spec(CONTROL, lifespan_s=1.0))
+    cloud = r.robot.publish("/robot/points", spec(BULK, depth=4))
+    thin = cloud if in_place else r.robot.publish("/robot/points/thin", spec(BULK, depth=4))
+    item = Thinned(r.robot, cloud, thin)
+    items.append(item)
+    r.feed(pose, 50.0, 120)
+
+    def send(now: float) -> None:
+        if r.world.network.elapsed_s < 75.0:
+            item.offer(TEXT, now)
+
+    r.world.network.after(0.05, lambda _now: r.world.network.every(0.2, send, node=r.robot))
+    r.world.network.every(0.5, lambda _now: r.world.validate())
+    r.world.run(80.0)
+    levels = [step.decision.chosen.summaries for step in r.steps]
+    changed = [(r.steps[i + 1].now, level) for i, (old, level) in enumerate(itertools.pairwise(levels)) if level != old]
+    assert [level for _, level in changed] == [(False, False, True), ALL_RAW]
+    thin_s, back_s = (at_s - r.world.network.start_s for at_s, _ in changed)
+    assert 10.0 < thin_s <= 13.0 and 40.0 < back_s <= 65.0
+    # To see that the link is better a whole one is sent now and then, which takes a tenth of it at most.
+    probes = [at_s for at_s, level in item.changes if level is SummaryLevel.RAW and thin_s < at_s < 40.0]
+    assert 1 <= len(probes) <= 3
+    for topic in {"/robot/points", thin.stream.id.topic}:
+        seqs = r.site.seqs(topic)
+        assert seqs == sorted(set(seqs))
+    for channel in {cloud, thin}:
+        assert channel.counters.offered == channel.counters.delivered + channel.counters.dropped
+    told = step_json(r.at(30.0))
+    assert told["chosen"]["summaries"] == {"control": False, "state": False, "bulk": True}
+    assert "s bulk" in told["chosen"]["text"]
+    r.adapter.close()
+    assert item.level is SummaryLevel.RAW
+
+
+def test_a_topic_of_which_only_the_summary_is_wanted_stays_as_its_rule_says() -> None:
+    items: list[Thinned] = []
+    initial = Configuration(queues=(10, 10, 10), summaries=ALL_RAW)
+    r = rig(Mmcf(LEVELS, weights=WEIGHTS, ranges=Ranges(), initial=initial), summaries=items)
+    cloud, thin = r.robot.publish("/other/points", spec(BULK)), r.robot.publish("/robot/thin", spec(BULK))
+    summary = SummaryLevel.SUMMARY
+    item = Thinned(r.robot, cloud, thin, level=summary, level_by_rule=summary)
+    items.append(item)
+    r.world.network.after(
+        0.05, lambda _now: r.world.network.every(0.2, lambda now: item.offer(TEXT, now), node=r.robot)
+    )
+    r.world.run(8.0)
+    assert item.changes == [] and len(r.site.on("/robot/thin")) > 10
+    assert r.steps[-1].situation.levels == {}
+    assert r.steps[-1].decision.chosen.summaries == ALL_RAW
+
+
+def test_policies_that_choose_no_level_leave_them_alone() -> None:
+    items: list[Thinned] = []
+    r = rig(FixedPolicy(Configuration(), None), summaries=items)
+    cloud, thin = r.robot.publish("/robot/points", spec(BULK)), r.robot.publish("/robot/thin", spec(BULK))
+    summary = SummaryLevel.SUMMARY
+    items.append(Thinned(r.robot, cloud, thin, level=summary, level_by_rule=summary))
+    r.world.network.every(0.2, lambda now: items[0].offer(TEXT, now), node=r.robot)
+    r.world.run(5.0)
+    assert items[0].changes == []
+    assert step_json(r.steps[-1])["chosen"]["summaries"] is None
