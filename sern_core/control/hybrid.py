@@ -31,6 +31,7 @@ from sern_core.control.parts import BaseDelay, Cubic, one_gap
 MIN_EPOCH_S: Final = 0.040
 MIN_EPOCH_SAMPLES: Final = 4
 BASE_WINDOW_S: Final = 10.0
+MAX_DRAIN_S: Final = 1.0
 DRAIN_INTERVAL_S: Final = 5.0
 DRAIN_RTTS: Final = 20.0
 """On long paths draining is rarer: a round trip at 0.6 of the product costs 2 % of twenty."""
@@ -255,7 +256,9 @@ class HybridWindow(CapacityEstimator):
         else:
             self._high_since_s = None
         self._measure_full(sample, queue_s)
-        self._measure_rate(now, receiver_s, cum_bytes, sample.app_limited)
+        # Half a window and no queue: it was not the path that held us back, but our own pacing or a busy processor.
+        idle = queue_s <= self._high_s and 2 * sample.inflight_bytes < self._window
+        self._measure_rate(now, receiver_s, cum_bytes, sample.app_limited or idle)
         if self._epoch_s is None:
             self._epoch_s = now
         elif now >= self._epoch_s + max(MIN_EPOCH_S, self._rtt_s or 0.0) and len(self._samples) >= MIN_EPOCH_SAMPLES:
@@ -529,7 +532,8 @@ class HybridWindow(CapacityEstimator):
         self._saved_window = self._window
         self._window = max(min(self._window, DRAIN_GAIN * self._rate * rtt_s), MIN_WINDOW_FRAGMENTS * self._fragment)
         wait_s = rtt_s + self._queue_s if self._cubic is not None or self._above_epochs else rtt_s
-        self._drain_until_s = now + wait_s + (self._saved_window - self._window) / self._rate
+        # What is too little for a rate must not become a pause without end.
+        self._drain_until_s = now + wait_s + min((self._saved_window - self._window) / self._rate, MAX_DRAIN_S)
 
     def _judge(self, now: float, queue_s: float, rtt_s: float) -> None:
         """We made way for a round trip: whose is the queue?"""

@@ -49,6 +49,9 @@ READER_HISTORY: Final = 1000
 """What DDS may hold until the worker takes it, usually within a millisecond. What overflows there nobody could count,
 so the bound that counts is the inbox behind it."""
 
+RETRY_S: Final = 1.0
+"""A reader that DDS refused is asked for again after so long."""
+
 _log = logging.getLogger(__name__)
 
 
@@ -282,10 +285,7 @@ class DdsEndpoint:
             raise UsageError(f"{name}: no such topic was announced")
         subscription = _Subscription(self, info, names.to_dds(name), sink)
         self._subscriptions.setdefault(name, []).append(subscription)
-        try:
-            subscription.refresh()
-        except ConfigError as error:
-            _log.error("%s is not taken: %s", name, error)
+        self._refresh(subscription)
         return subscription
 
     def advertise(self, info: TopicInfo) -> _Writer:
@@ -319,6 +319,12 @@ class DdsEndpoint:
             subscription.refresh()
         except ConfigError as error:
             self.say_once(f"{subscription.info.name} is not taken: {error}")
+            # Some of what DDS refuses it accepts a moment later: a reader right after the one before it was closed.
+            asyncio.get_running_loop().call_later(RETRY_S, self._refresh_again, subscription)
+
+    def _refresh_again(self, subscription: _Subscription) -> None:
+        if self._joined is not None and subscription in self._subscriptions.get(subscription.info.name, ()):
+            self._refresh(subscription)
 
     def forget(self, subscription: _Subscription) -> None:
         found = self._subscriptions.get(subscription.info.name, [])
