@@ -25,7 +25,8 @@ from typing import Final, NamedTuple, Protocol
 from sern_core.client import ClientCore
 from sern_core.errors import BodyError, UsageError
 from sern_core.message import KAPPA, StreamId, TopicInfo, TopicSpec
-from sern_core.queues import OutChannel, RateCap
+from sern_core.queues import OutChannel
+from sern_core.rate_cap import RateCap
 from sern_core.rules import AUTO, ResolvedTopic, TopicRule
 from sern_core.summaries.grids import UPDATE_TYPE
 from sern_core.summaries.mask import MaskMaker, MaskParams

@@ -38,7 +38,7 @@ def definition_hash(definition: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Announcement:
-    """A stream on a channel of this session. `first`: nothing below this seq will come. `owed`: who must get it.
+    """A stream on a channel of the session. `first`: nothing below this seq will come. `owed`: who must get it.
     `more`: only `owed` counts, and goes on in another part."""
 
     channel: int

@@ -16,8 +16,9 @@ from sern_core.fragments import InStream
 from sern_core.ledger import MAX_TOPICS, ReceiveLedger
 from sern_core.link import Link
 from sern_core.message import Message, StreamId, StreamInfo, TopicInfo, TopicSpec
+from sern_core.out_message import OutMessage
 from sern_core.params import LinkParams, SchedulerParams
-from sern_core.queues import OutChannel, OutMessage
+from sern_core.queues import OutChannel
 from sern_core.replay import LatchedCache
 from sern_core.trace import DecisionTrace, TraceEvent
 from sern_core.types import ClientName, DropReason, ObjectKind, TopicName

@@ -15,6 +15,7 @@ structure (grids, images of still scenes) gains more between 1 and 9.
 """
 
 import sys
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from enum import IntEnum, StrEnum
@@ -298,14 +299,16 @@ class Coder:
         return raw, self.clock() - start_s
 
 
-class Work:
+class Work(ABC):
     """Something that takes long: `run` in any thread, then `done` where the core lives, then the link is polled."""
 
     priority: int = 2
     """The class of the message: lower goes first."""
 
+    @abstractmethod
     def run(self) -> None:
-        raise NotImplementedError
+        """The long part; touches nothing of the core."""
 
+    @abstractmethod
     def done(self, *, now: float) -> None:
-        raise NotImplementedError
+        """Give the result to whoever asked."""

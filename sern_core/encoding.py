@@ -29,7 +29,8 @@ from sern_core.message import Message
 from sern_core.types import PriorityClass
 
 if TYPE_CHECKING:
-    from sern_core.queues import OutChannel, OutMessage
+    from sern_core.out_message import OutMessage
+    from sern_core.queues import OutChannel
 
 PROBE_EVERY: Final = 50
 """One message in so many is encoded in every mode, to know what each makes of the topic."""

@@ -97,7 +97,7 @@ class DropReport:
         self.seq = seq
         self.reason = reason
         self.where = where
-        self.control_seq = 0  # the control message of this session that carries it; 0: none yet
+        self.control_seq = 0  # the control message of the session that carries it; 0: none yet
 
 
 Deliver = Callable[["InStream", Message], None]
@@ -117,10 +117,10 @@ class InStream:
         self.delivered = first - 1
         self.confirmed = first - 1  # what the peer was told (`Hop.confirm`)
         self.unhandled = 0  # the first seq that had its turn and is still being decoded; 0: none
-        self.channel_id: int | None = None  # in this session
+        self.channel_id: int | None = None  # in the session
         self.wanted = True  # what the peer was told
         self.paused = False  # it was not wanted, and the peer has not said yet where it goes on
-        self.pause_seq = 0  # the control message of this session that said so
+        self.pause_seq = 0  # the control message of the session that said so
         self.known = False  # something has had its turn, or an earlier session announced it: a gap is then a gap
         self.reports: list[DropReport] = []  # drops that the peer may not know of yet
         self._seen = 0  # best effort: bit i set when seq delivered-1-i arrived

@@ -37,7 +37,7 @@ class Hop(Sender):
     # --- bytes in -------------------------------------------------------------------------------------------------
 
     def _receive_data(self, lane: Lane, number: int, stamp_us: int, data: bytes, now: float) -> None:
-        """A kind-16 datagram of this session."""
+        """A kind-16 datagram of the session."""
         self._rx_lane = lane
         self._rx_stamp_us = stamp_us
         self._rx_delay = None

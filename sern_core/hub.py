@@ -29,8 +29,9 @@ from sern_core.link import Link
 from sern_core.message import Message, StreamId, StreamInfo
 from sern_core.object_control import apply_object
 from sern_core.objects import ObjectRegistry
+from sern_core.out_message import OutMessage
 from sern_core.params import LinkParams, SchedulerParams
-from sern_core.queues import OutChannel, OutMessage
+from sern_core.queues import OutChannel
 from sern_core.replay import ReplayStore
 from sern_core.routing import RouteChange, RoutingTable
 from sern_core.rules import name_problem

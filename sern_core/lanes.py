@@ -56,7 +56,7 @@ class Lane:
         self.probe_due_s = 0.0
         self.up = False  # it has a transport
         self.proofs = 0  # questions answered since it was opened or had stalled
-        self.answered = False  # at all, in this session
+        self.answered = False  # at all, in the session
         self.ping = False
         self.ping_due_s = 0.0
         self.loss = 0.0

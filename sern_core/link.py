@@ -21,8 +21,9 @@ from sern_core.announce import MAX_STRINGS, Announcement, announcement_parts, de
 from sern_core.errors import RefusedError, UsageError, WireError
 from sern_core.fragments import DropReport, InStream
 from sern_core.message import Message, StreamId, StreamInfo
+from sern_core.out_message import OutMessage
 from sern_core.params import LinkParams, SchedulerParams
-from sern_core.queues import OutChannel, OutMessage
+from sern_core.queues import OutChannel
 from sern_core.session import Session
 from sern_core.trace import DecisionTrace, TraceEvent
 from sern_core.types import CLASS_LABELS, DROP_CODES, DROP_REASONS, ClientName, DropReason, PriorityClass
@@ -113,7 +114,7 @@ class Link(Session):
         """Incoming streams across sessions."""
         self._next_channel = 1
         self._asked: set[str] = set()  # definitions the peer asked for before we had them
-        self._told: set[str] = set()  # definitions the peer has had in this session
+        self._told: set[str] = set()  # definitions the peer has had in the session
         self._needed: set[str] = set()  # definitions we asked the peer for, not here yet
         self._peer_definitions = self._peer_definition_bytes = 0
         self._unheard = 0  # answers since the peer acknowledged the one of number `_unheard_seq`

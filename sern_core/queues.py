@@ -16,108 +16,15 @@ from typing import Final
 from sern_core.encoding import ChannelCodec, Coding
 from sern_core.ledger import SendCounters
 from sern_core.message import Message, StreamInfo
-from sern_core.types import DROP_CODES, DROP_REASONS, DropReason
-
-RATE_CAP_SLACK: Final = 0.25
-"""A sample this fraction of a period early still passes a rate cap, so that jitter does not halve the rate."""
+from sern_core.out_message import OutMessage
+from sern_core.rate_cap import RateCap
+from sern_core.types import DROP_REASONS, DropReason
 
 MESSAGE_OVERHEAD_BYTES: Final = 256
 """What a retained message counts for beside its body, about what its objects take: else the bound of a stream of many
 small ones would not bound memory."""
 
-OnDrop = Callable[["OutMessage", DropReason], None]
-
-
-class OutMessage:
-    """One message on its way over one hop. `ranges` are the parts of the body still to be sent, as [start, end).
-
-    `size` is that of the body as it is now, `offered_bytes` as it was when it came: the counters count that one.
-    """
-
-    __slots__ = (
-        "coding",
-        "counted",
-        "exposed",
-        "fragments_inflight",
-        "generation",
-        "message",
-        "offered_bytes",
-        "ranges",
-        "retain_from_s",
-        "seq",
-        "size",
-        "some_acked",
-        "started",
-    )
-
-    def __init__(self, message: Message) -> None:
-        self.message = message
-        self.seq = message.seq
-        self.size = self.offered_bytes = len(message.body)
-        self.coding = Coding.RAW
-        self.ranges: list[tuple[int, int]] | None = None  # None: untouched, send from 0
-        self.generation = 0  # of the body: acknowledgements of an earlier one no longer count
-        self.exposed = False  # all of it has left here: the peer, or an earlier process there, may have it
-        self.some_acked = False
-        self.fragments_inflight = 0
-        self.started = False
-        self.counted = False  # already accounted as dropped (a tombstone now)
-        self.retain_from_s = message.born_s  # retention counts from here
-
-    @property
-    def unsent_bytes(self) -> int:
-        if self.ranges is None:
-            return self.size
-        return sum(end - start for start, end in self.ranges)
-
-    @property
-    def withheld(self) -> bool:
-        """Whether it waits for its body to be encoded."""
-        return self.coding is Coding.RUNNING or self.coding is Coding.HELD
-
-    @property
-    def has_unsent(self) -> bool:
-        return self.ranges is None or bool(self.ranges)
-
-    def restart(self) -> None:
-        """Forget what was sent: the peer is a new process, or the body is another."""
-        self.ranges = None
-        self.generation += 1
-        self.some_acked = False
-        self.fragments_inflight = 0
-
-    def entomb(self, reason: DropReason) -> None:
-        """Become a tombstone: one byte that says why."""
-        old = self.message
-        self.message = Message(
-            old.stream, old.seq, bytes([DROP_CODES[reason]]), old.stamp_ns, old.born_s, tombstone=DROP_CODES[reason]
-        )
-        self.size = 1
-        self.coding = Coding.DONE
-        self.restart()
-        self.exposed = False
-        self.counted = True
-
-
-class RateCap:
-    """At most `max_rate_hz` samples a second; None: all."""
-
-    __slots__ = ("_next_allowed_s", "max_rate_hz")
-
-    def __init__(self, max_rate_hz: float | None) -> None:
-        self.max_rate_hz = max_rate_hz
-        self._next_allowed_s: float | None = None
-
-    def allows(self, now: float) -> bool:
-        """Whether a sample may pass now; it is taken to pass."""
-        if self.max_rate_hz is None:
-            return True
-        period_s = 1.0 / self.max_rate_hz
-        allowed_s = self._next_allowed_s
-        if allowed_s is not None and now < allowed_s - RATE_CAP_SLACK * period_s:
-            return False
-        self._next_allowed_s = period_s + (now if allowed_s is None or now > allowed_s + period_s else allowed_s)
-        return True
+OnDrop = Callable[[OutMessage, DropReason], None]
 
 
 class OutChannel:
@@ -151,7 +58,7 @@ class OutChannel:
         self._owed_share = 0.0
         self._cap = RateCap(stream.spec.max_rate_hz)
         self.wanted: bool | None = None  # None until the peer has answered
-        self.ready = False  # announced in this session
+        self.ready = False  # announced in the session
         self.gaps: deque[tuple[int, int]] = deque()  # reliable: after this seq, the next that will come
         self.offered = False  # the scheduler knows of a pending message
         self.owed: tuple[str, ...] = ()  # reliable subscribers behind the peer, as it told us
@@ -559,7 +466,7 @@ class OutChannel:
                 else:
                     self._entomb(out, reason)
         if not up:
-            # Nobody to tell in this session: the announcement of the next one starts behind them.
+            # Nobody to tell in the session: the announcement of the next one starts behind them.
             while self.retained and self.retained[0].message.tombstone:
                 out = self.retained.popleft()
                 self.retained_bytes -= out.size

@@ -25,8 +25,9 @@ from sern_core.lanes import (
 )
 from sern_core.ledger import SendCounters, SendLedger
 from sern_core.message import Message, StreamId, StreamInfo, TopicInfo, TopicSpec
+from sern_core.out_message import OutMessage
 from sern_core.params import LinkParams, SchedulerParams
-from sern_core.queues import OutChannel, OutMessage
+from sern_core.queues import OutChannel
 from sern_core.rules import plain_type
 from sern_core.scheduler import Scheduler
 from sern_core.trace import DecisionTrace, TraceEvent
@@ -115,7 +116,7 @@ class Sender(ABC):
         self.strays = 0  # fragments of streams that are unknown here (drop reason `unknown_channel`)
         self.channels: dict[int, OutChannel] = {}
         self.incoming: dict[int, InStream] = {}
-        """Streams of this session by the peer's channel number."""
+        """Streams of the session by the peer's channel number."""
         self.reassembly = Reassembly(max(64 * 2**20, 2 * link.max_message_bytes))
         self.established = False
         self.version = wire.VERSION_MAX

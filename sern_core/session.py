@@ -55,7 +55,7 @@ class Session(Hop):
         self._hello_stamp_us = -1
         self._reset_due_s = -float("inf")
         self._resumed = False
-        self._data_prefix = b""  # how a data datagram of this session begins
+        self._data_prefix = b""  # how a data datagram of the session begins
         super().__init__(
             name=name, boot=boot, peer=peer, link=link, scheduler=scheduler, trace=trace, now=now, lossless=lossless
         )
@@ -104,7 +104,7 @@ class Session(Hop):
         self._end_session(reason, now)
 
     def open_lane(self, *, now: float, lane_id: int = LANE_UDP) -> None:
-        """Another lane has a transport (admitted in this session): ask whether it works, then use it."""
+        """Another lane has a transport (admitted in the session): ask whether it works, then use it."""
         lane = self.lanes[lane_id] = Lane(lane_id, self.params, lossless=False)
         lane.up = True
         lane.new_session(now)
@@ -148,7 +148,7 @@ class Session(Hop):
     def joins(self, join: wire.Envelope, tag: int) -> bool:
         """The relay's end: whether a connection whose name and key were checked belongs to the session there is.
 
-        The name is what admits; boots and tag say that this session is meant, not an earlier one.
+        The name is what admits; boots and tag say that the session is meant, not an earlier one.
         """
         return (
             self.established

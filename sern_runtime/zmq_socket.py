@@ -23,6 +23,7 @@ import asyncio
 import errno
 import ipaddress
 import logging
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from enum import Enum
 from typing import Final, NamedTuple, Protocol, cast
@@ -106,7 +107,7 @@ def _raise_if_alive(socket: "zmq.Socket[bytes]", error: zmq.ZMQError) -> None:
         raise error
 
 
-class DrainedSocket:
+class DrainedSocket(ABC):
     """A socket in the running loop. Subclasses say what a message looks like in `_take`.
 
     All calls on the loop's thread. `close()` once; it closes the socket too (linger 0). `on_writable` is called once
@@ -232,9 +233,9 @@ class DrainedSocket:
             self._blocked = False
             self.on_writable()
 
+    @abstractmethod
     def _take(self, count: int) -> bool:
         """Receive and hand over up to `count` messages. True: there may be more. zmq.Again: all taken."""
-        raise NotImplementedError
 
     def _skip_rest(self, frame: zmq.Frame) -> None:
         """Drop the remaining frames of a message, without which they would pass for a message of their own."""

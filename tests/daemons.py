@@ -45,7 +45,7 @@ def recording(name: str) -> Path:
     """A real recording beside the checkout; skips the test where it is absent."""
     path = Path(__file__).resolve().parents[1] / "../shared/data" / name
     if not path.exists():
-        pytest.skip(f"the recording {name} is not beside this checkout")
+        pytest.skip(f"the recording {name} is not beside this checkout: put it into ../shared/data")
     return path.resolve()
 
 

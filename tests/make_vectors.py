@@ -298,7 +298,7 @@ def valid() -> list[Vector]:
         ),
         _control("first", "nothing below seq 41 will come on channel 3", {"t": "first", "ch": 3, "seq": 41}),
         _control("retract", "the stream on channel 3 is gone", {"t": "retract", "ch": 3}),
-        _control("synced", "all streams of this session are announced", {"t": "synced"}),
+        _control("synced", "all streams of the session are announced", {"t": "synced"}),
         _control("need", "asks for a definition", {"t": "need", "dh": digest}),
         _control("define", "the definition, packed with zlib", {"t": "define", "dh": digest}, DEFINITION),
         _control(

@@ -29,7 +29,8 @@ from sern_core.mmcf.model import (
 )
 from sern_core.mmcf.policy import Decision, Policy
 from sern_core.mmcf.predict import SERIALISE_S
-from sern_core.queues import OutChannel, OutMessage
+from sern_core.out_message import OutMessage
+from sern_core.queues import OutChannel
 from sern_core.types import CLASSES, DropReason, PriorityClass, TopicName
 
 INTERVAL_S: Final = 1.0

@@ -79,4 +79,6 @@ async def test_a_key_file_may_hold_two_keys_as_the_rotation_says(tmp_path: Path)
         key = next(line for line in other if "public_key" in line)
         at = next(index for index, line in enumerate(public) if "public_key" in line)
         (tmp_path / "relay.pub").write_text("\n".join([*public[:at], key, *public[at:]]) + "\n")
-        await lab.end(await lab.connected(config))
+        client = await lab.connected(config)
+        assert client.core.link.established
+        await lab.end(client)

@@ -78,4 +78,5 @@ async def test_the_client(tmp_path: Path, systemd: Systemd) -> None:
         await until(lambda: systemd.status("link down"), "says why it is not connected")
         await lab.relay()
         await until(lambda: systemd.status("link up"), "says that the link is up")
+        assert systemd.count("STOPPING=1") == 0
         await ends(client, systemd)

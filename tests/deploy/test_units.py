@@ -96,7 +96,7 @@ def test_the_template_is_the_client_with_its_name_in_it() -> None:
 def test_systemd_accepts_them(name: str, tmp_path: Path) -> None:
     program = shutil.which("systemd-analyze")
     if program is None:
-        pytest.skip("systemd-analyze is not installed")
+        pytest.skip("systemd-analyze is not installed: apt-get install systemd")
     unit = tmp_path / name.replace("@", "@robot1")
     # It looks whether the program is there: /opt/sern is only on hosts where SERN is installed.
     unit.write_text(re.sub(r"/opt/sern/bin/\S+", "/bin/true", (UNITS / name).read_text()))

@@ -44,6 +44,7 @@ def checked(data: bytes) -> None:
 @STEADY
 @given(st.binary(max_size=200))
 def test_any_bytes(data: bytes) -> None:
+    checked(data)
     try:
         parse_document(data, file="f.yaml")
     except ConfigError as error:

@@ -62,7 +62,7 @@ class Networks:
 @pytest.fixture
 def networks() -> Iterator[Networks]:
     if os.geteuid() != 0 or shutil.which("ip") is None:
-        pytest.skip("network namespaces need root and the ip command")
+        pytest.skip("network namespaces need root and the ip command (apt-get install iproute2)")
     networks = Networks()
     try:
         try:

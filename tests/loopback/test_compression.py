@@ -195,8 +195,9 @@ async def test_work_that_ends_after_the_pool_is_forgotten() -> None:
     pool = CodecPool(after=lambda: None)
     pool.take(Job(0, done))
     pool.close()
-    await asyncio.sleep(0)
-    await asyncio.sleep(0)
+    turned = asyncio.Event()
+    asyncio.get_running_loop().call_soon_threadsafe(turned.set)  # behind whatever the pool's threads have asked for
+    await turned.wait()
     assert done == []
 
 

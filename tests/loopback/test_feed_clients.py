@@ -1,6 +1,5 @@
 """The feed in front of real clients: plain ZeroMQ programs see what a robot sends, and drive it."""
 
-import asyncio
 import struct
 import time
 from collections.abc import Iterator
@@ -149,11 +148,15 @@ async def test_a_program_without_sern_code_sees_odometry_and_drives(tmp_path: Pa
         def driven() -> bool:
             return bool(abs(endpoint_of(robot, SyntheticEndpoint).state().pose.x_m - start_x_m) > 0.2)
 
-        while not driven() and count < 1_000:
+        def drive() -> bool:
+            nonlocal count
+            if driven():
+                return True
             send(publisher, CMD, go)
             count += 1
-            await asyncio.sleep(0.02)
-        assert driven()
+            return False
+
+        await until(drive, "the robot moves")
         owner = ClientName("feed_unity")
         assert relay.hub.routing.owners(CMD) == (owner,)
         await until(lambda: counters(relay).injected == count, "all have come in")

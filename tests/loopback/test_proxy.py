@@ -187,6 +187,7 @@ async def test_a_receiver_that_does_not_read_stops_its_sender_and_no_other() -> 
             blocked.write(b"x" * 30_000_000)
             writer.write(b"y" * 300_000)
             await until(lambda: len(peer.received) == 300_000)
+            assert deaf.received == b""
             writer.close()
             blocked.transport.abort()
 

@@ -154,6 +154,7 @@ async def test_what_a_stranger_sends_before_the_handshake_hurts_nobody(
                 connection.sendall(data)
             await world.refused("handshake")
             await world.go_on()
+            assert "Traceback" not in caplog.text
         finally:
             for connection in connections:
                 connection.close()

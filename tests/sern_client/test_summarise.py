@@ -24,7 +24,8 @@ from sern_core.client import ClientCore
 from sern_core.errors import BodyError
 from sern_core.message import TopicInfo, TopicSpec
 from sern_core.params import LinkParams, SchedulerParams
-from sern_core.queues import OutChannel, RateCap
+from sern_core.queues import OutChannel
+from sern_core.rate_cap import RateCap
 from sern_core.summaries.patches import PatchMaker, PatchParams
 from sern_core.summaries.spec import SummaryLevel, SummarySpec, VoxelParams
 from sern_core.types import ClientName, DropReason, Durability, Encoding, Reliability, TopicName

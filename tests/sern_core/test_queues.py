@@ -9,7 +9,8 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, pr
 
 from sern_core.ledger import SendLedger
 from sern_core.message import Message, StreamId, StreamInfo, TopicInfo, TopicSpec
-from sern_core.queues import OutChannel, OutMessage
+from sern_core.out_message import OutMessage
+from sern_core.queues import OutChannel
 from sern_core.types import ClientName, DropReason, Encoding, TopicName
 from tests.world import spec
 

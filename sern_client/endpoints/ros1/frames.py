@@ -8,6 +8,7 @@ own size, which the socket fills directly.
 import asyncio
 import socket
 import struct
+from abc import ABC, abstractmethod
 from typing import Final, cast
 
 from sern_client.endpoints.ros1.header import MAX_HEADER_BYTES, decode_header
@@ -22,7 +23,7 @@ _scratch: Final = memoryview(bytearray(SCRATCH_BYTES))
 _skipped: Final = memoryview(bytearray(SCRATCH_BYTES))
 
 
-class Frames(asyncio.BufferedProtocol):
+class Frames(asyncio.BufferedProtocol, ABC):
     """One connection's receiving half. A subclass says what to do with the header and with each message.
 
     `max_frame_bytes` bounds messages: one that is longer is read and thrown away, and `too_large` is told once it is
@@ -47,21 +48,21 @@ class Frames(asyncio.BufferedProtocol):
 
     # What a subclass does
 
+    @abstractmethod
     def header(self, fields: dict[str, str]) -> None:
         """The peer's header. WireError ends the connection."""
-        raise NotImplementedError
 
+    @abstractmethod
     def message(self, body: bytes) -> None:
         """One message."""
-        raise NotImplementedError
 
+    @abstractmethod
     def too_large(self, size_bytes: int) -> None:
         """A message above the limit is being thrown away."""
-        raise NotImplementedError
 
+    @abstractmethod
     def failed(self, error: WireError) -> None:
         """The peer broke the protocol; the connection ends."""
-        raise NotImplementedError
 
     # asyncio.BufferedProtocol
 

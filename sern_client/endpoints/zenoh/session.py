@@ -72,7 +72,7 @@ def make_config(zenoh: ModuleType, options: SessionOptions) -> Any:
 
 
 class ZenohSession:
-    """`open` once, `close` once. `zid` is what the graph calls this session."""
+    """`open` once, `close` once. `zid` is what the graph calls the session."""
 
     def __init__(self, options: SessionOptions) -> None:
         self.zenoh = load_zenoh()
