@@ -4,8 +4,8 @@ The sender numbers every acknowledgement-eliciting datagram from 1. A packet is 
 acknowledged, or when it is older than max(100 ms, 2 srtt + 30 ms, RTO); on a stream lane (TCP) nothing is lost while
 the connection lasts. A round trip is measured from every acknowledgement that names a newer packet, whether or not
 that packet was given up meanwhile: else a path slower than the first guess would never be measured.
-The receiver's half says what to acknowledge and when: by time, a share of the round trip, so that the estimator sees
-enough of each one and a fast link is not answered at every second datagram; at once on a gap or on class control.
+The receiver's half says what to acknowledge and when: every second datagram, at once on a gap or on class control,
+else within `ACK_DELAY_S`.
 """
 
 from collections.abc import Callable
@@ -22,16 +22,6 @@ STALL_RTTS: Final = 4.0
 FIRST_STALL_S: Final = 3.0
 """No acknowledgement for so long: the path is gone; the last one before any round trip was measured."""
 ACK_DELAY_S: Final = 0.010
-"""The longest that an acknowledgement waits for what might be told with it."""
-ACK_PATIENCE_S: Final = 0.005
-ACK_PATIENCE_RTTS: Final = 0.125
-"""A datagram that arrives so long after the first one that is not acknowledged yet has it done, but at least the second
-and at most the fourth. A share of the round trip: what waits here is missing in the sender's window."""
-ACK_AT_MOST: Final = 4
-ACK_AT_LEAST: Final = 2
-ACK_ALL_UP_TO: Final = 128
-"""Of the first datagrams of a session every second one is acknowledged: the sender is finding the capacity."""
-REORDER_MASK: Final = (1 << REORDER_THRESHOLD) - 1
 SACK_BITS: Final = 64
 SACK_MASK: Final = (1 << SACK_BITS) - 1
 
@@ -149,7 +139,7 @@ class Flight:
 class Arrivals:
     """The receiver's half: which numbers have arrived, and when to say so."""
 
-    __slots__ = ("cum_bytes", "due", "echo_us", "highest", "mask", "patience_s", "received_us", "since_s", "unacked")
+    __slots__ = ("cum_bytes", "due", "echo_us", "highest", "mask", "received_us", "since_s", "unacked")
 
     def __init__(self) -> None:
         self.highest = 0
@@ -160,12 +150,6 @@ class Arrivals:
         self.unacked = 0
         self.due = False
         self.since_s = 0.0
-        self.patience_s = 0.0
-
-    def expect(self, rtt_s: float) -> None:
-        """The path's round trip, as far as this side knows it; before, every second datagram is acknowledged."""
-        patience_s = ACK_PATIENCE_RTTS * rtt_s
-        self.patience_s = patience_s if patience_s < ACK_PATIENCE_S else ACK_PATIENCE_S
 
     def arrived(self, number: int, stamp_us: int, nbytes: int, *, now: float) -> bool:
         """Note one numbered datagram. False: seen before, a duplicate made by the network."""
@@ -192,12 +176,7 @@ class Arrivals:
         if not self.unacked:
             self.since_s = now
         self.unacked += 1
-        if self.unacked >= ACK_AT_LEAST and (
-            now - self.since_s >= self.patience_s
-            or self.unacked >= ACK_AT_MOST
-            or self.highest <= ACK_ALL_UP_TO
-            or self.mask & REORDER_MASK != REORDER_MASK  # the sender waits for these to know what is lost
-        ):
+        if self.unacked >= 2:
             self.due = True
         return True
 

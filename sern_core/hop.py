@@ -108,7 +108,6 @@ class Hop(Sender):
             sent_s, stamp_s, received_s = echo_us * 1e-6, self._rx_stamp_us * 1e-6, received_us * 1e-6
             rtt_s = max(1e-6, now - sent_s - (stamp_s - received_s))
             flight.rtt.sample(rtt_s, now=now)
-            state.arrivals.expect(flight.rtt.srtt_s)
             self.clock.sample(sent_s, received_s, stamp_s, now)
             newest = packets[-1] if packets else None
             state.estimator.on_ack(

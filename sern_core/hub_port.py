@@ -76,9 +76,6 @@ class HubPort:
             return self._out.pop(0)
         return self.link.next_datagram(now=now) if self.link is not None and self.current else None
 
-    def quiet(self) -> bool:
-        return not self._out and self.link is not None and self.current and self.link.quiet()
-
     def next_deadline(self) -> float | None:
         return self.link.next_deadline() if self.link is not None and self.current else None
 

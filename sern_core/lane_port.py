@@ -16,9 +16,6 @@ class LanePort:
     def next_datagram(self, *, now: float) -> bytes | None:
         return self.link.next_datagram(now=now, lane=self.lane)
 
-    def quiet(self) -> bool:
-        return self.link.quiet(self.lane)
-
     def next_deadline(self) -> float | None:
         return self.link.next_deadline(self.lane)
 

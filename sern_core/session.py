@@ -306,20 +306,6 @@ class Session(Hop):
             # Of another session; if that one is the peer's latest, it does not know yet that it is over.
             self._send_reset(header.tag, now)
 
-    def quiet(self, lane: int = LANE_ZMQ) -> bool:
-        """Whether only time, or a datagram that arrives there, can give this lane something to say: data go elsewhere.
-        So most changes need not be asked about there."""
-        state = self.lanes.get(lane)
-        return (
-            state is not None
-            and state is not self.lane
-            and state is not self.express
-            and self.established
-            and not state.arrivals.unacked
-            and not (state.ping or state.stalled or state.copies)
-            and not (lane == LANE_ZMQ and (self._handshake_out or self._hello_due_s is not None))
-        )
-
     def next_deadline(self, lane: int = LANE_ZMQ) -> float | None:
         """When to call `handle_timeout` and `next_datagram` at the latest, if nothing else happens."""
         state = self.lanes.get(lane)

@@ -26,8 +26,6 @@ class Port(Protocol):
 
     def next_datagram(self, *, now: float) -> bytes | None: ...
 
-    def quiet(self) -> bool: ...
-
     def next_deadline(self) -> float | None: ...
 
     def handle_timeout(self, *, now: float) -> None: ...
@@ -37,8 +35,8 @@ class Pump:
     """Sends what `port` has, when it has it, and wakes it at its deadline.
 
     Call `kick` after anything that may have given the port something to send: it costs one flag, and everything that
-    happens before the loop comes round is sent together. A port that is `quiet` is not even asked. `send` answers FULL
-    when the socket cannot take more; it is tried again soon. `on_gone` is called when the peer's connection is over.
+    happens before the loop comes round is sent together. `send` answers FULL when the socket cannot take more; it is
+    tried again soon. `on_gone` is called when the peer's connection is over.
 
     A paced lane (UDP) says with `next_deadline` when its next datagram may leave. The timer wakes at whole
     milliseconds, never early, and what has become due until then leaves as one burst: the core's pacing must grant what
@@ -65,12 +63,11 @@ class Pump:
         self._retry_s = 0.0  # not before then, while something is held
         self._pause_s = FULL_S
         self._closed = False
-        self._settled = False  # the port had nothing more to say, and the timer knows of its deadline
         self.datagrams = 0
         self.bytes = 0
 
     def kick(self) -> None:
-        if self._scheduled is None and not self._closed and not (self._settled and self._port.quiet()):
+        if self._scheduled is None and not self._closed:
             self._scheduled = self._loop.call_soon(self._run)
 
     def run(self) -> None:
@@ -81,7 +78,6 @@ class Pump:
     def reset(self) -> None:
         """The transport is another one: forget what waited for the old one."""
         self._held = None
-        self._settled = False
 
     def close(self) -> None:
         self._closed = True
@@ -100,7 +96,6 @@ class Pump:
             self._scheduled = None
         if self._closed:
             return
-        self._settled = False
         port = self._port
         ready = self._ready
         now = time.monotonic()
@@ -116,7 +111,6 @@ class Pump:
             if datagram is None:
                 datagram = port.next_datagram(now=now)
                 if datagram is None:
-                    self._settled = True
                     break
             result = self._send(datagram)
             if result is SendResult.OK:

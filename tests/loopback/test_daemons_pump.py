@@ -25,9 +25,6 @@ class Port:
         self.given += 1
         return str(self.given).encode()
 
-    def quiet(self) -> bool:
-        return False
-
     def next_deadline(self) -> float | None:
         return 0.0 if self.left else None
 

@@ -30,9 +30,6 @@ class PacedPort:
         self.taken.append(len(self.taken))
         return b"%d" % self.taken[-1]
 
-    def quiet(self) -> bool:
-        return False
-
     def next_deadline(self) -> float | None:
         return self.next_s if len(self.taken) < self.count else None
 

@@ -1,10 +1,9 @@
 """What is in flight, what has arrived, and when either is given up or acknowledged."""
 
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sern_core.flight import ACK_ALL_UP_TO, FIRST_LOSS_TIMEOUT_S, SACK_BITS, Arrivals, Flight
+from sern_core.flight import FIRST_LOSS_TIMEOUT_S, SACK_BITS, Arrivals, Flight
 
 
 def flight(count: int, *, lossless: bool = False, rtt_s: float | None = 0.1) -> Flight:
@@ -96,36 +95,6 @@ def test_acknowledged_at_once_on_a_gap_and_every_second_time_else() -> None:
         (True, 4, 0b110, 40, 300),
         (True, 4, 0b111, 40, 400),
     ]
-
-
-@pytest.mark.parametrize(
-    ("gap_s", "rtt_s", "together"),
-    [(0.0024, 0.050, 4), (0.0006, 0.200, 4), (0.0006, 0.008, 3), (0.0006, 0.001, 2), (0.0100, 0.200, 2)],
-)
-def test_acknowledged_by_a_share_of_the_round_trip(gap_s: float, rtt_s: float, together: int) -> None:
-    arrivals = Arrivals()
-    arrivals.expect(rtt_s)
-    waited = []
-    for number in range(1, ACK_ALL_UP_TO + 60):
-        arrivals.arrived(number, 0, 100, now=number * gap_s)
-        if arrivals.due:
-            waited.append(arrivals.unacked)
-            arrivals.flushed()
-    assert set(waited[: ACK_ALL_UP_TO // 2]) == {2}
-    assert set(waited[ACK_ALL_UP_TO // 2 :]) == {together}
-
-
-def test_acknowledged_every_second_time_behind_a_hole() -> None:
-    arrivals = Arrivals()
-    arrivals.expect(0.2)
-    due = []
-    first = ACK_ALL_UP_TO + 1
-    for number in (*range(1, first), *range(first + 1, first + 8)):
-        arrivals.arrived(number, 0, 100, now=0.0)
-        if arrivals.due:
-            due.append(number)
-            arrivals.flushed()
-    assert [number - first for number in due if number > first] == [1, 3, 7], "at the second it is found lost"
 
 
 def test_a_far_jump_of_numbers_costs_nothing() -> None:
