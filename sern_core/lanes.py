@@ -34,6 +34,10 @@ COPY_DELAY_S: Final = 0.007
 """Losses come in bursts: a copy right behind its original would share its fate. Long enough to leave a short burst,
 short against what a command may be late."""
 COPY_LOSS: Final = 0.005
+"""Above this share of losses class control is sent twice."""
+COPY_PACKETS: Final = 2000
+"""And for so many packets after: at 2 % the share falls below the threshold in lucky moments, and what is lost in them
+would have had no copy."""
 LOSS_GAIN: Final = 0.01
 
 
@@ -63,6 +67,7 @@ class Lane:
         """Share of recent packets that were lost."""
         self.copies: deque[tuple[float, int, bytes]] = deque()
         """Second copies to send: when, of which packet, the datagram."""
+        self._copied_packets = 0  # so many more will have copies
         self.copies_wanted: bool | None = None
         """What the adaptation says of them, where the configuration leaves it open (`auto`); None: the loss decides."""
         self._redundancy = params.redundancy
@@ -108,6 +113,7 @@ class Lane:
         """The fate of packets is known: follow the share of losses, over about the last hundred."""
         self.loss *= (1.0 - LOSS_GAIN) ** (acked + lost)
         self.loss = min(1.0, self.loss + LOSS_GAIN * lost)
+        self._copied_packets = COPY_PACKETS if self.loss > COPY_LOSS else self._copied_packets - acked - lost
 
     @property
     def redundant(self) -> bool:
@@ -116,7 +122,7 @@ class Lane:
             return False
         if self._redundancy is Redundancy.ALWAYS:
             return True
-        return self.loss > COPY_LOSS if self.copies_wanted is None else self.copies_wanted
+        return self._copied_packets > 0 if self.copies_wanted is None else self.copies_wanted
 
     def due_copy(self, now: float) -> bytes | None:
         """A second copy whose time has come and whose packet nobody has acknowledged yet."""

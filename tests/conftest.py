@@ -7,7 +7,6 @@ and sockets are checked once, at the end of the session.
 import asyncio
 import gc
 import threading
-import time
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping
 from pathlib import Path
 
@@ -17,7 +16,7 @@ import zmq
 
 from sern_core.types import ClientName
 from sern_runtime.keys import SecretKey, generate
-from tests.support import DEADLINE_S
+from tests.support import DEADLINE_S, Patience
 
 Context = zmq.Context[zmq.Socket[bytes]]
 
@@ -121,12 +120,12 @@ def nothing_left_behind() -> Iterator[None]:
     probes = (_threads, _children, _sockets)
     before = [probe() for probe in probes]
     yield
-    give_up_s = time.monotonic() + DEADLINE_S
+    patience = Patience()
     while True:
         gc.collect()
         left = [item for probe, old in zip(probes, before, strict=True) for item in probe() - old]
         if not left:
             return
-        if time.monotonic() > give_up_s:
+        if patience.over():
             pytest.fail(f"left behind by the session: {left}")
         threading.Event().wait(0.05)

@@ -12,13 +12,30 @@ from sern_core.types import TopicName
 DEADLINE_S: Final = 20.0
 """Long enough for a busy machine; reached only when something is broken."""
 _POLL_S: Final = 0.002
+_STEP_S: Final = 0.5
+"""The most that the time between two polls counts for."""
+
+
+class Patience:
+    """A deadline in time that this process could use: a machine that stood still for half a minute is no failure."""
+
+    def __init__(self, deadline_s: float = DEADLINE_S) -> None:
+        self.left_s = deadline_s
+        self._at = time.monotonic()
+
+    def over(self) -> bool:
+        """Whether the deadline has passed; to be asked at every poll."""
+        now = time.monotonic()
+        self.left_s -= min(now - self._at, _STEP_S)
+        self._at = now
+        return self.left_s <= 0.0
 
 
 async def until(condition: Callable[[], object], what: str = "", *, deadline_s: float = DEADLINE_S) -> None:
-    """Return once `condition()` is true; fail the test when it is not within `deadline_s`."""
-    give_up_s = time.monotonic() + deadline_s
+    """Return once `condition()` is true; fail the test when it is not within `deadline_s` (see `Patience`)."""
+    patience = Patience(deadline_s)
     while not condition():
-        if time.monotonic() > give_up_s:
+        if patience.over():
             raise AssertionError(f"not within {deadline_s:g} s: {what or condition}")
         await asyncio.sleep(_POLL_S)
 

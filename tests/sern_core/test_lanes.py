@@ -2,7 +2,7 @@
 
 from sern_core.client import ClientCore
 from sern_core.lane_port import LanePort
-from sern_core.lanes import DATAGRAM_BYTES, LANE_UDP, LANE_ZMQ
+from sern_core.lanes import COPY_PACKETS, DATAGRAM_BYTES, LANE_UDP, LANE_ZMQ, Lane
 from sern_core.params import LinkParams, Redundancy
 from sern_core.queues import OutChannel
 from sern_core.types import ClientName, PriorityClass
@@ -166,3 +166,13 @@ def test_no_datagram_is_larger_than_the_lane_takes() -> None:
         world.network.every(0.02 + 0.001 * number, send, node=robot)
     world.run(4.0)
     assert DATAGRAM_BYTES - 60 < max(sizes) <= DATAGRAM_BYTES
+
+
+def test_copies_go_on_through_lucky_moments_and_end_on_a_path_that_loses_nothing() -> None:
+    lane = Lane(LANE_UDP, LinkParams(), lossless=False)
+    seen = [lane.redundant]
+    for acked, lost in ((99, 1), (COPY_PACKETS - 1, 0), (1, 0)):
+        lane.resolved(acked=acked, lost=lost)
+        seen.append(lane.redundant)
+    assert seen == [False, True, True, False]
+    assert lane.loss < 1e-6

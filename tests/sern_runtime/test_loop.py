@@ -12,7 +12,7 @@ import pytest
 import uvloop
 
 from sern_runtime.loop import BlockDetector, Shutdown, Timer, run
-from tests.support import DEADLINE_S, until
+from tests.support import DEADLINE_S, Patience, until
 
 
 class FakeHandle:
@@ -150,8 +150,8 @@ async def test_a_callback_that_blocks_is_reported_with_its_place() -> None:
         hold = threading.Event()
 
         def a_blocking_call() -> None:
-            give_up_s = time.monotonic() + DEADLINE_S
-            while not detector.reports and time.monotonic() < give_up_s:
+            patience = Patience()
+            while not detector.reports and not patience.over():
                 hold.wait(0.01)
 
         a_blocking_call()
