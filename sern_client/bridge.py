@@ -5,10 +5,11 @@ import re
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from math import inf
 from typing import Final
 
 from sern_client.conversion import Converter
-from sern_client.endpoints.base import Endpoint, Publisher, Subscription
+from sern_client.endpoints.base import Endpoint, Publisher, Subscription, publisher_within
 from sern_client.endpoints.composite import CompositeEndpoint
 from sern_client.frames import FramePrefixer, Rewrite
 from sern_client.message_log import MessageLog
@@ -51,7 +52,7 @@ class Incoming:
     """A stream from elsewhere that is published here. `stop` is the body that a lost link makes us publish.
     `publisher` None: it is of use to another stream only."""
 
-    __slots__ = ("lease", "local", "publisher", "rewrite", "stop")
+    __slots__ = ("lease", "local", "publish", "publisher", "rewrite", "stop")
 
     def __init__(
         self,
@@ -63,6 +64,7 @@ class Incoming:
     ) -> None:
         self.local = local
         self.publisher = publisher
+        self.publish = None if publisher is None else publisher_within(publisher)
         self.lease = lease
         self.stop = stop
         self.rewrite = rewrite
@@ -158,11 +160,12 @@ class Bridge:
         if incoming.publisher is not None:
             incoming.publisher.close()
 
-    def _publish(self, incoming: Incoming, body: bytes, stamp_ns: int) -> None:
-        if incoming.publisher is None:
+    def _publish(self, incoming: Incoming, body: bytes, stamp_ns: int, left_s: float = inf) -> None:
+        """`left_s`: how much longer the message is young enough."""
+        if incoming.publish is None:
             return
         try:
-            incoming.publisher.publish(body, stamp_ns)
+            incoming.publish(body, stamp_ns, left_s)
         except Exception:  # noqa: BLE001  (a fault of one topic; the link below must finish what it was doing)
             self.publish_failures += 1
             _log.exception("%s could not be published here", incoming.local)
@@ -316,9 +319,9 @@ class Bridge:
             self.core.subscribe((*patterns, re.escape(topic)), now=time.monotonic())
             self._kick()
 
-    def _show(self, incoming: Incoming, body: bytes, stamp_ns: int) -> None:
-        """Publish what was put together here."""
-        self._publish(incoming, body if incoming.rewrite is None else incoming.rewrite(body), stamp_ns)
+    def _show(self, incoming: Incoming, body: bytes, stamp_ns: int, left_s: float = inf) -> None:
+        """Publish what came, or was put together here."""
+        self._publish(incoming, body if incoming.rewrite is None else incoming.rewrite(body), stamp_ns, left_s)
 
     def stream_closed(self, stream: StreamInfo) -> None:
         self.rebuilds.closed(stream)
@@ -338,7 +341,9 @@ class Bridge:
             return
         age_s = now - message.born_s
         if not self.rebuilds.message(stream, message):
-            self._show(incoming, message.body, message.stamp_ns)
+            lifespan_s = stream.spec.lifespan_s
+            left_s = inf if lifespan_s is None else max(lifespan_s - age_s, 0.0)
+            self._show(incoming, message.body, message.stamp_ns, left_s)
         self.ages.observe(stream.spec.priority, age_s)
         if stream.spec.deadline_s is not None:
             self._check_deadline(stream, now)

@@ -12,6 +12,7 @@ import logging
 import struct
 from collections.abc import Callable
 from dataclasses import replace
+from math import inf
 from typing import Any, Final
 
 from rosbags.interfaces import Nodetype
@@ -26,6 +27,7 @@ from sern_client.endpoints.base import (
     ServiceHandler,
     ServiceInfo,
     ServiceServer,
+    publisher_within,
 )
 from sern_core.errors import ConfigError, ServiceError
 from sern_core.message import TopicInfo
@@ -142,10 +144,14 @@ class _Converting:
         self._owner = owner
         self._info = info
         self._publisher = publisher
+        self._within = publisher_within(publisher)
         self._convert = convert
         self._complained = False
 
     def publish(self, body: bytes, stamp_ns: int) -> None:
+        self.publish_within(body, stamp_ns, inf)
+
+    def publish_within(self, body: bytes, stamp_ns: int, left_s: float) -> None:
         try:
             body = self._convert(body)
         except ConfigError as error:
@@ -154,7 +160,7 @@ class _Converting:
                 self._complained = True
                 _log.error("%s: a message is dropped, and others like it: %s", self._info.name, error)
             return
-        self._publisher.publish(body, stamp_ns)
+        self._within(body, stamp_ns, left_s)
 
     def close(self) -> None:
         self._publisher.close()

@@ -37,6 +37,24 @@ class Publisher(Protocol):
     def close(self) -> None: ...
 
 
+@runtime_checkable
+class AgingPublisher(Protocol):
+    """A `Publisher` that may keep a message back for a moment."""
+
+    def publish_within(self, body: bytes, stamp_ns: int, left_s: float) -> None:
+        """As `publish`, and never later than in `left_s`, when the message is too old."""
+
+
+PublishWithin = Callable[[bytes, int, float], None]
+
+
+def publisher_within(publisher: Publisher) -> PublishWithin:
+    """`publish_within` of any publisher: one that keeps nothing back need not know."""
+    if isinstance(publisher, AgingPublisher):
+        return publisher.publish_within
+    return lambda body, stamp_ns, _left_s: publisher.publish(body, stamp_ns)
+
+
 class Endpoint(Protocol):
     """Life cycle: `start` once, any calls, `stop` once. `stop` flushes files and leaves nothing running.
 

@@ -17,6 +17,7 @@ from sern_client.endpoints.base import (
     Sink,
     Subscription,
     TopicEvents,
+    publisher_within,
 )
 from sern_core.errors import ConfigError, ServiceError, UsageError
 from sern_core.message import TopicInfo
@@ -58,10 +59,15 @@ class _Members:
 class _Publishers:
     def __init__(self, publishers: list[Publisher]) -> None:
         self._publishers = publishers
+        self._within = [publisher_within(publisher) for publisher in publishers]
 
     def publish(self, body: bytes, stamp_ns: int) -> None:
         for publisher in self._publishers:
             publisher.publish(body, stamp_ns)
+
+    def publish_within(self, body: bytes, stamp_ns: int, left_s: float) -> None:
+        for publish in self._within:
+            publish(body, stamp_ns, left_s)
 
     def close(self) -> None:
         for publisher in self._publishers:

@@ -97,7 +97,6 @@ class Ros1Endpoint:
         self._topics: dict[str, Topic] = {}
         self._publications: dict[str, Publication] = {}
         self._limits = Limits(options.queue_messages, options.queue_bytes)
-        self._ended = Ended(self._publications)
         self._events: TopicEvents | None = None
         self._state = SystemState({}, {}, {})
         self._off = False
@@ -105,6 +104,7 @@ class Ros1Endpoint:
         self._master = Master(self.master_uri, self.caller)
         self._host_of_services = ServiceHost(self.caller)
         self._graph = Graph(self._master, self, self._graph_changed, poll_s=1 / options.poll_hz)
+        self._ended = Ended(self._publications, self._graph.poll_now)
         self._services = ServiceWatch(
             self._master, self._graph, self._local, options.max_message_bytes, heed_sern=options.heed_sern
         )
@@ -163,6 +163,11 @@ class Ros1Endpoint:
         """The master answered the last time it was asked."""
         return self._graph.connected
 
+    @property
+    def waited_for(self) -> int:
+        """Topics that we publish whose first messages wait for subscribers."""
+        return sum(not publication.hold.over for publication in self._publications.values())
+
     # Endpoint
 
     def subscribe(self, name: TopicName, sink: Sink) -> Subscription:
@@ -179,15 +184,19 @@ class Ros1Endpoint:
         info = self._complete(info)
         name = self._at_master(info.name)
         publication = self._publications.get(name)
+        if publication is not None and not (publication.handles or publication.goes_on_as(info)):
+            self._ended(publication)
+            publication = None
         if publication is None:
-            publication = self._publications[name] = Publication(name, info, self.caller, self._limits)
+            publication = self._publications[name] = Publication(name, info, self.caller, self._limits, self._ended)
+            self._tell_subscribers(publication)
             self._graph.poll_now()
-        elif (publication.info.type_name, publication.info.type_hash) != (info.type_name, info.type_hash):
+        elif not publication.fits(info):
             raise ConfigError(
                 f"{info.name}: {info.type_name} with md5sum {info.type_hash} is not what is published here already, "
                 f"{publication.info.type_name} with {publication.info.type_hash}"
             )
-        return Handle(publication, self._ended)
+        return Handle(publication)
 
     def interest(self, name: TopicName, wanted: bool) -> None:
         for topic in self._topics.values():
@@ -303,7 +312,15 @@ class Ros1Endpoint:
                 self._set_sources(self._topics[name], [])
             if not self._topics[name].sources:
                 self._topics.pop(name).close()
+        for publication in list(self._publications.values()):
+            self._tell_subscribers(publication)
         self._services.update(state.services)
+
+    def _tell_subscribers(self, publication: Publication) -> None:
+        """Once the master lists us: its subscribers connect now, or have."""
+        name = publication.topic
+        if self.caller in self._state.publishers.get(name, ()):
+            publication.registered(set(self._state.subscribers.get(name, ())) - {self.caller})
 
     def _set_sources(self, topic: Topic, nodes: list[str]) -> None:
         for node in [node for node in topic.sources if node not in nodes]:

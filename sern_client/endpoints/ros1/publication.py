@@ -2,16 +2,20 @@
 
 Every subscriber has a bounded queue of its own: one that does not keep up loses its oldest messages, which is counted,
 and holds up nobody. What several streams of the link have in common by name (/tf_static of two robots) is one topic
-here: `Publication` joins them, and a late subscriber gets the last message of each, static transforms as one.
+here: `Publication` joins them, and a late subscriber gets the last message of each, static transforms as one. Its first
+messages wait for the subscribers that there are (`hold`), also when the far side has ended the topic meanwhile.
 """
 
 import asyncio
 import logging
 from collections import deque
+from collections.abc import Callable, Iterable
+from math import inf
 from typing import TYPE_CHECKING, Final
 
 from sern_client.endpoints.ros1.frames import LENGTH
 from sern_client.endpoints.ros1.header import BRIDGE_FIELD
+from sern_client.endpoints.ros1.hold import Hold
 from sern_client.tf_latch import TfLatch, is_static_tf
 from sern_core.errors import ConfigError
 from sern_core.message import TopicInfo
@@ -74,7 +78,7 @@ class Feed:
                 _log.warning("%s: %s is slower than its messages; the oldest are dropped",
                              self.publication.topic, self.caller)  # fmt: skip
             self.dropped += 1
-            limits.dropped[DropReason.QUEUE_FULL] = limits.dropped.get(DropReason.QUEUE_FULL, 0) + 1
+            limits.drop(DropReason.QUEUE_FULL)
 
     def pause(self) -> None:
         self._paused = True
@@ -87,15 +91,18 @@ class Feed:
             self._write(body, None)
 
     def ended(self) -> None:
-        """The connection is gone."""
+        """The connection is gone, and what waited for it is lost."""
         self._transport = None
+        for _ in self._queue:
+            self.publication.limits.drop(DropReason.DISCONNECTED)
         self._queue.clear()
         self.publication.feeds.discard(self)
 
     def close(self) -> None:
-        """What the transport has got already is still sent: the last of it may be a stop command."""
-        self._queue.clear()
+        """What was published before is still sent: the last of it may be a stop command."""
         if self._transport is not None:
+            while self._queue:
+                self._write(self._queue.popleft(), None)
             self._transport.close()
 
 
@@ -107,11 +114,14 @@ class Limits:
         self.bytes = size_bytes
         self.dropped: dict[DropReason, int] = {}
 
+    def drop(self, why: DropReason) -> None:
+        self.dropped[why] = self.dropped.get(why, 0) + 1
+
 
 class Publication:
-    """One topic that this node publishes. `topic` is its name at the master."""
+    """One topic that this node publishes. `topic` is its name at the master. `over` is called when it has ended."""
 
-    def __init__(self, topic: str, info: TopicInfo, caller: str, limits: Limits) -> None:
+    def __init__(self, topic: str, info: TopicInfo, caller: str, limits: Limits, over: "Ended") -> None:
         self.topic = topic
         self.info = info
         self.type_name = ros_types.ros1_name(info.type_name)
@@ -122,6 +132,18 @@ class Publication:
         self._static = TfLatch(Encoding.ROS1) if is_static_tf(topic, info.type_name) else None
         self._last: dict[Handle, bytes] = {}
         self._unreadable = False
+        self._over = over
+        newest_only = info.reliable is False and not self.latched
+        self.hold = Hold(
+            topic,
+            max_messages=min(info.depth or 1, limits.messages) if newest_only else limits.messages,
+            max_bytes=limits.bytes,
+            overflow=DropReason.SUPERSEDED if newest_only else DropReason.QUEUE_FULL,
+            dropped=limits.drop,
+            done=self._judge,
+        )
+        if self._static is not None:
+            self.hold.close()  # one message says it all, to everybody who comes
         self.answer = {
             "callerid": caller,
             "topic": topic,
@@ -131,6 +153,14 @@ class Publication:
             "latching": "1" if self.latched else "0",
             BRIDGE_FIELD: caller,
         }
+
+    def fits(self, info: TopicInfo) -> bool:
+        """Whether another stream is of the same type."""
+        return (self.info.type_name, self.info.type_hash) == (info.type_name, info.type_hash)
+
+    def goes_on_as(self, info: TopicInfo) -> bool:
+        """Whether a new stream can take the place of those that have ended."""
+        return self.fits(info) and self.latched == (info.latched or self._static is not None)
 
     def refusal(self, fields: dict[str, str]) -> str | None:
         """Why a subscriber with this header cannot be served; None when it can."""
@@ -142,10 +172,15 @@ class Publication:
             )
         return None
 
+    def registered(self, subscribers: Iterable[str]) -> None:
+        """The master lists us as its publisher, and these nodes as its subscribers."""
+        self.hold.registered(subscribers)
+
     def join(self, feed: Feed) -> None:
-        """A new subscriber: it gets what is latched."""
+        """A new subscriber: it gets what is latched, and what was held for it."""
         self.feeds.add(feed)
-        for body in self.kept():
+        held = self.hold.joined(feed.caller)
+        for body in [*(body for body in self.kept() if not any(body is other for other in held)), *held]:
             feed.send(body, None)
 
     def kept(self) -> list[bytes]:
@@ -155,9 +190,10 @@ class Publication:
             return [] if merged is None else [merged]
         return list(self._last.values())
 
-    def publish(self, handle: "Handle", body: bytes) -> None:
+    def publish(self, handle: "Handle", body: bytes, left_s: float = inf) -> None:
         if self.latched:
             self._latch(handle, body)
+        self.hold.keep(body, left_s)
         frame = LENGTH.pack(len(body)) + body if len(body) <= JOIN_BYTES else None
         for feed in self.feeds:
             feed.send(body, frame)
@@ -180,39 +216,53 @@ class Publication:
         self._last.pop(handle, None)
         if self._static is not None:
             self._static.drop(handle)
+        self._judge()
+
+    def _judge(self) -> None:
+        """Without a stream it ends, once the subscribers it has messages for have come or are given up."""
+        if self.handles:
+            return
+        if self.hold.over or not len(self.hold):
+            self._over(self)
+        else:
+            self.hold.hurry()
 
     def close(self) -> None:
+        self.hold.close()
         for feed in list(self.feeds):
             feed.close()
 
 
 class Handle:
-    """The `Publisher` of one stream."""
+    """The `AgingPublisher` of one stream."""
 
-    def __init__(self, publication: Publication, ended: "Ended") -> None:
+    def __init__(self, publication: Publication) -> None:
         self._publication: Publication | None = publication
-        self._ended = ended
         publication.handles.append(self)
 
     def publish(self, body: bytes, stamp_ns: int) -> None:
+        self.publish_within(body, stamp_ns, inf)
+
+    def publish_within(self, body: bytes, stamp_ns: int, left_s: float) -> None:
         del stamp_ns  # TCPROS carries no time beside the message
         if self._publication is not None:
-            self._publication.publish(self, body)
+            self._publication.publish(self, body, left_s)
 
     def close(self) -> None:
         publication, self._publication = self._publication, None
         if publication is not None:
             publication.leave(self)
-            self._ended(publication)
 
 
 class Ended:
-    """Called when a stream of a publication has ended; ends the publication with its last stream."""
+    """Takes a publication that has ended out of the table it is in."""
 
-    def __init__(self, publications: dict[str, Publication]) -> None:
+    def __init__(self, publications: dict[str, Publication], changed: Callable[[], None]) -> None:
         self._publications = publications
+        self._changed = changed
 
     def __call__(self, publication: Publication) -> None:
-        if not publication.handles:
-            self._publications.pop(publication.topic, None)
-            publication.close()
+        if self._publications.get(publication.topic) is publication:
+            del self._publications[publication.topic]
+            self._changed()
+        publication.close()

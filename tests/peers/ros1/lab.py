@@ -25,6 +25,7 @@ PACKAGES: Final = {
     "/usr/bin/rosservice": "python3-rosservice",
     "/usr/bin/rosnode": "python3-rosnode",
     "/usr/lib/rosbag/play": "python3-rosbag",
+    "/usr/lib/rosbag/record": "python3-rosbag",
     "/usr/bin/rosbag": "python3-rosbag",
     "/usr/lib/topic_tools/relay": "topic-tools",
     "/usr/lib/python3/dist-packages/rospy": "python3-rospy",

@@ -1,8 +1,10 @@
 """From one ROS 1 system to another: two masters, a robot's client, the relay and a site's client."""
 
+import asyncio
 import signal
 import subprocess
 import zlib
+from functools import partial
 from pathlib import Path
 from typing import Any
 from xmlrpc.client import ServerProxy
@@ -90,6 +92,32 @@ def _played(bag: Path) -> dict[str, list[int]]:
             if time_ns <= last_ns:
                 found.setdefault(connection.topic, []).append(zlib.crc32(body))
     return found
+
+
+async def test_the_one_message_of_rostopic_pub_reaches_who_listens_at_the_other_master(tmp_path: Path) -> None:
+    need("/usr/bin/rostopic")
+    reliable = [{"match": ".*/sure", "class": "state", "reliability": "reliable"}]
+    async with (
+        RosLab(tmp_path, "robot_ros") as robot_ros,
+        RosLab(tmp_path, "site_ros") as site_ros,
+        Lab(tmp_path, "robot1", "site") as lab,
+    ):
+        await lab.relay()
+        dynamic = {"mode": "dynamic", "allow": ["/(robot1|site)?/?(sure|any)"]}
+        for name, ros, other in (("robot1", robot_ros, "site"), ("site", site_ros, "robot1")):
+            await lab.connected(
+                lab.client_file(name, endpoint(ros), topics=reliable, subscribe=[f"/{other}/.*"], discovery=dynamic)
+            )
+            ros.python("listener", SUBSCRIBER, "listener", f"/{other}/sure", f"/{other}/any")
+            await until(partial(ros.subscribers, f"/{other}/any"), "the listener has subscribed")
+        ways = [(robot_ros, "sure"), (robot_ros, "any"), (site_ros, "sure"), (site_ros, "any")]
+        await asyncio.gather(
+            *(ros.tool("rostopic", "pub", "-1", f"/{topic}", "std_msgs/String", f"my {topic}") for ros, topic in ways)
+        )
+        expected = sorted(f"my {topic}".encode().hex() for topic in ("sure", "any"))
+        for ros in (robot_ros, site_ros):
+            await ros.until_printed("listener", *expected)
+            assert sorted(line["hex"][8:] for line in ros.lines("listener")) == expected
 
 
 async def test_a_late_joiner_gets_the_map_and_commands_come_back_with_a_stop(tmp_path: Path) -> None:

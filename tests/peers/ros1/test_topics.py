@@ -1,5 +1,6 @@
 """Topics to and from real ROS 1 nodes."""
 
+import signal
 import subprocess
 import time
 import zlib
@@ -103,6 +104,28 @@ async def test_publishes_to_rospy_and_the_tools_byte_for_byte(tmp_path: Path) ->
         stream.close()
         latched.close()
         await until(lambda: ros.publishers("/chat") == [], "it is unregistered")
+
+
+async def test_what_is_published_at_once_and_ended_reaches_who_was_there(tmp_path: Path) -> None:
+    """As a far side does that has one message only; its subscribers connect when the master has told them."""
+    need("/usr/lib/rosbag/record")
+    async with RosLab(tmp_path) as ros:
+        endpoint, _ = await ros.started()
+        ros.python("listener", SUBSCRIBER, "listener", "/chat")
+        record = ros.spawn("record", "/usr/lib/rosbag/record", "-O", "chat.bag", "/chat")  # it is of roscpp
+        await until(lambda: len(ros.subscribers("/chat")) == 2, "both have subscribed")
+        for word in ("one", "two", "three"):
+            stream = endpoint.advertise(ros_types.topic_info("/chat", STRING, Encoding.ROS1))
+            stream.publish(text(word), 0)
+            stream.close()
+            await ros.until_printed("listener", text(word).hex())
+            await until(lambda: ros.publishers("/chat") == [], "it is unregistered")
+        record.send_signal(signal.SIGINT)
+        await until(lambda: record.poll() is not None, "the bag is complete")
+        sent = [text(word) for word in ("one", "two", "three")]
+        assert [line["hex"] for line in ros.lines("listener")] == [body.hex() for body in sent]
+        assert bodies(ros.directory / "chat.bag") == {"/chat": sent}
+        assert endpoint.drops == {}
 
 
 async def test_rostopic_hz_sees_the_rate(tmp_path: Path) -> None:

@@ -181,6 +181,7 @@ async def test_late_subscribers_get_the_last_message_of_every_stream(master: Fak
     async with running(master) as (endpoint, _):
         info = replace(STRING, latched=True)
         one, two = endpoint.advertise(info), endpoint.advertise(info)
+        await until(lambda: endpoint.waited_for == 0)  # the master knows no subscriber yet
         one.publish(text("one, old"), 0)
         one.publish(text("one"), 0)
         two.publish(text("two"), 0)
