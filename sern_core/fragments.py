@@ -124,7 +124,7 @@ class InStream:
         self.known = False  # something has had its turn, or an earlier session announced it: a gap is then a gap
         self.reports: list[DropReport] = []  # drops that the peer may not know of yet
         self._seen = 0  # best effort: bit i set when seq delivered-1-i arrived
-        self._partials: dict[int, Partial] = {}
+        self._partials: dict[int, Partial] = {}  # best effort: untouched for longest first
         self._waiting: dict[int, Message] = {}
         self._reassembly = reassembly
         self._deliver = deliver
@@ -188,6 +188,8 @@ class InStream:
             partial = self._partials[seq] = Partial(total)
             if not self.reliable:
                 self._reassembly.holders[self] = None
+        elif not self.reliable and len(self._partials) > 1:
+            self._partials[seq] = self._partials.pop(seq)  # the last to be evicted
         partial.touched_s = now
         partial.add(offset, body)
         if offset == 0:
@@ -228,12 +230,11 @@ class InStream:
 
     def stalest_s(self) -> float:
         """When the half-received message that was untouched for longest got its last fragment; there must be one."""
-        return min(partial.touched_s for partial in self._partials.values())
+        return next(iter(self._partials.values())).touched_s
 
     def evict(self) -> None:
         """Lose the half-received best-effort message that was untouched for longest."""
-        seq = min(self._partials, key=lambda held: self._partials[held].touched_s)
-        self._lose(seq, DropReason.REASSEMBLY)
+        self._lose(next(iter(self._partials)), DropReason.REASSEMBLY)
 
     def _lose(self, seq: int, reason: DropReason) -> None:
         self._on_drop(self, reason, len(self._partials[seq].body), 0)

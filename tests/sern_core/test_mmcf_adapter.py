@@ -278,8 +278,7 @@ LEVELS = Grid.of(
 ALL_RAW = (False, False, False)
 
 
-@pytest.mark.parametrize("lossless", [False, True])
-@pytest.mark.parametrize("in_place", [False, True])
+@pytest.mark.parametrize(("in_place", "lossless"), [(False, False), (True, True)])
 def test_a_cloud_goes_to_its_summary_while_the_link_is_thin_and_comes_back(*, in_place: bool, lossless: bool) -> None:
     steps = (RateStep(10.0, 0.3e6), RateStep(40.0, 6e6))
     items: list[Thinned] = []
