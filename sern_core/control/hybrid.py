@@ -26,7 +26,7 @@ from math import inf
 from typing import Final
 
 from sern_core.capacity import AckSample, CapacityEstimator
-from sern_core.control.parts import BaseDelay, Cubic, one_gap
+from sern_core.control.parts import BaseDelay, Cubic, GreatestRate, LatelyArrived, Swing, Train
 
 MIN_EPOCH_S: Final = 0.040
 MIN_EPOCH_SAMPLES: Final = 4
@@ -38,8 +38,6 @@ DRAIN_RTTS: Final = 20.0
 DRAIN_GAIN: Final = 0.6
 RATE_WINDOW_S: Final = 1.2
 MIN_RATE_SPAN_S: Final = 0.120
-BURST_RATE_SPAN_S: Final = 0.150
-MARK_SPACING_S: Final = 0.020
 TARGET_S: Final = 0.0002
 TARGET_PACKETS: Final = 0.32
 FAST_PACKETS: Final = 2.5
@@ -70,7 +68,6 @@ CALM_SHARE: Final = 0.05
 CALM_NOISE_S: Final = 0.0005
 CALM_PACKET_S: Final = 0.003
 DRAIN_PACING: Final = 0.98
-TRAIN_BYTES: Final = 8 * 1200
 INITIAL_WINDOW_BYTES: Final = 12_600
 MIN_WINDOW_FRAGMENTS: Final = 1.5
 """And the hop commits one fragment beyond the window."""
@@ -78,10 +75,8 @@ MAX_WINDOW_BYTES: Final = 64 * 2**20
 IDLE_S: Final = 2.0
 """What was not used for so long is halved, for the link may have changed; start-up brings it back."""
 STUCK_EPOCHS: Final = 4
-PINNED_S: Final = 2.0
 STUCK_WAIT_S: Final = 1.0
 FLAT_S: Final = 0.003
-STALL_S: Final = 0.1
 LOSS_MEMORY_S: Final = 3.0
 RIVAL_MEMORY_S: Final = 30.0
 COMPETE_MAX_S: Final = 30.0
@@ -107,7 +102,7 @@ class HybridWindow(CapacityEstimator):
         self._rate: float | None = None  # bytes/s, the capacity, or what was offered if there was never more to send
         self._saturated = False  # there was: it is the capacity
         self._peak = 0.0  # bytes/s, the greatest rate of the last minute or so
-        self._rates: deque[tuple[float, float]] = deque()  # (time, bytes/s), the greatest first
+        self._rates = GreatestRate()
         self._pacing: float | None = None  # bytes/s
         self._capped = False  # it keeps below the capacity
         self._calm = False
@@ -139,15 +134,13 @@ class HybridWindow(CapacityEstimator):
         self._span_limited = False
         self._faster_rate: float | None = None  # before the link seemed to get slower
         self._full: tuple[float, int] | None = None  # (time, bytes) at the receiver since which a queue never went
-        self._marks: deque[tuple[float, int]] = deque(maxlen=16)
+        self._arrived = LatelyArrived()
         self._busy_s: float | None = None
         self._high_since_s: float | None = None
         self._hold_until_s = -inf
         self._empty_epochs = 0
         self._above_epochs = 0
-        self._pinned_s: float | None = None  # since when the window is at its least
-        self._pinned_least_s = inf
-        self._pinned_most_s = 0.0
+        self._pinned = Swing()  # of the queue while the window is at its least
         self._recent: deque[float] = deque(maxlen=STUCK_EPOCHS)  # queues of the last epochs
         self._emptied_s = -inf
         self._drain_until_s: float | None = None
@@ -162,9 +155,7 @@ class HybridWindow(CapacityEstimator):
     def _begin_round(self, now: float) -> None:
         self._round_s = now  # packets sent later belong to this round of start-up
         self._round_window = self._window
-        self._train: deque[tuple[float, int]] = deque()
-        self._train_rate = 0.0
-        self._train_bytes = 0
+        self._train = Train()
         self._round_sent_pacing = self._pacing
 
     # --- what it says ---------------------------------------------------------------------------------------------
@@ -240,9 +231,7 @@ class HybridWindow(CapacityEstimator):
             self._busy_s = now  # the pacer may hold back what the window would let go
         self._acked_bytes += sample.acked_bytes
         self._inflight = sample.inflight_bytes
-        marks = self._marks
-        if not marks or receiver_s >= marks[-1][0] + MARK_SPACING_S:
-            marks.append((receiver_s, cum_bytes))
+        self._arrived.note(receiver_s, cum_bytes)
         if self._startup:
             if self._rtt_s is None or rtt_s < self._rtt_s:
                 self._rtt_s = rtt_s
@@ -327,23 +316,7 @@ class HybridWindow(CapacityEstimator):
         return self._drain_until_s is not None or now < self._drained_s + 2 * (self._rtt_s or 0.0) + MIN_RATE_SPAN_S
 
     def _note_rate(self, now: float, rate: float) -> None:
-        rates = self._rates
-        while rates and rates[-1][1] <= rate:
-            rates.pop()
-        rates.append((now, rate))
-        oldest_s = now - max(RATE_WINDOW_S, 3 * (self._rtt_s or 0.0))
-        while rates[0][0] < oldest_s:
-            rates.popleft()
-        self._rate = rates[0][1]
-
-    def _recent_rate(self) -> float | None:
-        """Bytes/s that arrived in the last 150 ms."""
-        marks = self._marks
-        if len(marks) < 2:
-            return None
-        last_s, last_bytes = marks[-1]
-        since = next((mark for mark in reversed(marks) if last_s - mark[0] >= BURST_RATE_SPAN_S), marks[0])
-        return (last_bytes - since[1]) / (last_s - since[0])
+        self._rate = self._rates.note(now, rate, max(RATE_WINDOW_S, 3 * (self._rtt_s or 0.0)))
 
     # --- start-up -------------------------------------------------------------------------------------------------
 
@@ -357,31 +330,19 @@ class HybridWindow(CapacityEstimator):
     def _ramp(self, now: float, receiver_s: float, cum_bytes: int, acked_bytes: int) -> None:
         """One acknowledgement of start-up: the window doubles in a round, and goes where the trains point."""
         train = self._train
-        train.append((receiver_s, cum_bytes))
-        self._train_bytes += acked_bytes
-        while cum_bytes - train[1][1] >= TRAIN_BYTES if len(train) > 2 else False:
-            train.popleft()
-        at_s, nbytes = train[0]
+        if not train.note(receiver_s, cum_bytes, acked_bytes):
+            return
         rtt_s = self._rtt_s or MIN_EPOCH_S
-        if cum_bytes - nbytes < TRAIN_BYTES:
-            return
-        span_s = receiver_s - at_s
-        if span_s > STALL_S and one_gap(train, 0.6 * span_s):
-            train.clear()  # a stream stood still for a lost segment: that says nothing about its rate
-            return
-        rate = (cum_bytes - nbytes) / span_s if span_s > 1e-5 else inf
-        if rate > self._train_rate:
-            self._train_rate = rate
-        seen = self._train_rate * rtt_s
+        seen = train.rate * rtt_s
         pacing = self._round_sent_pacing
-        held = pacing is None or self._train_rate < 0.75 * pacing  # by the bottleneck, not by our own pacing
+        held = pacing is None or train.rate < 0.75 * pacing  # by the bottleneck, not by our own pacing
         if held and self._window > seen + 2 * self._fragment:
             self._end_startup(seen + self._fragment)
             return
-        if self._train_bytes >= self._round_window / 4:
+        if train.nbytes >= self._round_window / 4:
             self._window = max(self._window, min(STARTUP_GAIN * self._round_window, STARTUP_AIM * seen))
             self._window = min(self._window, MAX_WINDOW_BYTES)
-            self._peak = max(self._peak, min(self._train_rate, self._window / rtt_s))
+            self._peak = max(self._peak, min(train.rate, self._window / rtt_s))
             self._pace()
             if held and self._window >= 0.85 * seen:
                 self._end_startup(self._window)
@@ -447,7 +408,7 @@ class HybridWindow(CapacityEstimator):
                 self._judging = True
         elif self._startup:
             if limited and (queue_s > self._high_s / 2 or lost > 0.2):
-                rate = self._recent_rate()
+                rate = self._arrived.rate()
                 self._end_startup(min(self._window, rate * rtt_s) if rate else self._window / 2)
         elif limited:
             if self._cubic is not None:
@@ -456,7 +417,7 @@ class HybridWindow(CapacityEstimator):
                 self._window = min(max(window, MIN_WINDOW_FRAGMENTS * self._fragment), most)
             else:
                 self._steer(now, queue_s, rtt_s)
-            stuck = self._cubic is None and (self._above_epochs >= STUCK_EPOCHS or self._pinned(now, queue_s))
+            stuck = self._cubic is None and (self._above_epochs >= STUCK_EPOCHS or self._is_pinned(now, queue_s))
             stuck = stuck and not self._own(queue_s)
             if stuck and now < self._rival_until_s:
                 self._compete(now, rtt_s + queue_s)
@@ -479,7 +440,7 @@ class HybridWindow(CapacityEstimator):
             self._empty_epochs = 0
             self._above_epochs += 1
             if now >= self._hold_until_s:
-                recent = self._recent_rate() or rate
+                recent = self._arrived.rate() or rate
                 if self._above_epochs >= 2 and self._faster_rate is None:
                     self._forget_rate(now, recent)
                 window = min(window, CUT * min(recent, rate) * rtt_s + self._fragment)
@@ -554,20 +515,14 @@ class HybridWindow(CapacityEstimator):
             else:
                 self._compete(now, rtt_s + queue_s)
 
-    def _pinned(self, now: float, queue_s: float) -> bool:
+    def _is_pinned(self, now: float, queue_s: float) -> bool:
         """Whether the window has long been at its least while the queue swings more than ours can: it is not ours,
         though no empty queue was ever seen to measure it by."""
         if self._window > 2 * self._fragment:
-            self._pinned_s = None
+            self._pinned.since_s = None
             return False
-        if self._pinned_s is None:
-            self._pinned_s = now
-            self._pinned_least_s = self._pinned_most_s = queue_s
-            return False
-        self._pinned_least_s = min(self._pinned_least_s, queue_s)
-        self._pinned_most_s = max(self._pinned_most_s, queue_s)
         swing_s = max(0.010, min(0.100, 2 * self._window / self._peak)) if self._peak else inf
-        return now > self._pinned_s + PINNED_S and self._pinned_most_s - self._pinned_least_s > swing_s
+        return self._pinned.wider(now, queue_s, swing_s)
 
     def _own(self, queue_s: float) -> bool:
         """Whether all that queues may be ours: class 0, which passes the window, what left before the window was cut,
@@ -579,7 +534,7 @@ class HybridWindow(CapacityEstimator):
 
     def _compete(self, now: float, rtt_s: float) -> None:
         self._faster_rate = None
-        window = max(self._window, self._calm_window, (self._recent_rate() or 0.0) * rtt_s)
+        window = max(self._window, self._calm_window, (self._arrived.rate() or 0.0) * rtt_s)
         self._cubic = Cubic(now, window, self._fragment)
         self._window = window
         self._above_epochs = 0
@@ -601,7 +556,7 @@ class HybridWindow(CapacityEstimator):
     def _emergency(self, now: float, queue_s: float) -> None:
         """The queue is far too long: the link got slower."""
         rtt_s = self._rtt_s
-        rate = self._recent_rate()
+        rate = self._arrived.rate()
         if rtt_s is None or rate is None:
             return
         self._forget_rate(now, rate)

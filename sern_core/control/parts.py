@@ -1,18 +1,20 @@
-"""Parts of the window estimator: the delay of the empty path, and CUBIC's window for company that keeps a queue."""
+"""Parts of the window estimator: the delay of the empty path, rates over sliding windows, the swing of a queue, and
+CUBIC's window for company that keeps a queue."""
 
 from collections import deque
-from collections.abc import Iterable
 from itertools import pairwise
+from math import inf
 from typing import Final
 
 CUBIC_C: Final = 0.4
 CUBIC_BETA: Final = 0.7
 CUBIC_RENO: Final = 3 * (1 - CUBIC_BETA) / (1 + CUBIC_BETA)
-
-
-def one_gap(train: Iterable[tuple[float, int]], gap_s: float) -> bool:
-    """Whether two packets of a train are further apart than `gap_s`."""
-    return any(later - earlier > gap_s for (earlier, _), (later, _) in pairwise(train))
+BURST_RATE_SPAN_S: Final = 0.150
+MARK_SPACING_S: Final = 0.020
+MAX_MARKS: Final = 16
+SWING_AFTER_S: Final = 2.0
+TRAIN_BYTES: Final = 8 * 1200
+STALL_S: Final = 0.1
 
 
 class BaseDelay:
@@ -46,6 +48,99 @@ class BaseDelay:
         self.least = deque([(at_s, least_s + delay_s) for at_s, least_s in self.least])
         if self.before_s is not None:
             self.before_s += delay_s
+
+
+class GreatestRate:
+    """The greatest rate, in bytes/s, of those noted in a sliding window."""
+
+    __slots__ = ("_rates",)
+
+    def __init__(self) -> None:
+        self._rates: deque[tuple[float, float]] = deque()  # (time, bytes/s), the greatest first
+
+    def note(self, now: float, rate: float, window_s: float) -> float:
+        rates = self._rates
+        while rates and rates[-1][1] <= rate:
+            rates.pop()
+        rates.append((now, rate))
+        while rates[0][0] < now - window_s:
+            rates.popleft()
+        return rates[0][1]
+
+    def clear(self) -> None:
+        self._rates.clear()
+
+
+class LatelyArrived:
+    """Bytes by the receiver's clock, noted every 20 ms, for the rate of a moment."""
+
+    __slots__ = ("_marks",)
+
+    def __init__(self) -> None:
+        self._marks: deque[tuple[float, int]] = deque(maxlen=MAX_MARKS)
+
+    def note(self, receiver_s: float, cum_bytes: int) -> None:
+        marks = self._marks
+        if not marks or receiver_s >= marks[-1][0] + MARK_SPACING_S:
+            marks.append((receiver_s, cum_bytes))
+
+    def rate(self) -> float | None:
+        """Bytes/s that arrived in the last 150 ms; None while that is not known."""
+        marks = self._marks
+        if len(marks) < 2:
+            return None
+        last_s, last_bytes = marks[-1]
+        since = next((mark for mark in reversed(marks) if last_s - mark[0] >= BURST_RATE_SPAN_S), marks[0])
+        return (last_bytes - since[1]) / (last_s - since[0])
+
+
+class Train:
+    """What arrives in a round of start-up. The dispersion of `TRAIN_BYTES` shows the bottleneck's rate."""
+
+    __slots__ = ("_packets", "nbytes", "rate")
+
+    def __init__(self) -> None:
+        self.rate = 0.0  # bytes/s, the greatest of the round
+        self.nbytes = 0
+        self._packets: deque[tuple[float, int]] = deque()  # (receiver's stamp, bytes by then)
+
+    def note(self, receiver_s: float, cum_bytes: int, acked_bytes: int) -> bool:
+        """Whether it was enough to tell a rate by."""
+        packets = self._packets
+        packets.append((receiver_s, cum_bytes))
+        self.nbytes += acked_bytes
+        while len(packets) > 2 and cum_bytes - packets[1][1] >= TRAIN_BYTES:
+            packets.popleft()
+        at_s, first_bytes = packets[0]
+        if cum_bytes - first_bytes < TRAIN_BYTES:
+            return False
+        span_s = receiver_s - at_s
+        if span_s > STALL_S and any(later - earlier > 0.6 * span_s for (earlier, _), (later, _) in pairwise(packets)):
+            packets.clear()  # a stream stood still for a lost segment: that says nothing about its rate
+            return False
+        rate = (cum_bytes - first_bytes) / span_s if span_s > 1e-5 else inf
+        self.rate = max(self.rate, rate)
+        return True
+
+
+class Swing:
+    """How far a queue goes up and down since `since_s`; None: not looked at."""
+
+    __slots__ = ("_least_s", "_most_s", "since_s")
+
+    def __init__(self) -> None:
+        self.since_s: float | None = None
+        self._least_s = self._most_s = 0.0
+
+    def wider(self, now: float, queue_s: float, than_s: float) -> bool:
+        """Whether, looked at for two seconds, it swings by more than `than_s`."""
+        if self.since_s is None:
+            self.since_s = now
+            self._least_s = self._most_s = queue_s
+            return False
+        self._least_s = min(self._least_s, queue_s)
+        self._most_s = max(self._most_s, queue_s)
+        return now > self.since_s + SWING_AFTER_S and self._most_s - self._least_s > than_s
 
 
 class Cubic:
