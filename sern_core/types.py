@@ -79,7 +79,6 @@ class DropReason(StrEnum):
     TOO_LARGE = "too_large"  # above max_message_bytes
     UNKNOWN_CHANNEL = "unknown_channel"  # data for a stream that was never announced or was closed
     REASSEMBLY = "reassembly"  # the receiver's reassembly limit
-    LOOP = "loop"  # came back to its origin
     DISCONNECTED = "disconnected"  # the peer went away for good
     SHUTDOWN = "shutdown"  # the daemon stopped before it was sent
     QUEUE_FULL = "queue_full"  # more waits for this client at the relay than its access rule allows
@@ -87,5 +86,8 @@ class DropReason(StrEnum):
     UNCONFIRMED = "unconfirmed"  # sent whole, given up without an acknowledgement: it may have arrived
 
 
-DROP_CODES: Final[dict[DropReason, int]] = {reason: code for code, reason in enumerate(DropReason, start=1)}
+_UNUSED_CODE: Final = 14  # a stream that comes back to its origin is not wanted there: no message is dropped for that
+DROP_CODES: Final[dict[DropReason, int]] = {
+    reason: code + (code >= _UNUSED_CODE) for code, reason in enumerate(DropReason, start=1)
+}
 DROP_REASONS: Final[dict[int, DropReason]] = {code: reason for reason, code in DROP_CODES.items()}
