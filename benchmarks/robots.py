@@ -308,7 +308,7 @@ def _draw(path: Path, median: dict[int, dict[str, float]]) -> None:
     try:
         import matplotlib
     except ImportError as error:
-        raise ConfigError("--figure needs matplotlib: pip install 'sern[report]'") from error
+        raise ConfigError("--figure needs matplotlib: pip install matplotlib") from error
     matplotlib.use("Agg")
     from matplotlib import pyplot
 

@@ -68,7 +68,8 @@ def missing(mode: str) -> str | None:
     module = NEEDS[mode]
     if find_spec(module) is not None:
         return None
-    return f"{mode} needs {'Pillow' if module == 'PIL' else module}: pip install 'sern[lossy]'"
+    package = "pillow" if module == "PIL" else module
+    return f"{mode} needs the Python package {package}: pip install {package}"
 
 
 def _library(mode: str, name: str) -> Any:

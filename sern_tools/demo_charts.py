@@ -1,4 +1,4 @@
-"""The pictures of the report, as PNG bytes. Needs matplotlib (`pip install sern[report]`)."""
+"""The pictures of the report, as PNG bytes. Needs matplotlib (the extra `report`)."""
 
 import io
 from collections.abc import Mapping, Sequence

@@ -312,7 +312,7 @@ def _figures(report: Report) -> list[str]:
             ("Delivered and dropped, by class", demo_charts.drops(report.results)),
         ]
     except ImportError:
-        return ["<p>No pictures: matplotlib is not installed (<code>pip install sern[report]</code>).</p>"]
+        return ["<p>No pictures: matplotlib is not installed (<code>pip install matplotlib</code>).</p>"]
     return [
         f'<h2>{title}</h2><img alt="{title}" src="data:image/png;base64,{base64.b64encode(png).decode()}">'
         for title, png in charts

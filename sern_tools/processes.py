@@ -166,5 +166,5 @@ def program(name: str) -> list[str]:
     """The command of an installed SERN program. SernError when it is not installed beside this Python."""
     path = Path(sys.executable).with_name(name)
     if not path.exists():
-        raise SernError(f"{name} is not installed beside {sys.executable}; install SERN there: pip install .")
+        raise SernError(f"{name} is not installed beside {sys.executable}: install SERN there")
     return [str(path)]

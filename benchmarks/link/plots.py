@@ -28,7 +28,7 @@ def check() -> None:
     try:
         import matplotlib
     except ImportError as error:
-        raise ConfigError("--plots needs matplotlib: pip install 'sern[report]'") from error
+        raise ConfigError("--plots needs matplotlib: pip install matplotlib") from error
     matplotlib.use("Agg")
 
 

@@ -215,7 +215,7 @@ class Ros1Endpoint(EndpointBase):
 
 
 class ZenohEndpoint(EndpointBase):
-    """ROS 2 over zenoh, among nodes that run with rmw_zenoh. Needs `pip install 'sern[zenoh]'`, no ROS installation."""
+    """ROS 2 over zenoh, among nodes that run with rmw_zenoh. Needs `pip install eclipse-zenoh`, no ROS installation."""
 
     kind: Literal["zenoh"]
     """ROS 2 over zenoh (rmw_zenoh)."""
@@ -239,8 +239,8 @@ class ZenohEndpoint(EndpointBase):
 
 
 class DdsEndpoint(EndpointBase):
-    """ROS 2 over DDS, among nodes of rmw_fastrtps, rmw_cyclonedds and others. Needs `pip install 'sern[dds]'`, no ROS
-    installation. Services work with nodes of rmw_cyclonedds only."""
+    """ROS 2 over DDS, among nodes of rmw_fastrtps, rmw_cyclonedds and others. Needs `pip install cyclonedds==11.0.1`,
+    no ROS installation. Services work with nodes of rmw_cyclonedds only."""
 
     kind: Literal["dds"]
     """ROS 2 over DDS."""

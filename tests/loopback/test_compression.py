@@ -144,7 +144,7 @@ async def test_an_absent_library_is_said_before_anything_starts(
     topic = rule("/points", "auto") | {"lossy": ["voxel_draco"]}
     lab = Lab(tmp_path, "robot1")
     path = lab.client_file("robot1", {"kind": "synthetic", "role": "robot"}, topics=[topic])
-    with pytest.raises(ConfigError, match=r"topics.0.lossy: .*pip install 'sern\[lossy\]'"):
+    with pytest.raises(ConfigError, match=r"topics.0.lossy: .*pip install DracoPy"):
         ClientDaemon(load_client(path))
 
 

@@ -18,7 +18,7 @@ from tests.daemons import Lab
 from tests.peers.test_zenoh import Router
 from tests.support import Events, until
 
-pytest.importorskip("zenoh", reason="the library eclipse-zenoh is missing: pip install 'sern[zenoh]'")
+pytest.importorskip("zenoh", reason="the library eclipse-zenoh is missing: pip install eclipse-zenoh")
 
 DOMAIN: Final = 9
 TYPE: Final = "example_interfaces/action/Fibonacci"

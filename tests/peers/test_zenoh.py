@@ -20,7 +20,7 @@ from sern_tools.demo_link import free_ports
 from tests.daemons import Lab, bodies, under, write_bag
 from tests.support import Events, until
 
-zenoh = pytest.importorskip("zenoh", reason="the library eclipse-zenoh is missing: pip install 'sern[zenoh]'")
+zenoh = pytest.importorskip("zenoh", reason="the library eclipse-zenoh is missing: pip install eclipse-zenoh")
 pytest.importorskip("zenoh_ros2_sdk", reason="the peer zenoh-ros2-sdk is missing: pip install zenoh-ros2-sdk")
 
 DOMAIN = 7

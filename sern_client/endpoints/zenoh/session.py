@@ -32,7 +32,7 @@ def load_zenoh() -> ModuleType:
         import zenoh
         import zenoh.ext
     except ImportError:
-        raise ConfigError("needs the zenoh library: pip install 'sern[zenoh]'") from None
+        raise ConfigError("needs the zenoh library: pip install eclipse-zenoh") from None
     return zenoh
 
 

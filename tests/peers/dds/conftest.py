@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-pytest.importorskip("cyclonedds", reason="the dds endpoint needs cyclonedds: pip install 'sern[dds]'")
+pytest.importorskip("cyclonedds", reason="the dds endpoint needs cyclonedds: pip install cyclonedds==11.0.1")
 
 from sern_client.endpoints.dds.domain import DomainOptions
 from sern_client.endpoints.dds.endpoint import DdsEndpoint, DdsOptions

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-pytest.importorskip("cyclonedds", reason="the dds endpoint needs cyclonedds: pip install 'sern[dds]'")
+pytest.importorskip("cyclonedds", reason="the dds endpoint needs cyclonedds: pip install cyclonedds==11.0.1")
 
 from cyclonedds.core import Policy, Qos
 
