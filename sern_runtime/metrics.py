@@ -123,10 +123,7 @@ class Metrics(Collector):
             raise UsageError(f"the counter {name} must end in _total")
 
         def collect(definition: _Definition) -> Metric:
-            family = CounterMetricFamily(definition.name, definition.help, labels=definition.labels)
-            for label_values, value in _sums(definition, read()).items():
-                family.add_metric(label_values, value)
-            return family
+            return _family(CounterMetricFamily, definition, _sums(definition, read()))
 
         self._add(_Definition(name, text, labels, known, allowed or {}), collect)
 
@@ -143,10 +140,7 @@ class Metrics(Collector):
         """A value that goes up and down. Those that share `other` show their maximum: usually the worst of them."""
 
         def collect(definition: _Definition) -> Metric:
-            family = GaugeMetricFamily(definition.name, definition.help, labels=definition.labels)
-            for label_values, value in _maxima(definition, read()).items():
-                family.add_metric(label_values, value)
-            return family
+            return _family(GaugeMetricFamily, definition, _maxima(definition, read()))
 
         self._add(_Definition(name, text, labels, known, allowed or {}), collect)
 
@@ -199,6 +193,15 @@ class Metrics(Collector):
             raise UsageError(f"the metric {definition.name} exists already")
         self._failures[definition.name] = 0
         self._sources.append((definition, collect))
+
+
+def _family(
+    kind: type[CounterMetricFamily] | type[GaugeMetricFamily], definition: _Definition, values: dict[Labels, float]
+) -> Metric:
+    family = kind(definition.name, definition.help, labels=definition.labels)
+    for label_values, value in values.items():
+        family.add_metric(label_values, value)
+    return family
 
 
 def _known(definition: _Definition) -> Iterable[Labels]:

@@ -9,6 +9,7 @@ does to datagrams.
 from collections import defaultdict
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
+from functools import partial
 from random import Random
 from typing import Any, Final, NamedTuple
 
@@ -123,26 +124,9 @@ class ReplayWorld:
             lossless=lossless,
         )
         self._hub_node = _HubNode(self.hub)
-        self.robot = ClientCore(
-            name=ROBOT,
-            boot=boots.getrandbits(63),
-            events=silent,
-            link=link,
-            scheduler=scheduler,
-            trace=trace,
-            now=now,
-            lossless=lossless,
-            coder=coder,
-        )
-        self.site = ClientCore(
-            name=SITE,
-            boot=boots.getrandbits(63),
-            events=site_events,
-            link=link,
-            scheduler=scheduler,
-            now=now,
-            lossless=lossless,
-        )
+        client = partial(ClientCore, link=link, scheduler=scheduler, now=now, lossless=lossless)
+        self.robot = client(name=ROBOT, boot=boots.getrandbits(63), events=silent, trace=trace, coder=coder)
+        self.site = client(name=SITE, boot=boots.getrandbits(63), events=site_events)
         self.site.subscribe((".*",), now=now)
         self.robot_node = _ClientNode(self.robot)
         perfect = LinkModel().as_stream() if lossless else LinkModel()

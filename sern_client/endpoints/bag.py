@@ -30,6 +30,7 @@ from rosbags.rosbag2 import Reader as Reader2
 
 from sern_client.endpoints.base import Publisher, Sink, TopicEvents
 from sern_client.endpoints.clock import Clock, SystemClock
+from sern_client.endpoints.held import HeldSubscription
 from sern_core.errors import ConfigError, UsageError
 from sern_core.message import TopicInfo
 from sern_core.types import Encoding, TopicName
@@ -88,26 +89,13 @@ class _Batch(NamedTuple):
 
 
 @dataclass(slots=True, eq=False)
-class _Subscription:
-    sink: Sink
-    topic: "_Topic"
-    backlog: deque[tuple[bytes, int]] = field(default_factory=deque)  # latched messages from before the subscription
-
-    @property
-    def closed(self) -> bool:
-        return self not in self.topic.subscriptions
-
-    def close(self) -> None:
-        self.backlog.clear()
-        if self in self.topic.subscriptions:
-            self.topic.subscriptions.remove(self)
-
-
-@dataclass(slots=True, eq=False)
 class _Topic:
     info: TopicInfo
-    subscriptions: list[_Subscription] = field(default_factory=list)
+    subscriptions: list["_Subscription"] = field(default_factory=list)
     retained: dict[int, tuple[bytes, int]] = field(default_factory=dict)  # latched: last message per connection
+
+
+_Subscription = HeldSubscription[_Topic]
 
 
 class BagEndpoint:
@@ -176,9 +164,9 @@ class BagEndpoint:
         topic = self._topics.get(name)
         if topic is None:
             raise UsageError(f"{name}: this bag announced no such topic")
-        subscription = _Subscription(sink, topic, deque(topic.retained.values()))
+        subscription = _Subscription(sink, topic, topic.subscriptions, deque(topic.retained.values()))
         topic.subscriptions.append(subscription)
-        if subscription.backlog:
+        if subscription.held:
             asyncio.get_running_loop().call_soon(self._drain_backlog, subscription)
         return subscription
 
@@ -197,7 +185,7 @@ class BagEndpoint:
     @property
     def exhausted(self) -> bool:
         """The last message was offered (or playback ended with `problem`) and no latched one still waits."""
-        return self._finished and not any(s.backlog for t in self._topics.values() for s in t.subscriptions)
+        return self._finished and not any(s.held for t in self._topics.values() for s in t.subscriptions)
 
     # Reading: everything here runs on the worker thread
 
@@ -363,7 +351,7 @@ class BagEndpoint:
         self._base_s += self._clock.monotonic_s() - since_s
 
     def _offer(self, subscription: _Subscription, body: bytes, time_ns: int) -> bool:
-        backlog = subscription.backlog
+        backlog = subscription.held
         while backlog:  # what is latched goes first
             if not self._hand_over(subscription, *backlog[0]):
                 return False
@@ -380,7 +368,7 @@ class BagEndpoint:
         return accepted
 
     def _drain_backlog(self, subscription: _Subscription) -> None:
-        backlog = subscription.backlog
+        backlog = subscription.held
         while backlog and self._hand_over(subscription, *backlog[0]):
             backlog.popleft()
         if backlog and not subscription.closed:

@@ -16,6 +16,7 @@ from typing import Any, Final, Literal
 
 from sern_client.endpoints.base import Sink, TopicEvents
 from sern_client.endpoints.clock import Clock, SystemClock
+from sern_client.endpoints.held import HeldSubscription
 from sern_client.endpoints.jackal import JACKAL, JackalSource, OperatorSource, Plan, Sizes
 from sern_core.errors import ConfigError, UsageError
 from sern_core.message import TopicInfo
@@ -96,29 +97,16 @@ class Received:
 
 
 @dataclass(slots=True, eq=False)
-class _Subscription:
-    sink: Sink
-    topic: "_Topic"
-    held: deque[tuple[bytes, int]] = field(default_factory=deque)
-
-    @property
-    def closed(self) -> bool:
-        return self not in self.topic.subscriptions
-
-    def close(self) -> None:
-        self.held.clear()
-        if self in self.topic.subscriptions:
-            self.topic.subscriptions.remove(self)
-
-
-@dataclass(slots=True, eq=False)
 class _Topic:
     plan: Plan
     info: TopicInfo
     counter: bool = False
     hold: bool = False  # refused messages are offered again
     number: int = 0
-    subscriptions: list[_Subscription] = field(default_factory=list)
+    subscriptions: list["_Subscription"] = field(default_factory=list)
+
+
+_Subscription = HeldSubscription[_Topic]
 
 
 class _Publisher:
@@ -181,7 +169,7 @@ class SyntheticEndpoint:
         topic = self._topics.get(name)
         if topic is None:
             raise UsageError(f"{name}: this {self.options.role} announced no such topic")
-        subscription = _Subscription(sink, topic)
+        subscription = _Subscription(sink, topic, topic.subscriptions)
         topic.subscriptions.append(subscription)
         if topic.plan.latched:
             asyncio.get_running_loop().call_soon(self._give_latched, subscription)

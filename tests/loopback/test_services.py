@@ -3,7 +3,8 @@
 import asyncio
 import re
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import asynccontextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -65,6 +66,11 @@ class Sites:
         rules = {"use": [{"match": match, "timeout_s": timeout_s, "class": "control"}]}
         return await self.lab.connected(self.lab.client_file(name, ENDPOINT, services=rules, **sections))
 
+    async def start(self, **site: Any) -> None:
+        self.relay = await self.lab.relay()
+        self.robot_daemon = await self.start_robot()
+        self.site_daemon = await self.start_site(**site)
+
     def offer(self) -> None:
         assert self.robot.events is not None
         self.robot.events.service_added(INFO)
@@ -74,18 +80,25 @@ class Sites:
         return self.site.served[name].handler
 
 
+@asynccontextmanager
+async def offered(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, **site: Any
+) -> AsyncIterator[tuple[Sites, ServiceHandler]]:
+    """A relay, the robot, a site with these options, and what the site serves of the robot's service."""
+    async with Lab(tmp_path, "robot1", "site") as lab:
+        sites = Sites(lab, monkeypatch)
+        await sites.start(**site)
+        sites.offer()
+        yield sites, await sites.served()
+
+
 def outcomes(daemon: ClientDaemon) -> dict[tuple[TopicName, str], int]:
     return dict(bridge(daemon).outcomes)
 
 
 async def test_a_call_goes_there_and_its_answer_comes_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    async with Lab(tmp_path, "robot1", "site") as lab:
-        sites = Sites(lab, monkeypatch)
-        await lab.relay()
-        await sites.start_robot()
-        site = await sites.start_site()
-        sites.offer()
-        handler = await sites.served()
+    async with offered(tmp_path, monkeypatch) as (sites, handler):
+        site = sites.site_daemon
 
         served = sites.site.served[GLOBAL].info
         assert served == ServiceInfo(GLOBAL, INFO.type_name, INFO.encoding, INFO.type_hash, INFO.definition)
@@ -101,13 +114,8 @@ async def test_an_error_of_the_service_is_the_callers(tmp_path: Path, monkeypatc
     async def refuse(request: bytes) -> bytes:
         raise ServiceError(f"not with {request.decode()}")
 
-    async with Lab(tmp_path, "robot1", "site") as lab:
-        sites = Sites(lab, monkeypatch)
-        await lab.relay()
-        await sites.start_robot()
-        site = await sites.start_site()
-        sites.offer()
-        handler = await sites.served()
+    async with offered(tmp_path, monkeypatch) as (sites, handler):
+        site = sites.site_daemon
         sites.robot.answer = refuse
 
         with pytest.raises(ServiceError, match=r"^not with me$"):
@@ -118,13 +126,8 @@ async def test_an_error_of_the_service_is_the_callers(tmp_path: Path, monkeypatc
 async def test_a_service_that_does_not_answer_is_an_error_in_time(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    async with Lab(tmp_path, "robot1", "site") as lab:
-        sites = Sites(lab, monkeypatch)
-        await lab.relay()
-        await sites.start_robot()
-        site = await sites.start_site(timeout_s=0.3)
-        sites.offer()
-        handler = await sites.served()
+    async with offered(tmp_path, monkeypatch, timeout_s=0.3) as (sites, handler):
+        site = sites.site_daemon
         never = asyncio.Event()
 
         async def wait(request: bytes) -> bytes:
@@ -140,19 +143,14 @@ async def test_a_service_that_does_not_answer_is_an_error_in_time(
 async def test_a_lost_relay_is_an_error_and_the_call_is_not_executed_later(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    async with Lab(tmp_path, "robot1", "site") as lab:
-        sites = Sites(lab, monkeypatch)
-        relay = await lab.relay()
-        await sites.start_robot()
-        await sites.start_site(timeout_s=0.5)
-        sites.offer()
-        handler = await sites.served()
+    async with offered(tmp_path, monkeypatch, timeout_s=0.5) as (sites, handler):
+        relay = sites.relay
         assert await handler(b"before") == b"re: before"
 
-        await lab.drop(relay)
+        await sites.lab.drop(relay)
         with pytest.raises(ServiceError):
             await handler(b"lost")
-        await lab.relay(tmp_path / "relay.yaml")
+        await sites.lab.relay(tmp_path / "relay.yaml")
         handler = await sites.served()
 
         async def again() -> bytes:
@@ -169,13 +167,7 @@ async def test_a_lost_relay_is_an_error_and_the_call_is_not_executed_later(
 
 
 async def test_a_service_that_goes_is_withdrawn_and_comes_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    async with Lab(tmp_path, "robot1", "site") as lab:
-        sites = Sites(lab, monkeypatch)
-        await lab.relay()
-        await sites.start_robot()
-        await sites.start_site()
-        sites.offer()
-        handler = await sites.served()
+    async with offered(tmp_path, monkeypatch) as (sites, handler):
         started = asyncio.Event()
 
         async def wait(request: bytes) -> bytes:
@@ -291,13 +283,8 @@ def stream_of(name: TopicName, origin: str) -> StreamInfo:
 
 
 async def test_nobody_else_answers_for_a_service(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    async with Lab(tmp_path, "robot1", "site") as lab:
-        sites = Sites(lab, monkeypatch)
-        await lab.relay()
-        await sites.start_robot()
-        services = bridge(await sites.start_site())
-        sites.offer()
-        handler = await sites.served()
+    async with offered(tmp_path, monkeypatch) as (sites, handler):
+        services = bridge(sites.site_daemon)
         sites.robot.answer, started, release = hold()
         pending = asyncio.ensure_future(handler(b"one"))
         await started.wait()
@@ -321,21 +308,17 @@ def hold() -> tuple[Callable[[bytes], Awaitable[bytes]], asyncio.Event, asyncio.
 
 
 async def test_a_call_whose_caller_leaves_is_not_made_later(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    async with Lab(tmp_path, "robot1", "site") as lab:
-        sites = Sites(lab, monkeypatch)
-        relay = await lab.relay()
-        await sites.start_robot()
-        site = await sites.start_site(timeout_s=30.0)
-        sites.offer()
-        handler = await sites.served()
+    async with offered(tmp_path, monkeypatch, timeout_s=30.0) as (sites, handler):
+        relay = sites.relay
+        site = sites.site_daemon
         assert await handler(b"before") == b"re: before"
-        await lab.drop(relay)
+        await sites.lab.drop(relay)
         await until(lambda: not site.core.link.established or site.core.link.lane.stalled, "the link is lost")
         leaves, stays = (asyncio.ensure_future(handler(body)) for body in (b"leaves", b"stays"))
         await until(lambda: len(bridge(site).used[GLOBAL].waiting) == 2, "both wait for the link")
         leaves.cancel()
         await asyncio.gather(leaves, return_exceptions=True)
-        await lab.relay(tmp_path / "relay.yaml")
+        await sites.lab.relay(tmp_path / "relay.yaml")
         assert await stays == b"re: stays"
         assert [body for _, body in sites.robot.calls] == [b"before", b"stays"]
         assert outcomes(site) == {(GLOBAL, "ok"): 2, (GLOBAL, "cancelled"): 1}
@@ -344,13 +327,8 @@ async def test_a_call_whose_caller_leaves_is_not_made_later(tmp_path: Path, monk
 async def test_a_call_for_an_earlier_process_of_the_robot_is_not_executed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    async with Lab(tmp_path, "robot1", "site") as lab:
-        sites = Sites(lab, monkeypatch)
-        await lab.relay()
-        robot = await sites.start_robot()
-        await sites.start_site()
-        sites.offer()
-        handler = await sites.served()
+    async with offered(tmp_path, monkeypatch) as (sites, handler):
+        robot = sites.robot_daemon
         assert await handler(b"now") == b"re: now"
         (identity,) = bridge(robot).callers
         calls = StreamInfo(identity, TopicInfo(identity.topic, INFO.type_name, INFO.encoding), TopicSpec())
@@ -374,13 +352,7 @@ async def test_error_texts_are_one_bounded_line(
     async def fail(request: bytes) -> bytes:
         raise ServiceError(raised)
 
-    async with Lab(tmp_path, "robot1", "site") as lab:
-        sites = Sites(lab, monkeypatch)
-        await lab.relay()
-        await sites.start_robot()
-        await sites.start_site()
-        sites.offer()
-        handler = await sites.served()
+    async with offered(tmp_path, monkeypatch) as (sites, handler):
         sites.robot.answer = fail
         with pytest.raises(ServiceError) as caught:
             await handler(b"")
@@ -411,18 +383,14 @@ async def test_a_robot_that_comes_back_with_another_relay_is_served_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The site still knows the stream of the robot's earlier process, which no relay can tell it of any more."""
-    async with Lab(tmp_path, "robot1", "site") as lab:
-        sites = Sites(lab, monkeypatch)
-        relay = await lab.relay()
-        robot = await sites.start_robot()
-        await sites.start_site()
-        sites.offer()
-        first = await sites.served()
+    async with offered(tmp_path, monkeypatch) as (sites, first):
+        relay = sites.relay
+        robot = sites.robot_daemon
         assert await first(b"one") == b"re: one"
-        await lab.drop(relay)
-        await lab.drop(robot)
+        await sites.lab.drop(relay)
+        await sites.lab.drop(robot)
         sites.ends["robot1"] = Services()
-        await lab.relay(tmp_path / "relay.yaml")
+        await sites.lab.relay(tmp_path / "relay.yaml")
         await sites.start_robot()
         sites.offer()
         await until(lambda: GLOBAL in sites.site.served and sites.site.served[GLOBAL].handler is not first, "again")

@@ -8,6 +8,7 @@ from typing import Final, Protocol
 
 from sern_client.endpoints.ros1.frames import Frames
 from sern_client.endpoints.ros1.header import encode_header
+from sern_client.endpoints.ros1.listener import Listener
 from sern_client.endpoints.ros1.publication import Feed, Publication
 from sern_core.errors import WireError
 
@@ -125,32 +126,22 @@ class Inbound(Frames):
             self._feed.resume()
 
 
-class TcprosServer:
+class TcprosServer(Listener):
     """Listens from `start` to `stop`. `publications` are the endpoint's, by name at the master."""
 
     def __init__(
         self, name: str, publications: dict[str, Publication], services: Services, *, max_frame_bytes: int
     ) -> None:
+        super().__init__(lambda: Inbound(self))
         self.name = name
         self.publications = publications
         self.services = services
         self.max_frame_bytes = max_frame_bytes
         self.connections: set[Inbound] = set()
         self.numbers = count(1)
-        self._server: asyncio.Server | None = None
         self._said: set[str] = set()
 
-    async def start(self, address: str) -> int:
-        """Listen on a free port of this address; the port. OSError when that is impossible."""
-        loop = asyncio.get_running_loop()
-        self._server = await loop.create_server(lambda: Inbound(self), address, 0)
-        return int(self._server.sockets[0].getsockname()[1])
-
-    async def stop(self) -> None:
-        server, self._server = self._server, None
-        if server is None:
-            return
-        server.close()
+    async def _end_connections(self) -> None:
         for connection in list(self.connections):
             if connection.transport is not None:
                 connection.transport.close()
@@ -160,7 +151,6 @@ class TcprosServer:
                     await asyncio.sleep(0.005)
         for connection in list(self.connections):
             connection.close()
-        await server.wait_closed()
 
     def complain(self, problem: str) -> None:
         """Log a problem of a peer, once."""

@@ -9,6 +9,7 @@ from urllib.parse import urlsplit
 from xmlrpc.client import Fault, dumps, loads
 
 from sern_client.endpoints.ros1.http import HttpMessage, HttpReader
+from sern_client.endpoints.ros1.listener import Listener
 from sern_core.errors import RemoteError, WireError
 from sern_runtime.ros_types import one_line
 
@@ -255,28 +256,17 @@ class _Server(asyncio.Protocol):
             self._transport.abort()
 
 
-class XmlRpcServer:
+class XmlRpcServer(Listener):
     """Serves calls from `start` to `stop`; every call is answered at once, on the loop's thread."""
 
     def __init__(self, dispatch: Dispatch) -> None:
+        super().__init__(lambda: _Server(self))
         self.connections: set[_Server] = set()
         self._dispatch = dispatch
-        self._server: asyncio.Server | None = None
 
-    async def start(self, address: str) -> int:
-        """Listen on a free port of this address; the port. OSError when that is impossible."""
-        loop = asyncio.get_running_loop()
-        self._server = await loop.create_server(lambda: _Server(self), address, 0)
-        return int(self._server.sockets[0].getsockname()[1])
-
-    async def stop(self) -> None:
-        server, self._server = self._server, None
-        if server is None:
-            return
-        server.close()
+    async def _end_connections(self) -> None:
         for connection in list(self.connections):
             connection.close()
-        await server.wait_closed()
 
     def answer(self, body: bytes) -> bytes:
         """The answer to one request, a fault when it cannot be carried out."""
