@@ -291,7 +291,7 @@ class Sink:
         local_s = now + self.offset_s
         if not arrivals.unacked or not (arrivals.due or local_s >= arrivals.since_s + ACK_DELAY_S - 1e-9):
             return None
-        arrivals.flushed()
+        arrivals.flushed(now)
         stamp_us = int(local_s * 1e6)
         ack = _ACK.pack(
             self.id,

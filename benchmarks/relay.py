@@ -368,7 +368,8 @@ class ScheduledLink(System):
                         core.send(channel, body, 0, now=now)
                         sent += 1
                     pump.run()
-                await asyncio.sleep(0.0005 if self._room(flow, sent) <= 0 or not site.wanted_now else 0)
+                # Not less than 1 ms: uvloop would make it none, and a publisher that spins takes a core of two.
+                await asyncio.sleep(0.001 if self._room(flow, sent) <= 0 or not site.wanted_now else 0)
 
         with asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:
             runner.run(self._client(ports, flow, "publisher", work))

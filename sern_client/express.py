@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import Final
 
 from sern_client.transport import Dialer, RelayTransport
+from sern_core import wire
 from sern_core.client import ClientCore
 from sern_core.errors import ConfigError, RemoteError
 from sern_core.lane_port import LanePort
@@ -115,7 +116,7 @@ class ClientExpress:
             asyncio.get_running_loop().call_soon(self._give_up)
         self._kick()
 
-    def received(self, connection: "_Connection", data: bytes) -> None:
+    def received(self, connection: "_Connection", data: wire.Datagram) -> None:
         try:
             self.core.link.receive(data, now=time.monotonic(), lane=LANE_EXPRESS)
         except RemoteError as error:
@@ -160,7 +161,7 @@ class _Connection:
         self._up = False
         self._lane.lost(self, answered=True)
 
-    def received(self, data: bytes) -> None:
+    def received(self, data: wire.Datagram) -> None:
         self._answered = True
         self._lane.received(self, data)
 

@@ -9,6 +9,7 @@ from typing import Final, Protocol
 
 import zmq
 
+from sern_core import wire
 from sern_core.errors import ConfigError, RemoteError
 from sern_core.link import Link
 from sern_runtime.monitor import TcpHandle, TransportWatch
@@ -35,7 +36,7 @@ class DialerEvents(Protocol):
     def given_up(self, reason: str) -> None:
         """The socket is made anew after a pause."""
 
-    def received(self, data: bytes) -> None: ...
+    def received(self, data: wire.Datagram) -> None: ...
 
     def writable(self) -> None: ...
 
@@ -89,7 +90,9 @@ class Dialer:
             tos=TOS_EXPEDITED if self._express else 0,
             before_connect=attach,
         )
-        self._socket = DealerSocket(raw, self._events.received, on_writable=self._events.writable)
+        self._socket = DealerSocket(
+            raw, self._events.received, on_view=self._events.received, on_writable=self._events.writable
+        )
 
     def _reopen(self) -> None:
         self._rebuild = None
@@ -227,7 +230,7 @@ class RelayTransport:
         self.pump.reset()
         self.link.disconnected(now=time.monotonic(), reason=reason)
 
-    def received(self, data: bytes) -> None:
+    def received(self, data: wire.Datagram) -> None:
         try:
             self.link.receive(data, now=time.monotonic())
         except RemoteError as error:

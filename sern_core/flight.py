@@ -4,11 +4,12 @@ The sender numbers every acknowledgement-eliciting datagram from 1. A packet is 
 acknowledged, or when it is older than max(100 ms, 2 srtt + 30 ms, RTO); on a stream lane (TCP) nothing is lost while
 the connection lasts. A round trip is measured from every acknowledgement that names a newer packet, whether or not
 that packet was given up meanwhile: else a path slower than the first guess would never be measured.
-The receiver's half says what to acknowledge and when: every second datagram, at once on a gap or on class control,
-else within `ACK_DELAY_S`.
+The receiver's half says what to acknowledge and when: every second datagram (large ones of a stream lane
+at most once in `ACK_SPACING_S`), at once on a gap or on class control, else within `ACK_DELAY_S`.
 """
 
 from collections.abc import Callable
+from math import inf
 from typing import Any, Final
 
 from sern_core.clocksync import RttEstimator
@@ -22,6 +23,11 @@ STALL_RTTS: Final = 4.0
 FIRST_STALL_S: Final = 3.0
 """No acknowledgement for so long: the path is gone; the last one before any round trip was measured."""
 ACK_DELAY_S: Final = 0.010
+ACK_SPACING_S: Final = 0.001
+"""Of a stream, where nobody waits to learn what is lost. Below 1 Gbit/s two full fragments take longer; above it every
+acknowledgement cost each end as much as half a message of 64 kB (measured)."""
+SPACED_BYTES: Final = 16 * 1024
+"""Smaller datagrams are those of a slow link, or of one whose rate its sender is about to find out."""
 SACK_BITS: Final = 64
 SACK_MASK: Final = (1 << SACK_BITS) - 1
 
@@ -139,9 +145,21 @@ class Flight:
 class Arrivals:
     """The receiver's half: which numbers have arrived, and when to say so."""
 
-    __slots__ = ("cum_bytes", "due", "echo_us", "highest", "mask", "received_us", "since_s", "unacked")
+    __slots__ = (
+        "cum_bytes",
+        "due",
+        "echo_us",
+        "flushed_s",
+        "highest",
+        "mask",
+        "received_us",
+        "since_s",
+        "spacing_s",
+        "unacked",
+    )
 
-    def __init__(self) -> None:
+    def __init__(self, *, lossless: bool = False) -> None:
+        self.spacing_s = ACK_SPACING_S if lossless else 0.0
         self.highest = 0
         self.mask = 0  # bit i: highest-1-i has arrived
         self.echo_us = 0
@@ -150,6 +168,7 @@ class Arrivals:
         self.unacked = 0
         self.due = False
         self.since_s = 0.0
+        self.flushed_s = -inf  # when the last acknowledgement left
 
     def arrived(self, number: int, stamp_us: int, nbytes: int, *, now: float) -> bool:
         """Note one numbered datagram. False: seen before, a duplicate made by the network."""
@@ -176,10 +195,17 @@ class Arrivals:
         if not self.unacked:
             self.since_s = now
         self.unacked += 1
-        if self.unacked >= 2:
+        if self.unacked >= 2 and (nbytes < SPACED_BYTES or now >= self.flushed_s + self.spacing_s):
             self.due = True
         return True
 
-    def flushed(self) -> None:
+    def deadline_s(self) -> float:
+        """When what has arrived is to be acknowledged by time alone; something must have arrived."""
+        delayed_s = self.since_s + ACK_DELAY_S
+        return delayed_s if self.due or self.unacked < 2 else min(delayed_s, self.flushed_s + self.spacing_s)
+
+    def flushed(self, now: float) -> None:
+        """They are acknowledged now."""
         self.unacked = 0
         self.due = False
+        self.flushed_s = now

@@ -13,7 +13,7 @@ from typing import Final
 from sern_core.errors import WireError
 from sern_core.message import Message, StreamInfo
 from sern_core.types import DROP_CODES, DROP_REASONS, DropReason
-from sern_core.wire import FLAG_REPLAY, FLAG_TOMBSTONE
+from sern_core.wire import FLAG_REPLAY, FLAG_TOMBSTONE, Datagram
 
 PARTIAL_IDLE_S: Final = 10.0
 """A half-received best-effort message with a newer one behind it that gets no fragment for so long was given up. The
@@ -43,7 +43,7 @@ class Partial:
         self.stamp_ns = 0
         self.touched_s = 0.0
 
-    def add(self, offset: int, data: bytes) -> None:
+    def add(self, offset: int, data: Datagram) -> None:
         end = offset + len(data)
         self.body[offset:end] = data
         spans = self.spans
@@ -152,7 +152,7 @@ class InStream:
         seq: int,
         offset: int,
         total: int,
-        body: bytes,
+        body: Datagram,
         stamp_ns: int,
         born_s: float,
         error_s: float,
@@ -171,11 +171,11 @@ class InStream:
             return
         if flags & FLAG_TOMBSTONE:
             code = body[0] if body[0] in DROP_REASONS else DROP_CODES[DropReason.LOST]
-            self._arrived(Message(self.stream.id, seq, body, stamp_ns, born_s, code))
+            self._arrived(Message(self.stream.id, seq, bytes(body), stamp_ns, born_s, code))
             return
         replay = bool(flags & FLAG_REPLAY)
         if len(body) == total:
-            self._arrived(Message(self.stream.id, seq, body, stamp_ns, born_s, 0, replay, error_s, codec))
+            self._arrived(Message(self.stream.id, seq, bytes(body), stamp_ns, born_s, 0, replay, error_s, codec))
             return
         partial = self._partials.get(seq)
         if partial is None or len(partial.body) != total:

@@ -10,7 +10,6 @@ from sern_core import wire
 from sern_core.capacity import AckSample
 from sern_core.codecs import KNOWN_CODECS
 from sern_core.errors import WireError
-from sern_core.flight import ACK_DELAY_S
 from sern_core.fragments import InStream
 from sern_core.lanes import (
     LANE_EXPRESS,
@@ -36,16 +35,18 @@ class Hop(Sender):
 
     # --- bytes in -------------------------------------------------------------------------------------------------
 
-    def _receive_data(self, lane: Lane, number: int, stamp_us: int, data: bytes, now: float) -> None:
+    def _receive_data(self, lane: Lane, number: int, stamp_us: int, data: wire.Datagram, now: float) -> None:
         """A kind-16 datagram of the session."""
         self._rx_lane = lane
         self._rx_stamp_us = stamp_us
         self._rx_delay = None
         self._now = now
         if number:
-            if not lane.arrivals.arrived(number, stamp_us, len(data) + OVERHEAD_BYTES, now=now):
+            arrivals = lane.arrivals
+            if not arrivals.arrived(number, stamp_us, len(data) + OVERHEAD_BYTES, now=now):
                 return
-            self.dirty = True  # an acknowledgement is owed
+            if arrivals.due or arrivals.unacked <= 2:
+                self.dirty = True  # an acknowledgement is owed; of the third and later ones the deadline is known
         wire.decode_frames(data, self)
 
     def on_data(
@@ -55,7 +56,7 @@ class Hop(Sender):
         seq: int,
         offset: int,
         total: int,
-        body: bytes,
+        body: wire.Datagram,
         stamp_ns: int,
         age_s: float,
         codec: int,
@@ -259,8 +260,8 @@ class Hop(Sender):
         if lane.id == LANE_ZMQ and self._sweep_due_s < deadline:
             deadline = self._sweep_due_s
         arrivals = lane.arrivals
-        if arrivals.unacked and arrivals.since_s + ACK_DELAY_S < deadline:
-            deadline = arrivals.since_s + ACK_DELAY_S
+        if arrivals.unacked and (due_s := arrivals.deadline_s()) < deadline:
+            deadline = due_s
         for candidate in (
             lane.probe_due_s if lane.stalled else lane.stall_deadline(),
             None if lane.lossless else lane.flight.loss_deadline(),

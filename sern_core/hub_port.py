@@ -41,7 +41,7 @@ class HubPort:
             self.link.disconnected(now=now)
         self.link = None
 
-    def receive(self, data: bytes, *, now: float) -> None:
+    def receive(self, data: wire.Datagram, *, now: float) -> None:
         """One datagram. Raises WireError or VersionError; the caller closes the connection."""
         if self.link is not None and self.current and data[2:3] != b"\x01":
             had_session = self.link.established
@@ -49,6 +49,7 @@ class HubPort:
             if had_session and data[2] == wire.Kind.CLOSE and not self.link.established:
                 self.hub.left(self.client, now=now)
             return
+        data = bytes(data)
         header = wire.decode_header(data)
         if header.kind == wire.Kind.HELLO:
             hello = wire.decode_handshake(data)

@@ -55,7 +55,7 @@ class Lane:
             self.estimator = HybridWindow(fragment_bytes=MIN_FRAGMENT_BYTES + OVERHEAD_BYTES)
         self.pacer = Pacer()
         self.flight = Flight(lossless=lossless)
-        self.arrivals = Arrivals()
+        self.arrivals = Arrivals(lossless=lossless)
         self.stalled = False
         self.probe_due_s = 0.0
         self.up = False  # it has a transport
@@ -70,6 +70,8 @@ class Lane:
         self._copied_packets = 0  # so many more will have copies
         self.copies_wanted: bool | None = None
         """What the adaptation says of them, where the configuration leaves it open (`auto`); None: the loss decides."""
+        self._unheard_bytes = 0.0
+        """What arrives between two acknowledgements of a fast stream, beyond the two fragments that make one due."""
         self._redundancy = params.redundancy
         self.fragment_bytes = self._fragment_bytes(None)
 
@@ -84,12 +86,13 @@ class Lane:
         """Adopt the rate that the path carries at least; returns it."""
         rate_bps = self.estimator.bound_bps
         self.fragment_bytes = self._fragment_bytes(rate_bps)
+        self._unheard_bytes = max(0.0, self.arrivals.spacing_s * (rate_bps or 0.0) / 8 - 2 * self.fragment_bytes)
         return rate_bps
 
     @property
     def window_open(self) -> bool:
         """Whether the bytes in flight leave room; class 0 does not ask, and the pacer has a word as well."""
-        return not self.stalled and self.flight.inflight_bytes < self.estimator.window_bytes
+        return not self.stalled and self.flight.inflight_bytes < self.estimator.window_bytes + self._unheard_bytes
 
     def open_at(self, now: float) -> bool:
         """Whether a datagram below class 0 may leave now."""
@@ -145,6 +148,6 @@ class Lane:
         self.ping_due_s = now
         self.copies.clear()
         self.flight = Flight(lossless=self.lossless)
-        self.arrivals = Arrivals()
+        self.arrivals = Arrivals(lossless=self.lossless)
         self.pacer = Pacer()
         self.stalled = False

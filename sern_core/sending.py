@@ -13,7 +13,6 @@ from sern_core import wire
 from sern_core.clocksync import ClockSync
 from sern_core.codecs import LOSSY, Coder, Compression, LossyTopic
 from sern_core.encoding import ChannelCodec, Coding, Encoder
-from sern_core.flight import ACK_DELAY_S
 from sern_core.fragments import InStream, Reassembly
 from sern_core.lanes import (
     COPY_DELAY_S,
@@ -299,8 +298,7 @@ class Sender(ABC):
         if not lane.stalled or now >= lane.probe_due_s:
             if lane is self.lane or lane is self.express:
                 self.dirty = False
-                if self._sendable(lane, now):
-                    self._compose(lane, frames, items, now)
+                self._compose(lane, frames, items, now)
             # A stream delivers what is under way, so one question at a time is enough there.
             if not items and (lane.ping or lane.stalled) and not (lane.lossless and lane.flight.packets):
                 frames.append(wire.PING_FRAME)
@@ -309,7 +307,7 @@ class Sender(ABC):
             if lane.stalled:
                 lane.probe_due_s = now + PROBE_INTERVAL_S
         arrivals = lane.arrivals
-        if arrivals.unacked and (items or arrivals.due or now >= arrivals.since_s + ACK_DELAY_S):
+        if arrivals.unacked and (items or arrivals.due or now >= arrivals.deadline_s()):
             # In front: the receiver's clock estimate has the newest sample before it judges the age of what follows.
             frames.insert(
                 0,
@@ -317,7 +315,7 @@ class Sender(ABC):
                     lane.id, arrivals.highest, arrivals.mask, arrivals.echo_us, arrivals.received_us, arrivals.cum_bytes
                 ),
             )
-            arrivals.flushed()
+            arrivals.flushed(now)
         if not frames:
             return None
         if not items:
@@ -329,32 +327,25 @@ class Sender(ABC):
         estimator = lane.estimator
         inflight_bytes = flight.inflight_bytes + nbytes
         # What could be picked if window and pacer let it is held back by them; ordering `paper` holds back by itself.
-        app_limited = inflight_bytes < estimator.window_bytes and not (
-            lane is self.lane and (self._control_waits or self._pick(now, window_open=True) is not None)
-        )
+        waits = lane is self.lane and (self._control_waits or self._pick(now, window_open=True) is not None)
+        app_limited = inflight_bytes < estimator.window_bytes and not waits
         flight.sent(now=now, nbytes=nbytes, items=items, app_limited=app_limited)
         estimator.on_sent(now=now, nbytes=nbytes, inflight_bytes=inflight_bytes)
         lane.pacer.sent(now=now, nbytes=nbytes, pacing_bps=estimator.pacing_bps)
         self.wire_bytes += nbytes
         lane.ping_due_s = now + PING_INTERVAL_S
-        self.dirty = len(self.lanes) > 1 or self._sendable(lane, now)
+        if len(self.lanes) > 1:
+            self.dirty = True
+        elif lane.open_at(now):
+            self.dirty = waits or bool(self._watermarks)
+        else:
+            self.dirty = bool(self._watermarks) or (waits and self._pick(now, window_open=False) is not None)
         if lane.redundant and any(type(item) is SentData and _urgent(item.channel) for item in items):
             lane.copies.append((now + COPY_DELAY_S, flight.next_number - 1, datagram))
         return datagram
 
     def _header(self, number: int, now: float) -> bytes:
         return wire.encode_header(wire.Kind.DATA, self.tag, number, microseconds(now), version=self.version)
-
-    def _sendable(self, lane: Lane, now: float) -> bool:
-        """Whether there is something for the next datagram, acknowledgements aside."""
-        if lane is self.express:
-            return self.scheduler.pick_control(now=now) is not None
-        if self._watermarks:
-            return True
-        window_open = lane.open_at(now)
-        if window_open and self._control_waits:
-            return True
-        return self._pick(now, window_open=window_open) is not None
 
     @property
     def _backlog(self) -> bool:

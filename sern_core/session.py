@@ -285,7 +285,7 @@ class Session(Hop):
             self._handshake_out.append(wire.encode_handshake(wire.Kind.RESET, tag, microseconds(now), {}))
             self.dirty = True
 
-    def receive(self, data: bytes, *, now: float, lane: int = LANE_ZMQ) -> None:
+    def receive(self, data: wire.Datagram, *, now: float, lane: int = LANE_ZMQ) -> None:
         """One datagram from the lane. Raises WireError or VersionError for bytes no honest peer sends."""
         if data[:4] == self._data_prefix and wire.HEADER_BYTES <= len(data) <= wire.MAX_DATAGRAM_BYTES:
             state = self.lanes.get(lane)
@@ -293,6 +293,7 @@ class Session(Hop):
                 number, stamp_us = NUMBER_AND_STAMP.unpack_from(data, 4)
                 self._receive_data(state, number, stamp_us, data, now)
             return
+        data = bytes(data)
         header = wire.decode_header(data)
         if header.kind != wire.Kind.DATA:
             if lane != LANE_ZMQ:

@@ -68,6 +68,7 @@ DATA_FIRST_BYTES: Final = DATA_FIRST.size
 MAX_FRAGMENT_BYTES: Final = 65_000
 """Largest fragment body; `length` is 16 bits and a ZMQ message on the WAN stays below 64 KiB."""
 MAX_DATAGRAM_BYTES: Final = 65_536
+SMALL_BODY_BYTES: Final = 4096
 MAX_ENVELOPE_BYTES: Final = 4096
 MAX_ENVELOPE_ITEMS: Final = 64
 """Arrays and maps of an envelope; without it one megabyte of empty maps costs 78 MB of memory."""
@@ -119,6 +120,10 @@ class Header:
     stamp_us: int
 
 
+Datagram = bytes | memoryview
+"""A datagram as it arrives, or a part of one: where it is a view, whoever keeps any of it makes bytes of that."""
+
+
 class FrameSink(Protocol):
     """What a decoder of kind-16 datagrams reports to, frame by frame, in order."""
 
@@ -129,7 +134,7 @@ class FrameSink(Protocol):
         seq: int,
         offset: int,
         total: int,
-        body: bytes,
+        body: Datagram,
         stamp_ns: int,
         age_s: float,
         codec: int,
@@ -167,7 +172,7 @@ def decode_header(data: bytes) -> Header:
     return Header(version, kind, tag, number, stamp_us)
 
 
-def decode_frames(data: bytes, sink: FrameSink) -> None:
+def decode_frames(data: Datagram, sink: FrameSink) -> None:
     """Walk the frames of a kind-16 datagram whose header was checked.
 
     Raises WireError at the first bad byte; the frames before it have been reported.
@@ -197,9 +202,11 @@ def decode_frames(data: bytes, sink: FrameSink) -> None:
                 raise WireError(f"fragment of {length} bytes exceeds {MAX_FRAGMENT_BYTES}")
             if offset + length > total:
                 raise WireError(f"fragment {offset}+{length} lies outside its message of {total} bytes")
-            body = data[position : position + length]
-            if len(body) != length:
+            if position + length > end:
                 raise WireError("truncated DATA body")
+            if length < SMALL_BODY_BYTES and type(data) is memoryview:
+                data = data.tobytes()  # small bodies, of which a datagram has many, are quicker cut from bytes
+            body = data[position : position + length]
             if flags & FLAG_TOMBSTONE and total != 1:
                 raise WireError("a tombstone carries exactly one byte")
             position += length

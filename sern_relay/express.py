@@ -89,10 +89,10 @@ class RelayExpress:
         lane.pump.kick()
         return older
 
-    def received(self, routing_id: bytes, joined: Joined, data: bytes) -> None:
+    def received(self, routing_id: bytes, joined: Joined, data: wire.Datagram) -> None:
         """Raises RemoteError; the caller closes the connection."""
         if data[2:3] == JOIN:  # of the next session
-            if self.join(routing_id, joined, data) is not None:
+            if self.join(routing_id, joined, bytes(data)) is not None:
                 raise WireError("it names no session of its client")
             return
         link = self.hub.links.get(joined.client)

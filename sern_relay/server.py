@@ -74,7 +74,9 @@ class RelayServer:
             max_message_bytes=LANE_MESSAGE_BYTES,
         )
         self.connections = ConnectionTable(raw, max_connections=max_connections, on_change=self._connections_changed)
-        self.socket = RouterSocket(raw, self._received, on_writable=self._writable)
+        self.socket = RouterSocket(
+            raw, self._received, on_view=self._received, identified=keys is not None, on_writable=self._writable
+        )
         self.socket.on_refused = self._refused
 
     def close(self) -> None:
@@ -85,14 +87,14 @@ class RelayServer:
         self.connections.close()
         self.socket.close()
 
-    def _received(self, routing_id: bytes, user: str, data: bytes) -> None:
+    def _received(self, routing_id: bytes, user: str, data: wire.Datagram) -> None:
         session = self._sessions.get(routing_id)
         if session is None:
             joined = self.express.joined.get(routing_id)
             if joined is not None:
                 self._received_express(routing_id, joined, user, data)
                 return
-            session = self._accept(routing_id, user, data)
+            session = self._accept(routing_id, user, bytes(data))
             if session is None:
                 return
         elif not self._insecure and user != session.port.client:
@@ -112,7 +114,7 @@ class RelayServer:
         _log.warning("connection from %s closed: %s", details.address, why)
         self.connections.cut(details.fd)
 
-    def _received_express(self, routing_id: bytes, joined: Joined, user: str, data: bytes) -> None:
+    def _received_express(self, routing_id: bytes, joined: Joined, user: str, data: wire.Datagram) -> None:
         if not self._insecure and user != joined.client:
             problem = f"its identity changed to {user!r}"
         else:

@@ -90,7 +90,7 @@ class Frames:
         seq: int,
         offset: int,
         total: int,
-        body: bytes,
+        body: wire.Datagram,
         stamp_ns: int,
         age_s: float,
         codec: int,

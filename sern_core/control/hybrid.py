@@ -43,6 +43,9 @@ TARGET_PACKETS: Final = 0.32
 FAST_PACKETS: Final = 2.5
 FAST_S: Final = 0.002
 """Where a packet takes less than this, up to so many more: they cost little, and flows share more fairly."""
+TURNS_S: Final = 0.002
+TURNS_RATE: Final = 50e6
+"""Bytes/s: what queues for a moment on a faster path waits for a processor, as processes take turns."""
 GAIN: Final = 0.35
 PATIENT_EPOCHS: Final = 2
 """The effect of a step is seen two epochs later; only then may the next one be larger."""
@@ -388,7 +391,8 @@ class HybridWindow(CapacityEstimator):
         # A slower flow wants a longer queue than a faster one, so that their shares meet.
         self._calm = noise_s <= CALM_NOISE_S and serialise_s <= CALM_PACKET_S
         packets = (CALM_PACKETS if self._calm else TARGET_PACKETS) + FAST_PACKETS * max(0.0, 1 - serialise_s / FAST_S)
-        self._target_s = TARGET_S + packets * min(own_s, 4 * serialise_s) + noise_s
+        turns_s = TURNS_S * max(0.0, 1 - TURNS_RATE / self._peak) if self._peak else 0.0
+        self._target_s = TARGET_S + packets * min(own_s, 4 * serialise_s) + noise_s + turns_s
         self._high_s = max(0.010, 0.1 * rtt_s) + serialise_s + 1.5 * noise_s
         self._recent.append(queue_s)
         if self._faster_rate is not None and queue_s <= self._high_s:

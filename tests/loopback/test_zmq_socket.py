@@ -15,6 +15,7 @@ from sern_runtime.keys import SecretKey
 from sern_runtime.zap import ZapHandler
 from sern_runtime.zmq_socket import (
     BATCH,
+    VIEW_BYTES,
     DealerSocket,
     FrameSocket,
     RouterSocket,
@@ -57,6 +58,31 @@ async def test_a_burst_arrives_whole_without_the_tick(zmq_context: Context) -> N
     assert count > 10 * BATCH
     router.close()
     dealer.close()
+
+
+async def test_large_messages_come_as_views_where_they_are_taken(zmq_context: Context) -> None:
+    seen: list[bytes] = []
+    views: list[memoryview] = []
+    answers: list[memoryview] = []
+    server = make_server(zmq_context, ["tcp://127.0.0.1:*"], None)
+
+    def on_view(routing_id: bytes, user: str, body: memoryview) -> None:
+        assert user == ""
+        views.append(body)
+        router.send_to(routing_id, body.tobytes())
+
+    router = RouterSocket(server, lambda _id, _user, body: seen.append(body), on_view=on_view, identified=False)
+    client = make_client(zmq_context, endpoint_of(server), None, None)
+    dealer = DealerSocket(client, seen.append, on_view=answers.append)
+    small, large = bytes(VIEW_BYTES - 1), bytes(range(256)) * (VIEW_BYTES // 256)
+    await until(lambda: dealer.send(small), "connected")
+    await until(lambda: dealer.send(large))
+    await until(lambda: bool(answers))
+    assert seen == [small]
+    assert views == [large] and answers == [large]
+    router.close()
+    dealer.close()
+    assert views == [large], "a view outlives the socket"
 
 
 async def test_one_message_a_callback_does_not_stall(zmq_context: Context) -> None:

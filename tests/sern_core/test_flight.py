@@ -1,9 +1,10 @@
 """What is in flight, what has arrived, and when either is given up or acknowledged."""
 
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sern_core.flight import FIRST_LOSS_TIMEOUT_S, SACK_BITS, Arrivals, Flight
+from sern_core.flight import ACK_DELAY_S, ACK_SPACING_S, FIRST_LOSS_TIMEOUT_S, SACK_BITS, SPACED_BYTES, Arrivals, Flight
 
 
 def flight(count: int, *, lossless: bool = False, rtt_s: float | None = 0.1) -> Flight:
@@ -88,13 +89,40 @@ def test_acknowledged_at_once_on_a_gap_and_every_second_time_else() -> None:
         assert arrivals.arrived(number, 10 * number, 100, now=float(at))
         told.append((arrivals.due, arrivals.highest, arrivals.mask, arrivals.echo_us, arrivals.cum_bytes))
         if arrivals.due:
-            arrivals.flushed()
+            arrivals.flushed(float(at))
     assert told == [
         (False, 1, 0, 10, 100),
         (True, 2, 0b1, 20, 200),
         (True, 4, 0b110, 40, 300),
         (True, 4, 0b111, 40, 400),
     ]
+
+
+def test_large_datagrams_of_a_fast_stream_are_acknowledged_together() -> None:
+    arrivals = Arrivals(lossless=True)
+    told = []
+    for number in range(1, 13):
+        now = 0.0002 * number
+        arrivals.arrived(number, 0, SPACED_BYTES, now=now)
+        if arrivals.due:
+            told.append(number)
+            arrivals.flushed(now)
+        elif told:
+            deadlines = (now + ACK_DELAY_S, 0.0002 * told[-1] + ACK_SPACING_S)
+            assert arrivals.deadline_s() == pytest.approx(deadlines[arrivals.unacked > 1])
+    assert told == [2, 7, 12]
+    for number in (13, 14):  # small ones are of a link that is slow, or not known yet
+        arrivals.arrived(number, 0, SPACED_BYTES - 1, now=0.0002 * 12)
+    assert arrivals.due
+
+
+def test_no_acknowledgement_of_datagrams_that_may_be_lost_waits() -> None:
+    arrivals = Arrivals(lossless=False)
+    for number in range(1, 9):
+        arrivals.arrived(number, 0, SPACED_BYTES, now=0.0)
+        assert arrivals.due is (number % 2 == 0)
+        if arrivals.due:
+            arrivals.flushed(0.0)
 
 
 def test_a_far_jump_of_numbers_costs_nothing() -> None:

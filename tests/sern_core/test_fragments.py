@@ -204,3 +204,15 @@ def test_closing_lets_go_of_everything() -> None:
     receiver.piece(2, 0, 50, 100)
     receiver.stream.close()
     assert receiver.room.held_bytes == 0
+
+
+@pytest.mark.parametrize("cuts", [(0, 40), (0, 16, 40)])
+def test_bodies_are_kept_as_bytes_of_their_own(cuts: tuple[int, ...]) -> None:
+    receiver = Receiver()
+    buffer = bytearray(_body(1, 40))
+    for start, end in pairwise(cuts):
+        receiver.stream.fragment(0, 1, start, 40, memoryview(buffer)[start:end], 7, 0.0, 0.0, 0.0)
+    buffer[:] = bytes(40)  # the lane takes its memory back
+    assert [message.body for message in receiver.turns] == [_body(1, 40)]
+    assert type(receiver.turns[0].body) is bytes
+    receiver.check()

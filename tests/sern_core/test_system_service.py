@@ -53,7 +53,7 @@ class Tap:
         seq: int,
         offset: int,
         total: int,
-        body: bytes,
+        body: wire.Datagram,
         stamp_ns: int,
         age_s: float,
         codec: int,

@@ -135,6 +135,19 @@ def test_data_round_trip(
     assert age_s - wire.AGE_UNIT_S <= got[0][7] <= age_s + 1e-9 * (1 + age_s)
 
 
+@pytest.mark.parametrize("sizes", [(3, 40), (wire.SMALL_BODY_BYTES,), (2 * wire.SMALL_BODY_BYTES, 1, 9000)])
+def test_a_view_says_what_its_bytes_say(sizes: tuple[int, ...]) -> None:
+    data = b"".join(
+        wire.encode_data_first(0, 1, seq, size, size, 0, 0.0, 0) + bytes([seq]) * size for seq, size in enumerate(sizes)
+    )
+    told = Frames()
+    wire.decode_frames(memoryview(HEADER + data), told)
+    assert told.frames == frames(data)
+    for cut in (1, sizes[-1], len(data) - 1):
+        with pytest.raises(WireError):
+            wire.decode_frames(memoryview(HEADER + data)[:-cut], Frames())
+
+
 @STEADY
 @given(U16, st.integers(0, 2**64), st.integers(1, 2**31), st.binary(min_size=1, max_size=40), st.integers(0, 2**30))
 def test_later_fragment_round_trip(channel: int, seq: int, offset: int, body: bytes, more: int) -> None:
