@@ -8,6 +8,7 @@ from dataclasses import replace
 from math import inf
 from typing import Final
 
+from sern_client.actions import GoalWatch
 from sern_client.conversion import Converter
 from sern_client.endpoints.base import Endpoint, Publisher, Subscription, publisher_within
 from sern_client.endpoints.composite import CompositeEndpoint
@@ -98,6 +99,8 @@ class Bridge:
         """The datagram lane, where there is one; set by the daemon."""
         self.services: ServiceBridge | None = None
         """Services offered and used, where there are rules for them; set by the daemon."""
+        self.goals: GoalWatch | None = None
+        """Goals of ROS 1 that this site gives to others, where there are rules for them; set by the daemon."""
         self.refusals = 0
         self.subscription_problems: dict[str, str] = {}
         """What the relay does not let us have, in its words, with the code."""
@@ -149,6 +152,8 @@ class Bridge:
         self.summaries.close()
         self._outgoing.clear()
         self._timer.cancel()
+        if self.goals is not None:
+            self.goals.close()
         for incoming in self._incoming.values():
             self._release(incoming)
         self._incoming.clear()
@@ -192,6 +197,8 @@ class Bridge:
             _log.error("%s cannot be offered as %s: %s", info.name, name, error)
             return
         sink = self._sink(channel, self.frames.outgoing(info)) if source is None else source.sink
+        if self.goals is not None:
+            sink = self.goals.outgoing(info, channel, sink)
         self._outgoing[info.name] = Outgoing(channel, self.endpoint.subscribe(info.name, sink), source)
         self._kick()
 
@@ -219,6 +226,8 @@ class Bridge:
     def topic_removed(self, name: TopicName) -> None:
         outgoing = self._outgoing.pop(name, None)
         if outgoing is not None:
+            if self.goals is not None:
+                self.goals.withdrawn(name)
             outgoing.subscription.close()
             if outgoing.source is not None:
                 outgoing.source.close()
@@ -299,6 +308,8 @@ class Bridge:
                 lease = CommandLease(resolved.lease.after_s)
         incoming = Incoming(local, publisher, lease, stop, self.frames.incoming(info))
         self._incoming[stream.id] = incoming
+        if self.goals is not None:
+            self.goals.opened(info, lambda body: self._publish(incoming, body, time.time_ns()))
         updates = self.rebuilds.opened(stream, lambda body, stamp_ns: self._show(incoming, body, stamp_ns))
         if updates is not None:
             self._ask_for(updates)
@@ -330,6 +341,8 @@ class Bridge:
         incoming = self._incoming.pop(stream.id, None)
         self._last_arrival_s.pop(stream.id, None)
         if incoming is not None:
+            if self.goals is not None:
+                self.goals.ended(incoming.local)
             self._release(incoming)
             _log.info("%s from %s has ended", stream.id.topic, stream.id.origin)
 
@@ -344,6 +357,8 @@ class Bridge:
             lifespan_s = stream.spec.lifespan_s
             left_s = inf if lifespan_s is None else max(lifespan_s - age_s, 0.0)
             self._show(incoming, message.body, message.stamp_ns, left_s)
+        if self.goals is not None:
+            self.goals.message(incoming.local, stream.info.encoding, message.body)
         self.ages.observe(stream.spec.priority, age_s)
         if stream.spec.deadline_s is not None:
             self._check_deadline(stream, now)
@@ -388,6 +403,8 @@ class Bridge:
                 outgoing.source.lost(stream.id)
         if self.services is not None:
             self.services.send_dropped(stream, seq, reason)
+        if self.goals is not None:
+            self.goals.send_dropped(stream.id, seq, reason)
         if stream.spec.reliable and not self._closed:  # what is left at the end was said in one line
             _log.warning("%s: our reliable message %d was dropped: %s", stream.id.topic, seq, reason)
 

@@ -13,6 +13,7 @@ from typing import Final
 import zmq
 from prometheus_client import CollectorRegistry
 
+from sern_client.actions import GoalWatch
 from sern_client.bridge import Bridge
 from sern_client.endpoints.base import CountingEndpoint, Endpoint, ServiceEndpoint
 from sern_client.express import ClientExpress
@@ -25,6 +26,7 @@ from sern_client.udp import ClientLane
 from sern_core.client import ClientCore
 from sern_core.errors import ConfigError
 from sern_core.lossy import missing
+from sern_core.rules import compile_pattern
 from sern_core.trace import DecisionTrace
 from sern_core.types import CLASS_LABELS, DropReason, ObjectKind
 from sern_runtime.adaptation import Adaptation
@@ -104,6 +106,9 @@ class ClientDaemon:
         self.bridge.attach(self.core)
         self.core.subscribe(model.subscribe_patterns(), now=now)
         self._serve_services(endpoint)
+        if model.actions.use:
+            rules = tuple((compile_pattern(section.match), section.timeout_s) for section in model.actions.use)
+            self.bridge.goals = GoalWatch(rules, lambda info: self.bridge.converter.advertise(endpoint, info))
         self.adaptation = self._make_adaptation()
         self.reason = "not connected yet"
         self._said: set[str] = set()  # since the last session: an attempt that fails as before is no news
@@ -307,6 +312,11 @@ class ClientDaemon:
             "Calls from here of services of other sites, by outcome: ok, error, timeout, cancelled.",
             ("service", "outcome"),
             self._service_calls,
+        )
+        metrics.counter(
+            "sern_goals_given_up_total",
+            "Goals of ROS 1 that were lost on their way, or not heard of for too long; their clients were told.",
+            read=lambda: [((), float(0 if self.bridge.goals is None else self.bridge.goals.reported))],
         )
         metrics.counter(
             "sern_publish_failures_total",

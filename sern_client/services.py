@@ -11,10 +11,12 @@ import secrets
 import time
 from collections import defaultdict
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Final
 
 from sern_client import conversion
+from sern_client.actions import cancel_request, refusal
 from sern_client.endpoints.base import ServiceEndpoint, ServiceInfo, ServiceServer
 from sern_core.client import ClientCore
 from sern_core.errors import ConfigError, ServiceError, UsageError
@@ -37,6 +39,10 @@ from sern_core.types import DropReason, Durability, PriorityClass, Reliability, 
 MAX_ERROR_CHARS: Final = 512
 MAX_SERVED: Final = 1000
 """Services of other sites that are served here at most: each site may offer what it likes."""
+
+CANCEL_S: Final = 600.0
+"""How long it is tried to cancel a goal that was lost on its way, in case it was not."""
+CANCEL_AGAIN_S: Final = 1.0
 
 _OFFER_SPEC: Final = TopicSpec(
     PriorityClass.STATE,
@@ -125,6 +131,7 @@ class ServiceBridge:
         self.used: dict[TopicName, _Used] = {}  # by global name, which has one owner at the relay
         self._calling: dict[StreamId, _Used] = {}  # by the stream of our calls
         self.callers: dict[StreamId, _Caller] = {}  # by the stream of its calls
+        self._cancelling: set[asyncio.Task[None]] = set()
         self._said_full = False
         self._closed = False
         endpoint.watch_services(self)
@@ -206,7 +213,7 @@ class ServiceBridge:
         self._closed = True
         for used in list(self.used.values()):
             self._withdraw(used, "this site stops", unpublish=False)
-        tasks = [task for caller in self.callers.values() for task in caller.tasks]
+        tasks = [*self._cancelling, *(task for caller in self.callers.values() for task in caller.tasks)]
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
@@ -230,15 +237,21 @@ class ServiceBridge:
         local = to_local(service, self._namespace)
         used = _Used(service, stream, rule)
 
+        offered = ServiceInfo(local, info.type_name, info.encoding, info.type_hash, info.definition)
+        otherwise = refusal(offered)
+
         async def handler(request: bytes) -> bytes:
-            return await self._call(used, request)
+            try:
+                return await self._call(used, request)
+            except ServiceError as error:
+                if otherwise is None:
+                    raise
+                _log.warning("%s: refused in its server's place: %s", local, error)
+                self._cancel_lost(service, request)
+                return otherwise
 
         try:
-            used.server = conversion.serve(
-                self._endpoint,
-                ServiceInfo(local, info.type_name, info.encoding, info.type_hash, info.definition),
-                handler,
-            )
+            used.server = conversion.serve(self._endpoint, offered, handler)
         except ConfigError as error:
             _log.error("service %s of %s cannot be served here: %s", service, stream.id.origin, error)
             raise
@@ -315,6 +328,26 @@ class ServiceBridge:
         finally:
             used.waiting.pop(number, None)
             used.numbers.pop(seq, None)
+
+    def _cancel_lost(self, service: TopicName, request: bytes) -> None:
+        """A goal of ROS 2 whose client is told that it is refused may have been accepted, unknown to us: end it."""
+        action = service.removesuffix("/_action/send_goal")
+        body = cancel_request(request)
+        if action != service and body is not None and len(self._cancelling) < MAX_CALLS:
+            task = asyncio.create_task(self._cancel(TopicName(f"{action}/_action/cancel_goal"), body))
+            self._cancelling.add(task)
+            task.add_done_callback(self._cancelling.discard)
+
+    async def _cancel(self, service: TopicName, request: bytes) -> None:
+        """Until it has been answered: the link may be away."""
+        until_s = time.monotonic() + CANCEL_S
+        while time.monotonic() < until_s:
+            used = self.used.get(service)
+            if used is not None:
+                with suppress(ServiceError):
+                    await self._call(used, request)
+                    return
+            await asyncio.sleep(CANCEL_AGAIN_S)
 
     def _replied(self, used: _Used, body: bytes) -> None:
         if len(body) < REPLY.size:

@@ -1,10 +1,14 @@
-"""Definitions from .msg and .srv files, for types that not every installation has.
+"""Definitions from .msg, .srv and .action files, for types that not every installation has.
 
 ROS 2 middleware announces a topic with the name and hash of its type, never with the definition. What is not known here
 comes from directories a person names: a ROS install's `share`, a workspace's `src`, or a folder laid out alike
 (`PACKAGE/msg/Name.msg`, at any depth).
+
+Of an action `pkg/action/Name` ROS 2 makes messages (`Name_Goal`, `Name_Result`, `Name_Feedback`,
+`Name_FeedbackMessage`) and services (`Name_SendGoal`, `Name_GetResult`), all of the kind `action`.
 """
 
+import re
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Final
@@ -17,6 +21,19 @@ from sern_runtime import ros_services, ros_types
 
 _SEPARATOR: Final = "=" * 80 + "\n"
 _DIVIDER: Final = "---"
+_KINDS: Final = ("msg", "srv", "action")
+_ACTION_PART: Final = re.compile(r"(?P<action>\w+/action/\w+)_(?P<part>[A-Za-z]+)")
+_ACTION_PARTS: Final = ("Goal", "Result", "Feedback")
+_BARE_TYPE: Final = re.compile(r"^\s*([A-Z]\w*)(?![\w/])", re.MULTILINE)
+_UUID: Final = "unique_identifier_msgs/UUID goal_id\n"
+_MADE: Final = {
+    "FeedbackMessage": _UUID + "{action}_Feedback feedback\n",
+    "SendGoal": _UUID + "{action}_Goal goal\n---\nbool accepted\nbuiltin_interfaces/Time stamp\n",
+    "GetResult": _UUID + "---\nint8 status\n{action}_Result result\n",
+}
+_KNOWN_ACTIONS: Final = {
+    "example_interfaces/action/Fibonacci": "int32 order\n---\nint32[] sequence\n---\nint32[] sequence\n",
+}
 
 
 class TypeFiles:
@@ -32,7 +49,7 @@ class TypeFiles:
         ConfigError when a file cannot be read, or uses a type that is nowhere.
         """
         name = ros_types.canonical(type_name)
-        own = self._read(name)
+        own = self._own(name)
         if own is None:
             known = ros_types.describe(name, encoding)
             return None if known is None else known.definition
@@ -43,19 +60,35 @@ class TypeFiles:
 
         Raises as `message` does.
         """
-        own = self._read(type_name)
+        own = self._own(type_name)
         if own is None:
             try:
                 return ros_services.resolve(type_name, "", encoding).text.definition
             except ConfigError:
                 return None
-        return own.rstrip("\n") + "\n" + self._below(type_name, _halves(type_name, own), encoding)
+        return own.rstrip("\n") + "\n" + self._below(type_name, _split(type_name, own, 2), encoding)
+
+    def _own(self, name: str) -> str | None:
+        """The text of one type, as its file has it or as ROS 2 makes it of an action's."""
+        part = _ACTION_PART.fullmatch(name)
+        if part is None:
+            return self._read(name)
+        text = self._read(part["action"]) or _KNOWN_ACTIONS.get(part["action"])
+        if text is None:
+            return None
+        if part["part"] in _MADE:
+            return _MADE[part["part"]].format(action=part["action"])
+        if part["part"] not in _ACTION_PARTS:
+            return None
+        own = _split(part["action"], text, len(_ACTION_PARTS))[_ACTION_PARTS.index(part["part"])]
+        # A name alone is of the package's messages, also in a text of the kind `action`.
+        return _BARE_TYPE.sub(rf"{name.partition('/')[0]}/\1", own)
 
     def _read(self, name: str) -> str | None:
         if self._files is None:
             self._files = {}
             for root in self._paths:
-                for kind in ("msg", "srv"):
+                for kind in _KINDS:
                     for file in sorted(root.rglob(f"{kind}/*.{kind}")):
                         self._files.setdefault(f"{file.parent.parent.name}/{kind}/{file.stem}", file)
         path = self._files.get(name)
@@ -72,8 +105,7 @@ class TypeFiles:
         for text in texts:
             self._collect(name, text, sections, encoding)
         return "".join(
-            f"{_SEPARATOR}MSG: {ros_types.ros1_name(used)}\n" + text.rstrip("\n") + "\n"
-            for used, text in sections.items()
+            f"{_SEPARATOR}MSG: {_heading(used)}\n" + text.rstrip("\n") + "\n" for used, text in sections.items()
         )
 
     def _collect(self, name: str, text: str, sections: dict[str, str], encoding: Encoding) -> None:
@@ -86,7 +118,7 @@ class TypeFiles:
         for used in ros_types.uses(types[parsed_as][1]):
             if used in sections or used == name:
                 continue
-            own = self._read(used)
+            own = self._own(used)
             if own is not None:
                 sections[used] = own
                 self._collect(used, own, sections, encoding)
@@ -100,14 +132,20 @@ class TypeFiles:
                 sections.setdefault(ros_types.canonical(head.removeprefix("MSG: ").strip()), body)
 
 
-def _halves(name: str, text: str) -> list[str]:
-    """Request and response of a .srv text."""
-    halves: list[list[str]] = [[]]
+def _heading(name: str) -> str:
+    """As a section of a definition names its type."""
+    return name if "/action/" in name else ros_types.ros1_name(name)
+
+
+def _split(type_name: str, text: str, count: int) -> list[str]:
+    """The parts of a .srv or .action text. ConfigError when there are not so many."""
+    parts: list[list[str]] = [[]]
     for line in text.splitlines():
         if line.strip() == _DIVIDER:
-            halves.append([])
+            parts.append([])
         else:
-            halves[-1].append(line)
-    if len(halves) != 2:
-        raise ConfigError(f"service type {name}: its definition needs one line of --- between request and response")
-    return ["\n".join(half) + "\n" for half in halves]
+            parts[-1].append(line)
+    if len(parts) != count:
+        wanted = "one line of --- between request and response" if count == 2 else "two lines of --- between its parts"
+        raise ConfigError(f"type {type_name}: its definition needs {wanted}")
+    return ["\n".join(part) + "\n" for part in parts]

@@ -18,6 +18,10 @@ from sern_runtime.ros_types import Counterpart, ResolvedType, TypeText
 
 _SEPARATOR: Final = "=" * 80 + "\n"
 _KNOWN: Final = {
+    "action_msgs/srv/CancelGoal": (
+        "action_msgs/GoalInfo goal_info\n---\nint8 ERROR_NONE=0\nint8 ERROR_REJECTED=1\nint8 ERROR_UNKNOWN_GOAL_ID=2\n"
+        "int8 ERROR_GOAL_TERMINATED=3\nint8 return_code\naction_msgs/GoalInfo[] goals_canceling\n"
+    ),
     "std_srvs/srv/Empty": "---\n",
     "std_srvs/srv/SetBool": "bool data\n---\nbool success\nstring message\n",
     "std_srvs/srv/Trigger": "---\nbool success\nstring message\n",
@@ -80,8 +84,8 @@ def counterpart(type_name: str, definition: str, encoding: Encoding) -> ServiceC
 
 
 def _canonical(type_name: str) -> str:
-    package, *_, name = type_name.split("/")
-    return ros_types.canonical(f"{package}/srv/{name}")
+    package, *kind, name = type_name.split("/")
+    return ros_types.canonical(f"{package}/{'action' if kind == ['action'] else 'srv'}/{name}")
 
 
 def _halves(name: str, definition: str, encoding: Encoding) -> list[tuple[str, str]]:

@@ -20,6 +20,8 @@ def share(tmp_path: Path) -> Path:
         "my_msgs/msg/Lost.msg": "nowhere_msgs/Thing thing\n",
         "my_msgs/msg/Bad.msg": "uint8[ x\n",
         "my_msgs/srv/Half.srv": "bool a\n",
+        "my_msgs/action/Go.action": "Part target\n---\nbool there\n---\nPart[] passed\n",
+        "my_msgs/action/Odd.action": "bool a\n---\nbool b\n",
     }
     for name, text in files.items():
         path = tmp_path / name
@@ -51,6 +53,47 @@ def test_a_service(share: Path) -> None:
     assert [name for name, _ in service.request.store.fielddefs[service.request.name][1]] == ["part"]
 
 
+def fields(type_name: str, text: str | None) -> list[tuple[str, str]]:
+    """Names and types of a message's fields, types by their last word."""
+    assert text is not None
+    resolved = ros_types.resolve(type_name, text, Encoding.CDR)
+    return [(name, repr(desc).split("'")[1]) for name, desc in resolved.store.fielddefs[type_name][1]]
+
+
+def test_an_action(share: Path) -> None:
+    """Three services and two topics, as ROS 2 makes them of it; `CancelGoal` and the status are of every action."""
+    files, go = TypeFiles([share]), "my_msgs/action/Go"
+    uuid = ("goal_id", "unique_identifier_msgs/msg/UUID")
+    assert fields(f"{go}_FeedbackMessage", files.message(f"{go}_FeedbackMessage")) == [
+        uuid,
+        ("feedback", f"{go}_Feedback"),
+    ]
+    assert fields(f"{go}_Goal", files.message(f"{go}_Goal")) == [("target", "my_msgs/msg/Part")]
+    parts = {}
+    for name in (f"{go}_SendGoal", f"{go}_GetResult", "action_msgs/srv/CancelGoal"):
+        text = files.service(name)
+        assert text is not None
+        service = ros_services.resolve(name, text, Encoding.CDR)
+        assert service.name == name and service.text.type_hash.startswith("RIHS01_")
+        parts[name] = [
+            [(key, repr(desc).split("'")[1]) for key, desc in half.store.fielddefs[half.name][1]]
+            for half in (service.request, service.response)
+        ]
+    assert parts == {
+        f"{go}_SendGoal": [
+            [uuid, ("goal", f"{go}_Goal")],
+            [("accepted", "bool"), ("stamp", "builtin_interfaces/msg/Time")],
+        ],
+        f"{go}_GetResult": [[uuid], [("status", "int8"), ("result", f"{go}_Result")]],
+        "action_msgs/srv/CancelGoal": [
+            [("goal_info", "action_msgs/msg/GoalInfo")],
+            [("return_code", "int8"), ("goals_canceling", "action_msgs/msg/GoalInfo")],
+        ],
+    }
+    assert files.message(f"{go}_Nothing") is None and files.service("my_msgs/action/Stay_SendGoal") is None
+    assert TypeFiles().service("example_interfaces/action/Fibonacci_SendGoal") is not None
+
+
 def test_what_is_known_needs_no_file() -> None:
     files = TypeFiles()
     known = ros_types.describe("nav_msgs/msg/Odometry", Encoding.CDR)
@@ -67,6 +110,7 @@ def test_what_is_known_needs_no_file() -> None:
         ("message", "my_msgs/msg/Lost", r"uses nowhere_msgs/msg/Thing, whose definition is in none of the type_paths"),
         ("message", "my_msgs/msg/Bad", r"my_msgs/msg/Bad: its definition cannot be parsed"),
         ("service", "my_msgs/srv/Half", r"needs one line of --- between"),
+        ("message", "my_msgs/action/Odd_Goal", r"action/Odd: its definition needs two lines of --- between its parts"),
     ],
 )
 def test_what_is_wrong_with_a_file_is_said(share: Path, kind: str, name: str, problem: str) -> None:

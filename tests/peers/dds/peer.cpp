@@ -108,6 +108,15 @@ static std::map<std::string, Kind> kinds() {
     add(Kind{TypeSupport(new std_msgs::msg::dds_::String_PubSubType()), nullptr, nullptr});
     add(Kind{TypeSupport(new std_srvs::srv::dds_::SetBool_Request_PubSubType()), nullptr, nullptr});
     add(Kind{TypeSupport(new std_srvs::srv::dds_::SetBool_Response_PubSubType()), nullptr, nullptr});
+    using namespace example_interfaces::action::dds_;
+    add(Kind{TypeSupport(new Fibonacci_SendGoal_Request_PubSubType()), nullptr, nullptr});
+    add(Kind{TypeSupport(new Fibonacci_SendGoal_Response_PubSubType()), nullptr, nullptr});
+    add(Kind{TypeSupport(new Fibonacci_GetResult_Request_PubSubType()), nullptr, nullptr});
+    add(Kind{TypeSupport(new Fibonacci_GetResult_Response_PubSubType()), nullptr, nullptr});
+    add(Kind{TypeSupport(new Fibonacci_FeedbackMessage_PubSubType()), nullptr, nullptr});
+    add(Kind{TypeSupport(new action_msgs::srv::dds_::CancelGoal_Request_PubSubType()), nullptr, nullptr});
+    add(Kind{TypeSupport(new action_msgs::srv::dds_::CancelGoal_Response_PubSubType()), nullptr, nullptr});
+    add(Kind{TypeSupport(new action_msgs::msg::dds_::GoalStatusArray_PubSubType()), nullptr, nullptr});
     add(Kind{TypeSupport(new rmw_dds_common::msg::dds_::ParticipantEntitiesInfo_PubSubType()), nullptr, nullptr});
     add(stamped_kind<nav_msgs::msg::dds_::Odometry_>(new nav_msgs::msg::dds_::Odometry_PubSubType()));
     add(stamped_kind<sensor_msgs::msg::dds_::PointCloud2_>(new sensor_msgs::msg::dds_::PointCloud2_PubSubType()));

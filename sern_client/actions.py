@@ -1,0 +1,308 @@
+"""Goals that the far side will never answer, told to who gave them.
+
+An action of ROS 1 (actionlib) is five topics, and its client waits for ever for a goal that was lost on its way. At the
+client's site each goal that goes out is therefore watched: where it is dropped, or nothing is heard of it in time, the
+client gets a result with the status REJECTED (never taken up, as far as we know) or ABORTED (it was under way), and a
+cancel goes after the goal, because what its client believes dead must not drive a robot. An action of ROS 2 is services
+and topics; there the answers of `refusal` take the place of those that do not come.
+"""
+
+import asyncio
+import logging
+import re
+import struct
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, Final, NamedTuple
+
+from sern_client.endpoints.base import Publisher, ServiceInfo, Sink
+from sern_core.errors import ConfigError
+from sern_core.message import StreamId, TopicInfo
+from sern_core.queues import OutChannel
+from sern_core.types import DropReason, Encoding, TopicName
+from sern_runtime import ros_services, ros_types
+from sern_runtime.loop import Timer
+
+REJECTED, ABORTED = 5, 4
+"""Of actionlib_msgs/GoalStatus."""
+ACCEPT_S: Final = 5.0
+"""How long beyond its lifespan on the link a goal may take until its server is heard of it."""
+MAX_GOALS: Final = 1000
+"""Goals of one action that are watched at a time; of more, the oldest are watched no longer."""
+STATUS_TYPE: Final = "actionlib_msgs/msg/GoalStatusArray"
+
+_LITTLE_ENDIAN: Final = b"\x00\x01\x00\x00"
+_UUID: Final = slice(4, 20)
+"""Of the goal, where a request of `send_goal` begins with it."""
+_TIME: Final = struct.Struct("<II")
+_LENGTH: Final = struct.Struct("<I")
+_HEADER_BYTES: Final = 12  # seq and stamp of a std_msgs/Header, before its frame_id
+
+_log = logging.getLogger(__name__)
+
+
+def refusal(info: ServiceInfo) -> bytes | None:
+    """What a service of an action of ROS 2 answers when the one of the far side does not: the goal is not accepted,
+    nothing is cancelled, the result is unknown. None for other services, and for a result that nobody can make up.
+    """
+    if info.encoding is not Encoding.CDR:
+        return None
+    part = info.name.rpartition("/_action/")[2]
+    if part == "send_goal":
+        return _LITTLE_ENDIAN + bytes(12)  # bool accepted, builtin_interfaces/Time stamp
+    if part == "cancel_goal":
+        return _LITTLE_ENDIAN + b"\x01" + bytes(7)  # int8 return_code ERROR_REJECTED, GoalInfo[] goals_canceling
+    if part != "get_result":
+        return None
+    try:
+        resolved = ros_services.resolve(info.type_name, info.definition, Encoding.CDR).response
+        empty = ros_types.new_in(resolved.store, resolved.name)  # int8 status STATUS_UNKNOWN
+        return bytes(resolved.store.serialize_cdr(empty, resolved.name))
+    except ConfigError:
+        return None
+
+
+def cancel_request(send_goal_request: bytes) -> bytes | None:
+    """action_msgs/CancelGoal for the goal of a request of `send_goal`, both as CDR; None where there is none in it."""
+    if len(send_goal_request) < _UUID.stop or send_goal_request[1] > 1:
+        return None
+    return send_goal_request[:4] + send_goal_request[_UUID] + bytes(8)  # GoalInfo: UUID goal_id, Time stamp
+
+
+class GoalId(NamedTuple):
+    """actionlib_msgs/GoalID: when the client gave the goal, and what it calls it."""
+
+    secs: int
+    nsecs: int
+    text: str
+
+    def pack(self) -> bytes:
+        text = self.text.encode(errors="surrogateescape")
+        return _TIME.pack(self.secs, self.nsecs) + _LENGTH.pack(len(text)) + text
+
+
+def goal_id(body: bytes) -> GoalId:
+    """Of an action goal, which begins with a header and this. ConfigError for bytes that do not."""
+    try:
+        (length,) = _LENGTH.unpack_from(body, _HEADER_BYTES)
+        at = _HEADER_BYTES + _LENGTH.size + length
+        secs, nsecs = _TIME.unpack_from(body, at)
+        at += _TIME.size
+        (length,) = _LENGTH.unpack_from(body, at)
+    except struct.error:
+        raise ConfigError(f"{len(body)} bytes are no action goal") from None
+    at += _LENGTH.size
+    if at + length > len(body):
+        raise ConfigError(f"{len(body)} bytes are no action goal")
+    return GoalId(secs, nsecs, body[at : at + length].decode(errors="surrogateescape"))
+
+
+def result_body(info: TopicInfo, goal: GoalId, status: int, text: str) -> bytes:
+    """An action result without content. ConfigError when its type is not known, or is none."""
+    resolved = ros_types.resolve(info.type_name, info.definition, Encoding.ROS1)
+    result: Any = ros_types.new_in(resolved.store, resolved.name)
+    try:
+        result.status.goal_id.stamp.sec = goal.secs
+        result.status.goal_id.stamp.nanosec = goal.nsecs
+        result.status.goal_id.id = goal.text
+        result.status.status = status
+        result.status.text = text
+    except AttributeError:
+        raise ConfigError(f"type {info.type_name} is no action result") from None
+    return bytes(resolved.store.serialize_ros1(result, resolved.name))
+
+
+@dataclass(slots=True)
+class _Goal:
+    """One that is on its way or under way. `due_s`: when we give it up, unless something is heard of it."""
+
+    ident: GoalId
+    stream: StreamId
+    seq: int
+    due_s: float
+    heard: bool = False
+
+
+@dataclass(slots=True, eq=False)
+class _Action:
+    """An action of another site that nodes here use. `patience_s`: how long a goal may go unmentioned."""
+
+    name: str
+    patience_s: float
+    accept_s: float = ACCEPT_S
+    goals: dict[str, _Goal] = field(default_factory=dict)
+    result: TopicInfo | None = None  # as it was last seen
+    publish: Callable[[bytes], None] | None = None  # while the far side has its result
+    cancel: Sink | None = None
+
+
+class GoalWatch:
+    """Of all actions that match one of `rules`: (local name, how long nothing may be heard of an accepted goal)."""
+
+    def __init__(
+        self, rules: tuple[tuple[re.Pattern[str], float], ...], advertise: Callable[[TopicInfo], Publisher]
+    ) -> None:
+        self.reported = 0
+        """Goals whose clients were told that they have failed."""
+        self._rules = rules
+        self._advertise = advertise
+        self._actions: dict[str, _Action] = {}
+        self._by_message: dict[tuple[StreamId, int], tuple[_Action, str]] = {}
+        self._timer = Timer(self._due)
+
+    def close(self) -> None:
+        self._timer.cancel()
+        self._actions.clear()
+        self._by_message.clear()
+
+    def _part(self, name: TopicName, encoding: Encoding) -> tuple[_Action, str] | None:
+        """The action that a topic of ours belongs to, and what it is there."""
+        action, _, part = name.rpartition("/")
+        if encoding is not Encoding.ROS1 or part not in {"goal", "cancel", "status", "result"}:
+            return None
+        known = self._actions.get(action)
+        if known is None:
+            patience_s = next((patience_s for match, patience_s in self._rules if match.fullmatch(action)), None)
+            if patience_s is None:
+                return None
+            known = self._actions[action] = _Action(action, patience_s)
+        return known, part
+
+    # What goes out
+
+    def outgoing(self, info: TopicInfo, channel: OutChannel, sink: Sink) -> Sink:
+        """The sink of a topic that is offered to the link, with its goals watched where it has any."""
+        found = self._part(info.name, info.encoding)
+        if found is None:
+            return sink
+        action, part = found
+        if part == "cancel":
+            action.cancel = sink
+        if part != "goal":
+            return sink
+        action.accept_s = (channel.spec.lifespan_s or 0.0) + ACCEPT_S
+
+        def watched(body: bytes, stamp_ns: int) -> bool:
+            goal = self._given(action, channel, body)
+            accepted = sink(body, stamp_ns)
+            if not accepted and goal is not None:
+                self._fail_soon(action, goal, "too much waits for the link")
+            return accepted
+
+        return watched
+
+    def withdrawn(self, name: TopicName) -> None:
+        """A topic of this site has ended. Who gave its goals is gone."""
+        found = self._part(name, Encoding.ROS1)
+        if found is None:
+            return
+        action, part = found
+        if part == "cancel":
+            action.cancel = None
+        elif part == "goal":
+            for text in list(action.goals):
+                self._forget(action, text)
+
+    def _given(self, action: _Action, channel: OutChannel, body: bytes) -> _Goal | None:
+        try:
+            ident = goal_id(body)
+        except ConfigError:
+            return None
+        while len(action.goals) >= MAX_GOALS:
+            self._forget(action, next(iter(action.goals)))
+        goal = _Goal(ident, channel.stream.id, channel.next_seq, time.monotonic() + action.accept_s)
+        action.goals[ident.text] = goal
+        self._by_message[goal.stream, goal.seq] = action, ident.text
+        self._arm()
+        return goal
+
+    def send_dropped(self, stream: StreamId, seq: int, reason: DropReason) -> None:
+        """A message of ours was dropped, here or on its way."""
+        found = self._by_message.get((stream, seq))
+        if found is not None:
+            action, text = found
+            self._fail_soon(action, action.goals[text], f"it was dropped on its way: {reason}")
+
+    # What comes in
+
+    def opened(self, info: TopicInfo, publish: Callable[[bytes], None]) -> None:
+        """A stream from another site is published here."""
+        found = self._part(info.name, info.encoding)
+        if found is not None and found[1] == "result":
+            found[0].result = info
+            found[0].publish = publish
+
+    def ended(self, name: TopicName) -> None:
+        found = self._part(name, Encoding.ROS1)
+        if found is not None and found[1] == "result":
+            found[0].publish = None
+
+    def message(self, name: TopicName, encoding: Encoding, body: bytes) -> None:
+        """Something arrived; what it says of goals that are watched counts."""
+        action, _, part = name.rpartition("/")
+        known = self._actions.get(action)
+        if known is None or not known.goals or encoding is not Encoding.ROS1 or part not in {"status", "result"}:
+            return
+        if part == "status":
+            try:
+                mentioned = ros_types.deserialise(body, STATUS_TYPE, Encoding.ROS1).status_list
+            except ConfigError:
+                return
+            for status in mentioned:
+                goal = known.goals.get(status.goal_id.id)
+                if goal is not None:
+                    goal.heard = True
+                    goal.due_s = time.monotonic() + known.patience_s
+            self._arm()
+            return
+        try:
+            ended = goal_id(body)  # a result begins as a goal does: header, then status, then goal id
+        except ConfigError:
+            return
+        if ended.text in known.goals:
+            self._forget(known, ended.text)
+
+    # Who waits
+
+    def _forget(self, action: _Action, text: str) -> None:
+        goal = action.goals.pop(text)
+        self._by_message.pop((goal.stream, goal.seq), None)
+
+    def _arm(self) -> None:
+        due = [goal.due_s for action in self._actions.values() for goal in action.goals.values()]
+        self._timer.arm(min(due) if due else None)
+
+    def _due(self) -> None:
+        now = time.monotonic()
+        for action in list(self._actions.values()):
+            for goal in [goal for goal in action.goals.values() if goal.due_s <= now]:
+                for_s = action.patience_s if goal.heard else action.accept_s
+                self._fail(action, goal, f"nothing was heard of it for {for_s:g} s")
+        self._arm()
+
+    def _fail_soon(self, action: _Action, goal: _Goal, why: str) -> None:
+        """Not from within the core, which is in the middle of something."""
+        asyncio.get_running_loop().call_soon(self._fail, action, goal, why)
+
+    def _fail(self, action: _Action, goal: _Goal, why: str) -> None:
+        if action.goals.get(goal.ident.text) is not goal:
+            return
+        self._forget(action, goal.ident.text)
+        if action.cancel is not None:
+            action.cancel(goal.ident.pack(), time.time_ns())
+        _log.warning("%s: goal %s is given up and cancelled: %s", action.name, goal.ident.text, why)
+        if action.result is None:
+            return  # its client has never seen a server either
+        try:
+            body = result_body(action.result, goal.ident, ABORTED if goal.heard else REJECTED, f"SERN: {why}")
+            if action.publish is not None:
+                action.publish(body)
+            else:
+                publisher = self._advertise(action.result)
+                publisher.publish(body, time.time_ns())
+                publisher.close()
+        except ConfigError as error:
+            _log.error("%s: the client of goal %s cannot be told: %s", action.name, goal.ident.text, error)
+            return
+        self.reported += 1
