@@ -1,31 +1,14 @@
-"""The `sern` command. Every subcommand is registered here, in one place."""
+"""The `sern` command: its entry. The subcommands are in `sern_tools.commands`."""
 
-import typer
-
-from sern_tools import check, keygen
-from sern_tools.demo import demo
-from sern_tools.echo import echo
-from sern_tools.explain import explain
-from sern_tools.lab.cli import app as lab_app
-from sern_tools.topics import topics
-
-app = typer.Typer(
-    name="sern",
-    help="Keep a robot's virtual twin and its operator useful over thin, lossy, broken links.",
-    no_args_is_help=True,
-    add_completion=False,
-    pretty_exceptions_enable=False,
-)
-app.command()(demo)
-app.add_typer(keygen.app, name="keygen")
-app.add_typer(lab_app, name="lab")
-app.command("check")(check.check_command)
-app.command()(topics)
-app.command()(echo)
-app.command()(explain)
+import signal
 
 
 def main() -> None:
+    # Ctrl-C during the imports, which take a second, is an end, not a traceback.
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    from sern_tools.commands import app
+
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     app()
 
 

@@ -10,7 +10,7 @@ import typer.main
 
 from sern_runtime.profiles import load_profiles
 from sern_sim.netem import netem_commands
-from sern_tools.cli import app
+from sern_tools.commands import app
 from tests.daemons import Lab
 
 ROOT: Final = Path(__file__).resolve().parents[2]

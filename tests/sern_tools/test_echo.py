@@ -22,7 +22,7 @@ from sern_core.message import Message, StreamId, StreamInfo, TopicInfo, TopicSpe
 from sern_core.types import ClientName, DropReason, Encoding, TopicName
 from sern_runtime import ros_types
 from sern_runtime.loop import Shutdown
-from sern_tools.cli import app
+from sern_tools.commands import app
 from sern_tools.echo import (
     Listener,
     Printer,

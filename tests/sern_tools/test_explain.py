@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 
 from sern_core.trace import DecisionTrace, TraceEvent
 from sern_core.types import TopicName
-from sern_tools.cli import app
+from sern_tools.commands import app
 from sern_tools.explain import WIDTH, story, trace_of
 from sern_tools.explain_replay import Setup, read_bag
 from tests.daemons import Lab, write_bag

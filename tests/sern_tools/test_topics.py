@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 
 from sern_core.errors import SernError, UsageError
 from sern_tools import api
-from sern_tools.cli import app
+from sern_tools.commands import app
 from sern_tools.demo_link import free_ports
 from sern_tools.topics import (
     Counts,
