@@ -108,7 +108,8 @@ class Queues:
         self.now = 0.0
         self.next = 0
         self.configuration = Configuration()
-        self.thinned = [(0.37 * index) % 1.0 for index in range(len(topics))]  # out of step with each other
+        phases = Random(f"thinning {seed}")  # which messages a share lets in must not suit one trace in every run
+        self.thinned = [phases.random() for _ in topics]
         self.waiting: list[deque[_Message]] = [deque() for _ in topics]
         self.active: list[_Message | None] = [None] * len(topics)  # begun, with fragments to send
         self.last_sent_s = [0.0] * len(topics)

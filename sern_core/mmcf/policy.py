@@ -12,7 +12,7 @@ summary costs less than GAIN_TO_SWITCH of that. Back it goes when raw fits with 
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
@@ -28,12 +28,20 @@ from sern_core.mmcf.model import (
     Prediction,
     Situation,
 )
-from sern_core.mmcf.predict import RAW_FIRST, Bounds, Grid, Predictions, Predictor
+from sern_core.mmcf.playback import CapacityPath
+from sern_core.mmcf.predict import PLANNED_SHARE, RAW_FIRST, Bounds, Grid, Predictions, Predictor
+from sern_core.mmcf.queueing import Floats
 from sern_core.mmcf.residuals import Residuals
 from sern_core.types import CLASSES, PriorityClass
 
 GAIN_TO_SWITCH: Final = 0.9
 """A new configuration must cost less than this share of the active one."""
+SAME_COST: Final = 0.01
+"""Costs that differ by less are the same: predictions err by more."""
+SAVED_TO_SWITCH: Final = 0.4
+"""On a link that swings: what a candidate must have been predicted to save since the last change, in costs of an
+interval. The prediction is of whole swings, so a small gain is believed when it lasts, and a large one is not when it
+does not: 8 % for five intervals, say."""
 INTERVALS_TO_STAND: Final = 3
 STEADY: Final = 0.25
 """A capacity that changed by more within the interval makes its measurement a mixture nobody can learn from."""
@@ -46,8 +54,8 @@ RAW_BACK_SERVED: Final = 0.95
 RAW_BACK_LOAD: Final = 0.8
 """Before a class that is summarised goes back to raw: of what is needed, and the load of the planned capacity."""
 
-SWINGS: Final = 2
-"""So many drops within the memory make a link that swings."""
+TURNS_OF_SWING: Final = 3
+"""Down, up and down again within the memory, or up, down and up: a link that swings."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,7 +158,7 @@ def fixed_reliability(codecs: Sequence[str]) -> Configuration:
 @dataclass(slots=True)
 class _Levels:
     at_s: float
-    capacities_bps: tuple[float, ...]
+    readings_bps: tuple[float, ...]
 
 
 class CapacityPlan:
@@ -167,45 +175,50 @@ class CapacityPlan:
     def add(self, link: LinkState, *, now: float) -> None:
         """Duty: the capacity is known."""
         assert link.capacity_bps is not None
-        self._levels.append(_Levels(now, (*link.samples_bps, link.capacity_bps)))
+        self._levels.append(_Levels(now, link.samples_bps or (link.capacity_bps,)))
         while self._levels[0].at_s < now - self._memory_s:
             self._levels.popleft()
 
     @property
     def steady(self) -> bool:
         """Whether the estimates of the last interval agree."""
-        latest = self._levels[-1].capacities_bps
+        latest = self._levels[-1].readings_bps
         if len(latest) == 1 and len(self._levels) > 1:
-            latest = (self._levels[-2].capacities_bps[-1], latest[0])
+            latest = (self._levels[-2].readings_bps[-1], latest[0])
         return max(latest) - min(latest) <= 2.0 * STEADY * max(latest)
 
-    def _history(self) -> list[float]:
-        return [capacity_bps for levels in self._levels for capacity_bps in levels.capacities_bps]
+    def path(self) -> CapacityPath | None:
+        """The capacities of late where the link swings, whole swings of them; None where it holds still, or has just
+        changed."""
+        readings = [capacity_bps for levels in self._levels for capacity_bps in levels.readings_bps]
+        turns = _turns(readings)
+        if len(turns) < TURNS_OF_SWING:
+            return None
+        # From fall to fall or from rise to rise: so good moments and bad ones have their shares.
+        last = turns[-1] if len(turns) % 2 else turns[-2]
+        first_s = self._levels[0].at_s
+        interval_s = (self._levels[-1].at_s - first_s) / max(len(self._levels) - 1, 1)
+        duration_s = interval_s * len(self._levels) * (last - turns[0]) / len(readings)
+        planned_bps = [PLANNED_SHARE * capacity_bps for capacity_bps in readings[turns[0] : last]]
+        return CapacityPath.of(duration_s, planned_bps, max(1, round(duration_s / interval_s)))
 
-    def _drops(self, history: list[float]) -> int:
-        """How often the estimate fell from one level to another: by much, and not noise about a threshold."""
-        drops, high = 0, history[0]
-        low = high
-        for capacity_bps in history:
-            if capacity_bps < (1.0 - SWING) * high:
-                drops += 1
-                high = low = capacity_bps
-            else:
-                low = min(low, capacity_bps)
-                high = max(high, capacity_bps) if capacity_bps > (1.0 + SWING) * low else high
-        return drops
 
-    def planned(self) -> list[tuple[float, float]]:
-        """(share, capacity), the estimate first."""
-        history = self._history()
-        latest = history[-1]
-        if self._drops(history) < SWINGS:
-            return [(1.0, latest)]
-        others = [capacity_bps for capacity_bps in history if abs(capacity_bps - latest) > SWING * latest]
-        if not others:
-            return [(1.0, latest)]
-        share = len(others) / len(history)
-        return [(1.0 - share, latest), (share, sum(others) / len(others))]
+def _turns(readings_bps: Sequence[float]) -> list[int]:
+    """Where the capacity went from one level to another, down and up in turn: by much, and not noise about a
+    threshold."""
+    turns: list[int] = []
+    down, low, high = None, readings_bps[0], readings_bps[0]
+    for place, capacity_bps in enumerate(readings_bps):
+        low, high = min(low, capacity_bps), max(high, capacity_bps)
+        if down is not True and capacity_bps < (1.0 - SWING) * high:
+            down = True
+        elif down is not False and (1.0 - SWING) * capacity_bps > low:
+            down = False
+        else:
+            continue
+        turns.append(place)
+        low = high = capacity_bps
+    return turns
 
 
 class Mmcf(Policy):
@@ -231,6 +244,7 @@ class Mmcf(Policy):
         self._plan = CapacityPlan(memory_s)
         self._active = initial
         self._stood = INTERVALS_TO_STAND
+        self._saved: Floats = np.zeros(len(grid))
         self._classes: frozenset[PriorityClass] = frozenset()
 
     @property
@@ -260,17 +274,11 @@ class Mmcf(Policy):
             if self._plan.steady:
                 bare = predictor.predict(situation, residuals.ratios)
                 residuals.learn(self._active.codec, bare.prediction(active), measurement)
-        predictions = self._predict(situation, saturated=measurement is not None and measurement.saturated)
-        return self._choose(predictions, active)
-
-    def _predict(self, situation: Situation, *, saturated: bool) -> Predictions:
-        predictor, residuals = self.predictor, self.residuals
+        saturated = measurement is not None and measurement.saturated
         factors = residuals.factors(predictor.grid.codecs, saturated=saturated)
-        parts = []
-        for share, capacity_bps in self._plan.planned():
-            case = replace(situation, link=replace(situation.link, capacity_bps=capacity_bps))
-            parts.append((share, predictor.corrected(predictor.predict(case, residuals.ratios), factors)))
-        return predictor.mixed(parts)
+        path = self._plan.path()
+        predictions = predictor.corrected(predictor.predict(situation, residuals.ratios, path), factors)
+        return self._choose(predictions, active, swings=path is not None)
 
     def _prefer_raw(self, predictions: Predictions, active: int) -> None:
         """Mark the summaries that raw messages come before. One class at a time, the others' levels being equal."""
@@ -306,18 +314,37 @@ class Mmcf(Policy):
             return False
         return bool(mine.on_time[index] >= (RAW_BACK_SERVED if back else RAW_SERVED) * mine.needed[index])
 
-    def _choose(self, predictions: Predictions, active: int) -> Decision:
+    def _shortest(self, predictions: Predictions, best: int) -> int:
+        """Of what differs from the best one in its queues alone and costs the same, as far as anybody can tell, the one
+        with the shortest: when the link gets worse before the next decision, less waits there."""
+        grid = self.predictor.grid
+        same = (grid.rates == grid.rates[best]).all(axis=1) & (grid.codec == grid.codec[best])
+        same &= (grid.redundancy == grid.redundancy[best]) & predictions.allowed
+        same &= predictions.cost <= (1.0 + SAME_COST) * predictions.cost[best]
+        level = grid.configurations[best].summaries
+        places = [int(i) for i in np.flatnonzero(same) if grid.configurations[i].summaries == level]
+        return min(places, key=lambda i: (float(grid.queues[i].sum()), float(predictions.cost[i])))
+
+    def _choose(self, predictions: Predictions, active: int, *, swings: bool) -> Decision:
         self._prefer_raw(predictions, active)
-        best = predictions.best()
+        best = self._shortest(predictions, predictions.best())
         current_cost, best_cost = float(predictions.cost[active]), float(predictions.cost[best])
+        if swings:
+            self._saved = np.maximum(0.0, self._saved + 1.0 - predictions.cost / max(current_cost, 1e-9))
+        else:
+            self._saved[:] = 0.0
         note = "" if (predictions.obstacle == 0).any() else "; nothing is feasible, this is the least bad"
-        if best == active:
-            return self._take(active, active, predictions, f"kept: nothing costs less{note}")
         if not predictions.allowed[active]:
             obstacle = predictions.candidate(active).obstacle
             return self._take(best, active, predictions, f"switched: the active one is infeasible ({obstacle}){note}")
-        if best_cost >= GAIN_TO_SWITCH * current_cost:
-            saved = 100.0 * (1.0 - best_cost / current_cost) if current_cost > 0.0 else 0.0
+        if best == active:
+            return self._take(active, active, predictions, f"kept: nothing costs less{note}")
+        saved = 100.0 * (1.0 - best_cost / current_cost) if current_cost > 0.0 else 0.0
+        if swings:
+            if self._saved[best] < SAVED_TO_SWITCH:
+                reason = f"kept: the link swings, and the best saves {saved:.1f} % so far{note}"
+                return self._take(active, active, predictions, reason)
+        elif best_cost >= GAIN_TO_SWITCH * current_cost:
             return self._take(active, active, predictions, f"kept: the best saves {saved:.1f} %, less than 10 %{note}")
         if self._stood < INTERVALS_TO_STAND:
             return self._take(active, active, predictions, f"kept: chosen {self._stood} intervals ago{note}")
@@ -329,6 +356,7 @@ class Mmcf(Policy):
         if switched:
             self._active = predictions.configurations[index]
             self._stood = 0
+            self._saved = np.zeros(len(self._saved))
         return Decision(
             self._active,
             reason,

@@ -44,9 +44,10 @@ from sern_core.mmcf.model import (
     Situation,
     Terms,
 )
+from sern_core.mmcf.playback import CapacityPath, played
+from sern_core.mmcf.queueing import Floats, Service, steady
 from sern_core.types import CLASSES, PriorityClass
 
-Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
 PLANNED_SHARE: Final = 0.9
@@ -56,10 +57,6 @@ CONTROL_SHARE_MAX: Final = 0.5
 SERIALISE_S: Final = 100e-6
 """CPU time of a message outside its codec, until measured."""
 FRAGMENT_BODY_BYTES: Final = DATAGRAM_BYTES - 31
-REPAIR_S: Final = 0.02
-"""Beyond a round trip, until a lost fragment is sent again."""
-MIN_VARIABILITY: Final = 0.25
-MIN_SHARE: Final = 1e-3
 OBSTACLES: Final = (
     "",
     "rate below the class's minimum",
@@ -250,14 +247,21 @@ class Predictor:
         self.serialise_s = serialise_s
 
     def predict(
-        self, situation: Situation, ratios: Mapping[tuple[PriorityClass, str], float] | None = None
+        self,
+        situation: Situation,
+        ratios: Mapping[tuple[PriorityClass, str], float] | None = None,
+        path: CapacityPath | None = None,
     ) -> Predictions:
-        """The bare formulas; `ratios` corrects the compression ratios of (class, mode). Duty: the capacity is known."""
+        """The bare predictions; `ratios` corrects the compression ratios of (class, mode). Duty: the capacity is known.
+
+        With a `path` what was offered is played over those capacities, one after the other; what is feasible is told
+        from the capacity as it is now in any case.
+        """
         grid = self.grid
         if situation.link.capacity_bps is None:
             raise UsageError("Predictor.predict: the capacity is not known")
         parts = {
-            level: self._predict(part, situation.at(level), situation.link, ratios or {})
+            level: self._predict(part, situation.at(level), situation.link, ratios or {}, path)
             for level, part in grid.parts.items()
         }
         if len(parts) == 1:
@@ -314,66 +318,46 @@ class Predictor:
         demands: Sequence[ClassDemand],
         link: LinkState,
         ratios: Mapping[tuple[PriorityClass, str], float],
+        path: CapacityPath | None,
     ) -> Predictions:
         """One level of the summaries."""
         assert link.capacity_bps is not None
         capacity_bps = max(PLANNED_SHARE * link.capacity_bps, 1.0)
-        fragment_s = 8.0 * (DATAGRAM_BYTES + OVERHEAD_BYTES) / capacity_bps
         omega = class_weights(demand.priority for demand in demands)
         shape = len(grid)
         parts = [self._service(grid, demand, capacity_bps, link, ratios) for demand in demands]
         offered_load = sum((part.load for part in parts), np.zeros(shape))
 
-        sigma = np.zeros(shape)  # carried by the classes so far
-        work = np.zeros(shape)  # Σ λ X² (c_a² + c_s²) of the classes so far
-        longest_s = np.zeros(shape)
+        if path is None:
+            outcomes = steady(parts, link, capacity_bps, self.ranges.latency_max_s)
+        else:
+            outcomes = played(parts, link, path, self.ranges.latency_max_s)
         latency_s, unreliability = np.zeros(shape), np.zeros(shape)
         compute, bandwidth_bps = np.zeros(shape), np.zeros(shape)
         control_load = np.zeros(shape)
         classes = []
-        for number, part in enumerate(parts):
-            demand, x_s = part.demand, part.x_s
-            left = np.maximum(1.0 - sigma, MIN_SHARE)
-            limit = np.minimum(grid.queues[:, demand.priority], demand.depth)
-            places = limit * demand.topics
-            variability = max(MIN_VARIABILITY, demand.arrival_cv2 + demand.cv2)
-            # Topics that tick are out of step with each other: together they come almost at random.
-            together = 1.0 + demand.cv2 if demand.topics > 1 else variability
-            drop = _overflow(part.load / left, (places + 1.0) * (2.0 / variability))
-            carried = np.minimum(part.load * (1.0 - drop), np.maximum(1.0 - sigma, 0.0))
-            drop = 1.0 - carried / np.maximum(part.load, 1e-12)
-            before, sigma = sigma, np.minimum(sigma + carried, 1.0)
-            work = work + part.rate_hz * (1.0 - drop) * x_s * x_s * together
-            longest_s = np.maximum(longest_s, x_s)
-            others = sum((later.load for later in parts[number + 1 :]), np.zeros(shape))
-            w0_s = np.minimum(0.5 * work, longest_s) + 0.5 * fragment_s * np.minimum(others, 1.0 - sigma)
-            service_s = x_s / left
-            wait_s = w0_s / (np.maximum(1.0 - before, MIN_SHARE) * np.maximum(1.0 - sigma, MIN_SHARE))
-            # A queue that keeps the newest is overrun: its oldest message is between q − 1 and q periods old.
-            period_s = demand.topics / np.maximum(part.rate_hz, 1e-9)
-            oldest_s = limit * period_s
-            overrun_s = np.minimum(oldest_s - 0.5 * period_s, places * service_s) + fragment_s
-            overrun = wait_s >= overrun_s
-            wait_s = np.minimum(wait_s, overrun_s)
-            fixed_s = link.rtt_s / 2.0 + part.encode_s + demand.prepare_s
-            slack_s = demand.deadline_s - fixed_s - service_s
-            tail = np.minimum(sigma, 1.0) * np.exp(-np.maximum(slack_s, 0.0) / np.maximum(wait_s, 1e-9))
-            late = np.where(overrun, np.clip((oldest_s - slack_s) / period_s, 0.0, 1.0), tail)
-            late = np.where(oldest_s + fragment_s <= slack_s, 0.0, late)
-            late = np.maximum(late, _too_long(service_s, demand.deadline_s - fixed_s, demand.cv2))
-            arrives, repair_s = _arrives(part, link, np.maximum(slack_s - wait_s, 0.0))
-            own_s = np.minimum(wait_s + service_s + fixed_s + repair_s, self.ranges.latency_max_s)
-            on_time = part.kept * (1.0 - drop) * (1.0 - late) * arrives
-            own_bps = carried * capacity_bps
-            latency_s += omega[demand.priority] * own_s
-            unreliability += omega[demand.priority] * np.maximum(0.0, 1.0 - on_time / demand.needed)
-            compute += part.rate_hz * (self.serialise_s + (1.0 - drop) * part.encode_s)
+        for part, found in zip(parts, outcomes, strict=True):
+            demand = part.demand
+            latency_s += omega[demand.priority] * found.latency_s
+            unreliability += omega[demand.priority] * found.short
+            compute += part.rate_hz * (self.serialise_s + (1.0 - found.drop) * part.encode_s)
             compute += demand.rate_hz * demand.prepare_s
-            bandwidth_bps += own_bps
+            bandwidth_bps += found.bandwidth_bps
             if demand.priority is PriorityClass.CONTROL:
                 control_load = part.load
             needed = np.full(shape, demand.needed)
-            classes.append(ClassArrays(demand.priority, part.load, drop, late, own_s, on_time, needed, own_bps))
+            classes.append(
+                ClassArrays(
+                    demand.priority,
+                    part.load,
+                    found.drop,
+                    found.late,
+                    found.latency_s,
+                    found.on_time,
+                    needed,
+                    found.bandwidth_bps,
+                )
+            )
 
         load_max = min(self.bounds.load_max, 1.0) if link.stream else self.bounds.load_max
         excess = np.maximum(control_load - CONTROL_SHARE_MAX, 0.0)
@@ -407,33 +391,6 @@ class Predictor:
             raw.excess,
             load=raw.load,
             classes=raw.classes,
-        )
-
-    def mixed(self, parts: Sequence[tuple[float, Predictions]]) -> Predictions:
-        """The expectation over several situations: (probability, predictions). Obstacles are those of the first."""
-        if len(parts) == 1:
-            return parts[0][1]
-        first = parts[0][1]
-
-        def mean(name: str) -> Floats:
-            return np.asarray(sum(share * getattr(part, name) for share, part in parts))
-
-        def of_class(number: int, name: str) -> Floats:
-            return np.asarray(sum(share * getattr(part.classes[number], name) for share, part in parts))
-
-        return self._costed(
-            self.grid,
-            mean("latency_s"),
-            mean("unreliability"),
-            mean("compute"),
-            mean("bandwidth_bps"),
-            first.obstacle,
-            first.excess,
-            load=first.load,
-            classes=tuple(
-                ClassArrays(mine.priority, *(of_class(number, name) for name in CLASS_ARRAYS))
-                for number, mine in enumerate(first.classes)
-            ),
         )
 
     def _costed(
@@ -492,7 +449,7 @@ class Predictor:
         capacity_bps: float,
         link: LinkState,
         ratios: Mapping[tuple[PriorityClass, str], float],
-    ) -> "_Service":
+    ) -> Service:
         profiles = [demand.codec(name) for name in grid.codecs]
         ratio = np.array(
             [
@@ -510,54 +467,5 @@ class Predictor:
         kept = 1.0 - demand.thinnable * (1.0 - grid.rates[:, demand.priority])
         rate_hz = kept * demand.rate_hz
         x_s = 8.0 * wire_bytes / capacity_bps
-        return _Service(demand, kept, rate_hz, x_s, rate_hz * x_s, encode_s, fragments, copies)
-
-
-@dataclass(slots=True)
-class _Service:
-    """What one class asks of the link, per candidate."""
-
-    demand: ClassDemand
-    kept: Floats
-    rate_hz: Floats
-    x_s: Floats
-    load: Floats
-    encode_s: Floats
-    fragments: Floats
-    copies: Floats
-
-
-def _overflow(u: Floats, k: Floats) -> Floats:
-    """Share dropped by a queue of k places at load u, in a form that neither overflows nor divides by zero."""
-    safe = np.where(np.abs(u - 1.0) < 1e-6, 1.0 + 1e-6, u)
-    log_u = np.log(np.maximum(safe, 1e-12))
-    # (1−u)·u^k/(1−u^{k+1}); above 1 both are divided by u^{k+1}.
-    below = (1.0 - safe) * np.exp(np.minimum(k * log_u, 0.0)) / (1.0 - np.exp(np.minimum((k + 1.0) * log_u, -1e-12)))
-    above = (1.0 - 1.0 / np.maximum(safe, 1.0)) / (1.0 - np.exp(np.minimum(-(k + 1.0) * log_u, -1e-12)))
-    return np.asarray(np.clip(np.where(safe < 1.0, below, above), 0.0, 1.0))
-
-
-def _too_long(mean_s: Floats, limit_s: Floats, cv2: float) -> Floats:
-    """Share of messages whose size alone takes longer than the limit, sizes log-normal about their mean."""
-    if cv2 < 0.01:
-        return np.asarray(np.where(mean_s > limit_s, 1.0, 0.0))
-    sigma2 = np.log1p(cv2)
-    ratio = np.log(np.maximum(limit_s, 1e-9) / np.maximum(mean_s, 1e-9)) + 0.5 * sigma2
-    # The logistic curve is within 0.01 of the normal one.
-    share = 1.0 / (1.0 + np.exp(np.clip(1.702 * ratio / np.sqrt(sigma2), -50.0, 50.0)))
-    return np.asarray(np.where(limit_s <= 0.0, 1.0, share))
-
-
-def _arrives(part: _Service, link: LinkState, slack_s: Floats) -> tuple[Floats, Floats]:
-    """Share of messages that arrive whole in time, and what repairs add to the mean latency."""
-    if link.loss <= 0.0:
-        return np.ones_like(slack_s), np.zeros_like(slack_s)
-    demand = part.demand
-    round_s = link.rtt_s + REPAIR_S
-    # A lost message of one fragment is not repaired once its topic has a fresher one.
-    period_s = demand.topics / np.maximum(part.rate_hz, 1e-9)
-    repairable = demand.repaired & ((part.fragments > 1.0) | (period_s > round_s))
-    sendings = np.where(repairable, 1.0 + np.floor(slack_s / round_s), 1.0)
-    arrives = (1.0 - link.loss ** (part.copies * sendings)) ** part.fragments
-    first = (1.0 - link.loss**part.copies) ** part.fragments
-    return arrives, np.where(repairable, (1.0 - first) * round_s, 0.0)
+        limit = np.minimum(grid.queues[:, demand.priority], demand.depth)
+        return Service(demand, kept, rate_hz, x_s, rate_hz * x_s, encode_s, fragments, copies, limit, 8.0 * wire_bytes)

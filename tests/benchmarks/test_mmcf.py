@@ -2,11 +2,13 @@
 
 from benchmarks.mmcf_queue import Path, Queues, arrivals
 from benchmarks.mmcf_replay import reconfigure
-from benchmarks.mmcf_run import Run, controlled, fixed, oracle, run
-from benchmarks.mmcf_traces import CODECS, GRID, Trace, robot
+from benchmarks.mmcf_run import Observer, Run, controlled, fixed, oracle, run, start
+from benchmarks.mmcf_traces import CODECS, GRID, Trace, robot, traces
 from sern_core.mmcf.cost import Ranges, profile
 from sern_core.mmcf.model import Configuration
+from sern_core.mmcf.playback import CapacityPath
 from sern_core.mmcf.policy import Mmcf, fixed_reliability, fixed_throughput
+from sern_core.mmcf.predict import Predictor
 
 RANGES = Ranges()
 WEIGHTS = profile("teleoperation")
@@ -73,6 +75,21 @@ def test_mmcf_costs_less_than_the_papers_fixed_policies() -> None:
     assert mmcf.cost < cost("throughput").cost < cost("reliability").cost
     assert cost("oracle").cost < 1.1 * mmcf.cost
     assert mmcf.switches_per_minute <= 20
+
+
+def test_what_was_played_is_what_the_model_does_on_a_wave() -> None:
+    """Costs of fixed configurations over a minute of a wave, as the predictor plays them, and as they came."""
+    trace = next(trace for trace in traces(1) if trace.name == "wave")
+    predictor = Predictor(GRID, weights=WEIGHTS, ranges=RANGES)
+    path = CapacityPath.of(9.0, [trace.path.rate_bps(0.1 * tenth) for tenth in range(90)], 9)
+    observer = Observer(trace, seed=1)
+    model = start(trace, 1)
+    model.run(1.0)
+    found = predictor.predict(observer.situation(model), None, path)
+    for share in (0.1, 0.25, 0.4, 1.0):
+        configuration = Configuration((1.0, 1.0, share), (1, 1, 1), "draco")
+        came = run(trace, "fixed", fixed(configuration), seed=1, ranges=RANGES, weights=WEIGHTS).cost
+        assert abs(float(found.cost[GRID.index[configuration]]) / came - 1.0) < 0.15
 
 
 def test_a_robot_that_appears_is_taken_in_within_an_interval_and_disturbs_nobody() -> None:
