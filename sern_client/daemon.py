@@ -34,6 +34,7 @@ from sern_runtime.codec_pool import CodecPool, make_coder
 from sern_runtime.config.base import split_tcp
 from sern_runtime.config.client import ClientFile, ServicesSection, load_client
 from sern_runtime.config.load import Loaded
+from sern_runtime.draining import Progress
 from sern_runtime.entry import blamed_on, end_tasks, log_warnings, serve
 from sern_runtime.http import Health, HttpServer
 from sern_runtime.keys import load_public, load_secret
@@ -364,9 +365,9 @@ class ClientDaemon:
         self._stopping = True
         self.bridge.stop_sources()
         link = self.core.link
-        now = moved_s = time.monotonic()
+        now = time.monotonic()
+        progress = Progress()
         give_up_s = now + self.loaded.model.link.drain_s
-        before: tuple[int, ...] = ()
         while now < give_up_s:
             channels = [channel for channel in link.channels.values() if channel.wanted is not False]
             unsent = sum(len(channel.queue) + len(channel.flying) for channel in channels) + self.bridge.pending
@@ -374,10 +375,8 @@ class ClientDaemon:
             if not unconfirmed and (not unsent or not link.established or link.lane.stalled):
                 break
             left = (unsent, unconfirmed, sum(nbytes for _messages, nbytes in link.queued().values()))
-            if left != before:
-                before, moved_s = left, now
             patience_s = STALL_PATIENCE_S if unsent and link.established else PATIENCE_S
-            if now - moved_s > patience_s + PATIENCE_RTTS * link.lane.flight.rtt.srtt_s:
+            if progress.still_s(left, now=now) > patience_s + PATIENCE_RTTS * link.lane.flight.rtt.srtt_s:
                 break
             self._kick()
             await asyncio.sleep(0.02)

@@ -30,6 +30,7 @@ from sern_runtime.adaptation import Adaptation
 from sern_runtime.codec_pool import CodecPool, make_coder
 from sern_runtime.config.load import Loaded
 from sern_runtime.config.relay import RelayFile, load_relay
+from sern_runtime.draining import Progress
 from sern_runtime.entry import blamed_on, end_tasks, log_warnings, serve
 from sern_runtime.http import Health, HttpServer
 from sern_runtime.keys import KeyDirectory, KeyStatus, load_secret
@@ -359,7 +360,8 @@ class RelayDaemon:
 
     async def drain(self) -> None:
         """Go on with what connected clients are owed while that gets anywhere, then end their sessions."""
-        now = moved_s = time.monotonic()
+        now = time.monotonic()
+        progress = Progress()
         give_up_s = now + self.loaded.model.link.drain_s
         # What comes in from now on its sources keep until the next relay confirms it.
         owed = [
@@ -368,7 +370,6 @@ class RelayDaemon:
             for channel in link.channels.values()
             if channel.retained
         ]
-        before: tuple[int, int] | None = None
         while now < give_up_s:
             owed = [item for item in owed if _owes(*item)]
             if not owed:
@@ -377,9 +378,7 @@ class RelayDaemon:
                 sum(len(channel.retained) for _link, channel, _last in owed),
                 sum(nbytes for link in self.hub.links.values() for _messages, nbytes in link.queued().values()),
             )
-            if left != before:
-                before, moved_s = left, now
-            elif now - moved_s > PATIENCE_S:
+            if progress.still_s(left, now=now) > PATIENCE_S:
                 break
             await asyncio.sleep(0.02)
             now = time.monotonic()
