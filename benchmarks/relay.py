@@ -51,7 +51,7 @@ from sern_relay.daemon import RelayDaemon
 from sern_runtime import logs
 from sern_runtime.config.relay import load_relay
 from sern_runtime.feed import Feed, FeedHeader, topic_frame
-from sern_runtime.loop import Shutdown, run
+from sern_runtime.loop import Shutdown, keep_freed_memory, run
 from sern_runtime.pump import Pump
 from sern_tools.demo_link import free_ports
 
@@ -325,6 +325,7 @@ class ScheduledLink(System):
     async def _client(
         self, ports: Ports, flow: Flow, name: str, work: Callable[[ClientCore, Pump, _Site], Any]
     ) -> None:
+        keep_freed_memory()  # as a daemon does
         site = _Site(flow)
         core = ClientCore(
             name=ClientName(name),

@@ -46,6 +46,8 @@ SWEEP_INTERVAL_S: Final = 0.25
 RATE_INTERVAL_S: Final = 0.05
 MIN_SHARE_BYTES: Final = 64
 """A fragment smaller than this is not worth its header: the datagram ends instead."""
+CRUMB: Final = 32
+"""Nor is one of less than such a share of a large datagram worth the looking for it."""
 RIDE_BYTES: Final = 256
 """So much of a control message travels with each datagram of class 0: where class 0 alone keeps the window shut, what
 would open a better lane, or another stream, must come through all the same."""
@@ -378,7 +380,8 @@ class Sender(ABC):
             size = self._put_watermarks(frames, items, size)
         control = self._control
         served: PriorityClass | None = None
-        while size <= limit - wire.DATA_FIRST_BYTES - MIN_SHARE_BYTES:
+        full = limit - max(wire.DATA_FIRST_BYTES + MIN_SHARE_BYTES, limit // CRUMB)
+        while size <= full:
             chosen = self.scheduler.pick_control(now=now) if express else self._pick(now, window_open=window_open)
             channel = self.channels[chosen] if chosen is not None else None
             rides = served is PriorityClass.CONTROL and not window_open and not express

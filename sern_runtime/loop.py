@@ -15,6 +15,9 @@ from typing import Any, Final, Protocol, Self
 
 import uvloop
 
+KEPT_BYTES: Final = 16 * 2**20
+"""Freed memory that a process keeps at the top of a heap."""
+
 _log = logging.getLogger(__name__)
 _STOP_SIGNALS: Final = (signal.SIGTERM, signal.SIGINT)
 
@@ -57,11 +60,24 @@ class Shutdown:
             self.on_reload()
 
 
+def keep_freed_memory() -> None:
+    """Have the C library keep what large messages free, for the next ones.
+
+    glibc gives more than 128 kB at the top of a heap back to the kernel at once and takes it again with the next
+    message, a page fault for every 4 kB: a tenth of the CPU that messages of 64 kB cost (measured). Freeing one
+    block that was mapped by itself raises that limit to twice the block's size (mallopt(3), M_MMAP_THRESHOLD).
+    """
+    block = bytes(KEPT_BYTES // 2)
+    del block
+
+
 def run(main: Callable[[Shutdown], Coroutine[Any, Any, int | None]]) -> int:
     """Run `main(shutdown)` in a new uvloop until it returns; its answer (None: 0) is the exit code.
 
     The signal handlers are in place before `main` starts and gone when `run` returns. Main thread only.
     """
+
+    keep_freed_memory()
 
     async def with_signals() -> int:
         loop = asyncio.get_running_loop()

@@ -1,6 +1,7 @@
 """The loop, its timers and its signals."""
 
 import asyncio
+import platform
 import signal
 import subprocess
 import sys
@@ -215,3 +216,24 @@ def test_the_second_signal_ends_a_stuck_drain(number: signal.Signals) -> None:
         assert process.stdout.readline() == b"draining\n"
         process.send_signal(number)
         assert process.wait(DEADLINE_S) == 128 + number
+
+
+_FAULTS = """
+import resource, sys
+from sern_runtime.loop import keep_freed_memory
+if sys.argv[1] == "keep":
+    keep_freed_memory()
+before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+for _ in range(3000):
+    del [bytes(100_000) for _ in range(3)][:]
+print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
+"""
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="only glibc gives memory back at every message")
+def test_freed_memory_is_kept_for_the_next_message() -> None:
+    kept, given_back = (
+        int(subprocess.run([sys.executable, "-c", _FAULTS, how], check=True, capture_output=True, text=True).stdout)
+        for how in ("keep", "give")
+    )
+    assert kept < given_back / 10
