@@ -348,3 +348,23 @@ async def test_from_a_ros_1_recording_to_a_ros_2_node(tmp_path: Path, router: Ro
         await until(lambda: len(peer.got) == 20, "all of the recording is there")
     expected = [body[4:].decode() for body in under("robot1", bodies(bag))["/robot1/chatter"]]
     assert [data for _, data in peer.got] == expected
+
+
+async def test_a_missing_router_is_said(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+    monkeypatch.setattr("sern_client.endpoints.zenoh.endpoint.ROUTER_WAIT_S", 0.0)
+    router = Router()
+    endpoint = ZenohEndpoint(ZenohOptions(session=router.options, domain=DOMAIN))
+    await endpoint.start(Events())
+    try:
+        await until(lambda: f"nobody answers at tcp/127.0.0.1:{router.port}; is the router" in caplog.text, "said")
+    finally:
+        await endpoint.stop()
+
+
+async def test_a_start_that_fails_leaves_no_session(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sern_client.endpoints.zenoh.names.node_token", lambda *_args: "@ros2_lv//two slashes")
+    endpoint = ZenohEndpoint(ZenohOptions(session=Router().options, domain=DOMAIN))
+    with pytest.raises(ConfigError, match=r"^zenoh: [^\n]+$"):
+        await endpoint.start(Events())
+    with pytest.raises(AssertionError):
+        _ = endpoint.session.opened

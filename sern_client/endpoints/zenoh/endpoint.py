@@ -27,6 +27,8 @@ from sern_runtime import ros_types
 from sern_runtime.ros_files import TypeFiles
 
 CDR: Final = "application/cdr"
+ROUTER_WAIT_S: Final = 3.0
+"""After so long without a router and without a peer we say so."""
 MAX_COMPLAINTS: Final = 256
 
 _log = logging.getLogger(__name__)
@@ -64,6 +66,7 @@ class ZenohEndpoint(Services):
         self._topics: dict[TopicName, _Topic] = {}
         self._open: list[_Declared] = []
         self._said: set[str] = set()
+        self._miss: asyncio.TimerHandle | None = None
 
     @property
     def encoding(self) -> Encoding | None:
@@ -80,9 +83,18 @@ class ZenohEndpoint(Services):
         return {DropReason.QUEUE_FULL: dropped} if dropped else {}
 
     async def start(self, events: TopicEvents) -> None:
+        """ConfigError when zenoh does not take the settings. A router that is not there yet is waited for."""
         await self.session.open()
         self._events = events
         self._loop = asyncio.get_running_loop()
+        try:
+            self._join()
+        except self.session.zenoh.ZError as error:
+            await self.session.close()
+            raise ConfigError(f"zenoh: {ros_types.one_line(error)}") from None
+        self._miss = self._loop.call_later(ROUTER_WAIT_S, self._miss_others)
+
+    def _join(self) -> None:
         session = self.session.opened
         self._zid = self.session.zid
         self._node = session.liveliness().declare_token(
@@ -93,7 +105,17 @@ class ZenohEndpoint(Services):
             f"{names.SPACE}/{self.options.domain}/**", self._token, history=True
         )
 
+    def _miss_others(self) -> None:
+        info = self.session.opened.info
+        if not info.routers_zid() and not info.peers_zid():
+            _log.warning(
+                "nobody answers at %s; is the router (rmw_zenohd) running there? Trying again until it works",
+                ", ".join(self.options.session.connect),
+            )
+
     async def stop(self) -> None:
+        if self._miss is not None:
+            self._miss.cancel()
         for declared in list(self._open):
             declared.close()
         await self.end_services()
