@@ -181,7 +181,7 @@ class Bridge:
         if info.name in self._outgoing or self._sources_stopped:
             return
         listed = self.rules.find(info.type_name, info.name) is not None
-        if not self.discovery.wants(info.name, listed=listed):
+        if not self.discovery.wants(info.name, info.type_name, listed=listed):
             return
         try:
             resolved = self.rules.resolve(info, local_name=info.name)

@@ -116,6 +116,11 @@ def plain_type(type_name: str) -> str:
     return type_name.replace("/msg/", "/", 1)
 
 
+def type_matches(patterns: tuple[re.Pattern[str], ...], type_name: str) -> bool:
+    """Whether one of the patterns is of this type, in either spelling."""
+    return matches_any(patterns, type_name) or matches_any(patterns, plain_type(type_name))
+
+
 # Patterns ------------------------------------------------------------------------------------------------------------
 
 
@@ -211,7 +216,7 @@ class TopicRule:
             return False
         if self.type_match is None:
             return True
-        return matches_any((self.type_match,), type_name) or matches_any((self.type_match,), plain_type(type_name))
+        return type_matches((self.type_match,), type_name)
 
 
 @dataclass(frozen=True, slots=True)
@@ -403,10 +408,15 @@ class Discovery:
     mode: DiscoveryMode = DiscoveryMode.MANUAL
     allow: tuple[re.Pattern[str], ...] = (re.compile(".*"),)
     deny: tuple[re.Pattern[str], ...] = ()
+    allow_types: tuple[re.Pattern[str], ...] = (re.compile(".*"),)
+    deny_types: tuple[re.Pattern[str], ...] = ()
 
-    def wants(self, local_name: TopicName, *, listed: bool) -> bool:
-        """`listed`: some rule matches the topic. `deny` wins over everything, then `allow` and the mode both decide."""
+    def wants(self, local_name: TopicName, type_name: str, *, listed: bool) -> bool:
+        """`listed`: some rule matches the topic. What is denied, by name or type, is out; then the mode and what is
+        allowed, by name and type, both decide."""
         if matches_any(self.deny, local_name) or not matches_any(self.allow, local_name):
+            return False
+        if type_matches(self.deny_types, type_name) or not type_matches(self.allow_types, type_name):
             return False
         return listed or self.mode is DiscoveryMode.DYNAMIC
 

@@ -139,7 +139,7 @@ class Baseline:
         resolved = self._rules.resolve(info, local_name=info.name)
         if info.name in self._subscriptions or not resolved.direction.sends:
             return
-        if not self._discovery.wants(info.name, listed=resolved.rule is not None):
+        if not self._discovery.wants(info.name, info.type_name, listed=resolved.rule is not None):
             return
         name = to_global(resolved.name, self._config.namespace)
         self._subscriptions[info.name] = self._endpoint.subscribe(

@@ -1,7 +1,8 @@
 """Endpoints beside what their middleware offers for the same work: added latency and CPU of a bridge.
 
-ros1   from one ROS 1 system to another, beside topic_tools relay and a bridge written with rospy
-dds    from one DDS domain to another, between Fast DDS peers
+ros1        from one ROS 1 system to another, beside topic_tools relay and a bridge written with rospy
+dds         from one DDS domain to another, between Fast DDS peers
+discovery   how soon a new ROS 1 topic is at the other master, and gone there
 """
 
 import argparse
@@ -10,11 +11,12 @@ from collections.abc import Callable
 from typing import Final
 
 from benchmarks import common
-from benchmarks.endpoints import dds, ros1
+from benchmarks.endpoints import dds, discovery, ros1
 
 PARTS: Final[dict[str, Callable[[argparse.Namespace, common.Report], None]]] = {
     "ros1": ros1.bench,
     "dds": dds.bench,
+    "discovery": discovery.bench,
 }
 
 

@@ -124,12 +124,18 @@ class DiscoverySection(Section):
     """Only topics (local names) that one of these patterns matches."""
     deny: tuple[Pattern, ...] = ()
     """No topic (local name) that one of these patterns matches; wins over everything else."""
+    allow_types: tuple[Pattern, ...] = (".*",)
+    """Only topics whose whole message type one of these patterns matches, such as sensor_msgs/.*."""
+    deny_types: tuple[Pattern, ...] = ()
+    """No topic whose message type one of these patterns matches; wins over everything else."""
 
     def filter(self) -> Discovery:
         return Discovery(
             mode=self.mode,
             allow=tuple(compile_pattern(text) for text in self.allow),
             deny=tuple(compile_pattern(text) for text in self.deny),
+            allow_types=tuple(compile_pattern(text) for text in self.allow_types),
+            deny_types=tuple(compile_pattern(text) for text in self.deny_types),
         )
 
 

@@ -37,7 +37,7 @@ def treated(
     name = TopicName(topic)
     info = TopicInfo(name, type_name, encoding, latched=latched)
     rules = model.rules()
-    if not model.discovery.filter().wants(name, listed=rules.find(type_name, name) is not None):
+    if not model.discovery.filter().wants(name, type_name, listed=rules.find(type_name, name) is not None):
         return None
     resolved = rules.resolve(info, local_name=name)
     kinds = tuple(type(summary.params).__name__ for summary in resolved.summaries)

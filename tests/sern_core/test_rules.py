@@ -315,7 +315,27 @@ def test_directions() -> None:
 )
 def test_discovery(mode: DiscoveryMode, name: str, listed: bool, wanted: bool) -> None:
     discovery = Discovery(mode, allow=(re.compile("/a.*"),), deny=(re.compile(".*/secret"),))
-    assert discovery.wants(TopicName(name), listed=listed) is wanted
+    assert discovery.wants(TopicName(name), "std_msgs/msg/String", listed=listed) is wanted
+
+
+@pytest.mark.parametrize(
+    ("type_name", "wanted"),
+    [
+        ("sensor_msgs/msg/Imu", True),
+        ("sensor_msgs/Imu", True),
+        ("sensor_msgs/msg/Image", False),  # denied wins over allowed
+        ("sensor_msgs/Image", False),
+        ("std_msgs/msg/String", False),  # not allowed
+    ],
+)
+def test_discovery_by_type(type_name: str, wanted: bool) -> None:
+    discovery = Discovery(
+        DiscoveryMode.DYNAMIC,
+        allow_types=(re.compile("sensor_msgs/.*"),),
+        deny_types=(re.compile("sensor_msgs/(Compressed)?Image"),),
+    )
+    for listed in (False, True):
+        assert discovery.wants(TopicName("/a"), type_name, listed=listed) is wanted
 
 
 def test_feed_roles_deny_by_default() -> None:

@@ -71,14 +71,17 @@ class DdsOptions:
 
 @dataclass(slots=True)
 class DdsCounters:
-    """Messages by fate. Dropped: the event loop was too slow (`overrun`), the link refused it (`refused`), or slow
-    reliable readers left a writer no room (`blocked`)."""
+    """Messages by fate. Dropped: the event loop was too slow (`overrun`), slow reliable readers left a writer no room
+    (`blocked`), too many calls of a service were under way (`calls`), or what came was no call (`unreadable`). What the
+    link did not take (`refused`), the link counts."""
 
     received: int = 0
     overrun: int = 0
     refused: int = 0
     written: int = 0
     blocked: int = 0
+    calls: int = 0
+    unreadable: int = 0
 
 
 class _Subscription:
@@ -449,8 +452,8 @@ class DdsEndpoint:
     def drops(self) -> dict[DropReason, int]:
         """Messages dropped between this domain's nodes and us, by reason."""
         counted = {
-            DropReason.QUEUE_FULL: self.overruns() + self.counters.blocked,
-            DropReason.REFUSED: self.counters.refused,
+            DropReason.QUEUE_FULL: self.overruns() + self.counters.blocked + self.counters.calls,
+            DropReason.UNDECODABLE: self.counters.unreadable,
         }
         return {reason: count for reason, count in counted.items() if count}
 

@@ -123,12 +123,17 @@ class _Server:
         if self.closed:
             return
         self.closed = True
-        for side in (self.writer, self.reader):
-            if side is not None:
-                side.close()
+        self.owner.forget(self)
+        if self.reader is not None:
+            self.reader.close()
+        # A call that has just been told that it fails may still have an answer to give.
+        asyncio.get_running_loop().call_soon(self._end)
+
+    def _end(self) -> None:
+        if self.writer is not None:
+            self.writer.close()
         for task in self.tasks:
             task.cancel()
-        self.owner.forget(self)
 
 
 class DdsServices:
@@ -256,6 +261,7 @@ class DdsServices:
             try:
                 body, client, number = Wrapped.split(sample.body)
             except ValueError:
+                self._endpoint.counters.unreadable += 1
                 return
             future = waiting.get(number)
             if client == client_id and future is not None and not future.done():
@@ -315,9 +321,11 @@ class DdsServices:
         try:
             request, client, number = Wrapped.split(sample.body)
         except ValueError as error:
+            self._endpoint.counters.unreadable += 1
             self._endpoint.say_once(f"service {server.info.name}: {error}")
             return
         if len(server.tasks) >= MAX_CALLS:
+            self._endpoint.counters.calls += 1
             self._endpoint.say_once(f"service {server.info.name}: more than {MAX_CALLS} calls at a time; some fail")
             return
         task = asyncio.get_running_loop().create_task(self._answer(server, request, client, number))

@@ -78,9 +78,12 @@ class ZenohEndpoint(Services):
 
     @property
     def drops(self) -> dict[DropReason, int]:
-        """Messages dropped between zenoh and the event loop, either way, because the other side was behind."""
-        dropped = self.session.put_dropped + (self.session.handover.dropped if self._events else 0)
-        return {DropReason.QUEUE_FULL: dropped} if dropped else {}
+        """Messages dropped between zenoh and us: one side was behind the other, or the session had ended."""
+        counted = {
+            DropReason.QUEUE_FULL: self.session.put_dropped + (self.session.handover.dropped if self._events else 0),
+            DropReason.DISCONNECTED: self.session.put_failed,
+        }
+        return {reason: count for reason, count in counted.items() if count}
 
     async def start(self, events: TopicEvents) -> None:
         """ConfigError when zenoh does not take the settings. A router that is not there yet is waited for."""

@@ -155,6 +155,10 @@ class _Server:
             return
         self._closed = True
         self._owner.forget(self)
+        # A call that has just been told that it fails may still have an answer to give.
+        asyncio.get_running_loop().call_soon(self._end)
+
+    def _end(self) -> None:
         for task in self._tasks:
             task.cancel()
         token, queryable = self._token, self._queryable

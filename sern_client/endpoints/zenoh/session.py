@@ -78,6 +78,8 @@ class ZenohSession:
         self.zenoh = load_zenoh()
         self.put_dropped = 0
         """Messages dropped because zenoh did not take them in time."""
+        self.put_failed = 0
+        """Messages that zenoh refused: its session has ended."""
         self._config = make_config(self.zenoh, options)
         self._session: Any = None
         self._handover: Handover | None = None
@@ -129,10 +131,21 @@ class ZenohSession:
         with self._wake:
             self._waiting.append((put, nbytes))
             self._waiting_bytes += nbytes
-            while self._waiting_bytes > MAX_WAITING_BYTES and len(self._waiting) > 1:
-                self._waiting_bytes -= self._waiting.popleft()[1]
-                self.put_dropped += 1
+            if self._waiting_bytes > MAX_WAITING_BYTES:
+                self._shed()
             self._wake.notify()
+
+    def _shed(self) -> None:
+        """Under the lock: the oldest messages go. What has no bytes is an end of something, and must be told."""
+        kept: deque[tuple[Callable[[], None], int]] = deque()
+        while self._waiting_bytes > MAX_WAITING_BYTES and len(self._waiting) > 1:
+            item = self._waiting.popleft()
+            if item[1]:
+                self._waiting_bytes -= item[1]
+                self.put_dropped += 1
+            else:
+                kept.append(item)
+        self._waiting.extendleft(reversed(kept))
 
     def _write(self) -> None:
         while True:
@@ -146,5 +159,6 @@ class ZenohSession:
             try:
                 put()
             except self.zenoh.ZError as error:
-                self.put_dropped += 1
+                if nbytes:
+                    self.put_failed += 1
                 _log.debug("zenoh did not take a message: %s", error)

@@ -8,6 +8,8 @@ from typing import Any
 from xmlrpc.client import ServerProxy
 
 from rosbags.highlevel import AnyReader
+from rosbags.rosbag1 import Reader, Writer
+from rosbags.typesys import Stores, get_typestore
 
 from sern_client.conversion import converted
 from sern_client.daemon import ClientDaemon
@@ -16,7 +18,7 @@ from sern_core.message import TopicInfo
 from sern_core.types import Encoding, TopicName
 from sern_runtime import ros_types
 from sern_runtime.ros_types import topic_info
-from tests.daemons import HOST, RELIABLE, Lab, endpoint_of, recording
+from tests.daemons import HOST, RELIABLE, Lab, endpoint_of, recording, write_bag
 from tests.peers.dds.conftest import MakePeer
 from tests.peers.dds.test_topics import ODOMETRY, same
 from tests.peers.ros1.lab import SUBSCRIBER, RosLab, need
@@ -24,6 +26,7 @@ from tests.sern_client.messages import made_up
 from tests.support import DEADLINE_S, until
 
 ODOM = "nav_msgs/msg/Odometry"
+STRING = "std_msgs/msg/String"
 ENOUGH = 150
 
 
@@ -163,3 +166,31 @@ async def test_two_ros2_sites(tmp_path: Path, domain: int, make_peer: MakePeer) 
         assert same(site.got("odom")[0], body)
         offered = {channel.stream.id.topic for channel in daemon.core.link.channels.values()}
         assert not any(name.endswith("/odom") for name in offered)  # nothing goes back
+
+
+async def test_a_type_that_cannot_be_converted_is_said_once_and_stops_nothing_else(
+    tmp_path: Path, domain: int, make_peer: MakePeer
+) -> None:
+    """Two fields of it differ in case only, which ROS 2 does not allow; the strings beside it arrive."""
+    bag = write_bag(tmp_path / "robot.bag", {"/chat": 50})
+    with Writer(tmp_path / "both.bag") as writer, Reader(bag) as reader:
+        odd = writer.add_connection("/odd", "my_msgs/msg/Odd", msgdef="int8 a\nint8 A\n", md5sum="0" * 32)
+        chat = writer.add_connection("/chat", STRING, typestore=get_typestore(Stores.ROS1_NOETIC))
+        for _, time_ns, body in reader.messages():
+            writer.write(odd, time_ns, b"\1\2")
+            writer.write(chat, time_ns, body)
+    peer = await make_peer(domain)
+    await peer.do("sub chat rt/robot1/chat std_msgs::msg::dds_::String_ reliable depth=1000")
+    async with Lab(tmp_path, "robot1", "site") as lab:
+        await lab.process(lab.relay_file()).ready()
+        play = {"wait_for": ["/chat"]}
+        site = lab.process(
+            lab.client_file(
+                "site", dds(domain), client={"namespace": "/"}, subscribe=["/robot1/.*"], discovery={"mode": "manual"}
+            )
+        )
+        await site.ready()
+        await lab.process(lab.player_file("robot1", tmp_path / "both.bag", play=play)).ready()
+        await peer.line("got chat ", 49)
+        await site.said("/robot1/odd", "cannot be converted to cdr: two of its fields differ in case only")
+        assert sum("/robot1/odd" in line for line in site.lines) == 1

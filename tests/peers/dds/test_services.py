@@ -7,9 +7,10 @@ import struct
 import pytest
 
 from sern_client.endpoints.base import ServiceInfo
+from sern_client.endpoints.dds import services
 from sern_client.endpoints.dds.services import Wrapped
 from sern_core.errors import ConfigError, ServiceError
-from sern_core.types import Encoding, TopicName
+from sern_core.types import DropReason, Encoding, TopicName
 from sern_runtime import ros_services
 from tests.peers.dds.conftest import MakeEndpoint, MakePeer
 from tests.support import until
@@ -116,6 +117,57 @@ async def test_no_answer_in_time(domain: int, make_peer: MakePeer, make_endpoint
         await endpoint.call(NAME, YES, timeout_s=0.05)
     await peer.do("close out")
     await until(lambda: NAME not in recorder.services)
+
+
+async def test_requests_beyond_the_limit_are_counted(
+    domain: int, make_endpoint: MakeEndpoint, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(services, "MAX_CALLS", 2)
+    one, _ = await make_endpoint(domain, node_name="one")
+    other, recorder = await make_endpoint(domain, node_name="two", heed_sern=True)
+    release = asyncio.Event()
+
+    async def handler(request: bytes) -> bytes:
+        await release.wait()
+        return RESPONSE
+
+    server = one.serve(service(), handler)
+    await until(lambda: NAME in recorder.services)
+    calls = [asyncio.create_task(other.call(NAME, YES, timeout_s=20)) for _ in range(3)]
+    await until(lambda: one.drops == {DropReason.QUEUE_FULL: 1})
+    release.set()
+    await until(lambda: sum(call.done() for call in calls) == 2)
+    assert all(call.result()[: len(RESPONSE)] == RESPONSE for call in calls if call.done())
+    for call in calls:
+        call.cancel()
+    await asyncio.gather(*calls, return_exceptions=True)
+    server.close()
+
+
+async def test_a_call_that_is_told_how_it_ends_answers_before_its_service_is_gone(
+    domain: int, make_peer: MakePeer, make_endpoint: MakeEndpoint
+) -> None:
+    peer = await make_peer(domain)
+    endpoint, _ = await make_endpoint(domain)
+    outcome: asyncio.Future[bytes] = asyncio.get_running_loop().create_future()
+    asked = asyncio.Event()
+
+    async def handler(request: bytes) -> bytes:
+        asked.set()
+        return await outcome
+
+    server = endpoint.serve(service(), handler)
+    await peer.do(f"sub answers rr/set_boolReply {REPLY} reliable userdata=clientid=7.8;")
+    await peer.do(f"pub calls rq/set_boolRequest {REQUEST} reliable userdata=clientid=7.8;")
+    await peer.line("matched answers 1")
+    await peer.line("matched calls 1")
+    await until(lambda: server.reader is not None and server.reader.matched == 1)
+    await peer.do(f"write calls {(HEAD + struct.pack('<Qq', 99, 1) + bytes([1])).hex()}")
+    await asyncio.wait_for(asked.wait(), 20)
+    outcome.set_result(RESPONSE)
+    server.close()
+    await peer.line("got answers ")
+    await peer.line("matched answers 0")
 
 
 async def test_a_service_of_rmw_fastrtps_is_left_alone(

@@ -28,6 +28,8 @@ PACKAGES: Final = {
     "/usr/lib/rosbag/record": "python3-rosbag",
     "/usr/bin/rosbag": "python3-rosbag",
     "/usr/lib/topic_tools/relay": "topic-tools",
+    "/usr/include/ros/ros.h": "libroscpp-dev",
+    "/usr/lib/python3/dist-packages/roscpp": "python3-roscpp-msg",
     "/usr/lib/python3/dist-packages/rospy": "python3-rospy",
     "/usr/lib/python3/dist-packages/std_srvs": "python3-std-srvs",
     "/usr/lib/python3/dist-packages/nav_msgs": "python3-nav-msgs",

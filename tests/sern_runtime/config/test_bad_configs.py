@@ -72,7 +72,8 @@ def test_every_problem_is_reported_in_the_order_of_the_file() -> None:
         "topics:\n  - {match: /a, depth: 0}\n  - {match: /b, class: contrl}\nlog: {level: loud}\n"
     )
     assert said(text, ClientFile, "c.yaml") == [
-        "c.yaml:4: discovery.mde: unknown key (did you mean mode?); accepted: mode, allow, deny",
+        "c.yaml:4: discovery.mde: unknown key (did you mean mode?); "
+        "accepted: mode, allow, deny, allow_types, deny_types",
         "c.yaml:6: topics.0.depth: must be >= 1, not 0",
         "c.yaml:7: topics.1.class: 'contrl' is not accepted (did you mean control?); accepted: control, state, bulk",
         "c.yaml:8: log.level: 'loud' is not accepted; accepted: debug, info, warning, error",

@@ -1,0 +1,100 @@
+"""How soon a new ROS 1 topic is at the other master, and how soon it is gone there, with clients and relay in between.
+
+A node begins to publish at one master, 100 messages a second. `first`: from there until its first message is at a node
+of the other master; `gone`: from when it says goodbye until the other master has no publisher of it.
+"""
+
+import argparse
+import asyncio
+import statistics
+import time
+from contextlib import ExitStack
+from typing import Final
+
+from benchmarks import common
+from benchmarks.endpoints.ros1 import Ros
+from benchmarks.endpoints.ros1_roles import HOST, ODOM, TYPES, advertise, body
+from sern_client.endpoints.ros1 import Ros1Endpoint, Ros1Options
+from sern_core.errors import SernError
+from sern_core.message import TopicInfo
+from sern_core.types import TopicName
+
+RUNS: Final = 30
+QUICK_RUNS: Final = 5
+OBSERVE_HZ: Final = 100.0
+"""How often the observer asks the other master: what it adds is a few milliseconds."""
+PERIOD_S: Final = 0.01
+TIMEOUT_S: Final = 30.0
+CASE: Final = "ros1, a new topic"
+
+
+class _Observer:
+    """What there is at the other master, and when."""
+
+    def __init__(self, uri: str) -> None:
+        self.endpoint = Ros1Endpoint(Ros1Options(uri, HOST, "observer", poll_hz=OBSERVE_HZ, heed_sern=True))
+        self.first_s: dict[str, float] = {}
+        self.gone_s: dict[str, float] = {}
+
+    def topic_added(self, info: TopicInfo) -> None:
+        def sink(_body: bytes, _stamp_ns: int) -> bool:
+            self.first_s.setdefault(info.name, time.monotonic())
+            return True
+
+        self.endpoint.subscribe(info.name, sink)
+
+    def topic_removed(self, name: TopicName) -> None:
+        self.gone_s[name] = time.monotonic()
+
+
+class _Nobody:
+    def topic_added(self, info: TopicInfo) -> None: ...
+
+    def topic_removed(self, name: TopicName) -> None: ...
+
+
+async def _once(source: Ros1Endpoint, observer: _Observer, topic: str) -> tuple[float, float]:
+    """Seconds until its first message, and until it is gone."""
+    began_s = time.monotonic()
+    handle = advertise(source, topic, TYPES[ODOM])
+    content = bytes(body(ODOM))
+    async with asyncio.timeout(TIMEOUT_S):
+        while topic not in observer.first_s:
+            handle.publish(content, 0)
+            await asyncio.sleep(PERIOD_S)
+    handle.close()
+    ended_s = time.monotonic()
+    async with asyncio.timeout(TIMEOUT_S):
+        while topic not in observer.gone_s:  # noqa: ASYNC110  the observer's events have no loop of their own
+            await asyncio.sleep(PERIOD_S / 10)
+    return observer.first_s[topic] - began_s, observer.gone_s[topic] - ended_s
+
+
+async def _measure(runs: int) -> dict[str, float]:
+    with ExitStack() as stack:
+        ros = Ros(stack)
+        master, other = ros.master(), ros.master()
+        ros.chain(master, other)
+        source, observer = Ros1Endpoint(Ros1Options(master, HOST, "source")), _Observer(other)
+        await source.start(_Nobody())
+        await observer.endpoint.start(observer)
+        try:
+            await _once(source, observer, "/bench/before/odom")  # the daemons have found each other
+            found = [await _once(source, observer, f"/bench/run{number}/odom") for number in range(runs)]
+        except TimeoutError:
+            raise SernError(f"discovery: nothing happened within {TIMEOUT_S:g} s") from None
+        finally:
+            await observer.endpoint.stop()
+            await source.stop()
+    first, gone = zip(*found, strict=True)
+    return {
+        "first_p50_ms": 1e3 * statistics.median(first), "first_max_ms": 1e3 * max(first),
+        "gone_p50_ms": 1e3 * statistics.median(gone), "gone_max_ms": 1e3 * max(gone),
+    }  # fmt: skip
+
+
+def bench(options: argparse.Namespace, report: common.Report) -> None:
+    """SernError where ROS 1 is not installed."""
+    report.row(CASE, "sern-chain", **asyncio.run(_measure(QUICK_RUNS if options.quick else RUNS)))
+    for what in ("first", "gone"):
+        report.reach(f"discovery: {what}, the slowest [ms]", report.value(CASE, "sern-chain", f"{what}_max_ms"), 1000)
