@@ -11,6 +11,7 @@ from typing import Final
 
 PACING_BURST_S: Final = 0.001
 """By so much a timer may be late; what could have left meanwhile leaves at once."""
+PACING_DEBT_S: Final = 0.1
 
 
 @dataclass(slots=True)
@@ -92,7 +93,11 @@ class Pacer:
         return now >= self.due_s
 
     def sent(self, *, now: float, nbytes: int, pacing_bps: float | None) -> None:
-        """`nbytes` left. Of the time that was not used no more is saved up than a timer may be late."""
+        """`nbytes` left. Of the time that was not used no more is saved up than a timer may be late; and what does not
+        ask, class control, keeps the others waiting for its own time or `PACING_DEBT_S` at most. Without that bound a
+        moment of a very low pace would hold them back for as long as class control had exceeded it."""
         if pacing_bps is not None:
             earliest_s = now - PACING_BURST_S
-            self.due_s = (self.due_s if self.due_s > earliest_s else earliest_s) + 8 * nbytes / pacing_bps
+            own_s = 8 * nbytes / pacing_bps
+            begin_s = self.due_s if self.due_s > earliest_s else earliest_s
+            self.due_s = max(begin_s, min(begin_s + own_s, now + max(own_s, PACING_DEBT_S)))

@@ -257,6 +257,21 @@ def test_another_route_is_not_taken_for_a_queue_for_ever(rtt_s: float, longer_s:
     assert at(world.poses_ms(14.0), 0.99) < 1e3 * (rtt_s / 2 + longer_s) + 15.0
 
 
+def test_class_control_that_exceeds_a_low_pace_holds_nobody_back_for_long() -> None:
+    """Class control does not ask the pacer. Forty datagrams a second at a pace of 25 kbit/s must not add up."""
+    pacer = Pacer()
+    for number in range(80):
+        now = 0.025 * number
+        before_s = pacer.due_s
+        pacer.sent(now=now, nbytes=420, pacing_bps=25_000.0)
+        assert before_s <= pacer.due_s <= max(before_s, now + 8 * 420 / 25_000)
+    assert pacer.due_s - 2.0 < 0.2
+    pacer.sent(now=2.0, nbytes=1250, pacing_bps=10_000.0)  # who asks still keeps to the pace
+    assert pacer.due_s >= 3.0 - 1e-9
+    pacer.sent(now=2.1, nbytes=420, pacing_bps=1e6)
+    assert pacer.due_s >= 3.0 - 1e-9
+
+
 def test_the_pacer_gives_back_what_a_late_timer_lost() -> None:
     pacer = Pacer()
     left, now = 0, 0.0
