@@ -11,6 +11,9 @@ Theory of operation
 - A value up to `max_value_bytes` is kept and shown. Of a larger one the object shows size and SHA-256: `observe` only
   keeps a reference to the body, which costs the hot path nothing, and the hash is worked out when somebody asks. When
   the references held reach `max_held_bytes`, further large bodies are not kept and show no hash.
+- A value that came encoded is decoded when somebody asks. Where that must not take long, the reader sets
+  `inline_bytes`, lets other threads do what `unread` gives, and asks then; a larger one that is still as it came shows
+  its size alone.
 - Topic objects are named `<topic>@<client>`; ids that end in `@<client>` are reserved for that client. Other ids
   belong to whoever puts them first.
 """
@@ -23,7 +26,7 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, Final
 
-from sern_core.codecs import Codec, decode
+from sern_core.codecs import Codec, Work, decode, raw_size
 from sern_core.errors import CodecError, RefusedError
 from sern_core.message import StreamId, StreamInfo
 from sern_core.rules import COMMAND_TYPES, plain_type
@@ -111,12 +114,39 @@ def text_hash(definition: str) -> str:
     return hashlib.sha256(_utf8(definition)).hexdigest() if definition else ""
 
 
+class ValueRequest(Work):
+    """One large value that another thread is to decode or to hash."""
+
+    def __init__(self, registry: "ObjectRegistry", entry: _Entry, body: bytes) -> None:
+        self.entry = entry
+        self.body = body
+        self.codec = entry.codec
+        self.raw: bytes | None = body
+        self.sha256: str | None = None
+        self._registry = registry
+
+    def run(self) -> None:
+        limits = self._registry.limits
+        if self.codec:
+            try:
+                self.raw = decode(self.codec, self.body, max_bytes=limits.max_decoded_bytes)
+            except CodecError:
+                self.raw = None
+        if self.raw is not None and len(self.raw) > limits.max_value_bytes:
+            self.sha256 = hashlib.sha256(self.raw).hexdigest()
+
+    def done(self, *, now: float) -> None:
+        self._registry.have_read(self)
+
+
 class ObjectRegistry:
     """See the module's text. `epoch` is this run's random number; a reader of another epoch is told to start over."""
 
     def __init__(self, *, epoch: int = 0, limits: ObjectLimits | None = None) -> None:
         self.epoch = epoch
         self.limits = limits or ObjectLimits()
+        self.inline_bytes: int | None = None
+        """The largest value that is decoded where it is asked for; None: any."""
         self._version = 0
         self._entries: OrderedDict[str, _Entry] = OrderedDict()  # least recently changed first
         self._by_stream: dict[StreamId, _Entry] = {}
@@ -303,6 +333,33 @@ class ObjectRegistry:
             if kind is None or self._entries[object_id].kind is kind
         )
 
+    def unread(
+        self, *, kind: ObjectKind | None = None, owner: ClientName | None = None, version: int = 0
+    ) -> list[ValueRequest]:
+        """What has to be done before the values of these objects, changed after `version`, can be told. Nothing while
+        `inline_bytes` is None."""
+        found: list[ValueRequest] = []
+        for entry in reversed(self._entries.values()):
+            if entry.version <= version:
+                break
+            wanted = kind in (None, entry.kind) and owner in (None, entry.owner)
+            if wanted and entry.body is not None and entry.sha256 is None and self._is_long(entry):
+                found.append(ValueRequest(self, entry, entry.body))
+        return found
+
+    def have_read(self, request: ValueRequest) -> None:
+        """Take what a request found out, unless the object has another value by now, or is gone."""
+        entry = request.entry
+        if entry.body is not request.body or self._entries.get(entry.id) is not entry:
+            return
+        self._forget_value(entry)
+        if request.raw is None:
+            return
+        if request.sha256 is None:
+            self._set_value(entry, request.raw)
+        else:
+            entry.value_bytes, entry.sha256 = len(request.raw), request.sha256
+
     def since(self, version: int, *, epoch: int | None = None) -> ObjectChanges:
         """What changed after `version`; start with 0. `epoch` None: the reader knows that it is this run."""
         foreign = version < 0 or version > self._version or (epoch is not None and epoch != self.epoch)
@@ -454,10 +511,22 @@ class ObjectRegistry:
                 return
             self._set_value(entry, raw)
 
+    def _claimed_bytes(self, entry: _Entry) -> int:
+        """How large the value is, or says it is; -1 for none."""
+        try:
+            return -1 if entry.body is None else raw_size(entry.codec, entry.body)
+        except CodecError:
+            return -1
+
+    def _is_long(self, entry: _Entry) -> bool:
+        """Whether telling the value takes longer than it may where somebody asks."""
+        return self.inline_bytes is not None and self._claimed_bytes(entry) > self.inline_bytes
+
     def _seen(self, entry: _Entry) -> XrObject:
-        if entry.codec:
+        long = self._is_long(entry)
+        if entry.codec and not long:
             self._decode(entry)
-        if entry.body is not None and entry.sha256 is None:
+        if entry.body is not None and entry.sha256 is None and not long:
             entry.sha256 = hashlib.sha256(entry.body).hexdigest()
             if entry.value_bytes > self.limits.max_value_bytes:
                 # Hashed once, when first asked for; after that the body is no longer needed.
@@ -471,8 +540,8 @@ class ObjectRegistry:
             definition=entry.definition,
             definition_hash=entry.definition_hash,
             attributes=entry.attributes,
-            value=entry.body,
-            value_bytes=entry.value_bytes,
+            value=None if long else entry.body,
+            value_bytes=self._claimed_bytes(entry) if long else entry.value_bytes,
             value_sha256=entry.sha256,
             seq=entry.seq,
             ros_stamp_ns=entry.ros_stamp_ns,

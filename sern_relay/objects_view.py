@@ -6,14 +6,20 @@ definitions=no      without the texts of message definitions; their hashes stay
 since=VERSION       what has changed after this version (`objects`) and the ids that are gone (`deleted`); with
                     `resync` true forget everything first. epoch=EPOCH of the earlier answer, so that a relay that
                     was started anew is noticed
+
+Large values that came encoded are decoded, and large values hashed, in another thread before the answer. Of one that
+came while that was done the answer has the size alone.
 """
 
-from collections.abc import Mapping
+import asyncio
+import time
+from collections.abc import Mapping, Sequence
 from typing import Any
 
+from sern_core.codecs import INLINE_BYTES
 from sern_core.errors import UsageError
 from sern_core.hub import Hub
-from sern_core.objects import text_hash, topic_object_id
+from sern_core.objects import ValueRequest, text_hash, topic_object_id
 from sern_core.types import ClientName, ObjectKind
 from sern_core.xr_object import changes_to_json
 from sern_runtime.http import JsonQuery
@@ -22,12 +28,26 @@ from sern_runtime.http import JsonQuery
 def objects_view(hub: Hub) -> JsonQuery:
     """The route of /api/objects."""
     registry = hub.objects
+    registry.inline_bytes = INLINE_BYTES
 
-    def read(query: Mapping[str, str]) -> object:
+    def selected(query: Mapping[str, str]) -> tuple[ObjectKind | None, ClientName | None]:
         kind = _one_of("kind", query["kind"], [str(kind) for kind in ObjectKind]) if "kind" in query else None
         owner = ClientName(query["owner"]) if "owner" in query else None
+        return None if kind is None else ObjectKind(kind), owner
+
+    async def prepare(query: Mapping[str, str]) -> None:
+        """Decode and hash large values in another thread."""
+        kind, owner = selected(query)
+        version = _number("since", query["since"]) if "since" in query else 0
+        requests = registry.unread(kind=kind, owner=owner, version=version)
+        if requests:
+            await asyncio.to_thread(_run, requests)
+            for request in requests:
+                request.done(now=time.monotonic())
+
+    def read(query: Mapping[str, str]) -> object:
+        wanted, owner = selected(query)
         definitions = _one_of("definitions", query.get("definitions", "yes"), ["yes", "no"]) == "yes"
-        wanted = None if kind is None else ObjectKind(kind)
         if "since" not in query:
             if "epoch" in query:
                 raise UsageError("epoch has no use without since")
@@ -36,7 +56,12 @@ def objects_view(hub: Hub) -> JsonQuery:
         changes = registry.since(_number("since", query["since"]), epoch=epoch)
         return _defined(hub, changes_to_json(changes, kind=wanted, owner=owner, definitions=definitions), definitions)
 
-    return JsonQuery(("kind", "owner", "definitions", "since", "epoch"), read)
+    return JsonQuery(("kind", "owner", "definitions", "since", "epoch"), read, prepare)
+
+
+def _run(requests: Sequence[ValueRequest]) -> None:
+    for request in requests:
+        request.run()
 
 
 def _defined(hub: Hub, answer: dict[str, Any], definitions: bool) -> dict[str, Any]:

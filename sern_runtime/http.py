@@ -23,6 +23,8 @@ class JsonQuery(NamedTuple):
 
     accepts: tuple[str, ...]
     read: Callable[[Mapping[str, str]], object]
+    prepare: Callable[[Mapping[str, str]], Awaitable[None]] | None = None
+    """What takes long and has to be done first, elsewhere than on the loop; raises as `read` does."""
 
 
 _SHUTDOWN_S: Final = 1.0
@@ -140,6 +142,8 @@ def _asked(source: JsonQuery, query: Mapping[str, str]) -> object:
 def _json_route(path: str, source: JsonSource | JsonQuery) -> Handler:
     async def handle(request: web.Request) -> web.Response:
         try:
+            if isinstance(source, JsonQuery) and source.prepare is not None:
+                await source.prepare(request.query)
             text = json.dumps(_asked(source, request.query) if isinstance(source, JsonQuery) else source())
         except UsageError as error:
             return web.json_response({"error": str(error)}, status=400)

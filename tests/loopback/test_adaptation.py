@@ -4,7 +4,14 @@ import re
 from functools import partial
 from pathlib import Path
 
-from tests.daemons import Lab, Process
+from prometheus_client import CollectorRegistry
+
+from sern_core.types import Encoding, TopicName
+from sern_runtime.metrics import Metrics
+from sern_sim.models import LinkModel, RateStep
+from sern_tools.proxy import Route, ShapingProxy
+from tests.daemons import HOST, Lab, Process, bodies
+from tests.sern_core.summaries import scenes
 from tests.support import until
 
 ROBOT = {"kind": "synthetic", "role": "robot", "topics": 3}
@@ -54,3 +61,57 @@ async def test_without_the_section_nothing_is_adapted(tmp_path: Path) -> None:
         await lab.relay()
         robot = await lab.connected(lab.client_file("robot1", ROBOT))
         assert robot.adaptation is None
+
+
+THIN = {"control": False, "state": False, "bulk": True}
+RAW = dict.fromkeys(THIN, False)
+
+
+async def test_a_cloud_goes_to_its_summary_when_the_link_gets_thin_and_comes_back(tmp_path: Path) -> None:
+    """Through the shaping proxy: 40 Mbit/s, for some seconds 0.3, then 40 again. Nothing overtakes, as the clouds' own
+    counts show."""
+    steps = (RateStep(0.5, 0.3e6), RateStep(4.0, 40e6))
+    up, down = LinkModel(rate_bps=40e6, delay_s=0.005, rate_steps=steps), LinkModel(rate_bps=40e6, delay_s=0.005)
+    endpoint = {"kind": "synthetic", "role": "robot", "topics": ["/points"], "encoding": "ros1"}
+    clouds = {"cloud_rate_hz": 10.0, "cloud_bytes": 100_000}
+    summary = {"kind": "voxel", "voxel_m": 2.0, "in_place": True, "adapt": True, "level": "raw"}
+    rule = {"match": "/points", "class": "bulk", "compression": "none", "summary": summary}
+    topic = TopicName("/robot1/points")
+    async with Lab(tmp_path, "robot1", "site") as lab:
+        relay = await lab.relay()
+        site = await lab.connected(lab.recorder_file("site", topic))
+        async with ShapingProxy(up, down, [Route((HOST, 0), (HOST, lab.port))], seed=1) as proxy:
+            host, port = proxy.addresses[0]
+            file = lab.client_file(
+                "robot1",
+                endpoint | clouds,
+                topics=[rule],
+                adaptation=QUICK,
+                relay={"endpoint": f"tcp://{host}:{port}", "udp": False},
+            )
+            robot = await lab.connected(file)
+            adaptation = robot.adaptation
+            assert adaptation is not None
+
+            def chosen() -> object:
+                (link,) = adaptation.to_json()["links"]
+                return link["history"][-1]["chosen"]["summaries"] if link["history"] else None
+
+            (item,) = robot.bridge.summaries.topics
+            await until(lambda: chosen() == RAW and item.profile.messages, "raw clouds go, and their summary is known")
+            proxy.start()
+            await until(lambda: chosen() == THIN and item.profile.messages > 5, "thin clouds go")
+            registry = CollectorRegistry()
+            adaptation.register(Metrics(registry, process=False))
+            peer = {"peer": robot.core.link.peer, "class": "bulk"}
+            assert registry.get_sample_value("sern_mmcf_summarised", peer) == 1.0
+            await until(lambda: chosen() == RAW, "raw clouds go again")
+            before = site.core.received.topics[topic].delivered
+            await until(lambda: site.core.received.topics[topic].delivered > before + 3, "they arrive")
+            for daemon in (robot, site, relay):
+                await lab.end(daemon)
+    found = bodies(tmp_path / "site.bag")[topic]
+    clouds_got = [scenes.read(body, scenes.CLOUD, Encoding.ROS1) for body in found]
+    numbers = [cloud.header.seq for cloud in clouds_got]
+    assert numbers == sorted(set(numbers))
+    assert {len(cloud.data) > 50_000 for cloud in clouds_got} == {True, False}

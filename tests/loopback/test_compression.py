@@ -21,6 +21,8 @@ from sern_runtime.codec_pool import CodecPool, make_coder
 from sern_runtime.config.client import load_client
 from sern_tools.demo_link import free_ports
 from tests.daemons import HOST, Lab, bodies, recording, under
+from tests.loopback.test_summaries import bag_of
+from tests.sern_core.test_lossy import IMAGE, image_body, scene
 from tests.support import until
 
 CLOUDS = TopicName("/robot1/points")
@@ -135,6 +137,37 @@ async def test_a_topic_that_allows_it_loses_points_and_stays_a_cloud(tmp_path: P
         assert 0.95 * len(wanted) <= len(points) == cloud.width <= len(wanted)
         assert np.allclose(points.min(axis=0), wanted.min(axis=0), atol=0.0101)
         assert np.allclose(points.max(axis=0), wanted.max(axis=0), atol=0.0101)
+
+
+async def test_images_arrive_as_images_through_jpeg(tmp_path: Path) -> None:
+    """A recorded camera: header, size and encoding survive, the pixels nearly, and the link carries a fraction."""
+    pytest.importorskip("PIL", reason="the Python package Pillow (extra lossy) is not installed")
+    view = scene(240, 320, 3)
+    shots = [image_body(np.roll(view, 4 * shot, axis=1), "rgb8", Encoding.ROS1, padding=8) for shot in range(12)]
+    bag = bag_of(tmp_path / "camera.bag", [("/camera", IMAGE, body) for body in shots])
+    play = {"kind": "bag", "path": str(bag), "rate": 1.0, "wait_for": ["/camera"], "start_delay_s": 0.2}
+    topic = rule("/camera", "jpeg") | {"lossy": ["jpeg"], "jpeg_quality": 85}
+    name = TopicName("/robot1/camera")
+    async with Lab(tmp_path, "robot1", "site") as lab:
+        relay = await lab.relay()
+        site = await lab.connected(lab.recorder_file("site", name))
+        robot = await lab.connected(lab.client_file("robot1", play, topics=[topic]))
+        arrived = site.core.received.topics
+        await until(lambda: name in arrived and arrived[name].delivered == len(shots), "all images are there")
+        passed = relay.hub.received.topics[name]
+        assert passed.delivered_bytes < 0.2 * sum(map(len, shots))
+        assert robot.topics()[name]["compression"]["mode"] == "jpeg"
+        assert robot.core.coder.unencodable == 0
+        for daemon in (robot, site, relay):
+            await lab.end(daemon)
+    found = bodies(tmp_path / "site.bag")[name]
+    for sent, body in zip(shots, found, strict=True):
+        before, after = (ros_types.deserialise(one, IMAGE, Encoding.ROS1) for one in (sent, body))
+        assert (after.header.frame_id, after.height, after.width, after.encoding) == ("camera", 240, 320, "rgb8")
+        assert after.header.stamp == before.header.stamp
+        assert after.step == 3 * 320  # the padding at the end of rows is gone
+        pixels = before.data.reshape(240, before.step)[:, : after.step].astype(float)
+        assert np.abs(after.data.reshape(240, after.step) - pixels).mean() < 4.0
 
 
 async def test_an_absent_library_is_said_before_anything_starts(

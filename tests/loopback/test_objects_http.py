@@ -2,6 +2,7 @@
 
 import base64
 import json
+import threading
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlencode
@@ -9,7 +10,8 @@ from urllib.parse import urlencode
 import aiohttp
 import pytest
 
-from sern_core.types import ObjectKind
+from sern_core.codecs import decode
+from sern_core.types import ObjectKind, TopicName
 from sern_relay.daemon import RelayDaemon
 from tests.daemons import Lab
 from tests.support import until
@@ -106,3 +108,28 @@ async def test_a_wrong_question_is_answered_in_one_line(tmp_path: Path, paramete
     async with Lab(tmp_path) as lab:
         relay = await lab.relay()
         assert await ask(relay, **parameters) == (400, {"error": said})
+
+
+async def test_an_encoded_cloud_is_decoded_beside_the_loop_when_somebody_asks(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    threads: set[int] = set()
+
+    def noted(codec: int, body: bytes, *, max_bytes: int) -> bytes:
+        threads.add(threading.get_ident())
+        return decode(codec, body, max_bytes=max_bytes)
+
+    monkeypatch.setattr("sern_core.objects.decode", noted)
+    endpoint = {"kind": "synthetic", "role": "robot", "topics": ["/points"], "cloud_bytes": 200_000}
+    rule = {"match": "/points", "compression": "zstd", "reliability": "reliable", "class": "state"}
+    async with Lab(tmp_path, "jackal1", "operator1") as lab:
+        relay = await lab.relay()
+        site = await lab.connected(lab.recorder_file("operator1", "/jackal1/points"))
+        await lab.connected(lab.client_file("jackal1", endpoint, topics=[rule]))
+        topic = TopicName("/jackal1/points")
+        await until(lambda: topic in site.core.received.topics and site.core.received.topics[topic].delivered >= 2)
+        status, found = await ask(relay, owner="jackal1", kind="topic")
+        assert status == 200
+        (item,) = found["objects"]
+        assert item["value"]["bytes"] > 150_000
+        assert threads and threading.get_ident() not in threads

@@ -10,6 +10,7 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule, run_state_machine_as_test
 
+from sern_core.codecs import SIZE, Compression, encode
 from sern_core.errors import RefusedError
 from sern_core.message import StreamId, StreamInfo, TopicInfo, TopicSpec
 from sern_core.objects import ObjectLimits, ObjectRegistry, kind_of, topic_object_id
@@ -293,6 +294,52 @@ def test_json_shape() -> None:
 
 IDS = ("x", "y", "z", "/t@a", "/u@b")
 OWNERS = (A, B)
+
+
+def test_where_it_must_not_take_long_large_values_are_read_elsewhere() -> None:
+    """Nothing large is decoded or hashed by whoever asks; what `unread` gave is, and counts while it is the latest."""
+    registry = ObjectRegistry()
+    registry.inline_bytes = 1000
+    info = stream()
+    registry.put_stream(info, wall_ns=0, now=0.0)
+    raw = b"point " * 10_000
+    codec, body = encode(Compression.ZSTD, raw)
+    for seq, value in ((1, body), (2, bytes(bytearray(body)))):
+        assert registry.observe(info.id, seq, value, wall_ns=0, now=1.0, codec=codec)
+    object_id = topic_object_id(info.id)
+
+    def told() -> object:
+        return registry.to_json()["objects"][0]["value"]
+
+    assert told() == {"bytes": len(raw), "sha256": None}
+    assert registry.unread(kind=ObjectKind.NODE) == [] == registry.unread(version=registry.version)
+    (request,) = registry.unread(kind=ObjectKind.TOPIC, owner=A)
+    request.run()
+    assert told() == {"bytes": len(raw), "sha256": None}  # done is what tells it
+    request.done(now=2.0)
+    assert told() == {"bytes": len(raw), "sha256": hashlib.sha256(raw).hexdigest()}
+    assert registry.unread() == []
+    registry.validate()
+
+    other = b"other " * 10_000  # a value that came meanwhile is not lost
+    codec, newer = encode(Compression.ZSTD, other)
+    registry.observe(info.id, 3, body, wall_ns=0, now=3.0, codec=codec)
+    (late,) = registry.unread()
+    late.run()
+    registry.observe(info.id, 4, newer, wall_ns=0, now=4.0, codec=codec)
+    late.done(now=5.0)
+    assert told() == {"bytes": len(other), "sha256": None}
+    registry.observe(info.id, 5, SIZE.pack(50_000) + b"no frame", wall_ns=0, now=6.0, codec=codec)
+    (damaged,) = registry.unread()
+    damaged.run()
+    damaged.done(now=6.0)
+    assert told() is None
+    small, text = encode(Compression.ZSTD, b"abc " * 200)
+    registry.observe(info.id, 6, text, wall_ns=0, now=7.0, codec=small)
+    assert registry.unread() == []
+    found = registry.get(object_id)
+    assert found is not None and found.value == b"abc " * 200
+    registry.validate()
 
 
 class RegistryMachine(RuleBasedStateMachine):
