@@ -202,8 +202,8 @@ class ServiceBridge:
         """A message of ours was dropped, here or on its way: if it was a call, nobody will answer it."""
         used = self._calling.get(stream.id)
         number = None if used is None else used.numbers.pop(seq, None)
-        if used is None or number is None:
-            return
+        if used is None or number is None or reason is DropReason.UNWANTED:
+            return  # unwanted by another site of the same name than the one that offers it, which will answer
         future = used.waiting.get(number)
         if future is not None and not future.done():
             future.set_exception(ServiceError(f"the call of {used.name} was dropped on its way: {reason}"))

@@ -19,7 +19,7 @@ from sern_client.services import MAX_ERROR_CHARS, ServiceBridge
 from sern_core.errors import ConfigError, ServiceError
 from sern_core.message import Message, StreamId, StreamInfo, TopicInfo, TopicSpec
 from sern_core.services import CALL, REPLY, call_name, reply_name
-from sern_core.types import ClientName, Encoding, TopicName
+from sern_core.types import ClientName, DropReason, Encoding, TopicName
 from sern_runtime.config.client import load_client
 from tests.daemons import Lab
 from tests.fake_services import Services
@@ -121,6 +121,29 @@ async def test_an_error_of_the_service_is_the_callers(tmp_path: Path, monkeypatc
         with pytest.raises(ServiceError, match=r"^not with me$"):
             await handler(b"me")
         assert outcomes(site) == {(GLOBAL, "error"): 1}
+
+
+async def test_a_call_that_another_site_does_not_want_is_still_answered(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The relay reports what one of two sites with the same names turned away, though the other has it."""
+    called, go = asyncio.Event(), asyncio.Event()
+
+    async def answer(request: bytes) -> bytes:
+        called.set()
+        await go.wait()
+        return b"re: " + request
+
+    async with offered(tmp_path, monkeypatch) as (sites, handler):
+        sites.robot.answer = answer
+        services = bridge(sites.site_daemon)
+        call = asyncio.ensure_future(handler(b"mine"))
+        await until(called.is_set, "the robot has the call")
+        calls = services.used[GLOBAL].calls
+        assert calls is not None
+        services.send_dropped(calls.stream, calls.next_seq - 1, DropReason.UNWANTED)
+        go.set()
+        assert await call == b"re: mine"
 
 
 async def test_a_service_that_does_not_answer_is_an_error_in_time(
