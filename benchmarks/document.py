@@ -25,6 +25,10 @@ TITLES: Final = {
     "messages_hz": "messages/s",
     "relay_cpu_us": "relay CPU a message, µs",
     "cost_1": "cost J",
+    "odom_lost": "odom lost",
+    "cloud_lost": "clouds lost",
+    "odom_received": "odom got",
+    "cloud_received": "clouds got",
 }
 """Of columns whose metric's name does not say it well."""
 PURE: Final = "1"
@@ -45,9 +49,9 @@ def _cell(metric: str, value: float | None) -> str:
         return "–"
     if metric.endswith("_s") and value >= NEVER_S:
         return "never"
-    if abs(value) >= 1000:
+    if abs(value) >= 1000 or isinstance(value, int):
         return f"{value:,.0f}"
-    if metric.endswith(f"_{PURE}"):
+    if metric.endswith(f"_{PURE}") or 0 < abs(value) < 0.1:
         return f"{value:.3f}"
     return f"{value:.2f}" if metric.endswith(("_s", "_Mbps")) else f"{value:.1f}"
 

@@ -56,7 +56,16 @@ def test_numbers_without_a_unit_have_three_places() -> None:
     assert "| mmcf | 0.079 | 0.100 |" in text
 
 
-@pytest.mark.parametrize("name", ["link", "robots", "mmcf_lab"])
+def test_counts_have_no_places_and_small_times_enough() -> None:
+    found = Report("endpoints")
+    found.row("3 kHz", "direct", odom_p50_ms=0.0057, odom_lost=0, odom_received=160, cpu_percent=0.0)
+    found.row("3 kHz", "sern", odom_p50_ms=0.25, odom_lost=3, odom_received=24_000, cpu_percent=0.21)
+    text = render(json.loads(json.dumps(found.as_json())))
+    assert "| direct | 0.006 | 0 | 160 | 0.0 |" in text
+    assert "| sern | 0.2 | 3 | 24,000 | 0.2 |" in text
+
+
+@pytest.mark.parametrize("name", ["link", "robots", "mmcf_lab", "endpoints"])
 def test_the_document_has_a_place_for_them_and_keeps_the_rest(name: str) -> None:
     text = DOCUMENT.read_text(encoding="utf-8")
     once = insert(text, name, "figures")
