@@ -24,9 +24,9 @@ def draw(folder: Path, runs: Mapping[tuple[str, str], Mapping[str, Run]]) -> Ite
         if profile != "teleoperation":
             continue
         figure, (costs, terms, rate) = plt.subplots(3, 1, figsize=(9, 7), sharex=True, layout="constrained")
-        for policy, run in mine.items():
+        for policy, colour in COLOURS.items():
+            run = mine[policy]
             times = [interval.at_s for interval in run.intervals]
-            colour = COLOURS[policy]
             costs.plot(times, [i.cost for i in run.intervals], color=colour, label=policy.replace("_", " "), lw=1.3)
             if policy in ("mmcf", "oracle"):
                 bulk = [i.configuration.rates[2] for i in run.intervals]
