@@ -83,11 +83,12 @@ class CapacityEstimator(ABC):
 class Pacer:
     """Spreads what the window allows over time. Class 0 does not wait for it, but counts."""
 
-    __slots__ = ("due_s",)
+    __slots__ = ("_next_s", "due_s")
 
     def __init__(self) -> None:
+        self._next_s = 0.0
         self.due_s = 0.0
-        """When the next datagram may leave."""
+        """When the next datagram may leave. May be put off: what is not used then is made good like a late timer."""
 
     def ready(self, now: float) -> bool:
         return now >= self.due_s
@@ -99,5 +100,5 @@ class Pacer:
         if pacing_bps is not None:
             earliest_s = now - PACING_BURST_S
             own_s = 8 * nbytes / pacing_bps
-            begin_s = self.due_s if self.due_s > earliest_s else earliest_s
-            self.due_s = max(begin_s, min(begin_s + own_s, now + max(own_s, PACING_DEBT_S)))
+            begin_s = self._next_s if self._next_s > earliest_s else earliest_s
+            self.due_s = self._next_s = max(begin_s, min(begin_s + own_s, now + max(own_s, PACING_DEBT_S)))

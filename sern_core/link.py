@@ -211,6 +211,7 @@ class Link(Session):
         channel.ready = False
         self._refresh(channel, now)
         self.channels.pop(channel.slot, None)
+        self.cadences.forget(channel.slot)
         self.by_stream.pop(channel.stream.id, None)
         if self.established:
             self.send_control({"t": "retract", "ch": channel.slot}, now=now)

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from typing import Final, NamedTuple
 
 from sern_core import wire
+from sern_core.cadence import Cadences
 from sern_core.clocksync import ClockSync
 from sern_core.codecs import LOSSY, Coder, Compression, LossyTopic
 from sern_core.encoding import ChannelCodec, Coding, Encoder
@@ -128,6 +129,8 @@ class Sender(ABC):
         self._sweep_due_s = now + SWEEP_INTERVAL_S
         self._rate_due_s = now
         self._up_since_s = now
+        self.cadences = Cadences()
+        """When class 0 will want the link again."""
         self._watermarks: dict[int, int] = {}  # channel -> delivered, not yet on the wire
         self._rx_stamp_us = 0
         self._rx_delay: tuple[float, float] | None = None  # of the datagram at hand, and its uncertainty
@@ -181,6 +184,8 @@ class Sender(ABC):
         if nbytes > self.params.max_message_bytes:
             self.reject(channel, message, DropReason.TOO_LARGE, now=now)
             return True
+        if channel.spec.priority is PriorityClass.CONTROL and not message.replay:
+            self.cadences.arrived(channel.slot, now=now)
         backlog = channel.offered
         capped, thinned = channel.counters.by_reason[DropReason.RATE_CAP], channel.thinned
         accepted = channel.submit(message, now=now, forced=forced)
@@ -333,7 +338,10 @@ class Sender(ABC):
         app_limited = inflight_bytes < estimator.window_bytes and not waits
         flight.sent(now=now, nbytes=nbytes, items=items, app_limited=app_limited)
         estimator.on_sent(now=now, nbytes=nbytes, inflight_bytes=inflight_bytes)
-        lane.pacer.sent(now=now, nbytes=nbytes, pacing_bps=estimator.pacing_bps)
+        pacer = lane.pacer
+        pacer.sent(now=now, nbytes=nbytes, pacing_bps=estimator.pacing_bps)
+        if lane is self.lane and (rate_bps := estimator.rate_bps) is not None:
+            pacer.due_s = self.cadences.hold(pacer.due_s, 8 * (lane.fragment_bytes + OVERHEAD_BYTES) / rate_bps)
         self.wire_bytes += nbytes
         lane.ping_due_s = now + PING_INTERVAL_S
         if len(self.lanes) > 1:
@@ -408,6 +416,8 @@ class Sender(ABC):
             if out.coding is Coding.RAW and channel.codec is not None and not self._encoded(channel, out, now):
                 continue
             priority = _class_of(channel, out)
+            if served is None and priority is not PriorityClass.CONTROL:
+                limit = self._cut(lane, limit, now)
             if frames and (
                 (served is not None and priority is not served)
                 or (out.size if out.ranges is None else out.unsent_bytes) > limit - size - wire.DATA_FIRST_BYTES
@@ -420,6 +430,14 @@ class Sender(ABC):
             self._refresh(channel, now)
             if lane.stalled:
                 break
+
+    def _cut(self, lane: Lane, limit: int, now: float) -> int:
+        """Bytes of a datagram without class 0: so many that the link is free when class 0 wants it next."""
+        rate_bps = lane.estimator.rate_bps
+        if rate_bps is None:
+            return limit
+        share = self.cadences.share(now, 8 * (limit + OVERHEAD_BYTES) / rate_bps)
+        return limit if share >= 1.0 else int(share * (limit + OVERHEAD_BYTES)) - OVERHEAD_BYTES
 
     def _put_watermarks(self, frames: list[bytes], items: list[SentData | SentWatermark | SentPing], size: int) -> int:
         for slot in list(self._watermarks)[:MAX_WATERMARKS]:

@@ -148,6 +148,10 @@ class Timer:
             self._handle.cancel()
             self._handle = None
 
+    def close(self) -> None:
+        """Disarm for good."""
+        self.cancel()
+
     def _schedule(self, deadline_s: float) -> None:
         if self._handle is not None:
             self._handle.cancel()

@@ -5,6 +5,7 @@ import time
 from collections.abc import Callable
 from typing import Final, Protocol
 
+from sern_runtime.fine_timer import FineTimer, fine_timer
 from sern_runtime.loop import Timer
 from sern_runtime.zmq_socket import SendResult
 
@@ -38,10 +39,10 @@ class Pump:
     happens before the loop comes round is sent together. `send` answers FULL when the socket cannot take more; it is
     tried again soon. `on_gone` is called when the peer's connection is over.
 
-    A paced lane (UDP) says with `next_deadline` when its next datagram may leave. The timer wakes at whole
-    milliseconds, never early, and what has become due until then leaves as one burst: the core's pacing must grant what
+    A paced lane (UDP) says with `next_deadline` when its next datagram may leave. The timer wakes for it at most once a
+    millisecond, never early, and what has become due until then leaves as one burst: the core's pacing must grant what
     was not used for at least that long. Give such a lane `ready`: it is asked before a datagram is taken, so that none
-    is held here, where it could no longer be overtaken, and its send stamp would grow old.
+    is held here, where it could no longer be overtaken, and its send stamp would grow old. It has a finer timer, too.
     """
 
     def __init__(
@@ -57,7 +58,7 @@ class Pump:
         self._on_gone = on_gone
         self._ready = ready
         self._loop = asyncio.get_running_loop()
-        self._timer = Timer(self._due)
+        self._timer: Timer | FineTimer = Timer(self._due) if ready is None else fine_timer(self._due)
         self._scheduled: asyncio.Handle | None = None
         self._held: bytes | None = None
         self._retry_s = 0.0  # not before then, while something is held
@@ -81,7 +82,7 @@ class Pump:
 
     def close(self) -> None:
         self._closed = True
-        self._timer.cancel()
+        self._timer.close()
         if self._scheduled is not None:
             self._scheduled.cancel()
             self._scheduled = None

@@ -63,9 +63,15 @@ STARTUP_PACING: Final = 4.0
 STARTUP_AIM: Final = 0.9
 PACING_GAIN: Final = 1.03
 CALM_PACING: Final = 0.985
-CALM_PACKETS: Final = 0.2
+CALM_PACKETS: Final = 0.3
 """Instead of `PACING_GAIN` and `TARGET_PACKETS` where there is no jitter and a packet takes little: by jitter the rate
 would drift down unseen, and of long packets an epoch has too few."""
+GENTLE_PACKET_S: Final = 0.0015
+GENTLE_PACKETS: Final = 0.4
+GENTLE_PACING: Final = (1.01, 1.01, 1.01, 1.02, 1.03, 1.05, 1.09, 1.17)
+"""Where a packet takes longer than that, one more in flight is a step of the queue: the pace steers there, not the
+window. While the path looks empty it is so many times the capacity, epoch by epoch; then the window grows as elsewhere,
+for the link is another one."""
 CALM_SHARE: Final = 0.05
 """So much faster is the pace of who has none of the link: shares meet."""
 CALM_NOISE_S: Final = 0.0005
@@ -109,6 +115,7 @@ class HybridWindow(CapacityEstimator):
         self._pacing: float | None = None  # bytes/s
         self._capped = False  # it keeps below the capacity
         self._calm = False
+        self._gentle = False  # calm, and a packet takes long enough to be steered for
         self._small, self._large = BaseDelay(), BaseDelay()
         self._queue_s = 0.0  # 20th percentile of the epoch
         self._queue_most_s = 0.0  # 80th
@@ -165,7 +172,7 @@ class HybridWindow(CapacityEstimator):
 
     @property
     def window_bytes(self) -> float:
-        return self._window
+        return self._window + self._fragment if self._capped and self._gentle else self._window
 
     @property
     def rate_bps(self) -> float | None:
@@ -390,7 +397,9 @@ class HybridWindow(CapacityEstimator):
         noise_s = NOISE * max(0.0, self._jitter_s - serialise_s)
         # A slower flow wants a longer queue than a faster one, so that their shares meet.
         self._calm = noise_s <= CALM_NOISE_S and serialise_s <= CALM_PACKET_S
-        packets = (CALM_PACKETS if self._calm else TARGET_PACKETS) + FAST_PACKETS * max(0.0, 1 - serialise_s / FAST_S)
+        self._gentle = self._calm and serialise_s >= GENTLE_PACKET_S
+        packets = GENTLE_PACKETS if self._gentle else CALM_PACKETS if self._calm else TARGET_PACKETS
+        packets += FAST_PACKETS * max(0.0, 1 - serialise_s / FAST_S)
         turns_s = TURNS_S * max(0.0, 1 - TURNS_RATE / self._peak) if self._peak else 0.0
         self._target_s = TARGET_S + packets * min(own_s, 4 * serialise_s) + noise_s + turns_s
         self._high_s = max(0.010, 0.1 * rtt_s) + serialise_s + 1.5 * noise_s
@@ -464,6 +473,9 @@ class HybridWindow(CapacityEstimator):
                     step = max(step, FIRST_GROWTH * window) * 2 ** min(self._empty_epochs - PATIENT_EPOCHS - 1, 8)
             if step > 0:
                 most = 1.4 * rate * (rtt_s + target_s) + 3 * self._fragment
+                if self._capped and self._gentle and self._empty_epochs < len(GENTLE_PACING):
+                    # It does not bind, so it would run away.
+                    most = GENTLE_PACING[self._empty_epochs] * rate * (rtt_s + target_s) + self._fragment
                 window = max(window, min(window + min(step, MAX_GROWTH * window), most))
             else:
                 window = min(window, 1.1 * rate * (rtt_s + queue_s) + 4 * self._fragment) + step
@@ -484,7 +496,14 @@ class HybridWindow(CapacityEstimator):
             return
         self._pacing = PACING_GAIN * self._window / rtt_s
         rate = self._rate
-        if rate is not None and self._queue_s >= 0.25 * self._target_s:
+        if rate is None:
+            return
+        if self._queue_s < 0.25 * self._target_s:
+            if self._gentle and self._saturated and self._empty_epochs < len(GENTLE_PACING):
+                gain = GENTLE_PACING[self._empty_epochs]
+                self._capped = gain * rate < self._pacing
+                self._pacing = min(self._pacing, gain * rate)
+        else:
             gain = DRAIN_PACING
             if self._queue_s < 2 * self._target_s + self._serialise_s:
                 gain = CALM_PACING + CALM_SHARE * max(0.0, 1 - rate / self._peak) if self._calm else PACING_GAIN
