@@ -20,6 +20,8 @@ SLIP: Final = 0.25
 MAX_MISSED: Final = 4
 MAX_TOPICS: Final = 16
 """With more of them there is no gap to fit anything into."""
+MIN_DATAGRAMS: Final = 3.0
+"""A topic that leaves no room for so many full datagrams between two messages is none to wait for."""
 AFTER_S: Final = 0.0003
 """Aim so long behind the message: its source may be that late, and what is cut must not end far ahead of it."""
 MIN_SHARE: Final = 0.25
@@ -66,11 +68,14 @@ class Cadence:
         self._due_s = now + gap_s
         self._error = 0.0
 
-    def due_after(self, now: float) -> float | None:
-        """When the first message behind `now` is due; None: nobody knows."""
-        if self._count < SETTLED or self._error > MAX_ERROR or now > self._due_s + MAX_MISSED * self._period_s:
+    def due_after(self, now: float, *, least_s: float = 0.0) -> float | None:
+        """When the first message behind `now` is due; None: nobody knows, or the period is shorter than `least_s`."""
+        period_s = self._period_s
+        if self._count < SETTLED or self._error > MAX_ERROR or period_s < least_s:
             return None
-        return self._due_s + max(0, ceil((now - self._due_s) / self._period_s)) * self._period_s
+        if now > self._due_s + MAX_MISSED * period_s:
+            return None  # it has ended, for all one knows
+        return self._due_s + max(0, ceil((now - self._due_s) / period_s)) * period_s
 
 
 class Cadences:
@@ -96,21 +101,22 @@ class Cadences:
     def share(self, now: float, datagram_s: float) -> float:
         """How much of a full datagram, which takes `datagram_s` of the link, should leave now: 1, or less, so that one
         of these and the equal ones behind it ends when the next class-0 message is due."""
-        left_s = self._due(now) + AFTER_S - now
+        left_s = self._due(now, datagram_s) + AFTER_S - now
         if left_s < MIN_SHARE * datagram_s or left_s > HORIZON * datagram_s:
             return 1.0
         return left_s / (datagram_s * ceil(left_s / datagram_s))
 
     def hold(self, at_s: float, datagram_s: float) -> float:
         """When a datagram that could leave at `at_s` should: not right ahead of a class-0 message."""
-        free_s = self._due(at_s) + AFTER_S
+        free_s = self._due(at_s, datagram_s) + AFTER_S
         return free_s if free_s < at_s + MIN_SHARE * datagram_s else at_s
 
-    def _due(self, now: float) -> float:
+    def _due(self, now: float, datagram_s: float) -> float:
         """When the next class-0 message should come, or should have come a moment ago; far away: nobody knows."""
         since_s = now - AFTER_S
         if since_s > self._due_s:
-            topics = self._topics
-            due = [at_s for topic in topics.values() if (at_s := topic.due_after(since_s)) is not None]
+            topics, least_s = self._topics, MIN_DATAGRAMS * datagram_s
+            found = [topic.due_after(since_s, least_s=least_s) for topic in topics.values()]
+            due = [at_s for at_s in found if at_s is not None]
             self._due_s = min(due) if due and len(topics) <= MAX_TOPICS else now + NEVER_S
         return self._due_s

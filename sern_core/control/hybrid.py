@@ -68,10 +68,9 @@ CALM_PACKETS: Final = 0.3
 would drift down unseen, and of long packets an epoch has too few."""
 GENTLE_PACKET_S: Final = 0.0015
 GENTLE_PACKETS: Final = 0.4
-GENTLE_PACING: Final = (1.01, 1.01, 1.01, 1.02, 1.03, 1.05, 1.09, 1.17)
+GENTLE_PACING: Final = (1.01, 1.01, 1.01, 1.02, 1.03, 1.05, 1.09, 1.17, 1.3, 1.5)
 """Where a packet takes longer than that, one more in flight is a step of the queue: the pace steers there, not the
-window. While the path looks empty it is so many times the capacity, epoch by epoch; then the window grows as elsewhere,
-for the link is another one."""
+window. While the path looks empty it is so many times the capacity, epoch by epoch."""
 CALM_SHARE: Final = 0.05
 """So much faster is the pace of who has none of the link: shares meet."""
 CALM_NOISE_S: Final = 0.0005
@@ -115,6 +114,7 @@ class HybridWindow(CapacityEstimator):
         self._pacing: float | None = None  # bytes/s
         self._capped = False  # it keeps below the capacity
         self._calm = False
+        self._loss = 0.0  # smoothed share
         self._gentle = False  # calm, and a packet takes long enough to be steered for
         self._small, self._large = BaseDelay(), BaseDelay()
         self._queue_s = 0.0  # 20th percentile of the epoch
@@ -397,7 +397,8 @@ class HybridWindow(CapacityEstimator):
         noise_s = NOISE * max(0.0, self._jitter_s - serialise_s)
         # A slower flow wants a longer queue than a faster one, so that their shares meet.
         self._calm = noise_s <= CALM_NOISE_S and serialise_s <= CALM_PACKET_S
-        self._gentle = self._calm and serialise_s >= GENTLE_PACKET_S
+        # Fragments of a stream grow with its rate, and TCP cuts them anew: what they take is not known so well.
+        self._gentle = self._calm and serialise_s >= GENTLE_PACKET_S and self._fragment <= self._first_fragment_bytes
         packets = GENTLE_PACKETS if self._gentle else CALM_PACKETS if self._calm else TARGET_PACKETS
         packets += FAST_PACKETS * max(0.0, 1 - serialise_s / FAST_S)
         turns_s = TURNS_S * max(0.0, 1 - TURNS_RATE / self._peak) if self._peak else 0.0
@@ -413,6 +414,7 @@ class HybridWindow(CapacityEstimator):
             self._emptied_s = now
         limited = 2 * self._limited >= count
         lost = self._lost_bytes / max(1, self._lost_bytes + self._acked_bytes)
+        self._loss += 0.05 * (min(lost, 0.2) - self._loss)
         if self._drain_until_s is not None:
             if now >= self._drain_until_s:
                 self._window = self._saved_window
@@ -473,9 +475,9 @@ class HybridWindow(CapacityEstimator):
                     step = max(step, FIRST_GROWTH * window) * 2 ** min(self._empty_epochs - PATIENT_EPOCHS - 1, 8)
             if step > 0:
                 most = 1.4 * rate * (rtt_s + target_s) + 3 * self._fragment
-                if self._capped and self._gentle and self._empty_epochs < len(GENTLE_PACING):
+                if self._capped and self._gentle:
                     # It does not bind, so it would run away.
-                    most = GENTLE_PACING[self._empty_epochs] * rate * (rtt_s + target_s) + self._fragment
+                    most = self._probing * rate / (1 - self._loss) * (rtt_s + target_s) + self._fragment
                 window = max(window, min(window + min(step, MAX_GROWTH * window), most))
             else:
                 window = min(window, 1.1 * rate * (rtt_s + queue_s) + 4 * self._fragment) + step
@@ -499,16 +501,23 @@ class HybridWindow(CapacityEstimator):
         if rate is None:
             return
         if self._queue_s < 0.25 * self._target_s:
-            if self._gentle and self._saturated and self._empty_epochs < len(GENTLE_PACING):
-                gain = GENTLE_PACING[self._empty_epochs]
-                self._capped = gain * rate < self._pacing
-                self._pacing = min(self._pacing, gain * rate)
+            if self._gentle and self._saturated:
+                pacing = self._probing * rate / (1 - self._loss)
+                self._capped = pacing < self._pacing
+                self._pacing = min(self._pacing, pacing)
         else:
             gain = DRAIN_PACING
             if self._queue_s < 2 * self._target_s + self._serialise_s:
                 gain = CALM_PACING + CALM_SHARE * max(0.0, 1 - rate / self._peak) if self._calm else PACING_GAIN
+            if self._calm:
+                rate /= 1 - self._loss  # what arrives is less than what was sent
             self._capped = self._calm and gain * rate < self._pacing
             self._pacing = max(min(self._pacing, gain * rate), 1.0)
+
+    @property
+    def _probing(self) -> float:
+        """Times the capacity that an empty path is tried with."""
+        return GENTLE_PACING[min(self._empty_epochs, len(GENTLE_PACING) - 1)]
 
     def _drain(self, now: float, rtt_s: float) -> None:
         if self._rate is None:
@@ -606,6 +615,7 @@ class HybridWindow(CapacityEstimator):
     def on_stall(self, *, now: float) -> None:
         self._rates.clear()
         self._rate = None
+        self._saturated = False  # what begins anew shows little at first
         self._restart()
         self._window = max(min(self._window, self._initial_bytes), MIN_WINDOW_FRAGMENTS * self._fragment)
         self._start_again(now)

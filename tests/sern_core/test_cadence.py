@@ -82,6 +82,16 @@ def test_nothing_leaves_right_ahead_of_a_message() -> None:
     assert cadences.hold(due_s - 0.0002, DATAGRAM_S) == due_s - 0.0002
 
 
+def test_a_topic_that_leaves_no_room_holds_nothing_back() -> None:
+    cadences = Cadences()
+    for at_s in every(PERIOD_S, 20):
+        cadences.arrived(1, now=at_s)
+    due_s = 10.0 + 21 * PERIOD_S
+    assert cadences.hold(due_s - 0.0002, PERIOD_S) == due_s - 0.0002
+    cadences.arrived(1, now=due_s)
+    assert cadences.share(due_s + 0.001, PERIOD_S / 2) == 1.0
+
+
 def test_among_many_topics_there_is_no_gap() -> None:
     cadences = Cadences()
     for at_s in every(PERIOD_S, 20):
