@@ -204,7 +204,7 @@ class HybridWindow(CapacityEstimator):
 
     def on_sent(self, *, now: float, nbytes: int, inflight_bytes: int) -> None:
         if nbytes > self._fragment:
-            if self._peak:
+            if self._saturated:
                 self._large.shift((nbytes - self._fragment) / self._peak)
             self._fragment = float(nbytes)
         if 2 * inflight_bytes >= self._window or self._busy_s is None:
@@ -227,8 +227,9 @@ class HybridWindow(CapacityEstimator):
         back_s = rtt_s - delay_s
         base = self._large if nbytes == 0 or 2 * nbytes >= self._fragment else self._small
         if base is self._large and 0 < nbytes < self._fragment:
-            # As if it had been a full one: else the least delay would be that of shorter ones.
-            if self._peak:
+            # As if it had been a full one: else the least delay would be that of shorter ones. While there was never
+            # more to send than the link took, what it takes is not known: what little was sent would make it seconds.
+            if self._saturated:
                 delay_s += (self._fragment - nbytes) / self._peak
             elif 10 * nbytes < 9 * self._fragment:
                 base = self._small

@@ -306,3 +306,18 @@ def test_our_own_slowness_is_not_taken_for_the_links() -> None:
     send(0.25, 0, 30.0)
     after_bps = estimator.bound_bps
     assert after_bps is not None and after_bps > 0.5 * before_bps
+
+
+def test_little_traffic_of_several_sizes_makes_no_long_path() -> None:
+    """The rate is that of what was offered, a few hundred bytes a second: by it a packet would take seconds."""
+    estimator = HybridWindow()
+    cum_bytes = 0
+    for number in range(400):
+        now, nbytes = 100.0 + 0.5 * number, (1231, 1000, 700, 200)[number % 4]
+        estimator.on_sent(now=now, nbytes=nbytes, inflight_bytes=nbytes)
+        cum_bytes += nbytes
+        estimator.on_ack(
+            AckSample(now + 0.002, 0.002, nbytes, 0, now + 0.001, cum_bytes, True, now, packet_bytes=nbytes)
+        )
+    assert estimator.rtprop_s == pytest.approx(0.002, rel=0.5)
+    assert estimator.rate_bps is None
