@@ -204,7 +204,7 @@ class HybridWindow(CapacityEstimator):
 
     def on_sent(self, *, now: float, nbytes: int, inflight_bytes: int) -> None:
         if nbytes > self._fragment:
-            if self._saturated:
+            if self._peak and self._saturated:
                 self._large.shift((nbytes - self._fragment) / self._peak)
             self._fragment = float(nbytes)
         if 2 * inflight_bytes >= self._window or self._busy_s is None:
@@ -229,7 +229,7 @@ class HybridWindow(CapacityEstimator):
         if base is self._large and 0 < nbytes < self._fragment:
             # As if it had been a full one: else the least delay would be that of shorter ones. While there was never
             # more to send than the link took, what it takes is not known: what little was sent would make it seconds.
-            if self._saturated:
+            if self._peak and self._saturated:
                 delay_s += (self._fragment - nbytes) / self._peak
             elif 10 * nbytes < 9 * self._fragment:
                 base = self._small
