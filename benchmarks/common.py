@@ -166,6 +166,8 @@ def main(
     options = parser.parse_args()
     report = Report(benchmark)
     try:
+        if options.json is not None:  # before the work, not after it
+            options.json.parent.mkdir(parents=True, exist_ok=True)
         run(options, report)
         report.print(Console(width=None if sys.stdout.isatty() else 140))
         if options.json is not None:
