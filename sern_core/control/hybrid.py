@@ -12,7 +12,8 @@ Theory of operation
     the path looks empty the step doubles every epoch, up to a quarter of W. A queue above `hi` cuts W to what the
     receiver saw; one far above for longer than a moment does it at once (the link got slower).
     *Pacing.* On a path without jitter a little below B while something queues: the window bounds, the pace keeps the
-    queue short. B does not follow what our own pacing made of it.
+    queue short. Where packets take long it also tries the empty path, in small steps, with a window that leaves room.
+    What is lost on the way is added. B does not follow what our own pacing made of it.
     *Start-up.* The first packets leave in a train: its dispersion shows the capacity one round trip later, and the
     window goes there in steps of at most `STARTUP_GAIN`.
     *Draining.* When no empty queue was seen for a while, one round trip at 0.6 of the product shows it. A queue that
