@@ -183,7 +183,7 @@ async def test_a_type_that_cannot_be_converted_is_said_once_and_stops_nothing_el
     await peer.do("sub chat rt/robot1/chat std_msgs::msg::dds_::String_ reliable depth=1000")
     async with Lab(tmp_path, "robot1", "site") as lab:
         await lab.process(lab.relay_file()).ready()
-        play = {"wait_for": ["/chat"]}
+        play = {"wait_for": ["/chat"], "loop": True}  # a reader of DDS misses what came before it was found
         site = lab.process(
             lab.client_file(
                 "site", dds(domain), client={"namespace": "/"}, subscribe=["/robot1/.*"], discovery={"mode": "manual"}
