@@ -20,8 +20,9 @@ SLIP: Final = 0.25
 MAX_MISSED: Final = 4
 MAX_TOPICS: Final = 16
 """With more of them there is no gap to fit anything into."""
-MIN_DATAGRAMS: Final = 3.0
-"""A topic that leaves no room for so many full datagrams between two messages is none to wait for."""
+MIN_DATAGRAMS: Final = 2.5
+"""Class 0 that leaves no room for so many full datagrams between two messages, all topics together, is none to wait
+for: all that is sent would be cut small."""
 AFTER_S: Final = 0.0003
 """Aim so long behind the message: its source may be that late, and what is cut must not end far ahead of it."""
 MIN_SHARE: Final = 0.25
@@ -35,19 +36,19 @@ NEVER_S: Final = 1.0
 class Cadence:
     """A second-order loop on the times of a topic's messages: period and phase."""
 
-    __slots__ = ("_count", "_due_s", "_error", "_period_s", "_seen_s")
+    __slots__ = ("_count", "_due_s", "_error", "_seen_s", "period_s")
 
     def __init__(self, now: float) -> None:
         self._seen_s = now
         self._count = 0  # messages in this rhythm
-        self._period_s = 0.0
+        self.period_s = 0.0
         self._due_s = now
         self._error = 0.0  # mean, as a share of the period
 
     def arrived(self, now: float) -> None:
         gap_s = now - self._seen_s
         self._seen_s = now
-        period_s = self._period_s
+        period_s = self.period_s
         periods = round((now - self._due_s) / period_s) + 1 if period_s > 0.0 else 0
         if not 0 < periods <= MAX_MISSED:
             self._begin(now, gap_s)
@@ -59,19 +60,19 @@ class Cadence:
             return
         self._count += 1
         self._error += ERROR_GAIN * (share - self._error)
-        self._period_s = period_s + PERIOD_GAIN * error_s / periods
-        self._due_s = now - (1.0 - PHASE_GAIN) * error_s + self._period_s
+        self.period_s = period_s + PERIOD_GAIN * error_s / periods
+        self._due_s = now - (1.0 - PHASE_GAIN) * error_s + self.period_s
 
     def _begin(self, now: float, gap_s: float) -> None:
         self._count = 0
-        self._period_s = gap_s
+        self.period_s = gap_s
         self._due_s = now + gap_s
         self._error = 0.0
 
-    def due_after(self, now: float, *, least_s: float = 0.0) -> float | None:
-        """When the first message behind `now` is due; None: nobody knows, or the period is shorter than `least_s`."""
-        period_s = self._period_s
-        if self._count < SETTLED or self._error > MAX_ERROR or period_s < least_s:
+    def due_after(self, now: float) -> float | None:
+        """When the first message behind `now` is due; None: nobody knows."""
+        period_s = self.period_s
+        if self._count < SETTLED or self._error > MAX_ERROR:
             return None
         if now > self._due_s + MAX_MISSED * period_s:
             return None  # it has ended, for all one knows
@@ -115,8 +116,10 @@ class Cadences:
         """When the next class-0 message should come, or should have come a moment ago; far away: nobody knows."""
         since_s = now - AFTER_S
         if since_s > self._due_s:
-            topics, least_s = self._topics, MIN_DATAGRAMS * datagram_s
-            found = [topic.due_after(since_s, least_s=least_s) for topic in topics.values()]
-            due = [at_s for at_s in found if at_s is not None]
-            self._due_s = min(due) if due and len(topics) <= MAX_TOPICS else now + NEVER_S
+            self._due_s = now + NEVER_S
+            if len(self._topics) <= MAX_TOPICS:
+                found = [(due_s, topic) for topic in self._topics.values() if (due_s := topic.due_after(since_s))]
+                rate_hz = sum([1.0 / topic.period_s for _, topic in found])
+                if found and rate_hz * MIN_DATAGRAMS * datagram_s <= 1.0:
+                    self._due_s = min([due_s for due_s, _ in found])
         return self._due_s

@@ -92,6 +92,20 @@ def test_a_topic_that_leaves_no_room_holds_nothing_back() -> None:
     assert cadences.share(due_s + 0.001, PERIOD_S / 2) == 1.0
 
 
+def test_topics_that_leave_no_room_together_hold_nothing_back() -> None:
+    """Five at 50 Hz, 4 ms apart: what is sent between them would be cut to a datagram and a half."""
+
+    def share(datagram_s: float) -> float:
+        cadences = Cadences()
+        for slot in range(5):
+            for at_s in every(PERIOD_S, 20):
+                cadences.arrived(slot, now=at_s + 0.004 * slot)
+        return cadences.share(10.0 + 20 * PERIOD_S + 0.0167, datagram_s)
+
+    assert share(DATAGRAM_S) == 1.0
+    assert share(DATAGRAM_S / 2) < 1.0, "of a faster link"
+
+
 def test_among_many_topics_there_is_no_gap() -> None:
     cadences = Cadences()
     for at_s in every(PERIOD_S, 20):
