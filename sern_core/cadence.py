@@ -42,6 +42,7 @@ class Cadence:
         self._seen_s = now
         self._count = 0  # messages in this rhythm
         self.period_s = 0.0
+        """Seconds between two messages, as far as it is periodic."""
         self._due_s = now
         self._error = 0.0  # mean, as a share of the period
 
