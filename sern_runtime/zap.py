@@ -187,7 +187,10 @@ async def self_test(
     Run it before accepting traffic. `endpoints` as `bind_all` returned them. Raises SernError of one line: refuse to
     start. A misconfigured CURVE server admits everyone in silence, so this is found by trying alone.
     """
-    await asyncio.gather(*(_must_refuse(ctx, handler, endpoint, server_key, timeout_s) for endpoint in endpoints))
+    tests = [_must_refuse(ctx, handler, endpoint, server_key, timeout_s) for endpoint in endpoints]
+    for outcome in await asyncio.gather(*tests, return_exceptions=True):  # all have ended, and closed their sockets
+        if isinstance(outcome, BaseException):
+            raise outcome
 
 
 async def _must_refuse(
