@@ -13,12 +13,17 @@ from pathlib import Path
 import pytest
 import uvloop
 import zmq
+from hypothesis import settings
 
 from sern_core.types import ClientName
 from sern_runtime.keys import SecretKey, generate
 from tests.support import DEADLINE_S, Patience
 
 Context = zmq.Context[zmq.Socket[bytes]]
+
+# The same cases in every run: a failure is one of the change at hand, and is there again in the next run.
+settings.register_profile("sern", derandomize=True, database=None, deadline=None)
+settings.load_profile("sern")
 
 
 @pytest.hookimpl(optionalhook=True)

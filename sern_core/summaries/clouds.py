@@ -72,8 +72,8 @@ class Cloud:
         points = self.points
         if not len(points):
             return np.empty(0, kind)
-        # A field may lie at any offset, so it is no column of any plain array: its stride is the point.
-        return np.ndarray(len(points), kind, points, field.offset, (points.strides[0],))
+        # Rows may be padded, so the points need not lie end to end; the bytes of one field of a point do.
+        return points[:, field.offset : field.offset + kind.itemsize].view(kind)[:, 0]
 
     def xyz(self) -> NDArray[np.float32] | NDArray[np.float64]:
         """(n, 3) coordinates in metres, native byte order; float64 if any of them is wider than float32."""

@@ -1,6 +1,7 @@
 """Thinned clouds: by value, by property, against rosbags' reading, and on clouds that nobody should send."""
 
 import struct
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -240,6 +241,14 @@ def test_a_changed_body_is_thinned_or_refused(data: st.DataObject, encoding: Enc
     except BodyError:
         return
     assert read_cloud(thin, encoding).width <= 3
+
+
+def test_rows_of_one_point_may_be_padded() -> None:
+    xyz = np.arange(9, dtype=np.float32).reshape(3, 3)
+    cloud = read_cloud(scenes.cloud_body(scenes.structured(xyz), Encoding.CDR, height=3), Encoding.CDR)
+    padded = np.zeros((3, cloud.point_step + 5), np.uint8)
+    padded[:, : cloud.point_step] = cloud.points
+    assert replace(cloud, points=padded[:, : cloud.point_step]).xyz().tolist() == xyz.tolist()
 
 
 def test_a_cloud_that_was_never_filled_is_empty() -> None:
