@@ -274,6 +274,9 @@ class IdleSite:
 
     def undecodable(self, stream: StreamInfo, problem: str) -> None: ...
 
+    def fault(self, error: Exception) -> None:
+        raise SystemExit(f"an internal error: {error!r}")
+
     def subscription_refused(self, code: str, text: str) -> None: ...
 
 

@@ -86,6 +86,7 @@ class Bridge:
         kick: Callable[[], None],
         on_up: Callable[[], None],
         on_down: Callable[[str], None],
+        on_fault: Callable[[Exception], None],
     ) -> None:
         self.endpoint = endpoint
         self.rules = rules
@@ -111,6 +112,7 @@ class Bridge:
         self._kick = kick
         self._on_up = on_up
         self._on_down = on_down
+        self._on_fault = on_fault
         self._sources_stopped = False
         self._closed = False
         self._core: ClientCore | None = None
@@ -414,6 +416,9 @@ class Bridge:
 
     def undecodable(self, stream: StreamInfo, problem: str) -> None:
         _log.error("%s from %s cannot be decoded and is dropped: %s", stream.id.topic, stream.id.origin, problem)
+
+    def fault(self, error: Exception) -> None:
+        self._on_fault(error)
 
     def subscription_refused(self, code: str, text: str) -> None:
         if text not in self.subscription_problems:  # it is said again in every session

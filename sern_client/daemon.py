@@ -37,6 +37,7 @@ from sern_runtime.config.load import Loaded
 from sern_runtime.draining import Progress
 from sern_runtime.entry import blamed_on, end_tasks, log_warnings, serve
 from sern_runtime.http import Health, HttpServer
+from sern_runtime.internal_errors import InternalErrors
 from sern_runtime.keys import load_public, load_secret
 from sern_runtime.link_metrics import register_codecs, register_links, register_received
 from sern_runtime.loop import Shutdown
@@ -77,6 +78,7 @@ class ClientDaemon:
         model = loaded.model
         self.notifier = Notifier.from_environment()
         endpoint = make_endpoint(loaded)
+        self.errors = InternalErrors()
         self.message_log = MessageLog(loaded.resolve(model.message_log)) if model.message_log else None
         self.bridge = Bridge(
             endpoint,
@@ -88,6 +90,7 @@ class ClientDaemon:
             kick=self._kick,
             on_up=self._link_up,
             on_down=self._link_down,
+            on_fault=self.errors.core,
         )
         now = time.monotonic()
         for index, section in enumerate(model.topics):
@@ -154,6 +157,7 @@ class ClientDaemon:
             )
 
     async def start(self) -> None:
+        self.errors.watch(asyncio.get_running_loop())
         model = self.loaded.model
         relay = model.relay
         keys = load_secret(self.loaded.resolve(relay.secret_key_file)) if relay.secret_key_file else None
@@ -266,6 +270,7 @@ class ClientDaemon:
         register_links(metrics, lambda: [link])
         register_received(metrics, self.core.received, self.bridge.ages)
         register_codecs(metrics, self.core.coder)
+        self.errors.register(metrics)
         register_summaries(metrics, self.bridge.summaries)
         metrics.counter(
             "sern_patch_gaps_total",
@@ -401,6 +406,7 @@ class ClientDaemon:
     async def stop(self) -> None:
         """Ends whatever was started, the last first, also when a part of it fails."""
         async with AsyncExitStack() as stack:
+            stack.callback(self.errors.unwatch, asyncio.get_running_loop())
             stack.callback(self.notifier.close)
             stack.callback(self._write_summary)
             stack.callback(self._give_up)

@@ -4,8 +4,9 @@ The shell (sern_client) feeds it endpoint messages and lane bytes, and is told t
 appear and which messages have their turn. Everything about bandwidth, order, replay and loss is in the link below.
 """
 
-from collections.abc import Sequence
-from typing import Protocol
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from typing import ParamSpec, Protocol
 
 from sern_core import wire
 from sern_core.announce import MAX_STRINGS, Announcement, check_stream
@@ -22,6 +23,8 @@ from sern_core.queues import OutChannel
 from sern_core.replay import LatchedCache
 from sern_core.trace import DecisionTrace, TraceEvent
 from sern_core.types import ClientName, DropReason, ObjectKind, TopicName
+
+P = ParamSpec("P")
 
 RELAY_NAME = ClientName("relay")
 """What the relay is called until its WELCOME says its own name."""
@@ -70,6 +73,10 @@ class ClientEvents(Protocol):
     def undecodable(self, stream: StreamInfo, problem: str) -> None:
         """The body of a message could not be decoded: it is dropped. Said once for each topic."""
 
+    def fault(self, error: Exception) -> None:
+        """Something raised what nobody expects, in the core or in one of these methods: log it with its traceback and
+        count it. What it was about is given up, everything else goes on."""
+
 
 class ClientCore:
     """One client. `boot` is a random 63-bit number of this process, `now` any monotonic time in seconds.
@@ -97,6 +104,8 @@ class ClientCore:
         self.definitions: dict[str, str] = {}
         self.received = ReceiveLedger()
         """Counters of what arrives, by topic: delivered, and dropped on arrival for a reason."""
+        self.faults = 0
+        """Errors of ours so far that nobody expects."""
         self.patterns: tuple[str, ...] = ()
         self.attributes: dict[str, str] = {}
         """Metadata of this node, for the object registry."""
@@ -106,7 +115,7 @@ class ClientCore:
         self._undecodable: set[TopicName] = set()
         self.coder = coder or Coder(max_bytes=link.max_message_bytes)
         self._decoder = Decoder[InStream](
-            self.coder, lambda stream: stream.stream, self._handle, self._failed, self._settled
+            self.coder, lambda stream: stream.stream, self._handle, self._failed, self._settled, fault=self.fault
         )
         self.link = Link(
             name=name,
@@ -227,23 +236,41 @@ class ClientCore:
     def delete_object(self, object_id: str, *, now: float) -> None:
         self.link.send_control({"t": "object", "op": "delete", "id": object_id}, now=now)
 
+    # --- errors of ours -------------------------------------------------------------------------------------------
+
+    def fault(self, error: Exception) -> None:
+        """Tell the shell of an error that nobody expects."""
+        self.faults += 1
+        with suppress(Exception):  # counted above; there is nobody left to tell
+            self.events.fault(error)
+
+    def _tell(self, call: Callable[P, object], *args: P.args, **kwargs: P.kwargs) -> None:
+        """Tell the shell; what it raises stops nothing here."""
+        try:
+            call(*args, **kwargs)
+        except Exception as error:  # noqa: BLE001  (the shell's, and no reason to leave our own work half done)
+            self.fault(error)
+
     # --- LinkHandler ----------------------------------------------------------------------------------------------
+
+    def on_fault(self, link: Link, error: Exception, *, now: float) -> None:
+        self.fault(error)
 
     def on_up(self, link: Link, *, resumed: bool, now: float) -> None:
         if not resumed:
             for identity, cache in self._latched.items():
                 link.by_stream[identity].prime(cache.replay(), now=now)
         self._send_subscription(now)
-        self.events.link_up(resumed=resumed)
+        self._tell(self.events.link_up, resumed=resumed)
 
     def on_down(self, link: Link, reason: str, *, now: float) -> None:
-        self.events.link_down(reason)
+        self._tell(self.events.link_down, reason)
 
     def on_lane_closed(self, link: Link) -> None:
-        self.events.lane_closed()
+        self._tell(self.events.lane_closed)
 
     def on_rejected(self, link: Link, code: str, text: str, *, now: float) -> None:
-        self.events.rejected(code, text)
+        self._tell(self.events.rejected, code, text)
 
     def on_announce(self, link: Link, announcement: Announcement, *, now: float) -> bool | None:
         stream = link.streams[announcement.stream.id]
@@ -269,12 +296,24 @@ class ClientCore:
                 info.reliable,
             )
             stream.stream = StreamInfo(identity, complete, stream.stream.spec, stream.stream.attributes)
-            try:
-                self.events.stream_opened(stream.stream)
-            except ConfigError:
-                return False  # the shell has logged it; nothing else stops
+            if not self._opened(stream.stream):
+                return False
             self._open.add(identity)
         return True
+
+    def _opened(self, stream: StreamInfo) -> bool:
+        """Whether the shell can publish this stream."""
+        for _ in range(2):
+            try:
+                self.events.stream_opened(stream)
+            except ConfigError:
+                return False  # the shell has logged it; nothing else stops
+            except Exception as error:  # noqa: BLE001  (of one stream, whatever its definition holds; it may pass)
+                self.fault(error)
+                self._tell(self.events.stream_closed, stream)  # as far as it had come
+            else:
+                return True
+        return False
 
     def on_definition(self, link: Link, digest: str, *, now: float) -> None:
         for stream in list(link.incoming.values()):
@@ -285,7 +324,7 @@ class ClientCore:
         if stream.stream.id in self._open:
             self._decoder.forget(stream.stream.id, now=now)
             self._open.discard(stream.stream.id)
-            self.events.stream_closed(stream.stream)
+            self._tell(self.events.stream_closed, stream.stream)
 
     def on_message(self, link: Link, stream: InStream, message: Message, *, now: float) -> None:
         self._decoder.message(stream, message, now=now)
@@ -300,10 +339,15 @@ class ClientCore:
         if message.tombstone:
             reason = message.drop_reason
             self.received.of(stream.stream).drop_arrived(reason)
-            self.events.expired(stream.stream, message.seq, reason)
+            self._tell(self.events.expired, stream.stream, message.seq, reason)
             return
-        self.received.of(stream.stream).arrived(len(message.body), now - message.born_s, now)
-        self.events.message(stream.stream, message, now=now)
+        try:
+            self.events.message(stream.stream, message, now=now)
+        except Exception as error:  # noqa: BLE001  (of one message: the stream goes on, whatever its bodies do)
+            self.fault(error)
+            self._failed(stream, message, DropReason.FAULT, "", now)
+        else:
+            self.received.of(stream.stream).arrived(len(message.body), now - message.born_s, now)
 
     def _failed(self, stream: InStream, message: Message, reason: DropReason, problem: str, now: float) -> None:
         """A message has had its turn and cannot be handed on."""
@@ -313,10 +357,10 @@ class ClientCore:
         told = self._undecodable
         if reason is DropReason.UNDECODABLE and topic not in told and len(told) < MAX_TOPICS:
             told.add(topic)
-            self.events.undecodable(stream.stream, problem)
+            self._tell(self.events.undecodable, stream.stream, problem)
         if stream.reliable and reason is not DropReason.DISCONNECTED:
             self.link.report_drop(stream, message.seq, reason, self.name, now=now)
-            self.events.expired(stream.stream, message.seq, reason)
+            self._tell(self.events.expired, stream.stream, message.seq, reason)
 
     def _settled(self, stream: InStream) -> None:
         """A body is decoded, or dropped: the peer may be told how far the stream has come."""
@@ -330,29 +374,28 @@ class ClientCore:
         self.trace.record(link.now, stream.stream.id.topic, TraceEvent.DROPPED, reason=reason, peer=link.peer)
 
     def on_out_drop(self, link: Link, channel: OutChannel, out: OutMessage, reason: DropReason) -> None:
-        self.events.send_dropped(channel.stream, out.seq, reason)
+        self._tell(self.events.send_dropped, channel.stream, out.seq, reason)
 
     def on_delivered(self, link: Link, channel: OutChannel, *, now: float) -> None:
         """The ledger has counted it."""
 
     def on_wanted(self, link: Link, channel: OutChannel, *, now: float) -> None:
-        self.events.wanted(channel.stream, bool(channel.wanted))
+        self._tell(self.events.wanted, channel.stream, bool(channel.wanted))
 
     def on_refused(self, link: Link, channel: OutChannel, code: str, text: str, *, now: float) -> None:
-        self.events.publication_refused(channel.stream, code, text)
+        self._tell(self.events.publication_refused, channel.stream, code, text)
 
     def on_skipped(self, link: Link, stream: InStream, count: int, *, now: float) -> None:
         if stream.known and stream.stream.id in self._open:
-            self.events.skipped(stream.stream, count)
+            self._tell(self.events.skipped, stream.stream, count)
 
     def on_control(self, link: Link, envelope: wire.Envelope, attachment: bytes, *, now: float) -> None:
         kind = envelope["t"]
         if kind == "lane":
             self.events.lane_offered(envelope)
         elif kind == "denied":
-            self.events.subscription_refused(
-                wire.take_str(envelope, "code", max_length=64), wire.take_str(envelope, "why")
-            )
+            code, why = wire.take_str(envelope, "code", max_length=64), wire.take_str(envelope, "why")
+            self._tell(self.events.subscription_refused, code, why)
         else:
             raise WireError(f"unknown control message {kind!r}")
 

@@ -280,14 +280,14 @@ class Coder:
         self.decoded: dict[Codec, CodecCounters] = {codec: CodecCounters() for codec in list(Codec)[1:]}
         self.undecodable = 0
         self.unencodable = 0
-        """Bodies that a lossy mode could not take; they were sent as they were."""
+        """Bodies that a mode could not take; they were sent as they were."""
 
     def encode(self, mode: Compression, body: bytes, topic: LossyTopic | None = None) -> Encoded:
-        """What cannot be encoded in a lossy mode comes back as it was."""
+        """What cannot be encoded comes back as it was."""
         start_s = self.clock()
         try:
             codec, encoded = encode(mode, body, topic)
-        except CodecError:
+        except Exception:  # noqa: BLE001  (whatever a library makes of a body, it can go as it is; counted)
             self.unencodable += 1
             codec, encoded = Codec.NONE, body
         return Encoded(codec, encoded, self.clock() - start_s)

@@ -53,7 +53,8 @@ class Decoder(Generic[Context]):
     by; `stream_of` tells which stream that is.
 
     `failed` is told of what cannot be handed on: `undecodable`, or `superseded` and `reassembly` where more waits than
-    a best-effort topic keeps, or than fits. `settled` is told when work of other threads was handed on.
+    a best-effort topic keeps, or than fits. `settled` is told when work of other threads was handed on. `fault` is told
+    of errors that nobody expects, of `deliver` too: the message is then dropped for that reason.
     """
 
     def __init__(
@@ -64,6 +65,7 @@ class Decoder(Generic[Context]):
         failed: Failed[Context],
         settled: Callable[[Context], None] = lambda _context: None,
         *,
+        fault: Callable[[Exception], None],
         max_waiting_bytes: int = MAX_WAITING_BYTES,
     ) -> None:
         self.coder = coder
@@ -72,6 +74,7 @@ class Decoder(Generic[Context]):
         self._deliver = deliver
         self._failed = failed
         self._settled = settled
+        self._fault = fault
         self._max_waiting_bytes = max_waiting_bytes
         self._waiting: dict[StreamId, deque[tuple[Context, Message]]] = {}  # of streams with a body at work elsewhere
         self._running: dict[StreamId, int] = {}
@@ -81,7 +84,7 @@ class Decoder(Generic[Context]):
         waiting = self._waiting.get(message.stream) if self._waiting else None
         if waiting is None:
             if not message.codec:
-                self._deliver(context, message, now)
+                self._hand_on(context, message, now)
             else:
                 self._begin(context, message, now)
             return
@@ -122,9 +125,21 @@ class Decoder(Generic[Context]):
             coder.undecodable += 1
             self._failed(context, message, DropReason.UNDECODABLE, str(error), now)
             return True
+        except Exception as error:  # noqa: BLE001  (of one body, whatever a library makes of it)
+            self._fault(error)
+            self._failed(context, message, DropReason.FAULT, "", now)
+            return True
         waiting = self._waiting.setdefault(message.stream, deque())
         self._running[message.stream] = message.seq
-        coder.offload(DecodeRequest(self, context, message, waiting))
+        try:
+            coder.offload(DecodeRequest(self, context, message, waiting))
+        except Exception as error:  # noqa: BLE001  (no thread can be had, for example)
+            self._fault(error)
+            self._failed(context, message, DropReason.FAULT, "", now)
+            if not waiting:
+                del self._waiting[message.stream]
+                del self._running[message.stream]
+            return True
         return False
 
     def _decoded(self, context: Context, message: Message, raw: bytes, elapsed_s: float, now: float) -> None:
@@ -140,7 +155,14 @@ class Decoder(Generic[Context]):
             message.replay,
             message.error_s,
         )
-        self._deliver(context, plain, now)
+        self._hand_on(context, plain, now)
+
+    def _hand_on(self, context: Context, message: Message, now: float) -> None:
+        try:
+            self._deliver(context, message, now)
+        except Exception as error:  # noqa: BLE001  (of one message: what waits behind it must not wait for ever)
+            self._fault(error)
+            self._failed(context, message, DropReason.FAULT, "", now)
 
     def decoded(self, request: DecodeRequest[Context], *, now: float) -> None:
         """Another thread is through with a body: hand it on, and what waited behind it."""
@@ -165,7 +187,7 @@ class Decoder(Generic[Context]):
             if message.codec == _UNKEPT:
                 self._failed(context, message, DropReason.REASSEMBLY, "too much waits to be decoded", now)
             elif not message.codec:
-                self._deliver(context, message, now)
+                self._hand_on(context, message, now)
             elif not self._begin(context, message, now):
                 return
         if self._waiting.get(stream) is waiting:

@@ -248,11 +248,13 @@ class Encoder:
         """Another thread is through with a body. If the message was dropped meanwhile, it stays dropped."""
         self.running -= 1
         channel, out = request.channel, request.out
-        if out.coding is Coding.RUNNING and out.message is request.message and channel.codec is not None:
-            self._apply(channel, out, channel.codec, request.result, request.mode)
-        self._refresh(channel, now)
-        held, self._held = self._held, []
-        for other, waiting in held:
-            if waiting.coding is Coding.HELD:
-                waiting.coding = Coding.RAW
-                self._refresh(other, now)
+        try:
+            if out.coding is Coding.RUNNING and out.message is request.message and channel.codec is not None:
+                self._apply(channel, out, channel.codec, request.result, request.mode)
+        finally:  # whoever waits for a turn must not wait for ever
+            self._refresh(channel, now)
+            held, self._held = self._held, []
+            for other, waiting in held:
+                if waiting.coding is Coding.HELD:
+                    waiting.coding = Coding.RAW
+                    self._refresh(other, now)

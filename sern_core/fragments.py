@@ -185,7 +185,13 @@ class InStream:
             if not self._reassembly.make_room(total + HELD_OVERHEAD_BYTES):
                 self.give_up(seq, DropReason.REASSEMBLY, len(body), now)
                 return
-            partial = self._partials[seq] = Partial(total)
+            try:
+                partial = Partial(total)
+            except MemoryError:  # the machine has less than our own bound
+                self._reassembly.held_bytes -= total + HELD_OVERHEAD_BYTES
+                self.give_up(seq, DropReason.REASSEMBLY, len(body), now)
+                return
+            self._partials[seq] = partial
             if not self.reliable:
                 self._reassembly.holders[self] = None
         elif not self.reliable and len(self._partials) > 1:
@@ -222,9 +228,16 @@ class InStream:
             self._on_drop(self, reason, nbytes, 0)
             return
         self._on_drop(self, reason, nbytes, seq)
-        self._arrived(self._tombstone(seq, reason, 0, now))
+        self._arrived(self.tombstone(seq, reason, 0, now))
 
-    def _tombstone(self, seq: int, reason: DropReason, stamp_ns: int, born_s: float) -> Message:
+    def fail(self, seq: int, nbytes: int, now: float) -> None:
+        """Message `seq` met an error of ours: it is given up, and what waited behind it goes on."""
+        self._discard_partial(seq)
+        self.give_up(seq, DropReason.FAULT, nbytes, now)
+        self._advance()
+
+    def tombstone(self, seq: int, reason: DropReason, stamp_ns: int, born_s: float) -> Message:
+        """What takes the turn of a reliable message that was dropped."""
         code = DROP_CODES[reason]
         return Message(self.stream.id, seq, bytes([code]), stamp_ns, born_s, code)
 
@@ -286,7 +299,7 @@ class InStream:
             # Without the message before it this one cannot be kept; its tombstone can.
             if not message.tombstone:
                 self._on_drop(self, DropReason.REASSEMBLY, size, seq)
-                message = self._tombstone(seq, DropReason.REASSEMBLY, message.stamp_ns, message.born_s)
+                message = self.tombstone(seq, DropReason.REASSEMBLY, message.stamp_ns, message.born_s)
             if not self._reassembly.make_room(len(message.body) + HELD_OVERHEAD_BYTES):
                 raise WireError(f"more messages out of order than {self._reassembly.limit_bytes} bytes hold")
         self._waiting[seq] = message
@@ -315,7 +328,7 @@ class InStream:
                 self._on_drop(self, DropReason.LIFESPAN, size, 0)
                 return
             self._on_drop(self, DropReason.LIFESPAN, size, message.seq)
-            message = self._tombstone(message.seq, DropReason.LIFESPAN, message.stamp_ns, message.born_s)
+            message = self.tombstone(message.seq, DropReason.LIFESPAN, message.stamp_ns, message.born_s)
         self.known = True
         self._deliver(self, message)
 

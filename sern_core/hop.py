@@ -9,7 +9,7 @@ from typing import Any, Final
 from sern_core import wire
 from sern_core.capacity import AckSample
 from sern_core.codecs import KNOWN_CODECS
-from sern_core.errors import WireError
+from sern_core.errors import RemoteError, WireError
 from sern_core.fragments import InStream
 from sern_core.lanes import (
     LANE_EXPRESS,
@@ -90,7 +90,15 @@ class Hop(Sender):
             delay_s, uncertainty_s = self._rx_delay
             born_s = now - age_s - delay_s
             error_s += uncertainty_s  # infinite before the first round trip
-        stream.fragment(flags, wide, offset, total, body, stamp_ns, born_s, error_s, now, codec)
+        try:
+            stream.fragment(flags, wide, offset, total, body, stamp_ns, born_s, error_s, now, codec)
+        except RemoteError:
+            raise
+        except Exception as error:
+            if stream is self._control_in:
+                raise  # what follows it depends on it: the session ends
+            self.fault(error)
+            stream.fail(wide, total, now)
 
     def on_ack(self, lane: int, highest: int, sack: int, echo_us: int, received_us: int, cum_bytes: int) -> None:
         """FrameSink: an acknowledgement of what we sent."""

@@ -12,15 +12,16 @@ and so is one whose name is revoked.
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import partial
 from typing import Final
 
 from sern_core import wire
 from sern_core.access import AccessTable, RateGuard, compile_peer_pattern
 from sern_core.announce import Announcement
 from sern_core.bound import QueueBound
-from sern_core.errors import RefusedError, WireError
+from sern_core.errors import RefusedError, UsageError, WireError
 from sern_core.fragments import InStream
-from sern_core.hub_events import HubEvents, Relayed
+from sern_core.hub_events import GuardedEvents, HubEvents, Relayed
 from sern_core.hub_local import LocalStreams
 from sern_core.hub_port import HubPort
 from sern_core.lanes import LANE_EXPRESS
@@ -80,7 +81,7 @@ class Hub(LocalStreams):
         self.boot = boot
         self.access = access
         self.known = known
-        self.events = events
+        self.events = GuardedEvents(events)
         self.params = params or HubParams()
         self.routing = RoutingTable(access)
         self.objects = ObjectRegistry(epoch=boot)
@@ -150,6 +151,22 @@ class Hub(LocalStreams):
         else:
             self._bounds[client] = QueueBound(limits.max_queue_bytes)
 
+    def failed(self, client: ClientName, error: Exception, *, now: float) -> None:
+        """An error of ours about one client: its session ends, and nobody else's."""
+        link = self.links.get(client)
+        if link is None:
+            self.events.fault(client, error)
+        else:
+            link.failed(error, now=now)
+
+    def _for(self, client: ClientName, now: float, call: Callable[[], object]) -> None:
+        """Do something about a client that need not be the one whose datagram is being read: if it fails, that
+        client's session ends."""
+        try:
+            call()
+        except Exception as error:  # noqa: BLE001  (whoever is at work goes on, and the other clients get theirs)
+            self.failed(client, error, now=now)
+
     def ports(self) -> list[HubPort]:
         return list(self.port_of.values())
 
@@ -161,7 +178,7 @@ class Hub(LocalStreams):
                 continue
             link.handle_timeout(now=now)  # retention goes on while a client is away
             if now - since_s > self.params.resume_s:
-                self._forget(client, now)
+                self._for(client, now, partial(self._forget, client, now))
         for client, link in self.links.items():
             if client not in self.port_of and link.established:  # only its datagram lane is left
                 link.handle_timeout(now=now)
@@ -238,7 +255,7 @@ class Hub(LocalStreams):
             self._close(client, identity, reason, now)
             touched.add(identity)
         for identity in change.updated:  # the origin offers it anew, with other properties: so is it offered onwards
-            for client in tuple(self.relayed[identity].outs):
+            for client in self.routing.subscribers(identity):
                 self._close(client, identity, DropReason.DISCONNECTED, now)
                 self._open(client, identity, now)
             touched.add(identity)
@@ -247,25 +264,36 @@ class Hub(LocalStreams):
             touched.add(identity)
         for identity in sorted(touched):
             relayed = self.relayed.get(identity)
-            if relayed is not None and relayed.source is not None:
-                relayed.source.answer(relayed.stream, self._wanted(relayed), now=now, owed=tuple(relayed.outs))
+            if relayed is not None:
+                self._answer(relayed, now)
                 self._confirm(relayed)
         for denied in [each for each in change.denied if each.by_name][:MAX_DENIED]:
             text = f"{denied.client} may not subscribe to {denied.topic}: no access rule grants it"
             self.events.refused(denied.client, "forbidden", text)
             self._tell(denied.client, {"t": "denied", "topic": denied.topic, "code": "forbidden", "why": text}, now)
 
+    def _answer(self, relayed: Relayed, now: float) -> None:
+        """Tell the origin whether anybody wants its stream."""
+        source = relayed.source
+        if source is not None:
+            owed = tuple(relayed.outs)
+            wanted = self._wanted(relayed)
+            self._for(source.peer, now, partial(source.answer, relayed.stream, wanted, now=now, owed=owed))
+
     def _tell(self, client: ClientName, envelope: wire.Envelope, now: float) -> None:
         """Say something to a client, if it is there; whoever comes later says what it wants anew, and is told then."""
         link = self.links.get(client)
         if link is not None:
-            link.send_control(envelope, now=now)
+            self._for(client, now, partial(link.send_control, envelope, now=now))
 
     def _close(self, client: ClientName, identity: StreamId, reason: DropReason, now: float) -> None:
         relayed = self.relayed.get(identity)
-        pair = relayed.outs.pop(client, None) if relayed is not None else None
+        if relayed is None:
+            return
+        relayed.unopened.discard(client)
+        pair = relayed.outs.pop(client, None)
         if pair is not None:
-            pair[0].close_channel(pair[1], reason, now=now)
+            self._for(client, now, partial(pair[0].close_channel, pair[1], reason, now=now))
 
     def _wanted(self, relayed: Relayed) -> bool:
         return bool(relayed.outs) or relayed.cache is not None or self.tap(relayed.stream.stream)
@@ -273,8 +301,7 @@ class Hub(LocalStreams):
     def refresh_interest(self, *, now: float) -> None:
         """The answer of `tap` may have changed: tell the origins."""
         for relayed in self.relayed.values():
-            if relayed.source is not None:
-                relayed.source.answer(relayed.stream, self._wanted(relayed), now=now, owed=tuple(relayed.outs))
+            self._answer(relayed, now)
 
     def _open(self, client: ClientName, identity: StreamId, now: float) -> None:
         relayed = self.relayed[identity]
@@ -284,13 +311,23 @@ class Hub(LocalStreams):
                 self._draining.remove((ended, channel))
                 relayed.outs[client] = (link, channel)
                 return
-        channel = link.open_channel(
-            relayed.stream.stream,
-            first=relayed.stream.delivered + 1,
-            now=now,
-            replays=self._replays(client, relayed),
-        )
-        relayed.outs[client] = (link, channel)
+        try:
+            channel = link.open_channel(
+                relayed.stream.stream,
+                first=relayed.stream.delivered + 1,
+                now=now,
+                replays=self._replays(client, relayed),
+            )
+        except UsageError as error:
+            relayed.unopened.add(client)
+            self.events.refused(client, "too_many_streams", str(error))
+            text = str(error)[:400]
+            self._tell(client, {"t": "denied", "topic": identity.topic, "code": "too_many_streams", "why": text}, now)
+        except Exception as error:  # noqa: BLE001  (of this client's link: the origin and the others go on)
+            relayed.unopened.add(client)
+            self.failed(client, error, now=now)
+        else:
+            relayed.outs[client] = (link, channel)
 
     def _replays(self, client: ClientName, relayed: Relayed) -> list[Message]:
         """The latched messages that a late joiner may have."""
@@ -329,6 +366,9 @@ class Hub(LocalStreams):
         source.confirm(stream, delivered)
 
     # --- LinkHandler ----------------------------------------------------------------------------------------------
+
+    def on_fault(self, link: Link, error: Exception, *, now: float) -> None:
+        self.events.fault(link.peer, error)
 
     def on_up(self, link: Link, *, resumed: bool, now: float) -> None:
         self._absent_since.pop(link.peer, None)
@@ -465,18 +505,42 @@ class Hub(LocalStreams):
         stream = relayed.stream
         behind = not relayed.outs
         for out_link, channel in relayed.outs.values():
-            if stream.reliable and channel.next_seq < message.seq:
-                out_link.skip(channel, message.seq, now=now)  # what lies between was given up before it came here
-            self._submit(out_link, channel, message, now)
+            ahead = message.seq - channel.next_seq
+            try:
+                if ahead < 0:
+                    self.received.of(stream.stream).drop_arrived(DropReason.DUPLICATE)  # it has gone that way before
+                    continue
+                if ahead and stream.reliable:
+                    out_link.skip(channel, message.seq, now=now)  # what lies between was given up before it came here
+                self._submit(out_link, channel, message, now)
+            except Exception as error:  # noqa: BLE001  (of that client's link: the others get theirs)
+                self._not_taken(relayed, out_link, channel, message, error, now)
             behind = behind or channel.watermark >= message.seq
         if not message.tombstone:
-            if relayed.cache is not None:
-                self.replays.add(relayed.cache, message)
-            self.objects.observe(
-                stream.stream.id, message.seq, message.body, wall_ns=message.stamp_ns, now=now, codec=message.codec
-            )
-            self.events.message(stream.stream, message, now=now)
+            try:
+                if relayed.cache is not None:
+                    self.replays.add(relayed.cache, message)
+                self.objects.observe(
+                    stream.stream.id, message.seq, message.body, wall_ns=message.stamp_ns, now=now, codec=message.codec
+                )
+                self.events.shell.message(stream.stream, message, now=now)
+            except Exception as error:  # noqa: BLE001  (the subscribers have it: it must not be taken for lost)
+                self.events.fault(stream.stream.id.origin, error)
         return behind
+
+    def _not_taken(
+        self, relayed: Relayed, link: Link, channel: OutChannel, message: Message, error: Exception, now: float
+    ) -> None:
+        """A client's link failed at a message: its session ends, and unless it has the message, the origin is told."""
+        link.failed(error, now=now)
+        if channel.next_seq > message.seq:
+            return
+        try:
+            link.reject(channel, message, DropReason.FAULT, now=now)
+        except Exception as again:  # noqa: BLE001
+            link.fault(again)
+            if channel.reliable and relayed.source is not None:
+                relayed.source.report_drop(relayed.stream, message.seq, DropReason.FAULT, link.peer, now=now)
 
     def _submit(self, link: Link, channel: OutChannel, message: Message, now: float) -> None:
         bound = self._bounds.get(link.peer)
@@ -493,7 +557,9 @@ class Hub(LocalStreams):
             return
         relayed = self.relayed.get(channel.stream.id)
         if relayed is not None and relayed.source is not None:
-            relayed.source.report_drop(relayed.stream, out.seq, reason, link.peer, now=link.now)
+            now, source = link.now, relayed.source
+            report = partial(source.report_drop, relayed.stream, out.seq, reason, link.peer, now=now)
+            self._for(source.peer, now, report)
 
     def on_delivered(self, link: Link, channel: OutChannel, *, now: float) -> None:
         relayed = self.relayed.get(channel.stream.id)
@@ -508,15 +574,16 @@ class Hub(LocalStreams):
         relayed = self.relayed.get(stream.stream.id)
         if relayed is None or not stream.reliable:
             return
-        for out_link, channel in relayed.outs.values():
-            out_link.skip(channel, stream.delivered + 1, now=now, silent=stream.paused)
+        for client, (out_link, channel) in relayed.outs.items():
+            skip = partial(out_link.skip, channel, stream.delivered + 1, now=now, silent=stream.paused)
+            self._for(client, now, skip)
 
     def on_wanted(self, link: Link, channel: OutChannel, *, now: float) -> None:
         """Nothing depends on it here: what a client subscribed to it gets."""
 
     def on_definition(self, link: Link, digest: str, *, now: float) -> None:
-        for other in self.links.values():
-            other.definition_known(digest, now=now)
+        for client, other in self.links.items():
+            self._for(client, now, partial(other.definition_known, digest, now=now))
 
     def on_control(self, link: Link, envelope: wire.Envelope, attachment: bytes, *, now: float) -> None:
         kind = envelope["t"]
@@ -561,7 +628,9 @@ class Hub(LocalStreams):
         self.replays.validate()
         for identity, relayed in self.relayed.items():
             outs = set(self.routing.subscribers(identity))
-            assert set(relayed.outs) == outs, f"{identity.topic}: channels {set(relayed.outs)} but routes {outs}"
+            held = set(relayed.outs) | relayed.unopened
+            assert held == outs, f"{identity.topic}: channels {held} but routes {outs}"
+            assert not relayed.unopened & set(relayed.outs), f"{identity.topic}: a channel that could not be opened"
 
 
 def _acceptable(pattern: str) -> bool:

@@ -1,6 +1,8 @@
 """What the relay's core tells its shell, and what it keeps of each stream."""
 
-from typing import Protocol
+from collections.abc import Callable
+from contextlib import suppress
+from typing import ParamSpec, Protocol
 
 from sern_core.fragments import InStream
 from sern_core.link import Link
@@ -32,15 +34,66 @@ class HubEvents(Protocol):
     def lane_closed(self, client: ClientName) -> None:
         """The client's datagram lane ended with its session."""
 
+    def fault(self, client: ClientName | None, error: Exception) -> None:
+        """Something raised what nobody expects, in the core or in one of these methods: log it with its traceback and
+        count it. What it was about is given up, everything else goes on. `client`: on whose link, if on one's."""
+
+
+P = ParamSpec("P")
+
+
+class GuardedEvents:
+    """`HubEvents` whose errors do not come back: what the shell does with news stops nothing in the core."""
+
+    def __init__(self, shell: HubEvents) -> None:
+        self.shell = shell
+        self.faults = 0
+
+    def fault(self, client: ClientName | None, error: Exception) -> None:
+        self.faults += 1
+        with suppress(Exception):  # counted above; there is nobody left to tell
+            self.shell.fault(client, error)
+
+    def _tell(self, call: Callable[P, object], *args: P.args, **kwargs: P.kwargs) -> None:
+        try:
+            call(*args, **kwargs)
+        except Exception as error:  # noqa: BLE001  (the shell's, and no reason to leave our own work half done)
+            self.fault(None, error)
+
+    def client_up(self, client: ClientName, *, resumed: bool) -> None:
+        self._tell(self.shell.client_up, client, resumed=resumed)
+
+    def client_down(self, client: ClientName, reason: str) -> None:
+        self._tell(self.shell.client_down, client, reason)
+
+    def stream_added(self, stream: StreamInfo) -> None:
+        self._tell(self.shell.stream_added, stream)
+
+    def stream_removed(self, stream: StreamInfo) -> None:
+        self._tell(self.shell.stream_removed, stream)
+
+    def message(self, stream: StreamInfo, message: Message, *, now: float) -> None:
+        self._tell(self.shell.message, stream, message, now=now)
+
+    def refused(self, client: ClientName, code: str, text: str) -> None:
+        self._tell(self.shell.refused, client, code, text)
+
+    def lane_asked(self, client: ClientName, ciphers: list[str]) -> None:
+        self._tell(self.shell.lane_asked, client, ciphers)
+
+    def lane_closed(self, client: ClientName) -> None:
+        self._tell(self.shell.lane_closed, client)
+
 
 class Relayed:
     """One stream at the relay: where it comes from (None: the relay itself), where it goes, what is kept of it."""
 
-    __slots__ = ("cache", "outs", "source", "stream")
+    __slots__ = ("cache", "outs", "source", "stream", "unopened")
 
     def __init__(self, source: Link | None, stream: InStream, replays: ReplayStore) -> None:
         self.source = source
         self.stream = stream
         self.outs: dict[ClientName, tuple[Link, OutChannel]] = {}
+        self.unopened: set[ClientName] = set()  # subscribers towards whom no channel could be opened; they were told
         spec = stream.stream.spec
         self.cache = replays.open(spec.depth) if spec.latched else None

@@ -7,7 +7,7 @@ HELLO, and a newer connection of the same client takes the session over. `Hub` k
 from typing import TYPE_CHECKING, Final
 
 from sern_core import wire
-from sern_core.errors import VersionError
+from sern_core.errors import RemoteError, VersionError
 from sern_core.link import Link
 from sern_core.sending import microseconds
 from sern_core.types import ClientName
@@ -49,7 +49,15 @@ class HubPort:
             if had_session and data[2] == wire.Kind.CLOSE and not self.link.established:
                 self.hub.left(self.client, now=now)
             return
-        data = bytes(data)
+        try:
+            self._greeted(bytes(data), now)
+        except RemoteError:
+            raise
+        except Exception as error:  # noqa: BLE001  (of ours: this client has no session then, nobody else notices)
+            self.hub.failed(self.client, error, now=now)
+
+    def _greeted(self, data: bytes, now: float) -> None:
+        """What comes before a session."""
         header = wire.decode_header(data)
         if header.kind == wire.Kind.HELLO:
             hello = wire.decode_handshake(data)

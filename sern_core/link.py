@@ -13,12 +13,13 @@ told what happens through its `LinkHandler`.
 
 from collections import deque
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import replace
-from typing import Final, Protocol
+from typing import Final, ParamSpec, Protocol
 
 from sern_core import wire
 from sern_core.announce import MAX_STRINGS, Announcement, announcement_parts, decode_announcement, definition_hash
-from sern_core.errors import RefusedError, UsageError, WireError
+from sern_core.errors import RefusedError, RemoteError, UsageError, WireError
 from sern_core.fragments import DropReport, InStream
 from sern_core.message import Message, StreamId, StreamInfo
 from sern_core.out_message import OutMessage
@@ -39,8 +40,19 @@ MAX_UNHEARD: Final = 20_000
 """Control messages that a peer may have answered, beside four for each channel, before it reads an answer."""
 
 
+P = ParamSpec("P")
+
+
 class LinkHandler(Protocol):
-    """What the owner of a link is told. Calls happen inside `receive`, `submit` and `handle_timeout`."""
+    """What the owner of a link is told. Calls happen inside `receive`, `submit` and `handle_timeout`.
+
+    What they raise unexpectedly goes to `on_fault` and stops nothing that is under way here. News is told once more, as
+    it does not come again; a message is given up (`fault`), counted and, of a reliable stream, reported; a stream that
+    cannot be announced is refused. Only `on_up` and `on_control` end the session, for the next one tells it all anew.
+    """
+
+    def on_fault(self, link: "Link", error: Exception, *, now: float) -> None:
+        """Something raised what nobody expects, here or in the owner: to be logged with its traceback, and counted."""
 
     def on_up(self, link: "Link", *, resumed: bool, now: float) -> None:
         """A session exists. `resumed`: the peer is the same process as before."""
@@ -122,6 +134,8 @@ class Link(Session):
         self._owed_parts: dict[tuple[str, int], tuple[str, ...]] = {}  # by message and channel: more will come
         self._announcing: deque[tuple[int, OutChannel]] = deque()  # may send once that control message is on its way
         self._missing: dict[StreamId, float] = {}  # not announced by a new peer, and since when
+        self.faults = 0
+        """Errors of ours on this link so far."""
         super().__init__(
             name=name,
             boot=boot,
@@ -141,19 +155,40 @@ class Link(Session):
         self._unheard = self._unheard_seq = 0
         self._announcing.clear()
         self._owed_parts.clear()
+        if self.initiator and not resumed:  # whatever becomes of this session: a new relay has yet to learn of them
+            for identity in self.streams:
+                self._missing.setdefault(identity, now)
         self.handler.on_up(self, resumed=resumed, now=now)
         for channel in list(self.channels.values()):
             self._announce(channel, now)
         self.send_control({"t": "synced"}, now=now)
 
     def _session_ended(self, reason: str, now: float) -> None:
-        self.handler.on_down(self, reason, now=now)
+        self._tell(self.handler.on_down, self, reason, now=now)
 
     def _lane_closed(self) -> None:
-        self.handler.on_lane_closed(self)
+        self._tell(self.handler.on_lane_closed, self)
 
     def _session_refused(self, code: str, text: str, now: float) -> None:
-        self.handler.on_rejected(self, code, text, now=now)
+        self._tell(self.handler.on_rejected, self, code, text, now=now)
+
+    # --- errors of ours -------------------------------------------------------------------------------------------
+
+    def fault(self, error: Exception) -> None:
+        self.faults += 1
+        with suppress(Exception):  # counted above; there is nobody left to tell
+            self.handler.on_fault(self, error, now=self._now)
+
+    def _tell(self, call: Callable[P, object], *args: P.args, **kwargs: P.kwargs) -> None:
+        """Tell the owner what it is not told again: once more if that raises."""
+        try:
+            call(*args, **kwargs)
+        except Exception as error:  # noqa: BLE001  (the owner's, and no reason to leave our own work half done)
+            self.fault(error)
+            try:
+                call(*args, **kwargs)
+            except Exception as again:  # noqa: BLE001
+                self.fault(again)
 
     # --- streams out ----------------------------------------------------------------------------------------------
 
@@ -200,7 +235,7 @@ class Link(Session):
             if channel is not None:
                 topic = channel.stream.id.topic
                 self.trace.record(self._now, topic, TraceEvent.DROPPED, seq=out.seq, reason=reason, peer=self.peer)
-                self.handler.on_out_drop(self, channel, out, reason)
+                self._tell(self.handler.on_out_drop, self, channel, out, reason)
 
         return dropped
 
@@ -290,6 +325,9 @@ class Link(Session):
         stream = self.streams.get(identity)
         if self.incoming.get(slot, stream) is not stream or (stream and stream.channel_id not in (None, slot)):
             raise WireError(f"channel {slot} or its stream {identity.topic!r} is announced twice")
+        if stream is not None and not _same_type(stream.stream, announcement):
+            self._retract(stream, now)  # the name came back with another type: that is another stream
+            stream = None
         if stream is None or stream.stream.spec != announcement.stream.spec:
             replaced = stream
             stream = InStream(
@@ -311,10 +349,10 @@ class Link(Session):
                 self._needed.add(announcement.definition_hash)
                 self.send_control({"t": "need", "dh": announcement.definition_hash}, now=now)
         try:
-            wanted = self.handler.on_announce(self, announcement, now=now)
+            wanted = self._offer_stream(stream, announcement, now)
         except RefusedError as refusal:
-            del self.incoming[slot]
-            del self.streams[identity]
+            self.incoming.pop(slot, None)
+            self.streams.pop(identity, None)
             self._watermarks.pop(slot, None)
             stream.channel_id = None
             stream.close()
@@ -326,10 +364,25 @@ class Link(Session):
         if wanted is not None:
             self.answer(stream, wanted, now=now)
 
+    def _offer_stream(self, stream: InStream, announcement: Announcement, now: float) -> bool | None:
+        """The owner's answer to an announcement. Raises RefusedError, also when it fails twice."""
+        for last in (False, True):
+            try:
+                return self.handler.on_announce(self, announcement, now=now)
+            except RemoteError:
+                raise
+            except Exception as error:
+                self.fault(error)
+                if last:
+                    self._tell(self.handler.on_retract, self, stream, now=now)
+                    text = f"{self.name} cannot take {announcement.stream.id.topic}: an error of its own; see its log"
+                    raise RefusedError("internal_error", text) from error
+        return None
+
     def _skip(self, stream: InStream, first: int, now: float) -> None:
         left_out = stream.skip_to(first, now)
         if left_out:
-            self.handler.on_skipped(self, stream, left_out, now=now)
+            self._tell(self.handler.on_skipped, self, stream, left_out, now=now)
             self._confirm_own(stream)
         if stream.wanted:
             stream.paused = False
@@ -344,9 +397,28 @@ class Link(Session):
         self._confirm_own(stream)
 
     def _deliver(self, stream: InStream, message: Message) -> None:
-        self.handler.on_message(self, stream, message, now=self._now)
+        try:
+            self.handler.on_message(self, stream, message, now=self._now)
+        except Exception as error:  # noqa: BLE001  (of one message: the stream goes on, whatever its bodies do)
+            self._undelivered(stream, message, error)
         if stream.reliable:
             self._confirm_own(stream)
+
+    def _undelivered(self, stream: InStream, message: Message, error: Exception) -> None:
+        """The owner failed at a message: it is given up, and its tombstone has the turn."""
+        self.fault(error)
+        if message.tombstone:
+            lost = message
+        elif stream.reliable:
+            self._in_drop(stream, DropReason.FAULT, len(message.body), message.seq)
+            lost = stream.tombstone(message.seq, DropReason.FAULT, message.stamp_ns, message.born_s)
+        else:
+            self._in_drop(stream, DropReason.FAULT, len(message.body), 0)
+            return
+        try:
+            self.handler.on_message(self, stream, lost, now=self._now)
+        except Exception as again:  # noqa: BLE001
+            self.fault(again)
 
     def _in_drop(self, stream: InStream, reason: DropReason, nbytes: int, seq: int) -> None:
         if stream is self._control_in:
@@ -355,7 +427,7 @@ class Link(Session):
             self.report_drop(stream, seq, reason, self.name, now=self._now)  # its tombstone tells the handler
             self._answered(1)
         else:
-            self.handler.on_in_drop(self, stream, reason, nbytes)
+            self._tell(self.handler.on_in_drop, self, stream, reason, nbytes)
 
     def skip(self, channel: OutChannel, first: int, *, now: float, silent: bool = False) -> None:
         """The stream goes on at seq `first`: what lies between will not come, and the peer must not wait for it.
@@ -378,17 +450,14 @@ class Link(Session):
     def _watermark_moved(self, channel: OutChannel) -> None:
         if channel.gaps:
             self._tell_gap(channel, self._now)
-        self.handler.on_delivered(self, channel, now=self._now)
+        self._tell(self.handler.on_delivered, self, channel, now=self._now)
 
     def _synced(self, now: float) -> None:
         """The peer has announced all it has. What it left out is gone, unless it is a relay that is still learning:
         a stream it has not been told of yet keeps its delivered count here, so that "once" survives its restart."""
         for identity, stream in list(self.streams.items()):
-            if stream.channel_id is None:
-                if self.initiator and (identity in self._missing or not self._resumed):
-                    self._missing.setdefault(identity, now)
-                else:
-                    self._retract(stream, now)
+            if stream.channel_id is None and identity not in self._missing:
+                self._retract(stream, now)
 
     def _retract(self, stream: InStream, now: float) -> None:
         self.streams.pop(stream.stream.id, None)
@@ -396,7 +465,7 @@ class Link(Session):
         if stream.channel_id is not None:
             self.incoming.pop(stream.channel_id, None)
             self._watermarks.pop(stream.channel_id, None)
-        self.handler.on_retract(self, stream, now=now)
+        self._tell(self.handler.on_retract, self, stream, now=now)
         stream.close()
         stream.channel_id = None
 
@@ -481,7 +550,7 @@ class Link(Session):
             self._set_wanted(channel, wanted, now)
             channel.ready = True
             self._refresh(channel, now)
-            self.handler.on_wanted(self, channel, now=now)
+            self._tell(self.handler.on_wanted, self, channel, now=now)
         elif kind == "dropped":
             reason = DROP_REASONS.get(wire.take_int(envelope, "code"), DropReason.LOST)
             channel.reported(wire.take_int(envelope, "seq"), reason)
@@ -491,7 +560,7 @@ class Link(Session):
                 channel, False, now, reason=DropReason.FORBIDDEN if code == "forbidden" else DropReason.UNWANTED
             )
             self._refresh(channel, now)
-            self.handler.on_refused(self, channel, code, why, now=now)
+            self._tell(self.handler.on_refused, self, channel, code, why, now=now)
 
     def _set_wanted(
         self, channel: OutChannel, wanted: bool, now: float, *, reason: DropReason = DropReason.UNWANTED
@@ -533,7 +602,7 @@ class Link(Session):
             if self._peer_definitions > MAX_PEER_DEFINITIONS or self._peer_definition_bytes > MAX_PEER_DEFINITION_BYTES:
                 raise WireError(f"{self.peer} sends more definitions than {MAX_PEER_DEFINITION_BYTES} bytes")
             self._define(text)
-            self.handler.on_definition(self, digest, now=now)
+            self._tell(self.handler.on_definition, self, digest, now=now)
 
     def definition_known(self, digest: str, *, now: float) -> None:
         """A text arrived from elsewhere: pass it on if this peer is waiting for it."""
@@ -595,3 +664,14 @@ class Link(Session):
         self.scheduler.validate()
         check(len(self.by_stream) == len(self.channels), "channel tables differ")
         check(self._watermarks.keys() <= self.incoming.keys(), "watermarks of streams that are gone")
+
+
+def _same_type(known: StreamInfo, announced: Announcement) -> bool:
+    """Whether bodies of both are to be read in the same way."""
+    one, other = known.info, announced.stream.info
+    return (
+        one.type_name == other.type_name
+        and one.encoding is other.encoding
+        and one.type_hash == other.type_hash
+        and known.attributes.get("definition", "") == announced.definition_hash
+    )

@@ -7,7 +7,7 @@ class.
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 from sern_core import wire
 from sern_core.cadence import Cadences
@@ -151,6 +151,14 @@ class Sender(ABC):
 
     @abstractmethod
     def _watermark_moved(self, channel: OutChannel) -> None: ...
+
+    @abstractmethod
+    def _give_back(self, lane: Lane, items: list[Any], now: float) -> None:
+        """What a packet carried did not arrive: send again what is still wanted."""
+
+    @abstractmethod
+    def fault(self, error: Exception) -> None:
+        """Something raised what nobody expects: tell the owner. What it was about is given up by the caller."""
 
     def _begin_control(self) -> None:
         """A fresh control stream in both directions, for a new session."""
@@ -305,7 +313,11 @@ class Sender(ABC):
         if not lane.stalled or now >= lane.probe_due_s:
             if lane is self.lane or lane is self.express:
                 self.dirty = False
-                self._compose(lane, frames, items, now)
+                try:
+                    self._compose(lane, frames, items, now)
+                except Exception:
+                    self._give_back(lane, items, now)  # what was taken would be neither in flight nor waiting
+                    raise
             # A stream delivers what is under way, so one question at a time is enough there.
             if not items and (lane.ping or lane.stalled) and not (lane.lossless and lane.flight.packets):
                 frames.append(wire.PING_FRAME)
@@ -482,6 +494,7 @@ class Sender(ABC):
         if self.trace.enabled and not out.started:
             self.trace.record(now, message.stream.topic, TraceEvent.CHOSEN, seq=out.seq, peer=self.peer)
         start, end = channel.take(out, max(limit - size - wire.DATA_FIRST_BYTES, MIN_SHARE_BYTES), now)
+        items.append(SentData(channel, out, out.generation, start, end))
         flags = wire.FLAG_TOMBSTONE if message.tombstone else 0
         if message.replay:
             flags |= wire.FLAG_REPLAY
@@ -497,7 +510,6 @@ class Sender(ABC):
             head = wire.encode_data_next(flags, channel.slot, out.seq, start, out.size, end - start)
         frames.append(head)
         frames.append(message.body if end - start == out.size else message.body[start:end])
-        items.append(SentData(channel, out, out.generation, start, end))
         return size + len(head) + end - start
 
 

@@ -8,6 +8,10 @@ The client's end is the initiator and says HELLO; the relay's end answers WELCOM
 
 Every session has a tag; datagrams of another one are ignored. The acceptor answers them with RESET: the initiator may
 not know yet that its session is over.
+
+A datagram is read whole, or its session ends: whatever goes wrong in it, by the peer's fault or by ours, ends the
+session before anything of it is acknowledged, on whichever lane it came. What it carried comes again in the next one,
+and what had its turn is known. A lane alone would not do: what was said after it would wait for ever for what was lost.
 """
 
 import struct
@@ -17,7 +21,7 @@ from typing import Final
 
 from sern_core import wire
 from sern_core.clocksync import ClockSync
-from sern_core.errors import WireError
+from sern_core.errors import RemoteError, WireError
 from sern_core.hop import Hop
 from sern_core.lanes import LANE_EXPRESS, LANE_UDP, LANE_ZMQ, Lane
 from sern_core.params import LinkParams, SchedulerParams
@@ -28,6 +32,8 @@ from sern_core.types import ClientName
 HELLO_INTERVAL_S: Final = 1.0
 RESET_INTERVAL_S: Final = 0.5
 REFUSED_INTERVAL_S: Final = 5.0
+ABORT_INTERVAL_S: Final = 1.0
+"""Sessions that end because something went wrong follow each other no faster: else both ends would do nothing else."""
 NUMBER_AND_STAMP: Final = struct.Struct("!IQ")
 
 
@@ -54,6 +60,7 @@ class Session(Hop):
         self._hello_due_s: float | None = None
         self._hello_stamp_us = -1
         self._reset_due_s = -float("inf")
+        self._abort_due_s = -float("inf")
         self._resumed = False
         self._data_prefix = b""  # how a data datagram of the session begins
         super().__init__(
@@ -165,6 +172,15 @@ class Session(Hop):
         False: an old HELLO that the network delivered late. Raises WireError, or VersionError when no wire version is
         common; the caller refuses then.
         """
+        try:
+            return self._accept(hello, tag, stamp_us, now, another_connection=another_connection)
+        except RemoteError:
+            raise
+        except Exception as error:  # noqa: BLE001  (an error of ours ends the session that it was to begin)
+            self.failed(error, now=now)
+            return True
+
+    def _accept(self, hello: wire.Envelope, tag: int, stamp_us: int, now: float, *, another_connection: bool) -> bool:
         boot = wire.take_int(hello, "boot")
         version = wire.agree_version(wire.take_int(hello, "vmin"), wire.take_int(hello, "vmax"))
         if boot == self.peer_boot and stamp_us < self._hello_stamp_us:
@@ -203,6 +219,24 @@ class Session(Hop):
             self.dirty = True
         self._end_session(reason, now)
 
+    def failed(self, error: Exception, *, now: float) -> None:
+        """An error of ours on this link: the owner is told, and the session ends; the next one begins in order."""
+        self._now = now
+        self.fault(error)
+        self._abort(f"internal error ({type(error).__name__})", now)
+
+    def _abort(self, reason: str, now: float) -> None:
+        """End the session because of what went wrong in it, and see to it that the peer begins another one."""
+        if not self.established:
+            return
+        self._end_session(reason, now)
+        if self.initiator:
+            due_s = max(now, self._abort_due_s)
+            self._abort_due_s = due_s + ABORT_INTERVAL_S
+            self._greet(due_s, now)
+        else:
+            self._send_reset(self.tag, now)
+
     def _establish(self, peer_boot: int, now: float) -> None:
         resumed = self._resumed = self.peer_boot == peer_boot
         if not resumed:
@@ -222,7 +256,11 @@ class Session(Hop):
         self._watermarks.clear()
         self._begin_control()
         self.trace.record(now, LINK, TraceEvent.LINK_UP, peer=self.peer)
-        self._session_began(resumed, now)
+        try:
+            self._session_began(resumed, now)
+        except Exception:
+            self.peer_boot = None  # the owner may not have begun: to it the next session is the first with that peer
+            raise
 
     def _end_session(self, reason: str, now: float) -> None:
         self._now = now
@@ -254,22 +292,26 @@ class Session(Hop):
 
     def next_datagram(self, *, now: float, lane: int = LANE_ZMQ) -> bytes | None:
         """The next bytes for the lane, or None if nothing may or need be sent now."""
-        if lane == LANE_ZMQ:
-            if self._handshake_out:
-                return self._handshake_out.popleft()
-            if self._hello_due_s is not None and self.transport_up:
-                if now >= self._hello_due_s:
-                    return self._hello(now)
+        try:
+            if lane == LANE_ZMQ:
+                if self._handshake_out:
+                    return self._handshake_out.popleft()
+                if self._hello_due_s is not None and self.transport_up:
+                    if now >= self._hello_due_s:
+                        return self._hello(now)
+                    self.dirty = False
+                    return None
+            state = self.lanes.get(lane)
+            if not self.established or state is None or not state.up:
                 self.dirty = False
                 return None
-        state = self.lanes.get(lane)
-        if not self.established or state is None or not state.up:
-            self.dirty = False
+            if state.flight.next_number >= wire.MAX_PACKET_NUMBER:
+                self._renew(now)
+                return self.next_datagram(now=now, lane=lane)
+            return self._next_data(state, now)
+        except Exception as error:  # noqa: BLE001  (what was taken for the datagram is given back; the session ends)
+            self.failed(error, now=now)
             return None
-        if state.flight.next_number >= wire.MAX_PACKET_NUMBER:
-            self._renew(now)
-            return self.next_datagram(now=now, lane=lane)
-        return self._next_data(state, now)
 
     def _renew(self, now: float) -> None:
         """Packet numbers are used up: go on in another session."""
@@ -286,14 +328,24 @@ class Session(Hop):
             self.dirty = True
 
     def receive(self, data: wire.Datagram, *, now: float, lane: int = LANE_ZMQ) -> None:
-        """One datagram from the lane. Raises WireError or VersionError for bytes no honest peer sends."""
-        if data[:4] == self._data_prefix and wire.HEADER_BYTES <= len(data) <= wire.MAX_DATAGRAM_BYTES:
-            state = self.lanes.get(lane)
-            if state is not None:
-                number, stamp_us = NUMBER_AND_STAMP.unpack_from(data, 4)
-                self._receive_data(state, number, stamp_us, data, now)
-            return
-        data = bytes(data)
+        """One datagram from the lane. Raises WireError or VersionError for bytes no honest peer sends; the session has
+        ended then, as it has after an error of ours, of which the owner is told (`fault`)."""
+        try:
+            if data[:4] == self._data_prefix and wire.HEADER_BYTES <= len(data) <= wire.MAX_DATAGRAM_BYTES:
+                state = self.lanes.get(lane)
+                if state is not None:
+                    number, stamp_us = NUMBER_AND_STAMP.unpack_from(data, 4)
+                    self._receive_data(state, number, stamp_us, data, now)
+            else:
+                self._receive_other(bytes(data), lane, now)
+        except RemoteError:
+            self._abort("what it sent could not be read", now)
+            raise
+        except Exception as error:  # noqa: BLE001  (the one place for errors of ours while a datagram is read)
+            self.failed(error, now=now)
+
+    def _receive_other(self, data: bytes, lane: int, now: float) -> None:
+        """What is no datagram of the session."""
         header = wire.decode_header(data)
         if header.kind != wire.Kind.DATA:
             if lane != LANE_ZMQ:
@@ -320,11 +372,14 @@ class Session(Hop):
 
     def handle_timeout(self, *, now: float, lane: int = LANE_ZMQ) -> None:
         state = self.lanes.get(lane)
-        if self.established and state is not None and state.up and not (lane == LANE_ZMQ and self._hello_due_s):
-            self._data_timeout(state, now)
-        elif lane == LANE_ZMQ and now >= self._sweep_due_s:
-            self._now = now
-            self._sweep(now)
+        try:
+            if self.established and state is not None and state.up and not (lane == LANE_ZMQ and self._hello_due_s):
+                self._data_timeout(state, now)
+            elif lane == LANE_ZMQ and now >= self._sweep_due_s:
+                self._now = now
+                self._sweep(now)
+        except Exception as error:  # noqa: BLE001  (as in `receive`)
+            self.failed(error, now=now)
         self.dirty = True
 
     def _handshake(self, header: wire.Header, data: bytes, now: float) -> None:

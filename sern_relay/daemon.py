@@ -33,6 +33,7 @@ from sern_runtime.config.relay import RelayFile, load_relay
 from sern_runtime.draining import Progress
 from sern_runtime.entry import blamed_on, end_tasks, log_warnings, serve
 from sern_runtime.http import Health, HttpServer
+from sern_runtime.internal_errors import InternalErrors
 from sern_runtime.keys import KeyDirectory, KeyStatus, load_secret
 from sern_runtime.link_metrics import AgeHistograms, register_codecs, register_links, register_received
 from sern_runtime.loop import Shutdown
@@ -47,8 +48,8 @@ PATIENCE_S: Final = 5.0
 SWEEP_S: Final = 1.0
 OTHER_CODE: Final = "other"
 REFUSAL_CODES: Final = frozenset({
-    "bad_id", "bad_name", "bad_pattern", "forbidden", "name_taken", "not_owner", "old_boot", "origin", "registry_full",
-    "too_large", "too_many_objects", "too_many_patterns", "too_many_streams", "type_mismatch",
+    "bad_id", "bad_name", "bad_pattern", "forbidden", "internal_error", "name_taken", "not_owner", "old_boot", "origin",
+    "registry_full", "too_large", "too_many_objects", "too_many_patterns", "too_many_streams", "type_mismatch",
 })  # fmt: skip
 """What a refusal is counted under; a code that a client made up is counted as `other`."""
 
@@ -85,6 +86,7 @@ class RelayDaemon:
         self.notifier = Notifier.from_environment()
         self.directory = self._directory(loaded)
         self.ages = AgeHistograms()
+        self.errors = InternalErrors()
         self.refusals = dict.fromkeys((*sorted(REFUSAL_CODES), OTHER_CODE), 0)
         self.reloads_failed = 0
         self.hub = Hub(
@@ -101,7 +103,9 @@ class RelayDaemon:
         )
         self.codecs = CodecPool(after=self._after)
         self.coder = make_coder(model.link.params(), self.codecs)
-        self._decoder = Decoder[StreamInfo](self.coder, lambda stream: stream, self._deliver, self._undecodable)
+        self._decoder = Decoder[StreamInfo](
+            self.coder, lambda stream: stream, self._deliver, self._undecodable, fault=self.errors.core
+        )
         self._told: set[TopicName] = set()
         self.adaptation: Adaptation | None = None
         if model.adaptation is not None:
@@ -130,6 +134,7 @@ class RelayDaemon:
         return self.directory is None or client in self.directory.names
 
     async def start(self) -> None:
+        self.errors.watch(asyncio.get_running_loop())
         model = self.loaded.model
         relay = model.relay
         keys = load_secret(self.loaded.resolve(relay.secret_key_file)) if relay.secret_key_file else None
@@ -274,6 +279,7 @@ class RelayDaemon:
         register_links(metrics, lambda: list(self.hub.links.values()))
         register_received(metrics, self.hub.received, self.ages)
         register_codecs(metrics, self.coder)
+        self.errors.register(metrics)
         adaptation = self.adaptation
         if adaptation is not None:
             adaptation.register(metrics)
@@ -392,6 +398,7 @@ class RelayDaemon:
         """Ends whatever was started, the last first, also when a part of it fails."""
         self._ready = False
         async with AsyncExitStack() as stack:
+            stack.callback(self.errors.unwatch, asyncio.get_running_loop())
             stack.callback(self.notifier.close)
             stack.callback(self._write_summary)
             if self._ctx is not None:
@@ -431,6 +438,9 @@ class RelayDaemon:
     def lane_closed(self, client: ClientName) -> None:
         if self.lanes is not None:
             self.lanes.closed(client)
+
+    def fault(self, client: ClientName | None, error: Exception) -> None:
+        self.errors.core(error, client or "")
 
     def client_down(self, client: ClientName, reason: str) -> None:
         _log.info("%s is away: %s", client, reason)

@@ -17,6 +17,8 @@ BLOCKED_S: Final = 0.01
 """A lane that is not ready, or has been full for a while, is tried again at most this often, whatever has become due
 meanwhile. libzmq reports every change of a full socket and seldom the one that helps: trying at each of them kept a
 core busy for as long as the peer took nothing (measured)."""
+AGAIN_S: Final = 1.0
+"""After an error that nobody expects, of the socket for example, the port is asked again in so long at the latest."""
 FULL_S: Final = 0.0002
 """The first pause after a full lane; it doubles up to `BLOCKED_S` while nothing leaves. A timer comes after a whole
 millisecond, a change of the socket sooner: a pipe of 32 datagrams of 64 kB is empty after one at 2 GB/s."""
@@ -88,8 +90,10 @@ class Pump:
             self._scheduled = None
 
     def _due(self) -> None:
-        self._port.handle_timeout(now=time.monotonic())
-        self._run()
+        try:
+            self._port.handle_timeout(now=time.monotonic())
+        finally:
+            self._run()
 
     def _run(self) -> None:
         if self._scheduled is not None:
@@ -97,9 +101,16 @@ class Pump:
             self._scheduled = None
         if self._closed:
             return
+        now = time.monotonic()
+        try:
+            self._serve(now)
+        except Exception:
+            self._timer.arm(now + AGAIN_S)  # whatever it was, the port is asked again
+            raise
+
+    def _serve(self, now: float) -> None:
         port = self._port
         ready = self._ready
-        now = time.monotonic()
         if self._held is not None and now < self._retry_s:
             self._timer.arm(self._retry_s)
             return

@@ -282,6 +282,9 @@ class Listener:
     def undecodable(self, stream: StreamInfo, problem: str) -> None:
         self._printer.lost(stream, 1, f"undecodable: {problem}")
 
+    def fault(self, error: Exception) -> None:
+        self._warn(f"an internal error; please report it: {error!r}")
+
     def subscription_refused(self, code: str, text: str) -> None:
         self.problem = RefusedError(code, f"the relay refuses us: {text}")
 

@@ -279,6 +279,9 @@ class SimClient:
     def subscription_refused(self, code: str, text: str) -> None:
         self.denials.append((code, text))
 
+    def fault(self, error: Exception) -> None:
+        self.world.fault(error)
+
     # helpers
     def publish(
         self, topic: str, topic_spec: TopicSpec, definition: str = "", *, type_name: str = "std_msgs/msg/String"
@@ -401,6 +404,9 @@ class SimHub:
     def refused(self, client: ClientName, code: str, text: str) -> None:
         self.refusals.append((code, text))
 
+    def fault(self, client: ClientName | None, error: Exception) -> None:
+        self.world.fault(error)
+
 
 class World:
     """One relay and any number of clients, each behind a link of its own."""
@@ -426,11 +432,17 @@ class World:
         self.lossless = lossless
         self.hub_params = hub_params or HubParams()
         self.relay_clock = relay_clock or Clock()
+        self.expected_faults: tuple[type[Exception], ...] = ()
+        self.faults: list[Exception] = []
         self._boots = Random(seed)
         self.relay = SimHub(self, boot=self._boot())
         self.clients: dict[str, SimClient] = {}
         self.hops: dict[str, Hop] = {}
         self.network.every(1.0, lambda _now: self.relay.hub.sweep(now=self.relay.now))
+
+    def fault(self, error: Exception) -> None:
+        """What a core tells its shell of errors that nobody expects: a test that expects one says so."""
+        self.faults.append(error)
 
     @property
     def now(self) -> float:
@@ -485,15 +497,28 @@ class World:
             pairs.append((port, self.relay.more_ports[-1]))
         self.network.replace_node(old, self.relay, pairs)
 
+    def check_faults(self) -> None:
+        """Raises what a core met and nobody expected (`expected_faults`)."""
+        unexpected = [error for error in self.faults if not isinstance(error, self.expected_faults)]
+        if unexpected:
+            raise AssertionError("an error inside a core") from unexpected[0]
+
     def run(self, seconds: float) -> None:
         self.network.run_for(seconds)
+        self.check_faults()
 
     def until(self, condition: Callable[[], object], *, within_s: float = 60.0, what: str = "condition") -> float:
-        return self.network.run_until_true(condition, within_s=within_s, what=what)
+        taken_s = self.network.run_until_true(condition, within_s=within_s, what=what)
+        self.check_faults()
+        return taken_s
 
     def links(self) -> Iterator[Link]:
         yield from (client.core.link for client in self.clients.values())
         yield from self.relay.links()
+
+    def up(self) -> set[ClientName]:
+        """Clients with a session, as the relay sees it."""
+        return {client for client, link in self.relay.hub.links.items() if link.established}
 
     def quiet(self) -> bool:
         """Everybody is connected, and nothing is left to send, to acknowledge or to confirm."""

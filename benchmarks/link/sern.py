@@ -162,6 +162,9 @@ class End:
     def undecodable(self, stream: StreamInfo, problem: str) -> None:
         self.problems.append(problem)
 
+    def fault(self, error: Exception) -> None:
+        self.problems.append(repr(error))
+
     def subscription_refused(self, code: str, text: str) -> None:
         self.problems.append(text)
 

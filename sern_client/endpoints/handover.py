@@ -66,4 +66,8 @@ class Handover:
         for deliver, _ in items:
             if self._closed:
                 return
-            deliver()
+            try:
+                deliver()
+            except Exception as error:  # noqa: BLE001  (of one item: those behind it are not lost with it)
+                message = "an item from another thread could not be delivered"
+                self._loop.call_exception_handler({"message": message, "exception": error})

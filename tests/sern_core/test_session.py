@@ -173,19 +173,25 @@ def test_bytes_of_no_honest_peer_are_an_error_and_hurt_nobody_else() -> None:
     world.run(1.0)
     port = inner(world, client)
     assert port.link is not None
-    for junk, error in (
-        (b"", WireError),
-        (b"junk" * 10, WireError),
-        (wire.encode_header(wire.Kind.DATA, port.link.tag, 0, 0) + b"\xff", WireError),
-        (wire.encode_header(wire.Kind.DATA, port.link.tag, 0, 0, version=9), VersionError),
-        (wire.encode_handshake(wire.Kind.WELCOME, port.link.tag, 0, {}), WireError),
-        (wire.encode_header(wire.Kind.DATA, port.link.tag, 0, 0) + wire.encode_ack(0, 10**6, 0, 0, 0, 0), WireError),
-        (wire.encode_header(wire.Kind.DATA, port.link.tag, 0, 0) + wire.encode_ack(9, 1, 0, 0, 0, 0), WireError),
+    for sessions, (kind, payload, error) in enumerate(
+        (
+            (None, b"", WireError),
+            (None, b"junk" * 10, WireError),
+            (wire.VERSION_MAX, b"\xff", WireError),
+            (9, b"", VersionError),
+            (None, wire.encode_handshake(wire.Kind.WELCOME, port.link.tag, 0, {}), WireError),
+            (wire.VERSION_MAX, wire.encode_ack(0, 10**6, 0, 0, 0, 0), WireError),
+            (wire.VERSION_MAX, wire.encode_ack(9, 1, 0, 0, 0, 0), WireError),
+        ),
+        start=1,
     ):
+        assert client.name in world.up() and len(client.ups) == sessions
+        header = b"" if kind is None else wire.encode_header(wire.Kind.DATA, port.link.tag, 0, 0, version=kind)
         with pytest.raises(error):
-            port.receive(junk, now=world.now)
-    world.run(1.0)
-    assert other.core.link.established
+            port.receive(header + payload, now=world.now)
+        assert client.name not in world.up(), "the session goes on over what could not be read"
+        world.run(1.0)
+    assert other.core.link.established and len(other.ups) == 1
     world.validate()
 
 

@@ -1,9 +1,11 @@
 """From threads to the event loop."""
 
 import asyncio
+from functools import partial
 from threading import Thread
 
 from sern_client.endpoints.handover import Handover
+from tests.support import until
 
 
 async def test_items_of_a_thread_arrive_in_order() -> None:
@@ -43,3 +45,22 @@ async def test_nothing_arrives_after_the_end() -> None:
     asyncio.get_running_loop().call_soon(done.set)
     await done.wait()
     assert got == []
+
+
+async def test_an_item_that_fails_does_not_take_those_behind_it_with_it() -> None:
+    loop = asyncio.get_running_loop()
+    escaped: list[object] = []
+    loop.set_exception_handler(lambda _loop, context: escaped.append(context["exception"]))
+    handover = Handover(loop)
+    seen: list[int] = []
+
+    def fail() -> None:
+        raise ValueError("of an item")
+
+    try:
+        for deliver in (partial(seen.append, 1), fail, partial(seen.append, 2)):
+            handover.put(deliver)
+        await until(lambda: len(seen) == 2)
+    finally:
+        loop.set_exception_handler(None)
+    assert seen == [1, 2] and [type(error) for error in escaped] == [ValueError]
