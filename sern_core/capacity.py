@@ -7,6 +7,7 @@ capacity in bits per second (None while unknown) and whether the path has stalle
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from math import inf
 from typing import Final
 
 PACING_BURST_S: Final = 0.001
@@ -29,8 +30,29 @@ class AckSample:
     packet_bytes: int = 0  # its size, 0 when unknown: what it took to serialise is no queue
 
 
+class Receiver:
+    """What the receiver says of its clock and of the bytes it has got. Both only grow, unless it errs or lies."""
+
+    __slots__ = ("_cum_bytes", "_receiver_s")
+
+    def __init__(self) -> None:
+        self._receiver_s = -inf
+        self._cum_bytes = 0
+
+    def went_back(self, receiver_s: float, cum_bytes: int) -> bool:
+        """Note one statement. True: nothing said before can be compared with it; measure from here."""
+        back = receiver_s < self._receiver_s or cum_bytes < self._cum_bytes
+        self._receiver_s = receiver_s
+        self._cum_bytes = cum_bytes
+        return back
+
+
 class CapacityEstimator(ABC):
-    """Window and capacity of one lane. Every method takes the time from its caller."""
+    """Window and capacity of one lane. Every method takes the time from its caller.
+
+    Samples hold what the peer says: counters that stand still or go back, times that do not move or lie years away.
+    Whatever they hold nothing is raised, the window is positive, and rates are positive and finite, or None.
+    """
 
     @property
     @abstractmethod

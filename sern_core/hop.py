@@ -114,26 +114,29 @@ class Hop(Sender):
         newer = highest > flight.highest_acked
         packets = flight.acked(highest, sack, now=now)
         if newer:
-            sent_s, stamp_s, received_s = echo_us * 1e-6, self._rx_stamp_us * 1e-6, received_us * 1e-6
-            rtt_s = max(1e-6, now - sent_s - (stamp_s - received_s))
-            flight.rtt.sample(rtt_s, now=now)
-            self.clock.sample(sent_s, received_s, stamp_s, now)
             newest = packets[-1] if packets else None
-            state.estimator.on_ack(
-                AckSample(
-                    now,
-                    rtt_s,
-                    sum([packet.nbytes for packet in packets]),
-                    flight.inflight_bytes,
-                    received_s,
-                    cum_bytes,
-                    newest is not None and newest.app_limited,
-                    sent_s,
-                    newest.nbytes if newest is not None and newest.number == highest else 0,
+            named = newest is not None and newest.number == highest
+            # When it left we know better than the peer, unless it was given up meanwhile.
+            sent_s = newest.sent_s if newest is not None and named else echo_us * 1e-6
+            stamp_s, received_s = self._rx_stamp_us * 1e-6, received_us * 1e-6
+            if self.clock.sample(sent_s, received_s, stamp_s, now):  # else no two clocks can have given these stamps
+                rtt_s = max(1e-6, now - sent_s - (stamp_s - received_s))
+                flight.rtt.sample(rtt_s, now=now)
+                state.estimator.on_ack(
+                    AckSample(
+                        now,
+                        rtt_s,
+                        sum([packet.nbytes for packet in packets]),
+                        flight.inflight_bytes,
+                        received_s,
+                        cum_bytes,
+                        newest is not None and newest.app_limited,
+                        sent_s,
+                        newest.nbytes if newest is not None and named else 0,
+                    )
                 )
-            )
-            if state is self.lane and now >= self._rate_due_s:
-                self._rate_known(now)
+                if state is self.lane and now >= self._rate_due_s:
+                    self._rate_known(now)
         if packets:
             state.resolved(acked=len(packets))
         if newer or packets:

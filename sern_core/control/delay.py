@@ -10,7 +10,7 @@ rate timed at the receiver so that acknowledgement bunching does not disturb it.
 from collections import deque
 from typing import Final
 
-from sern_core.capacity import AckSample, CapacityEstimator
+from sern_core.capacity import AckSample, CapacityEstimator, Receiver
 
 MIN_EPOCH_S: Final = 0.040
 RTPROP_WINDOW_S: Final = 10.0
@@ -34,6 +34,7 @@ class DelayWindow(CapacityEstimator):
         self._initial_bytes = initial_bytes
         self._rtprops: deque[tuple[float, float]] = deque()
         self._rates: deque[tuple[float, float]] = deque()
+        self._receiver = Receiver()
         self._begin()
 
     def _begin(self) -> None:
@@ -81,7 +82,7 @@ class DelayWindow(CapacityEstimator):
             self._close_epoch(sample.now)
 
     def _measure_rate(self, sample: AckSample) -> None:
-        if self._mark is None or sample.cum_bytes < self._mark[1]:
+        if self._receiver.went_back(sample.receiver_s, sample.cum_bytes) or self._mark is None:
             self._mark = (sample.receiver_s, sample.cum_bytes)
             self._span_limited = sample.app_limited
             return
@@ -93,7 +94,7 @@ class DelayWindow(CapacityEstimator):
         rate_bps = 8 * (sample.cum_bytes - since_bytes) / span_s
         self._mark = (sample.receiver_s, sample.cum_bytes)
         # An application-limited span only shows what was offered: it may raise the estimate, never lower it.
-        if not self._span_limited or rate_bps > (self.rate_bps or 0.0):
+        if rate_bps > (self.rate_bps or 0.0) or (rate_bps > 0.0 and not self._span_limited):
             while self._rates and self._rates[-1][1] <= rate_bps:
                 self._rates.pop()
             self._rates.append((sample.now, rate_bps))

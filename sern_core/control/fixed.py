@@ -1,6 +1,6 @@
 """A plain fixed window: for known links, for comparison, and for tests."""
 
-from sern_core.capacity import AckSample, CapacityEstimator
+from sern_core.capacity import AckSample, CapacityEstimator, Receiver
 
 
 class FixedWindow(CapacityEstimator):
@@ -12,6 +12,7 @@ class FixedWindow(CapacityEstimator):
         self._rate_bps = rate_bps
         self._rtprop_s: float | None = None
         self._mark: tuple[float, int] | None = None
+        self._receiver = Receiver()
 
     @property
     def window_bytes(self) -> float:
@@ -33,13 +34,13 @@ class FixedWindow(CapacityEstimator):
             self._rtprop_s = sample.rtt_s
         if self._configured_bps is not None:
             return
-        if self._mark is None:
+        if self._receiver.went_back(sample.receiver_s, sample.cum_bytes) or self._mark is None:
             self._mark = (sample.receiver_s, sample.cum_bytes)
             return
         since_s, since_bytes = self._mark
         span_s = sample.receiver_s - since_s
         if span_s >= max(0.12, 2 * self._rtprop_s):
-            if not sample.app_limited:
+            if not sample.app_limited and sample.cum_bytes > since_bytes:
                 self._rate_bps = 8 * (sample.cum_bytes - since_bytes) / span_s
             self._mark = (sample.receiver_s, sample.cum_bytes)
 

@@ -26,7 +26,7 @@ from collections import deque
 from math import inf
 from typing import Final
 
-from sern_core.capacity import AckSample, CapacityEstimator
+from sern_core.capacity import AckSample, CapacityEstimator, Receiver
 from sern_core.control.parts import BaseDelay, Cubic, GreatestRate, LatelyArrived, Swing, Train
 
 MIN_EPOCH_S: Final = 0.040
@@ -103,6 +103,7 @@ class HybridWindow(CapacityEstimator):
     def __init__(self, *, fragment_bytes: int = 1260, initial_bytes: int = INITIAL_WINDOW_BYTES) -> None:
         self._first_fragment_bytes = fragment_bytes
         self._initial_bytes = initial_bytes
+        self._receiver = Receiver()
         self._begin()
 
     def _begin(self) -> None:
@@ -219,6 +220,10 @@ class HybridWindow(CapacityEstimator):
     def on_ack(self, sample: AckSample) -> None:
         now, receiver_s, cum_bytes = sample.now, sample.receiver_s, sample.cum_bytes
         rtt_s, nbytes = sample.rtt_s, sample.packet_bytes
+        if self._receiver.went_back(receiver_s, cum_bytes):
+            self._mark = self._full = self._high_since_s = None
+            self._arrived = LatelyArrived()
+            self._train = Train()
         sent_s = sample.sent_s
         if sent_s is None:
             sent_s = now - rtt_s
@@ -267,7 +272,7 @@ class HybridWindow(CapacityEstimator):
 
     def _measure_rate(self, now: float, receiver_s: float, cum_bytes: int, app_limited: bool) -> None:
         mark = self._mark
-        if mark is None or cum_bytes < mark[1]:
+        if mark is None:
             self._mark = (receiver_s, cum_bytes)
             self._span_limited = app_limited
             return
@@ -277,6 +282,8 @@ class HybridWindow(CapacityEstimator):
         if span_s < MIN_RATE_SPAN_S or span_s < (self._rtt_s or 0.0):
             return
         rate = (cum_bytes - mark[1]) / span_s
+        if rate <= 0.0:
+            return  # the receiver names newer packets and no more bytes: that says nothing of the path
         # What was sent while draining or with nothing more to send only shows a lower bound.
         bound = self._span_limited or self._draining(now)
         self._saturated = self._saturated or not bound
@@ -429,7 +436,7 @@ class HybridWindow(CapacityEstimator):
                 self._end_startup(min(self._window, rate * rtt_s) if rate else self._window / 2)
         elif limited:
             if self._cubic is not None:
-                window = self._cubic.window(now, rtt_s + queue_s, self._fragment)
+                window = min(self._cubic.window(now, rtt_s + queue_s, self._fragment), MAX_WINDOW_BYTES)
                 most = 1.5 * self._window if queue_s < COMPETE_QUEUE_S else self._window
                 self._window = min(max(window, MIN_WINDOW_FRAGMENTS * self._fragment), most)
             else:
@@ -569,6 +576,7 @@ class HybridWindow(CapacityEstimator):
     def _compete(self, now: float, rtt_s: float) -> None:
         self._faster_rate = None
         window = max(self._window, self._calm_window, (self._arrived.rate() or 0.0) * rtt_s)
+        window = min(window, MAX_WINDOW_BYTES)
         self._cubic = Cubic(now, window, self._fragment)
         self._window = window
         self._above_epochs = 0

@@ -91,7 +91,7 @@ class LatelyArrived:
             return None
         last_s, last_bytes = marks[-1]
         since = next((mark for mark in reversed(marks) if last_s - mark[0] >= BURST_RATE_SPAN_S), marks[0])
-        return (last_bytes - since[1]) / (last_s - since[0])
+        return (last_bytes - since[1]) / (last_s - since[0]) or None
 
 
 class Train:
