@@ -19,6 +19,7 @@ from sern_core import wire
 from sern_core.access import AccessTable, RateGuard, compile_peer_pattern
 from sern_core.announce import Announcement
 from sern_core.bound import QueueBound
+from sern_core.draining import Draining
 from sern_core.errors import RefusedError, UsageError, WireError
 from sern_core.fragments import InStream
 from sern_core.hub_events import GuardedEvents, HubEvents, Relayed
@@ -102,7 +103,7 @@ class Hub(LocalStreams):
         self._awaited: dict[ClientName, set[TopicName]] = {}
         self._heard: set[ClientName] = set()  # said what they want, to this run of the relay
         self._absent_since: dict[ClientName, float] = {}
-        self._draining: list[tuple[Link, OutChannel]] = []  # streams that ended with reliable messages still owed
+        self._draining = Draining(self._end_channel)
         self.tap: Callable[[StreamInfo], bool] = lambda _stream: False
         """Whether the relay itself wants a stream (a subscriber of the feed); set by the shell."""
 
@@ -185,11 +186,7 @@ class Hub(LocalStreams):
                 waiting_s = link.lane.flight.waiting_since_s
                 if link.lane.stalled and waiting_s is not None and now - waiting_s > ORPHAN_S:
                     link.close_lane(now=now)
-        for link, channel in list(self._draining):
-            if not channel.retained or not channel.reliable:
-                self._draining.remove((link, channel))
-                if link.channels.get(channel.slot) is channel:
-                    link.close_channel(channel, DropReason.DISCONNECTED, now=now)
+        self._draining.sweep(now=now)
 
     def left(self, client: ClientName, *, now: float) -> None:
         """A client has said goodbye. One that has streams, or wants reliable ones, may come back to them (a daemon that
@@ -216,7 +213,9 @@ class Hub(LocalStreams):
         self._apply(self.routing.drop_client(client), now, reason=reason)
         for channel in list(link.channels.values()):
             link.close_channel(channel, reason, now=now)
-        self._draining = [(other, channel) for other, channel in self._draining if other is not link]
+        self._draining.forget(client)
+        if reason is DropReason.FORBIDDEN:
+            self._draining.keep(lambda _client, stream: stream.origin != client, reason, now=now)
         self.events.lane_closed(client)
         del self.links[client]
         port = self.port_of.pop(client, None)
@@ -235,6 +234,7 @@ class Hub(LocalStreams):
         self.access = access
         for client in self.links:
             self._limit(client, now)
+            self._draining.limit(client, self._max_queue_bytes(client), now=now)
         change = self.routing.set_access(access)
         for identity in change.removed:
             relayed = self.relayed[identity]
@@ -242,7 +242,17 @@ class Hub(LocalStreams):
                 text = f"{identity.origin} may no longer publish {identity.topic}: the access rules have changed"
                 relayed.source.refuse(relayed.stream, "forbidden", text, now=now)
                 self.events.refused(identity.origin, "forbidden", text)
-        self._apply(change, now)
+        self._apply(change, now, reason=DropReason.FORBIDDEN)
+        self._draining.keep(self._may_drain, DropReason.FORBIDDEN, now=now)
+
+    def _may_drain(self, client: ClientName, stream: StreamId) -> bool:
+        """Whether the rules allow what an ended stream left behind."""
+        access = self.access
+        return access.may_subscribe(client, stream.topic) and access.may_publish(stream.origin, stream.topic)
+
+    def _max_queue_bytes(self, client: ClientName) -> int | None:
+        bound = self._bounds.get(client)
+        return None if bound is None else bound.max_bytes
 
     # --- routes -----------------------------------------------------------------------------------------------------
 
@@ -250,7 +260,7 @@ class Hub(LocalStreams):
         """Open and close channels as the routes have changed; `reason`: of dropping what no longer has a taker."""
         touched: set[StreamId] = set(change.wanted) | set(change.unwanted)
         for identity in change.removed:
-            self._remove(identity, now)
+            self._remove(identity, now, drain=reason is not DropReason.FORBIDDEN)
         for client, identity in change.unmatched:
             self._close(client, identity, reason, now)
             touched.add(identity)
@@ -293,7 +303,10 @@ class Hub(LocalStreams):
         relayed.unopened.discard(client)
         pair = relayed.outs.pop(client, None)
         if pair is not None:
-            self._for(client, now, partial(pair[0].close_channel, pair[1], reason, now=now))
+            self._end_channel(client, *pair, reason, now)
+
+    def _end_channel(self, client: ClientName, link: Link, channel: OutChannel, reason: DropReason, now: float) -> None:
+        self._for(client, now, partial(link.close_channel, channel, reason, now=now))
 
     def _wanted(self, relayed: Relayed) -> bool:
         return bool(relayed.outs) or relayed.cache is not None or self.tap(relayed.stream.stream)
@@ -306,15 +319,15 @@ class Hub(LocalStreams):
     def _open(self, client: ClientName, identity: StreamId, now: float) -> None:
         relayed = self.relayed[identity]
         link = self._link(client, now)
-        for ended, channel in list(self._draining):
-            if ended is link and channel.stream.id == identity:  # it came back before it was gone
-                self._draining.remove((ended, channel))
-                relayed.outs[client] = (link, channel)
-                return
+        stream, first = relayed.stream.stream, relayed.stream.delivered + 1
+        ended = self._draining.take(client, stream, first, now=now)
+        if ended is not None:  # it came back before it was gone
+            relayed.outs[client] = ended
+            return
         try:
             channel = link.open_channel(
-                relayed.stream.stream,
-                first=relayed.stream.delivered + 1,
+                stream,
+                first=first,
                 now=now,
                 replays=self._replays(client, relayed),
             )
@@ -339,7 +352,8 @@ class Hub(LocalStreams):
             self._bounds[client].recount()
         return self.replays.replay(relayed.cache)
 
-    def _remove(self, identity: StreamId, now: float) -> None:
+    def _remove(self, identity: StreamId, now: float, *, drain: bool = True) -> None:
+        """The stream has ended. `drain`: what was owed of it is still delivered."""
         relayed = self.relayed.pop(identity, None)
         if relayed is None:
             return
@@ -347,11 +361,13 @@ class Hub(LocalStreams):
             self.replays.close(relayed.cache)
         if relayed.source is None:
             self._closed_local(relayed)
-        for link, channel in relayed.outs.values():
-            if channel.reliable and channel.retained:
-                self._draining.append((link, channel))
+        for client, (link, channel) in relayed.outs.items():
+            if not drain:
+                self._end_channel(client, link, channel, DropReason.FORBIDDEN, now)
+            elif channel.reliable and channel.retained:
+                self._draining.add(client, link, channel, max_bytes=self._max_queue_bytes(client), now=now)
             else:
-                link.close_channel(channel, DropReason.DISCONNECTED, now=now)
+                self._end_channel(client, link, channel, DropReason.DISCONNECTED, now)
         self.objects.delete_stream(identity)
         self.events.stream_removed(relayed.stream.stream)
 
@@ -450,6 +466,7 @@ class Hub(LocalStreams):
             if refused is not None and refused.cache is not None:
                 self.replays.close(refused.cache)
             raise
+        relayed.keep_latched(self.replays)
         if change.added:
             self.events.stream_added(stream.stream)
             try:
@@ -614,6 +631,12 @@ class Hub(LocalStreams):
         patterns = [part for part in parts if part not in names]
         try:
             self._apply(self.routing.subscribe(client, patterns, exact=names), now)
+            if self._draining.has(client):
+                self._draining.keep(
+                    lambda other, stream: other != client or self.routing.takes(client, stream.topic),
+                    DropReason.UNWANTED,
+                    now=now,
+                )
         except RefusedError as refusal:
             self.events.refused(client, refusal.code, str(refusal))
             bad = next((part for part in patterns if not _acceptable(part)), "")
@@ -631,6 +654,21 @@ class Hub(LocalStreams):
             held = set(relayed.outs) | relayed.unopened
             assert held == outs, f"{identity.topic}: channels {held} but routes {outs}"
             assert not relayed.unopened & set(relayed.outs), f"{identity.topic}: a channel that could not be opened"
+            latched = relayed.stream.stream.spec.latched
+            assert (relayed.cache is not None) == latched, f"{identity.topic}: its cache does not fit its spec"
+            for client, (link, channel) in relayed.outs.items():
+                assert self.links.get(client) is link, f"{identity.topic} goes to a link of {client} that is gone"
+                assert link.by_stream.get(identity) is channel, f"{identity.topic}: a closed channel to {client}"
+        known = {info.id for info in self.routing.infos()}
+        assert known == self.relayed.keys(), f"routes and streams differ: {known ^ self.relayed.keys()}"
+        held_channels = {id(pair[1]) for relayed in self.relayed.values() for pair in relayed.outs.values()}
+        held_channels |= self._draining.validate(self.links)
+        for client, link in self.links.items():
+            for channel in link.channels.values():
+                assert id(channel) in held_channels, f"{channel.stream.id.topic}: nobody's channel to {client}"
+        for table in (self._absent_since, self._awaited, self._guards, self._bounds, self._heard):
+            assert set(table) <= set(self.links), "something is kept for clients that are forgotten"
+        assert all(len(topics) <= MAX_AWAITED_TOPICS for topics in self._awaited.values()), "too much is awaited"
 
 
 def _acceptable(pattern: str) -> bool:

@@ -8,7 +8,7 @@ from sern_core.fragments import InStream
 from sern_core.link import Link
 from sern_core.message import Message, StreamInfo
 from sern_core.queues import OutChannel
-from sern_core.replay import ReplayStore
+from sern_core.replay import LatchedCache, ReplayStore
 from sern_core.types import ClientName
 
 
@@ -95,5 +95,17 @@ class Relayed:
         self.stream = stream
         self.outs: dict[ClientName, tuple[Link, OutChannel]] = {}
         self.unopened: set[ClientName] = set()  # subscribers towards whom no channel could be opened; they were told
-        spec = stream.stream.spec
+        self.cache: LatchedCache | None = None
+        self.keep_latched(replays)
+
+    def keep_latched(self, replays: ReplayStore) -> None:
+        """Keep as many messages for late joiners as the stream's properties say by now."""
+        spec, old = self.stream.stream.spec, self.cache
+        if old is not None and spec.latched and old.depth == spec.depth:
+            return
         self.cache = replays.open(spec.depth) if spec.latched else None
+        if old is not None:
+            if self.cache is not None:
+                for message in old.replay():
+                    replays.add(self.cache, message)
+            replays.close(old)

@@ -247,7 +247,8 @@ class Link(Session):
         self._refresh(channel, now)
         self.channels.pop(channel.slot, None)
         self.cadences.forget(channel.slot)
-        self.by_stream.pop(channel.stream.id, None)
+        if self.by_stream.get(channel.stream.id) is channel:
+            del self.by_stream[channel.stream.id]
         if self.established:
             self.send_control({"t": "retract", "ch": channel.slot}, now=now)
 

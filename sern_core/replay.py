@@ -37,6 +37,10 @@ class LatchedCache:
         return size
 
     @property
+    def depth(self) -> int:
+        return self._messages.maxlen or 0
+
+    @property
     def empty(self) -> bool:
         return not self._messages
 

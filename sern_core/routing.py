@@ -158,6 +158,11 @@ class RoutingTable:
             )
         )
 
+    def takes(self, client: ClientName, topic: TopicName) -> bool:
+        """Whether the client wants the global name and may have it, whether or not there is such a stream."""
+        interest = self._interests.get(client)
+        return interest is not None and interest.wants(topic) and self._access.may_subscribe(client, topic)
+
     def owners(self, topic: TopicName) -> tuple[ClientName, ...]:
         """The clients that hold the global name, first come first."""
         entry = self._topics.get(topic)
