@@ -17,9 +17,18 @@ from dataclasses import replace
 from typing import Final, Protocol
 
 from sern_core import wire
-from sern_core.announce import MAX_STRINGS, Announcement, announcement_parts, decode_announcement, definition_hash
+from sern_core.announce import (
+    Announcement,
+    Want,
+    announcement_parts,
+    decode_announcement,
+    decode_want,
+    definition_hash,
+)
 from sern_core.errors import RefusedError, UsageError, WireError
 from sern_core.fragments import DropReport, InStream
+from sern_core.interest import Interest
+from sern_core.lanes import Lane
 from sern_core.message import Message, StreamId, StreamInfo
 from sern_core.out_message import OutMessage
 from sern_core.params import LinkParams, SchedulerParams
@@ -34,7 +43,11 @@ MAX_PEER_DEFINITIONS: Final = 2048
 MAX_PEER_DEFINITION_BYTES: Final = 16 * 2**20
 """Texts that one peer may add; all types of a ROS distribution together have less than 2 MB."""
 MAX_OWED: Final = 8192
-"""Names in lists that have begun and not ended."""
+"""Names in lists that have begun and not ended, and of one stream."""
+MAX_NAMED: Final = 0x10000
+"""Price of the answers of one datagram, beside that of one for each open channel: a few bytes name many channels."""
+ANSWER_PRICE: Final = 16
+"""What an answer about an open channel costs, next to one about a channel that is closed."""
 MAX_UNHEARD: Final = 20_000
 """Control messages that a peer may have answered, beside four for each channel, before it reads an answer."""
 
@@ -117,6 +130,8 @@ class Link(Session):
         self._told: set[str] = set()  # definitions the peer has had in the session
         self._needed: set[str] = set()  # definitions we asked the peer for, not here yet
         self._peer_definitions = self._peer_definition_bytes = 0
+        self._interest = Interest()
+        self._price = self._priced_us = 0  # of the answers that came at this time
         self._unheard = 0  # answers since the peer acknowledged the one of number `_unheard_seq`
         self._unheard_seq = 0
         self._owed_parts: dict[tuple[str, int], tuple[str, ...]] = {}  # by message and channel: more will come
@@ -139,12 +154,14 @@ class Link(Session):
         self._told.clear()
         self._needed.clear()
         self._unheard = self._unheard_seq = 0
+        self._interest.begin()
+        self._unsaid = False
         self._announcing.clear()
         self._owed_parts.clear()
         self.handler.on_up(self, resumed=resumed, now=now)
         for channel in list(self.channels.values()):
             self._announce(channel, now)
-        self.send_control({"t": "synced"}, now=now)
+        self.send_control({"t": "synced", "batch": True}, now=now)
 
     def _session_ended(self, reason: str, now: float) -> None:
         self.handler.on_down(self, reason, now=now)
@@ -266,22 +283,35 @@ class Link(Session):
     # --- streams in -----------------------------------------------------------------------------------------------
 
     def answer(self, stream: InStream, wanted: bool, *, now: float, owed: tuple[str, ...] = ()) -> None:
-        """Tell the peer whether its stream is wanted; `owed` names the clients that must get a reliable one."""
-        stream.wanted = wanted
-        stream.paused = stream.paused or not wanted
-        stream.pause_seq = 0
-        if self.established and stream.channel_id is not None:
-            seq = 0
-            for start in range(0, max(1, len(owed)), MAX_STRINGS):
-                part, more = list(owed[start : start + MAX_STRINGS]), start + MAX_STRINGS < len(owed)
-                envelope = {"t": "want", "ch": stream.channel_id, "on": wanted, "owed": part, "more": more}
-                seq = self.send_control(envelope, now=now)
-            if not wanted:
-                stream.pause_seq = seq
+        """Tell the peer, if it does not know, whether its stream is wanted; `owed` names the clients that must get a
+        reliable one."""
+        if not stream.reliable:
+            owed = ()
+        if not self.established or stream.channel_id is None:
+            stream.wanted = wanted
+            stream.paused = stream.paused or not wanted
+            stream.pause_seq = 0
+        elif self._interest.answer(stream.channel_id, stream, wanted, owed, now=now):
+            self._unsaid = self.dirty = True
+
+    def _say_interest(self, now: float) -> None:
+        control = self._control
+        self._interest.tell(
+            lambda envelope: self.send_control(envelope, now=now),
+            heard=control.watermark,
+            unheard=len(control.retained),
+            now=now,
+        )
+        self._unsaid = bool(self._interest)
+
+    def _data_deadline(self, lane: Lane) -> float:
+        deadline_s = super()._data_deadline(lane)
+        return min(deadline_s, self._interest.deadline_s) if self._unsaid else deadline_s
 
     def refuse(self, stream: InStream, code: str, text: str, *, now: float) -> None:
         """Take back what `on_announce` allowed (an access rule changed)."""
         if self.established and stream.channel_id is not None:
+            self._interest.forget(stream.channel_id)
             self.send_control({"t": "refuse", "ch": stream.channel_id, "code": code, "why": text[:400]}, now=now)
 
     def _announced(self, announcement: Announcement, now: float) -> None:
@@ -300,6 +330,7 @@ class Link(Session):
                 replaced.close()
             self.streams[identity] = stream
         self._missing.pop(identity, None)
+        self._interest.forget(slot)  # every announcement waits for an answer
         stream.channel_id = slot
         self.incoming[slot] = stream
         for report in stream.reports:
@@ -315,6 +346,7 @@ class Link(Session):
         except RefusedError as refusal:
             del self.incoming[slot]
             del self.streams[identity]
+            self._interest.forget(slot)
             self._watermarks.pop(slot, None)
             stream.channel_id = None
             stream.close()
@@ -396,6 +428,7 @@ class Link(Session):
         if stream.channel_id is not None:
             self.incoming.pop(stream.channel_id, None)
             self._watermarks.pop(stream.channel_id, None)
+            self._interest.forget(stream.channel_id)
         self.handler.on_retract(self, stream, now=now)
         stream.close()
         stream.channel_id = None
@@ -436,7 +469,9 @@ class Link(Session):
             owed = self._owed_so_far(("announce", announcement.channel), announcement.owed, more=announcement.more)
             if owed is not None:
                 self._announced(replace(announcement, owed=owed), now)
-        elif kind in ("want", "refuse", "dropped"):
+        elif kind == "want":
+            self._answers(decode_want(envelope), now)
+        elif kind in ("refuse", "dropped"):
             channel = self.channels.get(wire.take_int(envelope, "ch", high=0xFFFF))
             if channel is not None:  # else closed meanwhile
                 self._about_channel(kind, channel, envelope, now)
@@ -451,6 +486,7 @@ class Link(Session):
             else:
                 self._retract(incoming, now)
         elif kind == "synced":
+            self._interest.batches = wire.take_bool(envelope, "batch")
             self._synced(now)
         elif kind == "need":
             self._send_definition(wire.take_str(envelope, "dh", max_length=64), now)
@@ -468,21 +504,48 @@ class Link(Session):
             return None
         return self._owed_parts.pop(key, ()) + names
 
+    def _answers(self, want: Want, now: float) -> None:
+        """The peer has said whether it wants streams of ours."""
+        first = want.runs[0][0]
+        if want.more:
+            self._owed_so_far(("want", first), want.owed or (), more=True)
+            return
+        owed = None if want.owed is None else self._owed_so_far(("want", first), want.owed, more=False)
+        for first, last in want.runs:
+            self._charge(last - first + 1, now)
+            for slot in range(first, last + 1):
+                channel = self.channels.get(slot)
+                if channel is not None:  # else closed meanwhile
+                    self._charge(ANSWER_PRICE, now)
+                    self._answer_came(channel, want, owed, now)
+
+    def _charge(self, price: int, now: float) -> None:
+        """Raises WireError if the peer answers more in one datagram than there is to be answered."""
+        now_us = int(now * 1e6)
+        if now_us != self._priced_us:
+            self._price, self._priced_us = 0, now_us
+        self._price += price
+        if self._price > MAX_NAMED + 2 * ANSWER_PRICE * len(self.channels):
+            raise WireError(f"{self.peer} answers the announcements of {len(self.channels)} channels again and again")
+
+    def _answer_came(self, channel: OutChannel, want: Want, owed: tuple[str, ...] | None, now: float) -> None:
+        if owed is None:
+            names = dict.fromkeys(channel.owed) | dict.fromkeys(want.add)
+            for name in want.drop:
+                names.pop(name, None)
+            owed = tuple(names)
+            if len(owed) > MAX_OWED:
+                raise WireError(f"{self.peer} owes a stream to more than {MAX_OWED} names")
+        channel.owed = owed
+        if want.on and channel.wanted is False and channel.reliable:
+            self.send_control({"t": "first", "ch": channel.slot, "seq": channel.first_seq}, now=now)
+        self._set_wanted(channel, want.on, now)
+        channel.ready = True
+        self._refresh(channel, now)
+        self.handler.on_wanted(self, channel, now=now)
+
     def _about_channel(self, kind: str, channel: OutChannel, envelope: wire.Envelope, now: float) -> None:
-        if kind == "want":
-            wanted = wire.take_bool(envelope, "on")
-            names = tuple(wire.take_strings(envelope, "owed", max_length=64))
-            owed = self._owed_so_far(("want", channel.slot), names, more=wire.take_bool(envelope, "more"))
-            if owed is None:
-                return
-            channel.owed = owed
-            if wanted and channel.wanted is False and channel.reliable:
-                self.send_control({"t": "first", "ch": channel.slot, "seq": channel.first_seq}, now=now)
-            self._set_wanted(channel, wanted, now)
-            channel.ready = True
-            self._refresh(channel, now)
-            self.handler.on_wanted(self, channel, now=now)
-        elif kind == "dropped":
+        if kind == "dropped":
             reason = DROP_REASONS.get(wire.take_int(envelope, "code"), DropReason.LOST)
             channel.reported(wire.take_int(envelope, "seq"), reason)
         else:

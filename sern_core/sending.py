@@ -125,6 +125,7 @@ class Sender(ABC):
         self.tag = boot % 255  # so that a late datagram of an earlier process is not taken for one of ours
         self.dirty = False
         """Something may be sendable: the owner should poll `next_datagram`. Set by every call that changes anything."""
+        self._unsaid = False  # answers to the peer's streams wait to be told
         self._rx_lane = self.lane
         self._sweep_due_s = now + SWEEP_INTERVAL_S
         self._rate_due_s = now
@@ -148,6 +149,10 @@ class Sender(ABC):
     @abstractmethod
     def _control_sent(self, seq: int) -> None:
         """Control message `seq` is on the wire."""
+
+    @abstractmethod
+    def _say_interest(self, now: float) -> None:
+        """Queue control messages with the answers that are due."""
 
     @abstractmethod
     def _watermark_moved(self, channel: OutChannel) -> None: ...
@@ -296,6 +301,8 @@ class Sender(ABC):
         if not self.dirty and len(self.lanes) == 1:
             return None  # nothing has changed since the last answer, and `handle_timeout` says when time has
         self._now = now
+        if self._unsaid:
+            self._say_interest(now)
         if lane.copies and (copy := lane.due_copy(now)) is not None:
             self.scheduler.charge(PriorityClass.CONTROL, len(copy), now=now)
             self.wire_bytes += len(copy) + OVERHEAD_BYTES
