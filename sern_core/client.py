@@ -11,6 +11,7 @@ from sern_core import wire
 from sern_core.announce import MAX_STRINGS, Announcement, check_stream
 from sern_core.codecs import CodecProfile, Coder, Compression
 from sern_core.decoding import Decoder
+from sern_core.definitions import DefinitionStore
 from sern_core.errors import ConfigError, WireError
 from sern_core.fragments import InStream
 from sern_core.ledger import MAX_TOPICS, ReceiveLedger
@@ -94,7 +95,7 @@ class ClientCore:
         self.boot = boot
         self.events = events
         self.trace = trace or DecisionTrace(enabled=False)
-        self.definitions: dict[str, str] = {}
+        self.definitions = DefinitionStore()
         self.received = ReceiveLedger()
         """Counters of what arrives, by topic: delivered, and dropped on arrival for a reason."""
         self.patterns: tuple[str, ...] = ()
@@ -264,7 +265,7 @@ class ClientCore:
                 info.type_name,
                 info.encoding,
                 info.type_hash,
-                self.definitions.get(digest, ""),
+                self.definitions.get(digest),
                 info.latched,
                 info.reliable,
             )

@@ -18,6 +18,7 @@ from sern_core import wire
 from sern_core.access import AccessTable, RateGuard, compile_peer_pattern
 from sern_core.announce import Announcement
 from sern_core.bound import QueueBound
+from sern_core.definitions import DefinitionStore
 from sern_core.errors import RefusedError, WireError
 from sern_core.fragments import InStream
 from sern_core.hub_events import HubEvents, Relayed
@@ -84,7 +85,7 @@ class Hub(LocalStreams):
         self.params = params or HubParams()
         self.routing = RoutingTable(access)
         self.objects = ObjectRegistry(epoch=boot)
-        self.definitions: dict[str, str] = {}
+        self.definitions = DefinitionStore()
         self.trace = trace or DecisionTrace(enabled=False)
         self.received = ReceiveLedger()
         self.links: dict[ClientName, Link] = {}
@@ -201,6 +202,7 @@ class Hub(LocalStreams):
             link.close_channel(channel, reason, now=now)
         self._draining = [(other, channel) for other, channel in self._draining if other is not link]
         self.events.lane_closed(client)
+        link.close_streams()
         del self.links[client]
         port = self.port_of.pop(client, None)
         if port is not None:
@@ -559,6 +561,7 @@ class Hub(LocalStreams):
         self.routing.validate()
         self.objects.validate()
         self.replays.validate()
+        self.definitions.validate()
         for identity, relayed in self.relayed.items():
             outs = set(self.routing.subscribers(identity))
             assert set(relayed.outs) == outs, f"{identity.topic}: channels {set(relayed.outs)} but routes {outs}"

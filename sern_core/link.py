@@ -25,6 +25,7 @@ from sern_core.announce import (
     decode_want,
     definition_hash,
 )
+from sern_core.definitions import DefinitionStore, PeerDefinitions
 from sern_core.errors import RefusedError, UsageError, WireError
 from sern_core.fragments import DropReport, InStream
 from sern_core.interest import Interest
@@ -37,11 +38,6 @@ from sern_core.session import Session
 from sern_core.trace import DecisionTrace, TraceEvent
 from sern_core.types import CLASS_LABELS, DROP_CODES, DROP_REASONS, ClientName, DropReason, PriorityClass
 
-MAX_DEFINITIONS: Final = 16_384
-"""Texts that a process keeps, of all its peers."""
-MAX_PEER_DEFINITIONS: Final = 2048
-MAX_PEER_DEFINITION_BYTES: Final = 16 * 2**20
-"""Texts that one peer may add; all types of a ROS distribution together have less than 2 MB."""
 MAX_OWED: Final = 8192
 """Names in lists that have begun and not ended, and of one stream."""
 MAX_NAMED: Final = 0x10000
@@ -99,7 +95,7 @@ class LinkHandler(Protocol):
 class Link(Session):
     """One end of one hop towards `peer`.
 
-    `definitions` maps digest to text and is shared by all links of a process. `auto_confirm`: what had its turn here
+    `definitions` is shared by all links of a process. `auto_confirm`: what had its turn here
     is delivered; a relay confirms by hand, when its subscribers have.
     """
 
@@ -111,7 +107,7 @@ class Link(Session):
         peer: ClientName,
         initiator: bool,
         handler: LinkHandler,
-        definitions: dict[str, str],
+        definitions: DefinitionStore,
         link: LinkParams,
         scheduler: SchedulerParams,
         trace: DecisionTrace,
@@ -121,15 +117,12 @@ class Link(Session):
     ) -> None:
         self.handler = handler
         self.definitions = definitions
+        self.texts = PeerDefinitions(definitions, peer)
         self.auto_confirm = auto_confirm
         self.by_stream: dict[StreamId, OutChannel] = {}
         self.streams: dict[StreamId, InStream] = {}
         """Incoming streams across sessions."""
         self._next_channel = 1
-        self._asked: set[str] = set()  # definitions the peer asked for before we had them
-        self._told: set[str] = set()  # definitions the peer has had in the session
-        self._needed: set[str] = set()  # definitions we asked the peer for, not here yet
-        self._peer_definitions = self._peer_definition_bytes = 0
         self._interest = Interest()
         self._price = self._priced_us = 0  # of the answers that came at this time
         self._unheard = 0  # answers since the peer acknowledged the one of number `_unheard_seq`
@@ -150,9 +143,8 @@ class Link(Session):
         )
 
     def _session_began(self, resumed: bool, now: float) -> None:
-        self._asked.clear()
-        self._told.clear()
-        self._needed.clear()
+        self.texts.peer = self.peer
+        self.texts.begin()
         self._unheard = self._unheard_seq = 0
         self._interest.begin()
         self._unsaid = False
@@ -206,7 +198,7 @@ class Link(Session):
         channel.prime(replays, now=now)
         self.channels[slot] = channel
         self.by_stream[stream.id] = channel
-        self._define(stream.info.definition)
+        self.texts.use_outgoing(slot, _digest(stream), stream.info.definition)
         if self.established:
             self._announce(channel, now)
         return channel
@@ -230,12 +222,14 @@ class Link(Session):
         self.channels.pop(channel.slot, None)
         self.cadences.forget(channel.slot)
         self.by_stream.pop(channel.stream.id, None)
+        self.texts.use_outgoing(channel.slot, "")
         if self.established:
             self.send_control({"t": "retract", "ch": channel.slot}, now=now)
 
     def _announce(self, channel: OutChannel, now: float) -> None:
         stream = channel.stream
-        digest = stream.attributes.get("definition") or definition_hash(stream.info.definition)
+        digest = _digest(stream)
+        self.texts.use_outgoing(channel.slot, digest)  # in another session its origin may say another
         owed = channel.owed if channel.reliable else ()
         announcement = Announcement(channel.slot, stream, digest, channel.first_seq, owed)
         channel.ready = False
@@ -335,18 +329,19 @@ class Link(Session):
         self.incoming[slot] = stream
         for report in stream.reports:
             self._send_report(stream, report, now)
-        definition = self.definitions.get(announcement.definition_hash, "")
-        if announcement.definition_hash:
-            stream.stream.attributes["definition"] = announcement.definition_hash
-            if not definition and announcement.definition_hash not in self._needed:
-                self._needed.add(announcement.definition_hash)
-                self.send_control({"t": "need", "dh": announcement.definition_hash}, now=now)
+        digest = announcement.definition_hash
+        self.texts.use_incoming(identity, digest)
+        if digest:
+            stream.stream.attributes["definition"] = digest
+            if self.texts.lacks(digest):
+                self.send_control({"t": "need", "dh": digest}, now=now)
         try:
             wanted = self.handler.on_announce(self, announcement, now=now)
         except RefusedError as refusal:
             del self.incoming[slot]
             del self.streams[identity]
             self._interest.forget(slot)
+            self.texts.use_incoming(identity, "")
             self._watermarks.pop(slot, None)
             stream.channel_id = None
             stream.close()
@@ -425,6 +420,7 @@ class Link(Session):
     def _retract(self, stream: InStream, now: float) -> None:
         self.streams.pop(stream.stream.id, None)
         self._missing.pop(stream.stream.id, None)
+        self.texts.use_incoming(stream.stream.id, "")
         if stream.channel_id is not None:
             self.incoming.pop(stream.channel_id, None)
             self._watermarks.pop(stream.channel_id, None)
@@ -451,8 +447,8 @@ class Link(Session):
         before = self._control.next_seq
         self._handle_control(kind, envelope, attachment, now)
         said = self._control.next_seq - before
-        # Reports of drops are repeated at an announcement: those are ours to say, not an answer.
-        self._answered(min(1, said) if kind == "announce" else said)
+        # Reports of drops are repeated at an announcement: ours to say, not an answer, which comes later.
+        self._answered(1 if kind == "announce" else said)
 
     def _answered(self, count: int) -> None:
         """The peer made us say `count` things. Raises WireError if it never reads what it makes us say."""
@@ -489,9 +485,12 @@ class Link(Session):
             self._interest.batches = wire.take_bool(envelope, "batch")
             self._synced(now)
         elif kind == "need":
-            self._send_definition(wire.take_str(envelope, "dh", max_length=64), now)
+            digest = wire.take_str(envelope, "dh", max_length=64)
+            self._define(digest, self.texts.asked(digest), now)
         elif kind == "define":
-            self._defined(envelope, attachment, now)
+            digest = wire.take_str(envelope, "dh", max_length=64)
+            if self.texts.came(digest, attachment):
+                self.handler.on_definition(self, digest, now=now)
         else:
             self.handler.on_control(self, envelope, attachment, now=now)
 
@@ -564,45 +563,22 @@ class Link(Session):
         if channel.watermark > watermark:
             self._watermark_moved(channel)
 
-    def _define(self, definition: str) -> None:
-        digest = definition_hash(definition)
-        if digest and len(self.definitions) < MAX_DEFINITIONS:
-            self.definitions.setdefault(digest, definition)
-
-    def _send_definition(self, digest: str, now: float) -> None:
-        definition = self.definitions.get(digest)
-        if definition is None:
-            if len(self._asked) >= MAX_PEER_DEFINITIONS:
-                raise WireError(f"{self.peer} asks for more than {MAX_PEER_DEFINITIONS} definitions that nobody has")
-            self._asked.add(digest)
-        elif digest not in self._told:
-            self._told.add(digest)
-            self.send_control({"t": "define", "dh": digest}, definition.encode(), now=now)
-
-    def _defined(self, envelope: wire.Envelope, attachment: bytes, now: float) -> None:
-        digest = wire.take_str(envelope, "dh", max_length=64)
-        try:
-            text = attachment.decode()
-        except UnicodeDecodeError as error:
-            raise WireError("a message definition is not UTF-8") from error
-        if definition_hash(text) != digest:
-            raise WireError("a message definition does not match its hash")
-        if digest not in self._needed:
-            raise WireError(f"{self.peer} defines {digest}, which it was not asked for")
-        self._needed.discard(digest)
-        if digest not in self.definitions:
-            self._peer_definitions += 1
-            self._peer_definition_bytes += len(attachment)
-            if self._peer_definitions > MAX_PEER_DEFINITIONS or self._peer_definition_bytes > MAX_PEER_DEFINITION_BYTES:
-                raise WireError(f"{self.peer} sends more definitions than {MAX_PEER_DEFINITION_BYTES} bytes")
-            self._define(text)
-            self.handler.on_definition(self, digest, now=now)
+    def _define(self, digest: str, text: str | None, now: float) -> None:
+        if text is not None and self.established:
+            self.send_control({"t": "define", "dh": digest}, text.encode(), now=now)
 
     def definition_known(self, digest: str, *, now: float) -> None:
         """A text arrived from elsewhere: pass it on if this peer is waiting for it."""
-        if digest in self._asked and self.established:
-            self._asked.discard(digest)
-            self._send_definition(digest, now)
+        self._define(digest, self.texts.known(digest), now)
+
+    def close_streams(self) -> None:
+        """The link is given up: its incoming streams are gone for good."""
+        for stream in self.streams.values():
+            stream.close()
+        self.streams.clear()
+        self.incoming.clear()
+        self._missing.clear()
+        self.texts.close()
 
     @property
     def now(self) -> float:
@@ -657,4 +633,10 @@ class Link(Session):
             lane.flight.validate(check)
         self.scheduler.validate()
         check(len(self.by_stream) == len(self.channels), "channel tables differ")
+        self.texts.validate()
         check(self._watermarks.keys() <= self.incoming.keys(), "watermarks of streams that are gone")
+
+
+def _digest(stream: StreamInfo) -> str:
+    """What the stream's definition is called; empty for none."""
+    return stream.attributes.get("definition") or definition_hash(stream.info.definition)
