@@ -29,6 +29,8 @@ CLIENT_ENTRIES: Final = 4_096
 """Clients whose compiled patterns are remembered; clients are bounded by the key directory anyway."""
 MAX_PATTERN_COST: Final = 8 * NAME_MAX_CHARS**3
 """Ways a peer's pattern may split a name of NAME_MAX_CHARS: three `.*` and a few alternatives."""
+DEFAULT_QUEUE_BYTES: Final = 128 * 2**20
+"""What may wait for one client at the relay: four reliable topics that are full at their origins."""
 DEFAULT_BURST_S: Final = 1.0
 """Seconds of its rate that a client may use at once."""
 
@@ -54,7 +56,7 @@ class AccessRule:
     replay: tuple[str, ...] | None = None
     max_bytes_per_s: float | None = None
     max_rate_hz: float | None = None
-    max_queue_bytes: int | None = None
+    max_queue_bytes: int | None = DEFAULT_QUEUE_BYTES
 
 
 class ClientLimits(NamedTuple):
@@ -62,7 +64,7 @@ class ClientLimits(NamedTuple):
 
     max_bytes_per_s: float | None = None
     max_rate_hz: float | None = None
-    max_queue_bytes: int | None = None
+    max_queue_bytes: int | None = DEFAULT_QUEUE_BYTES
 
 
 class LostAccess(NamedTuple):

@@ -482,10 +482,10 @@ class Hub(LocalStreams):
 
     def _submit(self, link: Link, channel: OutChannel, message: Message, now: float) -> None:
         bound = self._bounds.get(link.peer)
-        if bound is None or message.tombstone or bound.admit(link, channel, message, now=now):
+        if bound is None:
             link.submit(channel, message, now=now, forced=True)
         else:
-            link.reject(channel, message, DropReason.QUEUE_FULL, now=now)
+            bound.submit(link, channel, message, now=now)
 
     def on_in_drop(self, link: Link, stream: InStream, reason: DropReason, nbytes: int) -> None:
         self.received.of(stream.stream).drop_arrived(reason)

@@ -397,6 +397,12 @@ class Link(Session):
         channel.skip_to(first)
         self._tell_gap(channel, now)
 
+    def leave_out(self, channel: OutChannel, message: Message, reason: DropReason, *, now: float) -> None:
+        """Drop a reliable message that cannot be kept at all; the peer is told where the stream goes on."""
+        self._now = now
+        channel.leave_out(message, reason)
+        self._tell_gap(channel, now)
+
     def _tell_gap(self, channel: OutChannel, now: float) -> None:
         first = channel.next_gap()
         if first is not None and self.established:

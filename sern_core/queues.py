@@ -275,6 +275,12 @@ class OutChannel:
         return self.retained_bytes + size_bytes + overhead_bytes <= self.spec.max_queue_bytes
 
     @property
+    def kept_bytes(self) -> int:
+        """`held_bytes`, and what keeping these messages takes beside their bodies."""
+        count = len(self.retained) if self.reliable else len(self.queue) + len(self.flying)
+        return self.held_bytes + MESSAGE_OVERHEAD_BYTES * count
+
+    @property
     def held_bytes(self) -> int:
         """Bytes that wait here or are under way, and would have to be sent again to a peer that has lost them."""
         return self.retained_bytes if self.reliable else self.queued_bytes + sum(o.size for o in self.flying.values())
@@ -402,8 +408,24 @@ class OutChannel:
     def skip_to(self, first: int) -> None:
         """Nothing from `next_seq` up to `first` will come; the peer is told in its turn (`next_gap`)."""
         if first > self.next_seq:
-            self.gaps.append((self.next_seq - 1, first))
+            if self.gaps and self.gaps[-1][1] == self.next_seq:  # nothing was kept since that gap
+                self.gaps[-1] = (self.gaps[-1][0], first)
+            else:
+                self.gaps.append((self.next_seq - 1, first))
             self.next_seq = first
+
+    def leave_out(self, message: Message, reason: DropReason) -> None:
+        """There is no room for this reliable message, nor for a tombstone: the stream goes on behind it."""
+        size = len(message.body)
+        self.counters.offer(size)
+        if message.seq <= self.watermark:
+            self.counters.deliver(size)
+        elif message.tombstone:
+            self.counters.drop(message.drop_reason, size)  # reported where it was dropped
+        else:
+            self.counters.drop(reason, size)
+            self.on_drop(OutMessage(message), reason)
+        self.skip_to(message.seq + 1)
 
     def start_at(self, first: int) -> None:
         """Nothing has been submitted yet: begin at seq `first` instead."""
