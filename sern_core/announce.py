@@ -226,3 +226,12 @@ def decode_want(envelope: wire.Envelope) -> Want:
         drop=tuple(wire.take_strings(envelope, "drop", max_length=64)),
         more=wire.take_bool(envelope, "more"),
     )
+
+
+def encode_dropped(channel: int, seq: int, code: int, where: str, count: int = 1) -> wire.Envelope:
+    """The envelope that says that `count` messages from `seq` on were dropped; more than one only to a peer that
+    understands runs."""
+    envelope: wire.Envelope = {"t": "dropped", "ch": channel, "seq": seq, "code": code, "to": where, "n": count}
+    if count == 1:
+        del envelope["n"]
+    return envelope

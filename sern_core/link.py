@@ -19,31 +19,22 @@ from typing import Final, Protocol
 from sern_core import wire
 from sern_core.announce import (
     Announcement,
-    Want,
     announcement_parts,
     decode_announcement,
     decode_want,
     definition_hash,
 )
+from sern_core.answering import Answering
 from sern_core.definitions import DefinitionStore, PeerDefinitions
 from sern_core.errors import RefusedError, UsageError, WireError
-from sern_core.fragments import DropReport, InStream
-from sern_core.interest import Interest
-from sern_core.lanes import Lane
+from sern_core.fragments import InStream
 from sern_core.message import Message, StreamId, StreamInfo
 from sern_core.out_message import OutMessage
 from sern_core.params import LinkParams, SchedulerParams
 from sern_core.queues import OutChannel
-from sern_core.session import Session
 from sern_core.trace import DecisionTrace, TraceEvent
-from sern_core.types import CLASS_LABELS, DROP_CODES, DROP_REASONS, ClientName, DropReason, PriorityClass
+from sern_core.types import CLASS_LABELS, DROP_REASONS, ClientName, DropReason, PriorityClass
 
-MAX_OWED: Final = 8192
-"""Names in lists that have begun and not ended, and of one stream."""
-MAX_NAMED: Final = 0x10000
-"""Price of the answers of one datagram, beside that of one for each open channel: a few bytes name many channels."""
-ANSWER_PRICE: Final = 16
-"""What an answer about an open channel costs, next to one about a channel that is closed."""
 MAX_UNHEARD: Final = 20_000
 """Control messages that a peer may have answered, beside four for each channel, before it reads an answer."""
 
@@ -92,7 +83,7 @@ class LinkHandler(Protocol):
         """A control message that is not the link's own business. Raises WireError if it is nobody's."""
 
 
-class Link(Session):
+class Link(Answering):
     """One end of one hop towards `peer`.
 
     `definitions` is shared by all links of a process. `auto_confirm`: what had its turn here
@@ -123,11 +114,8 @@ class Link(Session):
         self.streams: dict[StreamId, InStream] = {}
         """Incoming streams across sessions."""
         self._next_channel = 1
-        self._interest = Interest()
-        self._price = self._priced_us = 0  # of the answers that came at this time
         self._unheard = 0  # answers since the peer acknowledged the one of number `_unheard_seq`
         self._unheard_seq = 0
-        self._owed_parts: dict[tuple[str, int], tuple[str, ...]] = {}  # by message and channel: more will come
         self._announcing: deque[tuple[int, OutChannel]] = deque()  # may send once that control message is on its way
         self._missing: dict[StreamId, float] = {}  # not announced by a new peer, and since when
         super().__init__(
@@ -146,14 +134,15 @@ class Link(Session):
         self.texts.peer = self.peer
         self.texts.begin()
         self._unheard = self._unheard_seq = 0
-        self._interest.begin()
-        self._unsaid = False
+        self._begin_answers()
         self._announcing.clear()
-        self._owed_parts.clear()
         self.handler.on_up(self, resumed=resumed, now=now)
         for channel in list(self.channels.values()):
             self._announce(channel, now)
         self.send_control({"t": "synced", "batch": True}, now=now)
+
+    def _heard_of(self, channel: OutChannel, now: float) -> None:
+        self.handler.on_wanted(self, channel, now=now)
 
     def _session_ended(self, reason: str, now: float) -> None:
         self.handler.on_down(self, reason, now=now)
@@ -261,51 +250,12 @@ class Link(Session):
         self.dirty = True
         return seq
 
-    def report_drop(self, stream: InStream, seq: int, reason: DropReason, where: str, *, now: float) -> None:
-        """Tell the origin's side that a reliable message was dropped here or further on: before the watermark passes
-        it, and again in the next session until it is known there."""
-        report = DropReport(seq, reason, where)
-        stream.reports.append(report)
-        self._send_report(stream, report, now)
-
-    def _send_report(self, stream: InStream, report: DropReport, now: float) -> None:
-        if stream.channel_id is not None:
-            code = DROP_CODES[report.reason]
-            envelope = {"t": "dropped", "ch": stream.channel_id, "seq": report.seq, "code": code, "to": report.where}
-            report.control_seq = self.send_control(envelope, now=now)
-
     # --- streams in -----------------------------------------------------------------------------------------------
-
-    def answer(self, stream: InStream, wanted: bool, *, now: float, owed: tuple[str, ...] = ()) -> None:
-        """Tell the peer, if it does not know, whether its stream is wanted; `owed` names the clients that must get a
-        reliable one."""
-        if not stream.reliable:
-            owed = ()
-        if not self.established or stream.channel_id is None:
-            stream.wanted = wanted
-            stream.paused = stream.paused or not wanted
-            stream.pause_seq = 0
-        elif self._interest.answer(stream.channel_id, stream, wanted, owed, now=now):
-            self._unsaid = self.dirty = True
-
-    def _say_interest(self, now: float) -> None:
-        control = self._control
-        self._interest.tell(
-            lambda envelope: self.send_control(envelope, now=now),
-            heard=control.watermark,
-            unheard=len(control.retained),
-            now=now,
-        )
-        self._unsaid = bool(self._interest)
-
-    def _data_deadline(self, lane: Lane) -> float:
-        deadline_s = super()._data_deadline(lane)
-        return min(deadline_s, self._interest.deadline_s) if self._unsaid else deadline_s
 
     def refuse(self, stream: InStream, code: str, text: str, *, now: float) -> None:
         """Take back what `on_announce` allowed (an access rule changed)."""
         if self.established and stream.channel_id is not None:
-            self._interest.forget(stream.channel_id)
+            self._forget_answers(stream)
             self.send_control({"t": "refuse", "ch": stream.channel_id, "code": code, "why": text[:400]}, now=now)
 
     def _announced(self, announcement: Announcement, now: float) -> None:
@@ -324,11 +274,9 @@ class Link(Session):
                 replaced.close()
             self.streams[identity] = stream
         self._missing.pop(identity, None)
-        self._interest.forget(slot)  # every announcement waits for an answer
         stream.channel_id = slot
         self.incoming[slot] = stream
-        for report in stream.reports:
-            self._send_report(stream, report, now)
+        self._expect_answer(stream, slot)
         digest = announcement.definition_hash
         self.texts.use_incoming(identity, digest)
         if digest:
@@ -340,7 +288,7 @@ class Link(Session):
         except RefusedError as refusal:
             del self.incoming[slot]
             del self.streams[identity]
-            self._interest.forget(slot)
+            self._forget_answers(stream)
             self.texts.use_incoming(identity, "")
             self._watermarks.pop(slot, None)
             stream.channel_id = None
@@ -430,7 +378,7 @@ class Link(Session):
         if stream.channel_id is not None:
             self.incoming.pop(stream.channel_id, None)
             self._watermarks.pop(stream.channel_id, None)
-            self._interest.forget(stream.channel_id)
+        self._forget_answers(stream)
         self.handler.on_retract(self, stream, now=now)
         stream.close()
         stream.channel_id = None
@@ -500,59 +448,11 @@ class Link(Session):
         else:
             self.handler.on_control(self, envelope, attachment, now=now)
 
-    def _owed_so_far(self, key: tuple[str, int], names: tuple[str, ...], *, more: bool) -> tuple[str, ...] | None:
-        """The names of a list that travels in parts, once it is complete."""
-        if more:
-            if sum(map(len, self._owed_parts.values())) + len(names) > MAX_OWED:
-                raise WireError(f"{self.peer} leaves lists of more than {MAX_OWED} names unfinished")
-            self._owed_parts[key] = self._owed_parts.get(key, ()) + names
-            return None
-        return self._owed_parts.pop(key, ()) + names
-
-    def _answers(self, want: Want, now: float) -> None:
-        """The peer has said whether it wants streams of ours."""
-        first = want.runs[0][0]
-        if want.more:
-            self._owed_so_far(("want", first), want.owed or (), more=True)
-            return
-        owed = None if want.owed is None else self._owed_so_far(("want", first), want.owed, more=False)
-        for first, last in want.runs:
-            self._charge(last - first + 1, now)
-            for slot in range(first, last + 1):
-                channel = self.channels.get(slot)
-                if channel is not None:  # else closed meanwhile
-                    self._charge(ANSWER_PRICE, now)
-                    self._answer_came(channel, want, owed, now)
-
-    def _charge(self, price: int, now: float) -> None:
-        """Raises WireError if the peer answers more in one datagram than there is to be answered."""
-        now_us = int(now * 1e6)
-        if now_us != self._priced_us:
-            self._price, self._priced_us = 0, now_us
-        self._price += price
-        if self._price > MAX_NAMED + 2 * ANSWER_PRICE * len(self.channels):
-            raise WireError(f"{self.peer} answers the announcements of {len(self.channels)} channels again and again")
-
-    def _answer_came(self, channel: OutChannel, want: Want, owed: tuple[str, ...] | None, now: float) -> None:
-        if owed is None:
-            names = dict.fromkeys(channel.owed) | dict.fromkeys(want.add)
-            for name in want.drop:
-                names.pop(name, None)
-            owed = tuple(names)
-            if len(owed) > MAX_OWED:
-                raise WireError(f"{self.peer} owes a stream to more than {MAX_OWED} names")
-        channel.owed = owed
-        if want.on and channel.wanted is False and channel.reliable:
-            self.send_control({"t": "first", "ch": channel.slot, "seq": channel.first_seq}, now=now)
-        self._set_wanted(channel, want.on, now)
-        channel.ready = True
-        self._refresh(channel, now)
-        self.handler.on_wanted(self, channel, now=now)
-
     def _about_channel(self, kind: str, channel: OutChannel, envelope: wire.Envelope, now: float) -> None:
         if kind == "dropped":
             reason = DROP_REASONS.get(wire.take_int(envelope, "code"), DropReason.LOST)
-            channel.reported(wire.take_int(envelope, "seq"), reason)
+            count = wire.take_int(envelope, "n", low=1, high=wire.MAX_SEQ, default=1)
+            channel.reported(wire.take_int(envelope, "seq"), reason, count)
         else:
             code, why = wire.take_str(envelope, "code", max_length=64), wire.take_str(envelope, "why")
             self._set_wanted(
@@ -560,14 +460,6 @@ class Link(Session):
             )
             self._refresh(channel, now)
             self.handler.on_refused(self, channel, code, why, now=now)
-
-    def _set_wanted(
-        self, channel: OutChannel, wanted: bool, now: float, *, reason: DropReason = DropReason.UNWANTED
-    ) -> None:
-        watermark = channel.watermark
-        channel.set_wanted(wanted, reason)
-        if channel.watermark > watermark:
-            self._watermark_moved(channel)
 
     def _define(self, digest: str, text: str | None, now: float) -> None:
         if text is not None and self.established:

@@ -453,15 +453,15 @@ class OutChannel:
             if out in self.active:
                 self.active.remove(out)
 
-    def reported(self, seq: int, reason: DropReason) -> None:
-        """A later hop dropped `seq` and said so, before its watermark passed it."""
+    def reported(self, seq: int, reason: DropReason, count: int = 1) -> None:
+        """A later hop dropped `count` messages from `seq` on and said so, before its watermark passed them."""
         for out in self.retained:
-            if out.seq == seq:
-                if not out.counted:
-                    self.counters.drop(reason, out.offered_bytes)
-                    out.counted = True
-                    self.on_drop(out, reason)
-                return
+            if out.seq >= seq + count:
+                break
+            if out.seq >= seq and not out.counted:
+                self.counters.drop(reason, out.offered_bytes)
+                out.counted = True
+                self.on_drop(out, reason)
 
     def sweep(self, now: float, *, up: bool) -> None:
         """Expire what nobody will send: lifespan and retention, also while the link is down."""

@@ -317,6 +317,11 @@ def valid() -> list[Vector]:
         _control("need", "asks for a definition", {"t": "need", "dh": digest}),
         _control("define", "the definition, packed with zlib", {"t": "define", "dh": digest}, DEFINITION),
         _control(
+            "dropped-run",
+            "a later hop gave up seq 41, 42 and 43 of channel 3",
+            {"t": "dropped", "ch": 3, "seq": 41, "code": DROP_CODES[DropReason.QUEUE_FULL], "to": "site1", "n": 3},
+        ),
+        _control(
             "dropped",
             "a later hop gave up seq 41 of channel 3",
             {"t": "dropped", "ch": 3, "seq": 41, "code": DROP_CODES[DropReason.RETENTION], "to": "site1"},
