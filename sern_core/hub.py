@@ -526,7 +526,7 @@ class Hub(LocalStreams):
             self._subscribe(link.peer, envelope, now)
         elif kind == "object":
             try:
-                apply_object(self.objects, link.peer, envelope, attachment, now=now)
+                apply_object(self.objects, self.access, link.peer, envelope, attachment, now=now)
             except RefusedError as refusal:
                 self.events.refused(link.peer, refusal.code, str(refusal))
         elif kind == "lane_ask":
