@@ -217,6 +217,15 @@ class RateGuard:
     def of(cls, limits: ClientLimits, *, now: float) -> "RateGuard":
         return cls(max_bytes_per_s=limits.max_bytes_per_s, max_rate_hz=limits.max_rate_hz, now=now)
 
+    def holds(self, limits: ClientLimits) -> bool:
+        """Whether these are its rates."""
+        rates = (limits.max_bytes_per_s, limits.max_rate_hz)
+        return tuple(math.inf if rate is None else rate for rate in rates) == (self._bytes_per_s, self._rate_hz)
+
+    def full(self, now: float) -> bool:
+        """Whether it is as good as a new one."""
+        return self._filled(now) == (self._messages_full, self._bytes_full)
+
     def admit(self, size_bytes: int, *, now: float) -> bool:
         """Take the tokens of one message, or take none and say no."""
         messages, tokens_bytes = self._filled(now)

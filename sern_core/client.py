@@ -17,6 +17,7 @@ from sern_core.fragments import InStream
 from sern_core.ledger import MAX_TOPICS, ReceiveLedger
 from sern_core.link import Link
 from sern_core.message import Message, StreamId, StreamInfo, TopicInfo, TopicSpec
+from sern_core.numbering import Numbering
 from sern_core.out_message import OutMessage
 from sern_core.params import LinkParams, SchedulerParams
 from sern_core.queues import OutChannel
@@ -101,7 +102,7 @@ class ClientCore:
         self.patterns: tuple[str, ...] = ()
         self.attributes: dict[str, str] = {}
         """Metadata of this node, for the object registry."""
-        self._generations: dict[StreamId, int] = {}
+        self._numbering = Numbering()  # of topics that were offered before
         self._latched: dict[StreamId, LatchedCache] = {}  # for a relay that comes back with nothing
         self._open: set[StreamId] = set()
         self._undecodable: set[TopicName] = set()
@@ -122,8 +123,14 @@ class ClientCore:
             now=now,
             lossless=lossless,
         )
+        self.link.on_tidy = self._tidy
         if coder is not None:
             self.link.encode_with(coder)
+
+    def _tidy(self, now: float) -> None:
+        """Fold the counters of topics that ended long ago, and forget their numbers."""
+        self.received.tidy({stream.topic for stream in self.link.streams}, now=now)
+        self._numbering.tidy(now=now)
 
     # --- publishing -----------------------------------------------------------------------------------------------
 
@@ -143,7 +150,7 @@ class ClientCore:
         Raises UsageError if it is offered already, or no relay would accept it.
         """
         identity = StreamId(self.name, self.boot, info.name)
-        first = self._generations.get(identity, 0) + 1
+        first = self._numbering.last(identity) + 1
         stream = StreamInfo(identity, info, spec, dict(attributes or {}))
         check_stream(stream)
         channel = self.link.open_channel(stream, first=first, owed=owed, now=now)
@@ -152,7 +159,7 @@ class ClientCore:
         return channel
 
     def unpublish(self, channel: OutChannel, *, now: float) -> None:
-        self._generations[channel.stream.id] = channel.next_seq - 1
+        self._numbering.ended(channel.stream.id, channel.next_seq - 1, now=now)
         self._latched.pop(channel.stream.id, None)
         self.link.close_channel(channel, DropReason.SHUTDOWN, now=now)
 

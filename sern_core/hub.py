@@ -26,7 +26,7 @@ from sern_core.hub_local import LocalStreams
 from sern_core.hub_port import HubPort
 from sern_core.lanes import LANE_EXPRESS
 from sern_core.ledger import ReceiveLedger
-from sern_core.link import Link
+from sern_core.link import TIDY_S, Link
 from sern_core.message import Message, StreamId, StreamInfo
 from sern_core.object_control import apply_object
 from sern_core.objects import ObjectRegistry
@@ -43,6 +43,8 @@ MAX_SUBSCRIPTION_PARTS: Final = 64
 ORPHAN_S: Final = 60.0
 """A session whose TCP connection is gone and whose datagram lane says nothing for so long has ended: longer than any
 blackout that is worth waiting for with keys in hand."""
+MAX_AWAITED_CLIENTS: Final = 1024
+"""Clients that have not come back yet and are waited for."""
 MAX_AWAITED_TOPICS: Final = 2048
 """Streams held for one client that has not come back yet; origins name them, so there must be an end to it."""
 MAX_DENIED: Final = 64
@@ -103,6 +105,7 @@ class Hub(LocalStreams):
         self._heard: set[ClientName] = set()  # said what they want, to this run of the relay
         self._absent_since: dict[ClientName, float] = {}
         self._draining: list[tuple[Link, OutChannel]] = []  # streams that ended with reliable messages still owed
+        self._tidy_due_s = now + TIDY_S
         self.tap: Callable[[StreamInfo], bool] = lambda _stream: False
         """Whether the relay itself wants a stream (a subscriber of the feed); set by the shell."""
 
@@ -145,7 +148,9 @@ class Hub(LocalStreams):
     def _limit(self, client: ClientName, now: float) -> None:
         """Put the limits of the access rules in force."""
         limits = self.access.limits(client)
-        self._guards[client] = RateGuard.of(limits, now=now)
+        guard = self._guards.get(client)
+        if guard is None or not guard.holds(limits):  # else what it has used up stays used up
+            self._guards[client] = RateGuard.of(limits, now=now)
         if limits.max_queue_bytes is None:
             self._bounds.pop(client, None)
         else:
@@ -169,6 +174,15 @@ class Hub(LocalStreams):
                 waiting_s = link.lane.flight.waiting_since_s
                 if link.lane.stalled and waiting_s is not None and now - waiting_s > ORPHAN_S:
                     link.close_lane(now=now)
+        for link in list(self.links.values()):
+            if link.deaf:
+                link.close("it does not read what it is told", now=now)
+        for client in [client for client in self._guards.keys() - self.links.keys() if self._guards[client].full(now)]:
+            del self._guards[client]  # by name, over sessions: one that comes back at once has no new burst
+        if now >= self._tidy_due_s:
+            self._tidy_due_s = now + TIDY_S
+            self.received.tidy({identity.topic for identity in self.relayed}, now=now)
+            self._numbering.tidy(now=now)
         for link, channel in list(self._draining):
             if not channel.retained or not channel.reliable:
                 self._draining.remove((link, channel))
@@ -211,7 +225,6 @@ class Hub(LocalStreams):
         self._absent_since.pop(client, None)
         self._awaited.pop(client, None)
         self._heard.discard(client)
-        self._guards.pop(client, None)
         self._bounds.pop(client, None)
         self.objects.delete_owned(client)
 
@@ -311,7 +324,7 @@ class Hub(LocalStreams):
         if relayed.cache is not None:
             self.replays.close(relayed.cache)
         if relayed.source is None:
-            self._closed_local(relayed)
+            self._closed_local(relayed, now)
         for link, channel in relayed.outs.values():
             if channel.reliable and channel.retained:
                 self._draining.append((link, channel))
@@ -334,6 +347,7 @@ class Hub(LocalStreams):
 
     def on_up(self, link: Link, *, resumed: bool, now: float) -> None:
         self._absent_since.pop(link.peer, None)
+        self._subscriptions.pop(link.peer, None)  # half of one that was said in an earlier session
         if not resumed:
             for relayed in self.relayed.values():
                 if link.peer in relayed.outs:
@@ -427,6 +441,8 @@ class Hub(LocalStreams):
             client = ClientName(text)
             # Connected is not enough: it may not have come to say what it wants yet.
             if client in self._heard or client == identity.origin or not self.known(client):
+                continue
+            if client not in self.links and len(self._awaited) >= MAX_AWAITED_CLIENTS:
                 continue
             self._link(client, now)
             topics = self._awaited.setdefault(client, set())

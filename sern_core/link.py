@@ -35,6 +35,10 @@ from sern_core.queues import OutChannel
 from sern_core.trace import DecisionTrace, TraceEvent
 from sern_core.types import CLASS_LABELS, DROP_REASONS, ClientName, DropReason, PriorityClass
 
+TIDY_S: Final = 60.0
+MAX_TOLD_BYTES: Final = 4 * 2**20
+MAX_TOLD_CHANNEL_BYTES: Final = 1024
+"""Control messages that may wait for a peer, beside so much for each channel: more than any leaves that reads."""
 MAX_UNHEARD: Final = 20_000
 """Control messages that a peer may have answered, beside four for each channel, before it reads an answer."""
 
@@ -113,6 +117,9 @@ class Link(Answering):
         self.by_stream: dict[StreamId, OutChannel] = {}
         self.streams: dict[StreamId, InStream] = {}
         """Incoming streams across sessions."""
+        self.on_tidy: Callable[[float], None] | None = None
+        """Called now and then, with the time, for the owner to let go of what nobody needs any more."""
+        self._tidy_due_s = now + TIDY_S
         self._next_channel = 1
         self._unheard = 0  # answers since the peer acknowledged the one of number `_unheard_seq`
         self._unheard_seq = 0
@@ -385,6 +392,11 @@ class Link(Answering):
 
     def _sweep(self, now: float) -> None:
         super()._sweep(now)
+        if now >= self._tidy_due_s:
+            self._tidy_due_s = now + TIDY_S
+            self.ledger.tidy({channel.counters.topic for channel in self.channels.values()}, now=now)
+            if self.on_tidy is not None:
+                self.on_tidy(now)
         if self.established:
             for stream in self.streams.values():
                 stream.sweep(now, self._up_since_s)
@@ -482,6 +494,11 @@ class Link(Answering):
     def now(self) -> float:
         """The time of the call under way, for handlers that are told without it."""
         return self._now
+
+    @property
+    def deaf(self) -> bool:
+        """Whether more waits to be told than any peer leaves behind that reads what it is told."""
+        return self._control.retained_bytes > MAX_TOLD_BYTES + MAX_TOLD_CHANNEL_BYTES * len(self.channels)
 
     # --- views ------------------------------------------------------------------------------------------------------
 
