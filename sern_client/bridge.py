@@ -23,6 +23,7 @@ from sern_core import wire
 from sern_core.client import ClientCore
 from sern_core.errors import ConfigError, UsageError
 from sern_core.lease import CommandLease
+from sern_core.ledger import MAX_TOPICS, OTHER_TOPIC
 from sern_core.message import Message, StreamId, StreamInfo, TopicInfo
 from sern_core.queues import OutChannel
 from sern_core.rules import Discovery, ResolvedTopic, RuleSet, to_global
@@ -376,7 +377,9 @@ class Bridge:
         deadline_s = stream.spec.deadline_s
         if last_s is not None and deadline_s is not None and now - last_s > deadline_s:
             topic = stream.id.topic
-            self.deadlines_missed[topic] = self.deadlines_missed.get(topic, 0) + 1
+            known = topic in self.deadlines_missed or len(self.deadlines_missed) < MAX_TOPICS
+            counted = topic if known else OTHER_TOPIC
+            self.deadlines_missed[counted] = self.deadlines_missed.get(counted, 0) + 1
             _log.warning("%s: %.3f s between messages, deadline %.3f s", topic, now - last_s, deadline_s)
 
     def expired(self, stream: StreamInfo, seq: int, reason: DropReason) -> None:

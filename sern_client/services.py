@@ -20,6 +20,7 @@ from sern_client.actions import cancel_request, refusal
 from sern_client.endpoints.base import ServiceEndpoint, ServiceInfo, ServiceServer
 from sern_core.client import ClientCore
 from sern_core.errors import ConfigError, ServiceError, UsageError
+from sern_core.ledger import MAX_TOPICS, OTHER_TOPIC
 from sern_core.message import Message, StreamId, StreamInfo, TopicInfo, TopicSpec
 from sern_core.queues import OutChannel
 from sern_core.rules import to_global, to_local
@@ -300,7 +301,8 @@ class ServiceBridge:
             outcome = "error"
             raise
         finally:
-            self.outcomes[used.name, outcome] += 1
+            known = (used.name, outcome) in self.outcomes or len(self.outcomes) < MAX_TOPICS
+            self.outcomes[used.name if known else OTHER_TOPIC, outcome] += 1
         return response
 
     async def _ask(self, used: _Used, request: bytes) -> bytes:

@@ -29,6 +29,8 @@ CLIENT_ENTRIES: Final = 4_096
 """Clients whose compiled patterns are remembered; clients are bounded by the key directory anyway."""
 MAX_PATTERN_COST: Final = 8 * NAME_MAX_CHARS**3
 """Ways a peer's pattern may split a name of NAME_MAX_CHARS: three `.*` and a few alternatives."""
+DEFAULT_QUEUE_BYTES: Final = 128 * 2**20
+"""What may wait for one client at the relay: four reliable topics that are full at their origins."""
 DEFAULT_BURST_S: Final = 1.0
 """Seconds of its rate that a client may use at once."""
 
@@ -54,7 +56,7 @@ class AccessRule:
     replay: tuple[str, ...] | None = None
     max_bytes_per_s: float | None = None
     max_rate_hz: float | None = None
-    max_queue_bytes: int | None = None
+    max_queue_bytes: int | None = DEFAULT_QUEUE_BYTES
 
 
 class ClientLimits(NamedTuple):
@@ -62,7 +64,7 @@ class ClientLimits(NamedTuple):
 
     max_bytes_per_s: float | None = None
     max_rate_hz: float | None = None
-    max_queue_bytes: int | None = None
+    max_queue_bytes: int | None = DEFAULT_QUEUE_BYTES
 
 
 class LostAccess(NamedTuple):
@@ -214,6 +216,15 @@ class RateGuard:
     @classmethod
     def of(cls, limits: ClientLimits, *, now: float) -> "RateGuard":
         return cls(max_bytes_per_s=limits.max_bytes_per_s, max_rate_hz=limits.max_rate_hz, now=now)
+
+    def holds(self, limits: ClientLimits) -> bool:
+        """Whether these are its rates."""
+        rates = (limits.max_bytes_per_s, limits.max_rate_hz)
+        return tuple(math.inf if rate is None else rate for rate in rates) == (self._bytes_per_s, self._rate_hz)
+
+    def full(self, now: float) -> bool:
+        """Whether it is as good as a new one."""
+        return self._filled(now) == (self._messages_full, self._bytes_full)
 
     def admit(self, size_bytes: int, *, now: float) -> bool:
         """Take the tokens of one message, or take none and say no."""

@@ -6,6 +6,7 @@ announcement names the hash, the receiver asks with `need` if it lacks the text,
 
 import hashlib
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -159,3 +160,78 @@ def decode_announcement(envelope: wire.Envelope) -> Announcement:
         owed=tuple(wire.take_strings(envelope, "owed", max_length=64)),
         more=wire.take_bool(envelope, "more"),
     )
+
+
+@dataclass(frozen=True, slots=True)
+class Want:
+    """Whether streams are wanted. `runs`: first and last of the channels it is said of, rising. `owed`: who is to get
+    them if they are reliable; None: `add` and `drop` are the difference to what was said before. `more`: only `owed`
+    counts, and goes on in another part."""
+
+    runs: tuple[tuple[int, int], ...]
+    on: bool
+    owed: tuple[str, ...] | None
+    add: tuple[str, ...]
+    drop: tuple[str, ...]
+    more: bool
+
+
+def encode_want(
+    slots: Sequence[int],
+    on: bool,
+    *,
+    owed: Sequence[str] = (),
+    add: Sequence[str] | None = None,
+    drop: Sequence[str] | None = None,
+    more: bool = False,
+) -> wire.Envelope:
+    """The envelope that says the same of rising `slots`: the first, and runs of the others. A peer that knows neither
+    `chs` nor differences is told each channel by itself, and whole lists."""
+    runs: list[int] = []
+    for slot in slots[1:]:
+        if runs and slot == runs[-1] + 1:
+            runs[-1] = slot
+        else:
+            runs += [slot, slot]
+    envelope: wire.Envelope = {
+        "t": "want",
+        "ch": slots[0],
+        "on": on,
+        "chs": runs or None,
+        "owed": list(owed) or None,
+        "add": None if add is None else list(add),
+        "drop": list(drop) if drop else None,
+        "more": more or None,
+    }
+    return {key: value for key, value in envelope.items() if value is not None}
+
+
+def decode_want(envelope: wire.Envelope) -> Want:
+    """Raises WireError for anything that is not a sane answer."""
+    first = wire.take_int(envelope, "ch", high=0xFFFF)
+    ends = envelope.get("chs", [])
+    if not isinstance(ends, list) or len(ends) % 2 or not all(type(end) is int for end in ends):
+        raise WireError("envelope key 'chs' must be a list of pairs of channels")
+    runs = [(first, first)]
+    for low, high in zip(ends[::2], ends[1::2], strict=True):
+        if not runs[-1][1] < low <= high <= 0xFFFF:
+            raise WireError("the channels of an answer must rise")
+        runs.append((low, high))
+    difference = "add" in envelope or "drop" in envelope
+    return Want(
+        runs=tuple(runs),
+        on=wire.take_bool(envelope, "on"),
+        owed=None if difference else tuple(wire.take_strings(envelope, "owed", max_length=64)),
+        add=tuple(wire.take_strings(envelope, "add", max_length=64)),
+        drop=tuple(wire.take_strings(envelope, "drop", max_length=64)),
+        more=wire.take_bool(envelope, "more"),
+    )
+
+
+def encode_dropped(channel: int, seq: int, code: int, where: str, count: int = 1) -> wire.Envelope:
+    """The envelope that says that `count` messages from `seq` on were dropped; more than one only to a peer that
+    understands runs."""
+    envelope: wire.Envelope = {"t": "dropped", "ch": channel, "seq": seq, "code": code, "to": where, "n": count}
+    if count == 1:
+        del envelope["n"]
+    return envelope

@@ -1,10 +1,10 @@
 """The bound of what may wait for one client at the relay (`access.max_queue_bytes`).
 
-Counted is what the client's link holds: queued or under way, of reliable streams all that is not confirmed. When a
-message would exceed the bound, what waits makes room, the lowest class first: best effort oldest first, then, only for
-a message of a more urgent class, reliable ones newest first; never what has begun transmission, and nothing that is
-more urgent than the message. If that is not enough, the message itself is dropped. Every loss is counted as
-`queue_full`, and of a reliable stream the origin is told.
+Counted is what the client's link holds: queued or under way, of reliable streams all that is not confirmed, and for
+each message `MESSAGE_OVERHEAD_BYTES` beside its body. When a message would exceed the bound, what waits makes room, the
+lowest class first: best effort oldest first, then, only for a message of a more urgent class, reliable ones newest
+first; never what has begun transmission, and nothing that is more urgent than the message. If that is not enough, the
+message itself is dropped. Every loss is counted as `queue_full`, and of a reliable stream the origin is told.
 """
 
 import math
@@ -12,38 +12,63 @@ from typing import Final
 
 from sern_core.link import Link
 from sern_core.message import Message
-from sern_core.queues import OutChannel
+from sern_core.queues import MESSAGE_OVERHEAD_BYTES, OutChannel
 from sern_core.types import CLASSES, DropReason
 
 UNKNOWN: Final = math.inf
+FULL_S: Final = 0.01
+"""A message that found no room speaks so long for those of its size and class that come after it: adding up what a link
+holds is too dear to be done for each."""
+TOMBSTONE_BYTES: Final = 1 + MESSAGE_OVERHEAD_BYTES
 
 
 class QueueBound:
-    """Keeps one link below `max_bytes`. Ask `admit` before every message that is submitted to the link."""
+    """Keeps one link below `max_bytes`. Hand every message that is for the link to `submit`."""
 
-    __slots__ = ("_at_most_bytes", "max_bytes")
+    __slots__ = ("_at_most_bytes", "_full_bytes", "_full_until_s", "max_bytes")
 
     def __init__(self, max_bytes: int) -> None:
         self.max_bytes = max_bytes
         self._at_most_bytes = UNKNOWN  # an upper bound of what is held: adding up is only needed when that is too much
+        self._full_until_s = [-UNKNOWN] * len(CLASSES)
+        self._full_bytes = [0] * len(CLASSES)  # messages of this size found no room, by class
 
     def recount(self) -> None:
         """Messages have come to the link in another way (replays)."""
         self._at_most_bytes = UNKNOWN
 
-    def admit(self, link: Link, channel: OutChannel, message: Message, *, now: float) -> bool:
-        """Make room for `message` of `channel`. False: there is none, and the caller drops it as `queue_full`."""
-        size = len(message.body)
+    def submit(self, link: Link, channel: OutChannel, message: Message, *, now: float) -> None:
+        """Make room for `message` of `channel` and submit it; without room it is dropped as `queue_full`. A reliable
+        one leaves a tombstone if there is room for that, else a gap."""
+        size = len(message.body) + MESSAGE_OVERHEAD_BYTES
         if self._at_most_bytes + size <= self.max_bytes:
             self._at_most_bytes += size
-            return True
-        excess_bytes = sum(other.held_bytes for other in link.channels.values()) + size - self.max_bytes
+            link.submit(channel, message, now=now, forced=True)
+        elif self._makes_room(link, channel, size, now, shed=not message.tombstone):
+            link.submit(channel, message, now=now, forced=True)
+        elif not channel.reliable or (
+            not message.tombstone and self._makes_room(link, channel, TOMBSTONE_BYTES, now, shed=False)
+        ):
+            link.reject(channel, message, DropReason.QUEUE_FULL, now=now)
+        else:
+            link.leave_out(channel, message, DropReason.QUEUE_FULL, now=now)
+
+    def _makes_room(self, link: Link, channel: OutChannel, size: int, now: float, *, shed: bool) -> bool:
+        priority = channel.spec.priority
+        if now < self._full_until_s[priority] and size >= self._full_bytes[priority]:
+            return False
+        excess_bytes = sum(other.kept_bytes for other in link.channels.values()) + size - self.max_bytes
         if channel.coalesced and channel.queue:
-            excess_bytes -= channel.queue[0].size  # the message takes its place
-        if excess_bytes > 0:
+            excess_bytes -= channel.queue[0].size + MESSAGE_OVERHEAD_BYTES  # the message takes its place
+        if excess_bytes > 0 and shed:
             excess_bytes = _shed(link, channel, excess_bytes, now)
-        self._at_most_bytes = UNKNOWN if excess_bytes > 0 else self.max_bytes + excess_bytes
-        return excess_bytes <= 0
+        if excess_bytes <= 0:
+            self._at_most_bytes = self.max_bytes + excess_bytes
+            return True
+        self._at_most_bytes = UNKNOWN
+        self._full_until_s[priority] = now + FULL_S
+        self._full_bytes[priority] = size
+        return False
 
 
 def _shed(link: Link, incoming: OutChannel, excess_bytes: int, now: float) -> int:
@@ -59,5 +84,5 @@ def _shed(link: Link, incoming: OutChannel, excess_bytes: int, now: float) -> in
             chosen = sorted((c for c in rows if c.reliable is reliable), key=lambda c: (-c.queued_bytes, c.slot))
             for channel in chosen:
                 while excess_bytes > 0 and (freed_bytes := link.shed(channel, DropReason.QUEUE_FULL, now=now)):
-                    excess_bytes -= freed_bytes
+                    excess_bytes -= freed_bytes + (0 if reliable else MESSAGE_OVERHEAD_BYTES)
     return excess_bytes

@@ -12,11 +12,13 @@ from sern_core import wire
 from sern_core.announce import MAX_STRINGS, Announcement, check_stream
 from sern_core.codecs import CodecProfile, Coder, Compression
 from sern_core.decoding import Decoder
+from sern_core.definitions import DefinitionStore
 from sern_core.errors import ConfigError, WireError
 from sern_core.fragments import InStream
 from sern_core.ledger import MAX_TOPICS, ReceiveLedger
 from sern_core.link import Link
 from sern_core.message import Message, StreamId, StreamInfo, TopicInfo, TopicSpec
+from sern_core.numbering import Numbering
 from sern_core.out_message import OutMessage
 from sern_core.params import LinkParams, SchedulerParams
 from sern_core.queues import OutChannel
@@ -101,7 +103,7 @@ class ClientCore:
         self.boot = boot
         self.events = events
         self.trace = trace or DecisionTrace(enabled=False)
-        self.definitions: dict[str, str] = {}
+        self.definitions = DefinitionStore()
         self.received = ReceiveLedger()
         """Counters of what arrives, by topic: delivered, and dropped on arrival for a reason."""
         self.faults = 0
@@ -109,7 +111,7 @@ class ClientCore:
         self.patterns: tuple[str, ...] = ()
         self.attributes: dict[str, str] = {}
         """Metadata of this node, for the object registry."""
-        self._generations: dict[StreamId, int] = {}
+        self._numbering = Numbering()  # of topics that were offered before
         self._latched: dict[StreamId, LatchedCache] = {}  # for a relay that comes back with nothing
         self._open: set[StreamId] = set()
         self._undecodable: set[TopicName] = set()
@@ -130,8 +132,14 @@ class ClientCore:
             now=now,
             lossless=lossless,
         )
+        self.link.on_tidy = self._tidy
         if coder is not None:
             self.link.encode_with(coder)
+
+    def _tidy(self, now: float) -> None:
+        """Fold the counters of topics that ended long ago, and forget their numbers."""
+        self.received.tidy({stream.topic for stream in self.link.streams}, now=now)
+        self._numbering.tidy(now=now)
 
     # --- publishing -----------------------------------------------------------------------------------------------
 
@@ -151,7 +159,7 @@ class ClientCore:
         Raises UsageError if it is offered already, or no relay would accept it.
         """
         identity = StreamId(self.name, self.boot, info.name)
-        first = self._generations.get(identity, 0) + 1
+        first = self._numbering.last(identity) + 1
         stream = StreamInfo(identity, info, spec, dict(attributes or {}))
         check_stream(stream)
         channel = self.link.open_channel(stream, first=first, owed=owed, now=now)
@@ -160,7 +168,7 @@ class ClientCore:
         return channel
 
     def unpublish(self, channel: OutChannel, *, now: float) -> None:
-        self._generations[channel.stream.id] = channel.next_seq - 1
+        self._numbering.ended(channel.stream.id, channel.next_seq - 1, now=now)
         self._latched.pop(channel.stream.id, None)
         self.link.close_channel(channel, DropReason.SHUTDOWN, now=now)
 
@@ -291,7 +299,7 @@ class ClientCore:
                 info.type_name,
                 info.encoding,
                 info.type_hash,
-                self.definitions.get(digest, ""),
+                self.definitions.get(digest),
                 info.latched,
                 info.reliable,
             )

@@ -7,7 +7,9 @@ State is kept per `StreamId`, across sessions and peers: that is what makes "onc
 new process and everything is sent again.
 """
 
+from collections import deque
 from collections.abc import Callable
+from itertools import islice
 from typing import Final
 
 from sern_core.errors import WireError
@@ -25,6 +27,11 @@ MAX_SPANS: Final = 1024
 """Pieces of a half-received message: more gaps than a sender has packets in flight."""
 HELD_OVERHEAD_BYTES: Final = 512
 """What a half-received or waiting message costs beside its body: without it, small ones could fill the memory."""
+MAX_REPORTS: Final = 16_384
+"""Reports of drops that one peer has not heard of; one that goes on sending reliable messages then is not read. What is
+behind it is kept at its end."""
+MERGED_REPORTS: Final = 8
+"""Latest reports of a stream that one more drop may belong to: of so many subscribers the runs are found."""
 SEEN_BITS: Final = 64
 SEEN_MASK: Final = (1 << SEEN_BITS) - 1
 
@@ -69,11 +76,12 @@ class Partial:
 
 
 class Reassembly:
-    """Memory that half-received and waiting messages of one link may hold in all."""
+    """Memory that half-received and waiting messages of one link may hold in all, and how much is to be reported."""
 
-    __slots__ = ("held_bytes", "holders", "limit_bytes")
+    __slots__ = ("held_bytes", "holders", "limit_bytes", "reports")
 
     def __init__(self, limit_bytes: int) -> None:
+        self.reports = 0  # drop reports that the peer has not heard, of all streams
         self.limit_bytes = limit_bytes
         self.held_bytes = 0
         self.holders: dict[InStream, None] = {}  # best-effort streams with half-received messages
@@ -89,12 +97,14 @@ class Reassembly:
 
 
 class DropReport:
-    """A reliable message dropped here or further on, of which the peer must know before its watermark passes it."""
+    """Reliable messages, `count` from `seq` on, dropped here or further on, of which the peer must know before its
+    watermark passes them."""
 
-    __slots__ = ("control_seq", "reason", "seq", "where")
+    __slots__ = ("control_seq", "count", "reason", "seq", "where")
 
     def __init__(self, seq: int, reason: DropReason, where: str) -> None:
         self.seq = seq
+        self.count = 1
         self.reason = reason
         self.where = where
         self.control_seq = 0  # the control message of the session that carries it; 0: none yet
@@ -122,7 +132,7 @@ class InStream:
         self.paused = False  # it was not wanted, and the peer has not said yet where it goes on
         self.pause_seq = 0  # the control message of the session that said so
         self.known = False  # something has had its turn, or an earlier session announced it: a gap is then a gap
-        self.reports: list[DropReport] = []  # drops that the peer may not know of yet
+        self.reports: deque[DropReport] = deque()  # drops that the peer may not know of yet
         self._seen = 0  # best effort: bit i set when seq delivered-1-i arrived
         self._partials: dict[int, Partial] = {}  # best effort: untouched for longest first
         self._waiting: dict[int, Message] = {}
@@ -219,6 +229,43 @@ class InStream:
                 )
             )
 
+    def report(self, seq: int, reason: DropReason, where: str) -> None:
+        """The peer is to hear that message `seq` was dropped; runs of it are one report until it is on its way."""
+        for report in islice(reversed(self.reports), MERGED_REPORTS):
+            if report.control_seq:
+                break
+            if report.seq + report.count == seq and report.reason is reason and report.where == where:
+                report.count += 1
+                return
+        self.reports.append(DropReport(seq, reason, where))
+        self._reassembly.reports += 1
+
+    def unsaid(self, *, runs: bool) -> DropReport | None:
+        """The first report that is not on its way yet; without `runs`, of one message."""
+        for index, report in enumerate(self.reports):
+            if report.control_seq == 0:
+                if report.count > 1 and not runs:
+                    first = DropReport(report.seq, report.reason, report.where)
+                    report.seq += 1
+                    report.count -= 1
+                    self.reports.insert(index, first)
+                    self._reassembly.reports += 1
+                    return first
+                return report
+        return None
+
+    def heard(self, control_seq: int) -> bool:
+        """The peer has the control messages up to this one. Returns whether it knows of all drops."""
+        reports = self.reports
+        while reports and 0 < reports[0].control_seq <= control_seq:
+            reports.popleft()
+            self._reassembly.reports -= 1
+        return not reports
+
+    def _check_heard(self) -> None:
+        if self._reassembly.reports > MAX_REPORTS and self.channel_id is not None:  # not of the control stream
+            raise WireError(f"the peer goes on sending and does not read {self._reassembly.reports} reports of drops")
+
     def give_up(self, seq: int, reason: DropReason, nbytes: int, now: float) -> None:
         """Message `seq` cannot be taken here: best effort loses it, of a reliable stream a tombstone takes its turn."""
         self._now = now
@@ -227,6 +274,7 @@ class InStream:
         if not self.reliable:
             self._on_drop(self, reason, nbytes, 0)
             return
+        self._check_heard()
         self._on_drop(self, reason, nbytes, seq)
         self._arrived(self.tombstone(seq, reason, 0, now))
 
@@ -288,6 +336,8 @@ class InStream:
                         self._seen |= 1 << (seq - 1 - stale)  # the rest of it is no news
             self._turn(message)
             return
+        if self._reassembly.reports > MAX_REPORTS:
+            self._check_heard()
         if seq == self.delivered + 1:
             self.delivered = seq
             self._turn(message)
@@ -347,6 +397,7 @@ class InStream:
     def close(self) -> None:
         """The stream ends."""
         self.forget(DropReason.DISCONNECTED)
+        self._reassembly.reports -= len(self.reports)
         self.reports.clear()
 
     def forget(self, reason: DropReason) -> None:

@@ -19,6 +19,7 @@ from sern_core import wire
 from sern_core.access import AccessTable, RateGuard, compile_peer_pattern
 from sern_core.announce import Announcement
 from sern_core.bound import QueueBound
+from sern_core.definitions import DefinitionStore
 from sern_core.draining import Draining
 from sern_core.errors import RefusedError, UsageError, WireError
 from sern_core.fragments import InStream
@@ -27,7 +28,7 @@ from sern_core.hub_local import LocalStreams
 from sern_core.hub_port import HubPort
 from sern_core.lanes import LANE_EXPRESS
 from sern_core.ledger import ReceiveLedger
-from sern_core.link import Link
+from sern_core.link import TIDY_S, Link
 from sern_core.message import Message, StreamId, StreamInfo
 from sern_core.object_control import apply_object
 from sern_core.objects import ObjectRegistry
@@ -44,6 +45,8 @@ MAX_SUBSCRIPTION_PARTS: Final = 64
 ORPHAN_S: Final = 60.0
 """A session whose TCP connection is gone and whose datagram lane says nothing for so long has ended: longer than any
 blackout that is worth waiting for with keys in hand."""
+MAX_AWAITED_CLIENTS: Final = 1024
+"""Clients that have not come back yet and are waited for."""
 MAX_AWAITED_TOPICS: Final = 2048
 """Streams held for one client that has not come back yet; origins name them, so there must be an end to it."""
 MAX_DENIED: Final = 64
@@ -86,7 +89,7 @@ class Hub(LocalStreams):
         self.params = params or HubParams()
         self.routing = RoutingTable(access)
         self.objects = ObjectRegistry(epoch=boot)
-        self.definitions: dict[str, str] = {}
+        self.definitions = DefinitionStore()
         self.trace = trace or DecisionTrace(enabled=False)
         self.received = ReceiveLedger()
         self.links: dict[ClientName, Link] = {}
@@ -104,6 +107,7 @@ class Hub(LocalStreams):
         self._heard: set[ClientName] = set()  # said what they want, to this run of the relay
         self._absent_since: dict[ClientName, float] = {}
         self._draining = Draining(self._end_channel)
+        self._tidy_due_s = now + TIDY_S
         self.tap: Callable[[StreamInfo], bool] = lambda _stream: False
         """Whether the relay itself wants a stream (a subscriber of the feed); set by the shell."""
 
@@ -146,7 +150,9 @@ class Hub(LocalStreams):
     def _limit(self, client: ClientName, now: float) -> None:
         """Put the limits of the access rules in force."""
         limits = self.access.limits(client)
-        self._guards[client] = RateGuard.of(limits, now=now)
+        guard = self._guards.get(client)
+        if guard is None or not guard.holds(limits):  # else what it has used up stays used up
+            self._guards[client] = RateGuard.of(limits, now=now)
         if limits.max_queue_bytes is None:
             self._bounds.pop(client, None)
         else:
@@ -187,6 +193,15 @@ class Hub(LocalStreams):
                 if link.lane.stalled and waiting_s is not None and now - waiting_s > ORPHAN_S:
                     link.close_lane(now=now)
         self._draining.sweep(now=now)
+        for link in list(self.links.values()):
+            if link.deaf:
+                link.close("it does not read what it is told", now=now)
+        for client in [client for client in self._guards.keys() - self.links.keys() if self._guards[client].full(now)]:
+            del self._guards[client]  # by name, over sessions: one that comes back at once has no new burst
+        if now >= self._tidy_due_s:
+            self._tidy_due_s = now + TIDY_S
+            self.received.tidy({identity.topic for identity in self.relayed}, now=now)
+            self._numbering.tidy(now=now)
 
     def left(self, client: ClientName, *, now: float) -> None:
         """A client has said goodbye. One that has streams, or wants reliable ones, may come back to them (a daemon that
@@ -217,6 +232,7 @@ class Hub(LocalStreams):
         if reason is DropReason.FORBIDDEN:
             self._draining.keep(lambda _client, stream: stream.origin != client, reason, now=now)
         self.events.lane_closed(client)
+        link.close_streams()
         del self.links[client]
         port = self.port_of.pop(client, None)
         if port is not None:
@@ -225,7 +241,6 @@ class Hub(LocalStreams):
         self._absent_since.pop(client, None)
         self._awaited.pop(client, None)
         self._heard.discard(client)
-        self._guards.pop(client, None)
         self._bounds.pop(client, None)
         self.objects.delete_owned(client)
 
@@ -360,7 +375,7 @@ class Hub(LocalStreams):
         if relayed.cache is not None:
             self.replays.close(relayed.cache)
         if relayed.source is None:
-            self._closed_local(relayed)
+            self._closed_local(relayed, now)
         for client, (link, channel) in relayed.outs.items():
             if not drain:
                 self._end_channel(client, link, channel, DropReason.FORBIDDEN, now)
@@ -388,6 +403,7 @@ class Hub(LocalStreams):
 
     def on_up(self, link: Link, *, resumed: bool, now: float) -> None:
         self._absent_since.pop(link.peer, None)
+        self._subscriptions.pop(link.peer, None)  # half of one that was said in an earlier session
         if not resumed:
             for relayed in self.relayed.values():
                 if link.peer in relayed.outs:
@@ -483,6 +499,8 @@ class Hub(LocalStreams):
             # Connected is not enough: it may not have come to say what it wants yet.
             if client in self._heard or client == identity.origin or not self.known(client):
                 continue
+            if client not in self.links and len(self._awaited) >= MAX_AWAITED_CLIENTS:
+                continue
             self._link(client, now)
             topics = self._awaited.setdefault(client, set())
             if len(topics) >= MAX_AWAITED_TOPICS and identity.topic not in topics:
@@ -561,10 +579,10 @@ class Hub(LocalStreams):
 
     def _submit(self, link: Link, channel: OutChannel, message: Message, now: float) -> None:
         bound = self._bounds.get(link.peer)
-        if bound is None or message.tombstone or bound.admit(link, channel, message, now=now):
+        if bound is None:
             link.submit(channel, message, now=now, forced=True)
         else:
-            link.reject(channel, message, DropReason.QUEUE_FULL, now=now)
+            bound.submit(link, channel, message, now=now)
 
     def on_in_drop(self, link: Link, stream: InStream, reason: DropReason, nbytes: int) -> None:
         self.received.of(stream.stream).drop_arrived(reason)
@@ -608,7 +626,7 @@ class Hub(LocalStreams):
             self._subscribe(link.peer, envelope, now)
         elif kind == "object":
             try:
-                apply_object(self.objects, link.peer, envelope, attachment, now=now)
+                apply_object(self.objects, self.access, link.peer, envelope, attachment, now=now)
             except RefusedError as refusal:
                 self.events.refused(link.peer, refusal.code, str(refusal))
         elif kind == "lane_ask":
@@ -649,6 +667,7 @@ class Hub(LocalStreams):
         self.routing.validate()
         self.objects.validate()
         self.replays.validate()
+        self.definitions.validate()
         for identity, relayed in self.relayed.items():
             outs = set(self.routing.subscribers(identity))
             held = set(relayed.outs) | relayed.unopened
@@ -666,7 +685,7 @@ class Hub(LocalStreams):
         for client, link in self.links.items():
             for channel in link.channels.values():
                 assert id(channel) in held_channels, f"{channel.stream.id.topic}: nobody's channel to {client}"
-        for table in (self._absent_since, self._awaited, self._guards, self._bounds, self._heard):
+        for table in (self._absent_since, self._awaited, self._bounds, self._heard):
             assert set(table) <= set(self.links), "something is kept for clients that are forgotten"
         assert all(len(topics) <= MAX_AWAITED_TOPICS for topics in self._awaited.values()), "too much is awaited"
 

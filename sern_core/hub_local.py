@@ -1,7 +1,6 @@
 """Streams of the relay itself: what its feed takes in, published under a name of its own like any client's. Pure."""
 
 from abc import ABC, abstractmethod
-from typing import Final
 
 from sern_core.errors import RefusedError
 from sern_core.fragments import InStream, Reassembly
@@ -9,11 +8,10 @@ from sern_core.hub_events import Relayed
 from sern_core.ledger import ReceiveLedger
 from sern_core.link import Link
 from sern_core.message import Message, StreamId, StreamInfo, TopicInfo, TopicSpec
+from sern_core.numbering import Numbering
 from sern_core.replay import ReplayStore
 from sern_core.routing import RouteChange, RoutingTable
 from sern_core.types import ClientName, DropReason
-
-MAX_LOCAL_SEQS: Final = 4096
 
 
 class LocalStreams(ABC):
@@ -29,7 +27,7 @@ class LocalStreams(ABC):
     def __init__(self) -> None:
         self.local_owners: set[ClientName] = set()
         """Names under which the relay itself publishes; no client may have one of them."""
-        self._local_seqs: dict[StreamId, int] = {}  # of local streams that were closed: the last seq
+        self._numbering = Numbering()  # of local streams that were closed
 
     @abstractmethod
     def _take(self, source: Link | None, stream: InStream, now: float) -> Relayed: ...
@@ -40,11 +38,9 @@ class LocalStreams(ABC):
     @abstractmethod
     def _forward(self, relayed: Relayed, message: Message, now: float) -> bool: ...
 
-    def _closed_local(self, relayed: Relayed) -> None:
+    def _closed_local(self, relayed: Relayed, now: float) -> None:
         """A local stream has ended: should it come again, it counts on."""
-        if len(self._local_seqs) >= MAX_LOCAL_SEQS:
-            self._local_seqs.clear()  # the far side has been told that they ended: they may begin anew
-        self._local_seqs[relayed.stream.stream.id] = relayed.stream.delivered
+        self._numbering.ended(relayed.stream.stream.id, relayed.stream.delivered, now=now)
 
     def open_local(self, info: TopicInfo, spec: TopicSpec, owner: ClientName, *, now: float) -> Relayed:
         """Publish a topic from here, under the name of `owner`, who then owns the topic's name like any client.
@@ -62,7 +58,7 @@ class LocalStreams(ABC):
             Reassembly(0),
             lambda _stream, _message: None,
             lambda _stream, _reason, _nbytes, _seq: None,
-            first=self._local_seqs.get(identity, 0) + 1,
+            first=self._numbering.last(identity) + 1,
         )
         if held is not None:
             stream.delivered = held.stream.delivered

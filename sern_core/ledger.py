@@ -4,7 +4,7 @@ Plain integers bumped by the hot path; metrics are collected from them at scrape
 from the moment its stream does, so that a rate over them never misses the first event.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from typing import Final
 
 from sern_core.message import StreamInfo
@@ -12,7 +12,10 @@ from sern_core.types import DropReason, PriorityClass, TopicName
 
 MAX_TOPICS: Final = 4096
 OTHER_TOPIC: Final = TopicName("/other")
-"""Where topics beyond MAX_TOPICS are counted together: a peer cannot grow this table without bound."""
+"""Where topics beyond MAX_TOPICS are counted together, and those that ended long ago: a peer cannot grow this table
+without bound, and sums stay what they were."""
+IDLE_S: Final = 3600.0
+"""How long the counters of a topic without streams are kept by themselves."""
 
 
 class SendCounters:
@@ -40,6 +43,13 @@ class SendCounters:
         self.dropped = self.dropped_bytes = 0
         self.refused = self.refused_bytes = 0
         self.by_reason: dict[DropReason, int] = dict.fromkeys(DropReason, 0)
+
+    def add(self, other: "SendCounters") -> None:
+        """Take over what another topic's counters say."""
+        for name in _SEND_SUMS:
+            setattr(self, name, getattr(self, name) + getattr(other, name))
+        for reason, count in other.by_reason.items():
+            self.by_reason[reason] += count
 
     def offer(self, nbytes: int) -> None:
         self.offered += 1
@@ -75,6 +85,13 @@ class ReceiveCounters:
         self.last_born_s: float | None = None
         self.by_reason: dict[DropReason, int] = dict.fromkeys(DropReason, 0)
 
+    def add(self, other: "ReceiveCounters") -> None:
+        """Take over what another topic's counters say; what is delivered here stays the latest."""
+        self.delivered += other.delivered
+        self.delivered_bytes += other.delivered_bytes
+        for reason, count in other.by_reason.items():
+            self.by_reason[reason] += count
+
     def arrived(self, nbytes: int, age_s: float, now: float) -> None:
         self.delivered += 1
         self.delivered_bytes += nbytes
@@ -89,11 +106,40 @@ class ReceiveCounters:
         return None if self.last_born_s is None else now - self.last_born_s
 
 
+_SEND_SUMS: Final = (
+    "offered", "offered_bytes", "delivered", "delivered_bytes", "dropped", "dropped_bytes", "refused", "refused_bytes",
+)  # fmt: skip
+
+
+class _Idle:
+    """Since when topics have had no stream."""
+
+    def __init__(self) -> None:
+        self._since_s: dict[TopicName, float] = {}
+
+    def over(self, topics: Iterable[TopicName], used: Collection[TopicName], now: float) -> list[TopicName]:
+        """Those of `topics` that have not been in use for IDLE_S."""
+        since_s = self._since_s
+        self._since_s = {topic: since_s.get(topic, now) for topic in topics if topic not in used}
+        self._since_s.pop(OTHER_TOPIC, None)
+        over = [topic for topic, at_s in self._since_s.items() if now - at_s > IDLE_S]
+        for topic in over:
+            del self._since_s[topic]
+        return over
+
+
 class SendLedger:
     """Counters of what goes out over one link, by topic."""
 
     def __init__(self) -> None:
         self.topics: dict[TopicName, SendCounters] = {}
+        self._idle = _Idle()
+
+    def tidy(self, used: Collection[TopicName], *, now: float) -> None:
+        """Count topics together with all others once they had no stream for IDLE_S; `used`: those that have one."""
+        for topic in self._idle.over(self.topics, used, now):
+            counters = self.topics.pop(topic)
+            self.topics.setdefault(OTHER_TOPIC, SendCounters(OTHER_TOPIC, counters.priority)).add(counters)
 
     def topic(self, topic: TopicName, priority: PriorityClass) -> SendCounters:
         name = topic if topic in self.topics or len(self.topics) < MAX_TOPICS else OTHER_TOPIC
@@ -133,6 +179,13 @@ class ReceiveLedger:
 
     def __init__(self) -> None:
         self.topics: dict[TopicName, ReceiveCounters] = {}
+        self._idle = _Idle()
+
+    def tidy(self, used: Collection[TopicName], *, now: float) -> None:
+        """As `SendLedger.tidy`."""
+        for topic in self._idle.over(self.topics, used, now):
+            counters = self.topics.pop(topic)
+            self.topics.setdefault(OTHER_TOPIC, ReceiveCounters(OTHER_TOPIC, counters.priority)).add(counters)
 
     def of(self, stream: StreamInfo) -> ReceiveCounters:
         topic = stream.id.topic

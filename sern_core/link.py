@@ -18,24 +18,28 @@ from dataclasses import replace
 from typing import Final, ParamSpec, Protocol
 
 from sern_core import wire
-from sern_core.announce import MAX_STRINGS, Announcement, announcement_parts, decode_announcement, definition_hash
+from sern_core.announce import (
+    Announcement,
+    announcement_parts,
+    decode_announcement,
+    decode_want,
+    definition_hash,
+)
+from sern_core.answering import Answering
+from sern_core.definitions import DefinitionStore, PeerDefinitions
 from sern_core.errors import RefusedError, RemoteError, UsageError, WireError
-from sern_core.fragments import DropReport, InStream
+from sern_core.fragments import InStream
 from sern_core.message import Message, StreamId, StreamInfo
 from sern_core.out_message import OutMessage
 from sern_core.params import LinkParams, SchedulerParams
 from sern_core.queues import OutChannel
-from sern_core.session import Session
 from sern_core.trace import DecisionTrace, TraceEvent
-from sern_core.types import CLASS_LABELS, DROP_CODES, DROP_REASONS, ClientName, DropReason, PriorityClass
+from sern_core.types import CLASS_LABELS, DROP_REASONS, ClientName, DropReason, PriorityClass
 
-MAX_DEFINITIONS: Final = 16_384
-"""Texts that a process keeps, of all its peers."""
-MAX_PEER_DEFINITIONS: Final = 2048
-MAX_PEER_DEFINITION_BYTES: Final = 16 * 2**20
-"""Texts that one peer may add; all types of a ROS distribution together have less than 2 MB."""
-MAX_OWED: Final = 8192
-"""Names in lists that have begun and not ended."""
+TIDY_S: Final = 60.0
+MAX_TOLD_BYTES: Final = 4 * 2**20
+MAX_TOLD_CHANNEL_BYTES: Final = 1024
+"""Control messages that may wait for a peer, beside so much for each channel: more than any leaves that reads."""
 MAX_UNHEARD: Final = 20_000
 """Control messages that a peer may have answered, beside four for each channel, before it reads an answer."""
 
@@ -95,10 +99,10 @@ class LinkHandler(Protocol):
         """A control message that is not the link's own business. Raises WireError if it is nobody's."""
 
 
-class Link(Session):
+class Link(Answering):
     """One end of one hop towards `peer`.
 
-    `definitions` maps digest to text and is shared by all links of a process. `auto_confirm`: what had its turn here
+    `definitions` is shared by all links of a process. `auto_confirm`: what had its turn here
     is delivered; a relay confirms by hand, when its subscribers have.
     """
 
@@ -110,7 +114,7 @@ class Link(Session):
         peer: ClientName,
         initiator: bool,
         handler: LinkHandler,
-        definitions: dict[str, str],
+        definitions: DefinitionStore,
         link: LinkParams,
         scheduler: SchedulerParams,
         trace: DecisionTrace,
@@ -120,18 +124,17 @@ class Link(Session):
     ) -> None:
         self.handler = handler
         self.definitions = definitions
+        self.texts = PeerDefinitions(definitions, peer)
         self.auto_confirm = auto_confirm
         self.by_stream: dict[StreamId, OutChannel] = {}
         self.streams: dict[StreamId, InStream] = {}
         """Incoming streams across sessions."""
+        self.on_tidy: Callable[[float], None] | None = None
+        """Called now and then, with the time, for the owner to let go of what nobody needs any more."""
+        self._tidy_due_s = now + TIDY_S
         self._next_channel = 1
-        self._asked: set[str] = set()  # definitions the peer asked for before we had them
-        self._told: set[str] = set()  # definitions the peer has had in the session
-        self._needed: set[str] = set()  # definitions we asked the peer for, not here yet
-        self._peer_definitions = self._peer_definition_bytes = 0
         self._unheard = 0  # answers since the peer acknowledged the one of number `_unheard_seq`
         self._unheard_seq = 0
-        self._owed_parts: dict[tuple[str, int], tuple[str, ...]] = {}  # by message and channel: more will come
         self._announcing: deque[tuple[int, OutChannel]] = deque()  # may send once that control message is on its way
         self._missing: dict[StreamId, float] = {}  # not announced by a new peer, and since when
         self.faults = 0
@@ -149,19 +152,21 @@ class Link(Session):
         )
 
     def _session_began(self, resumed: bool, now: float) -> None:
-        self._asked.clear()
-        self._told.clear()
-        self._needed.clear()
+        self.texts.peer = self.peer
+        self.texts.begin()
         self._unheard = self._unheard_seq = 0
+        self._begin_answers()
         self._announcing.clear()
-        self._owed_parts.clear()
         if self.initiator and not resumed:  # whatever becomes of this session: a new relay has yet to learn of them
             for identity in self.streams:
                 self._missing.setdefault(identity, now)
         self.handler.on_up(self, resumed=resumed, now=now)
         for channel in list(self.channels.values()):
             self._announce(channel, now)
-        self.send_control({"t": "synced"}, now=now)
+        self.send_control({"t": "synced", "batch": True}, now=now)
+
+    def _heard_of(self, channel: OutChannel, now: float) -> None:
+        self._tell(self.handler.on_wanted, self, channel, now=now)
 
     def _session_ended(self, reason: str, now: float) -> None:
         self._tell(self.handler.on_down, self, reason, now=now)
@@ -224,7 +229,7 @@ class Link(Session):
         channel.prime(replays, now=now)
         self.channels[slot] = channel
         self.by_stream[stream.id] = channel
-        self._define(stream.info.definition)
+        self.texts.use_outgoing(slot, _digest(stream), stream.info.definition)
         if self.established:
             self._announce(channel, now)
         return channel
@@ -249,12 +254,14 @@ class Link(Session):
         self.cadences.forget(channel.slot)
         if self.by_stream.get(channel.stream.id) is channel:
             del self.by_stream[channel.stream.id]
+        self.texts.use_outgoing(channel.slot, "")
         if self.established:
             self.send_control({"t": "retract", "ch": channel.slot}, now=now)
 
     def _announce(self, channel: OutChannel, now: float) -> None:
         stream = channel.stream
-        digest = stream.attributes.get("definition") or definition_hash(stream.info.definition)
+        digest = _digest(stream)
+        self.texts.use_outgoing(channel.slot, digest)  # in another session its origin may say another
         owed = channel.owed if channel.reliable else ()
         announcement = Announcement(channel.slot, stream, digest, channel.first_seq, owed)
         channel.ready = False
@@ -286,38 +293,12 @@ class Link(Session):
         self.dirty = True
         return seq
 
-    def report_drop(self, stream: InStream, seq: int, reason: DropReason, where: str, *, now: float) -> None:
-        """Tell the origin's side that a reliable message was dropped here or further on: before the watermark passes
-        it, and again in the next session until it is known there."""
-        report = DropReport(seq, reason, where)
-        stream.reports.append(report)
-        self._send_report(stream, report, now)
-
-    def _send_report(self, stream: InStream, report: DropReport, now: float) -> None:
-        if stream.channel_id is not None:
-            code = DROP_CODES[report.reason]
-            envelope = {"t": "dropped", "ch": stream.channel_id, "seq": report.seq, "code": code, "to": report.where}
-            report.control_seq = self.send_control(envelope, now=now)
-
     # --- streams in -----------------------------------------------------------------------------------------------
-
-    def answer(self, stream: InStream, wanted: bool, *, now: float, owed: tuple[str, ...] = ()) -> None:
-        """Tell the peer whether its stream is wanted; `owed` names the clients that must get a reliable one."""
-        stream.wanted = wanted
-        stream.paused = stream.paused or not wanted
-        stream.pause_seq = 0
-        if self.established and stream.channel_id is not None:
-            seq = 0
-            for start in range(0, max(1, len(owed)), MAX_STRINGS):
-                part, more = list(owed[start : start + MAX_STRINGS]), start + MAX_STRINGS < len(owed)
-                envelope = {"t": "want", "ch": stream.channel_id, "on": wanted, "owed": part, "more": more}
-                seq = self.send_control(envelope, now=now)
-            if not wanted:
-                stream.pause_seq = seq
 
     def refuse(self, stream: InStream, code: str, text: str, *, now: float) -> None:
         """Take back what `on_announce` allowed (an access rule changed)."""
         if self.established and stream.channel_id is not None:
+            self._forget_answers(stream)
             self.send_control({"t": "refuse", "ch": stream.channel_id, "code": code, "why": text[:400]}, now=now)
 
     def _announced(self, announcement: Announcement, now: float) -> None:
@@ -341,19 +322,20 @@ class Link(Session):
         self._missing.pop(identity, None)
         stream.channel_id = slot
         self.incoming[slot] = stream
-        for report in stream.reports:
-            self._send_report(stream, report, now)
-        definition = self.definitions.get(announcement.definition_hash, "")
-        if announcement.definition_hash:
-            stream.stream.attributes["definition"] = announcement.definition_hash
-            if not definition and announcement.definition_hash not in self._needed:
-                self._needed.add(announcement.definition_hash)
-                self.send_control({"t": "need", "dh": announcement.definition_hash}, now=now)
+        self._expect_answer(stream, slot)
+        digest = announcement.definition_hash
+        self.texts.use_incoming(identity, digest)
+        if digest:
+            stream.stream.attributes["definition"] = digest
+            if self.texts.lacks(digest):
+                self.send_control({"t": "need", "dh": digest}, now=now)
         try:
             wanted = self._offer_stream(stream, announcement, now)
         except RefusedError as refusal:
             self.incoming.pop(slot, None)
             self.streams.pop(identity, None)
+            self._forget_answers(stream)
+            self.texts.use_incoming(identity, "")
             self._watermarks.pop(slot, None)
             stream.channel_id = None
             stream.close()
@@ -443,6 +425,12 @@ class Link(Session):
         channel.skip_to(first)
         self._tell_gap(channel, now)
 
+    def leave_out(self, channel: OutChannel, message: Message, reason: DropReason, *, now: float) -> None:
+        """Drop a reliable message that cannot be kept at all; the peer is told where the stream goes on."""
+        self._now = now
+        channel.leave_out(message, reason)
+        self._tell_gap(channel, now)
+
     def _tell_gap(self, channel: OutChannel, now: float) -> None:
         first = channel.next_gap()
         if first is not None and self.established:
@@ -463,15 +451,22 @@ class Link(Session):
     def _retract(self, stream: InStream, now: float) -> None:
         self.streams.pop(stream.stream.id, None)
         self._missing.pop(stream.stream.id, None)
+        self.texts.use_incoming(stream.stream.id, "")
         if stream.channel_id is not None:
             self.incoming.pop(stream.channel_id, None)
             self._watermarks.pop(stream.channel_id, None)
+        self._forget_answers(stream)
         self._tell(self.handler.on_retract, self, stream, now=now)
         stream.close()
         stream.channel_id = None
 
     def _sweep(self, now: float) -> None:
         super()._sweep(now)
+        if now >= self._tidy_due_s:
+            self._tidy_due_s = now + TIDY_S
+            self.ledger.tidy({channel.counters.topic for channel in self.channels.values()}, now=now)
+            if self.on_tidy is not None:
+                self.on_tidy(now)
         if self.established:
             for stream in self.streams.values():
                 stream.sweep(now, self._up_since_s)
@@ -488,8 +483,8 @@ class Link(Session):
         before = self._control.next_seq
         self._handle_control(kind, envelope, attachment, now)
         said = self._control.next_seq - before
-        # Reports of drops are repeated at an announcement: those are ours to say, not an answer.
-        self._answered(min(1, said) if kind == "announce" else said)
+        # Reports of drops are repeated at an announcement: ours to say, not an answer, which comes later.
+        self._answered(1 if kind == "announce" else said)
 
     def _answered(self, count: int) -> None:
         """The peer made us say `count` things. Raises WireError if it never reads what it makes us say."""
@@ -506,7 +501,9 @@ class Link(Session):
             owed = self._owed_so_far(("announce", announcement.channel), announcement.owed, more=announcement.more)
             if owed is not None:
                 self._announced(replace(announcement, owed=owed), now)
-        elif kind in ("want", "refuse", "dropped"):
+        elif kind == "want":
+            self._answers(decode_want(envelope), now)
+        elif kind in ("refuse", "dropped"):
             channel = self.channels.get(wire.take_int(envelope, "ch", high=0xFFFF))
             if channel is not None:  # else closed meanwhile
                 self._about_channel(kind, channel, envelope, now)
@@ -521,40 +518,23 @@ class Link(Session):
             else:
                 self._retract(incoming, now)
         elif kind == "synced":
+            self._interest.batches = wire.take_bool(envelope, "batch")
             self._synced(now)
         elif kind == "need":
-            self._send_definition(wire.take_str(envelope, "dh", max_length=64), now)
+            digest = wire.take_str(envelope, "dh", max_length=64)
+            self._define(digest, self.texts.asked(digest), now)
         elif kind == "define":
-            self._defined(envelope, attachment, now)
+            digest = wire.take_str(envelope, "dh", max_length=64)
+            if self.texts.came(digest, attachment):
+                self._tell(self.handler.on_definition, self, digest, now=now)
         else:
             self.handler.on_control(self, envelope, attachment, now=now)
 
-    def _owed_so_far(self, key: tuple[str, int], names: tuple[str, ...], *, more: bool) -> tuple[str, ...] | None:
-        """The names of a list that travels in parts, once it is complete."""
-        if more:
-            if sum(map(len, self._owed_parts.values())) + len(names) > MAX_OWED:
-                raise WireError(f"{self.peer} leaves lists of more than {MAX_OWED} names unfinished")
-            self._owed_parts[key] = self._owed_parts.get(key, ()) + names
-            return None
-        return self._owed_parts.pop(key, ()) + names
-
     def _about_channel(self, kind: str, channel: OutChannel, envelope: wire.Envelope, now: float) -> None:
-        if kind == "want":
-            wanted = wire.take_bool(envelope, "on")
-            names = tuple(wire.take_strings(envelope, "owed", max_length=64))
-            owed = self._owed_so_far(("want", channel.slot), names, more=wire.take_bool(envelope, "more"))
-            if owed is None:
-                return
-            channel.owed = owed
-            if wanted and channel.wanted is False and channel.reliable:
-                self.send_control({"t": "first", "ch": channel.slot, "seq": channel.first_seq}, now=now)
-            self._set_wanted(channel, wanted, now)
-            channel.ready = True
-            self._refresh(channel, now)
-            self._tell(self.handler.on_wanted, self, channel, now=now)
-        elif kind == "dropped":
+        if kind == "dropped":
             reason = DROP_REASONS.get(wire.take_int(envelope, "code"), DropReason.LOST)
-            channel.reported(wire.take_int(envelope, "seq"), reason)
+            count = wire.take_int(envelope, "n", low=1, high=wire.MAX_SEQ, default=1)
+            channel.reported(wire.take_int(envelope, "seq"), reason, count)
         else:
             code, why = wire.take_str(envelope, "code", max_length=64), wire.take_str(envelope, "why")
             self._set_wanted(
@@ -563,58 +543,32 @@ class Link(Session):
             self._refresh(channel, now)
             self._tell(self.handler.on_refused, self, channel, code, why, now=now)
 
-    def _set_wanted(
-        self, channel: OutChannel, wanted: bool, now: float, *, reason: DropReason = DropReason.UNWANTED
-    ) -> None:
-        watermark = channel.watermark
-        channel.set_wanted(wanted, reason)
-        if channel.watermark > watermark:
-            self._watermark_moved(channel)
-
-    def _define(self, definition: str) -> None:
-        digest = definition_hash(definition)
-        if digest and len(self.definitions) < MAX_DEFINITIONS:
-            self.definitions.setdefault(digest, definition)
-
-    def _send_definition(self, digest: str, now: float) -> None:
-        definition = self.definitions.get(digest)
-        if definition is None:
-            if len(self._asked) >= MAX_PEER_DEFINITIONS:
-                raise WireError(f"{self.peer} asks for more than {MAX_PEER_DEFINITIONS} definitions that nobody has")
-            self._asked.add(digest)
-        elif digest not in self._told:
-            self._told.add(digest)
-            self.send_control({"t": "define", "dh": digest}, definition.encode(), now=now)
-
-    def _defined(self, envelope: wire.Envelope, attachment: bytes, now: float) -> None:
-        digest = wire.take_str(envelope, "dh", max_length=64)
-        try:
-            text = attachment.decode()
-        except UnicodeDecodeError as error:
-            raise WireError("a message definition is not UTF-8") from error
-        if definition_hash(text) != digest:
-            raise WireError("a message definition does not match its hash")
-        if digest not in self._needed:
-            raise WireError(f"{self.peer} defines {digest}, which it was not asked for")
-        self._needed.discard(digest)
-        if digest not in self.definitions:
-            self._peer_definitions += 1
-            self._peer_definition_bytes += len(attachment)
-            if self._peer_definitions > MAX_PEER_DEFINITIONS or self._peer_definition_bytes > MAX_PEER_DEFINITION_BYTES:
-                raise WireError(f"{self.peer} sends more definitions than {MAX_PEER_DEFINITION_BYTES} bytes")
-            self._define(text)
-            self._tell(self.handler.on_definition, self, digest, now=now)
+    def _define(self, digest: str, text: str | None, now: float) -> None:
+        if text is not None and self.established:
+            self.send_control({"t": "define", "dh": digest}, text.encode(), now=now)
 
     def definition_known(self, digest: str, *, now: float) -> None:
         """A text arrived from elsewhere: pass it on if this peer is waiting for it."""
-        if digest in self._asked and self.established:
-            self._asked.discard(digest)
-            self._send_definition(digest, now)
+        self._define(digest, self.texts.known(digest), now)
+
+    def close_streams(self) -> None:
+        """The link is given up: its incoming streams are gone for good."""
+        for stream in self.streams.values():
+            stream.close()
+        self.streams.clear()
+        self.incoming.clear()
+        self._missing.clear()
+        self.texts.close()
 
     @property
     def now(self) -> float:
         """The time of the call under way, for handlers that are told without it."""
         return self._now
+
+    @property
+    def deaf(self) -> bool:
+        """Whether more waits to be told than any peer leaves behind that reads what it is told."""
+        return self._control.retained_bytes > MAX_TOLD_BYTES + MAX_TOLD_CHANNEL_BYTES * len(self.channels)
 
     # --- views ------------------------------------------------------------------------------------------------------
 
@@ -664,6 +618,7 @@ class Link(Session):
             lane.flight.validate(check)
         self.scheduler.validate()
         check(len(self.by_stream) == len(self.channels), "channel tables differ")
+        self.texts.validate()
         check(self._watermarks.keys() <= self.incoming.keys(), "watermarks of streams that are gone")
 
 
@@ -676,3 +631,8 @@ def _same_type(known: StreamInfo, announced: Announcement) -> bool:
         and one.type_hash == other.type_hash
         and known.attributes.get("definition", "") == announced.definition_hash
     )
+
+
+def _digest(stream: StreamInfo) -> str:
+    """What the stream's definition is called; empty for none."""
+    return stream.attributes.get("definition") or definition_hash(stream.info.definition)

@@ -51,6 +51,8 @@ class ObjectLimits:
     """What the registry holds; beyond it an owner is refused by name."""
 
     max_objects_per_owner: int = 4_096
+    max_bytes_per_owner: int = 8 * 2**20  # of an owner's objects, as in max_total_bytes
+    max_held_per_owner: int = 16 * 2**20  # of an owner's objects, as in max_held_bytes
     max_total_bytes: int = 64 * 2**20  # ids, type names, definitions, attributes and kept values
     max_held_bytes: int = 64 * 2**20  # references to larger values
     max_value_bytes: int = 4_096
@@ -155,6 +157,7 @@ class ObjectRegistry:
         self._forgotten_version = 0  # deletions up to this version may have left the log
         self._total_bytes = 0
         self._held_bytes = 0
+        self._bytes_of: dict[ClientName, list[int]] = {}  # of owners: their share of total and held bytes
 
     # Writing ---------------------------------------------------------------------------------------------------------
 
@@ -188,17 +191,22 @@ class ObjectRegistry:
         entry = self._entries.get(object_id)
         old_bytes = 0 if entry is None else entry.fixed_bytes + (0 if value is None else self._kept_bytes(entry))
         kept_bytes = 0 if value is None or len(value) > self.limits.max_value_bytes else len(value)
-        if self._total_bytes - old_bytes + fixed_bytes + kept_bytes > self.limits.max_total_bytes:
-            raise RefusedError(
-                "registry_full",
-                f"{owner} may not put {object_id}: the registry holds {self._total_bytes} of "
-                f"{self.limits.max_total_bytes} bytes; delete objects or shorten definitions",
-            )
+        own_bytes = self._bytes_of.get(owner, (0, 0))[0]
+        for what, held_bytes, limit_bytes in (
+            (f"{owner}'s objects hold", own_bytes, self.limits.max_bytes_per_owner),
+            ("the registry holds", self._total_bytes, self.limits.max_total_bytes),
+        ):
+            if held_bytes - old_bytes + fixed_bytes + kept_bytes > limit_bytes:
+                raise RefusedError(
+                    "registry_full",
+                    f"{owner} may not put {object_id}: {what} {held_bytes} of {limit_bytes} bytes; "
+                    "delete objects or shorten definitions",
+                )
         if entry is None:
             entry = _Entry(object_id, owner, now)
             self._entries[object_id] = entry
             self._owned.setdefault(owner, set()).add(object_id)
-        self._total_bytes += fixed_bytes - entry.fixed_bytes
+        self._count(entry, fixed_bytes - entry.fixed_bytes)
         entry.fixed_bytes = fixed_bytes
         entry.kind = kind
         entry.type_name = type_name
@@ -393,6 +401,13 @@ class ObjectRegistry:
         fixed = sum(entry.fixed_bytes for entry in entries.values())
         assert self._total_bytes == fixed + small <= self.limits.max_total_bytes, "total bytes"
         assert self._held_bytes == large <= self.limits.max_held_bytes, "held bytes"
+        for owner, (own_bytes, own_held_bytes) in self._bytes_of.items():
+            mine = [entry for entry in entries.values() if entry.owner == owner]
+            assert own_bytes == sum(entry.fixed_bytes + self._kept_bytes(entry) for entry in mine), "bytes of an owner"
+            assert own_held_bytes == sum(map(self._referenced_bytes, mine)), "held bytes of an owner"
+            assert own_bytes <= self.limits.max_bytes_per_owner, "an owner has too much"
+            assert own_held_bytes <= self.limits.max_held_per_owner, "an owner holds too much"
+        assert self._bytes_of.keys() == self._owned.keys(), "owners by bytes"
         versions = [entry.version for entry in entries.values()]
         assert versions == sorted(set(versions)), "the order of changes"
         assert not versions or versions[-1] <= self._version, "a version from the future"
@@ -444,27 +459,39 @@ class ObjectRegistry:
         limits = self.limits
         self._forget_value(entry)
         size = len(body)
+        own_bytes, own_held_bytes = self._bytes_of[entry.owner]
+        may_hold = (
+            self._held_bytes + size <= limits.max_held_bytes and own_held_bytes + size <= limits.max_held_per_owner
+        )
         if codec:
-            if self._held_bytes + size <= limits.max_held_bytes:
-                self._held_bytes += size
+            if may_hold:
+                self._count_held(entry, size)
                 entry.body, entry.codec = body, codec
             return
         entry.value_bytes = size
         if size <= limits.max_value_bytes:
-            if self._total_bytes + size <= limits.max_total_bytes:
-                self._total_bytes += size
+            if self._total_bytes + size <= limits.max_total_bytes and own_bytes + size <= limits.max_bytes_per_owner:
+                self._count(entry, size)
                 entry.body = body
-        elif self._held_bytes + size <= limits.max_held_bytes:
-            self._held_bytes += size
+        elif may_hold:
+            self._count_held(entry, size)
             entry.body = body
+
+    def _count(self, entry: _Entry, nbytes: int) -> None:
+        self._total_bytes += nbytes
+        self._bytes_of.setdefault(entry.owner, [0, 0])[0] += nbytes
+
+    def _count_held(self, entry: _Entry, nbytes: int) -> None:
+        self._held_bytes += nbytes
+        self._bytes_of[entry.owner][1] += nbytes
 
     def _forget_value(self, entry: _Entry) -> None:
         old = entry.body
         if old is not None:
             if not entry.codec and len(old) <= self.limits.max_value_bytes:
-                self._total_bytes -= len(old)
+                self._count(entry, -len(old))
             else:
-                self._held_bytes -= len(old)
+                self._count_held(entry, -len(old))
             entry.body = None
         entry.codec = 0
         entry.value_bytes = -1
@@ -478,14 +505,14 @@ class ObjectRegistry:
 
     def _delete(self, entry: _Entry) -> None:
         self._forget_value(entry)
-        self._total_bytes -= entry.fixed_bytes
+        self._count(entry, -entry.fixed_bytes)
         if entry.stream is not None:
             del self._by_stream[entry.stream]
         del self._entries[entry.id]
         owned = self._owned[entry.owner]
         owned.discard(entry.id)
         if not owned:
-            del self._owned[entry.owner]
+            del self._owned[entry.owner], self._bytes_of[entry.owner]
         self._version += 1
         if len(self._deletions) == self._deletions.maxlen:
             self._forgotten_version = self._deletions[0][0] if self._deletions else self._version
@@ -530,7 +557,7 @@ class ObjectRegistry:
             entry.sha256 = hashlib.sha256(entry.body).hexdigest()
             if entry.value_bytes > self.limits.max_value_bytes:
                 # Hashed once, when first asked for; after that the body is no longer needed.
-                self._held_bytes -= entry.value_bytes
+                self._count_held(entry, -entry.value_bytes)
                 entry.body = None
         return XrObject(
             id=entry.id,

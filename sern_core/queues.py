@@ -275,6 +275,12 @@ class OutChannel:
         return self.retained_bytes + size_bytes + overhead_bytes <= self.spec.max_queue_bytes
 
     @property
+    def kept_bytes(self) -> int:
+        """`held_bytes`, and what keeping these messages takes beside their bodies."""
+        count = len(self.retained) if self.reliable else len(self.queue) + len(self.flying)
+        return self.held_bytes + MESSAGE_OVERHEAD_BYTES * count
+
+    @property
     def held_bytes(self) -> int:
         """Bytes that wait here or are under way, and would have to be sent again to a peer that has lost them."""
         return self.retained_bytes if self.reliable else self.queued_bytes + sum(o.size for o in self.flying.values())
@@ -402,8 +408,24 @@ class OutChannel:
     def skip_to(self, first: int) -> None:
         """Nothing from `next_seq` up to `first` will come; the peer is told in its turn (`next_gap`)."""
         if first > self.next_seq:
-            self.gaps.append((self.next_seq - 1, first))
+            if self.gaps and self.gaps[-1][1] == self.next_seq:  # nothing was kept since that gap
+                self.gaps[-1] = (self.gaps[-1][0], first)
+            else:
+                self.gaps.append((self.next_seq - 1, first))
             self.next_seq = first
+
+    def leave_out(self, message: Message, reason: DropReason) -> None:
+        """There is no room for this reliable message, nor for a tombstone: the stream goes on behind it."""
+        size = len(message.body)
+        self.counters.offer(size)
+        if message.seq <= self.watermark:
+            self.counters.deliver(size)
+        elif message.tombstone:
+            self.counters.drop(message.drop_reason, size)  # reported where it was dropped
+        else:
+            self.counters.drop(reason, size)
+            self.on_drop(OutMessage(message), reason)
+        self.skip_to(message.seq + 1)
 
     def start_at(self, first: int) -> None:
         """Nothing has been submitted yet: begin at seq `first` instead."""
@@ -431,15 +453,15 @@ class OutChannel:
             if out in self.active:
                 self.active.remove(out)
 
-    def reported(self, seq: int, reason: DropReason) -> None:
-        """A later hop dropped `seq` and said so, before its watermark passed it."""
+    def reported(self, seq: int, reason: DropReason, count: int = 1) -> None:
+        """A later hop dropped `count` messages from `seq` on and said so, before its watermark passed them."""
         for out in self.retained:
-            if out.seq == seq:
-                if not out.counted:
-                    self.counters.drop(reason, out.offered_bytes)
-                    out.counted = True
-                    self.on_drop(out, reason)
-                return
+            if out.seq >= seq + count:
+                break
+            if out.seq >= seq and not out.counted:
+                self.counters.drop(reason, out.offered_bytes)
+                out.counted = True
+                self.on_drop(out, reason)
 
     def sweep(self, now: float, *, up: bool) -> None:
         """Expire what nobody will send: lifespan and retention, also while the link is down."""

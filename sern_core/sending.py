@@ -125,6 +125,7 @@ class Sender(ABC):
         self.tag = boot % 255  # so that a late datagram of an earlier process is not taken for one of ours
         self.dirty = False
         """Something may be sendable: the owner should poll `next_datagram`. Set by every call that changes anything."""
+        self._unsaid = False  # answers or reports about the peer's streams wait to be told
         self._rx_lane = self.lane
         self._sweep_due_s = now + SWEEP_INTERVAL_S
         self._rate_due_s = now
@@ -148,6 +149,10 @@ class Sender(ABC):
     @abstractmethod
     def _control_sent(self, seq: int) -> None:
         """Control message `seq` is on the wire."""
+
+    @abstractmethod
+    def _say(self, now: float) -> None:
+        """Queue control messages with answers and reports that are due."""
 
     @abstractmethod
     def _watermark_moved(self, channel: OutChannel) -> None: ...
@@ -304,6 +309,8 @@ class Sender(ABC):
         if not self.dirty and len(self.lanes) == 1:
             return None  # nothing has changed since the last answer, and `handle_timeout` says when time has
         self._now = now
+        if self._unsaid:
+            self._say(now)
         if lane.copies and (copy := lane.due_copy(now)) is not None:
             self.scheduler.charge(PriorityClass.CONTROL, len(copy), now=now)
             self.wire_bytes += len(copy) + OVERHEAD_BYTES
@@ -453,19 +460,12 @@ class Sender(ABC):
 
     def _put_watermarks(self, frames: list[bytes], items: list[SentData | SentWatermark | SentPing], size: int) -> int:
         for slot in list(self._watermarks)[:MAX_WATERMARKS]:
-            if self._must_hear(self.incoming[slot]):
+            if not self.incoming[slot].heard(self._control.watermark):
                 continue  # of drops first: behind the watermark it would take them for delivered
             frames.append(wire.encode_watermark(slot, self._watermarks.pop(slot)))
             items.append(SentWatermark(slot))
             size += wire.WATERMARK.size
         return size
-
-    def _must_hear(self, stream: InStream) -> bool:
-        """Whether the peer does not know yet of all the drops that were reported to it."""
-        reports = stream.reports
-        while reports and 0 < reports[0].control_seq <= self._control.watermark:
-            del reports[0]
-        return bool(reports)
 
     def _pick(self, now: float, *, window_open: bool) -> int | None:
         """The scheduler's choice; under `ordering: paper` what it found stale is dropped first."""

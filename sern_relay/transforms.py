@@ -37,6 +37,9 @@ MAX_BODY_BYTES: Final = 64 * 2**10
 """About 500 transforms."""
 MAX_PAIRS: Final = 1_000
 """Pairs of frames of one client."""
+MAX_REFUSED: Final = 4_096
+OTHER_CLIENT: Final = ClientName("other")
+"""Clients and reasons that are counted apart; under which name the others are."""
 
 _MESSAGE: Final = "tf2_msgs/msg/TFMessage"
 _STREAMS: Final = frozenset({"tf2_msgs/TFMessage", "tf/tfMessage"})  # the older one has the same layout
@@ -98,6 +101,8 @@ class TransformObjects:
             if self._writers.get(object_id) == stream.id:
                 del self._writers[object_id]
                 self._pairs[stream.id.origin] -= 1
+                if not self._pairs[stream.id.origin]:
+                    del self._pairs[stream.id.origin]
                 self._registry.delete(object_id, owner=stream.id.origin)
 
     def _read_due(self) -> None:
@@ -175,6 +180,8 @@ class TransformObjects:
 
     def _refuse(self, stream: StreamInfo, code: str, text: str) -> None:
         key = (stream.id.origin, code)
+        if key not in self.refused and len(self.refused) >= MAX_REFUSED:
+            key = (OTHER_CLIENT, code)
         if key not in self.refused:
             _log.warning("%s of %s: a transform is not taken as an object: %s", stream.id.topic, stream.id.origin, text)
         self.refused[key] = self.refused.get(key, 0) + 1

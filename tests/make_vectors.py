@@ -290,6 +290,16 @@ def valid() -> list[Vector]:
             "the first of several messages that name who is owed channel 3",
             {"t": "want", "ch": 3, "on": True, "owed": ["site1"], "more": True},
         ),
+        _control(
+            "want-many",
+            "channels 3, 4, 5, 6 and 9 are wanted, and client site1 is owed them",
+            {"t": "want", "ch": 3, "on": True, "owed": ["site1"], "chs": [4, 6, 9, 9]},
+        ),
+        _control(
+            "want-difference",
+            "channel 3 stays wanted: site3 is owed it as well, site2 no longer",
+            {"t": "want", "ch": 3, "on": True, "add": ["site3"], "drop": ["site2"]},
+        ),
         _control("want-not", "nobody wants channel 3", {"t": "want", "ch": 3, "on": False, "owed": []}),
         _control(
             "refuse-stream",
@@ -299,8 +309,18 @@ def valid() -> list[Vector]:
         _control("first", "nothing below seq 41 will come on channel 3", {"t": "first", "ch": 3, "seq": 41}),
         _control("retract", "the stream on channel 3 is gone", {"t": "retract", "ch": 3}),
         _control("synced", "all streams of the session are announced", {"t": "synced"}),
+        _control(
+            "synced-batch",
+            "the same, and several channels may be answered at once",
+            {"t": "synced", "batch": True},
+        ),
         _control("need", "asks for a definition", {"t": "need", "dh": digest}),
         _control("define", "the definition, packed with zlib", {"t": "define", "dh": digest}, DEFINITION),
+        _control(
+            "dropped-run",
+            "a later hop gave up seq 41, 42 and 43 of channel 3",
+            {"t": "dropped", "ch": 3, "seq": 41, "code": DROP_CODES[DropReason.QUEUE_FULL], "to": "site1", "n": 3},
+        ),
         _control(
             "dropped",
             "a later hop gave up seq 41 of channel 3",

@@ -218,6 +218,8 @@ class HopAdapter:
             by_topic.setdefault(channel.counters.topic, []).append(channel)
         for gone in self._topics.keys() - by_topic.keys():
             self._topics[gone].history.clear()
+            if gone not in self.link.ledger.topics:
+                del self._topics[gone]
         for topic, mine in by_topic.items():
             counters, count = mine[0].counters, counts[mine[0].spec.priority]
             stats = self._topics.setdefault(topic, _TopicStats())

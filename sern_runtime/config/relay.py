@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from sern_core.access import AccessRule
+from sern_core.access import DEFAULT_QUEUE_BYTES, AccessRule
 from sern_core.errors import ConfigError
 from sern_core.objects import COMMAND_OBJECT_TYPES
 from sern_core.rules import AUTO, FeedRole, FeedTopic, TopicRule, compile_pattern, plain_type
@@ -109,9 +109,10 @@ class AccessSection(Section):
     """Messages a second taken from it over all its topics; null: no limit."""
     max_bytes_per_s: Annotated[float, Field(gt=0, le=1e12)] | None = None
     """Bytes a second taken from it over all its topics; null: no limit."""
-    max_queue_bytes: Bytes | None = None
-    """Bytes that may wait for it at the relay. Beyond, best effort of the lowest class is dropped first, then what
-    does not fit, counted as `queue_full` and reported if reliable; null: no limit beside those of the topics."""
+    max_queue_bytes: Bytes | None = DEFAULT_QUEUE_BYTES
+    """Bytes that may wait for it at the relay, 256 for each message beside its body. Beyond, best effort of the lowest
+    class is dropped first, then what does not fit, counted as `queue_full` and reported if reliable; null: no limit,
+    for a relay whose clients are all trusted."""
 
     def rule(self) -> AccessRule:
         return AccessRule(

@@ -1,16 +1,22 @@
 """access.max_queue_bytes: what may wait for one client at the relay, and who gives way."""
 
 from random import Random
+from typing import Any
 
 import pytest
 
-from sern_core.access import AccessRule, AccessTable
+from sern_core import wire
+from sern_core.access import DEFAULT_QUEUE_BYTES, AccessRule, AccessTable
+from sern_core.bound import TOMBSTONE_BYTES
 from sern_core.link import Link
+from sern_core.queues import MESSAGE_OVERHEAD_BYTES, OutChannel
 from sern_core.types import ClientName, DropReason, PriorityClass
 from sern_sim.models import LinkModel
+from tests.fuzz.test_hostile_peer import Hostile, _whole
 from tests.world import World, spec
 
-LIMIT_BYTES = 50_000
+LARGE_BYTES = 10_000 + MESSAGE_OVERHEAD_BYTES
+LIMIT_BYTES = 5 * LARGE_BYTES + 20 * TOMBSTONE_BYTES
 BOUNDED = AccessTable(
     [
         AccessRule(client="site", subscribe=(".*",), max_queue_bytes=LIMIT_BYTES),
@@ -28,7 +34,7 @@ def to_site(world: World) -> Link:
 
 
 def waiting(world: World) -> int:
-    return sum(channel.held_bytes for channel in to_site(world).channels.values())
+    return sum(channel.kept_bytes for channel in to_site(world).channels.values())
 
 
 def queue_full(world: World, topic: str) -> int:
@@ -39,8 +45,7 @@ def bounded_world(*, checked: bool = True) -> World:
     world = World(access=BOUNDED)
 
     def check(_now: float) -> None:
-        tombstones = sum(out.message.tombstone > 0 for c in to_site(world).channels.values() for out in c.retained)
-        assert waiting(world) <= LIMIT_BYTES + tombstones
+        assert waiting(world) <= LIMIT_BYTES
 
     world.client("robot")
     world.client("site", slow(), patterns=[".*"])
@@ -102,7 +107,7 @@ def test_urgent_messages_pass_over_reliable_bulk() -> None:
     for _ in range(5):
         robot.send(log, b"l" * 10_000)
     world.run(0.2)
-    assert waiting(world) == LIMIT_BYTES
+    assert waiting(world) == 5 * LARGE_BYTES
     robot.send(command, b"g" * 5_000)
     world.run(30.0)
     assert site.seqs("/cmd") == [1]
@@ -176,8 +181,81 @@ def test_whatever_comes_the_bound_holds_and_nothing_is_lost_silently(seed: int) 
         topic = channel.stream.id.topic
         sent = list(range(1, channel.next_seq))
         if channel.reliable:
-            assert sorted(site.seqs(topic) + site.expired_seqs[topic]) == sent
-            assert {drop.seq for drop in robot.dropped_out if drop.topic == topic} == set(site.expired_seqs[topic])
+            got, expired = site.seqs(topic), site.expired_seqs[topic]
+            assert len(got) + len(expired) + site.skipped_count[topic] == len(sent)
+            assert {drop.seq for drop in robot.dropped_out if drop.topic == topic} == set(sent) - set(got)
+            assert got == sorted(set(got)) and not set(got) & set(expired)
         else:
             assert site.seqs(topic) == sorted(set(site.seqs(topic)))
     assert waiting(world) == 0
+
+
+def test_a_client_that_is_away_holds_no_more_than_its_bound_whatever_comes() -> None:
+    """Also when its origin keeps to no bound of its own, and in messages that are next to nothing."""
+    world = World(access=BOUNDED)
+    peer, site = Hostile(world), Hostile(world, "site")
+    site.control({"t": "subscribe", "patterns": [".*"], "more": False})
+    site.port.disconnected(now=site.now)
+    peer.announce(1, "/robot/a", reliable=True)
+    peer.announce(2, "/robot/b", reliable=True)
+    link = to_site(world)
+    for seq in range(1, 3000):
+        peer.say(_whole(1, seq, b"x" * (seq % 3)), _whole(2, seq, b"\x01", flags=wire.FLAG_TOMBSTONE))
+        while (data := peer.port.next_datagram(now=peer.now)) is not None:
+            peer.say(wire.encode_ack(0, wire.decode_header(data).number, 2**64 - 1, 0, 0, 10**6))
+        assert waiting(world) <= LIMIT_BYTES
+        assert sum(len(channel.gaps) + len(channel.retained) for channel in link.channels.values()) < 500
+    assert all(channel.next_seq == 3000 for channel in link.channels.values())
+    world.relay.hub.validate()
+
+
+def test_what_was_left_out_is_skipped_in_its_turn_and_reported() -> None:
+    world = World(access=BOUNDED).watch(0.5)
+    robot = world.client("robot")
+    site = world.client("site", patterns=[".*"])
+    log = robot.publish("/log", spec(PriorityClass.BULK, reliable=True))
+    world.run(1.0)
+    world.hops["site"].break_connection(reconnect_s=30.0)
+    world.run(0.5)
+    for _ in range(400):  # so many that not even a tombstone of each has room
+        robot.send(log, b"l" * 200)
+        world.run(0.02)
+    world.run(60.0)
+    got = site.seqs("/log")
+    assert 50 < len(got) < 200 and got == list(range(1, len(got) + 1))
+    assert {drop.seq for drop in robot.dropped_out} == set(range(1, 401)) - set(got)
+    assert len(got) + len(site.expired_seqs["/log"]) + site.skipped_count["/log"] == 400
+    robot.send(log, b"again")
+    world.until(lambda: site.seqs("/log")[-1] == 401)
+    world.until(lambda: log.held_bytes == 0)
+
+
+def test_there_is_a_bound_where_no_rule_gives_one() -> None:
+    assert AccessTable([AccessRule(client=".*")]).limits(ClientName("any")).max_queue_bytes == DEFAULT_QUEUE_BYTES
+    assert AccessTable([]).limits(ClientName("any")).max_queue_bytes == DEFAULT_QUEUE_BYTES
+
+
+def test_a_full_queue_is_not_added_up_for_each_message() -> None:
+    world = World(access=BOUNDED)
+    peer, site = Hostile(world), Hostile(world, "site")
+    site.control({"t": "subscribe", "patterns": [".*"], "more": False})
+    site.port.disconnected(now=site.now)
+    for index in range(200):
+        peer.announce(index + 1, f"/robot/t{index}", reliable=True)
+    for _ in range(4):
+        while (data := peer.port.next_datagram(now=peer.now)) is not None:
+            peer.say(wire.encode_ack(0, wire.decode_header(data).number, 2**64 - 1, 0, 0, 10**6))
+    looked = 0
+    link = to_site(world)
+
+    class Counted(dict[int, OutChannel]):
+        def values(self) -> Any:
+            nonlocal looked
+            looked += 1
+            return super().values()
+
+    link.channels = Counted(link.channels)
+    for seq in range(1, 40):
+        peer.say(*(_whole(channel + 1, seq, b"x" * 30) for channel in range(200)))
+        peer.now -= 1e-4  # all in one instant
+    assert looked < 20

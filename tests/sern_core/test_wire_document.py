@@ -21,7 +21,7 @@ ROOT = Path(__file__).resolve().parents[2]
 DOCUMENT = (ROOT / "schemas" / "wire.md").read_text()
 CORE = [
     ROOT / "sern_core" / name
-    for name in ("announce.py", "client.py", "hop.py", "hub.py", "hub_port.py", "link.py", "session.py")
+    for name in ("announce.py", "answering.py", "client.py", "hop.py", "hub.py", "hub_port.py", "link.py", "session.py")
 ]
 
 

@@ -1,0 +1,117 @@
+"""Reports of dropped reliable messages: every one is heard, few are said, and who hears none has no more kept."""
+
+import pytest
+
+from sern_core import fragments, wire
+from sern_core.access import AccessRule, AccessTable
+from sern_core.announce import Announcement, encode_announcement
+from sern_core.errors import WireError
+from sern_core.message import StreamId, StreamInfo, TopicInfo
+from sern_core.types import DropReason, Encoding, PriorityClass, TopicName
+from sern_sim.models import LinkModel
+from tests.fuzz.test_hostile_peer import Hostile, _whole
+from tests.sern_core.test_interest import ControlBytes
+from tests.world import World, spec
+
+CAPPED = AccessTable([AccessRule(client=".*", publish=(".*",), subscribe=(".*",), max_rate_hz=10.0)])
+
+
+def said(peer: Hostile, *, acknowledge: bool = True) -> list[dict[str, object]]:
+    """The control messages that wait for the peer, which it reads."""
+    found: list[dict[str, object]] = []
+
+    class Sink:
+        def on_data(self, *args: object) -> None:
+            assert isinstance(args[5], bytes)
+            found.append(wire.decode_control(args[5])[0])
+
+        def on_ack(self, *_args: object) -> None: ...
+
+        def on_watermark(self, *_args: object) -> None: ...
+
+        def on_ping(self) -> None: ...
+
+    while (data := peer.port.next_datagram(now=peer.now)) is not None:
+        header = wire.decode_header(data)
+        if header.kind == wire.Kind.DATA:
+            wire.decode_frames(data, Sink())
+            if acknowledge and header.number:
+                peer.say(wire.encode_ack(0, header.number, 2**64 - 1, header.stamp_us, int(peer.now * 1e6), 10**6))
+    return found
+
+
+@pytest.mark.parametrize("absent", [False, True], ids=["rate cap", "retention"])
+def test_a_peer_that_never_reads_has_no_more_kept_for_it_in_any_session(
+    absent: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(fragments, "MAX_REPORTS", 500)
+    world = World() if absent else World(access=CAPPED)
+    peer = Hostile(world)
+    site = Hostile(world, "site")
+    site.control({"t": "subscribe", "patterns": [".*"], "more": False})
+    if absent:
+        site.port.disconnected(now=0.0)
+    identity = StreamId(peer.name, peer.boot, TopicName("/robot/a"))
+    info = TopicInfo(identity.topic, "a/b", Encoding.CDR)
+    stream = StreamInfo(identity, info, spec(reliable=True, retention_s=0.001))
+    seq, cuts = 0, 0
+    for _ in range(5):
+        peer.control(encode_announcement(Announcement(1, stream, "", 1)))
+        try:
+            for _ in range(1500):
+                seq += 1
+                peer.say(_whole(1, seq, b"x"))
+                peer.now += 0.0999 if seq % 2 else 0.0  # every second one is above the rate, so that no runs form
+                peer.port.next_datagram(now=peer.now)
+                if absent:
+                    peer.hub.sweep(now=peer.now)
+        except WireError:
+            cuts += 1
+            seq -= 1
+        link = peer.hub.links[peer.name]
+        assert sum(len(each.reports) for each in link.streams.values()) <= 520
+        assert len(link._control.retained) < 200
+        peer.port.disconnected(now=peer.now)
+        peer.port = world.relay.port(peer.name)
+        peer.tag, peer.number, peer.control_seq = peer.tag + 1, 0, 0
+        hello = {"name": peer.name, "boot": peer.boot, "vmin": 1, "vmax": 1}
+        peer.port.receive(wire.encode_handshake(wire.Kind.HELLO, peer.tag, int(peer.now * 1e6), hello), now=peer.now)
+    assert cuts or absent
+    peer.hub.validate()
+
+
+def test_every_drop_is_heard_and_runs_of_them_in_few_words() -> None:
+    world = World(access=CAPPED).watch(1.0)
+    thin = LinkModel(rate_bps=64e3, delay_s=0.1).as_stream()
+    robot = world.client("robot", LinkModel(delay_s=0.1).as_stream(), thin)
+    site = world.client("site", patterns=[".*"])
+    other = world.client("other", patterns=[".*"])
+    log = robot.publish("/robot/log", spec(PriorityClass.BULK, reliable=True))
+    world.run(3.0)
+    control = ControlBytes().watch(world, robot)
+    stop = robot.every(0.001, log, b"x")
+    world.run(10.0)
+    stop()
+    world.until(lambda: log.watermark == log.next_seq - 1, within_s=30.0)
+    sent = set(range(1, log.next_seq))
+    got = set(site.seqs("/robot/log"))
+    assert got == set(other.seqs("/robot/log")) and 80 < len(got) < 150 and len(sent) > 9000
+    assert sorted(drop.seq for drop in robot.dropped_out) == sorted(sent - got)
+    assert {drop.reason for drop in robot.dropped_out} == {DropReason.RATE_CAP}
+    assert control.nbytes < 40_000
+
+
+def test_an_older_peer_hears_of_each_by_itself() -> None:
+    peer = Hostile(World(access=CAPPED))
+    peer.announce(1, "/robot/a", reliable=True)
+    peer.control({"t": "synced"})
+    said(peer)
+    peer.say(*(_whole(1, seq) for seq in range(1, 501)))
+    reports = [message for _ in range(20) for message in said(peer) if message["t"] == "dropped"]
+    assert not any("n" in report for report in reports)
+    assert [report["seq"] for report in reports] == list(range(11, 501))
+    peer.control({"t": "synced", "batch": True})
+    peer.say(*(_whole(1, seq) for seq in range(501, 1001)))
+    (report,) = [message for message in said(peer) if message["t"] == "dropped"]
+    assert (report["seq"], report["n"]) == (501, 500)
+    peer.hub.validate()
