@@ -5,6 +5,7 @@ appear and which messages have their turn. Everything about bandwidth, order, re
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Protocol
 
 from sern_core import wire
@@ -258,7 +259,7 @@ class ClientCore:
             return False  # our own, come back through somebody else
         if identity not in self._open:
             info = stream.stream.info
-            digest = stream.stream.attributes.get("definition", "")
+            digest = stream.stream.definition_hash
             complete = TopicInfo(
                 info.name,
                 info.type_name,
@@ -268,7 +269,7 @@ class ClientCore:
                 info.latched,
                 info.reliable,
             )
-            stream.stream = StreamInfo(identity, complete, stream.stream.spec, stream.stream.attributes)
+            stream.stream = replace(stream.stream, info=complete)
             try:
                 self.events.stream_opened(stream.stream)
             except ConfigError:
@@ -278,7 +279,7 @@ class ClientCore:
 
     def on_definition(self, link: Link, digest: str, *, now: float) -> None:
         for stream in list(link.incoming.values()):
-            if stream.stream.attributes.get("definition") == digest:
+            if stream.stream.definition_hash == digest:
                 link.answer(stream, self._open_stream(stream), now=now)
 
     def on_retract(self, link: Link, stream: InStream, *, now: float) -> None:

@@ -218,7 +218,7 @@ class Link(Session):
 
     def _announce(self, channel: OutChannel, now: float) -> None:
         stream = channel.stream
-        digest = stream.attributes.get("definition") or definition_hash(stream.info.definition)
+        digest = stream.definition_hash or definition_hash(stream.info.definition)
         owed = channel.owed if channel.reliable else ()
         announcement = Announcement(channel.slot, stream, digest, channel.first_seq, owed)
         channel.ready = False
@@ -305,11 +305,10 @@ class Link(Session):
         for report in stream.reports:
             self._send_report(stream, report, now)
         definition = self.definitions.get(announcement.definition_hash, "")
-        if announcement.definition_hash:
-            stream.stream.attributes["definition"] = announcement.definition_hash
-            if not definition and announcement.definition_hash not in self._needed:
-                self._needed.add(announcement.definition_hash)
-                self.send_control({"t": "need", "dh": announcement.definition_hash}, now=now)
+        stream.stream.definition_hash = announcement.definition_hash
+        if announcement.definition_hash and not definition and announcement.definition_hash not in self._needed:
+            self._needed.add(announcement.definition_hash)
+            self.send_control({"t": "need", "dh": announcement.definition_hash}, now=now)
         try:
             wanted = self.handler.on_announce(self, announcement, now=now)
         except RefusedError as refusal:
