@@ -18,7 +18,6 @@ import importlib.util
 import json
 import multiprocessing
 import random
-import re
 import signal
 import statistics
 import sys
@@ -45,6 +44,7 @@ from sern_core.client import ClientCore
 from sern_core.errors import SernError
 from sern_core.message import Message, StreamInfo, TopicInfo, TopicSpec
 from sern_core.params import LinkParams, SchedulerParams
+from sern_core.patterns import compile_pattern
 from sern_core.rules import FeedRole
 from sern_core.types import ClientName, DropReason, Encoding, PriorityClass, TopicName
 from sern_relay.daemon import RelayDaemon
@@ -179,7 +179,7 @@ class FeedRelay(ZmqSystem):
     name = "feed"
 
     def relay(self, ports: Ports, ready: Callable[[], None]) -> None:
-        everything = (re.compile("/bench/.*"),)
+        everything = (compile_pattern("/bench/.*"),)
         role = FeedRole(
             "bench",
             f"tcp://127.0.0.1:{ports.publish}",

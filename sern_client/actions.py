@@ -9,7 +9,6 @@ and topics; there the answers of `refusal` take the place of those that do not c
 
 import asyncio
 import logging
-import re
 import struct
 import time
 from collections.abc import Callable
@@ -19,6 +18,7 @@ from typing import Any, Final, NamedTuple
 from sern_client.endpoints.base import Publisher, ServiceInfo, Sink
 from sern_core.errors import ConfigError
 from sern_core.message import StreamId, TopicInfo
+from sern_core.patterns import Pattern
 from sern_core.queues import OutChannel
 from sern_core.types import DropReason, Encoding, TopicName
 from sern_runtime import ros_services, ros_types
@@ -140,9 +140,7 @@ class _Action:
 class GoalWatch:
     """Of all actions that match one of `rules`: (local name, how long nothing may be heard of an accepted goal)."""
 
-    def __init__(
-        self, rules: tuple[tuple[re.Pattern[str], float], ...], advertise: Callable[[TopicInfo], Publisher]
-    ) -> None:
+    def __init__(self, rules: tuple[tuple[Pattern, float], ...], advertise: Callable[[TopicInfo], Publisher]) -> None:
         self.reported = 0
         """Goals whose clients were told that they have failed."""
         self._rules = rules

@@ -1,7 +1,6 @@
 """Joins an endpoint to the client core: discovery, names, rules, leases; what comes in goes out on the other side."""
 
 import logging
-import re
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -25,6 +24,7 @@ from sern_core.errors import ConfigError, UsageError
 from sern_core.lease import CommandLease
 from sern_core.ledger import MAX_TOPICS, OTHER_TOPIC
 from sern_core.message import Message, StreamId, StreamInfo, TopicInfo
+from sern_core.patterns import PatternSet
 from sern_core.queues import OutChannel
 from sern_core.rules import Discovery, ResolvedTopic, RuleSet, to_global
 from sern_core.services import parse as parse_service
@@ -322,15 +322,15 @@ class Bridge:
         """Of patches, the updates are only taken to make whole grids of, unless somebody here has asked for them."""
         if not self.rebuilds.is_updates(stream) or self._asked is None:
             return True
-        return any(re.fullmatch(pattern, stream.id.topic) for pattern in self._asked)
+        return PatternSet(self._asked).fullmatch(stream.id.topic)
 
     def _ask_for(self, topic: TopicName) -> None:
         """Subscribe to one more topic, unless our patterns have it already."""
         patterns = self.core.patterns
         if self._asked is None:
             self._asked = patterns
-        if not any(re.fullmatch(pattern, topic) for pattern in patterns):
-            self.core.subscribe((*patterns, re.escape(topic)), now=time.monotonic())
+        if not PatternSet(patterns).fullmatch(topic):
+            self.core.subscribe((*patterns, topic), now=time.monotonic())
             self._kick()
 
     def _show(self, incoming: Incoming, body: bytes, stamp_ns: int, left_s: float = inf) -> None:

@@ -26,7 +26,7 @@ from sern_client.udp import ClientLane
 from sern_core.client import ClientCore
 from sern_core.errors import ConfigError
 from sern_core.lossy import missing
-from sern_core.rules import compile_pattern
+from sern_core.patterns import compile_pattern
 from sern_core.trace import DecisionTrace
 from sern_core.types import CLASS_LABELS, DropReason, ObjectKind
 from sern_runtime.adaptation import Adaptation

@@ -53,6 +53,7 @@ def make_section(section: sections.EndpointSection, resolve: Resolve) -> Endpoin
                     loop=section.loop,
                     namespaces=section.namespaces,
                     topics=section.topics,
+                    deny=section.deny,
                     start_delay_s=section.start_delay_s,
                     wait_for=section.wait_for,
                     on_refused=section.on_refused,

@@ -3,11 +3,8 @@
 The first rule whose `client` pattern matches a name holds for that client; nothing is merged, so exceptions go above
 the general rule. A client that no rule names may do nothing.
 
-Patterns are full-match regular expressions. In a topic pattern `{self}` stands for the client's own name, literally:
-`/{self}/.*` grants `jackal1` what is under `/jackal1/` and nothing of `jackal10`.
-
-Rules come from the operator's own file, so any regular expression is accepted in them. Patterns that arrive from a
-peer go through `compile_peer_pattern`, which refuses those that a backtracking matcher could be kept busy with.
+Patterns are full-match regular expressions (patterns.py). In a topic pattern `{self}` stands for the client's own name,
+literally: `/{self}/.*` grants `jackal1` what is under `/jackal1/` and nothing of `jackal10`.
 """
 
 import math
@@ -17,18 +14,20 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final, NamedTuple
 
-from sern_core.errors import ConfigError, RefusedError, UsageError
-from sern_core.rules import NAME_MAX_CHARS, compile_pattern, matches_any
+from sern_core.errors import ConfigError, UsageError
+from sern_core.patterns import PatternError, PatternSet, compile_pattern
+from sern_core.rules import NAME_MAX_CHARS
 from sern_core.types import ClientName, TopicName
 
 SELF: Final = "{self}"
 """Placeholder for the client's own name in topic patterns."""
+_SELF: Final = re.compile(r"\{self\}(?=([?*+{])?)")
+LONGEST_NAME: Final = "x" * 63
+"""A rule that can be compiled for this client can be for any."""
 CACHE_ENTRIES: Final = 65_536
 """Decisions remembered in all; when full the cache is emptied, so that invented names cannot grow it."""
 CLIENT_ENTRIES: Final = 4_096
 """Clients whose compiled patterns are remembered; clients are bounded by the key directory anyway."""
-MAX_PATTERN_COST: Final = 8 * NAME_MAX_CHARS**3
-"""Ways a peer's pattern may split a name of NAME_MAX_CHARS: three `.*` and a few alternatives."""
 DEFAULT_QUEUE_BYTES: Final = 128 * 2**20
 """What may wait for one client at the relay: four reliable topics that are full at their origins."""
 DEFAULT_BURST_S: Final = 1.0
@@ -86,12 +85,12 @@ class _Grants(NamedTuple):
     """The patterns of one client, compiled, and its limits."""
 
     limits: ClientLimits
-    publish: tuple[re.Pattern[str], ...]
-    subscribe: tuple[re.Pattern[str], ...]
-    replay: tuple[re.Pattern[str], ...]
+    publish: PatternSet
+    subscribe: PatternSet
+    replay: PatternSet
 
 
-_NOTHING: Final = _Grants(ClientLimits(), (), (), ())
+_NOTHING: Final = _Grants(ClientLimits(), PatternSet(()), PatternSet(()), PatternSet(()))
 
 
 class AccessTable:
@@ -157,10 +156,10 @@ class AccessTable:
             return False
         granted = self._granted(client)
         if right is Right.PUBLISH:
-            return matches_any(granted.publish, topic)
-        if not matches_any(granted.subscribe, topic):
+            return granted.publish.fullmatch(topic)
+        if not granted.subscribe.fullmatch(topic):
             return False
-        return right is Right.SUBSCRIBE or matches_any(granted.replay, topic)
+        return right is Right.SUBSCRIBE or granted.replay.fullmatch(topic)
 
     def _granted(self, client: ClientName) -> _Grants:
         granted = self._grants.get(client)
@@ -172,8 +171,10 @@ class AccessTable:
         return granted
 
     def _compiled(self, client: ClientName) -> _Grants:
+        if len(client) > len(LONGEST_NAME) or not (client.isascii() and client.isprintable()):
+            return _NOTHING  # no client has such a name
         for rule, pattern in zip(self._rules, self._client_patterns, strict=True):
-            if pattern.fullmatch(client) is not None:
+            if pattern.fullmatch(client):
                 return _Grants(
                     ClientLimits(rule.max_bytes_per_s, rule.max_rate_hz, rule.max_queue_bytes),
                     _for_client(rule.publish, client),
@@ -255,114 +256,23 @@ class RateGuard:
         )
 
 
-def compile_peer_pattern(text: str) -> re.Pattern[str]:
-    """Compile a topic pattern that a peer sent; full match is the caller's.
-
-    Accepted: literals, `.`, classes, escapes other than back-references, groups `(…)` and `(?:…)`, alternatives and
-    repeats, as long as a backtracking matcher can try at most MAX_PATTERN_COST ways to split a name (a repeat inside
-    a repeat is the classic that cannot be bounded). Raises RefusedError(code `bad_pattern`).
-    """
-    try:
-        compiled = compile_pattern(text)
-    except UsageError as error:
-        raise RefusedError("bad_pattern", f"pattern {text[:80]!r} {error}") from None
-    if _PatternCost(text).total() > MAX_PATTERN_COST:
-        raise RefusedError(
-            "bad_pattern",
-            f"pattern {text[:80]!r} could take too long to match; use plain groups, at most three of * or +, "
-            "and no repeat inside a repeat",
-        )
-    return compiled
+def with_self(text: str, client: str) -> str:
+    """The pattern with the client's own name in place of `{self}`, in a group where a repeat follows: `{self}?` means
+    the whole name."""
+    name = re.escape(client)
+    return _SELF.sub(lambda found: f"(?:{name})" if found[1] else name, text) if SELF in text else text
 
 
-class _PatternCost:
-    """Upper bound on the ways a backtracking matcher can split a name of NAME_MAX_CHARS, infinite when unbounded.
-
-    A sequence multiplies its items, alternatives add, `?` adds one way, a repeat of something that matches in one
-    way only has as many ways as it has lengths. Called on patterns that `re` has accepted.
-    """
-
-    _QUANTIFIER = re.compile(r"(?:\*|\+|\?|\{(?!\})(\d*)(,?)(\d*)\})[?+]?")
-    _CLASS = re.compile(r"\[\^?\]?(?:\\.|[^\]\\])*\]", re.DOTALL)
-
-    def __init__(self, text: str) -> None:
-        self._text = text
-        self._at = 0
-
-    def total(self) -> float:
-        try:
-            cost = self._alternatives()
-        except (OverflowError, RecursionError):
-            return math.inf
-        return cost if self._at == len(self._text) else math.inf
-
-    def _alternatives(self) -> float:
-        ways = 0.0
-        while True:
-            ways += self._sequence()
-            if not self._text.startswith("|", self._at):
-                return ways
-            self._at += 1
-
-    def _sequence(self) -> float:
-        ways = 1.0
-        while self._at < len(self._text) and self._text[self._at] not in "|)":
-            ways *= self._repeated(self._atom())
-        return ways
-
-    def _atom(self) -> float:
-        text, at = self._text, self._at
-        if text[at] == "(":
-            if text.startswith("(?", at) and not text.startswith("(?:", at):
-                self._at = len(text) + 1  # look-around, flags, conditionals, named groups: not counted, so refused
-                return math.inf
-            self._at += 3 if text.startswith("(?:", at) else 1
-            ways = self._alternatives()
-            self._at += 1  # the closing parenthesis: `re` has checked that it is there
-            return ways
-        if text[at] == "[":
-            klass = self._CLASS.match(text, at)
-            self._at = klass.end() if klass else len(text) + 1
-            return 1.0
-        if text[at] == "\\":
-            self._at += 2
-            return math.inf if text[at + 1].isdigit() else 1.0  # a back-reference
-        self._at += 1
-        return 1.0
-
-    def _repeated(self, ways: float) -> float:
-        quantifier = self._QUANTIFIER.match(self._text, self._at)
-        if quantifier is None:
-            return ways
-        self._at = quantifier.end()
-        kind = quantifier[0][0]
-        if kind == "?":
-            return ways + 1.0
-        if kind in "*+":
-            least, most = 0, NAME_MAX_CHARS
-        else:
-            least = int(quantifier[1] or 0)
-            most = NAME_MAX_CHARS if quantifier[2] and not quantifier[3] else int(quantifier[3] or least)
-        if ways == 1.0:
-            return max(1.0, float(min(most, NAME_MAX_CHARS) - least + 1))
-        return math.inf if most > NAME_MAX_CHARS or kind in "*+" else (ways + 1.0) ** most
+def _for_client(texts: tuple[str, ...], client: ClientName) -> PatternSet:
+    return PatternSet(with_self(text, client) for text in texts)
 
 
-def _with_self(text: str, client: str) -> str:
-    # In a group of its own, so that `{self}?` means the whole name.
-    return text.replace(SELF, f"(?:{re.escape(client)})")
-
-
-def _for_client(texts: tuple[str, ...], client: ClientName) -> tuple[re.Pattern[str], ...]:
-    return tuple(re.compile(_with_self(text, client)) for text in texts)
-
-
-def _checked(rule: AccessRule, index: int) -> re.Pattern[str]:
+def _checked(rule: AccessRule, index: int) -> PatternSet:
     """Compile every pattern of a rule once, so that a bad one is found before the rule is in force."""
     where = f"access[{index}]"
     for right, texts in ((Right.PUBLISH, rule.publish), (Right.SUBSCRIBE, rule.subscribe), (Right.REPLAY, rule.replay)):
         for position, text in enumerate(texts or ()):
-            _compile_rule(_with_self(text, "self"), text, f"{where}.{right}[{position}]")
+            _compile_rule(with_self(text, LONGEST_NAME), text, f"{where}.{right}[{position}]")
     limits = ClientLimits(rule.max_bytes_per_s, rule.max_rate_hz, rule.max_queue_bytes)
     for name, limit in limits._asdict().items():
         if limit is not None and not (limit > 0 and math.isfinite(limit)):
@@ -370,8 +280,8 @@ def _checked(rule: AccessRule, index: int) -> re.Pattern[str]:
     return _compile_rule(rule.client, rule.client, f"{where}.client")
 
 
-def _compile_rule(pattern: str, text: str, key: str) -> re.Pattern[str]:
+def _compile_rule(pattern: str, text: str, key: str) -> PatternSet:
     try:
         return compile_pattern(pattern)
-    except UsageError as error:
+    except PatternError as error:
         raise ConfigError(f"pattern {text!r} {error}", key=key) from None

@@ -25,8 +25,8 @@ MAX_HASH_CHARS: Final = 128
 MAX_ATTRIBUTES: Final = 16
 MAX_ATTRIBUTE_CHARS: Final = 256
 MAX_ATTRIBUTE_BYTES: Final = 1024
-"""All attributes of a stream. With the bounds on the names it leaves room for what a relay adds when it announces the
-stream further: an announcement of a valid name that was accepted can always be passed on."""
+"""All attributes of a stream. With the bounds on the names every announcement fits into an envelope."""
+MAX_CHANNEL: Final = 0xFFFF
 _DIGEST: Final = re.compile(rf"(?:[0-9a-f]{{{DEFINITION_HASH_CHARS}}})?")
 
 
@@ -105,6 +105,16 @@ def check_stream(stream: StreamInfo) -> None:
         raise UsageError(f"{stream.id.topic} cannot be announced: {error}") from error
 
 
+def check_onwards(stream: StreamInfo) -> None:
+    """Raises WireError unless everybody whom a relay announces this stream to takes the announcement, whatever channel
+    and `first` it has there. Types are ASCII, like the names of ROS."""
+    if not (stream.info.type_name.isascii() and stream.info.type_hash.isascii()):
+        raise WireError(f"type {stream.info.type_name[:80]!r} or its hash holds something else than ASCII")
+    onwards = Announcement(MAX_CHANNEL, stream, stream.definition_hash, wire.MAX_SEQ)
+    envelope, _ = wire.decode_control(wire.encode_control(encode_announcement(onwards)))
+    decode_announcement(envelope)
+
+
 def decode_announcement(envelope: wire.Envelope) -> Announcement:
     """Raises WireError for anything that is not a complete, sane announcement. The definition is not in it."""
     attributes = wire.take_texts(
@@ -153,7 +163,7 @@ def decode_announcement(envelope: wire.Envelope) -> Announcement:
     )
     origin = ClientName(wire.take_str(envelope, "or", max_length=64))
     return Announcement(
-        channel=wire.take_int(envelope, "ch", low=1, high=0xFFFF),
+        channel=wire.take_int(envelope, "ch", low=1, high=MAX_CHANNEL),
         stream=StreamInfo(StreamId(origin, wire.take_int(envelope, "boot"), topic), info, spec, attributes),
         definition_hash=digest,
         first=wire.take_int(envelope, "first", low=1, high=wire.MAX_SEQ),

@@ -6,6 +6,7 @@ appear and which messages have their turn. Everything about bandwidth, order, re
 
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from typing import ParamSpec, Protocol
 
 from sern_core import wire
@@ -293,7 +294,7 @@ class ClientCore:
             return False  # our own, come back through somebody else
         if identity not in self._open:
             info = stream.stream.info
-            digest = stream.stream.attributes.get("definition", "")
+            digest = stream.stream.definition_hash
             complete = TopicInfo(
                 info.name,
                 info.type_name,
@@ -303,7 +304,7 @@ class ClientCore:
                 info.latched,
                 info.reliable,
             )
-            stream.stream = StreamInfo(identity, complete, stream.stream.spec, stream.stream.attributes)
+            stream.stream = replace(stream.stream, info=complete)
             if not self._opened(stream.stream):
                 return False
             self._open.add(identity)
@@ -325,7 +326,7 @@ class ClientCore:
 
     def on_definition(self, link: Link, digest: str, *, now: float) -> None:
         for stream in list(link.incoming.values()):
-            if stream.stream.attributes.get("definition") == digest:
+            if stream.stream.definition_hash == digest:
                 link.answer(stream, self._open_stream(stream), now=now)
 
     def on_retract(self, link: Link, stream: InStream, *, now: float) -> None:

@@ -111,4 +111,9 @@ def _held_bytes(channel: OutChannel) -> int:
 
 
 def _same(one: StreamInfo, other: StreamInfo) -> bool:
-    return one.info == other.info and one.spec == other.spec and one.attributes == other.attributes
+    return (
+        one.info == other.info
+        and one.spec == other.spec
+        and one.definition_hash == other.definition_hash
+        and one.attributes == other.attributes
+    )

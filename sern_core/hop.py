@@ -79,6 +79,8 @@ class Hop(Sender):
                 return
             stream = known
         wide = wire.widen_seq(seq, stream.delivered)
+        if wide >= wire.MAX_SEQ:
+            raise WireError(f"seq {wide}: streams end below {wire.MAX_SEQ}")  # what follows it could not be announced
         if total > self.params.max_message_bytes:
             if offset == 0:
                 stream.give_up(wide, DropReason.TOO_LARGE, total, now)

@@ -16,8 +16,8 @@ from functools import partial
 from typing import Final
 
 from sern_core import wire
-from sern_core.access import AccessTable, RateGuard, compile_peer_pattern
-from sern_core.announce import Announcement
+from sern_core.access import AccessTable, RateGuard
+from sern_core.announce import Announcement, check_onwards
 from sern_core.bound import QueueBound
 from sern_core.definitions import DefinitionStore
 from sern_core.draining import Draining
@@ -25,6 +25,7 @@ from sern_core.errors import RefusedError, UsageError, WireError
 from sern_core.fragments import InStream
 from sern_core.hub_events import GuardedEvents, HubEvents, Relayed
 from sern_core.hub_local import LocalStreams
+from sern_core.hub_matching import Matching
 from sern_core.hub_port import HubPort
 from sern_core.lanes import LANE_EXPRESS
 from sern_core.ledger import ReceiveLedger
@@ -36,8 +37,8 @@ from sern_core.out_message import OutMessage
 from sern_core.params import LinkParams, SchedulerParams
 from sern_core.queues import OutChannel
 from sern_core.replay import ReplayStore
-from sern_core.routing import RouteChange, RoutingTable
-from sern_core.rules import name_problem
+from sern_core.routing import BadPatternError, RouteChange, RoutingTable
+from sern_core.rules import is_client_name, name_problem
 from sern_core.trace import DecisionTrace
 from sern_core.types import DROP_CODES, ClientName, DropReason, TopicName
 
@@ -103,6 +104,7 @@ class Hub(LocalStreams):
         self._guards: dict[ClientName, RateGuard] = {}
         self._bounds: dict[ClientName, QueueBound] = {}
         self._subscriptions: dict[ClientName, list[str]] = {}  # parts that have arrived
+        self.matching = Matching(self.routing, self._subscribed, self._apply)
         self._awaited: dict[ClientName, set[TopicName]] = {}
         self._heard: set[ClientName] = set()  # said what they want, to this run of the relay
         self._absent_since: dict[ClientName, float] = {}
@@ -202,6 +204,7 @@ class Hub(LocalStreams):
             self._tidy_due_s = now + TIDY_S
             self.received.tidy({identity.topic for identity in self.relayed}, now=now)
             self._numbering.tidy(now=now)
+        self.matching.sweep(now=now)
 
     def left(self, client: ClientName, *, now: float) -> None:
         """A client has said goodbye. One that has streams, or wants reliable ones, may come back to them (a daemon that
@@ -238,6 +241,7 @@ class Hub(LocalStreams):
         if port is not None:
             port.link = None
         self._subscriptions.pop(client, None)
+        self.matching.forget(client)
         self._absent_since.pop(client, None)
         self._awaited.pop(client, None)
         self._heard.discard(client)
@@ -259,6 +263,8 @@ class Hub(LocalStreams):
                 self.events.refused(identity.origin, "forbidden", text)
         self._apply(change, now, reason=DropReason.FORBIDDEN)
         self._draining.keep(self._may_drain, DropReason.FORBIDDEN, now=now)
+        for client in self.links:
+            self.matching.look(client, now=now)
 
     def _may_drain(self, client: ClientName, stream: StreamId) -> bool:
         """Whether the rules allow what an ended stream left behind."""
@@ -292,7 +298,7 @@ class Hub(LocalStreams):
             if relayed is not None:
                 self._answer(relayed, now)
                 self._confirm(relayed)
-        for denied in [each for each in change.denied if each.by_name][:MAX_DENIED]:
+        for denied in change.denied[:MAX_DENIED]:
             text = f"{denied.client} may not subscribe to {denied.topic}: no access rule grants it"
             self.events.refused(denied.client, "forbidden", text)
             self._tell(denied.client, {"t": "denied", "topic": denied.topic, "code": "forbidden", "why": text}, now)
@@ -475,6 +481,11 @@ class Hub(LocalStreams):
             relayed = self.relayed[identity] = Relayed(source, stream, self.replays)
         relayed.stream = stream
         try:
+            try:
+                check_onwards(stream.stream)
+            except WireError as error:
+                text = f"{identity.origin} may not publish {identity.topic[:80]!r}: nobody would take its announcement"
+                raise RefusedError("bad_announcement", f"{text}: {error}") from None
             change = self.routing.announce(stream.stream)
         except RefusedError:
             self._apply(self.routing.withdraw(identity), now)
@@ -497,7 +508,9 @@ class Hub(LocalStreams):
         for text in owed:
             client = ClientName(text)
             # Connected is not enough: it may not have come to say what it wants yet.
-            if client in self._heard or client == identity.origin or not self.known(client):
+            if client in self._heard or client == identity.origin:
+                continue
+            if not is_client_name(client) or not self.known(client):
                 continue
             if client not in self.links and len(self._awaited) >= MAX_AWAITED_CLIENTS:
                 continue
@@ -511,6 +524,7 @@ class Hub(LocalStreams):
                     self._apply(self.routing.subscribe(client, (), exact=topics), now)
                 except RefusedError as refusal:
                     self.events.refused(client, refusal.code, str(refusal))
+                self.matching.look(client, now=now)
 
     def on_retract(self, link: Link, stream: InStream, *, now: float) -> None:
         self._apply(self.routing.withdraw(stream.stream.id), now)
@@ -641,7 +655,9 @@ class Hub(LocalStreams):
             if len(parts) > MAX_SUBSCRIPTION_PARTS * wire.MAX_ENVELOPE_ITEMS:
                 raise WireError(f"more than {MAX_SUBSCRIPTION_PARTS * wire.MAX_ENVELOPE_ITEMS} subscription patterns")
             return
-        del self._subscriptions[client]
+        self.matching.ask(client, self._subscriptions.pop(client), now=now)
+
+    def _subscribed(self, client: ClientName, parts: list[str], now: float) -> None:
         self._awaited.pop(client, None)
         self._heard.add(client)
         # What is a name and no pattern is denied by name: that gives nothing away about what there is.
@@ -657,7 +673,7 @@ class Hub(LocalStreams):
                 )
         except RefusedError as refusal:
             self.events.refused(client, refusal.code, str(refusal))
-            bad = next((part for part in patterns if not _acceptable(part)), "")
+            bad = refusal.pattern if isinstance(refusal, BadPatternError) else ""
             self._tell(client, {"t": "denied", "pattern": bad, "code": refusal.code, "why": str(refusal)[:400]}, now)
 
     def validate(self) -> None:
@@ -688,11 +704,3 @@ class Hub(LocalStreams):
         for table in (self._absent_since, self._awaited, self._bounds, self._heard):
             assert set(table) <= set(self.links), "something is kept for clients that are forgotten"
         assert all(len(topics) <= MAX_AWAITED_TOPICS for topics in self._awaited.values()), "too much is awaited"
-
-
-def _acceptable(pattern: str) -> bool:
-    try:
-        compile_peer_pattern(pattern)
-    except RefusedError:
-        return False
-    return True

@@ -4,6 +4,7 @@ A connection is not yet a client: who speaks is known from the key (or believed,
 HELLO, and a newer connection of the same client takes the session over. `Hub` keeps the links; a port finds its own.
 """
 
+import math
 from typing import TYPE_CHECKING, Final
 
 from sern_core import wire
@@ -86,12 +87,21 @@ class HubPort:
         return self.link.next_datagram(now=now) if self.link is not None and self.current else None
 
     def next_deadline(self) -> float | None:
-        return self.link.next_deadline() if self.link is not None and self.current else None
+        if self.link is None or not self.current:
+            return None
+        deadline_s, match_s = self.link.next_deadline(), self.hub.matching.due_s.get(self.client)
+        return deadline_s if match_s is None or (deadline_s is not None and deadline_s < match_s) else match_s
 
     def handle_timeout(self, *, now: float) -> None:
         if self.link is not None and self.current:
             self.link.handle_timeout(now=now)
+            if now >= self.hub.matching.due_s.get(self.client, math.inf):
+                self.hub.matching.go_on(self.client, now=now)
 
     @property
     def dirty(self) -> bool:
-        return bool(self._out) or (self.link is not None and self.current and self.link.dirty)
+        if self._out:
+            return True
+        if self.link is None or not self.current:
+            return False
+        return self.link.dirty or self.client in self.hub.matching.due_s

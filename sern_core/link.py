@@ -323,12 +323,10 @@ class Link(Answering):
         stream.channel_id = slot
         self.incoming[slot] = stream
         self._expect_answer(stream, slot)
-        digest = announcement.definition_hash
+        digest = stream.stream.definition_hash = announcement.definition_hash
         self.texts.use_incoming(identity, digest)
-        if digest:
-            stream.stream.attributes["definition"] = digest
-            if self.texts.lacks(digest):
-                self.send_control({"t": "need", "dh": digest}, now=now)
+        if digest and self.texts.lacks(digest):
+            self.send_control({"t": "need", "dh": digest}, now=now)
         try:
             wanted = self._offer_stream(stream, announcement, now)
         except RefusedError as refusal:
@@ -629,10 +627,10 @@ def _same_type(known: StreamInfo, announced: Announcement) -> bool:
         one.type_name == other.type_name
         and one.encoding is other.encoding
         and one.type_hash == other.type_hash
-        and known.attributes.get("definition", "") == announced.definition_hash
+        and known.definition_hash == announced.definition_hash
     )
 
 
 def _digest(stream: StreamInfo) -> str:
     """What the stream's definition is called; empty for none."""
-    return stream.attributes.get("definition") or definition_hash(stream.info.definition)
+    return stream.definition_hash or definition_hash(stream.info.definition)

@@ -128,3 +128,5 @@ class StreamInfo:
     info: TopicInfo
     spec: TopicSpec
     attributes: dict[str, str] = field(default_factory=dict)
+    definition_hash: str = ""
+    """Of a stream from a peer: the hash of its definition, as it was announced; empty: it has none."""

@@ -3,10 +3,13 @@
 Theory of operation
 - A client announces its streams and says what it wants as patterns and exact names. A *match* is a (client, stream)
   pair for which the client wants the stream's global name, may subscribe to it, and is not its origin.
-- Every change of streams, interests or access rules is worked out at once, and the call returns it as a
-  `RouteChange`: the caller opens and closes channels from it and tells origins whether anybody listens. Per message
-  there is only `subscribers(stream)`, one look-up.
-- Patterns are matched once per (client, global name), whatever the number of streams and messages under that name.
+- Every change of streams, interests or access rules comes back as a `RouteChange`: the caller opens and closes channels
+  from it and tells origins whether anybody listens. Per message there is only `subscribers(stream)`, one look-up.
+- Patterns are matched once per (client, global name), whatever the number of streams and messages under that name, and
+  only against names that the client may subscribe to.
+- A new stream is matched at once: it costs at most `MAX_CLIENT_PROGRAM` steps a character and client. A new interest,
+  which has all names before it, is worked out in slices of `SLICE_UNITS`: while `unfinished`, call `go_on`. Until a
+  name's turn has come it stays as it was; what a client may no longer have is taken away at once.
 
 Names
 - A global name has one owner, the first client that announces it, until the owner withdraws it or is dropped.
@@ -17,21 +20,39 @@ Names
 Who announces is the caller's business: `StreamInfo.id.origin` must be the name bound to the peer's key.
 """
 
-import re
 from bisect import bisect_left
 from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
-from sern_core.access import AccessTable, compile_peer_pattern
+from sern_core.access import AccessTable
 from sern_core.errors import RefusedError
 from sern_core.message import StreamId, StreamInfo, TopicInfo
+from sern_core.patterns import MAX_CLIENT_PROGRAM, PatternError, PatternSet
 from sern_core.rules import name_problem, plain_type
 from sern_core.types import ClientName, TopicName
 
 RETIRED_BOOTS: Final = 8
 """Replaced boots remembered per client, against announcements that were still under way."""
+UNIT_S: Final = 4e-9
+"""What one instruction of a pattern's program costs for one character at most, roughly: the unit of what follows."""
+SLICE_UNITS: Final = 2_000_000
+"""Matching that is done in one go."""
+NAME_UNITS: Final = 500
+"""A look at one name, access included."""
+ROUTE_UNITS: Final = 20_000
+"""What follows from a route that comes or goes: a channel, its announcement, an answer to the origin."""
+COMPILE_UNITS: Final = 200
+"""Compiling, for each instruction of the program and each character of a pattern."""
+
+
+class BadPatternError(RefusedError):
+    """A client subscribes to something that is no pattern."""
+
+    def __init__(self, pattern: str, problem: str) -> None:
+        super().__init__("bad_pattern", f"pattern {pattern[:80]!r} {problem}")
+        self.pattern = pattern
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,6 +62,10 @@ class RoutingLimits:
     max_streams: int = 2_000
     max_patterns: int = 256
     max_exact: int = 4_096
+    max_program: int = MAX_CLIENT_PROGRAM
+    """Of all patterns together, in instructions of RE2."""
+    max_all_streams: int = 60_000
+    """Of all clients: what fits into the channel numbers of one that takes everything."""
 
 
 class Match(NamedTuple):
@@ -51,14 +76,11 @@ class Match(NamedTuple):
 
 
 class Denied(NamedTuple):
-    """The client wants the topic and the access rules forbid it.
-
-    Tell the client only when it named the topic itself (`by_name`): otherwise it would learn what it may not see.
-    """
+    """The client named the topic, and the access rules forbid it. Of what it has only patterns for, nothing is said:
+    it would learn what it may not see."""
 
     client: ClientName
     topic: TopicName
-    by_name: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,19 +109,21 @@ NO_CHANGE: Final = RouteChange()
 
 
 class _Interest:
-    """What one client wants; `topics` are the known global names that it wants and may have."""
+    """What one client wants; `topics` are the known global names that it wants and may have.
 
-    __slots__ = ("exact", "pattern", "texts", "topics")
+    `left` are names that have not been looked at since the interest or the access rules changed.
+    """
 
-    def __init__(self, texts: tuple[str, ...], exact: frozenset[TopicName]) -> None:
-        self.texts = texts
+    __slots__ = ("exact", "left", "patterns", "topics")
+
+    def __init__(self, patterns: PatternSet, exact: frozenset[TopicName]) -> None:
+        self.patterns = patterns
         self.exact = exact
-        # One alternation is one call per name. The parts were compiled one by one before: they cannot break out.
-        self.pattern: re.Pattern[str] | None = re.compile("|".join(f"(?:{text})" for text in texts)) if texts else None
         self.topics: set[TopicName] = set()
+        self.left: deque[TopicName] = deque()
 
     def wants(self, topic: TopicName) -> bool:
-        return topic in self.exact or (self.pattern is not None and self.pattern.fullmatch(topic) is not None)
+        return topic in self.exact or self.patterns.fullmatch(topic)
 
 
 class _Topic:
@@ -125,6 +149,8 @@ class RoutingTable:
         self._boots: dict[ClientName, int] = {}
         self._retired: dict[ClientName, deque[int]] = {}
         self._interests: dict[ClientName, _Interest] = {}
+        self.spent_units = 0
+        """What the last `subscribe`, `go_on` or `set_access` has cost."""
 
     # Look-ups --------------------------------------------------------------------------------------------------------
 
@@ -161,7 +187,7 @@ class RoutingTable:
     def takes(self, client: ClientName, topic: TopicName) -> bool:
         """Whether the client wants the global name and may have it, whether or not there is such a stream."""
         interest = self._interests.get(client)
-        return interest is not None and interest.wants(topic) and self._access.may_subscribe(client, topic)
+        return interest is not None and self._access.may_subscribe(client, topic) and interest.wants(topic)
 
     def owners(self, topic: TopicName) -> tuple[ClientName, ...]:
         """The clients that hold the global name, first come first."""
@@ -173,6 +199,11 @@ class RoutingTable:
         used = {(stream.origin, stream.topic) for stream in self._infos}
         used.update((client, topic) for client, interest in self._interests.items() for topic in interest.topics)
         return tuple(sorted(used))
+
+    def unfinished(self, client: ClientName) -> bool:
+        """Whether there are names that the client's interest was not matched with yet: call `go_on`."""
+        interest = self._interests.get(client)
+        return interest is not None and bool(interest.left)
 
     # Changes ---------------------------------------------------------------------------------------------------------
 
@@ -211,10 +242,11 @@ class RoutingTable:
     def subscribe(
         self, client: ClientName, patterns: Iterable[str] = (), *, exact: Iterable[TopicName] = ()
     ) -> RouteChange:
-        """Replace what the client wants: full-match patterns on global names, and exact names.
+        """Replace what the client wants: full-match patterns on global names, and exact names. See `unfinished`.
 
         Raises RefusedError with code `bad_pattern` or `too_many_patterns`; then the earlier interest stays.
         """
+        self.spent_units = NAME_UNITS
         texts = tuple(dict.fromkeys(patterns))
         names = frozenset(exact)
         if len(texts) > self._limits.max_patterns or len(names) > self._limits.max_exact:
@@ -224,14 +256,27 @@ class RoutingTable:
                 f"and {self._limits.max_exact} are taken; join patterns with '|'",
             )
         old = self._interests.get(client)
-        denied = [Denied(client, name, by_name=True) for name in names if not self._access.may_subscribe(client, name)]
-        if old is not None and old.texts == texts and old.exact == names:
+        denied = [Denied(client, name) for name in names if not self._access.may_subscribe(client, name)]
+        if old is not None and old.patterns.texts == texts and old.exact == names:
             return RouteChange(denied=tuple(sorted(denied)))  # said again: it may be another process that asks
-        for text in texts:
-            compile_peer_pattern(text)
+        self.spent_units += COMPILE_UNITS * sum(map(len, texts))
+        try:
+            wanted = PatternSet(texts, max_program=self._limits.max_program)
+        except PatternError as error:
+            raise _refused(error, client) from None
+        self.spent_units += COMPILE_UNITS * wanted.program
         change = _Collector()
         change.denied.update(denied)
-        self._set_interest(client, _Interest(texts, names) if texts or names else None, change)
+        self._set_interest(client, _Interest(wanted, names), change)
+        return change.result(self._routes)
+
+    def go_on(self, client: ClientName) -> RouteChange:
+        """Match the client's interest with some more of the names that are left; nothing happens when none is."""
+        self.spent_units = 0
+        change = _Collector()
+        interest = self._interests.get(client)
+        if interest is not None:
+            self._match_some(client, interest, change)
         return change.result(self._routes)
 
     def drop_client(self, client: ClientName) -> RouteChange:
@@ -247,19 +292,25 @@ class RoutingTable:
 
     def set_access(self, access: AccessTable) -> RouteChange:
         """New access rules are in force: `removed` streams and `unmatched` pairs have lost their right, others may
-        have gained one. A name that a client asked for and just lost is listed in `denied`."""
+        have gained one (see `unfinished`). A name that a client asked for and just lost is listed in `denied`."""
         before, self._access = self._access, access
+        self.spent_units = 0
         change = _Collector()
         for stream in tuple(self._infos):
             if not access.may_publish(stream.origin, stream.topic):
                 self._remove(stream, change)
-        for client, interest in self._interests.items():
+        for client, interest in list(self._interests.items()):
             change.denied.update(
-                Denied(client, name, by_name=True)
+                Denied(client, name)
                 for name in interest.exact
                 if before.may_subscribe(client, name) and not access.may_subscribe(client, name)
             )
-            self._refresh(client, interest, change)
+            for name in sorted(interest.topics):
+                if not access.may_subscribe(client, name):
+                    interest.topics.discard(name)
+                    self._set_taker(client, name, change, takes=False)
+            interest.left = self._to_look_at(interest)
+            self._match_some(client, interest, change)
         return change.result(self._routes)
 
     # Internals -------------------------------------------------------------------------------------------------------
@@ -283,6 +334,12 @@ class RoutingTable:
                 "too_many_streams",
                 f"{origin} may not publish {topic}: it has {self._limits.max_streams} streams, which is the limit; "
                 "deny some topics in its discovery",
+            )
+        if stream.id not in self._infos and len(self._infos) >= self._limits.max_all_streams:
+            raise RefusedError(
+                "too_many_streams",
+                f"{origin} may not publish {topic}: the relay has {self._limits.max_all_streams} streams, which is the "
+                "limit; deny some topics in the discovery of the clients",
             )
         entry = self._topics.get(topic)
         for other, held in entry.streams.items() if entry is not None else ():
@@ -311,12 +368,9 @@ class RoutingTable:
         if topic is None:
             topic = self._topics[name] = _Topic()
             for client, interest in self._interests.items():
-                if interest.wants(name):
-                    if self._access.may_subscribe(client, name):
-                        interest.topics.add(name)
-                        topic.takers.add(client)
-                    elif client != origin and name not in interest.exact:
-                        change.denied.add(Denied(client, name, by_name=False))
+                if self._takes(client, interest, name):
+                    interest.topics.add(name)
+                    topic.takers.add(client)
         topic.streams[origin] = stream.id
         change.before.setdefault(stream.id, ())
         self._routes[stream.id] = tuple(sorted(topic.takers - {origin}))
@@ -338,22 +392,46 @@ class RoutingTable:
         if interest is not None:
             interest.topics = old.topics if old is not None else set()
             self._interests[client] = interest
-            self._refresh(client, interest, change)
+            interest.left = self._to_look_at(interest)
+            self._match_some(client, interest, change)
         elif old is not None:
             for name in old.topics:
                 self._set_taker(client, name, change, takes=False)
 
-    def _refresh(self, client: ClientName, interest: _Interest, change: "_Collector") -> None:
-        """Match every known name against the client's interest and rights again."""
-        for name, topic in self._topics.items():
-            takes = interest.wants(name)
-            if takes and not self._access.may_subscribe(client, name):
-                takes = False
-                if name not in interest.exact and topic.streams.keys() != {client}:
-                    change.denied.add(Denied(client, name, by_name=False))
+    def _to_look_at(self, interest: _Interest) -> deque[TopicName]:
+        """The names that may come to the interest or leave it, those that it names itself first."""
+        if interest.patterns.texts:
+            return deque(self._topics)
+        named = interest.exact & self._topics.keys()
+        return deque((*sorted(named - interest.topics), *sorted(interest.topics - named)))
+
+    def _takes(self, client: ClientName, interest: _Interest, name: TopicName) -> bool:
+        """Whether the client wants the name and may have it. What may take long is asked last."""
+        steps = interest.patterns.steps(name)
+        if steps:
+            if not self._access.may_subscribe(client, name):
+                return False
+            self.spent_units += steps * len(name)
+            return interest.wants(name)
+        return interest.wants(name) and self._access.may_subscribe(client, name)
+
+    def _match_some(self, client: ClientName, interest: _Interest, change: "_Collector") -> None:
+        """Match names that are left against the client's rights and interest, one slice of them at least by one."""
+        left = interest.left
+        while left:
+            name = left.popleft()
+            self.spent_units += NAME_UNITS
+            if name not in self._topics:
+                continue  # gone meanwhile
+            takes = self._takes(client, interest, name)
             if takes != (name in interest.topics):
                 (interest.topics.add if takes else interest.topics.discard)(name)
                 self._set_taker(client, name, change, takes=takes)
+                self.spent_units += ROUTE_UNITS
+            if self.spent_units >= SLICE_UNITS:
+                return
+        if not interest.patterns.texts and not interest.exact:
+            del self._interests[client]
 
     def _set_taker(self, client: ClientName, name: TopicName, change: "_Collector", *, takes: bool) -> None:
         topic = self._topics[name]
@@ -369,15 +447,18 @@ class RoutingTable:
         """Check the tables against each other and against brute force; raises AssertionError."""
         for stream, info in self._infos.items():
             name = stream.topic
+            route = self._routes[stream]
             expected = tuple(
                 sorted(
                     client
                     for client, interest in self._interests.items()
-                    if client != stream.origin and interest.wants(name) and self._access.may_subscribe(client, name)
+                    if client != stream.origin
+                    and self._access.may_subscribe(client, name)
+                    and (client in route if name in interest.left else interest.wants(name))
                 )
             )
             assert info.id == stream, f"{stream} is filed under another id"
-            assert self._routes[stream] == expected, f"{stream}: routes {self._routes[stream]}, expected {expected}"
+            assert route == expected, f"{stream}: routes {route}, expected {expected}"
             assert self._boots[stream.origin] == stream.boot, f"{stream} is of a retired boot"
             assert self._topics[name].streams[stream.origin] == stream, f"{stream} does not hold its name"
             assert self._by_client[stream.origin][name] == stream, f"{stream} is not among its origin's streams"
@@ -443,5 +524,16 @@ def type_problem(mine: TopicInfo, theirs: TopicInfo) -> str | None:
     return None
 
 
+def _refused(error: PatternError, client: ClientName) -> RefusedError:
+    if error.text is not None:
+        return BadPatternError(error.text, str(error))
+    return RefusedError("too_many_patterns", f"{client}: {error}")
+
+
 def _same(one: StreamInfo, other: StreamInfo) -> bool:
-    return one.info == other.info and one.spec == other.spec and one.attributes == other.attributes
+    return (
+        one.info == other.info
+        and one.spec == other.spec
+        and one.attributes == other.attributes
+        and one.definition_hash == other.definition_hash
+    )

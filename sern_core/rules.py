@@ -1,14 +1,13 @@
 """Names and topic rules: what the configuration says about a topic, as plain data.
 
 Rules of this file:
-- every pattern is a regular expression that must match the whole name;
+- every pattern is a regular expression that must match the whole name (patterns.py);
 - the first rule that matches wins; nothing is merged;
 - a *local* name is what the endpoint of one site calls a topic, a *global* name is what everyone else calls it;
 - all values here were checked by the configuration, and the functions below still refuse what would be unsafe.
 """
 
 import re
-import warnings
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from enum import Enum, StrEnum
@@ -26,13 +25,13 @@ from sern_core.message import (
     TopicInfo,
     TopicSpec,
 )
+from sern_core.patterns import Pattern, PatternSet, compile_pattern
 from sern_core.summaries.spec import SummarySpec
 from sern_core.summaries.transforms import TF_TYPES, is_static
 from sern_core.types import ClientName, Durability, Encoding, PriorityClass, Reliability, TopicName
 
 NAME_MAX_CHARS: Final = 255
 """Longest topic name; ROS 2 middleware allows no more."""
-PATTERN_MAX_CHARS: Final = 512
 DEFAULT_RELIABLE_DEPTH: Final = 10
 DEFAULT_BEST_EFFORT_DEPTH: Final = 1
 LEASE_REPEAT_HZ: Final = 10.0
@@ -80,9 +79,13 @@ def topic_name(name: str) -> TopicName:
     return TopicName(name)
 
 
+def is_client_name(name: str) -> bool:
+    return _CLIENT_NAME.fullmatch(name) is not None
+
+
 def client_name(name: str) -> ClientName:
     """`name` as a checked ClientName; UsageError otherwise."""
-    if not _CLIENT_NAME.fullmatch(name):
+    if not is_client_name(name):
         raise UsageError(f"client name {name[:80]!r} must be a lower-case letter, then up to 62 of a-z, 0-9, '_'")
     return ClientName(name)
 
@@ -116,35 +119,13 @@ def plain_type(type_name: str) -> str:
     return type_name.replace("/msg/", "/", 1)
 
 
-def type_matches(patterns: tuple[re.Pattern[str], ...], type_name: str) -> bool:
+def matches_any(patterns: Iterable[PatternSet], name: str) -> bool:
+    return any(pattern.fullmatch(name) for pattern in patterns)
+
+
+def type_matches(patterns: tuple[PatternSet, ...], type_name: str) -> bool:
     """Whether one of the patterns is of this type, in either spelling."""
     return matches_any(patterns, type_name) or matches_any(patterns, plain_type(type_name))
-
-
-# Patterns ------------------------------------------------------------------------------------------------------------
-
-
-def compile_pattern(text: str) -> re.Pattern[str]:
-    """A pattern for `fullmatch`; UsageError with one line for anything that is not a plain regular expression.
-
-    Refuses global flags such as `(?i)`, because patterns are combined with namespaces.
-    """
-    if not text:
-        raise UsageError("is empty; '.*' matches everything")
-    if len(text) > PATTERN_MAX_CHARS:
-        raise UsageError(f"is longer than {PATTERN_MAX_CHARS} characters")
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("error")  # "possible nested set": the meaning would change with the Python version
-            re.compile(f"(?:{text})")
-            return re.compile(text)
-    except (re.error, Warning, OverflowError, RecursionError) as error:
-        reason = error.msg if isinstance(error, re.error) else str(error)
-        raise UsageError(f"is not a regular expression ({reason.splitlines()[0].split(' at position')[0]})") from error
-
-
-def matches_any(patterns: Iterable[re.Pattern[str]], name: str) -> bool:
-    return any(pattern.fullmatch(name) for pattern in patterns)
 
 
 # Topic rules ---------------------------------------------------------------------------------------------------------
@@ -183,8 +164,8 @@ class TopicRule:
     AUTO and None stand for the defaults that `RuleSet.resolve` documents; `lifespan_s` None means for ever.
     """
 
-    match: re.Pattern[str]
-    type_match: re.Pattern[str] | None = None
+    match: Pattern
+    type_match: Pattern | None = None
     priority: PriorityClass = PriorityClass.BULK
     direction: Direction = Direction.BOTH
     weight: float | None = None
@@ -377,14 +358,14 @@ class RuleSet:
         local = to_local(name, namespace)
         return self._inward.get(local, local) if in_namespace(name, namespace) else local
 
-    def receive_patterns(self, namespace: str) -> tuple[re.Pattern[str], ...]:
+    def receive_patterns(self, namespace: str) -> tuple[str, ...]:
         """What to subscribe to because of rules with direction `receive`: patterns of global names.
 
         The pattern of a late rule may cover names that an earlier rule takes; `resolve` has the last word.
         """
-        prefix = "" if namespace == "/" else re.escape(namespace)
+        prefix = "" if namespace == "/" else namespace
         return tuple(
-            re.compile(f"{prefix}(?:{rule.remap or rule.match.pattern})")
+            f"{prefix}(?:{rule.remap or rule.match.pattern})"
             for rule in self.rules
             if rule.direction is Direction.RECEIVE
         )
@@ -406,10 +387,10 @@ class Discovery:
     """Which local topics are offered to the link at all."""
 
     mode: DiscoveryMode = DiscoveryMode.MANUAL
-    allow: tuple[re.Pattern[str], ...] = (re.compile(".*"),)
-    deny: tuple[re.Pattern[str], ...] = ()
-    allow_types: tuple[re.Pattern[str], ...] = (re.compile(".*"),)
-    deny_types: tuple[re.Pattern[str], ...] = ()
+    allow: tuple[Pattern, ...] = (compile_pattern(".*"),)
+    deny: tuple[Pattern, ...] = ()
+    allow_types: tuple[Pattern, ...] = (compile_pattern(".*"),)
+    deny_types: tuple[Pattern, ...] = ()
 
     def wants(self, local_name: TopicName, type_name: str, *, listed: bool) -> bool:
         """`listed`: some rule matches the topic. What is denied, by name or type, is out; then the mode and what is
@@ -444,8 +425,8 @@ class FeedRole:
     name: str
     publish_endpoint: str
     ingest_endpoint: str | None = None
-    subscribe: tuple[re.Pattern[str], ...] = ()
-    publish: tuple[re.Pattern[str], ...] = ()
+    subscribe: tuple[Pattern, ...] = ()
+    publish: tuple[Pattern, ...] = ()
     allow_control: bool = False
     types: tuple[FeedTopic, ...] = ()
     max_rate_hz: float | None = None

@@ -15,6 +15,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
+from sern_core.patterns import Pattern
 from sern_core.types import ClientName, PriorityClass, TopicName
 
 CALL: Final = struct.Struct("!Q")
@@ -31,7 +32,7 @@ _PARTS: Final = re.compile(r"(?P<service>/.+)/_(?:(?P<offer>service)|(?P<kind>ca
 class ServiceRule:
     """Services that one site offers, or uses. `match`: local names where offered, global names where used."""
 
-    match: re.Pattern[str]
+    match: Pattern
     timeout_s: float
     priority: PriorityClass = PriorityClass.STATE
 
@@ -73,7 +74,7 @@ def subscriptions(
     client: ClientName, namespace: str, *, offer: Iterable[ServiceRule], use: Iterable[ServiceRule]
 ) -> tuple[str, ...]:
     """The patterns that a client must subscribe to for these rules. `namespace` is normal."""
-    prefix = "" if namespace == "/" else re.escape(namespace)
+    prefix = "" if namespace == "/" else namespace
     found = [f"{prefix}(?:{rule.match.pattern})/_call/[a-z0-9_]+" for rule in offer]
     for rule in use:
         found += [f"(?:{rule.match.pattern})/_service", f"(?:{rule.match.pattern})/_reply/{client}"]

@@ -37,6 +37,7 @@ Decoding accepts or raises WireError (VersionError for a version that is not spo
 that another program needs to know to speak it is in schemas/wire.md.
 """
 
+import re
 import struct
 import zlib
 from bisect import bisect_left
@@ -81,7 +82,7 @@ MAX_ACK_FRAMES: Final = 4
 MAX_PACKET_NUMBER: Final = 0xFFFFFFFF
 """Packet numbers do not wrap: a session ends before they are used up, and the next one starts at 1."""
 MAX_SEQ: Final = 2**62
-"""Where a stream may begin to count: far enough below 2^63 that no sender ever counts past what msgpack holds."""
+"""Where a stream may begin to count; every message's seq is below it, so that a stream can be announced anew at any."""
 AGE_UNIT_S: Final = 1e-4
 MAX_AGE_S: Final = AGE_UNIT_S * 0xFFFFFFFF
 AGE_ERRORS_S: Final = (0.0, *(AGE_UNIT_S * 2.0 ** (code / 8) for code in range(254)), float("inf"))
@@ -404,9 +405,18 @@ def take_float(envelope: Envelope, key: str, *, low: float, high: float, default
     return float(value)
 
 
+_UNPRINTABLE: Final = re.compile(
+    "[\x00-\x1f\x7f-\xa0\xad\u0600-\u0605\u061c\u06dd\u070f\u0890\u0891\u08e2\u1680\u180e\u2000-\u200f\u2028-\u202f\u205f-\u206f"
+    "\u3000\ud800-\uf8ff\ufeff\ufff0-\ufffb\ufffe\uffff\U000110bd\U000110cd\U00013430-\U0001343f\U0001bca0-\U0001bca3"
+    "\U0001d173-\U0001d17a\U000e0000-\U000e00ff\U000f0000-\U0010ffff]"
+)
+"""Control and format characters, spaces other than the usual one, surrogates, private use. A list of our own:
+`str.isprintable` knows other characters in every version of Python, and what a relay takes every receiver must."""
+
+
 def _is_text(value: object, max_length: int) -> bool:
     """Text of a peer ends up in logs and on terminals: no control characters."""
-    return isinstance(value, str) and len(value) <= max_length and value.isprintable()
+    return isinstance(value, str) and len(value) <= max_length and _UNPRINTABLE.search(value) is None
 
 
 def take_str(envelope: Envelope, key: str, *, max_length: int = 512, default: str | None = None) -> str:

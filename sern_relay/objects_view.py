@@ -67,7 +67,7 @@ def _run(requests: Sequence[ValueRequest]) -> None:
 def _defined(hub: Hub, answer: dict[str, Any], definitions: bool) -> dict[str, Any]:
     """Put in the texts of streams, which the hub has once for all streams of a type, and the hashes of these texts."""
     streams = [relayed.stream.stream for relayed in hub.relayed.values()]
-    digests = {topic_object_id(stream.id): stream.attributes.get("definition", "") for stream in streams}
+    digests = {topic_object_id(stream.id): stream.definition_hash for stream in streams}
     for item in answer["objects"]:
         text = hub.definitions.get(digests.get(item["id"], ""), "")
         item["definition_hash"] = item["definition_hash"] or text_hash(text)

@@ -22,7 +22,7 @@ from sern_runtime import ros_services, ros_types
 _SEPARATOR: Final = "=" * 80 + "\n"
 _DIVIDER: Final = "---"
 _KINDS: Final = ("msg", "srv", "action")
-_ACTION_PART: Final = re.compile(r"(?P<action>\w+/action/\w+)_(?P<part>[A-Za-z]+)")
+_ACTION_PART: Final = re.compile(r"(?P<action>\w+/action/\w+)_(?P<part>[A-Za-z]+)", re.ASCII)
 _ACTION_PARTS: Final = ("Goal", "Result", "Feedback")
 _BARE_TYPE: Final = re.compile(r"^\s*([A-Z]\w*)(?![\w/])", re.MULTILINE)
 _UUID: Final = "unique_identifier_msgs/UUID goal_id\n"

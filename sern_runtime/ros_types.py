@@ -30,7 +30,7 @@ MAX_DEFINITION_BYTES: Final = 2**20
 """A definition text above this is refused: the largest in a ROS desktop install is about 50 kB."""
 
 _SEPARATOR: Final = "=" * 80
-_NAME: Final = re.compile(r"[A-Za-z]\w*/(?:(?:msg|srv|action)/)?[A-Za-z]\w*")
+_NAME: Final = re.compile(r"[A-Za-z]\w*/(?:(?:msg|srv|action)/)?[A-Za-z]\w*", re.ASCII)
 _EXTRA: Final = {
     "tf2_msgs/msg/TFMessage": "geometry_msgs/TransformStamped[] transforms\n",
     "map_msgs/msg/OccupancyGridUpdate": (

@@ -117,7 +117,7 @@ class Scenario:
         if self.bag is None:
             return [robot]
         # Clouds, to overload the link, and the counter come from the simulated robot; the bag brings the rest.
-        bag = {"kind": "bag", "path": str(self.bag.resolve()), "loop": True, "topics": [r"(?!/points$|/counter$).*"]}
+        bag = {"kind": "bag", "path": str(self.bag.resolve()), "loop": True, "deny": ["/points|/counter"]}
         return [bag, {**robot, "topics": ["/points"]}]
 
     @property

@@ -1,6 +1,5 @@
 """A recording over a scripted link, in virtual time, with the adaptation a client would run."""
 
-import re
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -18,6 +17,7 @@ from sern_core.message import TopicInfo, TopicSpec
 from sern_core.mmcf.adapter import SAMPLES, HopAdapter, Step
 from sern_core.mmcf.report import step_json
 from sern_core.params import LinkParams, SchedulerParams
+from sern_core.patterns import compile_pattern
 from sern_core.rules import RuleSet, TopicRule
 from sern_core.trace import DecisionTrace
 from sern_core.types import Encoding, PriorityClass, TopicName
@@ -33,8 +33,8 @@ CONTROL_TYPES: Final = r".*/(Odometry|Imu|NavSatFix|JointState|TFMessage|Twist.*
 STATE_TYPES: Final = r".*/(LaserScan|OccupancyGrid.*|Path|BatteryState|MarkerArray|DiagnosticArray)"
 DEFAULT_RULES: Final = RuleSet(
     (
-        TopicRule(re.compile(".*"), re.compile(CONTROL_TYPES), PriorityClass.CONTROL),
-        TopicRule(re.compile(".*"), re.compile(STATE_TYPES), PriorityClass.STATE),
+        TopicRule(compile_pattern(".*"), compile_pattern(CONTROL_TYPES), PriorityClass.CONTROL),
+        TopicRule(compile_pattern(".*"), compile_pattern(STATE_TYPES), PriorityClass.STATE),
     )
 )
 """Without a client's file: pose, motion and transforms are control, scans and maps state, all else bulk."""

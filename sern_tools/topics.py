@@ -5,7 +5,6 @@ client, in is what came from the relay and out what the relay has. Rates come fr
 """
 
 import json
-import re
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping
@@ -19,6 +18,7 @@ from rich.table import Table
 from rich.text import Text
 
 from sern_core.errors import SernError, UsageError
+from sern_core.patterns import Pattern, compile_pattern
 from sern_core.services import parse as parse_service
 from sern_core.types import CLASS_LABELS, TopicName
 from sern_tools.api import DEFAULT_API, NotFoundError, checked_api, drop_output, get_json, is_stream, say
@@ -147,7 +147,7 @@ class Watcher:
     def __init__(
         self,
         api: str,
-        pattern: re.Pattern[str] | None = None,
+        pattern: Pattern | None = None,
         *,
         services: bool = False,
         get: Callable[[str, str], Any] = get_json,
@@ -258,9 +258,9 @@ def run_topics(
     if not out.is_terminal:
         out.width = PLAIN_WIDTH
     try:
-        compiled = None if pattern is None else re.compile(pattern)
-    except re.error as error:
-        raise UsageError(f"{pattern!r} is not a regular expression: {error}") from None
+        compiled = None if pattern is None else compile_pattern(pattern)
+    except UsageError as error:
+        raise UsageError(f"pattern {pattern!r} {error}") from None
     watcher = Watcher(checked_api(api), compiled, services=services)
     if not watch:
         pause(interval_s)

@@ -33,6 +33,7 @@ from sern_client.endpoints.clock import Clock, SystemClock
 from sern_client.endpoints.held import HeldSubscription
 from sern_core.errors import ConfigError, UsageError
 from sern_core.message import TopicInfo
+from sern_core.patterns import PatternError, PatternSet
 from sern_core.types import Encoding, TopicName
 from sern_runtime import ros_types
 from sern_runtime.ros_types import one_line
@@ -47,7 +48,7 @@ BACKOFF_S: Final = (0.001, 0.05)
 
 _R = TypeVar("_R")
 _LOG = logging.getLogger(__name__)
-_NAMESPACE: Final = re.compile(r"/?[A-Za-z]\w*(/[A-Za-z]\w*)*/?")
+_NAMESPACE: Final = re.compile(r"/?[A-Za-z]\w*(/[A-Za-z]\w*)*/?", re.ASCII)
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,8 +56,8 @@ class BagOptions:
     """What to play and how.
 
     `rate` scales time; 0 plays as fast as messages are accepted. `namespaces` replays the bag once per name, under
-    `/name`. `topics` are full-match regular expressions on the bag's own topic names; None means all. Play starts
-    when every topic of `wait_for` (names as announced) is wanted at the far side, and then `start_delay_s` later.
+    `/name`. `topics` are patterns of the bag's own topic names, None means all; what `deny` matches is left out. Play
+    starts when every topic of `wait_for` (names as announced) is wanted at the far side, then `start_delay_s` later.
     """
 
     path: Path
@@ -64,6 +65,7 @@ class BagOptions:
     loop: bool = False
     namespaces: tuple[str, ...] = ()
     topics: tuple[str, ...] | None = None
+    deny: tuple[str, ...] = ()
     start_delay_s: float = 0.0
     wait_for: tuple[str, ...] = ()
     on_refused: Literal["wait", "drop"] = "wait"
@@ -108,9 +110,10 @@ class BagEndpoint:
             if not _NAMESPACE.fullmatch(name):
                 raise ConfigError(f"{name!r} is not a ROS namespace; write it like robot1", file=str(options.path))
         try:
-            self._patterns = None if options.topics is None else [re.compile(p) for p in options.topics]
-        except re.error as error:
-            raise ConfigError(f"topic pattern {error.pattern!r}: {error}", file=str(options.path)) from None
+            self._patterns = PatternSet((".*",) if options.topics is None else options.topics)
+            self._denied = PatternSet(options.deny)
+        except PatternError as error:
+            raise ConfigError(f"topic pattern {error.text!r} {error}", file=str(options.path)) from None
         self.options = options
         self.counters = BagCounters()
         self.problem: str | None = None
@@ -209,7 +212,7 @@ class BagEndpoint:
         infos: dict[str, TopicInfo] = {}
         for connection in connections:
             name = "/" + connection.topic.lstrip("/")
-            if self._patterns is not None and not any(p.fullmatch(name) for p in self._patterns):
+            if self._denied.fullmatch(name) or not self._patterns.fullmatch(name):
                 continue
             info = self._describe(name, connection)
             known = infos.get(name, info)

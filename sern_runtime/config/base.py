@@ -14,9 +14,10 @@ from typing import Annotated, Any, Final
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, WrapValidator
 from pydantic_core import PydanticCustomError
 
-from sern_core.access import SELF, compile_peer_pattern
-from sern_core.errors import RefusedError, UsageError
-from sern_core.rules import client_name, compile_pattern, normal_namespace, topic_name
+from sern_core.access import LONGEST_NAME, with_self
+from sern_core.errors import UsageError
+from sern_core.patterns import compile_pattern
+from sern_core.rules import client_name, normal_namespace, topic_name
 from sern_runtime.config.yaml import Loc
 
 _HOST: Final = re.compile(r"[A-Za-z0-9_](?:[A-Za-z0-9_.-]{0,251}[A-Za-z0-9_])?")
@@ -79,12 +80,12 @@ def described(expected: str) -> WrapValidator:
 
 
 def _checked(check: Callable[[str], object]) -> AfterValidator:
-    """A validator that leaves the text as it is and reports the UsageError or RefusedError of `check`."""
+    """A validator that leaves the text as it is and reports the UsageError of `check`."""
 
     def validate(text: str) -> str:
         try:
             check(text)
-        except (UsageError, RefusedError) as error:
+        except UsageError as error:
             raise fault(str(error)) from error
         return text
 
@@ -92,7 +93,7 @@ def _checked(check: Callable[[str], object]) -> AfterValidator:
 
 
 def _check_self_pattern(text: str) -> None:
-    compile_pattern(text.replace(SELF, "(?:a)"))
+    compile_pattern(with_self(text, LONGEST_NAME))
 
 
 def _check_path(text: str) -> None:
@@ -181,8 +182,6 @@ def _shown(text: str) -> str:
 
 
 Pattern = Annotated[str, _checked(compile_pattern), Field(json_schema_extra={"format": "regex"})]
-PeerPattern = Annotated[str, _checked(compile_peer_pattern), Field(json_schema_extra={"format": "regex"})]
-"""A pattern that the relay will be asked to match: it refuses those that can take long."""
 SelfPattern = Annotated[str, _checked(_check_self_pattern)]
 TopicText = Annotated[str, _checked(topic_name)]
 ClientText = Annotated[str, _checked(client_name)]

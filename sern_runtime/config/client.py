@@ -7,11 +7,10 @@ from typing import Annotated, Final, Literal
 
 from pydantic import Discriminator, Field, Tag, model_validator
 
-from sern_core.access import compile_peer_pattern
 from sern_core.codecs import Compression
-from sern_core.errors import RefusedError
 from sern_core.lossy import DEFAULT_LOSSY, LossyParams
 from sern_core.message import DEFAULT_RELIABLE_QUEUE_BYTES
+from sern_core.patterns import MAX_CLIENT_PROGRAM, PatternError, PatternSet, compile_pattern
 from sern_core.rules import (
     AUTO,
     COMMAND_TYPES,
@@ -23,7 +22,6 @@ from sern_core.rules import (
     RuleError,
     RuleSet,
     TopicRule,
-    compile_pattern,
     name_problem,
     normal_namespace,
 )
@@ -41,7 +39,6 @@ from sern_runtime.config.base import (
     NamespaceText,
     PathText,
     Pattern,
-    PeerPattern,
     Seconds,
     Section,
     TopicText,
@@ -231,11 +228,6 @@ class TopicSection(Section):
 
     @model_validator(mode="after")
     def _consistent(self) -> "TopicSection":
-        if self.direction is Direction.RECEIVE:
-            try:
-                compile_peer_pattern(self.match)
-            except RefusedError as error:
-                raise fault(str(error), "match") from error
         if self.compression in ("voxel_draco", "jpeg") and self.compression not in self.lossy:
             raise fault(f"{self.compression} loses something; name it in lossy as well", "compression")
         if self.on_link_loss is not None:
@@ -297,8 +289,8 @@ class ServiceSection(Section):
     @model_validator(mode="after")
     def _simple(self) -> "ServiceSection":
         try:
-            compile_peer_pattern(f"(?:{self.match})/_call/[a-z0-9_]+")
-        except RefusedError as error:
+            compile_pattern(f"(?:{self.match})/_call/[a-z0-9_]+")
+        except PatternError as error:
             raise fault(str(error), "match") from error
         return self
 
@@ -328,8 +320,8 @@ class ActionSection(Section):
     @model_validator(mode="after")
     def _simple(self) -> "ActionSection":
         try:
-            compile_peer_pattern(self.under("_action/get_result/_call/[a-z0-9_]+"))
-        except RefusedError as error:
+            compile_pattern(self.under("_action/get_result/_call/[a-z0-9_]+"))
+        except PatternError as error:
             raise fault(str(error), "match") from error
         return self
 
@@ -397,7 +389,7 @@ class ClientFile(FileModel):
     """Which topics are offered to the link."""
     topics: tuple[TopicSection, ...] = ()
     """Rules for topics, first match wins. A topic without a rule: bulk, best effort, depth 1, lifespan 1 s."""
-    subscribe: tuple[PeerPattern, ...] = ()
+    subscribe: tuple[Pattern, ...] = ()
     """Regular expressions for the whole global names that this site wants, beside rules with direction `receive`."""
     services: ServicesSection = ServicesSection()
     """Services offered to other sites and used from them."""
@@ -424,6 +416,12 @@ class ClientFile(FileModel):
             self.rules()
         except RuleError as error:
             raise fault(error.problem, "topics", error.index, error.field) from error
+        try:
+            PatternSet(self.subscribe_patterns(), max_program=MAX_CLIENT_PROGRAM)
+        except PatternError as error:
+            what = "" if error.text is None else f"pattern {error.text!r} "
+            at = ("subscribe",) if self.subscribe else ()
+            raise fault(f"all that it subscribes to: {what}{error}", *at) from error
         return self
 
     @property
@@ -457,7 +455,7 @@ class ClientFile(FileModel):
 
     def subscribe_patterns(self) -> tuple[str, ...]:
         """What to ask the relay for, on global names: `subscribe`, rules with direction `receive`, and services."""
-        received = (pattern.pattern for pattern in self.rules().receive_patterns(self.namespace))
+        received = self.rules().receive_patterns(self.namespace)
         services = subscriptions(self.name, self.namespace, offer=self.offered_services(), use=self.used_services())
         return tuple(dict.fromkeys((*self.subscribe, *received, *services, *self.actions.patterns())))
 

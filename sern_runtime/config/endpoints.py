@@ -56,6 +56,8 @@ class BagEndpoint(EndpointBase):
     """Play the recording once for each of these namespaces, as so many robots; empty: once, with its own names."""
     topics: tuple[Pattern, ...] | None = None
     """Play only topics whose name in the recording matches one of these; null: all."""
+    deny: tuple[Pattern, ...] = ()
+    """Play no topic whose name in the recording matches one of these; wins over `topics`."""
     start_delay_s: SecondsOrZero = 0.0
     """Wait so long before the first message."""
     wait_for: tuple[TopicText, ...] = ()

@@ -36,9 +36,12 @@ Generated from the configuration models by `make schemas`; do not edit.
 
 Files are YAML 1.2, one a daemon; `sern check FILE` validates one without starting anything, and every error is one
 line with file, line, key and the accepted values. Unknown keys are errors. Relative paths start at the directory of
-the file. Units are in the names of the keys. Patterns are regular expressions (Python's `re`) that must match the whole
-name. The same models as JSON Schema: `schemas/client.schema.json`, `schemas/relay.schema.json`,
-`schemas/keys.schema.json`. Examples: `deploy/examples/`.
+the file. Units are in the names of the keys. Patterns are regular expressions that must match the whole
+name, in the syntax of RE2 and in printable ASCII: like Python's, without look-around, back-references and possessive or
+atomic groups, `{,3}` is written `{0,3}`, and a repeat goes up to 1000. Matching takes time linear in the length of a
+name. A pattern of more than 2048 steps (about one a character, times what repeats say) is refused, and so are more than
+4096 steps in all that a client subscribes to. The same models as JSON Schema: `schemas/client.schema.json`,
+`schemas/relay.schema.json`, `schemas/keys.schema.json`. Examples: `deploy/examples/`.
 """
 
 

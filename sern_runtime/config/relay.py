@@ -9,7 +9,8 @@ from pydantic import Field, model_validator
 from sern_core.access import DEFAULT_QUEUE_BYTES, AccessRule
 from sern_core.errors import ConfigError
 from sern_core.objects import COMMAND_OBJECT_TYPES
-from sern_core.rules import AUTO, FeedRole, FeedTopic, TopicRule, compile_pattern, plain_type
+from sern_core.patterns import PatternSet, compile_pattern
+from sern_core.rules import AUTO, FeedRole, FeedTopic, TopicRule, plain_type
 from sern_core.types import ClientName, Durability, Encoding, PriorityClass, Reliability
 from sern_runtime import ros_types
 from sern_runtime.config.adaptation import AdaptationSection
@@ -337,9 +338,9 @@ class RelayFile(FileModel):
             if role.owner in directory.names:
                 problem = f"the relay publishes for this role as {role.owner}, and there is a client of that name"
                 yield FileProblem(("feed", "roles", index, "name"), problem)
-        rules = [compile_pattern(section.client) for section in self.access]
+        rules = PatternSet(section.client for section in self.access)
         for name in directory.names:
-            if not any(rule.fullmatch(name) for rule in rules):
+            if not rules.fullmatch(name):
                 problem = f"no rule matches client {name}: it may connect and do nothing"
                 yield FileProblem(("access",), problem, warning=True)
 

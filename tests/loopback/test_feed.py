@@ -1,6 +1,5 @@
 """The feed, as a program without SERN code sees it: plain PUB and SUB sockets."""
 
-import re
 import socket as socketlib
 from collections.abc import AsyncIterator, Iterable
 from dataclasses import replace
@@ -12,13 +11,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sern_core.errors import ConfigError
+from sern_core.patterns import compile_pattern
 from sern_core.rules import FeedRole
 from sern_core.types import PriorityClass, TopicName
 from sern_runtime.feed import Feed, FeedHeader, parse_topic, topic_frame
 from tests.support import until
 
 Context = zmq.Context[zmq.Socket[bytes]]
-ANY = re.compile(".*")
+ANY = compile_pattern(".*")
 ODOM = TopicName("/r/odom")
 HEADER = FeedHeader(PriorityClass.STATE, 7, 1_700_000_000_000_000_000, 1500)
 
@@ -35,8 +35,8 @@ def role(
         name,
         publish_endpoint,
         ingest_endpoint=None if publish is None else "tcp://127.0.0.1:*",
-        subscribe=(re.compile(see),),
-        publish=() if publish is None else (re.compile(publish),),
+        subscribe=(compile_pattern(see),),
+        publish=() if publish is None else (compile_pattern(publish),),
         allow_control=allow_control,
     )
 

@@ -1,6 +1,5 @@
 """Goals that nobody will answer: what their clients are told."""
 
-import re
 import struct
 from collections.abc import AsyncIterator, Callable
 from typing import Any
@@ -13,6 +12,7 @@ from sern_client.endpoints.base import ServiceInfo, Sink
 from sern_core.errors import ConfigError
 from sern_core.ledger import SendCounters
 from sern_core.message import StreamId, StreamInfo, TopicInfo, TopicSpec
+from sern_core.patterns import compile_pattern
 from sern_core.queues import OutChannel
 from sern_core.types import ClientName, DropReason, Encoding, PriorityClass, TopicName
 from sern_runtime import ros_types
@@ -83,7 +83,7 @@ class Site:
         self.results: list[bytes] = []
         self.advertised: list[TopicInfo] = []
         self.closed = 0
-        self.watch = GoalWatch(((re.compile(ACTION), patience_s),), self._advertise)
+        self.watch = GoalWatch(((compile_pattern(ACTION), patience_s),), self._advertise)
         spec = TopicSpec(PriorityClass.CONTROL, lifespan_s=0.0)
         stream = StreamInfo(StreamId(ClientName("site"), 1, GOAL.name), GOAL, spec)
         self.channel = OutChannel(

@@ -18,7 +18,7 @@ from tests.world import Clock, SimClient, World, spec
 RULES = AccessTable(
     [
         AccessRule(client="secret.*", publish=("/{self}/.*",), max_rate_hz=5.0),
-        AccessRule(client=".*", publish=("/{self}/.*", "/tf", "/shared/.*"), subscribe=("(?!/secret).*",)),
+        AccessRule(client=".*", publish=("/{self}/.*", "/tf", "/shared/.*"), subscribe=("/[^s].*", "/s[^e].*")),
     ]
 )
 VISITS = 10
@@ -79,7 +79,7 @@ class Visits:
         robot = self.come(f"robot{self.day % 3}", [f"/tf{self.day}", "/shared/.*"])
         site = self.come(f"site{self.day % 3}", ["/robot.*", "/secret/x", f"/x{self.day}.*"])
         secret = self.come(f"secret{self.day % 2}", [".*"])
-        odd = self.come(f"odd{self.day % 2}", ["/(a*)*", *(f"/n{self.day}_{n}" for n in range(5))])
+        odd = self.come(f"odd{self.day % 2}", ["/(a", *(f"/n{self.day}_{n}" for n in range(5))])
         world.run(0.5)
         channels = []
         for index in range(6):

@@ -1,7 +1,6 @@
 """`sern topics`: counters become rates, a relay and a client are told apart, and what is wrong is one line."""
 
 import json
-import re
 import threading
 from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler, HTTPServer
@@ -14,6 +13,7 @@ from rich.console import Console
 from typer.testing import CliRunner
 
 from sern_core.errors import SernError, UsageError
+from sern_core.patterns import compile_pattern
 from sern_tools import api
 from sern_tools.commands import app
 from sern_tools.demo_link import free_ports
@@ -127,7 +127,7 @@ def test_the_registry_is_read_when_a_name_is_new() -> None:
         return OBJECTS if path == "/api/objects" else {"links": {}, "received": {"/r/odom": arrived(1)}}
 
     clock = iter((0.0, 1.0, 2.0))
-    watcher = Watcher(URL, re.compile("/r/.*"), get=get, clock=lambda: next(clock))
+    watcher = Watcher(URL, compile_pattern("/r/.*"), get=get, clock=lambda: next(clock))
     assert watcher.rows()[0].owner == "r"
     assert watcher.rows()[0].owner == "r"
     assert asked.count("/api/objects") == 1
@@ -135,7 +135,11 @@ def test_the_registry_is_read_when_a_name_is_new() -> None:
 
 @pytest.mark.parametrize(
     ("options", "expected"),
-    [({}, ["/r/odom"]), ({"services": True}, ["/r/go/_call/a", "/r/odom"]), ({"pattern": re.compile(".*go.*")}, None)],
+    [
+        ({}, ["/r/odom"]),
+        ({"services": True}, ["/r/go/_call/a", "/r/odom"]),
+        ({"pattern": compile_pattern(".*go.*")}, None),
+    ],
 )
 def test_streams_of_services_are_shown_when_asked_for(options: dict[str, Any], expected: list[str] | None) -> None:
     def get(_api: str, path: str) -> Any:

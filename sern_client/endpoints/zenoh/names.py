@@ -25,7 +25,7 @@ GID_BYTES: Final = 16
 DEFAULT_DEPTH: Final = 10
 """Of ROS 2's default profile, which an empty depth stands for."""
 _ATTACHMENT: Final = struct.Struct("<qqB16s")
-_DDS_TYPE: Final = re.compile(r"([A-Za-z]\w*)::(msg|srv|action)::dds_::([A-Za-z]\w*)_")
+_DDS_TYPE: Final = re.compile(r"([A-Za-z]\w*)::(msg|srv|action)::dds_::([A-Za-z]\w*)_", re.ASCII)
 _RELIABLE, _BEST_EFFORT = "1", "2"
 _TRANSIENT_LOCAL: Final = "1"
 

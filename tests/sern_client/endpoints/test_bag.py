@@ -77,7 +77,7 @@ async def test_db3_file_without_its_folder(make_bag: Make, events: Any, until: U
 
 
 async def test_namespaces_make_one_bag_several_robots(make_bag: Make, events: Any, until: Until) -> None:
-    options = BagOptions(make_bag("bag"), rate=0, namespaces=("r1", "/fleet/r2/"), topics=("/chat",))
+    options = BagOptions(make_bag("bag"), rate=0, namespaces=("r1", "/fleet/r2/"), topics=(".*",), deny=("/[^c].*",))
     got = await collect(BagEndpoint(options), events, until)
     assert sorted(got) == ["/fleet/r2/chat", "/r1/chat"]
     assert [b for b, _ in got["/r1/chat"]] == [b for b, _ in got["/fleet/r2/chat"]]
