@@ -29,7 +29,7 @@ from sern_core.rules import Discovery, ResolvedTopic, RuleSet, to_global
 from sern_core.services import parse as parse_service
 from sern_core.summaries.transforms import is_static
 from sern_core.types import DropReason, Encoding, TopicName
-from sern_runtime import ros_types
+from sern_runtime import clock, ros_types
 from sern_runtime.link_metrics import AgeHistograms
 from sern_runtime.loop import Timer
 
@@ -215,7 +215,7 @@ class Bridge:
         if merge:
             # A message of all static transforms replaces the ones before; every other one counts.
             spec = replace(spec, max_rate_hz=None, depth=1 if static else spec.depth)
-        channel = core.publish(replace(info, name=name), spec, now=time.monotonic())
+        channel = core.publish(replace(info, name=name), spec, now=clock.now())
         if not merge:
             return channel, None
         send = self._sender(channel, info)
@@ -232,7 +232,7 @@ class Bridge:
             if outgoing.source is not None:
                 outgoing.source.close()
                 self.summaries.forget(outgoing.source)
-            self.core.unpublish(outgoing.channel, now=time.monotonic())
+            self.core.unpublish(outgoing.channel, now=clock.now())
             self._kick()
 
     def _sink(self, channel: OutChannel, rewrite: Rewrite | None) -> Callable[[bytes, int], bool]:
@@ -250,7 +250,7 @@ class Bridge:
             seq = channel.next_seq
             if rewrite is not None:
                 body = rewrite(body)
-            accepted = core.send(channel, body, stamp_ns, born_s=born_s, now=time.monotonic())
+            accepted = core.send(channel, body, stamp_ns, born_s=born_s, now=clock.now())
             if log is not None:
                 log.offered(stream, seq, body, stamp_ns, accepted=accepted)
             kick()
@@ -327,7 +327,7 @@ class Bridge:
         if self._asked is None:
             self._asked = patterns
         if not any(re.fullmatch(pattern, topic) for pattern in patterns):
-            self.core.subscribe((*patterns, re.escape(topic)), now=time.monotonic())
+            self.core.subscribe((*patterns, re.escape(topic)), now=clock.now())
             self._kick()
 
     def _show(self, incoming: Incoming, body: bytes, stamp_ns: int, left_s: float = inf) -> None:
@@ -432,7 +432,7 @@ class Bridge:
         self._timer.arm(min(deadlines) if deadlines else None)
 
     def _leases_due(self) -> None:
-        now = time.monotonic()
+        now = clock.now()
         for incoming in self._incoming.values():
             lease = incoming.lease
             if lease is None or incoming.stop is None:

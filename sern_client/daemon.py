@@ -29,6 +29,7 @@ from sern_core.lossy import missing
 from sern_core.rules import compile_pattern
 from sern_core.trace import DecisionTrace
 from sern_core.types import CLASS_LABELS, DropReason, ObjectKind
+from sern_runtime import clock
 from sern_runtime.adaptation import Adaptation
 from sern_runtime.codec_pool import CodecPool, make_coder
 from sern_runtime.config.base import split_tcp
@@ -89,7 +90,7 @@ class ClientDaemon:
             on_up=self._link_up,
             on_down=self._link_down,
         )
-        now = time.monotonic()
+        now = clock.now()
         for index, section in enumerate(model.topics):
             for problem in filter(None, map(missing, section.lossy)):
                 raise ConfigError(problem, file=str(loaded.path), key=f"topics.{index}.lossy")
@@ -228,7 +229,7 @@ class ClientDaemon:
             self._express.begin()
 
     async def _tick(self) -> None:
-        watchdog = Watchdog(self.notifier, {"loop": lambda: int(time.monotonic() * 1e3)})
+        watchdog = Watchdog(self.notifier, {"loop": lambda: int(clock.now() * 1e3)})
         while True:
             await asyncio.sleep(TICK_S)
             if self.message_log is not None:
@@ -256,7 +257,7 @@ class ClientDaemon:
                 "topics": str(len(self.core.link.channels)),
             },
             wall_ns=time.time_ns(),
-            now=time.monotonic(),
+            now=clock.now(),
         )
 
     def _make_http(self, listen: str) -> HttpServer:
@@ -353,7 +354,7 @@ class ClientDaemon:
 
     def topics(self) -> dict[str, TopicView]:
         """Counters of every topic by global name, sent and received."""
-        return both_ways(self.core.link, self.core.received, now=time.monotonic())
+        return both_ways(self.core.link, self.core.received, now=clock.now())
 
     async def drain(self) -> None:
         """Stop the sources, then go on sending what is owed while that gets anywhere, `link.drain_s` at most. What
@@ -365,7 +366,7 @@ class ClientDaemon:
         self._stopping = True
         self.bridge.stop_sources()
         link = self.core.link
-        now = time.monotonic()
+        now = clock.now()
         progress = Progress()
         give_up_s = now + self.loaded.model.link.drain_s
         while now < give_up_s:
@@ -380,7 +381,7 @@ class ClientDaemon:
                 break
             self._kick()
             await asyncio.sleep(0.02)
-            now = time.monotonic()
+            now = clock.now()
         unconfirmed = sum(len(channel.retained) for channel in link.channels.values())
         if unconfirmed:
             _log.warning("stopping with %d reliable messages that not everyone has confirmed", unconfirmed)
@@ -388,7 +389,7 @@ class ClientDaemon:
             self._kick()
             await asyncio.sleep(0.02)  # what has arrived here is confirmed before we say goodbye
             self._transport.pump.run()
-            link.close("client stops", now=time.monotonic())
+            link.close("client stops", now=clock.now())
             self._transport.pump.run()
             await asyncio.sleep(0.05)  # libzmq's thread takes it from here
 
@@ -396,7 +397,7 @@ class ClientDaemon:
         """Count what is left, so that every message has a fate."""
         link = self.core.link
         for channel in list(link.channels.values()):
-            link.close_channel(channel, DropReason.SHUTDOWN, now=time.monotonic())
+            link.close_channel(channel, DropReason.SHUTDOWN, now=clock.now())
 
     async def stop(self) -> None:
         """Ends whatever was started, the last first, also when a part of it fails."""

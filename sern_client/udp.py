@@ -1,7 +1,6 @@
 """The client's datagram lane: asked for in each session, opened with the keys the relay answers, closed by the core."""
 
 import logging
-import time
 from collections.abc import Callable
 from typing import Final
 
@@ -10,6 +9,7 @@ from sern_core.client import ClientCore
 from sern_core.errors import RemoteError, SernError
 from sern_core.lane_port import LanePort
 from sern_core.lanes import LANE_UDP
+from sern_runtime import clock
 from sern_runtime.pump import Pump
 from sern_runtime.seal import SessionParameters, offered_ciphers
 from sern_runtime.udp_client import UdpClient
@@ -41,7 +41,7 @@ class ClientLane:
     def ask(self) -> None:
         """A session has begun."""
         self._ask_s = None
-        self.core.ask_lane(offered_ciphers(), now=time.monotonic())
+        self.core.ask_lane(offered_ciphers(), now=clock.now())
 
     def offered(self, envelope: wire.Envelope) -> None:
         """The relay's answer. Raises WireError when it is none."""
@@ -61,8 +61,8 @@ class ClientLane:
             return
         port = LanePort(self.core.link, LANE_UDP)
         self._pump = Pump(port, self._socket.send, on_gone=self._failed, ready=self._socket.ready)
-        self.core.link.close_lane(now=time.monotonic())
-        self.core.link.open_lane(now=time.monotonic())
+        self.core.link.close_lane(now=clock.now())
+        self.core.link.open_lane(now=clock.now())
         self._pump.kick()
 
     def closed(self) -> None:
@@ -79,7 +79,7 @@ class ClientLane:
             self._pump.kick()
 
     def tick(self) -> None:
-        now = time.monotonic()
+        now = clock.now()
         if self._ask_s is not None and now >= self._ask_s and self.core.link.established:
             self.ask()
         lane = self.core.link.lanes.get(LANE_UDP)
@@ -101,8 +101,8 @@ class ClientLane:
 
     def _failed(self) -> None:
         self.closed()
-        self.core.link.close_lane(now=time.monotonic())
-        self._ask_s = time.monotonic() + ASK_AGAIN_S
+        self.core.link.close_lane(now=clock.now())
+        self._ask_s = clock.now() + ASK_AGAIN_S
         self._kick()
 
     def _writable(self) -> None:

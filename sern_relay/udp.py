@@ -1,7 +1,6 @@
 """The relay's datagram lanes: one UDP socket for each listener, one session for each client that asks for one."""
 
 import logging
-import time
 from collections.abc import Callable, Sequence
 
 from sern_core.errors import RefusedError, RemoteError
@@ -9,6 +8,7 @@ from sern_core.hub import Hub
 from sern_core.lane_port import LanePort
 from sern_core.lanes import LANE_UDP
 from sern_core.types import ClientName
+from sern_runtime import clock
 from sern_runtime.config.base import split_tcp
 from sern_runtime.pump import Pump
 from sern_runtime.udp import UdpServer, UdpSession
@@ -48,7 +48,7 @@ class RelayLanes:
         """A client would like a datagram lane: give it one, over the session that its CURVE key opened."""
         self.closed(client)
         link = self.hub.links[client]
-        link.close_lane(now=time.monotonic())
+        link.close_lane(now=clock.now())
         try:
             session = self.server.open_session(client, ciphers)
         except RefusedError as refusal:
@@ -57,7 +57,7 @@ class RelayLanes:
         port = LanePort(link, LANE_UDP)
         pump = Pump(port, session.send, on_gone=lambda: self._gone(client, session), ready=session.ready)
         self._lanes[client] = (session, pump)
-        self.hub.offer_lane(client, session.parameters.to_envelope(), now=time.monotonic())
+        self.hub.offer_lane(client, session.parameters.to_envelope(), now=clock.now())
         pump.kick()
 
     def closed(self, client: ClientName) -> None:
@@ -91,7 +91,7 @@ class RelayLanes:
         lane = self._lanes.get(client)
         if lane is not None and lane[0] is session:
             self.closed(client)
-            self.hub.links[client].close_lane(now=time.monotonic())
+            self.hub.links[client].close_lane(now=clock.now())
 
     def _path(self, session: UdpSession, address: Address, validated: bool) -> None:
         if validated:

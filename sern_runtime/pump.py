@@ -1,10 +1,10 @@
 """Moves datagrams between a port of the core (a link, or the relay's side of one) and a lane's socket."""
 
 import asyncio
-import time
 from collections.abc import Callable
 from typing import Final, Protocol
 
+from sern_runtime import clock
 from sern_runtime.fine_timer import FineTimer, fine_timer
 from sern_runtime.loop import Timer
 from sern_runtime.zmq_socket import SendResult
@@ -88,7 +88,7 @@ class Pump:
             self._scheduled = None
 
     def _due(self) -> None:
-        self._port.handle_timeout(now=time.monotonic())
+        self._port.handle_timeout(now=clock.now())
         self._run()
 
     def _run(self) -> None:
@@ -99,7 +99,7 @@ class Pump:
             return
         port = self._port
         ready = self._ready
-        now = time.monotonic()
+        now = clock.now()
         if self._held is not None and now < self._retry_s:
             self._timer.arm(self._retry_s)
             return
