@@ -13,6 +13,7 @@ from sern_client.conversion import Converter
 from sern_client.endpoints.base import Endpoint, Publisher, Subscription, publisher_within
 from sern_client.endpoints.composite import CompositeEndpoint
 from sern_client.frames import FramePrefixer, Rewrite
+from sern_client.guard import Guard
 from sern_client.message_log import MessageLog
 from sern_client.rebuild import Rebuilds
 from sern_client.services import ServiceBridge
@@ -30,8 +31,8 @@ from sern_core.services import parse as parse_service
 from sern_core.summaries.transforms import is_static
 from sern_core.types import DropReason, Encoding, TopicName
 from sern_runtime import clock, ros_types
+from sern_runtime.fine_timer import fine_timer
 from sern_runtime.link_metrics import AgeHistograms
-from sern_runtime.loop import Timer
 
 MAX_PROBLEMS: Final = 256
 
@@ -51,9 +52,9 @@ class Outgoing:
 
 class Incoming:
     """A stream from elsewhere that is published here. `stop` is the body that a lost link makes us publish.
-    `publisher` None: it is of use to another stream only."""
+    `publisher` None: it is of use to another stream only. `guarded`: what the guard calls it; None: it has none."""
 
-    __slots__ = ("lease", "local", "publish", "publisher", "rewrite", "stop")
+    __slots__ = ("guarded", "lease", "local", "publish", "publisher", "rewrite", "stop")
 
     def __init__(
         self,
@@ -69,6 +70,7 @@ class Incoming:
         self.lease = lease
         self.stop = stop
         self.rewrite = rewrite
+        self.guarded: int | None = None
 
 
 class Bridge:
@@ -101,6 +103,8 @@ class Bridge:
         """Services offered and used, where there are rules for them; set by the daemon."""
         self.goals: GoalWatch | None = None
         """Goals of ROS 1 that this site gives to others, where there are rules for them; set by the daemon."""
+        self.guard: Guard | None = None
+        """Publishes stop commands while this process cannot; set by the daemon."""
         self.refusals = 0
         self.subscription_problems: dict[str, str] = {}
         """What the relay does not let us have, in its words, with the code."""
@@ -117,7 +121,7 @@ class Bridge:
         self._outgoing: dict[TopicName, Outgoing] = {}
         self._incoming: dict[StreamId, Incoming] = {}
         self._last_arrival_s: dict[StreamId, float] = {}
-        self._timer = Timer(self._leases_due)
+        self._timer = fine_timer(self._leases_due)  # one that is due while the machine sleeps is due when it wakes
         self.summaries = Summaries(self._sender)
         self.rebuilds = Rebuilds()
         self._asked: tuple[str, ...] | None = None  # the patterns we were started with
@@ -151,7 +155,7 @@ class Bridge:
                 outgoing.source.close()
         self.summaries.close()
         self._outgoing.clear()
-        self._timer.cancel()
+        self._timer.close()
         if self.goals is not None:
             self.goals.close()
         for incoming in self._incoming.values():
@@ -162,6 +166,8 @@ class Bridge:
         """No more commands will come from there: the last one must not stand."""
         if incoming.lease is not None and incoming.stop is not None and incoming.lease.deadline() is not None:
             self._publish(incoming, incoming.stop, time.time_ns())
+        if self.guard is not None and incoming.guarded is not None:
+            self.guard.closed(incoming.guarded)
         if incoming.publisher is not None:
             incoming.publisher.close()
 
@@ -307,6 +313,8 @@ class Bridge:
             else:
                 lease = CommandLease(resolved.lease.after_s)
         incoming = Incoming(local, publisher, lease, stop, self.frames.incoming(info))
+        if self.guard is not None and stop is not None:
+            incoming.guarded = self.guard.opened(info, stop)
         self._incoming[stream.id] = incoming
         if self.goals is not None:
             self.goals.opened(info, lambda body: self._publish(incoming, body, time.time_ns()))
@@ -353,6 +361,10 @@ class Bridge:
                 self.services.message(stream, message)
             return
         age_s = now - message.born_s
+        if incoming.lease is not None:
+            incoming.lease.renew(born_s=message.born_s)
+            self._arm()
+            self._tell_guard(incoming)  # before it is published: no stop command of before may come after it
         if not self.rebuilds.message(stream, message):
             lifespan_s = stream.spec.lifespan_s
             left_s = inf if lifespan_s is None else max(lifespan_s - age_s, 0.0)
@@ -362,9 +374,6 @@ class Bridge:
         self.ages.observe(stream.spec.priority, age_s)
         if stream.spec.deadline_s is not None:
             self._check_deadline(stream, now)
-        if incoming.lease is not None:
-            incoming.lease.renew(born_s=message.born_s)
-            self._arm()
         if self._log is not None:
             self._log.delivered(stream, message, age_s)
 
@@ -431,6 +440,10 @@ class Bridge:
         ]
         self._timer.arm(min(deadlines) if deadlines else None)
 
+    def _tell_guard(self, incoming: Incoming) -> None:
+        if self.guard is not None and incoming.guarded is not None and incoming.lease is not None:
+            self.guard.lease(incoming.guarded, incoming.lease.deadline())
+
     def _leases_due(self) -> None:
         now = clock.now()
         for incoming in self._incoming.values():
@@ -440,6 +453,7 @@ class Bridge:
             first = not lease.expired
             if lease.due(now=now):
                 self._publish(incoming, incoming.stop, time.time_ns())
+                self._tell_guard(incoming)
                 if first:
                     self.leases_fired += 1
                     _log.warning("%s: no fresh command; publishing the stop command", incoming.local)

@@ -18,6 +18,7 @@ from sern_client.bridge import Bridge
 from sern_client.endpoints.base import CountingEndpoint, Endpoint, ServiceEndpoint
 from sern_client.express import ClientExpress
 from sern_client.factory import make_endpoint
+from sern_client.guard import Guard
 from sern_client.message_log import MessageLog
 from sern_client.services import ServiceBridge
 from sern_client.summarise import register_summaries
@@ -106,6 +107,7 @@ class ClientDaemon:
             coder=make_coder(model.link.params(), self.codecs),
         )
         self.bridge.attach(self.core)
+        self.bridge.guard = self.guard = Guard.of(loaded)
         self.core.subscribe(model.subscribe_patterns(), now=now)
         self._serve_services(endpoint)
         if model.actions.use:
@@ -174,6 +176,8 @@ class ClientDaemon:
         # Before the transport: streams from the relay are advertised at the endpoint as soon as there is a session.
         await self.bridge.endpoint.start(self.bridge)
         self._endpoint_started = True
+        if self.guard is not None:
+            self.guard.start()
         self._ctx = zmq.Context()
         with blamed_on(self.loaded.path, "relay", "endpoint"):
             self._transport = RelayTransport(
@@ -292,6 +296,16 @@ class ClientDaemon:
             "sern_command_lease_expired_total",
             "Times a command topic went quiet and the stop command was published.",
             read=lambda: [((), float(self.bridge.leases_fired))],
+        )
+        metrics.counter(
+            "sern_command_guard_stops_total",
+            "Leases that ran out while the client was held up: its guard published the stop command.",
+            read=lambda: [((), float(0 if self.guard is None else self.guard.stopped))],
+        )
+        metrics.counter(
+            "sern_command_guard_restarts_total",
+            "Times the guard of the command topics had ended and was started again.",
+            read=lambda: [((), float(0 if self.guard is None else self.guard.restarts))],
         )
         metrics.counter(
             "sern_deadline_missed_total",
@@ -413,6 +427,8 @@ class ClientDaemon:
                 stack.push_async_callback(self._http.stop)
             if self._endpoint_started:
                 stack.push_async_callback(self.bridge.endpoint.stop)
+            if self.guard is not None:
+                stack.push_async_callback(self.guard.stop)
             stack.callback(self.bridge.close)
             if self.bridge.services is not None:
                 stack.push_async_callback(self.bridge.services.stop)

@@ -44,7 +44,7 @@ def test_the_core_is_given_a_clock_that_goes_on_while_the_machine_sleeps() -> No
             for argument in node.keywords if isinstance(node, ast.Call) else ():
                 called = argument.value.func if isinstance(argument.value, ast.Call) else argument.value
                 if argument.arg in ("now", "born_s") and isinstance(called, ast.Attribute) and called.attr in clocks:
-                    offenders.append(f"{path.name}:{node.lineno}")
+                    offenders.append(f"{path.name}:{called.lineno}")
             if isinstance(node, ast.Attribute) and node.attr.startswith("monotonic") and path.name not in OWN_CLOCK:
                 offenders.append(f"{path.name}:{node.lineno} {node.attr}")
     assert offenders == []
