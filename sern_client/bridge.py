@@ -406,7 +406,7 @@ class Bridge:
                 self.endpoint.interest(local, wanted)
                 break
 
-    def send_dropped(self, stream: StreamInfo, seq: int, reason: DropReason) -> None:
+    def send_dropped(self, stream: StreamInfo, seq: int, reason: DropReason, where: str) -> None:
         for outgoing in self._outgoing.values():
             if outgoing.source is not None:
                 outgoing.source.lost(stream.id)
@@ -414,8 +414,14 @@ class Bridge:
             self.services.send_dropped(stream, seq, reason)
         if self.goals is not None:
             self.goals.send_dropped(stream.id, seq, reason)
-        if stream.spec.reliable and not self._closed:  # what is left at the end was said in one line
-            _log.warning("%s: our reliable message %d was dropped: %s", stream.id.topic, seq, reason)
+        if not stream.spec.reliable or self._closed:  # what is left at the end was said in one line
+            return
+        if reason is DropReason.UNWANTED:  # who wanted it has left or unsubscribed: counted, and no loss to anybody
+            _log.debug("%s: nobody wants our reliable message %d any more", stream.id.topic, seq)
+        elif where:
+            _log.warning("%s: our reliable message %d was dropped for %s: %s", stream.id.topic, seq, where, reason)
+        else:
+            _log.warning("%s: our reliable message %d was dropped here: %s", stream.id.topic, seq, reason)
 
     def publication_refused(self, stream: StreamInfo, code: str, text: str) -> None:
         self.refusals += 1

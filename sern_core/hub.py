@@ -40,8 +40,9 @@ from sern_core.types import DROP_CODES, ClientName, DropReason, TopicName
 
 MAX_SUBSCRIPTION_PARTS: Final = 64
 ORPHAN_S: Final = 60.0
-"""A session whose TCP connection is gone and whose datagram lane says nothing for so long has ended: longer than any
-blackout that is worth waiting for with keys in hand."""
+"""A session that a blackout cost its TCP connection has ended when its datagram lane says nothing for so long: longer
+than any blackout that is worth waiting for with keys in hand. Where the connection ended while datagrams still came, it
+is the client's process that ended, and the heartbeat's time is enough."""
 MAX_AWAITED_TOPICS: Final = 2048
 """Streams held for one client that has not come back yet; origins name them, so there must be an end to it."""
 MAX_DENIED: Final = 64
@@ -166,8 +167,10 @@ class Hub(LocalStreams):
             if client not in self.port_of and link.established:  # only its datagram lane is left
                 link.handle_timeout(now=now)
                 waiting_s = link.lane.flight.waiting_since_s
-                if link.lane.stalled and waiting_s is not None and now - waiting_s > ORPHAN_S:
-                    link.close_lane(now=now)
+                patience_s = ORPHAN_S if link.cut_off else link.params.heartbeat_timeout_s
+                if link.lane.stalled and waiting_s is not None and now - waiting_s > patience_s:
+                    silent_s = now - waiting_s
+                    link.close_lane(now=now, reason=f"its connection is gone and no datagram came for {silent_s:.0f} s")
         for link, channel in list(self._draining):
             if not channel.retained or not channel.reliable:
                 self._draining.remove((link, channel))
@@ -492,8 +495,11 @@ class Hub(LocalStreams):
         if not channel.reliable:
             return
         relayed = self.relayed.get(channel.stream.id)
-        if relayed is not None and relayed.source is not None:
-            relayed.source.report_drop(relayed.stream, out.seq, reason, link.peer, now=link.now)
+        if relayed is None or relayed.source is None:
+            return
+        if reason is DropReason.UNWANTED and link.peer not in relayed.outs:
+            return  # it has just unsubscribed: it is owed nothing, and others may have the message
+        relayed.source.report_drop(relayed.stream, out.seq, reason, link.peer, now=link.now)
 
     def on_delivered(self, link: Link, channel: OutChannel, *, now: float) -> None:
         relayed = self.relayed.get(channel.stream.id)

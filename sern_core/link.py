@@ -484,7 +484,8 @@ class Link(Session):
             self.handler.on_wanted(self, channel, now=now)
         elif kind == "dropped":
             reason = DROP_REASONS.get(wire.take_int(envelope, "code"), DropReason.LOST)
-            channel.reported(wire.take_int(envelope, "seq"), reason)
+            where = wire.take_str(envelope, "to", max_length=64, default="")
+            channel.reported(wire.take_int(envelope, "seq"), reason, where)
         else:
             code, why = wire.take_str(envelope, "code", max_length=64), wire.take_str(envelope, "why")
             self._set_wanted(

@@ -431,13 +431,14 @@ class OutChannel:
             if out in self.active:
                 self.active.remove(out)
 
-    def reported(self, seq: int, reason: DropReason) -> None:
-        """A later hop dropped `seq` and said so, before its watermark passed it."""
+    def reported(self, seq: int, reason: DropReason, where: str = "") -> None:
+        """A later hop dropped `seq` for the client `where` and said so, before its watermark passed it."""
         for out in self.retained:
             if out.seq == seq:
                 if not out.counted:
                     self.counters.drop(reason, out.offered_bytes)
                     out.counted = True
+                    out.lost_to = where
                     self.on_drop(out, reason)
                 return
 

@@ -56,6 +56,8 @@ class Session(Hop):
         self._reset_due_s = -float("inf")
         self._resumed = False
         self._data_prefix = b""  # how a data datagram of the session begins
+        self.cut_off = False
+        """The stream lane ended when the datagram lane was silent already: the path is gone, not the peer's process."""
         super().__init__(
             name=name, boot=boot, peer=peer, link=link, scheduler=scheduler, trace=trace, now=now, lossless=lossless
         )
@@ -97,6 +99,7 @@ class Session(Hop):
         if self.established and udp is not None and udp.answered:
             self._now = now
             self.lanes[LANE_ZMQ].up = False
+            self.cut_off = udp.stalled
             self._recall(self.lanes[LANE_ZMQ], now)
             self._use_lane(udp, now)
             self._choose_express(now)
@@ -114,8 +117,8 @@ class Session(Hop):
         lane.estimator.on_reset(now=now)
         self.dirty = True
 
-    def close_lane(self, *, now: float, lane_id: int = LANE_UDP) -> None:
-        """A lane's transport is gone or its keys are used up."""
+    def close_lane(self, *, now: float, lane_id: int = LANE_UDP, reason: str = "both lanes are gone") -> None:
+        """A lane's transport is gone or its keys are used up. `reason`: of the session's end, if that was its last."""
         lane = self.lanes.pop(lane_id, None)
         if lane is None:
             return
@@ -125,7 +128,7 @@ class Session(Hop):
         self._choose_express(now)
         self._recall(lane, now)
         if self.established and not self.transport_up:
-            self._end_session("both lanes are gone", now)
+            self._end_session(reason, now)
 
     def _greet(self, due_s: float, now: float) -> None:
         self._end_session("new session", now)
