@@ -33,7 +33,10 @@ class RelayLanes:
         self.bad_frames = 0
         self.moved = 0
         """Times a client's address changed."""
+        self.rekeyed = 0
+        """Lanes opened anew because the relay's own key was used up."""
         self._lanes: dict[ClientName, tuple[UdpSession, Pump]] = {}
+        self._ciphers: dict[ClientName, tuple[str, ...]] = {}  # what the client of a lane has offered
         self.server = UdpServer(
             udp_endpoints(listen), self._received, on_path=self._path, on_writable=self._writable, after=after
         )
@@ -55,14 +58,16 @@ class RelayLanes:
             _log.warning("%s gets no datagram lane: %s", client, refusal)
             return
         port = LanePort(link, LANE_UDP)
-        pump = Pump(port, session.send, on_gone=lambda: self._gone(client, session), ready=session.ready)
+        pump = Pump(port, session.send, on_gone=lambda: self._used_up(client, session), ready=session.ready)
         self._lanes[client] = (session, pump)
+        self._ciphers[client] = tuple(ciphers)
         self.hub.offer_lane(client, session.parameters.to_envelope(), now=clock.now())
         pump.kick()
 
     def closed(self, client: ClientName) -> None:
         """The core has closed the client's lane."""
         lane = self._lanes.pop(client, None)
+        self._ciphers.pop(client, None)
         if lane is not None:
             session, pump = lane
             pump.close()
@@ -86,8 +91,16 @@ class RelayLanes:
             _log.warning("datagram lane of %s closed: bad frame: %s", session.client, error)
             self._gone(session.client, session)
 
+    def _used_up(self, client: ClientName, session: UdpSession) -> None:
+        """The session can send no more, as its key is used up: offer another, as if the client had asked. It asks by
+        itself, long before, where the key lasts longer than it takes to look."""
+        lane = self._lanes.get(client)
+        if lane is not None and lane[0] is session:
+            self.rekeyed += 1
+            self.asked(client, self._ciphers[client])
+
     def _gone(self, client: ClientName, session: UdpSession) -> None:
-        """The session can send no more: its key is used up, or its client sent what no honest one does."""
+        """The client sent what no honest one does."""
         lane = self._lanes.get(client)
         if lane is not None and lane[0] is session:
             self.closed(client)

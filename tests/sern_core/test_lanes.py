@@ -1,5 +1,8 @@
 """Two lanes under one session: which carries data, what a lost lane costs, and how a session outlives its stream."""
 
+import pytest
+
+from sern_core import wire
 from sern_core.client import ClientCore
 from sern_core.lane_port import LanePort
 from sern_core.lanes import COPY_PACKETS, DATAGRAM_BYTES, LANE_UDP, LANE_ZMQ, Lane
@@ -107,6 +110,20 @@ def test_a_session_outlives_the_stream_and_a_fresh_pose_is_there_at_once() -> No
     assert lanes.robot.ups == [False]  # one session all along
     assert lanes.first_pose_after(24.0) <= 0.3
     assert lanes.core.link.lanes[LANE_ZMQ].up
+    lanes.check_log()
+
+
+@pytest.mark.parametrize("end", ["robot", "relay"])
+def test_packet_numbers_of_the_datagram_lane_that_run_out_begin_another_session(end: str) -> None:
+    lanes = TwoLanes(stream=models()[0], datagrams=models()[1])
+    lanes.run(5.0)
+    link = lanes.core.link if end == "robot" else lanes.world.relay.hub.links[ClientName("robot")]
+    link.lanes[LANE_UDP].flight.next_number = wire.MAX_PACKET_NUMBER - 5
+    lanes.run(5.0)
+    assert lanes.robot.ups == [False, True]
+    lanes._open(lanes.world.network.now)
+    lanes.run(5.0)
+    assert lanes.core.link.lane.id == LANE_UDP
     lanes.check_log()
 
 
