@@ -344,9 +344,22 @@ class Link(Session):
         self._confirm_own(stream)
 
     def _deliver(self, stream: InStream, message: Message) -> None:
+        if self.initiator and stream.perishable:  # at the relay the next hop sees that the relay's clock stood still
+            self._fresh.append((stream, message, self.clock.steps))
+            self.dirty = True
+            return
         self.handler.on_message(self, stream, message, now=self._now)
         if stream.reliable:
             self._confirm_own(stream)
+
+    def _hand_on(self, now: float) -> None:
+        self._now = now
+        while self._fresh:
+            stream, message, steps = self._fresh.popleft()
+            if steps != self.clock.steps:
+                self.handler.on_in_drop(self, stream, DropReason.LIFESPAN, len(message.body))
+            else:
+                self.handler.on_message(self, stream, message, now=now)
 
     def _in_drop(self, stream: InStream, reason: DropReason, nbytes: int, seq: int) -> None:
         if stream is self._control_in:
@@ -391,6 +404,7 @@ class Link(Session):
                     self._retract(stream, now)
 
     def _retract(self, stream: InStream, now: float) -> None:
+        self._hand_on(now)
         self.streams.pop(stream.stream.id, None)
         self._missing.pop(stream.stream.id, None)
         if stream.channel_id is not None:

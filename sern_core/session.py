@@ -18,8 +18,10 @@ from typing import Final
 from sern_core import wire
 from sern_core.clocksync import ClockSync
 from sern_core.errors import WireError
+from sern_core.fragments import InStream
 from sern_core.hop import Hop
 from sern_core.lanes import LANE_EXPRESS, LANE_UDP, LANE_ZMQ, Lane
+from sern_core.message import Message
 from sern_core.params import LinkParams, SchedulerParams
 from sern_core.sending import microseconds
 from sern_core.trace import LINK, DecisionTrace, TraceEvent
@@ -56,6 +58,9 @@ class Session(Hop):
         self._reset_due_s = -float("inf")
         self._resumed = False
         self._data_prefix = b""  # how a data datagram of the session begins
+        self._fresh: deque[tuple[InStream, Message, int]] = deque()
+        """Messages of class control that were young enough, with the number of steps that the clock estimate had seen:
+        what arrives in the same turn may tell that our clock stood still while they lay here."""
         self.cut_off = False
         """The stream lane ended when the datagram lane was silent already: the path is gone, not the peer's process."""
         super().__init__(
@@ -67,6 +72,10 @@ class Session(Hop):
 
     @abstractmethod
     def _session_ended(self, reason: str, now: float) -> None: ...
+
+    @abstractmethod
+    def _hand_on(self, now: float) -> None:
+        """Deliver what is in `_fresh`: everything that had arrived has been looked at."""
 
     @abstractmethod
     def _lane_closed(self) -> None:
@@ -229,6 +238,7 @@ class Session(Hop):
 
     def _end_session(self, reason: str, now: float) -> None:
         self._now = now
+        self._hand_on(now)
         for lane in self.lanes.values():
             self._recall(lane, now)
         self.lane = self.lanes[LANE_ZMQ]
@@ -257,6 +267,8 @@ class Session(Hop):
 
     def next_datagram(self, *, now: float, lane: int = LANE_ZMQ) -> bytes | None:
         """The next bytes for the lane, or None if nothing may or need be sent now."""
+        if self._fresh:
+            self._hand_on(now)
         if lane == LANE_ZMQ:
             if self._handshake_out:
                 return self._handshake_out.popleft()
@@ -322,6 +334,8 @@ class Session(Hop):
         return self._sweep_due_s
 
     def handle_timeout(self, *, now: float, lane: int = LANE_ZMQ) -> None:
+        if self._fresh:
+            self._hand_on(now)
         state = self.lanes.get(lane)
         if self.established and state is not None and state.up and not (lane == LANE_ZMQ and self._hello_due_s):
             self._data_timeout(state, now)
