@@ -189,6 +189,14 @@ def _make_endpoint(said: dict[str, Any]) -> Endpoint:
     return made[0] if len(made) == 1 else CompositeEndpoint(made)
 
 
+def _watch(parent: int) -> int | None:
+    """A descriptor that tells of the client's end; None where the kernel has none (before 5.3), or it has ended."""
+    try:
+        return os.pidfd_open(parent)
+    except OSError:
+        return None
+
+
 async def guard(parent: int) -> None:
     """Runs until the client is gone. Raises ConfigError when an endpoint cannot be started."""
     source, answers = sys.stdin.fileno(), sys.stdout.fileno()
@@ -205,16 +213,18 @@ async def guard(parent: int) -> None:
     await endpoint.start(_Nothing())
     try:
         process = GuardProcess(endpoint, source, answers)
-        watch = os.pidfd_open(parent)  # a child of the client may hold its end of the pipe after it
+        watch = _watch(parent)  # a child of the client may hold its end of the pipe after it
         try:
-            loop.add_reader(watch, process.parent_gone)
+            if watch is not None:
+                loop.add_reader(watch, process.parent_gone)
             if os.getppid() != parent:
                 process.parent_gone()
             process.say({"ready": True})
             await process.over.wait()
         finally:
-            loop.remove_reader(watch)
-            os.close(watch)
+            if watch is not None:
+                loop.remove_reader(watch)
+                os.close(watch)
             process.close()
     finally:
         await endpoint.stop()
@@ -227,7 +237,7 @@ def main() -> int:
     try:
         with asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:
             runner.run(guard(parent))
-    except (ConfigError, ProcessLookupError) as error:
+    except ConfigError as error:
         print(f"sern-client guard: {error}", file=sys.stderr)
         return 2
     return 0
