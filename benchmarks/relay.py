@@ -48,7 +48,7 @@ from sern_core.patterns import compile_pattern
 from sern_core.rules import FeedRole
 from sern_core.types import ClientName, DropReason, Encoding, PriorityClass, TopicName
 from sern_relay.daemon import RelayDaemon
-from sern_runtime import logs
+from sern_runtime import clock, logs
 from sern_runtime.config.relay import load_relay
 from sern_runtime.feed import Feed, FeedHeader, topic_frame
 from sern_runtime.loop import Shutdown, keep_freed_memory, run
@@ -103,12 +103,12 @@ class Flow:
             for _ in range(burst):
                 send()
             sent += burst
-            moved_s, seen = time.monotonic(), received.value
+            moved_s, seen = clock.now(), received.value
             while sent - received.value > self.window - burst and not stopped.value:
                 time.sleep(0.0001)
                 if received.value != seen:
-                    moved_s, seen = time.monotonic(), received.value
-                elif time.monotonic() - moved_s > STALL_S:
+                    moved_s, seen = clock.now(), received.value
+                elif clock.now() - moved_s > STALL_S:
                     sent = seen
 
     def arrived(self) -> None:
@@ -266,7 +266,7 @@ class IdleSite:
 
     def skipped(self, stream: StreamInfo, count: int) -> None: ...
 
-    def send_dropped(self, stream: StreamInfo, seq: int, reason: DropReason) -> None: ...
+    def send_dropped(self, stream: StreamInfo, seq: int, reason: DropReason, where: str) -> None: ...
 
     def wanted(self, stream: StreamInfo, wanted: bool) -> None: ...
 
@@ -336,7 +336,7 @@ class ScheduledLink(System):
             events=site,
             link=LinkParams(),
             scheduler=SchedulerParams(),
-            now=time.monotonic(),
+            now=clock.now(),
         )
         with zmq.Context() as context:
             transport = RelayTransport(
@@ -357,12 +357,12 @@ class ScheduledLink(System):
     def publisher(self, ports: Ports, flow: Flow) -> None:
         async def work(core: ClientCore, pump: Pump, site: _Site) -> None:
             info = TopicInfo(TopicName(TOPIC), "bench/Bytes", Encoding.RAW)
-            channel = core.publish(info, TopicSpec(depth=HIGH_WATER, lifespan_s=None), now=time.monotonic())
+            channel = core.publish(info, TopicSpec(depth=HIGH_WATER, lifespan_s=None), now=clock.now())
             body, received, stopped = bytes(flow.size_bytes), flow.received, flow.stopped
             sent = moved = 0
-            moved_s = time.monotonic()
+            moved_s = clock.now()
             while not stopped.value:
-                now = time.monotonic()
+                now = clock.now()
                 if site.wanted_now:
                     if received.value != moved:
                         moved_s, moved = now, received.value
@@ -384,7 +384,7 @@ class ScheduledLink(System):
 
     def subscriber(self, ports: Ports, flow: Flow) -> None:
         async def work(core: ClientCore, pump: Pump, site: _Site) -> None:
-            core.subscribe((TOPIC,), now=time.monotonic())
+            core.subscribe((TOPIC,), now=clock.now())
             while not flow.stopped.value:  # noqa: ASYNC110  (a flag in shared memory has no event)
                 await asyncio.sleep(0.02)
 
@@ -424,9 +424,9 @@ def measure(system: System, size_bytes: int, duration_s: float) -> Sample:
         _wait_for_messages(system, flow, (relay, *ends))
         time.sleep(duration_s / 4)
         watched = psutil.Process(relay.pid)
-        start_s, start, start_cpu_s = time.monotonic(), flow.received.value, cpu_s(watched)
+        start_s, start, start_cpu_s = clock.now(), flow.received.value, cpu_s(watched)
         time.sleep(duration_s)
-        end_s, end, end_cpu_s = time.monotonic(), flow.received.value, cpu_s(watched)
+        end_s, end, end_cpu_s = clock.now(), flow.received.value, cpu_s(watched)
     finally:
         flow.stopped.value = True
         for process in ends:
@@ -445,9 +445,9 @@ def cpu_s(process: psutil.Process) -> float:
 
 
 def _wait_for_messages(system: System, flow: Flow, processes: tuple[BaseProcess, ...]) -> None:
-    give_up_s = time.monotonic() + START_S
+    give_up_s = clock.now() + START_S
     while flow.received.value < 2 * BURST:
-        if time.monotonic() > give_up_s or not all(process.is_alive() for process in processes):
+        if clock.now() > give_up_s or not all(process.is_alive() for process in processes):
             raise SernError(f"no messages through {system.name}")
         time.sleep(0.01)
 

@@ -42,7 +42,7 @@ from sern_core.params import LinkParams, SchedulerParams
 from sern_core.queues import OutChannel
 from sern_core.types import CLASS_LABELS, ClientName, Encoding, PriorityClass, TopicName
 from sern_relay.daemon import RelayDaemon
-from sern_runtime import logs
+from sern_runtime import clock, logs
 from sern_runtime.config.relay import load_relay
 from sern_runtime.keys import PublicKey, PublicKeys, generate, load_public, load_secret, write_public, write_secret
 from sern_runtime.loop import Shutdown, run
@@ -132,7 +132,7 @@ def _client(
         events=events,
         link=LinkParams(),
         scheduler=SchedulerParams(),
-        now=time.monotonic(),
+        now=clock.now(),
     )
     transport = RelayTransport(
         context,
@@ -159,7 +159,7 @@ class _Site(IdleSite):
         self.shared.received.value += 1
         if self.shared.measuring.value:
             (sent_s,) = STAMP.unpack_from(message.body)
-            self.ages_s[CLASS_LABELS[stream.spec.priority]].append(time.monotonic() - sent_s)
+            self.ages_s[CLASS_LABELS[stream.spec.priority]].append(clock.now() - sent_s)
 
 
 def _site(folder: Path, port: int, shared: Shared, result: Any) -> None:
@@ -167,7 +167,7 @@ def _site(folder: Path, port: int, shared: Shared, result: Any) -> None:
         site = _Site(shared)
         with zmq.Context() as context:
             core, transport = _client(context, folder, port, ClientName("site"), site)
-            core.subscribe((".*",), now=time.monotonic())
+            core.subscribe((".*",), now=clock.now())
             try:
                 while not shared.stopped.value:  # noqa: ASYNC110  (a flag in shared memory has no event)
                     await asyncio.sleep(0.02)
@@ -184,7 +184,7 @@ def _offer(core: ClientCore) -> list[tuple[OutChannel, Kind]]:
     for kind in ROBOT:
         for _ in range(kind.topics):
             info = TopicInfo(TopicName(f"/{core.name}/topic{len(channels)}"), "bench/Bytes", Encoding.RAW)
-            channels.append((core.publish(info, TopicSpec(priority=kind.priority), now=time.monotonic()), kind))
+            channels.append((core.publish(info, TopicSpec(priority=kind.priority), now=clock.now()), kind))
     return channels
 
 
@@ -197,18 +197,18 @@ def _robots(folder: Path, port: int, numbers: range, shared: Shared) -> None:
                 core, transport = _client(context, folder, port, robot_name(number), IdleSite())
                 stack.callback(transport.close)
                 for channel, kind in _offer(core):
-                    start_s = time.monotonic() + rng.random() / kind.rate_hz
+                    start_s = clock.now() + rng.random() / kind.rate_hz
                     due.append((start_s, len(due), core, transport, channel, kind))
             heapq.heapify(due)
             while not shared.stopped.value:
-                now = time.monotonic()
+                now = clock.now()
                 while due[0][0] <= now:
                     due_s, order, core, transport, channel, kind = due[0]
-                    body = STAMP.pack(time.monotonic()).ljust(kind.nbytes, b"\0")
+                    body = STAMP.pack(clock.now()).ljust(kind.nbytes, b"\0")
                     core.send(channel, body, 0, now=now)
                     transport.pump.kick()
                     heapq.heapreplace(due, (due_s + 1.0 / kind.rate_hz, order, core, transport, channel, kind))
-                await asyncio.sleep(min(0.02, max(0.0, due[0][0] - time.monotonic())))
+                await asyncio.sleep(min(0.02, max(0.0, due[0][0] - clock.now())))
 
     with asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:
         runner.run(main())
@@ -253,11 +253,11 @@ def measure(robots: int, duration_s: float) -> Sample:
             settled = shared.received.value + int(robots * RATE_HZ)
             _wait(lambda: shared.received.value > settled, (relay, *ends), "messages do not flow")
             watched = psutil.Process(relay.pid)
-            start_s, start, start_cpu_s = time.monotonic(), shared.received.value, cpu_s(watched)
+            start_s, start, start_cpu_s = clock.now(), shared.received.value, cpu_s(watched)
             shared.measuring.value = True
             time.sleep(duration_s)
             shared.measuring.value = False
-            end_s, end, end_cpu_s = time.monotonic(), shared.received.value, cpu_s(watched)
+            end_s, end, end_cpu_s = clock.now(), shared.received.value, cpu_s(watched)
             shared.stopped.value = True
             if not ours.poll(START_S):
                 raise SernError("the site does not answer")
@@ -271,9 +271,9 @@ def measure(robots: int, duration_s: float) -> Sample:
 
 
 def _wait(condition: Callable[[], bool], processes: tuple[BaseProcess, ...], problem: str) -> None:
-    give_up_s = time.monotonic() + START_S
+    give_up_s = clock.now() + START_S
     while not condition():
-        if time.monotonic() > give_up_s or not all(process.is_alive() for process in processes):
+        if clock.now() > give_up_s or not all(process.is_alive() for process in processes):
             raise SernError(problem)
         time.sleep(0.02)
 

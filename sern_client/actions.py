@@ -21,7 +21,7 @@ from sern_core.message import StreamId, TopicInfo
 from sern_core.patterns import Pattern
 from sern_core.queues import OutChannel
 from sern_core.types import DropReason, Encoding, TopicName
-from sern_runtime import ros_services, ros_types
+from sern_runtime import clock, ros_services, ros_types
 from sern_runtime.loop import Timer
 
 REJECTED, ABORTED = 5, 4
@@ -209,7 +209,7 @@ class GoalWatch:
             return None
         while len(action.goals) >= MAX_GOALS:
             self._forget(action, next(iter(action.goals)))
-        goal = _Goal(ident, channel.stream.id, channel.next_seq, time.monotonic() + action.accept_s)
+        goal = _Goal(ident, channel.stream.id, channel.next_seq, clock.now() + action.accept_s)
         action.goals[ident.text] = goal
         self._by_message[goal.stream, goal.seq] = action, ident.text
         self._arm()
@@ -251,7 +251,7 @@ class GoalWatch:
                 goal = known.goals.get(status.goal_id.id)
                 if goal is not None:
                     goal.heard = True
-                    goal.due_s = time.monotonic() + known.patience_s
+                    goal.due_s = clock.now() + known.patience_s
             self._arm()
             return
         try:
@@ -272,7 +272,7 @@ class GoalWatch:
         self._timer.arm(min(due) if due else None)
 
     def _due(self) -> None:
-        now = time.monotonic()
+        now = clock.now()
         for action in list(self._actions.values()):
             for goal in [goal for goal in action.goals.values() if goal.due_s <= now]:
                 for_s = action.patience_s if goal.heard else action.accept_s

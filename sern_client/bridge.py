@@ -12,6 +12,7 @@ from sern_client.conversion import Converter
 from sern_client.endpoints.base import Endpoint, Publisher, Subscription, publisher_within
 from sern_client.endpoints.composite import CompositeEndpoint
 from sern_client.frames import FramePrefixer, Rewrite
+from sern_client.guard import Guard
 from sern_client.message_log import MessageLog
 from sern_client.rebuild import Rebuilds
 from sern_client.services import ServiceBridge
@@ -30,9 +31,9 @@ from sern_core.rules import Discovery, ResolvedTopic, RuleSet, to_global
 from sern_core.services import parse as parse_service
 from sern_core.summaries.transforms import is_static
 from sern_core.types import DropReason, Encoding, TopicName
-from sern_runtime import ros_types
+from sern_runtime import clock, ros_types
+from sern_runtime.fine_timer import fine_timer
 from sern_runtime.link_metrics import AgeHistograms
-from sern_runtime.loop import Timer
 
 MAX_PROBLEMS: Final = 256
 
@@ -52,9 +53,9 @@ class Outgoing:
 
 class Incoming:
     """A stream from elsewhere that is published here. `stop` is the body that a lost link makes us publish.
-    `publisher` None: it is of use to another stream only."""
+    `publisher` None: it is of use to another stream only. `guarded`: what the guard calls it; None: it has none."""
 
-    __slots__ = ("lease", "local", "publish", "publisher", "rewrite", "stop")
+    __slots__ = ("guarded", "lease", "local", "publish", "publisher", "rewrite", "stop")
 
     def __init__(
         self,
@@ -70,6 +71,7 @@ class Incoming:
         self.lease = lease
         self.stop = stop
         self.rewrite = rewrite
+        self.guarded: int | None = None
 
 
 class Bridge:
@@ -103,6 +105,8 @@ class Bridge:
         """Services offered and used, where there are rules for them; set by the daemon."""
         self.goals: GoalWatch | None = None
         """Goals of ROS 1 that this site gives to others, where there are rules for them; set by the daemon."""
+        self.guard: Guard | None = None
+        """Publishes stop commands while this process cannot; set by the daemon."""
         self.refusals = 0
         self.subscription_problems: dict[str, str] = {}
         """What the relay does not let us have, in its words, with the code."""
@@ -120,7 +124,7 @@ class Bridge:
         self._outgoing: dict[TopicName, Outgoing] = {}
         self._incoming: dict[StreamId, Incoming] = {}
         self._last_arrival_s: dict[StreamId, float] = {}
-        self._timer = Timer(self._leases_due)
+        self._timer = fine_timer(self._leases_due)  # one that is due while the machine sleeps is due when it wakes
         self.summaries = Summaries(self._sender)
         self.rebuilds = Rebuilds()
         self._asked: tuple[str, ...] | None = None  # the patterns we were started with
@@ -154,7 +158,7 @@ class Bridge:
                 outgoing.source.close()
         self.summaries.close()
         self._outgoing.clear()
-        self._timer.cancel()
+        self._timer.close()
         if self.goals is not None:
             self.goals.close()
         for incoming in self._incoming.values():
@@ -165,6 +169,8 @@ class Bridge:
         """No more commands will come from there: the last one must not stand."""
         if incoming.lease is not None and incoming.stop is not None and incoming.lease.deadline() is not None:
             self._publish(incoming, incoming.stop, time.time_ns())
+        if self.guard is not None and incoming.guarded is not None:
+            self.guard.closed(incoming.guarded)
         if incoming.publisher is not None:
             incoming.publisher.close()
 
@@ -218,7 +224,7 @@ class Bridge:
         if merge:
             # A message of all static transforms replaces the ones before; every other one counts.
             spec = replace(spec, max_rate_hz=None, depth=1 if static else spec.depth)
-        channel = core.publish(replace(info, name=name), spec, now=time.monotonic())
+        channel = core.publish(replace(info, name=name), spec, now=clock.now())
         if not merge:
             return channel, None
         send = self._sender(channel, info)
@@ -235,7 +241,7 @@ class Bridge:
             if outgoing.source is not None:
                 outgoing.source.close()
                 self.summaries.forget(outgoing.source)
-            self.core.unpublish(outgoing.channel, now=time.monotonic())
+            self.core.unpublish(outgoing.channel, now=clock.now())
             self._kick()
 
     def _sink(self, channel: OutChannel, rewrite: Rewrite | None) -> Callable[[bytes, int], bool]:
@@ -253,7 +259,7 @@ class Bridge:
             seq = channel.next_seq
             if rewrite is not None:
                 body = rewrite(body)
-            accepted = core.send(channel, body, stamp_ns, born_s=born_s, now=time.monotonic())
+            accepted = core.send(channel, body, stamp_ns, born_s=born_s, now=clock.now())
             if log is not None:
                 log.offered(stream, seq, body, stamp_ns, accepted=accepted)
             kick()
@@ -310,6 +316,8 @@ class Bridge:
             else:
                 lease = CommandLease(resolved.lease.after_s)
         incoming = Incoming(local, publisher, lease, stop, self.frames.incoming(info))
+        if self.guard is not None and stop is not None:
+            incoming.guarded = self.guard.opened(info, stop)
         self._incoming[stream.id] = incoming
         if self.goals is not None:
             self.goals.opened(info, lambda body: self._publish(incoming, body, time.time_ns()))
@@ -330,7 +338,7 @@ class Bridge:
         if self._asked is None:
             self._asked = patterns
         if not PatternSet(patterns).fullmatch(topic):
-            self.core.subscribe((*patterns, topic), now=time.monotonic())
+            self.core.subscribe((*patterns, topic), now=clock.now())
             self._kick()
 
     def _show(self, incoming: Incoming, body: bytes, stamp_ns: int, left_s: float = inf) -> None:
@@ -356,6 +364,10 @@ class Bridge:
                 self.services.message(stream, message)
             return
         age_s = now - message.born_s
+        if incoming.lease is not None:
+            incoming.lease.renew(born_s=message.born_s)
+            self._arm()
+            self._tell_guard(incoming)  # before it is published: no stop command of before may come after it
         if not self.rebuilds.message(stream, message):
             lifespan_s = stream.spec.lifespan_s
             left_s = inf if lifespan_s is None else max(lifespan_s - age_s, 0.0)
@@ -365,9 +377,6 @@ class Bridge:
         self.ages.observe(stream.spec.priority, age_s)
         if stream.spec.deadline_s is not None:
             self._check_deadline(stream, now)
-        if incoming.lease is not None:
-            incoming.lease.renew(born_s=message.born_s)
-            self._arm()
         if self._log is not None:
             self._log.delivered(stream, message, age_s)
 
@@ -402,7 +411,7 @@ class Bridge:
                 self.endpoint.interest(local, wanted)
                 break
 
-    def send_dropped(self, stream: StreamInfo, seq: int, reason: DropReason) -> None:
+    def send_dropped(self, stream: StreamInfo, seq: int, reason: DropReason, where: str) -> None:
         for outgoing in self._outgoing.values():
             if outgoing.source is not None:
                 outgoing.source.lost(stream.id)
@@ -410,8 +419,14 @@ class Bridge:
             self.services.send_dropped(stream, seq, reason)
         if self.goals is not None:
             self.goals.send_dropped(stream.id, seq, reason)
-        if stream.spec.reliable and not self._closed:  # what is left at the end was said in one line
-            _log.warning("%s: our reliable message %d was dropped: %s", stream.id.topic, seq, reason)
+        if not stream.spec.reliable or self._closed:  # what is left at the end was said in one line
+            return
+        if reason is DropReason.UNWANTED:  # who wanted it has left or unsubscribed: counted, and no loss to anybody
+            _log.debug("%s: nobody wants our reliable message %d any more", stream.id.topic, seq)
+        elif where:
+            _log.warning("%s: our reliable message %d was dropped for %s: %s", stream.id.topic, seq, where, reason)
+        else:
+            _log.warning("%s: our reliable message %d was dropped here: %s", stream.id.topic, seq, reason)
 
     def publication_refused(self, stream: StreamInfo, code: str, text: str) -> None:
         self.refusals += 1
@@ -439,8 +454,12 @@ class Bridge:
         ]
         self._timer.arm(min(deadlines) if deadlines else None)
 
+    def _tell_guard(self, incoming: Incoming) -> None:
+        if self.guard is not None and incoming.guarded is not None and incoming.lease is not None:
+            self.guard.lease(incoming.guarded, incoming.lease.deadline())
+
     def _leases_due(self) -> None:
-        now = time.monotonic()
+        now = clock.now()
         for incoming in self._incoming.values():
             lease = incoming.lease
             if lease is None or incoming.stop is None:
@@ -448,6 +467,7 @@ class Bridge:
             first = not lease.expired
             if lease.due(now=now):
                 self._publish(incoming, incoming.stop, time.time_ns())
+                self._tell_guard(incoming)
                 if first:
                     self.leases_fired += 1
                     _log.warning("%s: no fresh command; publishing the stop command", incoming.local)

@@ -18,6 +18,7 @@ from sern_client.bridge import Bridge
 from sern_client.endpoints.base import CountingEndpoint, Endpoint, ServiceEndpoint
 from sern_client.express import ClientExpress
 from sern_client.factory import make_endpoint
+from sern_client.guard import Guard
 from sern_client.message_log import MessageLog
 from sern_client.services import ServiceBridge
 from sern_client.summarise import register_summaries
@@ -29,6 +30,7 @@ from sern_core.lossy import missing
 from sern_core.patterns import compile_pattern
 from sern_core.trace import DecisionTrace
 from sern_core.types import CLASS_LABELS, DropReason, ObjectKind
+from sern_runtime import clock
 from sern_runtime.adaptation import Adaptation
 from sern_runtime.codec_pool import CodecPool, make_coder
 from sern_runtime.config.base import split_tcp
@@ -92,7 +94,7 @@ class ClientDaemon:
             on_down=self._link_down,
             on_fault=self.errors.core,
         )
-        now = time.monotonic()
+        now = clock.now()
         for index, section in enumerate(model.topics):
             for problem in filter(None, map(missing, section.lossy)):
                 raise ConfigError(problem, file=str(loaded.path), key=f"topics.{index}.lossy")
@@ -108,6 +110,7 @@ class ClientDaemon:
             coder=make_coder(model.link.params(), self.codecs),
         )
         self.bridge.attach(self.core)
+        self.bridge.guard = self.guard = Guard.of(loaded)
         self.core.subscribe(model.subscribe_patterns(), now=now)
         self._serve_services(endpoint)
         if model.actions.use:
@@ -177,6 +180,8 @@ class ClientDaemon:
         # Before the transport: streams from the relay are advertised at the endpoint as soon as there is a session.
         await self.bridge.endpoint.start(self.bridge)
         self._endpoint_started = True
+        if self.guard is not None:
+            self.guard.start()
         self._ctx = zmq.Context()
         with blamed_on(self.loaded.path, "relay", "endpoint"):
             self._transport = RelayTransport(
@@ -232,7 +237,7 @@ class ClientDaemon:
             self._express.begin()
 
     async def _tick(self) -> None:
-        watchdog = Watchdog(self.notifier, {"loop": lambda: int(time.monotonic() * 1e3)})
+        watchdog = Watchdog(self.notifier, {"loop": lambda: int(clock.now() * 1e3)})
         while True:
             await asyncio.sleep(TICK_S)
             if self.message_log is not None:
@@ -260,7 +265,7 @@ class ClientDaemon:
                 "topics": str(len(self.core.link.channels)),
             },
             wall_ns=time.time_ns(),
-            now=time.monotonic(),
+            now=clock.now(),
         )
 
     def _make_http(self, listen: str) -> HttpServer:
@@ -296,6 +301,16 @@ class ClientDaemon:
             "sern_command_lease_expired_total",
             "Times a command topic went quiet and the stop command was published.",
             read=lambda: [((), float(self.bridge.leases_fired))],
+        )
+        metrics.counter(
+            "sern_command_guard_stops_total",
+            "Leases that ran out while the client was held up: its guard published the stop command.",
+            read=lambda: [((), float(0 if self.guard is None else self.guard.stopped))],
+        )
+        metrics.counter(
+            "sern_command_guard_restarts_total",
+            "Times the guard of the command topics had ended and was started again.",
+            read=lambda: [((), float(0 if self.guard is None else self.guard.restarts))],
         )
         metrics.counter(
             "sern_deadline_missed_total",
@@ -358,7 +373,7 @@ class ClientDaemon:
 
     def topics(self) -> dict[str, TopicView]:
         """Counters of every topic by global name, sent and received."""
-        return both_ways(self.core.link, self.core.received, now=time.monotonic())
+        return both_ways(self.core.link, self.core.received, now=clock.now())
 
     async def drain(self) -> None:
         """Stop the sources, then go on sending what is owed while that gets anywhere, `link.drain_s` at most. What
@@ -370,7 +385,7 @@ class ClientDaemon:
         self._stopping = True
         self.bridge.stop_sources()
         link = self.core.link
-        now = time.monotonic()
+        now = clock.now()
         progress = Progress()
         give_up_s = now + self.loaded.model.link.drain_s
         while now < give_up_s:
@@ -385,7 +400,7 @@ class ClientDaemon:
                 break
             self._kick()
             await asyncio.sleep(0.02)
-            now = time.monotonic()
+            now = clock.now()
         unconfirmed = sum(len(channel.retained) for channel in link.channels.values())
         if unconfirmed:
             _log.warning("stopping with %d reliable messages that not everyone has confirmed", unconfirmed)
@@ -393,7 +408,7 @@ class ClientDaemon:
             self._kick()
             await asyncio.sleep(0.02)  # what has arrived here is confirmed before we say goodbye
             self._transport.pump.run()
-            link.close("client stops", now=time.monotonic())
+            link.close("client stops", now=clock.now())
             self._transport.pump.run()
             await asyncio.sleep(0.05)  # libzmq's thread takes it from here
 
@@ -401,7 +416,7 @@ class ClientDaemon:
         """Count what is left, so that every message has a fate."""
         link = self.core.link
         for channel in list(link.channels.values()):
-            link.close_channel(channel, DropReason.SHUTDOWN, now=time.monotonic())
+            link.close_channel(channel, DropReason.SHUTDOWN, now=clock.now())
 
     async def stop(self) -> None:
         """Ends whatever was started, the last first, also when a part of it fails."""
@@ -418,6 +433,8 @@ class ClientDaemon:
                 stack.push_async_callback(self._http.stop)
             if self._endpoint_started:
                 stack.push_async_callback(self.bridge.endpoint.stop)
+            if self.guard is not None:
+                stack.push_async_callback(self.guard.stop)
             stack.callback(self.bridge.close)
             if self.bridge.services is not None:
                 stack.push_async_callback(self.bridge.services.stop)

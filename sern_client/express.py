@@ -2,7 +2,6 @@
 
 import asyncio
 import logging
-import time
 from collections.abc import Callable
 from typing import Final
 
@@ -13,6 +12,7 @@ from sern_core.errors import ConfigError, RemoteError
 from sern_core.lane_port import LanePort
 from sern_core.lanes import LANE_EXPRESS, LANE_ZMQ
 from sern_core.params import Redundancy
+from sern_runtime import clock
 from sern_runtime.express import CONNECTIONS, ExpressPaths
 from sern_runtime.monitor import TcpHandle
 from sern_runtime.pump import Pump
@@ -52,7 +52,7 @@ class ClientExpress:
 
     def begin(self) -> None:
         """A session has begun: what is connected must join it."""
-        self._open_s = time.monotonic() + self._wait_s
+        self._open_s = clock.now() + self._wait_s
         self._failures = 0
         self.paths.clear()
         for connection in self._connections:
@@ -61,7 +61,7 @@ class ClientExpress:
     def tick(self) -> None:
         link = self.core.link
         if not self._connections:
-            if link.established and link.lane.id == LANE_ZMQ and time.monotonic() >= self._open_s:
+            if link.established and link.lane.id == LANE_ZMQ and clock.now() >= self._open_s:
                 self._open()
         else:
             self.paths.look()
@@ -78,7 +78,7 @@ class ClientExpress:
 
     def _give_up(self) -> None:
         self.close()
-        self._open_s = time.monotonic() + ASK_AGAIN_S
+        self._open_s = clock.now() + ASK_AGAIN_S
 
     def close(self) -> None:
         """The daemon stops, or the relay does not want the lane."""
@@ -89,7 +89,7 @@ class ClientExpress:
             connection.dialer.close()
         self._connections.clear()
         self.paths.clear()
-        self.core.link.close_lane(now=time.monotonic(), lane_id=LANE_EXPRESS)
+        self.core.link.close_lane(now=clock.now(), lane_id=LANE_EXPRESS)
 
     def kick(self) -> None:
         if self._pump is not None:
@@ -101,13 +101,13 @@ class ClientExpress:
         if LANE_EXPRESS not in link.lanes:
             if self._pump is not None:
                 self._pump.reset()
-            link.open_lane(now=time.monotonic(), lane_id=LANE_EXPRESS)
+            link.open_lane(now=clock.now(), lane_id=LANE_EXPRESS)
         self._kick()
 
     def lost(self, connection: "_Connection", *, answered: bool) -> None:
         self.paths.discard(connection)
         if not self.paths:
-            self.core.link.close_lane(now=time.monotonic(), lane_id=LANE_EXPRESS)
+            self.core.link.close_lane(now=clock.now(), lane_id=LANE_EXPRESS)
         self._failures = 0 if answered else self._failures + 1
         link = self.core.link
         if self._failures >= ATTEMPTS * CONNECTIONS and link.established and link.express is None:
@@ -118,7 +118,7 @@ class ClientExpress:
 
     def received(self, connection: "_Connection", data: wire.Datagram) -> None:
         try:
-            self.core.link.receive(data, now=time.monotonic(), lane=LANE_EXPRESS)
+            self.core.link.receive(data, now=clock.now(), lane=LANE_EXPRESS)
         except RemoteError as error:
             self.bad_frames += 1
             _log.warning("the relay sent a bad frame for class control (%s); reconnecting", error)
@@ -141,7 +141,7 @@ class _Connection:
 
     def join(self) -> None:
         """Say whose connection this is; without a session, when there is one."""
-        said = self._lane.core.link.join(now=time.monotonic())
+        said = self._lane.core.link.join(now=clock.now())
         if self._up and said is not None and self.dialer.send(said):
             self._lane.joined(self, self._handle)
 

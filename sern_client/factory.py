@@ -23,11 +23,11 @@ Resolve = Callable[[str], Path]
 
 def make_endpoint(loaded: Loaded[ClientFile]) -> Endpoint:
     """The endpoint of a client: the one its file names, or several as one. Raises ConfigError."""
-    made = [make_section(section, loaded.resolve) for section in _named(loaded.model)]
+    made = [make_section(section, loaded.resolve) for section in named_sections(loaded.model)]
     return made[0] if len(made) == 1 else CompositeEndpoint(made)
 
 
-def _named(model: ClientFile) -> list[sections.EndpointSection]:
+def named_sections(model: ClientFile) -> list[sections.EndpointSection]:
     """The sections, ROS nodes with the names that they get when the file gives none: no two of them the same, because
     a master lets only the last node of a name live."""
     named: list[sections.EndpointSection] = []

@@ -36,6 +36,7 @@ from sern_core.services import (
     reply_name,
 )
 from sern_core.types import DropReason, Durability, PriorityClass, Reliability, TopicName
+from sern_runtime import clock
 
 MAX_ERROR_CHARS: Final = 512
 MAX_SERVED: Final = 1000
@@ -148,18 +149,18 @@ class ServiceBridge:
             offer_name(name), info.type_name, info.encoding, info.type_hash, info.definition, latched=True
         )
         try:
-            channel = self._core.publish(topic, _OFFER_SPEC, now=time.monotonic())
+            channel = self._core.publish(topic, _OFFER_SPEC, now=clock.now())
         except UsageError as error:
             _log.error("service %s cannot be offered: %s", info.name, error)
             return
-        self.offered[name] = _Offered(info, rule, channel, time.monotonic())
+        self.offered[name] = _Offered(info, rule, channel, clock.now())
         _log.info("offering service %s (%s) as %s", info.name, info.type_name, name)
         self._kick()
 
     def service_removed(self, name: TopicName) -> None:
         offered = self.offered.pop(to_global(name, self._namespace), None)
         if offered is not None:
-            self._core.unpublish(offered.channel, now=time.monotonic())
+            self._core.unpublish(offered.channel, now=clock.now())
             _log.info("service %s has ended", name)
             self._kick()
 
@@ -282,7 +283,7 @@ class ServiceBridge:
             info = used.offer.info
             calls = TopicInfo(call_name(used.name, self._core.name), info.type_name, info.encoding)
             try:
-                used.calls = self._core.publish(calls, spec, owed=(used.offer.id.origin,), now=time.monotonic())
+                used.calls = self._core.publish(calls, spec, owed=(used.offer.id.origin,), now=clock.now())
             except UsageError as error:
                 raise ServiceError(f"{used.name} cannot be called from here: {error}") from None
             self._calling[used.calls.stream.id] = used
@@ -317,7 +318,7 @@ class ServiceBridge:
         used.waiting[number] = future
         used.numbers[seq] = number
         try:
-            if not self._core.send(calls, CALL.pack(number) + request, time.time_ns(), now=time.monotonic()):
+            if not self._core.send(calls, CALL.pack(number) + request, time.time_ns(), now=clock.now()):
                 raise ServiceError(f"{used.name}: too much waits for the link")
             self._kick()
             async with asyncio.timeout(used.rule.timeout_s):
@@ -325,7 +326,7 @@ class ServiceBridge:
         except asyncio.CancelledError:
             if not used.gone:  # its caller is gone: if the call still waits here, it is not made
                 used.numbers.pop(seq, None)
-                self._core.link.shed(calls, DropReason.UNWANTED, seq=seq, now=time.monotonic())
+                self._core.link.shed(calls, DropReason.UNWANTED, seq=seq, now=clock.now())
             raise
         finally:
             used.waiting.pop(number, None)
@@ -342,8 +343,8 @@ class ServiceBridge:
 
     async def _cancel(self, service: TopicName, request: bytes) -> None:
         """Until it has been answered: the link may be away."""
-        until_s = time.monotonic() + CANCEL_S
-        while time.monotonic() < until_s:
+        until_s = clock.now() + CANCEL_S
+        while clock.now() < until_s:
             used = self.used.get(service)
             if used is not None:
                 with suppress(ServiceError):
@@ -375,7 +376,7 @@ class ServiceBridge:
         if used.calls is not None:
             del self._calling[used.calls.stream.id]
             if unpublish:
-                self._core.unpublish(used.calls, now=time.monotonic())
+                self._core.unpublish(used.calls, now=clock.now())
                 self._kick()
 
     # --- the side that has the service ------------------------------------------------------------------------------
@@ -394,7 +395,7 @@ class ServiceBridge:
         self._release_name(name)
         replies = TopicInfo(name, offered.info.type_name, offered.info.encoding)
         try:
-            channel = self._core.publish(replies, spec, now=time.monotonic())
+            channel = self._core.publish(replies, spec, now=clock.now())
         except UsageError as error:
             raise ConfigError(f"{stream.id.origin} cannot be answered: {error}") from None
         self.callers[stream.id] = _Caller(service, channel)
@@ -410,7 +411,7 @@ class ServiceBridge:
     def _dismiss(self, caller: _Caller) -> None:
         for task in caller.tasks:
             task.cancel()
-        self._core.unpublish(caller.replies, now=time.monotonic())
+        self._core.unpublish(caller.replies, now=clock.now())
         self._kick()
 
     def _called(self, caller: _Caller, stream: StreamInfo, message: Message) -> None:
@@ -433,7 +434,7 @@ class ServiceBridge:
             return
         left_s = offered.rule.timeout_s
         if stream.spec.lifespan_s is not None:
-            left_s = min(left_s, stream.spec.lifespan_s - message.age_s(time.monotonic()))
+            left_s = min(left_s, stream.spec.lifespan_s - message.age_s(clock.now()))
         task = asyncio.create_task(
             self._execute(caller, offered, number, message.body[CALL.size :], left_s), name=f"call-{number}"
         )
@@ -462,6 +463,6 @@ class ServiceBridge:
                 f"site that has it ({limit_bytes + REPLY.size})"
             ).encode()
         body = REPLY.pack(number, failed) + response
-        if not self._core.send(caller.replies, body, time.time_ns(), now=time.monotonic()):
+        if not self._core.send(caller.replies, body, time.time_ns(), now=clock.now()):
             _log.warning("an answer of %s was lost: too much waits for the link", caller.service)
         self._kick()

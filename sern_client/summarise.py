@@ -42,7 +42,7 @@ from sern_core.summaries.spec import (
 )
 from sern_core.summaries.voxel import thin_cloud
 from sern_core.types import DropReason, Durability, Encoding, PriorityClass, Reliability, TopicName
-from sern_runtime import ros_types
+from sern_runtime import clock, ros_types
 from sern_runtime.loop import Timer
 from sern_runtime.metrics import Labels, Metrics
 
@@ -201,7 +201,7 @@ class TopicSummary:
             self._drop(self._waiting.popleft(), DropReason.SUPERSEDED)
         self._waiting.append(job)
         if self._running is None and self._timer.deadline_s is None:
-            self._timer.arm(time.monotonic() + POLL_S)
+            self._timer.arm(clock.now() + POLL_S)
         return True
 
     def _may_start(self) -> bool:
@@ -210,7 +210,7 @@ class TopicSummary:
 
     def _drop(self, job: Job, reason: DropReason) -> None:
         """A grid that is given up is counted with the whole grids, a cloud with what would have been made of it."""
-        self._core.drop(self._channels[0], len(job.body), reason, now=time.monotonic())
+        self._core.drop(self._channels[0], len(job.body), reason, now=clock.now())
 
     # --- work -------------------------------------------------------------------------------------------------------
 
@@ -244,13 +244,13 @@ class TopicSummary:
     def _hold(self, job: Job) -> None:
         """The reliable queue is full: try this one again in a while."""
         self._waiting.appendleft(job)
-        self._timer.arm(time.monotonic() + RETRY_S)
+        self._timer.arm(clock.now() + RETRY_S)
 
     def _go_on(self) -> None:
         """Start what waits, as far as it may start; the timer looks again."""
         while self._waiting and self._running is None and self._timer.deadline_s is None and not self._closed:
             if not self._may_start():
-                self._timer.arm(time.monotonic() + POLL_S)
+                self._timer.arm(clock.now() + POLL_S)
             elif not self._start(job := self._waiting.popleft()):
                 self._hold(job)
 
@@ -439,7 +439,7 @@ class SummarisedTopic:
 
     def sink(self, body: bytes, stamp_ns: int) -> bool:
         """A `Sink`. False: what counts most was refused, the topic itself or its only summary."""
-        now = time.monotonic()
+        now = clock.now()
         if not self._cap.allows(now):
             self._core.drop(self._channel, len(body), DropReason.RATE_CAP, now=now)
             return True
@@ -470,7 +470,7 @@ class SummarisedTopic:
                 output.lost()
 
     def close(self) -> None:
-        now = time.monotonic()
+        now = clock.now()
         for output in self.outputs:
             output.close()
             if output.channel is not self._channel:
@@ -501,7 +501,7 @@ class Summaries:
         specs = fits(info, resolved)
         if not specs:
             return None
-        now = time.monotonic()
+        now = clock.now()
         spec = replace(resolved.spec, max_rate_hz=None)
         updates = spec
         patches = next((item.params for item in specs if isinstance(item.params, PatchParams)), None)

@@ -5,7 +5,6 @@ newest of every pair, and nothing in it can be superseded together with the pair
 """
 
 import logging
-import time
 from typing import Final
 
 from sern_client.summarise import POLL_S, Send
@@ -15,6 +14,7 @@ from sern_core.message import StreamId
 from sern_core.queues import OutChannel
 from sern_core.summaries.transforms import StaticTransforms, TransformMerger
 from sern_core.types import DropReason, Encoding, TopicName
+from sern_runtime import clock
 from sern_runtime.loop import Timer
 
 DEFAULT_RATE_HZ: Final = 20.0
@@ -88,7 +88,7 @@ class MergedTransforms(_Transforms):
 
     def sink(self, body: bytes, stamp_ns: int) -> bool:
         """A `Sink`."""
-        now = time.monotonic()
+        now = clock.now()
         if self._channel.wanted is False and not self._channel.spec.latched:
             self._core.drop(self._channel, len(body), DropReason.UNWANTED, now=now)
             return True
@@ -102,7 +102,7 @@ class MergedTransforms(_Transforms):
         return True
 
     def _flush(self) -> None:
-        now = time.monotonic()
+        now = clock.now()
         if self._channel.queue:
             self._timer.arm(now + POLL_S)
             return
@@ -126,7 +126,7 @@ class LatchedTransforms(_Transforms):
 
     def sink(self, body: bytes, stamp_ns: int) -> bool:
         """A `Sink`. A message that says nothing new is counted as superseded."""
-        now = time.monotonic()
+        now = clock.now()
         try:
             merged = self.transforms.add(body)
         except BodyError as error:

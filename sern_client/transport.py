@@ -2,7 +2,6 @@
 
 import asyncio
 import logging
-import time
 from collections.abc import Callable, Sequence
 from random import Random
 from typing import Final, Protocol
@@ -12,6 +11,7 @@ import zmq
 from sern_core import wire
 from sern_core.errors import ConfigError, RemoteError
 from sern_core.link import Link
+from sern_runtime import clock
 from sern_runtime.monitor import TcpHandle, TransportWatch
 from sern_runtime.pump import LANE_MESSAGE_BYTES, Pump
 from sern_runtime.zmq_socket import TOS_EXPEDITED, CurvePair, DealerSocket, SendResult, make_client
@@ -214,7 +214,7 @@ class RelayTransport:
 
     def up(self, handle: TcpHandle | None) -> None:
         self.pump.reset()
-        self.link.connected(now=time.monotonic())
+        self.link.connected(now=clock.now())
         self.pump.kick()
 
     def down(self, reason: str) -> None:
@@ -224,15 +224,15 @@ class RelayTransport:
 
     def refused(self, reason: str) -> None:
         """Then not by another lane either."""
-        self.link.close(reason, now=time.monotonic())
+        self.link.close(reason, now=clock.now())
 
     def given_up(self, reason: str) -> None:
         self.pump.reset()
-        self.link.disconnected(now=time.monotonic(), reason=reason)
+        self.link.disconnected(now=clock.now(), reason=reason)
 
     def received(self, data: wire.Datagram) -> None:
         try:
-            self.link.receive(data, now=time.monotonic())
+            self.link.receive(data, now=clock.now())
         except RemoteError as error:
             self.bad_frames += 1
             _log.warning("%s sent a bad frame (%s); reconnecting", self.endpoint, error)

@@ -1,23 +1,27 @@
 """The client's datagram lane: asked for in each session, opened with the keys the relay answers, closed by the core."""
 
 import logging
-import time
 from collections.abc import Callable
+from math import inf
 from typing import Final
 
 from sern_core import wire
 from sern_core.client import ClientCore
 from sern_core.errors import RemoteError, SernError
 from sern_core.lane_port import LanePort
-from sern_core.lanes import LANE_UDP
+from sern_core.lanes import LANE_UDP, LANE_ZMQ
+from sern_runtime import clock
 from sern_runtime.pump import Pump
 from sern_runtime.seal import SessionParameters, offered_ciphers
 from sern_runtime.udp_client import UdpClient
 
 REBIND_S: Final = 2.0
 """While the lane has stalled it tries another source port this often: a lost NAT binding or route raises no error."""
-ASK_AGAIN_S: Final = 30.0
-"""A lane that failed is asked for again after so long."""
+ASK_AGAIN_S: Final = (10.0, 300.0)
+"""First and longest pause before a lane that failed, or is silent while the stream works, is asked for again: the relay
+may have given it up, or the way be open again."""
+ANSWER_S: Final = 5.0
+"""How long an answer is waited for before a lane whose keys are nearly used up is asked for again."""
 
 _log = logging.getLogger(__name__)
 
@@ -37,11 +41,14 @@ class ClientLane:
         self._pump: Pump | None = None
         self._rebind_s = 0.0
         self._ask_s: float | None = None
+        self._asked_s = -inf
+        self._pause_s = ASK_AGAIN_S[0]
 
     def ask(self) -> None:
-        """A session has begun."""
+        """A session has begun, or the lane there is will not do."""
         self._ask_s = None
-        self.core.ask_lane(offered_ciphers(), now=time.monotonic())
+        self._asked_s = clock.now()
+        self.core.ask_lane(offered_ciphers(), now=clock.now())
 
     def offered(self, envelope: wire.Envelope) -> None:
         """The relay's answer. Raises WireError when it is none."""
@@ -58,11 +65,12 @@ class ClientLane:
             )
         except SernError as error:
             _log.warning("no datagram lane: %s", error)
+            self._ask_later()
             return
         port = LanePort(self.core.link, LANE_UDP)
-        self._pump = Pump(port, self._socket.send, on_gone=self._failed, ready=self._socket.ready)
-        self.core.link.close_lane(now=time.monotonic())
-        self.core.link.open_lane(now=time.monotonic())
+        self._pump = Pump(port, self._socket.send, on_gone=self._used_up, ready=self._socket.ready)
+        self.core.link.close_lane(now=clock.now())
+        self.core.link.open_lane(now=clock.now())
         self._pump.kick()
 
     def closed(self) -> None:
@@ -79,13 +87,18 @@ class ClientLane:
             self._pump.kick()
 
     def tick(self) -> None:
-        now = time.monotonic()
+        now = clock.now()
         if self._ask_s is not None and now >= self._ask_s and self.core.link.established:
             self.ask()
         lane = self.core.link.lanes.get(LANE_UDP)
         if self._socket is None or lane is None:
             return
-        if self._socket.rekey_due:
+        if lane.answered and not lane.stalled:
+            self._ask_s = None
+            self._pause_s = ASK_AGAIN_S[0]
+        elif self._ask_s is None and self.core.link.lanes[LANE_ZMQ].usable:
+            self._ask_later()  # a blackout takes both: then there is nobody to ask
+        if self._socket.rekey_due and now >= self._asked_s + ANSWER_S:
             self.ask()
         elif lane.stalled and now >= self._rebind_s:
             self._rebind_s = now + REBIND_S
@@ -99,11 +112,22 @@ class ClientLane:
             _log.warning("the relay sent a bad datagram (%s); the lane is closed", error)
             self._failed()
 
+    def _used_up(self) -> None:
+        """Our key has sealed all that it may, before there was another."""
+        self.closed()
+        self.core.link.close_lane(now=clock.now())
+        self.ask()
+        self._kick()
+
     def _failed(self) -> None:
         self.closed()
-        self.core.link.close_lane(now=time.monotonic())
-        self._ask_s = time.monotonic() + ASK_AGAIN_S
+        self.core.link.close_lane(now=clock.now())
+        self._ask_later()
         self._kick()
+
+    def _ask_later(self) -> None:
+        self._ask_s = clock.now() + self._pause_s
+        self._pause_s = min(2 * self._pause_s, ASK_AGAIN_S[1])
 
     def _writable(self) -> None:
         self.kick()

@@ -62,8 +62,8 @@ class ClientEvents(Protocol):
     def skipped(self, stream: StreamInfo, count: int) -> None:
         """`count` messages of a reliable stream were given up before this site was told of it again."""
 
-    def send_dropped(self, stream: StreamInfo, seq: int, reason: DropReason) -> None:
-        """A message of ours was dropped, here or at a later hop."""
+    def send_dropped(self, stream: StreamInfo, seq: int, reason: DropReason, where: str) -> None:
+        """A message of ours was dropped: here (`where` is empty), or further on for the client `where`."""
 
     def wanted(self, stream: StreamInfo, wanted: bool) -> None:
         """Whether anybody at the far side wants a stream of ours; said again after every change."""
@@ -383,7 +383,7 @@ class ClientCore:
         self.trace.record(link.now, stream.stream.id.topic, TraceEvent.DROPPED, reason=reason, peer=link.peer)
 
     def on_out_drop(self, link: Link, channel: OutChannel, out: OutMessage, reason: DropReason) -> None:
-        self._tell(self.events.send_dropped, channel.stream, out.seq, reason)
+        self._tell(self.events.send_dropped, channel.stream, out.seq, reason, out.lost_to)
 
     def on_delivered(self, link: Link, channel: OutChannel, *, now: float) -> None:
         """The ledger has counted it."""

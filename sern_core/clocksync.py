@@ -16,8 +16,16 @@ the least δ, and once more the mean of that, because the least one may have met
 errors at their worst signs bounds the skew's error as long as the path keeps its asymmetry. Skew is used only where
 it is known better than MAX_SKEW_PPM, the tolerance of any clock.
 
-Two offsets whose error bounds do not overlap cannot be of one pair of clocks: one of them was stepped (or suspended),
-and the estimate starts over from the newer one.
+Two offsets whose error bounds do not overlap cannot be of one pair of clocks: one of them stood still (a virtual
+machine that was paused) or was stepped, and the estimate starts over from the newer one. Which one it was decides what
+is older than it looks:
+
+- The peer's clock fell behind. What it had before and sends afterwards is older, by what was lost, than it says.
+  `behind_s` tells how much a message may have lost, from when it was born on the peer's clock; small changes of the
+  estimate count as well, as a short pause hides in its bounds.
+- Ours fell behind. What was sent before and lay in our buffers looks as if it had come at once. The first thing that
+  was sent later, by more than the bounds, comes from the future: nothing is known of the offset then, until a new
+  sample. Peers send something twice a second: what we lost within such a silence nothing shows.
 """
 
 import math
@@ -26,6 +34,8 @@ from typing import Final, NamedTuple
 
 from sern_core.errors import UsageError
 
+MAX_SHIFTS: Final = 8
+"""Changes of the estimate that are remembered: those of two seconds at least, and of steps the last ones."""
 FILTER_SAMPLES: Final = 8
 """Stages of the clock filter (RFC 5905, section 7.2, NSTAGE)."""
 STAGE_S: Final = 0.25
@@ -49,6 +59,7 @@ RTT_GRANULARITY_S: Final = 0.001
 MIN_RTO_S: Final = 0.1
 """Least retransmission timeout; RFC 6298 says 1 s, which is long for a pose at 50 Hz."""
 MAX_RTO_S: Final = 60.0
+STAMP_UNIT_S: Final = 1e-6
 _PPM: Final = 1e-6
 
 
@@ -136,6 +147,11 @@ class ClockSync:
         """Samples that no pair of clocks can give (not finite, negative times); a peer's fault, or a step between."""
         self.steps = 0
         """How often either clock was stepped."""
+        self.ahead_s = math.inf
+        """The peer's clock cannot be ahead of ours by more than this and the drift since the best sample: `witness`."""
+        self._stepped: deque[tuple[float, float]] = deque(maxlen=MAX_SHIFTS)  # peer's time, and what its clock lost
+        self._shifted: deque[tuple[float, float]] = deque(maxlen=MAX_SHIFTS)  # the same, within the bounds
+        self._behind_until_s = -math.inf  # the newest of these times
         self._filter: deque[_Sample] = deque(maxlen=FILTER_SAMPLES)
         self._stage_s = 0.0  # when the newest stage began
         self._best: _Sample | None = None
@@ -159,6 +175,8 @@ class ClockSync:
         if best is not None:
             apart_s = abs(new.offset_s - best.offset_s)
             if apart_s > new.bound_s + best.bound_s + MAX_SKEW_PPM * _PPM * abs(new.at_s - best.at_s):
+                if new.offset_s < best.offset_s:
+                    self._fell_behind(self._stepped, t3, apart_s + new.bound_s + best.bound_s)
                 self._restart()
                 self.steps += 1
         self.rtt.sample(rtt_s, now=t4)
@@ -173,10 +191,32 @@ class ClockSync:
             (held for held in self._filter if held.at_s >= new.at_s - SKEW_WINDOW_S),
             key=lambda held: (held.rtt_s, -held.at_s),
         )
-        if best is not self._best:
+        known = self._best
+        if best is not known:
+            if known is not None and best.offset_s < known.offset_s:
+                self._fell_behind(self._shifted, t3, known.offset_s - best.offset_s)
             self._best = best
+            self.ahead_s = best.offset_s + best.bound_s
             self._fit_skew(best)
         return True
+
+    def witness(self, sent_peer_s: float, received_local_s: float) -> None:
+        """Something arrived that was sent at `sent_peer_s`. Call it where that is ahead by more than `ahead_s`."""
+        sent_local_s, uncertainty_s = self.to_local_s(sent_peer_s)
+        if sent_local_s - received_local_s > uncertainty_s + STAMP_UNIT_S:
+            self._restart()
+            self.steps += 1
+
+    def behind_s(self, born_peer_s: float) -> float:
+        """How much older than it looks something may be that was born at `born_peer_s`, as the peer's clock was slow,
+        stood still or was set back since then. To be added to the error of its age."""
+        if born_peer_s > self._behind_until_s:
+            return 0.0
+        return sum(lost_s for at_s, lost_s in (*self._stepped, *self._shifted) if born_peer_s <= at_s)
+
+    def _fell_behind(self, losses: deque[tuple[float, float]], at_peer_s: float, lost_s: float) -> None:
+        losses.append((at_peer_s, lost_s))
+        self._behind_until_s = at_peer_s
 
     def reset(self) -> None:
         """Forget everything: the peer is another process, or the path another one. The counters stay."""
@@ -239,6 +279,7 @@ class ClockSync:
         self._filter.clear()
         self._fit.clear()
         self._best = None
+        self.ahead_s = math.inf
         self._forget_skew()
 
     def _forget_skew(self) -> None:

@@ -14,7 +14,7 @@ from typing import Final
 
 from sern_core.errors import WireError
 from sern_core.message import Message, StreamInfo
-from sern_core.types import DROP_CODES, DROP_REASONS, DropReason
+from sern_core.types import DROP_CODES, DROP_REASONS, DropReason, PriorityClass
 from sern_core.wire import FLAG_REPLAY, FLAG_TOMBSTONE, Datagram
 
 PARTIAL_IDLE_S: Final = 10.0
@@ -124,6 +124,9 @@ class InStream:
         self.stream = stream
         self.reliable = stream.spec.reliable
         self.lifespan_s = stream.spec.lifespan_s
+        control = stream.spec.priority is PriorityClass.CONTROL
+        self.perishable = control and not self.reliable and self.lifespan_s is not None
+        """A command or a pose: nobody shall have it too late."""
         self.delivered = first - 1
         self.confirmed = first - 1  # what the peer was told (`Hop.confirm`)
         self.unhandled = 0  # the first seq that had its turn and is still being decoded; 0: none

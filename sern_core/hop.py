@@ -41,6 +41,8 @@ class Hop(Sender):
         self._rx_stamp_us = stamp_us
         self._rx_delay = None
         self._now = now
+        if stamp_us * 1e-6 - now > self.clock.ahead_s:
+            self.clock.witness(stamp_us * 1e-6, now)
         if number:
             arrivals = lane.arrivals
             if not arrivals.arrived(number, stamp_us, len(data) + OVERHEAD_BYTES, now=now):
@@ -91,7 +93,8 @@ class Hop(Sender):
                 self._rx_delay = self.clock.one_way_delay_s(self._rx_stamp_us * 1e-6, now)
             delay_s, uncertainty_s = self._rx_delay
             born_s = now - age_s - delay_s
-            error_s += uncertainty_s  # infinite before the first round trip
+            # Infinite before the first round trip; and what the peer's clock has lost since the message was born.
+            error_s += uncertainty_s + self.clock.behind_s(self._rx_stamp_us * 1e-6 - age_s)
         try:
             stream.fragment(flags, wide, offset, total, body, stamp_ns, born_s, error_s, now, codec)
         except RemoteError:

@@ -44,8 +44,9 @@ from sern_core.types import DROP_CODES, ClientName, DropReason, TopicName
 
 MAX_SUBSCRIPTION_PARTS: Final = 64
 ORPHAN_S: Final = 60.0
-"""A session whose TCP connection is gone and whose datagram lane says nothing for so long has ended: longer than any
-blackout that is worth waiting for with keys in hand."""
+"""A session that a blackout cost its TCP connection has ended when its datagram lane says nothing for so long: longer
+than any blackout that is worth waiting for with keys in hand. Where the connection ended while datagrams still came, it
+is the client's process that ended, and the heartbeat's time is enough."""
 MAX_AWAITED_CLIENTS: Final = 1024
 """Clients that have not come back yet and are waited for."""
 MAX_AWAITED_TOPICS: Final = 2048
@@ -192,8 +193,10 @@ class Hub(LocalStreams):
             if client not in self.port_of and link.established:  # only its datagram lane is left
                 link.handle_timeout(now=now)
                 waiting_s = link.lane.flight.waiting_since_s
-                if link.lane.stalled and waiting_s is not None and now - waiting_s > ORPHAN_S:
-                    link.close_lane(now=now)
+                patience_s = ORPHAN_S if link.cut_off else link.params.heartbeat_timeout_s
+                if link.lane.stalled and waiting_s is not None and now - waiting_s > patience_s:
+                    silent_s = now - waiting_s
+                    link.close_lane(now=now, reason=f"its connection is gone and no datagram came for {silent_s:.0f} s")
         self._draining.sweep(now=now)
         for link in list(self.links.values()):
             if link.deaf:
@@ -605,10 +608,13 @@ class Hub(LocalStreams):
         if not channel.reliable:
             return
         relayed = self.relayed.get(channel.stream.id)
-        if relayed is not None and relayed.source is not None:
-            now, source = link.now, relayed.source
-            report = partial(source.report_drop, relayed.stream, out.seq, reason, link.peer, now=now)
-            self._for(source.peer, now, report)
+        if relayed is None or relayed.source is None:
+            return
+        if reason is DropReason.UNWANTED and link.peer not in relayed.outs:
+            return  # it has just unsubscribed: it is owed nothing, and others may have the message
+        now, source = link.now, relayed.source
+        report = partial(source.report_drop, relayed.stream, out.seq, reason, link.peer, now=now)
+        self._for(source.peer, now, report)
 
     def on_delivered(self, link: Link, channel: OutChannel, *, now: float) -> None:
         relayed = self.relayed.get(channel.stream.id)

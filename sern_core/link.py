@@ -378,12 +378,28 @@ class Link(Answering):
         self._confirm_own(stream)
 
     def _deliver(self, stream: InStream, message: Message) -> None:
+        if self.initiator and stream.perishable:  # at the relay the next hop sees that the relay's clock stood still
+            self._fresh.append((stream, message, self.clock.steps))
+            self.dirty = True
+            return
+        self._hand_over(stream, message)
+        if stream.reliable:
+            self._confirm_own(stream)
+
+    def _hand_over(self, stream: InStream, message: Message) -> None:
         try:
             self.handler.on_message(self, stream, message, now=self._now)
         except Exception as error:  # noqa: BLE001  (of one message: the stream goes on, whatever its bodies do)
             self._undelivered(stream, message, error)
-        if stream.reliable:
-            self._confirm_own(stream)
+
+    def _hand_on(self, now: float) -> None:
+        self._now = now
+        while self._fresh:
+            stream, message, steps = self._fresh.popleft()
+            if steps != self.clock.steps:
+                self._tell(self.handler.on_in_drop, self, stream, DropReason.LIFESPAN, len(message.body))
+            else:
+                self._hand_over(stream, message)
 
     def _undelivered(self, stream: InStream, message: Message, error: Exception) -> None:
         """The owner failed at a message: it is given up, and its tombstone has the turn."""
@@ -447,6 +463,7 @@ class Link(Answering):
                 self._retract(stream, now)
 
     def _retract(self, stream: InStream, now: float) -> None:
+        self._hand_on(now)
         self.streams.pop(stream.stream.id, None)
         self._missing.pop(stream.stream.id, None)
         self.texts.use_incoming(stream.stream.id, "")
@@ -531,8 +548,9 @@ class Link(Answering):
     def _about_channel(self, kind: str, channel: OutChannel, envelope: wire.Envelope, now: float) -> None:
         if kind == "dropped":
             reason = DROP_REASONS.get(wire.take_int(envelope, "code"), DropReason.LOST)
+            where = wire.take_str(envelope, "to", max_length=64, default="")
             count = wire.take_int(envelope, "n", low=1, high=wire.MAX_SEQ, default=1)
-            channel.reported(wire.take_int(envelope, "seq"), reason, count)
+            channel.reported(wire.take_int(envelope, "seq"), reason, where, count)
         else:
             code, why = wire.take_str(envelope, "code", max_length=64), wire.take_str(envelope, "why")
             self._set_wanted(

@@ -17,6 +17,7 @@ class OutMessage:
         "exposed",
         "fragments_inflight",
         "generation",
+        "lost_to",
         "message",
         "offered_bytes",
         "ranges",
@@ -39,6 +40,7 @@ class OutMessage:
         self.fragments_inflight = 0
         self.started = False
         self.counted = False  # already accounted as dropped (a tombstone now)
+        self.lost_to = ""  # the client further on that will not get it; empty: nobody did, or nobody was named
         self.retain_from_s = message.born_s  # retention counts from here
 
     @property

@@ -453,14 +453,16 @@ class OutChannel:
             if out in self.active:
                 self.active.remove(out)
 
-    def reported(self, seq: int, reason: DropReason, count: int = 1) -> None:
-        """A later hop dropped `count` messages from `seq` on and said so, before its watermark passed them."""
+    def reported(self, seq: int, reason: DropReason, where: str = "", count: int = 1) -> None:
+        """A later hop dropped `count` messages from `seq` on, for the client `where`, and said so before its watermark
+        passed them."""
         for out in self.retained:
             if out.seq >= seq + count:
                 break
             if out.seq >= seq and not out.counted:
                 self.counters.drop(reason, out.offered_bytes)
                 out.counted = True
+                out.lost_to = where
                 self.on_drop(out, reason)
 
     def sweep(self, now: float, *, up: bool) -> None:

@@ -22,8 +22,10 @@ from typing import Final
 from sern_core import wire
 from sern_core.clocksync import ClockSync
 from sern_core.errors import RemoteError, WireError
+from sern_core.fragments import InStream
 from sern_core.hop import Hop
 from sern_core.lanes import LANE_EXPRESS, LANE_UDP, LANE_ZMQ, Lane
+from sern_core.message import Message
 from sern_core.params import LinkParams, SchedulerParams
 from sern_core.sending import microseconds
 from sern_core.trace import LINK, DecisionTrace, TraceEvent
@@ -63,6 +65,11 @@ class Session(Hop):
         self._abort_due_s = -float("inf")
         self._resumed = False
         self._data_prefix = b""  # how a data datagram of the session begins
+        self._fresh: deque[tuple[InStream, Message, int]] = deque()
+        """Messages of class control that were young enough, with the number of steps that the clock estimate had seen:
+        what arrives in the same turn may tell that our clock stood still while they lay here."""
+        self.cut_off = False
+        """The stream lane ended when the datagram lane was silent already: the path is gone, not the peer's process."""
         super().__init__(
             name=name, boot=boot, peer=peer, link=link, scheduler=scheduler, trace=trace, now=now, lossless=lossless
         )
@@ -72,6 +79,10 @@ class Session(Hop):
 
     @abstractmethod
     def _session_ended(self, reason: str, now: float) -> None: ...
+
+    @abstractmethod
+    def _hand_on(self, now: float) -> None:
+        """Deliver what is in `_fresh`: everything that had arrived has been looked at."""
 
     @abstractmethod
     def _lane_closed(self) -> None:
@@ -104,6 +115,7 @@ class Session(Hop):
         if self.established and udp is not None and udp.answered:
             self._now = now
             self.lanes[LANE_ZMQ].up = False
+            self.cut_off = udp.stalled
             self._recall(self.lanes[LANE_ZMQ], now)
             self._use_lane(udp, now)
             self._choose_express(now)
@@ -121,8 +133,8 @@ class Session(Hop):
         lane.estimator.on_reset(now=now)
         self.dirty = True
 
-    def close_lane(self, *, now: float, lane_id: int = LANE_UDP) -> None:
-        """A lane's transport is gone or its keys are used up."""
+    def close_lane(self, *, now: float, lane_id: int = LANE_UDP, reason: str = "both lanes are gone") -> None:
+        """A lane's transport is gone or its keys are used up. `reason`: of the session's end, if that was its last."""
         lane = self.lanes.pop(lane_id, None)
         if lane is None:
             return
@@ -132,7 +144,7 @@ class Session(Hop):
         self._choose_express(now)
         self._recall(lane, now)
         if self.established and not self.transport_up:
-            self._end_session("both lanes are gone", now)
+            self._end_session(reason, now)
 
     def _greet(self, due_s: float, now: float) -> None:
         self._end_session("new session", now)
@@ -264,6 +276,7 @@ class Session(Hop):
 
     def _end_session(self, reason: str, now: float) -> None:
         self._now = now
+        self._hand_on(now)
         for lane in self.lanes.values():
             self._recall(lane, now)
         self.lane = self.lanes[LANE_ZMQ]
@@ -293,6 +306,8 @@ class Session(Hop):
     def next_datagram(self, *, now: float, lane: int = LANE_ZMQ) -> bytes | None:
         """The next bytes for the lane, or None if nothing may or need be sent now."""
         try:
+            if self._fresh:
+                self._hand_on(now)
             if lane == LANE_ZMQ:
                 if self._handshake_out:
                     return self._handshake_out.popleft()
@@ -373,6 +388,8 @@ class Session(Hop):
     def handle_timeout(self, *, now: float, lane: int = LANE_ZMQ) -> None:
         state = self.lanes.get(lane)
         try:
+            if self._fresh:
+                self._hand_on(now)
             if self.established and state is not None and state.up and not (lane == LANE_ZMQ and self._hello_due_s):
                 self._data_timeout(state, now)
             elif lane == LANE_ZMQ and now >= self._sweep_due_s:

@@ -26,6 +26,7 @@ from sern_relay.objects_view import objects_view
 from sern_relay.server import RelayServer
 from sern_relay.transforms import TransformObjects
 from sern_relay.udp import RelayLanes
+from sern_runtime import clock
 from sern_runtime.adaptation import Adaptation
 from sern_runtime.codec_pool import CodecPool, make_coder
 from sern_runtime.config.load import Loaded
@@ -99,7 +100,7 @@ class RelayDaemon:
             scheduler=model.scheduler.params(),
             params=HubParams(cache_bytes=model.replay.cache_bytes, resume_s=model.replay.resume_s),
             wall_ns=lambda _now: time.time_ns(),
-            now=time.monotonic(),
+            now=clock.now(),
         )
         self.codecs = CodecPool(after=self._after)
         self.coder = make_coder(model.link.params(), self.codecs)
@@ -207,7 +208,7 @@ class RelayDaemon:
         for client, keys in before.items():
             if keys - self._valid.get(client, frozenset()) and self.server is not None:
                 _log.warning("%s lost a key; %d connections cut", client, self.server.cut_client(client))
-                self.hub.end_session(client, "the key no longer holds", now=time.monotonic())
+                self.hub.end_session(client, "the key no longer holds", now=clock.now())
 
     def _after(self) -> None:
         """Something came in: before the loop comes round again, whoever has something to send sends it."""
@@ -229,7 +230,7 @@ class RelayDaemon:
         while True:
             await asyncio.sleep(SWEEP_S)
             self._end_lapsed()
-            now = time.monotonic()
+            now = clock.now()
             self.hub.sweep(now=now)
             if self.server is not None:
                 self.server.express.look()
@@ -259,7 +260,7 @@ class RelayDaemon:
             return
         log_warnings(_log, loaded.warnings)
         self.directory = directory
-        now = time.monotonic()
+        now = clock.now()
         self.hub.revoke(access, now=now)
         if self.feed is not None:
             self._update_feed(loaded.model, now)
@@ -358,7 +359,7 @@ class RelayDaemon:
 
     def topics(self) -> dict[str, object]:
         """Counters by client link and topic, and of what arrived."""
-        now = time.monotonic()
+        now = clock.now()
         return {
             "links": {name: link_summary(link, direction="send") for name, link in self.hub.links.items()},
             "received": received_summary(self.hub.received, now=now),
@@ -366,7 +367,7 @@ class RelayDaemon:
 
     async def drain(self) -> None:
         """Go on with what connected clients are owed while that gets anywhere, then end their sessions."""
-        now = time.monotonic()
+        now = clock.now()
         progress = Progress()
         give_up_s = now + self.loaded.model.link.drain_s
         # What comes in from now on its sources keep until the next relay confirms it.
@@ -387,9 +388,9 @@ class RelayDaemon:
             if progress.still_s(left, now=now) > PATIENCE_S:
                 break
             await asyncio.sleep(0.02)
-            now = time.monotonic()
+            now = clock.now()
         for link in self.hub.links.values():
-            link.close("relay stops", now=time.monotonic())
+            link.close("relay stops", now=clock.now())
         if self.server is not None:
             self.server.run_all()
             await asyncio.sleep(0.05)  # libzmq's thread takes it from here
@@ -452,7 +453,7 @@ class RelayDaemon:
 
     def stream_removed(self, stream: StreamInfo) -> None:
         _log.info("%s of %s has ended", stream.id.topic, stream.id.origin)
-        self._decoder.forget(stream.id, now=time.monotonic())
+        self._decoder.forget(stream.id, now=clock.now())
         if self.transforms is not None:
             self.transforms.stream_removed(stream)
         if self.feed is not None:

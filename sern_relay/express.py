@@ -1,6 +1,5 @@
 """The relay's end of the express lanes: further connections of a client, for class control alone."""
 
-import time
 from collections.abc import Callable
 from functools import partial
 from typing import Final, NamedTuple
@@ -13,6 +12,7 @@ from sern_core.lanes import LANE_EXPRESS
 from sern_core.link import Link
 from sern_core.params import Redundancy
 from sern_core.types import ClientName
+from sern_runtime import clock
 from sern_runtime.express import CONNECTIONS, ExpressPaths
 from sern_runtime.monitor import Connection
 from sern_runtime.pump import Pump
@@ -65,7 +65,7 @@ class RelayExpress:
     def join(self, routing_id: bytes, joined: Joined, data: bytes) -> Joined | None:
         """A connection names its session. The answer is the connection to close, if any: itself, when there is no such
         session; the oldest of its client, when there are enough. Raises WireError."""
-        if not self.hub.join(joined.client, data, now=time.monotonic()):
+        if not self.hub.join(joined.client, data, now=clock.now()):
             self.refused += 1
             self.left(routing_id)
             return joined
@@ -97,7 +97,7 @@ class RelayExpress:
             return
         link = self.hub.links.get(joined.client)
         if link is not None:
-            link.receive(data, now=time.monotonic(), lane=LANE_EXPRESS)
+            link.receive(data, now=clock.now(), lane=LANE_EXPRESS)
 
     def left(self, routing_id: bytes) -> None:
         """The connection is gone."""
@@ -119,7 +119,7 @@ class RelayExpress:
         lane = self._lanes.pop(client, None)
         if lane is not None:
             lane.pump.close()
-            lane.link.close_lane(now=time.monotonic(), lane_id=LANE_EXPRESS)
+            lane.link.close_lane(now=clock.now(), lane_id=LANE_EXPRESS)
 
     def look(self) -> None:
         """See what TCP loses. Call about once a second."""

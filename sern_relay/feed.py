@@ -21,6 +21,7 @@ from sern_core.message import Message, StreamInfo
 from sern_core.rules import FeedRole, FeedTopic, RuleSet
 from sern_core.types import ClientName, Durability, PriorityClass, TopicName
 from sern_runtime import ros_types
+from sern_runtime.clock import now
 from sern_runtime.feed import Feed, FeedHeader
 
 IDLE_S: Final = 30.0
@@ -70,7 +71,7 @@ class RelayFeed:
         *,
         after: Callable[[], None],
         refused: OnRefused,
-        clock: Callable[[], float] = time.monotonic,
+        clock: Callable[[], float] = now,
         wall_ns: Callable[[], int] = time.time_ns,
     ) -> None:
         self._hub = hub

@@ -12,7 +12,6 @@ came while that was done the answer has the size alone.
 """
 
 import asyncio
-import time
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -22,6 +21,7 @@ from sern_core.hub import Hub
 from sern_core.objects import ValueRequest, text_hash, topic_object_id
 from sern_core.types import ClientName, ObjectKind
 from sern_core.xr_object import changes_to_json
+from sern_runtime import clock
 from sern_runtime.http import JsonQuery
 
 
@@ -43,7 +43,7 @@ def objects_view(hub: Hub) -> JsonQuery:
         if requests:
             await asyncio.to_thread(_run, requests)
             for request in requests:
-                request.done(now=time.monotonic())
+                request.done(now=clock.now())
 
     def read(query: Mapping[str, str]) -> object:
         wanted, owner = selected(query)

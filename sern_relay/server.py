@@ -1,7 +1,6 @@
 """The relay's lane: one ROUTER for all clients, one port of the hub for each connection."""
 
 import logging
-import time
 from collections.abc import Callable
 
 import zmq
@@ -14,6 +13,7 @@ from sern_core.params import Redundancy
 from sern_core.rules import client_name
 from sern_core.types import ClientName
 from sern_relay.express import JOIN, Joined, RelayExpress
+from sern_runtime import clock
 from sern_runtime.monitor import ConnectionTable
 from sern_runtime.pump import LANE_MESSAGE_BYTES, Pump
 from sern_runtime.zmq_socket import CurvePair, RouterSocket, SendResult, make_server
@@ -101,7 +101,7 @@ class RelayServer:
             self._cut(routing_id, session, f"its identity changed to {user!r}")
             return
         try:
-            session.port.receive(data, now=time.monotonic())
+            session.port.receive(data, now=clock.now())
         except RemoteError as error:
             self.bad_frames += 1
             self._cut(routing_id, session, f"bad frame: {error}")
@@ -222,7 +222,7 @@ class RelayServer:
         session = self._sessions.pop(routing_id, None)
         if session is not None:
             session.pump.close()
-            session.port.disconnected(now=time.monotonic())
+            session.port.disconnected(now=clock.now())
             self._after()
 
     def _connections_changed(self) -> None:

@@ -17,7 +17,6 @@ and reason in `refused`, and the first of each is logged.
 import json
 import logging
 import math
-import time
 from collections import deque
 from collections.abc import Callable
 from typing import Any, Final
@@ -28,6 +27,7 @@ from sern_core.objects import ObjectRegistry
 from sern_core.rules import plain_type
 from sern_core.types import ClientName, Encoding, ObjectKind
 from sern_runtime import ros_types
+from sern_runtime.clock import now
 from sern_runtime.loop import Timer
 
 RATE_HZ: Final = 5.0
@@ -61,7 +61,7 @@ class _Stream:
 class TransformObjects:
     """Keeps the registry's transforms up to date. `close` once."""
 
-    def __init__(self, registry: ObjectRegistry, *, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, registry: ObjectRegistry, *, clock: Callable[[], float] = now) -> None:
         self.refused: dict[tuple[ClientName, str], int] = {}
         """By client and reason: undecodable, too_large, not_finite, too_many_transforms, or what the registry says."""
         self._registry = registry

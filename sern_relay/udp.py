@@ -1,7 +1,6 @@
 """The relay's datagram lanes: one UDP socket for each listener, one session for each client that asks for one."""
 
 import logging
-import time
 from collections.abc import Callable, Sequence
 
 from sern_core.errors import RefusedError, RemoteError
@@ -9,6 +8,7 @@ from sern_core.hub import Hub
 from sern_core.lane_port import LanePort
 from sern_core.lanes import LANE_UDP
 from sern_core.types import ClientName
+from sern_runtime import clock
 from sern_runtime.config.base import split_tcp
 from sern_runtime.pump import Pump
 from sern_runtime.udp import UdpServer, UdpSession
@@ -33,7 +33,10 @@ class RelayLanes:
         self.bad_frames = 0
         self.moved = 0
         """Times a client's address changed."""
+        self.rekeyed = 0
+        """Lanes opened anew because the relay's own key was used up."""
         self._lanes: dict[ClientName, tuple[UdpSession, Pump]] = {}
+        self._ciphers: dict[ClientName, tuple[str, ...]] = {}  # what the client of a lane has offered
         self.server = UdpServer(
             udp_endpoints(listen), self._received, on_path=self._path, on_writable=self._writable, after=after
         )
@@ -48,21 +51,23 @@ class RelayLanes:
         """A client would like a datagram lane: give it one, over the session that its CURVE key opened."""
         self.closed(client)
         link = self.hub.links[client]
-        link.close_lane(now=time.monotonic())
+        link.close_lane(now=clock.now())
         try:
             session = self.server.open_session(client, ciphers)
         except RefusedError as refusal:
             _log.warning("%s gets no datagram lane: %s", client, refusal)
             return
         port = LanePort(link, LANE_UDP)
-        pump = Pump(port, session.send, on_gone=lambda: self._gone(client, session), ready=session.ready)
+        pump = Pump(port, session.send, on_gone=lambda: self._used_up(client, session), ready=session.ready)
         self._lanes[client] = (session, pump)
-        self.hub.offer_lane(client, session.parameters.to_envelope(), now=time.monotonic())
+        self._ciphers[client] = tuple(ciphers)
+        self.hub.offer_lane(client, session.parameters.to_envelope(), now=clock.now())
         pump.kick()
 
     def closed(self, client: ClientName) -> None:
         """The core has closed the client's lane."""
         lane = self._lanes.pop(client, None)
+        self._ciphers.pop(client, None)
         if lane is not None:
             session, pump = lane
             pump.close()
@@ -86,12 +91,20 @@ class RelayLanes:
             _log.warning("datagram lane of %s closed: bad frame: %s", session.client, error)
             self._gone(session.client, session)
 
+    def _used_up(self, client: ClientName, session: UdpSession) -> None:
+        """The session can send no more, as its key is used up: offer another, as if the client had asked. It asks by
+        itself, long before, where the key lasts longer than it takes to look."""
+        lane = self._lanes.get(client)
+        if lane is not None and lane[0] is session:
+            self.rekeyed += 1
+            self.asked(client, self._ciphers[client])
+
     def _gone(self, client: ClientName, session: UdpSession) -> None:
-        """The session can send no more: its key is used up, or its client sent what no honest one does."""
+        """The client sent what no honest one does."""
         lane = self._lanes.get(client)
         if lane is not None and lane[0] is session:
             self.closed(client)
-            self.hub.links[client].close_lane(now=time.monotonic())
+            self.hub.links[client].close_lane(now=clock.now())
 
     def _path(self, session: UdpSession, address: Address, validated: bool) -> None:
         if validated:

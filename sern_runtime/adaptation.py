@@ -2,7 +2,6 @@
 
 import asyncio
 import logging
-import time
 from collections import deque
 from collections.abc import Callable, Collection, Iterable, Sequence
 from typing import Any, Final
@@ -14,6 +13,7 @@ from sern_core.mmcf.levels import Summarised
 from sern_core.mmcf.report import adapter_json, step_json
 from sern_core.rules import TopicRule
 from sern_core.types import CLASS_LABELS, CLASSES
+from sern_runtime import clock
 from sern_runtime.config.adaptation import AdaptationSection
 from sern_runtime.metrics import Labels, Metrics
 
@@ -60,7 +60,7 @@ class Adaptation:
             self.tick(step=count % SAMPLES == 0)
 
     def tick(self, *, step: bool) -> None:
-        now = time.monotonic()
+        now = clock.now()
         links = self._links()
         for gone in self._adapters.keys() - set(links):
             del self._adapters[gone]
@@ -97,7 +97,7 @@ class Adaptation:
                 "bandwidth_max_bps": ranges.bandwidth_max_bps,
             },
             "interval_s": self._params.interval_s,
-            "now_s": time.monotonic(),
+            "now_s": clock.now(),
             "links": [
                 {**adapter_json(adapter), "history": list(self._history.get(link, ()))}
                 for link, adapter in self._adapters.items()

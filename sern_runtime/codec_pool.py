@@ -12,6 +12,7 @@ from typing import Final
 
 from sern_core.codecs import Coder, Work
 from sern_core.params import LinkParams
+from sern_runtime import clock
 
 WORKERS: Final = 2
 """One body being decoded does not keep another from being encoded."""
@@ -73,7 +74,7 @@ class CodecPool:
         if self._closed:
             return
         self._start()
-        work.done(now=time.monotonic())
+        work.done(now=clock.now())
         self._after()
 
 

@@ -35,6 +35,7 @@ import zmq
 from sern_core.access import RateGuard
 from sern_core.rules import FeedRole
 from sern_core.types import CLASSES, PriorityClass, TopicName
+from sern_runtime.clock import now
 from sern_runtime.zmq_socket import (
     BACKLOG,
     ZERO_COPY_BYTES,
@@ -139,7 +140,7 @@ class Feed:
         keys: CurvePair | None = None,
         max_message_bytes: int = MAX_MESSAGE_BYTES,
         wall_ns: Callable[[], int] = time.time_ns,
-        clock: Callable[[], float] = time.monotonic,
+        clock: Callable[[], float] = now,
     ) -> None:
         self.clock = clock
         self.on_publish = on_publish

@@ -8,10 +8,10 @@ import asyncio
 import ctypes
 import math
 import os
-import time
 from collections.abc import Callable
 from typing import Final
 
+from sern_runtime import clock
 from sern_runtime.loop import Timer
 
 MIN_PERIOD_S: Final = 0.001
@@ -35,7 +35,7 @@ class _Times(ctypes.Structure):
 
 
 class FineTimer:
-    """One callback at an absolute deadline, in seconds of `time.monotonic`; like `Timer`, and never early either.
+    """One callback at an absolute deadline, in seconds of `clock.now`; like `Timer`, and never early either.
 
     Needs `close`. Raises OSError where the process has no descriptors left.
     """
@@ -48,7 +48,7 @@ class FineTimer:
         self._times = _Times()
         self._wake_s = math.inf  # when the descriptor wakes us
         self._woken_s = -math.inf
-        self._fd = _libc.timerfd_create(time.CLOCK_MONOTONIC, _CLOEXEC_NONBLOCK)
+        self._fd = _libc.timerfd_create(clock.CLOCK, _CLOEXEC_NONBLOCK)
         if self._fd < 0:
             code = ctypes.get_errno()
             raise OSError(code, f"timerfd_create: {os.strerror(code)}")
@@ -80,7 +80,7 @@ class FineTimer:
             raise OSError(code, f"timerfd_settime: {os.strerror(code)}")
 
     def _wake(self) -> None:
-        now = time.monotonic()
+        now = clock.now()
         self._woken_s = now
         deadline_s = self.deadline_s
         if deadline_s is not None and deadline_s <= now:

@@ -7,6 +7,7 @@ from collections.abc import Awaitable, Callable, Mapping
 from typing import Final, NamedTuple
 
 from aiohttp import web
+from aiohttp.http_exceptions import HttpProcessingError
 from prometheus_client import CollectorRegistry
 from prometheus_client.exposition import choose_encoder
 
@@ -29,6 +30,32 @@ class JsonQuery(NamedTuple):
 
 _SHUTDOWN_S: Final = 1.0
 _log = logging.getLogger(__name__)
+
+
+class _RequestLog(logging.Logger):
+    """What aiohttp logs of requests. One that is none (a scanner, TLS at this port) is a line without a traceback, and
+    counted; the limit on repeated warnings holds back the rest."""
+
+    def __init__(self) -> None:
+        super().__init__(_log.name)
+        self.parent = _log
+        self.refused = 0
+        self.addFilter(self._one_line)
+
+    def _one_line(self, record: logging.LogRecord) -> bool:
+        error = record.exc_info[1] if record.exc_info else None
+        if isinstance(error, HttpProcessingError):
+            self.refused += 1
+            why = " ".join(error.message.split())[:100]
+            peer = record.args[0] if isinstance(record.args, tuple) and record.args else "somebody"
+            record.msg, record.args = "%s sent what is no HTTP request: %s", (peer, why)
+            record.levelno, record.levelname = logging.WARNING, "WARNING"
+            record.exc_info = record.exc_text = None
+        return True
+
+    def isEnabledFor(self, level: int) -> bool:  # noqa: N802
+        """aiohttp says some of it at DEBUG: all of it is counted, and written alike."""
+        return level >= logging.DEBUG
 
 
 class Health(NamedTuple):
@@ -70,6 +97,7 @@ class HttpServer:
         self._host, self._port = parse_listen(listen)
         self._registry = registry
         self._runner: web.AppRunner | None = None
+        self._requests = _RequestLog()
         self._app = web.Application()
         self._app.router.add_get("/metrics", self._metrics)
         self._app.router.add_get("/healthz", _health_route(health))
@@ -90,9 +118,16 @@ class HttpServer:
             raise UsageError("the server is not started")
         return int(self._runner.addresses[0][1])
 
+    @property
+    def refused(self) -> int:
+        """Requests that were none, so far."""
+        return self._requests.refused
+
     async def start(self) -> None:
         """Raises ConfigError of one line when it cannot listen."""
-        runner = web.AppRunner(self._app, access_log=None, handle_signals=False, shutdown_timeout=_SHUTDOWN_S)
+        runner = web.AppRunner(
+            self._app, access_log=None, handle_signals=False, shutdown_timeout=_SHUTDOWN_S, logger=self._requests
+        )
         self._runner = runner
         await runner.setup()
         try:

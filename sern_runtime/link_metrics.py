@@ -1,13 +1,13 @@
 """Metrics that both daemons have: their links, what goes out over them, what arrives, and how old it is."""
 
 import math
-import time
 from collections.abc import Callable, Collection, Iterable
 
 from sern_core.codecs import Coder
 from sern_core.ledger import ReceiveLedger
 from sern_core.link import Link
 from sern_core.types import CLASS_LABELS
+from sern_runtime import clock
 from sern_runtime.metrics import LATENCY_EDGES_S, Histogram, HistogramCounts, Labels, Metrics
 
 
@@ -135,7 +135,7 @@ def register_received(metrics: Metrics, received: ReceiveLedger, ages: AgeHistog
         return collect
 
     def information_age() -> list[tuple[Labels, float]]:
-        now = time.monotonic()
+        now = clock.now()
         rows: list[tuple[Labels, float]] = []
         for counters in received.topics.values():
             age_s = counters.age_of_information_s(now)

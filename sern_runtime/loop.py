@@ -15,6 +15,8 @@ from typing import Any, Final, Protocol, Self
 
 import uvloop
 
+from sern_runtime.clock import now
+
 KEPT_BYTES: Final = 16 * 2**20
 """Freed memory that a process keeps at the top of a heap."""
 
@@ -108,7 +110,7 @@ class Wakeups(Protocol):
 
 
 class Timer:
-    """One callback at an absolute deadline, on `clock` (monotonic seconds).
+    """One callback at an absolute deadline, on `clock` (seconds, never stepped).
 
     uvloop fires delays under 0.5 ms at once, others may fire early, and its own time is cached. So: delays are
     rounded up to whole milliseconds, the clock is read again when the loop wakes us, and an early wake-up waits for
@@ -122,7 +124,7 @@ class Timer:
         callback: Callable[[], None],
         *,
         loop: Wakeups | None = None,
-        clock: Callable[[], float] = time.monotonic,
+        clock: Callable[[], float] = now,
     ) -> None:
         self.deadline_s: float | None = None
         """When the callback is due; None while unarmed."""

@@ -12,7 +12,6 @@ import os
 import socket as socketlib
 import stat
 import struct
-import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -22,6 +21,7 @@ from typing import Final, NamedTuple
 
 import zmq
 
+from sern_runtime.clock import now
 from sern_runtime.zmq_socket import HANDSHAKE_IVL_MS, TOS_EXPEDITED, FrameSocket
 
 EventKind = zmq.Event
@@ -369,7 +369,7 @@ class ConnectionTable:
         max_half_open: int = 256,
         max_connections: int = 1024,
         on_change: Callable[[], None] | None = None,
-        clock: Callable[[], float] = time.monotonic,
+        clock: Callable[[], float] = now,
     ) -> None:
         self.capped = 0
         self.accepted = 0

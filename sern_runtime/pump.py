@@ -1,10 +1,10 @@
 """Moves datagrams between a port of the core (a link, or the relay's side of one) and a lane's socket."""
 
 import asyncio
-import time
 from collections.abc import Callable
 from typing import Final, Protocol
 
+from sern_runtime import clock
 from sern_runtime.fine_timer import FineTimer, fine_timer
 from sern_runtime.loop import Timer
 from sern_runtime.zmq_socket import SendResult
@@ -91,7 +91,7 @@ class Pump:
 
     def _due(self) -> None:
         try:
-            self._port.handle_timeout(now=time.monotonic())
+            self._port.handle_timeout(now=clock.now())
         finally:
             self._run()
 
@@ -101,7 +101,7 @@ class Pump:
             self._scheduled = None
         if self._closed:
             return
-        now = time.monotonic()
+        now = clock.now()
         try:
             self._serve(now)
         except Exception:

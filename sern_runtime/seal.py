@@ -26,7 +26,8 @@ each direction, HKDF-SHA256 (RFC 5869; no salt, input the secret) with the info
 
 gives 36 bytes: the key (32) and the nonce's salt (4). So nothing sealed by one side, for one session, or with one
 cipher opens as anything else. A session ends with the connection that carried its secret, and before it has sealed as
-much as its cipher allows (RFC 9001, 6.6 and B.1); the next one has another secret.
+much as its cipher allows (RFC 9001, 6.6 and B.1); the next one has another secret. The client asks for it when three
+quarters are used up of either key: it sees the relay's counter in what it opens.
 """
 
 import os
@@ -213,6 +214,7 @@ class Opener:
         "_id",
         "_mask",
         "_salt",
+        "_seal_limit",
         "bad_tags",
         "foreign",
         "highest",
@@ -227,6 +229,7 @@ class Opener:
         self._decrypt = _aead(parameters.cipher, key).decrypt
         self._id = parameters.id
         self._forgery_limit = forgery_limit or FORGERY_LIMITS[parameters.cipher]
+        self._seal_limit = SEAL_LIMITS[parameters.cipher]
         self._mask = 1  # bit i: counter highest - i has arrived; 0 is no counter, so it counts as seen
         self.highest = 0
         """The newest counter that was opened; 0 before the first."""
@@ -238,7 +241,8 @@ class Opener:
 
     @property
     def rekey_due(self) -> bool:
-        return self.bad_tags >= REKEY_SHARE * self._forgery_limit
+        """Time to open another session: because of forgeries, or because the other side's key is nearly used up."""
+        return self.bad_tags >= REKEY_SHARE * self._forgery_limit or self.highest >= REKEY_SHARE * self._seal_limit
 
     @property
     def refused(self) -> Mapping[str, int]:

@@ -21,13 +21,13 @@ import asyncio
 import os
 import secrets
 import struct
-import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from typing import Final
 
 from sern_core.errors import UsageError
 from sern_core.types import ClientName
+from sern_runtime import clock
 from sern_runtime.seal import (
     ROOM_BYTES,
     SEAL_BYTES,
@@ -197,7 +197,7 @@ class UdpSession(Sealed):
 
     def _challenge_again(self) -> None:
         self._retry = None
-        if time.monotonic() - self._since_s < PATH_TIMEOUT_S:
+        if clock.now() - self._since_s < PATH_TIMEOUT_S:
             self._challenge()
         elif self._good is not None:
             (self._listener, self.address), self._good = self._good, None
@@ -280,7 +280,7 @@ class UdpServer:
             if inner is None:
                 return False
             newest = opener.highest > highest
-            session._arrived(listener, address, inner, len(view), newest=newest, now=time.monotonic())
+            session._arrived(listener, address, inner, len(view), newest=newest, now=clock.now())
             return True
 
         def writable() -> None:

@@ -7,12 +7,12 @@ import asyncio
 import ipaddress
 import os
 import socket as socketlib
-import time
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Final
 
 from sern_core.errors import UsageError
+from sern_runtime import clock
 from sern_runtime.seal import RekeyError, SessionParameters, Side
 from sern_runtime.udp import (
     INNER_BYTES,
@@ -193,7 +193,7 @@ class UdpClient(Sealed):
         self._socket = socket
         self.address = address
         self.validated = False
-        self._opened_s = time.monotonic()
+        self._opened_s = clock.now()
         self._several = several
         self._token = os.urandom(TOKEN_BYTES)
         self._challenge()
@@ -223,7 +223,7 @@ class UdpClient(Sealed):
             return False
         kind = inner[:1]
         if kind == TYPE_DATA:
-            self.on_datagram(inner[1:], time.monotonic())
+            self.on_datagram(inner[1:], clock.now())
         elif kind == TYPE_CHALLENGE:
             if len(inner) > TOKEN_BYTES and not self.closed:
                 self._put(TYPE_RESPONSE, inner[1:])
@@ -252,7 +252,7 @@ class UdpClient(Sealed):
 
     def _challenge_again(self) -> None:
         self._probe = None
-        if self._several and time.monotonic() - self._opened_s > PATH_TIMEOUT_S:
+        if self._several and clock.now() - self._opened_s > PATH_TIMEOUT_S:
             self._renew()  # the host has another address
         else:
             self._probe_delay_s = min(2 * self._probe_delay_s, PROBE_MAX_S)

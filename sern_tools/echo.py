@@ -34,6 +34,7 @@ from sern_core.message import Message, StreamId, StreamInfo
 from sern_core.params import LinkParams, SchedulerParams
 from sern_core.rules import client_name, name_problem
 from sern_core.types import ClientName, DropReason, Encoding, TopicName
+from sern_runtime import clock
 from sern_runtime.config.client import RelayConnection, load_client
 from sern_runtime.keys import SecretKey, load_public, load_secret
 from sern_runtime.loop import Shutdown, run
@@ -98,12 +99,12 @@ class RatePrinter:
         self._bytes = 0
         self._missed = 0
         self._last_seq: dict[StreamId, int] = {}
-        self._since_s = time.monotonic()
+        self._since_s = clock.now()
 
     def opened(self, stream: StreamInfo) -> None:
         """Any type can be counted."""
         if not self._last_seq:
-            self._since_s = time.monotonic()
+            self._since_s = clock.now()
 
     def show(self, stream: StreamInfo, message: Message, age_s: float) -> bool:
         last = self._last_seq.get(stream.id)
@@ -119,7 +120,7 @@ class RatePrinter:
 
     def tick(self) -> bool:
         """Called often; a line when its second is over. True when that was the last one."""
-        interval_s = time.monotonic() - self._since_s
+        interval_s = clock.now() - self._since_s
         if interval_s < RATE_INTERVAL_S:
             return False
         ages = sorted(self._ages_s)
@@ -270,7 +271,7 @@ class Listener:
     def skipped(self, stream: StreamInfo, count: int) -> None:
         self._printer.lost(stream, count, "given up before we were told of them")
 
-    def send_dropped(self, stream: StreamInfo, seq: int, reason: DropReason) -> None:
+    def send_dropped(self, stream: StreamInfo, seq: int, reason: DropReason, where: str) -> None:
         """We send nothing."""
 
     def wanted(self, stream: StreamInfo, wanted: bool) -> None:
@@ -310,9 +311,9 @@ async def listen(
         events=listener,
         link=identity.link,
         scheduler=identity.scheduler,
-        now=time.monotonic(),
+        now=clock.now(),
     )
-    core.subscribe((re.escape(topic),), now=time.monotonic())
+    core.subscribe((re.escape(topic),), now=clock.now())
     reason = "the relay does not answer"
 
     def note(text: str) -> None:
@@ -332,7 +333,7 @@ async def listen(
             random=Random(secrets.randbits(64)),
             on_reason=note,
         )
-        began_s = time.monotonic()
+        began_s = clock.now()
         while not (shutdown.requested or listener.done):
             await asyncio.sleep(_CHECK_S)
             if listener.problem is not None:
@@ -366,7 +367,7 @@ def _check_patience(
     """Raises SernError when what is missing will not come, or has not come in time."""
     if transport.rebuilds and not core.link.established:
         raise SernError(f"{identity.endpoint}: {reason}")
-    if not timeout_s or time.monotonic() - began_s < timeout_s:
+    if not timeout_s or clock.now() - began_s < timeout_s:
         return
     if not core.link.established:
         raise SernError(f"{identity.endpoint}: {reason} (waited {timeout_s:g} s)")
@@ -380,11 +381,11 @@ async def _leave(core: ClientCore, transport: RelayTransport, listener: Listener
     """Unsubscribe, or the relay would keep reliable messages for us and hold up their publishers meanwhile."""
     if not core.link.established:
         return
-    core.subscribe((), now=time.monotonic())
+    core.subscribe((), now=clock.now())
     transport.pump.run()
     with suppress(TimeoutError):
         await asyncio.wait_for(listener.left.wait(), LEAVE_S)
-    core.link.close("sern echo ends", now=time.monotonic())
+    core.link.close("sern echo ends", now=clock.now())
     transport.pump.run()
     await asyncio.sleep(_CHECK_S)  # libzmq's thread takes it from here
 
@@ -411,11 +412,11 @@ async def poll(
 ) -> None:
     """Print the latest value of `topic` whenever the registry at `api` has a newer one. Raises SernError."""
     shown: dict[str, int] = {}
-    began_s = time.monotonic()
+    began_s = clock.now()
     while not shutdown.requested:
         answer = await asyncio.to_thread(get_json, api, "/api/objects")
         found = [item for item in answer["objects"] if is_stream(item) and item["attributes"]["topic"] == topic]
-        if not found and not shown and timeout_s and time.monotonic() - began_s > timeout_s:
+        if not found and not shown and timeout_s and clock.now() - began_s > timeout_s:
             raise SernError(f"{api}: no topic {topic} within {timeout_s:g} s; `sern topics` lists what there is")
         for item in found:
             value = item["value"]

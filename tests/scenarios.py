@@ -215,7 +215,7 @@ class Run:
         assert accepted == set(range(1, channel.next_seq)), "the origin counts with gaps"
         delivered = set(site.seqs(name))
         expired = set(site.expired_seqs[name])
-        dropped = {seq for dropped_name, seq, _ in self.robot.dropped_out if dropped_name == name}
+        dropped = {drop.seq for drop in self.robot.dropped_out if drop.topic == name}
         unaccounted = accepted - delivered - expired - dropped
         assert not unaccounted, f"{name}: neither delivered nor reported: {sorted(unaccounted)}"
         turns = site.turns[channel.stream.id]

@@ -9,6 +9,7 @@ ROOT = Path(__file__).resolve().parent.parent
 PURE_PACKAGES = ("sern_core", "sern_sim")
 # `random` may be imported for its type (a seeded Random is handed in), never for the module's own functions.
 RANDOM_ALLOWED = {"Random"}
+OWN_CLOCK = {"loop.py", "logs.py"}  # how long the loop was held, how often a line was written: nothing of the core
 
 
 def test_layers_import_only_downward() -> None:
@@ -28,4 +29,22 @@ def test_pure_packages_use_no_global_randomness() -> None:
                 if isinstance(node, ast.ImportFrom) and node.module == "random":
                     extra = {alias.name for alias in node.names} - RANDOM_ALLOWED
                     offenders += [f"{path.relative_to(ROOT)}:{node.lineno} {name}" for name in extra]
+    assert offenders == []
+
+
+def test_the_core_is_given_a_clock_that_goes_on_while_the_machine_sleeps() -> None:
+    """`time.monotonic` stands still then, and what it measured would be as young as before (sern_runtime/clock.py)."""
+    clocks = {"monotonic", "monotonic_ns", "perf_counter", "time"}
+    files = [path for name in ("sern_relay", "sern_client", "sern_runtime") for path in (ROOT / name).glob("*.py")]
+    offenders = []
+    for path in [*files, ROOT / "sern_tools" / "echo.py"]:
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ImportFrom) and node.module == "time":
+                offenders += [f"{path.name}:{node.lineno} {alias.name}" for alias in node.names]
+            for argument in node.keywords if isinstance(node, ast.Call) else ():
+                called = argument.value.func if isinstance(argument.value, ast.Call) else argument.value
+                if argument.arg in ("now", "born_s") and isinstance(called, ast.Attribute) and called.attr in clocks:
+                    offenders.append(f"{path.name}:{called.lineno}")
+            if isinstance(node, ast.Attribute) and node.attr.startswith("monotonic") and path.name not in OWN_CLOCK:
+                offenders.append(f"{path.name}:{node.lineno} {node.attr}")
     assert offenders == []

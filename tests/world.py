@@ -160,6 +160,7 @@ class Dropped(NamedTuple):
     topic: str
     seq: int
     reason: DropReason
+    where: str
 
 
 @dataclass
@@ -264,8 +265,8 @@ class SimClient:
         self.turns[stream.id].append(-count)
         self.skipped_count[stream.id.topic] += count
 
-    def send_dropped(self, stream: StreamInfo, seq: int, reason: DropReason) -> None:
-        self.dropped_out.append(Dropped(stream.id.topic, seq, reason))
+    def send_dropped(self, stream: StreamInfo, seq: int, reason: DropReason, where: str) -> None:
+        self.dropped_out.append(Dropped(stream.id.topic, seq, reason, where))
 
     def wanted(self, stream: StreamInfo, wanted: bool) -> None:
         self.wants[stream.id.topic].append(wanted)

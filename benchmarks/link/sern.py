@@ -19,7 +19,7 @@ from sern_core.client import ClientCore
 from sern_core.message import KAPPA, Message, StreamInfo, TopicInfo, TopicSpec
 from sern_core.params import LinkParams, SchedulerParams
 from sern_core.types import ClientName, DropReason, Encoding, PriorityClass, TopicName
-from sern_runtime import logs
+from sern_runtime import clock, logs
 from sern_runtime.keys import load_public, load_secret
 from sern_runtime.topics_view import both_ways
 
@@ -46,7 +46,7 @@ class End:
             events=self,
             link=LinkParams(),
             scheduler=SchedulerParams(),
-            now=time.monotonic(),
+            now=clock.now(),
         )
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         self._lane: ClientLane | None = None
@@ -149,7 +149,7 @@ class End:
 
     def skipped(self, stream: StreamInfo, count: int) -> None: ...
 
-    def send_dropped(self, stream: StreamInfo, seq: int, reason: DropReason) -> None:
+    def send_dropped(self, stream: StreamInfo, seq: int, reason: DropReason, where: str) -> None:
         """The link's counters have it."""
 
     def wanted(self, stream: StreamInfo, wanted: bool) -> None:
@@ -171,7 +171,7 @@ class End:
     # --- result -------------------------------------------------------------------------------------------------------
 
     def seen(self) -> dict[str, Any]:
-        topics = both_ways(self.core.link, self.core.received, now=time.monotonic())
+        topics = both_ways(self.core.link, self.core.received, now=clock.now())
         return {"samples": self.samples, "topics": topics, "problems": self.problems}
 
 
@@ -184,13 +184,13 @@ async def _send(end: End, load: Load, orders: Orders) -> None:
                 weight=KAPPA[flow.kind],
                 lifespan_s=LIFESPANS_S[flow.kind],
             ),
-            now=time.monotonic(),
+            now=clock.now(),
         )
         for flow in load.flows
     }
 
     def send(kind: Kind, body: bytes) -> None:
-        end.core.send(channels[kind], body, 0, now=time.monotonic())
+        end.core.send(channels[kind], body, 0, now=clock.now())
         end.kick()
 
     await _until(lambda: end.connected and len(end.wanted_topics) == len(channels), orders)
@@ -202,7 +202,7 @@ async def _send(end: End, load: Load, orders: Orders) -> None:
 
 
 async def _receive(end: End, load: Load, orders: Orders) -> None:
-    end.core.subscribe(("/bench/.*",), now=time.monotonic())
+    end.core.subscribe(("/bench/.*",), now=clock.now())
     await _until(lambda: end.connected and end.log.heard, orders)
     ready()
     await _until(lambda: False, orders)

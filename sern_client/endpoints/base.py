@@ -7,10 +7,14 @@ its business. All calls happen on the event-loop thread; an endpoint with thread
 
 from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Final, Protocol, runtime_checkable
 
 from sern_core.message import TopicInfo
 from sern_core.types import DropReason, Encoding, TopicName
+
+GUARD_SUFFIX: Final = "_guard"
+"""What the node of a client's guard (sern_client/guard.py) has behind the name of the client's own node. It publishes
+the client's stop commands: its topics are no topics of this site."""
 
 Sink = Callable[[bytes, int], bool]
 """`sink(body, stamp_ns) -> accepted`. False: refused (a reliable queue is full); the endpoint may hold the message

@@ -12,7 +12,7 @@ from pathlib import Path
 from threading import Thread
 from typing import TYPE_CHECKING, Final
 
-from sern_client.endpoints.base import Publisher, Sink, Subscription, TopicEvents
+from sern_client.endpoints.base import GUARD_SUFFIX, Publisher, Sink, Subscription, TopicEvents
 from sern_client.endpoints.handover import Handover
 from sern_core.errors import ConfigError, UsageError
 from sern_core.message import TopicInfo
@@ -165,13 +165,15 @@ class RclpyEndpoint:
         """Announce what appeared, retract what went. Topics that only we publish are not there."""
         from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 
+        own, namespace = self._node.get_name(), self._node.get_namespace()
+        ours = {(own, namespace), (own + GUARD_SUFFIX, namespace)}
         found: set[TopicName] = set()
         for text, type_names in self._node.get_topic_names_and_types():
             name = TopicName(text)
             publishers = [
                 info
                 for info in self._node.get_publishers_info_by_topic(name)
-                if info.node_name != self._node.get_name() or info.node_namespace != self._node.get_namespace()
+                if (info.node_name, info.node_namespace) not in ours
             ]
             if not publishers:
                 continue

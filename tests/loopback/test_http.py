@@ -3,6 +3,7 @@
 import asyncio
 import json
 import socket as socketlib
+from contextlib import suppress
 
 import aiohttp
 import pytest
@@ -12,6 +13,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from sern_core.errors import ConfigError, UsageError
 from sern_runtime.http import Health, HttpServer, parse_listen
 from sern_runtime.metrics import Metrics
+from tests.support import until
 
 
 class Daemon:
@@ -133,3 +135,52 @@ def test_listen(listen: str, expected: tuple[str, int] | None) -> None:
             parse_listen(listen)
     else:
         assert parse_listen(listen) == expected
+
+
+GARBAGE = {
+    "noise": b"\x00\xff\xfe garbage\r\n\r\n",
+    "tls": b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03" + bytes(range(200)),
+    "huge header": b"GET /healthz HTTP/1.1\r\nHost: x\r\nX: " + b"a" * 100_000 + b"\r\n\r\n",
+    "huge path": b"GET /" + b"a" * 100_000,
+    "no host": b"GET /healthz HTTP/1.1\r\nContent-Length: 99\r\n\r\nabc",
+    "bad chunk": b"POST /healthz HTTP/1.1\r\nHost: x\r\nTransfer-Encoding: chunked\r\n\r\nzz\r\n",
+    "bad url": b"GET http://[::1 HTTP/1.1\r\nHost: x\r\n\r\n",
+    "bad query": b"GET /api/link?\xff%zz HTTP/1.1\r\nHost: x\r\n\r\n",
+    "version": b"GET /healthz HTTP/9.9\r\n\r\n",
+    "http2": b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n",
+    "forged line": b"GET /\x1b[31m\nERROR sern forged HTTP/1.1\r\n\r\n",
+}
+
+
+@pytest.mark.parametrize("name", GARBAGE)
+async def test_what_is_no_request_is_a_line_and_no_traceback(name: str, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("DEBUG")
+    daemon = Daemon()
+    await daemon.server.start()
+    reader, writer = await asyncio.open_connection("127.0.0.1", daemon.server.port)
+    with suppress(ConnectionError):
+        writer.write(GARBAGE[name])
+        await writer.drain()
+        answer = await reader.read()
+        assert answer.split()[1] in (b"400", b"405", b"505")
+    writer.transport.abort()
+    await until(lambda: daemon.server.refused or caplog.records)
+    assert await daemon.get("/healthz") == (200, "text/plain", "ok\n")
+    await daemon.server.stop()
+    assert not any(record.exc_info for record in caplog.records)
+    lines = [record.getMessage() for record in caplog.records if record.name.startswith(("sern", "aiohttp"))]
+    assert len(lines) == daemon.server.refused == 1, lines
+    assert "sent what is no HTTP request" in lines[0] and "\n" not in lines[0] and len(lines[0]) < 200
+
+
+async def test_half_a_request_is_nothing_to_speak_of(caplog: pytest.LogCaptureFixture) -> None:
+    daemon = Daemon()
+    await daemon.server.start()
+    for part in (b"", b"GET /heal", b"GET /healthz HTTP/1.1\r\nHost: x\r\n", b"\r\n" * 100):
+        _reader, writer = await asyncio.open_connection("127.0.0.1", daemon.server.port)
+        writer.write(part)
+        await writer.drain()
+        writer.transport.abort()
+    assert await daemon.get("/healthz") == (200, "text/plain", "ok\n")
+    await daemon.server.stop()
+    assert [record.getMessage() for record in caplog.records] == []

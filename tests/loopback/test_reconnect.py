@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from sern_client.daemon import ClientDaemon
+from sern_core.lanes import LANE_UDP
 from sern_core.types import ClientName, TopicName
 from sern_runtime.keys import PublicKey, PublicKeys, load_public, write_public
 from tests.daemons import Lab, Process, bodies, under, write_bag
@@ -143,4 +144,19 @@ async def test_late_joiners_get_what_is_latched(tmp_path: Path, robot_leaves: bo
             assert found == expected
         if not robot_leaves:
             await lab.end(robot)
+        await lab.end(relay)
+
+
+async def test_a_killed_client_is_away_on_both_lanes(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """Its connection ends at once, its datagrams cease: the relay says so after the heartbeat's time, not a minute."""
+    caplog.set_level("INFO")
+    async with Lab(tmp_path, "robot1") as lab:
+        relay = await lab.relay(lab.relay_file(link={"heartbeat_timeout_s": 2.0}))
+        robot = lab.process(lab.client_file("robot1", {"kind": "synthetic", "role": "robot", "topics": ["/pose"]}))
+        name = ClientName("robot1")
+        await until(lambda: name in relay.hub.links and relay.hub.links[name].lane.id == LANE_UDP)
+        robot.kill()
+        await until(lambda: not relay.hub.links[name].established)
+        words = "robot1 is away: its connection is gone and no datagram came for"
+        assert any(words in message for message in caplog.messages)
         await lab.end(relay)

@@ -2,7 +2,6 @@
 
 import asyncio
 import re
-import time
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
 from dataclasses import replace
@@ -20,6 +19,7 @@ from sern_core.errors import ConfigError, ServiceError
 from sern_core.message import Message, StreamId, StreamInfo, TopicInfo, TopicSpec
 from sern_core.services import CALL, REPLY, call_name, reply_name
 from sern_core.types import ClientName, DropReason, Encoding, TopicName
+from sern_runtime import clock
 from sern_runtime.config.client import load_client
 from tests.daemons import Lab
 from tests.fake_services import Services
@@ -280,11 +280,11 @@ async def test_nobody_calls_in_the_name_of_another_site(tmp_path: Path, monkeypa
         rogue = await lab.connected(lab.client_file("rogue", {"kind": "synthetic", "role": "operator"}))
         sites.offer()
         forged = TopicInfo(call_name(GLOBAL, ClientName("site")), INFO.type_name, INFO.encoding)
-        channel = rogue.core.publish(forged, TopicSpec(), now=time.monotonic())
+        channel = rogue.core.publish(forged, TopicSpec(), now=clock.now())
         honest = TopicInfo(call_name(GLOBAL, ClientName("rogue")), INFO.type_name, INFO.encoding)
-        own = rogue.core.publish(honest, TopicSpec(), now=time.monotonic())
-        rogue.core.send(channel, CALL.pack(1) + b"forged", 0, now=time.monotonic())
-        rogue.core.send(own, CALL.pack(2) + b"own", 0, now=time.monotonic())
+        own = rogue.core.publish(honest, TopicSpec(), now=clock.now())
+        rogue.core.send(channel, CALL.pack(1) + b"forged", 0, now=clock.now())
+        rogue.core.send(own, CALL.pack(2) + b"own", 0, now=clock.now())
         await until(lambda: (SERVICE, b"own") in sites.robot.calls, "its own call is executed")
         assert (SERVICE, b"forged") not in sites.robot.calls
         assert [stream.topic for stream in robot.core.link.by_stream] == [
@@ -313,7 +313,7 @@ async def test_nobody_else_answers_for_a_service(tmp_path: Path, monkeypatch: py
         await started.wait()
         (number,) = services.used[GLOBAL].waiting
         forged = stream_of(reply_name(GLOBAL, ClientName("site")), "rogue")
-        services.message(forged, Message(forged.id, 1, REPLY.pack(number, False) + b"forged", 0, time.monotonic()))
+        services.message(forged, Message(forged.id, 1, REPLY.pack(number, False) + b"forged", 0, clock.now()))
         release.set()
         assert await pending == b"one"
 

@@ -1,8 +1,8 @@
 """A paced lane through the pump: bursts instead of wake-ups, late binding, and no spinning while it is not ready."""
 
-import time
 from functools import partial
 
+from sern_runtime import clock
 from sern_runtime.pump import BURST, Pump
 from sern_runtime.zmq_socket import SendResult
 from tests.loopback.udp_support import ROBOT, Client, Relay
@@ -15,7 +15,7 @@ class PacedPort:
     def __init__(self, count: int, interval_s: float) -> None:
         self.count = count
         self.interval_s = interval_s
-        self.next_s = time.monotonic()
+        self.next_s = clock.now()
         self.taken: list[int] = []
         self.asked = 0
         self.too_early = 0
@@ -72,9 +72,9 @@ async def test_nothing_is_taken_while_the_lane_is_not_ready() -> None:
     port = PacedPort(3 * BURST, 0.0)
     pump = Pump(port, lambda _datagram: SendResult.OK, on_gone=unexpected, ready=ready)
     pump.kick()
-    begun_s = time.monotonic()
+    begun_s = clock.now()
     await until(lambda: asked >= 4)
-    assert asked <= 2 + (time.monotonic() - begun_s) / 0.009
+    assert asked <= 2 + (clock.now() - begun_s) / 0.009
     assert port.asked == 0 and port.taken == []
     answers.append(True)
     pump.kick()

@@ -259,3 +259,54 @@ def test_the_least_of_the_window_against_brute_force(steps: list[tuple[float, fl
         seen.append((now, rtt_s))
         assert rtt.min_s == min(value for at, value in seen if at >= now - 10.0)
         assert rtt.min_s <= max(value for _, value in seen) and 0.0 <= rtt.srtt_s <= 1.0 and rtt.rttvar_s >= 0.0
+
+
+def ping(sync: ClockSync, at_s: float, offset_s: float, rtt_s: float = 0.02) -> None:
+    """One round trip that is as long each way, of a peer that answers at once."""
+    middle_s = at_s + rtt_s / 2 + offset_s
+    assert sync.sample(at_s, middle_s, middle_s, at_s + rtt_s)
+
+
+def test_what_the_peer_had_before_its_clock_stood_still_is_older_than_it_says() -> None:
+    sync = ClockSync()
+    for number in range(8):
+        ping(sync, 10.0 + number, 100.0)
+    assert sync.behind_s(117.0) == 0.0
+    ping(sync, 20.0, 97.0)  # it stood still for 3 s, some time after 117 s on it
+    assert sync.steps == 1
+    assert 3.0 <= sync.behind_s(117.0) <= 3.1
+    assert sync.behind_s(118.0) == 0.0, "born after the sample that showed it"
+    ping(sync, 30.0, 95.0)
+    assert 5.0 <= sync.behind_s(117.0) <= 5.2 and 2.0 <= sync.behind_s(118.0) <= 2.1
+
+
+def test_a_pause_that_hides_in_the_bounds_counts_as_well() -> None:
+    sync = ClockSync()
+    for number in range(8):
+        ping(sync, 10.0 + number, 100.0, 0.4)
+    ping(sync, 20.0, 99.7, 0.35)
+    assert sync.steps == 0 and sync.offset_s == pytest.approx(99.7)
+    assert sync.behind_s(117.0) == pytest.approx(0.3)
+
+
+@pytest.mark.parametrize("late_s", [0.0, 0.5, 1e6])
+def test_what_comes_late_is_no_sign_of_a_pause(late_s: float) -> None:
+    sync = ClockSync()
+    ping(sync, 10.0, 100.0)
+    sync.witness(110.5, 10.5 + late_s)
+    assert sync.ready and sync.steps == 0
+
+
+def test_what_comes_from_the_future_tells_that_our_clock_stood_still() -> None:
+    sync = ClockSync()
+    ping(sync, 10.0, 100.0)
+    assert sync.ahead_s == pytest.approx(100.01, abs=1e-4)
+    known = []
+    for sent_s in (110.505, 111.0):  # within the bounds, and beyond
+        sync.witness(sent_s, 10.5)
+        known.append((sync.ready, sync.steps))
+    assert known == [(True, 0), (False, 1)]
+    assert sync.ahead_s == math.inf
+    assert sync.one_way_delay_s(111.0, 10.5).uncertainty_s == math.inf
+    ping(sync, 10.6, 100.5)
+    assert sync.offset_s == pytest.approx(100.5)

@@ -1,5 +1,8 @@
 """Two lanes under one session: which carries data, what a lost lane costs, and how a session outlives its stream."""
 
+import pytest
+
+from sern_core import wire
 from sern_core.client import ClientCore
 from sern_core.lane_port import LanePort
 from sern_core.lanes import COPY_PACKETS, DATAGRAM_BYTES, LANE_UDP, LANE_ZMQ, Lane
@@ -108,6 +111,56 @@ def test_a_session_outlives_the_stream_and_a_fresh_pose_is_there_at_once() -> No
     assert lanes.first_pose_after(24.0) <= 0.3
     assert lanes.core.link.lanes[LANE_ZMQ].up
     lanes.check_log()
+
+
+@pytest.mark.parametrize("end", ["robot", "relay"])
+def test_packet_numbers_of_the_datagram_lane_that_run_out_begin_another_session(end: str) -> None:
+    lanes = TwoLanes(stream=models()[0], datagrams=models()[1])
+    lanes.run(5.0)
+    link = lanes.core.link if end == "robot" else lanes.world.relay.hub.links[ClientName("robot")]
+    link.lanes[LANE_UDP].flight.next_number = wire.MAX_PACKET_NUMBER - 5
+    lanes.run(5.0)
+    assert lanes.robot.ups == [False, True]
+    lanes._open(lanes.world.network.now)
+    lanes.run(5.0)
+    assert lanes.core.link.lane.id == LANE_UDP
+    lanes.check_log()
+
+
+def test_a_client_that_was_killed_is_away_after_the_heartbeat() -> None:
+    """Its kernel ends the connection at once, and its datagrams cease with it: that is no blackout."""
+    lanes = TwoLanes(stream=models()[0], datagrams=models()[1])
+    lanes.run(5.0)
+    link = lanes.world.relay.hub.links[ClientName("robot")]
+    assert link.lane.id == LANE_UDP
+    lanes.world.network.crash_node(lanes.robot)
+    lanes.run(4.0)
+    assert link.established, "its datagrams may yet come"
+    lanes.run(3.0)
+    assert not link.established
+
+
+def test_a_client_in_a_blackout_is_waited_for() -> None:
+    stream, datagrams = models(Window(5.0, 50.0))
+    lanes = TwoLanes(stream=stream, datagrams=datagrams)
+    link = lanes.world.relay.hub._link(ClientName("robot"), 0.0)
+    lanes.run(20.0)
+    assert not link.lanes[LANE_ZMQ].up, "the connection did not survive it"
+    lanes.run(29.0)
+    assert link.established
+    lanes.run(6.0)
+    assert lanes.robot.ups == [False], "one session all along"
+    assert lanes.first_pose_after(50.0) <= 0.3
+
+
+def test_a_client_that_ends_in_a_blackout_is_away_in_the_end() -> None:
+    stream, datagrams = models(Window(5.0, 500.0))
+    lanes = TwoLanes(stream=stream, datagrams=datagrams)
+    link = lanes.world.relay.hub._link(ClientName("robot"), 0.0)
+    lanes.run(60.0)
+    assert link.established
+    lanes.run(15.0)
+    assert not link.established
 
 
 def test_the_lane_closes_with_its_session() -> None:

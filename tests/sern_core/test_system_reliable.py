@@ -181,6 +181,43 @@ def test_a_new_subscriber_is_not_told_of_what_nobody_wanted() -> None:
     assert not site.expired_seqs["/robot/log"] and not site.skipped_count["/robot/log"]
 
 
+@pytest.mark.parametrize("others", [True, False])
+def test_what_a_subscriber_that_leaves_no_longer_wants_is_no_loss_to_the_origin(others: bool) -> None:
+    """What waits for it at the relay is given up; whoever else wants the stream has it, and it counts as delivered."""
+    world = World().watch()
+    robot = world.client("robot")
+    guest = world.client("guest", LinkModel(rate_bps=20e3, delay_s=0.05).as_stream(), patterns=["/robot/.*"])
+    stays = world.client("stays", patterns=["/robot/.*"]) if others else None
+    log = robot.publish("/robot/log", spec(reliable=True))
+    world.run(2.0)
+    send(robot, log, 20, 10_000)
+    world.run(1.0)
+    assert len(guest.seqs("/robot/log")) < 3
+    guest.subscribe()  # as a tool does that ends
+    world.until(lambda: not log.retained, within_s=20.0)
+    assert len(guest.seqs("/robot/log")) < 10
+    if stays is not None:
+        assert stays.seqs("/robot/log") == list(range(1, 21))
+        assert robot.dropped_out == [] and log.counters.delivered == 20
+    else:
+        assert {drop.reason for drop in robot.dropped_out} <= {DropReason.UNWANTED}
+
+
+def test_a_report_names_who_did_not_get_it() -> None:
+    world = World().watch()
+    robot = world.client("robot")
+    world.client("near", patterns=["/robot/.*"])
+    far = world.client("far", patterns=["/robot/.*"])
+    log = robot.publish("/robot/log", spec(reliable=True, retention_s=3.0))
+    world.run(2.0)
+    world.network.crash_node(far)
+    send(robot, log, 3)
+    world.run(6.0)
+    assert [(drop.seq, drop.reason, drop.where) for drop in robot.dropped_out] == [
+        (seq, DropReason.RETENTION, "far") for seq in (1, 2, 3)
+    ]
+
+
 def test_one_slow_subscriber_holds_back_nobody_else() -> None:
     world = World().watch()
     robot = world.client("robot")

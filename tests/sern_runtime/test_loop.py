@@ -7,12 +7,12 @@ import signal
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Callable
 
 import pytest
 import uvloop
 
+from sern_runtime import clock
 from sern_runtime.loop import BlockDetector, Shutdown, Timer, run
 from tests.support import DEADLINE_S, Patience, until
 
@@ -126,12 +126,12 @@ async def test_a_real_timer_never_fires_early() -> None:
     """uvloop fires delays under half a millisecond at once, and others early."""
     late_s: list[float] = []
     done = asyncio.Event()
-    deadlines_s = iter([time.monotonic() + n * 0.0007 for n in range(1, 60)])
+    deadlines_s = iter([clock.now() + n * 0.0007 for n in range(1, 60)])
     due_s = next(deadlines_s)
 
     def fire() -> None:
         nonlocal due_s
-        late_s.append(time.monotonic() - due_s)
+        late_s.append(clock.now() - due_s)
         following = next(deadlines_s, None)
         if following is None:
             done.set()

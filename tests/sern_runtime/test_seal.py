@@ -13,6 +13,7 @@ from sern_core.wire import decode_envelope, encode_envelope
 from sern_runtime import seal
 from sern_runtime.seal import (
     CLEAR_BYTES,
+    REKEY_SHARE,
     REPLAY_WINDOW,
     ROOM_BYTES,
     SEAL_BYTES,
@@ -295,3 +296,17 @@ def test_bad_parameters_are_refused_without_telling_the_secret(key: str, value: 
 def test_a_secret_of_another_length_is_the_callers_mistake() -> None:
     with pytest.raises(UsageError, match="32 bytes"):
         parameters(secret=b"short")
+
+
+@pytest.mark.parametrize("cipher", Cipher)
+def test_an_opener_asks_for_a_rekey_before_the_other_sides_key_is_used_up(cipher: Cipher) -> None:
+    """Whoever looks sees it: the counter is there to be read."""
+    drawn = SessionParameters.draw(7, cipher, 5555)
+    sealer, opener = Sealer(drawn, Side.RELAY), Opener(drawn, Side.RELAY)
+    due = int(REKEY_SHARE * SEAL_LIMITS[cipher])
+    sealer.counter = due - 2
+    seen = []
+    for _ in range(2):
+        assert opener.open(sealer.seal(b"x")) == b"x"
+        seen.append((opener.rekey_due, sealer.rekey_due))
+    assert seen == [(False, False), (True, True)]

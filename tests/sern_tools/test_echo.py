@@ -153,7 +153,7 @@ def test_printed_messages_are_yaml_documents() -> None:
 
 def test_rates(monkeypatch: pytest.MonkeyPatch) -> None:
     now_s = 100.0
-    monkeypatch.setattr("sern_tools.echo.time.monotonic", lambda: now_s)
+    monkeypatch.setattr("sern_tools.echo.clock.now", lambda: now_s)
     out, stream = StringIO(), stream_of()
     printer = RatePrinter(out, count=2)
     printer.opened(stream)

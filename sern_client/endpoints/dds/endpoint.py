@@ -20,7 +20,7 @@ from cyclonedds.pub import DataWriter, Publisher
 from cyclonedds.sub import DataReader, Subscriber
 from cyclonedds.topic import Topic
 
-from sern_client.endpoints.base import ServiceEvents, ServiceHandler, ServiceInfo, Sink, TopicEvents
+from sern_client.endpoints.base import GUARD_SUFFIX, ServiceEvents, ServiceHandler, ServiceInfo, Sink, TopicEvents
 from sern_client.endpoints.dds import names, node_info, raw
 from sern_client.endpoints.dds.definitions import Definitions
 from sern_client.endpoints.dds.domain import DomainOptions, close_domain, open_domain
@@ -210,6 +210,7 @@ class DdsEndpoint:
         self.options = options
         self.counters = DdsCounters()
         self.graph = Graph(UUID(int=0), self, heed_sern=options.heed_sern)
+        self.graph.own_guard = options.node_name + GUARD_SUFFIX
         self.types = Definitions(options.type_paths)
         self.services = DdsServices(self)
         self._events: TopicEvents | None = None

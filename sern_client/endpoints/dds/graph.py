@@ -73,11 +73,12 @@ class GraphEvents(Protocol):
 
 @dataclass
 class Graph:
-    """`heed_sern`: topics of other SERN endpoints count as topics of this site."""
+    """`heed_sern`: topics of other SERN endpoints count as topics of this site, but those of `own_guard` never do."""
 
     own: UUID
     events: GraphEvents
     heed_sern: bool = False
+    own_guard: str = ""
     participants: dict[UUID, Participant] = field(default_factory=dict)
     remotes: dict[UUID, Remote] = field(default_factory=dict)
     locals: dict[UUID, Local] = field(default_factory=dict)
@@ -140,10 +141,10 @@ class Graph:
 
     def foreign(self, remote: Remote) -> bool:
         """Whether it is of this site, and not of a SERN endpoint that brings it from elsewhere."""
-        if self.heed_sern:
-            return True
         participant = self.participants.get(remote.participant)
-        return participant is None or not participant.sern
+        if participant is None or not participant.sern:
+            return True
+        return self.heed_sern and participant.sern != self.own_guard
 
     def writers(self, topic: str) -> list[Remote]:
         """Of this site, on a DDS topic, in the order of their GUIDs."""

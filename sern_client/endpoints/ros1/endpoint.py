@@ -25,7 +25,7 @@ from ipaddress import ip_address
 from itertools import count
 from typing import Final
 
-from sern_client.endpoints.base import ServiceEvents, ServiceHandler, ServiceInfo, Sink, TopicEvents
+from sern_client.endpoints.base import GUARD_SUFFIX, ServiceEvents, ServiceHandler, ServiceInfo, Sink, TopicEvents
 from sern_client.endpoints.ros1.graph import Graph, Registration
 from sern_client.endpoints.ros1.master import Master, SystemState
 from sern_client.endpoints.ros1.publication import Ended, Handle, Limits, Publication
@@ -90,6 +90,8 @@ class Ros1Endpoint:
         self.max_message_bytes = options.max_message_bytes
         self.tcp_nodelay = options.tcp_nodelay
         self.heed_sern = options.heed_sern
+        self.publishes_only = False
+        """Whether topics and services of other nodes are no concern of ours: set by a guard, before the start."""
         self.problem: str | None = None
         """Why this node has left the master for good, in one line; None while all is well."""
         self._prefix = "" if options.namespace in (None, "/") else "/" + str(options.namespace).strip("/")
@@ -300,8 +302,8 @@ class Ros1Endpoint:
         if self._off:
             return
         self._state = state
-        for name, nodes in state.publishers.items():
-            others = [node for node in nodes if node != self.caller]
+        for name, nodes in () if self.publishes_only else state.publishers.items():
+            others = [node for node in nodes if node not in (self.caller, self.caller + GUARD_SUFFIX)]
             topic = self._topics.get(name)
             if topic is None and others and name_problem(self._local(name)) is None:
                 topic = self._topics[name] = Topic(name, self._local(name), self)
@@ -314,7 +316,8 @@ class Ros1Endpoint:
                 self._topics.pop(name).close()
         for publication in list(self._publications.values()):
             self._tell_subscribers(publication)
-        self._services.update(state.services)
+        if not self.publishes_only:
+            self._services.update(state.services)
 
     def _tell_subscribers(self, publication: Publication) -> None:
         """Once the master lists us: its subscribers connect now, or have."""

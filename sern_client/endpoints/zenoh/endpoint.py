@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
-from sern_client.endpoints.base import Publisher, Sink, Subscription, TopicEvents
+from sern_client.endpoints.base import GUARD_SUFFIX, Publisher, Sink, Subscription, TopicEvents
 from sern_client.endpoints.zenoh import names
 from sern_client.endpoints.zenoh.names import Entity, Kind, Qos
 from sern_client.endpoints.zenoh.services import Services
@@ -205,7 +205,7 @@ class ZenohEndpoint(Services):
     def _token_changed(self, key: str, alive: bool) -> None:
         try:
             entity = names.parse_token(key)
-            if entity.session == self._zid:
+            if entity.session == self._zid or entity.node == f"/{self.options.node_name}{GUARD_SUFFIX}":
                 return
             if entity.kind is Kind.PUBLISHER:
                 if alive:

@@ -1,0 +1,201 @@
+"""The client's end of its guard: started beside it, told of every command lease, started again when it ends.
+
+What the guard is for, and what is said over the pipes, is told in sern_client/guard_process.py. Only endpoints that
+drive a robot have one: a recording or the simulated robot of this process has nothing that another could publish to.
+"""
+
+import asyncio
+import base64
+import json
+import logging
+import os
+import sys
+from asyncio.subprocess import PIPE, Process
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Final, Self
+
+from sern_client.endpoints.base import GUARD_SUFFIX
+from sern_client.factory import named_sections
+from sern_core.message import TopicInfo
+from sern_runtime.config import endpoints as sections
+from sern_runtime.config.client import ClientFile
+from sern_runtime.config.load import Loaded
+from sern_runtime.config.shared import LogSection
+from sern_runtime.entry import end_tasks
+
+PING_S: Final = 1.0
+SILENT_S: Final = 15.0
+"""A guard that answers nothing for so long is killed and started again: longer than it needs to start on a busy
+machine."""
+AGAIN_S: Final = (1.0, 30.0)
+"""First and longest pause before it is started again."""
+END_S: Final = 3.0
+"""How long it may take to leave its masters and domains."""
+
+DrivesRobots = sections.Ros1Endpoint | sections.DdsEndpoint | sections.ZenohEndpoint | sections.RclpyEndpoint
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(slots=True)
+class _Topic:
+    info: TopicInfo
+    stop: bytes
+    due_s: float | None = None
+
+
+class Guard:
+    """`start`, then any calls, then `stop`. Counts what it had to do, for metrics."""
+
+    def __init__(self, joins: Sequence[DrivesRobots], folder: Path, log: LogSection) -> None:
+        self.ready = False
+        """Whether it runs and has joined what it is to join."""
+        self.restarts = 0
+        self.stopped = 0
+        """Leases that ran out there because this process did not answer."""
+        self._hello: dict[str, object] = {
+            "endpoints": [section.model_dump(mode="json") for section in joins],
+            "folder": str(folder),
+            "log": {"format": log.format.value, "level": log.level.value},
+        }
+        self._topics: dict[int, _Topic] = {}
+        self._next_key = 1
+        self._process: Process | None = None
+        self._heard_s = 0.0
+        self._task: asyncio.Task[None] | None = None
+        self._spawning: asyncio.Task[Process] | None = None
+
+    @classmethod
+    def of(cls, loaded: Loaded[ClientFile]) -> Self | None:
+        """The guard that a client with this file needs; None: nothing there that it could stop."""
+        model = loaded.model
+        if all(section.on_link_loss is None for section in model.topics):
+            return None
+        joins = [
+            section.model_copy(update={"node_name": f"{section.node_name}{GUARD_SUFFIX}"})
+            for section in named_sections(model)
+            if isinstance(section, DrivesRobots)
+        ]
+        return cls(joins, loaded.path.parent.resolve(), model.log) if joins else None
+
+    def start(self) -> None:
+        self._task = asyncio.create_task(self._keep(), name="guard")
+
+    async def stop(self) -> None:
+        """What is armed still is due now: let the leases say their last word before."""
+        if self._task is None:
+            return
+        await end_tasks([self._task])
+        self._process = None
+        if self._spawning is not None:
+            with suppress(OSError):
+                await _end(await self._spawning)
+
+    # --- leases -----------------------------------------------------------------------------------------------------
+
+    def opened(self, info: TopicInfo, stop: bytes) -> int:
+        """A command topic with a lease; returns what it is called in `lease` and `closed`."""
+        key, self._next_key = self._next_key, self._next_key + 1
+        topic = self._topics[key] = _Topic(info, stop)
+        self._say(_opening(key, topic))
+        return key
+
+    def lease(self, key: int, due_s: float | None) -> None:
+        """When the lease of a topic runs out now. Call it before a command is published, and after a stop command."""
+        self._topics[key].due_s = due_s
+        self._say({"lease": key, "due": due_s})
+
+    def closed(self, key: int) -> None:
+        del self._topics[key]
+        self._say({"close": key})
+
+    def _say(self, said: dict[str, object]) -> None:
+        process = self._process
+        if process is not None and process.stdin is not None and not process.stdin.is_closing():
+            process.stdin.write(json.dumps(said).encode() + b"\n")
+
+    # --- the process ------------------------------------------------------------------------------------------------
+
+    async def _keep(self) -> None:
+        pause_s = AGAIN_S[0]
+        while True:
+            code = await self._run()
+            if self.ready:
+                pause_s = AGAIN_S[0]
+            self.ready = False
+            self._process = None
+            self.restarts += 1
+            _log.error(
+                "the guard of the command topics has ended (%s); started again in %g s; until then a held-up client "
+                "stops nothing",
+                code, pause_s,
+            )  # fmt: skip
+            await asyncio.sleep(pause_s)
+            pause_s = min(2 * pause_s, AGAIN_S[1])
+
+    async def _run(self) -> str:
+        """From its start to its end; how it ended."""
+        command = (sys.executable, "-P", "-m", "sern_client.guard_process", str(os.getpid()))
+        try:
+            self._spawning = asyncio.create_task(_spawn(*command), name="guard-spawn")
+            process = await asyncio.shield(self._spawning)  # an end in the middle of it must not lose the process
+        except OSError as error:
+            return error.strerror or str(error)
+        self._process = process
+        self._say(self._hello)
+        for key, topic in self._topics.items():
+            self._say(_opening(key, topic))
+            if topic.due_s is not None:
+                self._say({"lease": key, "due": topic.due_s})
+        loop = asyncio.get_running_loop()
+        self._heard_s = loop.time()
+        silence = asyncio.create_task(self._listen_for_silence(process), name="guard-silence")
+        try:
+            assert process.stdout is not None
+            while line := await process.stdout.readline():
+                self._heard_s = loop.time()
+                self._answered(json.loads(line))
+            return f"exit code {await process.wait()}"
+        finally:
+            await end_tasks([silence])
+
+    async def _listen_for_silence(self, process: Process) -> None:
+        loop = asyncio.get_running_loop()
+        number = 0
+        while loop.time() - self._heard_s < SILENT_S:
+            await asyncio.sleep(PING_S)
+            number += 1
+            self._say({"ping": number})
+        _log.error("the guard of the command topics has not answered for %g s; it is killed", SILENT_S)
+        process.kill()
+
+    def _answered(self, said: dict[str, object]) -> None:
+        if "ready" in said:
+            self.ready = True
+            _log.info("the guard of the command topics runs as process %d", self._process.pid if self._process else 0)
+        elif "stopped" in said:
+            self.stopped += 1
+
+
+def _opening(key: int, topic: _Topic) -> dict[str, object]:
+    return {"open": key, "info": asdict(topic.info), "stop": base64.b64encode(topic.stop).decode()}
+
+
+async def _spawn(*command: str) -> Process:
+    return await asyncio.create_subprocess_exec(*command, stdin=PIPE, stdout=PIPE)
+
+
+async def _end(process: Process) -> None:
+    """Close its standard input and wait for its end, or make one."""
+    if process.stdin is not None:
+        process.stdin.close()
+    try:
+        async with asyncio.timeout(END_S):
+            await process.wait()
+    except TimeoutError:
+        _log.error("the guard of the command topics does not end; it is killed")
+        process.kill()
+        await process.wait()
