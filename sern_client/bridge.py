@@ -10,9 +10,10 @@ from typing import Final
 
 from sern_client.actions import GoalWatch
 from sern_client.conversion import Converter
-from sern_client.endpoints.base import Endpoint, Publisher, Subscription, publisher_within
+from sern_client.endpoints.base import Endpoint, Publisher, Subscription, keepers_of, publisher_within
 from sern_client.endpoints.composite import CompositeEndpoint
 from sern_client.frames import FramePrefixer, Rewrite
+from sern_client.keeping import Keeping
 from sern_client.message_log import MessageLog
 from sern_client.rebuild import Rebuilds
 from sern_client.services import ServiceBridge
@@ -121,6 +122,7 @@ class Bridge:
         self.summaries = Summaries(self._sender)
         self.rebuilds = Rebuilds()
         self._asked: tuple[str, ...] | None = None  # the patterns we were started with
+        self.keeping = Keeping(keepers_of(endpoint), self._hold, self._release_kept)
 
     def attach(self, core: ClientCore) -> None:
         self._core = core
@@ -356,7 +358,12 @@ class Bridge:
         if not self.rebuilds.message(stream, message):
             lifespan_s = stream.spec.lifespan_s
             left_s = inf if lifespan_s is None else max(lifespan_s - age_s, 0.0)
-            self._show(incoming, message.body, message.stamp_ns, left_s)
+            if stream.spec.reliable and self.keeping:
+                mark = self.keeping.mark()
+                self._show(incoming, message.body, message.stamp_ns, left_s)
+                self.keeping.published(stream.id, message.seq, mark)
+            else:
+                self._show(incoming, message.body, message.stamp_ns, left_s)
         if self.goals is not None:
             self.goals.message(incoming.local, stream.info.encoding, message.body)
         self.ages.observe(stream.spec.priority, age_s)
@@ -367,6 +374,13 @@ class Bridge:
             self._arm()
         if self._log is not None:
             self._log.delivered(stream, message, age_s)
+
+    def _hold(self, stream: StreamId, seq: int) -> None:
+        self.core.hold(stream, seq)
+
+    def _release_kept(self, stream: StreamId, seq: int, lost: DropReason | None) -> None:
+        self.core.release(stream, seq, lost=lost, now=time.monotonic())
+        self._kick()
 
     def _check_deadline(self, stream: StreamInfo, now: float) -> None:
         last_s = self._last_arrival_s.get(stream.id)

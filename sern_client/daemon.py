@@ -384,6 +384,7 @@ class ClientDaemon:
         unconfirmed = sum(len(channel.retained) for channel in link.channels.values())
         if unconfirmed:
             _log.warning("stopping with %d reliable messages that not everyone has confirmed", unconfirmed)
+        await self._keep(give_up_s)
         if self._transport is not None:
             self._kick()
             await asyncio.sleep(0.02)  # what has arrived here is confirmed before we say goodbye
@@ -391,6 +392,14 @@ class ClientDaemon:
             link.close("client stops", now=time.monotonic())
             self._transport.pump.run()
             await asyncio.sleep(0.05)  # libzmq's thread takes it from here
+
+    async def _keep(self, give_up_s: float) -> None:
+        """Have what was recorded flushed, so that it is confirmed before we say goodbye."""
+        keeping = self.bridge.keeping
+        if keeping.pending:
+            keeping.flush()
+        while keeping.pending and time.monotonic() < give_up_s:  # noqa: ASYNC110  (its thread tells the loop)
+            await asyncio.sleep(0.01)
 
     def _give_up(self) -> None:
         """Count what is left, so that every message has a fate."""

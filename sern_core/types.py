@@ -84,6 +84,7 @@ class DropReason(StrEnum):
     QUEUE_FULL = "queue_full"  # more waits for this client at the relay than its access rule allows
     UNDECODABLE = "undecodable"  # its body cannot be decoded: damaged, above the limit, of another layout or codec
     UNCONFIRMED = "unconfirmed"  # sent whole, given up without an acknowledgement: it may have arrived
+    STORAGE = "storage"  # the recording could not take it: disk full or gone
 
 
 _UNUSED_CODE: Final = 14  # a stream that comes back to its origin is not wanted there: no message is dropped for that

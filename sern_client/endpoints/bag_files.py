@@ -1,14 +1,16 @@
 """The two kinds of file a recording is written to, on top of the rosbags writers; used from one thread only.
 
-A file grows as `<name>.active` and takes its name in `finish`. Both formats are written in chunks of about 1 MB; what
-is behind the last flushed chunk is safe. When the disk refuses, `give_up` cuts the file back to there, which also frees
-the room that the index needs, so that `finish` leaves a readable file.
+A file grows as `<name>.active` and takes its name in `finish`. Both formats are written in chunks, of about 1 MB or
+of what came before a `flush`. What lies before the end of the last flushed chunk is safe: the operating system has it,
+and leftovers.py reads it when this process was killed. When the disk refuses, `give_up` cuts the file back to there,
+which also frees the room that the index needs, so that `finish` leaves a readable file.
 """
 
+import errno
+import os
 import shutil
 from abc import ABC, abstractmethod
 from collections import Counter, defaultdict
-from contextlib import suppress
 from io import BufferedWriter, BytesIO, FileIO
 from pathlib import Path
 from typing import BinaryIO, Final, cast
@@ -19,6 +21,7 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.rosbag2.storage_mcap import McapWriter, PendingChunk
 
+from sern_client.endpoints.leftovers import lock
 from sern_core.message import TopicInfo
 
 MAX_TIME: Final = 2**63 - 1
@@ -33,17 +36,20 @@ def active_path(path: Path) -> Path:
 class RecordFile(ABC):
     """One file being recorded. Every method but `give_up` may raise OSError."""
 
-    def __init__(self, path: Path) -> None:
-        """Starts a new file; leftovers under its active name are removed."""
+    def __init__(self, path: Path, *, sync: bool = False) -> None:
+        """Starts a new file; its active name must be free. `sync`: what is flushed is on the disk, not only in the
+        memory of the operating system."""
         self.path = path
         self.active = active_path(path)
         self.full = False
+        self.gone = False
+        """Somebody has deleted the file."""
+        self.sync = sync
+        self.messages = 0
+        """Messages in the file, safe or not."""
         self._connections: dict[tuple[object, ...], Connection] = {}
         self._unsafe: Counter[int] = Counter()  # messages per connection since the last flushed chunk
-        if self.active.is_dir():
-            shutil.rmtree(self.active)
-        else:
-            self.active.unlink(missing_ok=True)
+        self._lock: int | None = None  # says that a living process writes here
 
     @staticmethod
     @abstractmethod
@@ -56,25 +62,64 @@ class RecordFile(ABC):
         if key not in self._connections and not self.full:
             self._connections[key] = self._connect(info)
 
-    def write(self, info: TopicInfo, stamp_ns: int, body: bytes) -> None:
+    def knows(self, info: TopicInfo) -> bool:
+        """Whether the topic was announced."""
+        return self.key(info) in self._connections
+
+    def write(self, info: TopicInfo, stamp_ns: int, body: bytes) -> bool:
+        """Add a message. True: with it a chunk was completed, and everything so far is safe."""
         connection = self._connections[self.key(info)]
         self._unsafe[connection.id] += 1
+        self.messages += 1
         self._put(connection, stamp_ns, body)
-        if self._flush_chunks():
-            self._unsafe.clear()
+        return self._flushed()
+
+    def flush(self) -> None:
+        """Make everything so far safe."""
+        if self._unsafe and not self.full:
+            self._end_chunk()
+            self._flushed()
+
+    def _flushed(self) -> bool:
+        if not self._flush_chunks():
+            return False
+        if self.sync:
+            os.fsync(self._descriptor())
+        if not os.fstat(self._descriptor()).st_nlink:
+            raise FileNotFoundError(errno.ENOENT, "it was deleted while it was being written")
+        self._unsafe.clear()
+        return True
+
+    def _take_lock(self, growing: Path) -> None:
+        try:
+            self._lock = lock(growing)
+        except BlockingIOError:
+            raise
+        except OSError:
+            self._lock = None  # a file system without locks
 
     def give_up(self) -> int:
         """Cut the file back to its last flushed chunk and take no more. Returns how many messages that loses."""
         lost = self._unsafe.total()
         self.full = True
-        with suppress(OSError):  # then finish fails too, and says so
+        self.messages -= lost
+        try:
             self._cut_back()
+        except FileNotFoundError:
+            self.gone = True
+            lost, self.messages = lost + self.messages, 0
+        except OSError:
+            pass  # then finish fails too, and says so
         self._unsafe.clear()
         return lost
 
     def finish(self) -> int:
         """Complete the file and give it its name. Returns how many messages were lost on the way (a full disk)."""
         lost = 0
+        if self.gone:
+            self._abandon()
+            self._unlock()
+            return 0
         try:
             self._close()
         except OSError:
@@ -83,9 +128,18 @@ class RecordFile(ABC):
                 self._close()
             except OSError:
                 self._abandon()
+                self._unlock()
                 raise
-        self._take_name()
+        try:
+            self._take_name()
+        finally:
+            self._unlock()
         return lost
+
+    def _unlock(self) -> None:
+        if self._lock is not None:
+            os.close(self._lock)
+            self._lock = None
 
     @abstractmethod
     def _connect(self, info: TopicInfo) -> Connection: ...
@@ -96,6 +150,12 @@ class RecordFile(ABC):
     @abstractmethod
     def _flush_chunks(self) -> bool:
         """Flush to the disk if a chunk was completed; tells whether it was."""
+
+    @abstractmethod
+    def _end_chunk(self) -> None: ...
+
+    @abstractmethod
+    def _descriptor(self) -> int: ...
 
     @abstractmethod
     def _cut_back(self) -> None: ...
@@ -113,10 +173,11 @@ class RecordFile(ABC):
 class BagFile(RecordFile):
     """A ROS 1 bag, format 2.0."""
 
-    def __init__(self, path: Path) -> None:
-        super().__init__(path)
+    def __init__(self, path: Path, *, sync: bool = False) -> None:
+        super().__init__(path, sync=sync)
         self._writer = Writer1(self.active)
         self._writer.open()
+        self._take_lock(self.active)
         self._safe_chunks = 0
         self._safe_position = self._flushed_position()
 
@@ -148,6 +209,13 @@ class BagFile(RecordFile):
         self._safe_chunks = len(chunks) - 1
         return True
 
+    def _end_chunk(self) -> None:
+        self._writer.write_chunk(self._writer.chunks[-1])
+
+    def _descriptor(self) -> int:
+        assert self._writer.bio is not None
+        return self._writer.bio.fileno()
+
     def _cut_back(self) -> None:
         del self._writer.chunks[self._safe_chunks :]
         self._writer.bio = _cut(self._writer.bio, self.active, self._safe_position)
@@ -171,12 +239,13 @@ class BagFile(RecordFile):
 class McapFile(RecordFile):
     """An MCAP file with the ROS 2 profile. rosbags makes a folder; the file inside becomes `path` in the end."""
 
-    def __init__(self, path: Path) -> None:
-        super().__init__(path)
+    def __init__(self, path: Path, *, sync: bool = False) -> None:
+        super().__init__(path, sync=sync)
         self._writer = Writer2(self.active, version=Writer2.VERSION_LATEST, storage_plugin=StoragePlugin.MCAP)
         self._writer.open()
         assert isinstance(self._writer.storage, McapWriter)
         self._storage = self._writer.storage
+        self._take_lock(self._storage.path)
         self._safe_chunks = 0
         self._safe_position = self._flushed_position()
 
@@ -198,6 +267,12 @@ class McapFile(RecordFile):
         self._safe_position = self._flushed_position()
         self._safe_chunks = len(self._storage.chunks)
         return True
+
+    def _end_chunk(self) -> None:
+        self._storage.close_chunk()
+
+    def _descriptor(self) -> int:
+        return self._storage.bio.fileno()
 
     def _cut_back(self) -> None:
         storage = self._storage
