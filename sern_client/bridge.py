@@ -122,7 +122,8 @@ class Bridge:
         self.summaries = Summaries(self._sender)
         self.rebuilds = Rebuilds()
         self._asked: tuple[str, ...] | None = None  # the patterns we were started with
-        self.keeping = Keeping(keepers_of(endpoint), self._hold, self._release_kept)
+        self.keeping = Keeping(keepers_of(endpoint), self._hold, self._release_kept, self._keep_in)
+        self._keep_timer = Timer(self.keeping.keep_soon)
 
     def attach(self, core: ClientCore) -> None:
         self._core = core
@@ -154,6 +155,7 @@ class Bridge:
         self.summaries.close()
         self._outgoing.clear()
         self._timer.cancel()
+        self._keep_timer.cancel()
         if self.goals is not None:
             self.goals.close()
         for incoming in self._incoming.values():
@@ -377,6 +379,9 @@ class Bridge:
 
     def _hold(self, stream: StreamId, seq: int) -> None:
         self.core.hold(stream, seq)
+
+    def _keep_in(self, delay_s: float) -> None:
+        self._keep_timer.arm(time.monotonic() + delay_s)
 
     def _release_kept(self, stream: StreamId, seq: int, lost: DropReason | None) -> None:
         self.core.release(stream, seq, lost=lost, now=time.monotonic())

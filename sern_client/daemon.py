@@ -384,7 +384,8 @@ class ClientDaemon:
         unconfirmed = sum(len(channel.retained) for channel in link.channels.values())
         if unconfirmed:
             _log.warning("stopping with %d reliable messages that not everyone has confirmed", unconfirmed)
-        await self._keep(give_up_s)
+        if self.bridge.keeping:
+            await self._keep()
         if self._transport is not None:
             self._kick()
             await asyncio.sleep(0.02)  # what has arrived here is confirmed before we say goodbye
@@ -393,13 +394,15 @@ class ClientDaemon:
             self._transport.pump.run()
             await asyncio.sleep(0.05)  # libzmq's thread takes it from here
 
-    async def _keep(self, give_up_s: float) -> None:
-        """Have what was recorded flushed, so that it is confirmed before we say goodbye."""
+    async def _keep(self) -> None:
+        """Have what was recorded flushed, so that all of it is confirmed before we say goodbye, and read nothing more:
+        what comes now the next process gets."""
         keeping = self.bridge.keeping
-        if keeping.pending:
-            keeping.flush()
+        self.core.link.deaf = True
+        keeping.flush()
+        give_up_s = time.monotonic() + PATIENCE_S
         while keeping.pending and time.monotonic() < give_up_s:  # noqa: ASYNC110  (its thread tells the loop)
-            await asyncio.sleep(0.01)
+            await asyncio.sleep(0.005)
 
     def _give_up(self) -> None:
         """Count what is left, so that every message has a fate."""

@@ -117,6 +117,8 @@ class ClientExpress:
         self._kick()
 
     def received(self, connection: "_Connection", data: wire.Datagram) -> None:
+        if self.core.link.deaf:
+            return
         try:
             self.core.link.receive(data, now=time.monotonic(), lane=LANE_EXPRESS)
         except RemoteError as error:

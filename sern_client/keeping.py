@@ -7,6 +7,7 @@ endpoints between the bridge and the file make no difference.
 
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
+from typing import Final
 
 from sern_client.endpoints.base import KeepingEndpoint
 from sern_core.message import StreamId
@@ -20,13 +21,22 @@ Release = Callable[[StreamId, int, DropReason | None], None]
 Numbers = tuple[int, ...]
 
 
-class Keeping:
-    """Holds what waits for `keepers`. `mark` before a message is published, `published` after it."""
+SOON_S: Final = 0.005
+"""So long a reliable message waits at least before it is flushed, so that many are flushed together."""
 
-    def __init__(self, keepers: Sequence[KeepingEndpoint], hold: Hold, release: Release) -> None:
+
+class Keeping:
+    """Holds what waits for `keepers`. `mark` before a message is published, `published` after it. `soon` is called with
+    the delay after which `keep_soon` should be."""
+
+    def __init__(
+        self, keepers: Sequence[KeepingEndpoint], hold: Hold, release: Release, soon: Callable[[float], None]
+    ) -> None:
         self._keepers = list(keepers)
         self._hold = hold
         self._release = release
+        self._soon = soon
+        self._asked = False
         self._waiting: list[deque[tuple[int, StreamId, int]]] = [deque() for _ in self._keepers]  # in order of number
         self._left: dict[tuple[StreamId, int], int] = {}  # message -> keepers that have not kept it
         for index, keeper in enumerate(self._keepers):
@@ -50,11 +60,21 @@ class Keeping:
             return
         self._left[stream, seq] = len(takers)
         self._hold(stream, seq)
+        if not self._asked:
+            self._asked = True
+            self._soon(SOON_S)
         for index in takers:
             self._waiting[index].append((self._keepers[index].taken, stream, seq))
 
+    def keep_soon(self) -> None:
+        """Have what waits kept, if that is cheap."""
+        self._asked = False
+        if self._left:
+            for keeper in self._keepers:
+                keeper.keep_soon()
+
     def flush(self) -> None:
-        """Have everything kept soon."""
+        """Have everything kept now."""
         for keeper in self._keepers:
             keeper.flush()
 

@@ -231,6 +231,8 @@ class RelayTransport:
         self.link.disconnected(now=time.monotonic(), reason=reason)
 
     def received(self, data: wire.Datagram) -> None:
+        if self.link.deaf:
+            return
         try:
             self.link.receive(data, now=time.monotonic())
         except RemoteError as error:

@@ -92,6 +92,8 @@ class ClientLane:
             self._socket.rebind()
 
     def _received(self, data: bytes, now: float) -> None:
+        if self.core.link.deaf:
+            return
         try:
             self.core.link.receive(data, now=now, lane=LANE_UDP)
         except RemoteError as error:

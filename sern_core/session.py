@@ -50,6 +50,8 @@ class Session(Hop):
         self.initiator = initiator
         self.peer_boot: int | None = None
         self.transport_up = False
+        self.deaf = False
+        """The owner reads nothing more, as it is about to end the session: what comes now is another process's."""
         self._handshake_out: deque[bytes] = deque()
         self._hello_due_s: float | None = None
         self._hello_stamp_us = -1

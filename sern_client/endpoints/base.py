@@ -116,7 +116,11 @@ class KeepingEndpoint(Protocol):
         ...
 
     def flush(self) -> None:
-        """Keep what was taken so far as soon as may be."""
+        """Keep what was taken so far now."""
+        ...
+
+    def keep_soon(self) -> None:
+        """Somebody waits for what was taken so far: keep it, unless that would cost too much to be done often."""
         ...
 
 

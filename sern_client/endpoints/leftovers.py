@@ -10,7 +10,6 @@ import fcntl
 import os
 import struct
 from collections import defaultdict
-from collections.abc import Iterator
 from io import BytesIO
 from pathlib import Path
 from typing import BinaryIO, Final, NamedTuple
@@ -33,13 +32,17 @@ from rosbags.rosbag2.storage_mcap import (
     Schema,
     get_qos,
     read_string,
-    write_record,
-    write_string,
-    write_uint16,
-    write_uint32,
-    write_uint64,
 )
 
+from sern_client.endpoints.bag_index import (
+    MCAP_CHUNK,
+    MCAP_RECORD,
+    bag_chunk_head,
+    mcap_chunk_head,
+    mcap_chunk_index,
+    write_bag_index,
+    write_mcap_index,
+)
 from sern_core.errors import ConfigError
 from sern_core.types import Encoding
 from sern_runtime import ros_types
@@ -53,8 +56,12 @@ _MAX_NUMBER: Final = 10_000
 _U32: Final = struct.Struct("<I")
 _U64: Final = struct.Struct("<Q")
 _TIME: Final = struct.Struct("<II")
-_CHUNK_TIMES: Final = struct.Struct("<QQQI")
-_MCAP_RECORD: Final = struct.Struct("<BQ")
+_BAG_HEAD_BYTES: Final = len(bag_chunk_head(0))
+_BAG_TAIL: Final = frozenset({2, 4, 6, 7})
+_MCAP_TAIL: Final = frozenset({2, 3, 4, 5, 7, 8, 11, 12, 13, 14, 15})
+"""Records that may stand behind the last whole chunk of a recording of ours."""
+_MAX_TAIL_BYTES: Final = 4096
+"""So much may stand there that is not even the beginning of a record."""
 _UNREADABLE: Final = (EOFError, ValueError, KeyError, IndexError, struct.error, ReaderError, ConfigError)
 """What bytes that are no record of theirs raise here."""
 
@@ -168,25 +175,32 @@ def _finish_bag(path: Path) -> int:
             raise _BadFileError("its header is damaged") from None
         position = len(_BAG_MAGIC) + _BAG_HEADER_BYTES
         connections: dict[int, Connection] = {}
-        try:
-            while position < size:
+        while position < size:
+            file.seek(position)
+            head = file.read(_BAG_HEAD_BYTES)
+            length = _U32.unpack(head[-4:])[0] if len(head) == _BAG_HEAD_BYTES else 0
+            if not length or head != bag_chunk_head(length):
+                _check_tail(
+                    path, position, size, _bag_op(file, position + (head == bag_chunk_head(0)) * len(head), size)
+                )
+                break
+            chunk, new, whole = _bag_chunk(position, file.read(length), writer)
+            behind = position + len(head) + whole
+            if whole < length:
+                _check_end(path, behind, position + len(head) + length, size)
                 file.seek(position)
-                header, body = _bag_record(file, size)
-                if header["op"] != b"\x05" or header["compression"] != b"none":
-                    break
-                chunk, new = _bag_chunk(position, body, writer)
-                after_chunk = file.tell()
-                position, indexed = _bag_index(file, size, chunk)
-                connections |= {c.id: c for c in new if c.id not in connections}
-                writer.chunks.append(chunk)
-                messages += sum(map(len, chunk.connections.values()))
-                if not indexed:  # cut off in the middle of the chunk's index: write that again
-                    position = after_chunk
-                    file.seek(position)
-                    position = _write_bag_index(file, chunk)
-                    break
-        except _UNREADABLE:
-            pass  # what follows is not whole
+                file.write(bag_chunk_head(whole))
+            connections |= {c.id: c for c in new if c.id not in connections}
+            writer.chunks.append(chunk)
+            messages += sum(map(len, chunk.connections.values()))
+            file.seek(behind)
+            indexed = _bag_index(file, size, chunk) if whole == length else None
+            if indexed is None:  # cut off in the chunk or its index
+                file.seek(behind)
+                write_bag_index(file, chunk.connections)
+                position = file.tell()
+                break
+            position = indexed
         if complete:
             return messages
         file.truncate(position)
@@ -226,58 +240,75 @@ def _fields(data: bytes) -> dict[str, bytes]:
     return fields
 
 
-def _bag_chunk(position: int, body: bytes, owner: Writer1) -> tuple[WriteChunk, list[Connection]]:
+def _bag_chunk(position: int, body: bytes, owner: Writer1) -> tuple[WriteChunk, list[Connection], int]:
+    """What the chunk at `position` holds, its connections, and how many of its bytes are whole records."""
     chunk = WriteChunk(BytesIO(), position, MAX_TIME, 0, defaultdict(list))
     connections: list[Connection] = []
     inner = BytesIO(body)
-    while inner.tell() < len(body):
-        offset = inner.tell()
-        header, data = _bag_record(inner, len(body))
-        number = _U32.unpack(header["conn"])[0]
-        if header["op"] == b"\x07":
-            fields = _fields(data)
-            latching = fields.get("latching")
-            extension = ConnectionExtRosbag1(
-                fields["callerid"].decode() if "callerid" in fields else None,
-                None if latching is None else int(latching),
-            )
-            definition = MessageDefinition(MessageDefinitionFormat.MSG, fields["message_definition"].decode())
-            type_name = ros_types.canonical(fields["type"].decode())
-            topic, digest = header["topic"].decode(), fields["md5sum"].decode()
-            connections.append(Connection(number, topic, type_name, definition, digest, -1, extension, owner))
-        elif header["op"] == b"\x02":
-            seconds, nanoseconds = _TIME.unpack(header["time"])
-            stamp_ns = seconds * 10**9 + nanoseconds
-            chunk.start, chunk.end = min(chunk.start, stamp_ns), max(chunk.end, stamp_ns)
-            chunk.connections[number].append((stamp_ns, offset))
-    return chunk, connections
+    offset = 0
+    try:
+        while offset < len(body):
+            header, data = _bag_record(inner, len(body))
+            number = _U32.unpack(header["conn"])[0]
+            if header["op"] == b"\x07":
+                connections.append(_bag_connection(number, header["topic"].decode(), _fields(data), owner))
+            elif header["op"] == b"\x02":
+                seconds, nanoseconds = _TIME.unpack(header["time"])
+                stamp_ns = seconds * 10**9 + nanoseconds
+                chunk.start, chunk.end = min(chunk.start, stamp_ns), max(chunk.end, stamp_ns)
+                chunk.connections[number].append((stamp_ns, offset))
+            else:
+                break
+            offset = inner.tell()
+    except _UNREADABLE:
+        pass  # the rest is not whole
+    return chunk, connections, offset
 
 
-def _bag_index(file: BinaryIO, size: int, chunk: WriteChunk) -> tuple[int, bool]:
-    """(position behind the index records of a chunk, whether they are all there)."""
+def _bag_connection(number: int, topic: str, fields: dict[str, bytes], owner: Writer1) -> Connection:
+    latching = fields.get("latching")
+    extension = ConnectionExtRosbag1(
+        fields["callerid"].decode() if "callerid" in fields else None, None if latching is None else int(latching)
+    )
+    definition = MessageDefinition(MessageDefinitionFormat.MSG, fields["message_definition"].decode())
+    type_name = ros_types.canonical(fields["type"].decode())
+    return Connection(number, topic, type_name, definition, fields["md5sum"].decode(), -1, extension, owner)
+
+
+def _bag_op(file: BinaryIO, position: int, size: int) -> int | None:
+    """What kind of record stands there; None where that cannot be told."""
+    file.seek(position)
+    try:
+        return _fields(_exact(file, _U32.unpack(_exact(file, 4, size))[0], size))["op"][0]
+    except _UNREADABLE:
+        return None
+
+
+def _check_tail(path: Path, position: int, size: int, op: int | None) -> None:
+    """What stands behind the last chunk is cut off only if it is ours: content that its head does not count yet, or
+    the beginning of the index of the whole file."""
+    ours = _BAG_TAIL if path.suffix == ACTIVE else _MCAP_TAIL
+    if op not in ours if op is not None else size - position > _MAX_TAIL_BYTES:
+        raise _BadFileError(f"at byte {position} stands what SERN does not write; it may be another program's")
+
+
+def _check_end(path: Path, whole: int, end: int, size: int) -> None:
+    """A damaged chunk is cut back only if it is the last thing in the file."""
+    if end < size:
+        raise _BadFileError(f"it is damaged at byte {whole}, and more follows")
+
+
+def _bag_index(file: BinaryIO, size: int, chunk: WriteChunk) -> int | None:
+    """The position behind the index records of a chunk; None when they are not all there."""
     left = {number for number, entries in chunk.connections.items() if entries}
-    position = file.tell()
-    while left:
-        try:
+    try:
+        while left:
             header, _ = _bag_record(file, size)
             if header["op"] != b"\x04":
-                return position, False
+                return None
             left.discard(_U32.unpack(header["conn"])[0])
-        except _UNREADABLE:
-            return position, False
-        position = file.tell()
-    return position, True
-
-
-def _write_bag_index(file: BinaryIO, chunk: WriteChunk) -> int:
-    for number, entries in chunk.connections.items():
-        if entries:
-            conn, count = _U32.pack(number), _U32.pack(len(entries))
-            values = (b"op=\x04", b"ver=" + _U32.pack(1), b"conn=" + conn, b"count=" + count)
-            header = b"".join(_U32.pack(len(value)) + value for value in values)
-            file.write(_U32.pack(len(header)) + header + _U32.pack(12 * len(entries)))
-            for stamp_ns, offset in entries:
-                file.write(_TIME.pack(*divmod(stamp_ns, 10**9)) + _U32.pack(offset))
+    except _UNREADABLE:
+        return None
     return file.tell()
 
 
@@ -294,55 +325,47 @@ class _Scan:
         self.counts: dict[int, int] = {}
         self.start_ns, self.end_ns = MAX_TIME, 0
 
-    def chunk(self, body: bytes) -> dict[int, list[tuple[int, int]]]:
-        """Take in a chunk record; its messages by channel, as (time, offset)."""
-        start_ns, end_ns, _size, _crc = _CHUNK_TIMES.unpack_from(body)
-        source = BytesIO(body)
-        source.seek(_CHUNK_TIMES.size)
-        if read_string(source):
-            raise ValueError("it is compressed")
-        records = body[source.tell() + 8 :]
+    def chunk(self, records: bytes) -> tuple[dict[int, list[tuple[int, int]]], int]:
+        """Take in the content of a chunk: its messages by channel, as (time, offset), and how many of its bytes are
+        whole records."""
         entries: dict[int, list[tuple[int, int]]] = {}
-        for offset, op, data in _mcap_records(records):
-            if op == 0x03:
-                inner = BytesIO(data)
-                number = int.from_bytes(inner.read(2), "little")
-                schema = Schema(number, read_string(inner), read_string(inner), read_string(inner))
-                self.schemas.setdefault(number, schema)
-            elif op == 0x04:
-                inner = BytesIO(data)
-                number, of = int.from_bytes(inner.read(2), "little"), int.from_bytes(inner.read(2), "little")
-                topic, encoding = read_string(inner), read_string(inner)
-                metadata = inner.read()[4:]
-                self.channels.setdefault(number, Channel(number, self.schemas[of].name, topic, encoding, metadata))
-            elif op == 0x05:
-                number, stamp_ns = int.from_bytes(data[:2], "little"), _U64.unpack_from(data, 6)[0]
-                if number not in self.channels:
-                    raise ValueError("a message of no channel")
-                entries.setdefault(number, []).append((stamp_ns, offset))
+        offset = 0
+        try:
+            while offset < len(records):
+                op, length = MCAP_RECORD.unpack_from(records, offset)
+                begin = offset + MCAP_RECORD.size
+                data = records[begin : begin + length]
+                if len(data) < length or not self._record(op, data, offset, entries):
+                    break
+                offset = begin + length
+        except _UNREADABLE:
+            pass  # the rest is not whole
         for number, found in entries.items():
             self.counts[number] = self.counts.get(number, 0) + len(found)
-        if entries:
-            self.start_ns, self.end_ns = min(self.start_ns, start_ns), max(self.end_ns, end_ns)
-        return entries
+            self.start_ns = min(self.start_ns, *(stamp_ns for stamp_ns, _ in found))
+            self.end_ns = max(self.end_ns, *(stamp_ns for stamp_ns, _ in found))
+        return entries, offset
 
-
-def _mcap_records(data: bytes) -> Iterator[tuple[int, int, bytes]]:
-    """(offset, opcode, content) of every record; EOFError when the last one is not whole."""
-    position = 0
-    while position < len(data):
-        if position + _MCAP_RECORD.size > len(data):
-            raise EOFError
-        op, length = _MCAP_RECORD.unpack_from(data, position)
-        begin = position + _MCAP_RECORD.size
-        if begin + length > len(data):
-            raise EOFError
-        yield position, op, data[begin : begin + length]
-        position = begin + length
+    def _record(self, op: int, data: bytes, offset: int, entries: dict[int, list[tuple[int, int]]]) -> bool:
+        """Take in one record of a chunk. False for one that no chunk of ours holds."""
+        inner = BytesIO(data)
+        number = int.from_bytes(inner.read(2), "little")
+        if op == 0x03:
+            schema = Schema(number, read_string(inner), read_string(inner), read_string(inner))
+            self.schemas.setdefault(number, schema)
+        elif op == 0x04:
+            of = int.from_bytes(inner.read(2), "little")
+            topic, encoding = read_string(inner), read_string(inner)
+            self.channels.setdefault(number, Channel(number, self.schemas[of].name, topic, encoding, inner.read()[4:]))
+        elif op == 0x05 and number in self.channels:
+            entries.setdefault(number, []).append((_U64.unpack_from(data, 6)[0], offset))
+        else:
+            return False
+        return True
 
 
 def _mcap_record(file: BinaryIO, size: int) -> tuple[int, bytes]:
-    op, length = _MCAP_RECORD.unpack(_exact(file, _MCAP_RECORD.size, size))
+    op, length = MCAP_RECORD.unpack(_exact(file, MCAP_RECORD.size, size))
     return op, _exact(file, length, size)
 
 
@@ -359,20 +382,36 @@ def _finish_mcap(path: Path, folder: Path) -> int:
         except _UNREADABLE:
             raise _BadFileError("its header is damaged") from None
         position = file.tell()
-        try:
-            while position < size:
-                begin = position
-                op, body = _mcap_record(file, size)
-                if op == 0x0C:
-                    complete = _ends_whole(file, size)
-                if op != 0x06:
-                    break
-                entries = scan.chunk(body)
-                behind = file.tell()
-                position = _mcap_index(file, size, behind, entries)
-                scan.chunks.append(_chunk_index(body, begin, behind, position, entries))
-        except _UNREADABLE:
-            pass  # what follows is not whole
+        while position < size:
+            begin = position
+            file.seek(begin)
+            head = file.read(MCAP_CHUNK.size)
+            fields = MCAP_CHUNK.unpack(head) if len(head) == MCAP_CHUNK.size else None
+            if fields is None or not fields[-1] or head != mcap_chunk_head(fields[2], fields[3], fields[-1]):
+                ours = fields is not None and head == mcap_chunk_head(fields[2], fields[3], 0)
+                tail = begin + ours * len(head)
+                file.seek(tail)
+                op = file.read(1)
+                complete = op == b"\x0c" and _ends_whole(file, size)
+                _check_tail(path, begin, size, op[0] if op else None)
+                break
+            length = fields[-1]
+            entries, whole = scan.chunk(file.read(length))
+            times = [stamp_ns for found in entries.values() for stamp_ns, _ in found]
+            start_ns, end_ns = min(times, default=fields[2]), max(times, default=fields[3])
+            behind = begin + len(head) + whole
+            if whole < length:
+                _check_end(path, behind, begin + len(head) + length, size)
+                file.seek(begin)
+                file.write(mcap_chunk_head(start_ns, end_ns, whole))
+            file.seek(behind)
+            position = _mcap_index(file, size, behind, entries if whole == length else None)
+            if position < 0:  # cut off in the chunk or its index
+                file.seek(behind)
+                file.truncate()
+                write_mcap_index(file, entries)
+                position = size = file.tell()
+            scan.chunks.append(mcap_chunk_index(start_ns, end_ns, begin, behind, entries))
         if not complete:
             file.truncate(position)
             file.seek(position)
@@ -386,50 +425,20 @@ def _ends_whole(file: BinaryIO, size: int) -> bool:
     return file.read() == _MCAP_MAGIC
 
 
-def _mcap_index(file: BinaryIO, size: int, behind: int, entries: dict[int, list[tuple[int, int]]]) -> int:
-    """The position behind the index records of a chunk; they are written again where they are not all there."""
+def _mcap_index(file: BinaryIO, size: int, behind: int, entries: dict[int, list[tuple[int, int]]] | None) -> int:
+    """The position behind the index records of a chunk; -1 when they are not all there, or the chunk is not whole."""
+    if entries is None:
+        return -1
     left = set(entries)
-    position = behind
     try:
         while left:
             op, body = _mcap_record(file, size)
             if op != 0x07:
-                break
+                return -1
             left.discard(int.from_bytes(body[:2], "little"))
-            position = file.tell()
     except EOFError:
-        pass
-    if not left:
-        return position
-    file.seek(behind)
-    file.truncate()
-    for number, found in entries.items():
-        record = BytesIO()
-        write_uint16(record, number)
-        write_uint32(record, len(found) * 16)
-        for stamp_ns, offset in found:
-            write_uint64(record, stamp_ns)
-            write_uint64(record, offset)
-        write_record(file, 0x07, record)
+        return -1
     return file.tell()
-
-
-def _chunk_index(body: bytes, begin: int, behind: int, end: int, entries: dict[int, list[tuple[int, int]]]) -> BytesIO:
-    start_ns, end_ns, raw_bytes, _crc = _CHUNK_TIMES.unpack_from(body)
-    record = BytesIO()
-    for value in (start_ns, end_ns, begin, behind - begin):
-        write_uint64(record, value)
-    write_uint32(record, len(entries) * 10)
-    position = behind
-    for number, found in entries.items():
-        write_uint16(record, number)
-        write_uint64(record, position)
-        position += _MCAP_RECORD.size + 6 + 16 * len(found)
-    write_uint64(record, end - behind)
-    write_string(record, "")
-    write_uint64(record, raw_bytes)
-    write_uint64(record, raw_bytes)
-    return record
 
 
 def _end_mcap(file: BinaryIO, path: Path, folder: Path, scan: _Scan) -> None:

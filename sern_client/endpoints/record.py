@@ -2,10 +2,10 @@
 
 Files grow under `<name>.active` and get their own name when they are complete, so a file with its own name is always
 readable. One thread writes; the event loop only appends to a bounded buffer. What was written is flushed to the
-operating system at each megabyte and `flush_s` after it came, and said to be kept from then on (`KeepingEndpoint`): it
-survives the end of this process, however that comes, and with `sync` that of the machine. What a killed process left is
-finished by the next one, under a name of its own (leftovers.py). When the disk refuses, the file is finished with what
-it already holds, and everything later is counted as dropped.
+operating system at each megabyte, `flush_s` after it came, and when asked, and said to be kept from then on
+(`KeepingEndpoint`): it survives the end of this process, however that comes, and with `sync` that of the machine. What
+a killed process left is finished by the next one, under a name of its own (leftovers.py). When the disk refuses, the
+file is finished with what it already holds, and everything later is counted as dropped.
 """
 
 import asyncio
@@ -217,6 +217,11 @@ class RecordEndpoint:
     def flush(self) -> None:
         """Flush what was taken so far, without waiting for `flush_s`."""
         self._jobs.put(_Order.FLUSH)
+
+    def keep_soon(self) -> None:
+        """Flush what was taken so far; to the disk itself (`sync`) only every `flush_s`."""
+        if not self.options.sync:
+            self.flush()
 
     def take(self, job: _Job) -> None:
         """Buffer one message for the writer thread; called by this recorder's publishers on the event loop."""

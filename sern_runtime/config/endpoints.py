@@ -159,7 +159,8 @@ class RecordEndpoint(EndpointBase):
     """What may wait for the disk; beyond, messages are dropped and counted."""
     flush_s: Annotated[float, Field(gt=0, le=60)] = 1.0
     """Longest time, in seconds, before a message is given to the operating system and so survives the end of this
-    process, however it ends. A reliable message is confirmed to its sender then. At a megabyte it is done earlier."""
+    process, however it ends. A reliable message is confirmed to its sender then; without `sync` that is done after
+    some milliseconds. At a megabyte it is done earlier."""
     sync: bool = False
     """Have each flush written to the disk itself (fsync), so that what is confirmed survives a power cut as well."""
 

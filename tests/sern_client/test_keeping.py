@@ -17,7 +17,7 @@ class FakeKeeper:
     def __init__(self) -> None:
         self.taken = 0
         self.told: KeptUpTo = lambda upto, lost: None
-        self.flushes = 0
+        self.flushes = self.asked = 0
 
     def watch_kept(self, told: KeptUpTo) -> None:
         self.told = told
@@ -25,13 +25,20 @@ class FakeKeeper:
     def flush(self) -> None:
         self.flushes += 1
 
+    def keep_soon(self) -> None:
+        self.asked += 1
+
 
 class Bench:
     def __init__(self, keepers: int) -> None:
         self.keepers = [FakeKeeper() for _ in range(keepers)]
         self.held: list[int] = []
         self.released: dict[int, DropReason | None] = {}
-        self.keeping = Keeping(self.keepers, lambda stream, seq: self.held.append(seq), self._release)
+        self.delays: list[float] = []
+        self.keeping = Keeping(self.keepers, self._hold, self._release, self.delays.append)
+
+    def _hold(self, stream: StreamId, seq: int) -> None:
+        self.held.append(seq)
 
     def _release(self, stream: StreamId, seq: int, lost: DropReason | None) -> None:
         assert stream == STREAM and seq in self.held and seq not in self.released
@@ -64,6 +71,20 @@ def test_only_what_was_taken_waits_and_all_takers_must_have_kept_it() -> None:
     assert bench.released == {1: None, 3: DropReason.STORAGE} and bench.keeping.pending == 0
     bench.keeping.flush()
     assert [keeper.flushes for keeper in bench.keepers] == [1, 1]
+
+
+def test_many_are_kept_together() -> None:
+    bench = Bench(1)
+    for seq in range(1, 4):
+        bench.publish(seq, 0)
+    assert len(bench.delays) == 1
+    bench.keeping.keep_soon()
+    assert bench.keepers[0].asked == 1
+    bench.publish(4, 0)
+    assert len(bench.delays) == 2
+    bench.keepers[0].told(4, {})
+    bench.keeping.keep_soon()  # nothing waits any more
+    assert bench.keepers[0].asked == 1
 
 
 def test_a_message_that_did_not_get_into_the_buffer_is_lost_before_those_ahead_of_it_are_kept() -> None:

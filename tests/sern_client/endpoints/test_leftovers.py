@@ -103,6 +103,24 @@ async def test_a_finished_file_is_finished_again_without_change(encoding: Encodi
 
 
 @ENCODINGS
+async def test_damage_in_the_middle_and_what_others_wrote_is_kept_as_it_is(encoding: Encoding, tmp_path: Path) -> None:
+    """A file is cut only where it ends: more behind the damage would be lost."""
+    left, _ = await interrupted(tmp_path, encoding)
+    raw = bytearray(growing(left).read_bytes())
+    at = raw.index(bytes([1, 0]) * 20)
+    raw[at - 60 : at - 10] = b"\xff" * 50
+    raw += b"\x05" * 9000
+    growing(left).write_bytes(raw)
+    done = finish(left)
+    assert done.messages is None and done.path.name.endswith(".broken") and "damaged at byte" in done.problem
+    assert growing(done.path).read_bytes() == raw
+    other = tmp_path / "other.bag.active"
+    header = bytes(raw[: 13 + 4096]) if encoding is Encoding.ROS1 else b"#ROSBAG V2.0\n" + b"\0" * 4096
+    other.write_bytes(header + b"\x05" * 9000)
+    assert finish(other).messages is None and (tmp_path / "other.bag.broken").stat().st_size == 4109 + 9000
+
+
+@ENCODINGS
 @pytest.mark.parametrize("content", [b"", b"precious", b"#ROSBAG V2.0\nno", b"\x89MCAP0\r\n"])
 async def test_what_cannot_be_read_is_moved_aside(
     encoding: Encoding, content: bytes, tmp_path: Path, caplog: pytest.LogCaptureFixture
