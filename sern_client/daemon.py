@@ -370,7 +370,7 @@ class ClientDaemon:
         give_up_s = now + self.loaded.model.link.drain_s
         while now < give_up_s:
             channels = [channel for channel in link.channels.values() if channel.wanted is not False]
-            unsent = sum(len(channel.queue) + len(channel.flying) for channel in channels) + self.bridge.pending
+            unsent = sum(len(c.queue) + len(c.flying) + (c.newest is not None) for c in channels) + self.bridge.pending
             unconfirmed = sum(len(channel.retained) for channel in channels)
             if not unconfirmed and (not unsent or not link.established or link.lane.stalled):
                 break

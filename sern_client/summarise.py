@@ -429,6 +429,8 @@ class SummarisedTopic:
         self._channel = channel
         self._raw = raw
         self._cap = cap
+        self._newest: tuple[bytes, int, float] | None = None  # held back by the cap: body, stamp, when it came
+        self._timer: Timer | None = None
 
     @property
     def sends_raw(self) -> bool:
@@ -440,14 +442,32 @@ class SummarisedTopic:
     def sink(self, body: bytes, stamp_ns: int) -> bool:
         """A `Sink`. False: what counts most was refused, the topic itself or its only summary."""
         now = time.monotonic()
-        if not self._cap.allows(now):
-            self._core.drop(self._channel, len(body), DropReason.RATE_CAP, now=now)
-            return True
+        if self._newest is not None:
+            self._drop_newest(DropReason.RATE_CAP)
+        if self._cap.allows(now):
+            return self._pass(body, stamp_ns, now)
+        self._newest = (body, stamp_ns, now)  # the last of a series goes when its time comes
+        if self._timer is None:
+            self._timer = Timer(self._due)
+        self._timer.arm(self._cap.next_s)
+        return True
+
+    def _due(self) -> None:
+        if self._newest is not None and self._cap.allows(time.monotonic()):
+            newest, self._newest = self._newest, None
+            self._pass(*newest)
+
+    def _pass(self, body: bytes, stamp_ns: int, born_s: float) -> bool:
         raw = self.sends_raw
-        if raw and not self._raw(body, stamp_ns, now):
+        if raw and not self._raw(body, stamp_ns, born_s):
             return False
-        accepted = [output.offer(body, stamp_ns, now) for output in self.outputs]
+        accepted = [output.offer(body, stamp_ns, born_s) for output in self.outputs]
         return raw or len(accepted) > 1 or accepted[0]
+
+    def _drop_newest(self, reason: DropReason) -> None:
+        newest, self._newest = self._newest, None
+        if newest is not None:
+            self._core.drop(self._channel, len(newest[0]), reason, now=time.monotonic())
 
     def owns(self, stream: StreamId) -> bool:
         return any(output.owns(stream) for output in self.outputs)
@@ -458,7 +478,7 @@ class SummarisedTopic:
 
     @property
     def pending(self) -> int:
-        return sum(output.pending for output in self.outputs)
+        return (self._newest is not None) + sum(output.pending for output in self.outputs)
 
     def audience_changed(self) -> None:
         for output in self.outputs:
@@ -471,6 +491,9 @@ class SummarisedTopic:
 
     def close(self) -> None:
         now = time.monotonic()
+        if self._timer is not None:
+            self._timer.cancel()
+        self._drop_newest(DropReason.SHUTDOWN)
         for output in self.outputs:
             output.close()
             if output.channel is not self._channel:
