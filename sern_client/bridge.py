@@ -33,6 +33,7 @@ from sern_core.types import DropReason, Encoding, TopicName
 from sern_runtime import ros_types
 from sern_runtime.link_metrics import AgeHistograms
 from sern_runtime.loop import Timer
+from sern_runtime.optional import OptionalParts
 
 MAX_PROBLEMS: Final = 256
 
@@ -87,7 +88,9 @@ class Bridge:
         kick: Callable[[], None],
         on_up: Callable[[], None],
         on_down: Callable[[str], None],
+        parts: OptionalParts | None = None,
     ) -> None:
+        self.parts = parts or OptionalParts()
         self.endpoint = endpoint
         self.rules = rules
         self.discovery = discovery
@@ -119,7 +122,7 @@ class Bridge:
         self._incoming: dict[StreamId, Incoming] = {}
         self._last_arrival_s: dict[StreamId, float] = {}
         self._timer = Timer(self._leases_due)
-        self.summaries = Summaries(self._sender)
+        self.summaries = Summaries(self._sender, self.parts)
         self.rebuilds = Rebuilds()
         self._asked: tuple[str, ...] | None = None  # the patterns we were started with
         self.keeping = Keeping(keepers_of(endpoint), self._hold, self._release_kept, self._keep_in)
@@ -248,7 +251,7 @@ class Bridge:
         return self._send(channel, self.frames.outgoing(info))
 
     def _send(self, channel: OutChannel, rewrite: Rewrite | None) -> Callable[[bytes, int, float | None], bool]:
-        core, kick, log, stream = self.core, self._kick, self._log, channel.stream
+        core, kick, log, stream, parts = self.core, self._kick, self._log, channel.stream, self.parts
 
         def send(body: bytes, stamp_ns: int, born_s: float | None) -> bool:
             seq = channel.next_seq
@@ -256,7 +259,10 @@ class Bridge:
                 body = rewrite(body)
             accepted = core.send(channel, body, stamp_ns, born_s=born_s, now=time.monotonic())
             if log is not None:
-                log.offered(stream, seq, body, stamp_ns, accepted=accepted)
+                try:
+                    log.offered(stream, seq, body, stamp_ns, accepted=accepted)
+                except Exception as error:  # noqa: BLE001  (of the log alone)
+                    parts.failed("message_log", error)
             kick()
             return accepted
 
@@ -336,7 +342,12 @@ class Bridge:
 
     def _show(self, incoming: Incoming, body: bytes, stamp_ns: int, left_s: float = inf) -> None:
         """Publish what came, or was put together here."""
-        self._publish(incoming, body if incoming.rewrite is None else incoming.rewrite(body), stamp_ns, left_s)
+        if incoming.rewrite is not None:
+            try:
+                body = incoming.rewrite(body)
+            except Exception as error:  # noqa: BLE001  (as it came is better than not at all)
+                self.parts.failed("frames", error)
+        self._publish(incoming, body, stamp_ns, left_s)
 
     def stream_closed(self, stream: StreamInfo) -> None:
         self.rebuilds.closed(stream)
@@ -368,14 +379,20 @@ class Bridge:
                 self._show(incoming, message.body, message.stamp_ns, left_s)
         if self.goals is not None:
             self.goals.message(incoming.local, stream.info.encoding, message.body)
-        self.ages.observe(stream.spec.priority, age_s)
-        if stream.spec.deadline_s is not None:
-            self._check_deadline(stream, now)
+        try:
+            self.ages.observe(stream.spec.priority, age_s)
+            if stream.spec.deadline_s is not None:
+                self._check_deadline(stream, now)
+        except Exception as error:  # noqa: BLE001  (of what is counted alone)
+            self.parts.failed("metrics", error)
         if incoming.lease is not None:
             incoming.lease.renew(born_s=message.born_s)
             self._arm()
-        if self._log is not None:
-            self._log.delivered(stream, message, age_s)
+        try:
+            if self._log is not None:
+                self._log.delivered(stream, message, age_s)
+        except Exception as error:  # noqa: BLE001  (of the log alone)
+            self.parts.failed("message_log", error)
 
     def _hold(self, stream: StreamId, seq: int) -> None:
         self.core.hold(stream, seq)

@@ -41,6 +41,7 @@ from sern_runtime.keys import load_public, load_secret
 from sern_runtime.link_metrics import register_codecs, register_links, register_received
 from sern_runtime.loop import Shutdown
 from sern_runtime.metrics import Metrics
+from sern_runtime.optional import OptionalParts
 from sern_runtime.sdnotify import Notifier, Watchdog
 from sern_runtime.topics_view import TopicView, both_ways
 
@@ -77,6 +78,7 @@ class ClientDaemon:
         model = loaded.model
         self.notifier = Notifier.from_environment()
         endpoint = make_endpoint(loaded)
+        self.parts = OptionalParts("adaptation", "codecs", "frames", "http", "message_log", "metrics", "summaries")
         self.message_log = MessageLog(loaded.resolve(model.message_log)) if model.message_log else None
         self.bridge = Bridge(
             endpoint,
@@ -88,12 +90,13 @@ class ClientDaemon:
             kick=self._kick,
             on_up=self._link_up,
             on_down=self._link_down,
+            parts=self.parts,
         )
         now = time.monotonic()
         for index, section in enumerate(model.topics):
             for problem in filter(None, map(missing, section.lossy)):
                 raise ConfigError(problem, file=str(loaded.path), key=f"topics.{index}.lossy")
-        self.codecs = CodecPool(after=self._kick)
+        self.codecs = CodecPool(after=self._kick, parts=self.parts)
         self.core = ClientCore(
             name=model.name,
             boot=secrets.randbits(63),
@@ -135,6 +138,7 @@ class ClientDaemon:
                 kick=self._kick,
                 rules=self.bridge.rules.rules,
                 summaries=lambda: self.bridge.summaries.topics,
+                parts=self.parts,
             )
 
     def _serve_services(self, endpoint: Endpoint) -> None:
@@ -200,7 +204,8 @@ class ClientDaemon:
             )
         self.tasks.append(asyncio.create_task(self._tick(), name="client-tick"))
         if self.adaptation is not None:
-            self.tasks.append(asyncio.create_task(self.adaptation.run(), name="adaptation"))
+            kept = self.parts.keep("adaptation", self.adaptation.run, reset=self.adaptation.reset)
+            self.tasks.append(asyncio.create_task(kept, name="adaptation"))
         self.notifier.ready(f"{model.name} -> {relay.endpoint}")
         _log.info("client %s started, relay %s", model.name, relay.endpoint)
 
@@ -232,7 +237,8 @@ class ClientDaemon:
         while True:
             await asyncio.sleep(TICK_S)
             if self.message_log is not None:
-                self.message_log.flush()
+                with self.parts.survive("message_log"):
+                    self.message_log.flush()
             link = self.core.link
             if self._lane is not None:
                 self._lane.tick()
@@ -284,6 +290,7 @@ class ClientDaemon:
             ("reason",),
             endpoint_drops,
         )
+        self.parts.register(metrics)
         adaptation = self.adaptation
         if adaptation is not None:
             adaptation.register(metrics)
@@ -340,6 +347,7 @@ class ClientDaemon:
                 "/api/trace": self.core.trace.to_json,
                 **({} if adaptation is None else {"/api/mmcf": adaptation.to_json}),
             },
+            parts=self.parts,
         )
 
     def _service_calls(self) -> list[tuple[tuple[str, str], float]]:

@@ -300,6 +300,30 @@ async def test_the_topic_itself_goes_at_level_raw_or_beside(bench: Bench) -> Non
     assert raw[-1] == b"e" and bench.dropped(channel) == {DropReason.RATE_CAP: 1, DropReason.SHUTDOWN: 1}
 
 
+@pytest.mark.parametrize("size", [10, 200_000])
+async def test_a_fault_of_ours_is_counted_and_the_message_is_unreadable(bench: Bench, size: int) -> None:
+    own = bench.channel("/robot1/points/voxel")
+
+    def work(job: Job) -> tuple[tuple[int, bytes], ...]:
+        if job.stamp_ns == 1:
+            raise ZeroDivisionError("injected")
+        return ((0, b"made"),)
+
+    summary = bench.summary(VoxelParams(), (own,), work=work)
+    assert summary.offer(bytes(size), 1, 0.0)
+    await until(lambda: not summary.pending)
+    assert summary.undecodable == summary.failures == 1 and bench.dropped(own) == {DropReason.UNDECODABLE: 1}
+    assert summary.offer(bytes(size), 2, 0.0)
+    await until(lambda: bench.sent == [b"made"])
+
+
+async def test_a_dead_thread_is_done_without(bench: Bench) -> None:
+    own = bench.channel("/robot1/points/voxel")
+    summary = bench.summary(VoxelParams(), (own,), work=lambda _job: ((0, b"made"),))
+    bench.executor.shutdown()
+    assert summary.offer(bytes(200_000), 1, 0.0) and bench.sent == [b"made"] and summary.failures == 1
+
+
 async def test_the_last_of_a_capped_series_goes_when_its_time_comes(bench: Bench) -> None:
     channel = bench.channel()
     raw: list[tuple[bytes, int]] = []
