@@ -122,6 +122,7 @@ class ClientCore:
             now=now,
             lossless=lossless,
         )
+        self.link.on_stray = self.received.stray
         if coder is not None:
             self.link.encode_with(coder)
 

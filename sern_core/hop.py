@@ -76,6 +76,8 @@ class Hop(Sender):
             known = self.incoming.get(channel)
             if known is None:
                 self.strays += 1
+                if offset == 0 and self.on_stray is not None:
+                    self.on_stray()
                 return
             stream = known
         wide = wire.widen_seq(seq, stream.delivered)

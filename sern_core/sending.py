@@ -116,7 +116,9 @@ class Sender(ABC):
         """Called when the peer has a message whole: channel, message, now."""
         self.wire_bytes = 0
         """Bytes of numbered datagrams sent so far, second copies and headers included."""
-        self.strays = 0  # fragments of streams that are unknown here (drop reason `unknown_channel`)
+        self.strays = 0  # fragments of streams that are unknown here
+        self.on_stray: Callable[[], None] | None = None
+        """Called for each message of a stream that is unknown here (drop reason `unknown_channel`)."""
         self.channels: dict[int, OutChannel] = {}
         self.incoming: dict[int, InStream] = {}
         """Streams of the session by the peer's channel number."""
