@@ -9,10 +9,11 @@ from typing import Final
 
 from sern_client.actions import GoalWatch
 from sern_client.conversion import Converter
-from sern_client.endpoints.base import Endpoint, Publisher, Subscription, publisher_within
+from sern_client.endpoints.base import Endpoint, Publisher, Subscription, keepers_of, publisher_within
 from sern_client.endpoints.composite import CompositeEndpoint
 from sern_client.frames import FramePrefixer, Rewrite
 from sern_client.guard import Guard
+from sern_client.keeping import Keeping
 from sern_client.message_log import MessageLog
 from sern_client.rebuild import Rebuilds
 from sern_client.services import ServiceBridge
@@ -34,6 +35,8 @@ from sern_core.types import DropReason, Encoding, TopicName
 from sern_runtime import clock, ros_types
 from sern_runtime.fine_timer import fine_timer
 from sern_runtime.link_metrics import AgeHistograms
+from sern_runtime.loop import Timer
+from sern_runtime.optional import OptionalParts
 
 MAX_PROBLEMS: Final = 256
 
@@ -90,7 +93,9 @@ class Bridge:
         on_up: Callable[[], None],
         on_down: Callable[[str], None],
         on_fault: Callable[[Exception], None],
+        parts: OptionalParts | None = None,
     ) -> None:
+        self.parts = parts or OptionalParts()
         self.endpoint = endpoint
         self.rules = rules
         self.discovery = discovery
@@ -125,9 +130,11 @@ class Bridge:
         self._incoming: dict[StreamId, Incoming] = {}
         self._last_arrival_s: dict[StreamId, float] = {}
         self._timer = fine_timer(self._leases_due)  # one that is due while the machine sleeps is due when it wakes
-        self.summaries = Summaries(self._sender)
+        self.summaries = Summaries(self._sender, self.parts)
         self.rebuilds = Rebuilds()
         self._asked: tuple[str, ...] | None = None  # the patterns we were started with
+        self.keeping = Keeping(keepers_of(endpoint), self._hold, self._release_kept, self._keep_in)
+        self._keep_timer = Timer(self.keeping.keep_soon)
 
     def attach(self, core: ClientCore) -> None:
         self._core = core
@@ -159,6 +166,7 @@ class Bridge:
         self.summaries.close()
         self._outgoing.clear()
         self._timer.close()
+        self._keep_timer.cancel()
         if self.goals is not None:
             self.goals.close()
         for incoming in self._incoming.values():
@@ -253,7 +261,7 @@ class Bridge:
         return self._send(channel, self.frames.outgoing(info))
 
     def _send(self, channel: OutChannel, rewrite: Rewrite | None) -> Callable[[bytes, int, float | None], bool]:
-        core, kick, log, stream = self.core, self._kick, self._log, channel.stream
+        core, kick, log, stream, parts = self.core, self._kick, self._log, channel.stream, self.parts
 
         def send(body: bytes, stamp_ns: int, born_s: float | None) -> bool:
             seq = channel.next_seq
@@ -261,7 +269,10 @@ class Bridge:
                 body = rewrite(body)
             accepted = core.send(channel, body, stamp_ns, born_s=born_s, now=clock.now())
             if log is not None:
-                log.offered(stream, seq, body, stamp_ns, accepted=accepted)
+                try:
+                    log.offered(stream, seq, body, stamp_ns, accepted=accepted)
+                except Exception as error:  # noqa: BLE001  (of the log alone)
+                    parts.failed("message_log", error)
             kick()
             return accepted
 
@@ -343,7 +354,12 @@ class Bridge:
 
     def _show(self, incoming: Incoming, body: bytes, stamp_ns: int, left_s: float = inf) -> None:
         """Publish what came, or was put together here."""
-        self._publish(incoming, body if incoming.rewrite is None else incoming.rewrite(body), stamp_ns, left_s)
+        if incoming.rewrite is not None:
+            try:
+                body = incoming.rewrite(body)
+            except Exception as error:  # noqa: BLE001  (as it came is better than not at all)
+                self.parts.failed("frames", error)
+        self._publish(incoming, body, stamp_ns, left_s)
 
     def stream_closed(self, stream: StreamInfo) -> None:
         self.rebuilds.closed(stream)
@@ -371,14 +387,35 @@ class Bridge:
         if not self.rebuilds.message(stream, message):
             lifespan_s = stream.spec.lifespan_s
             left_s = inf if lifespan_s is None else max(lifespan_s - age_s, 0.0)
-            self._show(incoming, message.body, message.stamp_ns, left_s)
+            if stream.spec.reliable and self.keeping:
+                mark = self.keeping.mark()
+                self._show(incoming, message.body, message.stamp_ns, left_s)
+                self.keeping.published(stream.id, message.seq, mark)
+            else:
+                self._show(incoming, message.body, message.stamp_ns, left_s)
         if self.goals is not None:
             self.goals.message(incoming.local, stream.info.encoding, message.body)
-        self.ages.observe(stream.spec.priority, age_s)
-        if stream.spec.deadline_s is not None:
-            self._check_deadline(stream, now)
-        if self._log is not None:
-            self._log.delivered(stream, message, age_s)
+        try:
+            self.ages.observe(stream.spec.priority, age_s)
+            if stream.spec.deadline_s is not None:
+                self._check_deadline(stream, now)
+        except Exception as error:  # noqa: BLE001  (of what is counted alone)
+            self.parts.failed("metrics", error)
+        try:
+            if self._log is not None:
+                self._log.delivered(stream, message, age_s)
+        except Exception as error:  # noqa: BLE001  (of the log alone)
+            self.parts.failed("message_log", error)
+
+    def _hold(self, stream: StreamId, seq: int) -> None:
+        self.core.hold(stream, seq)
+
+    def _keep_in(self, delay_s: float) -> None:
+        self._keep_timer.arm(clock.now() + delay_s)
+
+    def _release_kept(self, stream: StreamId, seq: int, lost: DropReason | None) -> None:
+        self.core.release(stream, seq, lost=lost, now=clock.now())
+        self._kick()
 
     def _check_deadline(self, stream: StreamInfo, now: float) -> None:
         last_s = self._last_arrival_s.get(stream.id)

@@ -44,6 +44,7 @@ from sern_runtime.keys import load_public, load_secret
 from sern_runtime.link_metrics import register_codecs, register_links, register_received
 from sern_runtime.loop import Shutdown
 from sern_runtime.metrics import Metrics
+from sern_runtime.optional import OptionalParts
 from sern_runtime.sdnotify import Notifier, Watchdog
 from sern_runtime.topics_view import TopicView, both_ways
 
@@ -81,6 +82,7 @@ class ClientDaemon:
         self.notifier = Notifier.from_environment()
         endpoint = make_endpoint(loaded)
         self.errors = InternalErrors()
+        self.parts = OptionalParts("adaptation", "codecs", "frames", "http", "message_log", "metrics", "summaries")
         self.message_log = MessageLog(loaded.resolve(model.message_log)) if model.message_log else None
         self.bridge = Bridge(
             endpoint,
@@ -93,12 +95,13 @@ class ClientDaemon:
             on_up=self._link_up,
             on_down=self._link_down,
             on_fault=self.errors.core,
+            parts=self.parts,
         )
         now = clock.now()
         for index, section in enumerate(model.topics):
             for problem in filter(None, map(missing, section.lossy)):
                 raise ConfigError(problem, file=str(loaded.path), key=f"topics.{index}.lossy")
-        self.codecs = CodecPool(after=self._kick)
+        self.codecs = CodecPool(after=self._kick, parts=self.parts)
         self.core = ClientCore(
             name=model.name,
             boot=secrets.randbits(63),
@@ -141,6 +144,7 @@ class ClientDaemon:
                 kick=self._kick,
                 rules=self.bridge.rules.rules,
                 summaries=lambda: self.bridge.summaries.topics,
+                parts=self.parts,
             )
 
     def _serve_services(self, endpoint: Endpoint) -> None:
@@ -209,7 +213,8 @@ class ClientDaemon:
             )
         self.tasks.append(asyncio.create_task(self._tick(), name="client-tick"))
         if self.adaptation is not None:
-            self.tasks.append(asyncio.create_task(self.adaptation.run(), name="adaptation"))
+            kept = self.parts.keep("adaptation", self.adaptation.run, reset=self.adaptation.reset)
+            self.tasks.append(asyncio.create_task(kept, name="adaptation"))
         self.notifier.ready(f"{model.name} -> {relay.endpoint}")
         _log.info("client %s started, relay %s", model.name, relay.endpoint)
 
@@ -241,7 +246,8 @@ class ClientDaemon:
         while True:
             await asyncio.sleep(TICK_S)
             if self.message_log is not None:
-                self.message_log.flush()
+                with self.parts.survive("message_log"):
+                    self.message_log.flush()
             link = self.core.link
             if self._lane is not None:
                 self._lane.tick()
@@ -294,6 +300,7 @@ class ClientDaemon:
             ("reason",),
             endpoint_drops,
         )
+        self.parts.register(metrics)
         adaptation = self.adaptation
         if adaptation is not None:
             adaptation.register(metrics)
@@ -360,6 +367,7 @@ class ClientDaemon:
                 "/api/trace": self.core.trace.to_json,
                 **({} if adaptation is None else {"/api/mmcf": adaptation.to_json}),
             },
+            parts=self.parts,
         )
 
     def _service_calls(self) -> list[tuple[tuple[str, str], float]]:
@@ -390,7 +398,7 @@ class ClientDaemon:
         give_up_s = now + self.loaded.model.link.drain_s
         while now < give_up_s:
             channels = [channel for channel in link.channels.values() if channel.wanted is not False]
-            unsent = sum(len(channel.queue) + len(channel.flying) for channel in channels) + self.bridge.pending
+            unsent = sum(len(c.queue) + len(c.flying) + (c.newest is not None) for c in channels) + self.bridge.pending
             unconfirmed = sum(len(channel.retained) for channel in channels)
             if not unconfirmed and (not unsent or not link.established or link.lane.stalled):
                 break
@@ -404,6 +412,8 @@ class ClientDaemon:
         unconfirmed = sum(len(channel.retained) for channel in link.channels.values())
         if unconfirmed:
             _log.warning("stopping with %d reliable messages that not everyone has confirmed", unconfirmed)
+        if self.bridge.keeping:
+            await self._keep()
         if self._transport is not None:
             self._kick()
             await asyncio.sleep(0.02)  # what has arrived here is confirmed before we say goodbye
@@ -411,6 +421,16 @@ class ClientDaemon:
             link.close("client stops", now=clock.now())
             self._transport.pump.run()
             await asyncio.sleep(0.05)  # libzmq's thread takes it from here
+
+    async def _keep(self) -> None:
+        """Have what was recorded flushed, so that all of it is confirmed before we say goodbye, and read nothing more:
+        what comes now the next process gets."""
+        keeping = self.bridge.keeping
+        self.core.link.reads = False
+        keeping.flush()
+        give_up_s = clock.now() + PATIENCE_S
+        while keeping.pending and clock.now() < give_up_s:  # noqa: ASYNC110  (its thread tells the loop)
+            await asyncio.sleep(0.005)
 
     def _give_up(self) -> None:
         """Count what is left, so that every message has a fate."""

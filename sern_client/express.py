@@ -117,6 +117,8 @@ class ClientExpress:
         self._kick()
 
     def received(self, connection: "_Connection", data: wire.Datagram) -> None:
+        if not self.core.link.reads:
+            return
         try:
             self.core.link.receive(data, now=clock.now(), lane=LANE_EXPRESS)
         except RemoteError as error:

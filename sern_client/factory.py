@@ -66,6 +66,8 @@ def make_section(section: sections.EndpointSection, resolve: Resolve) -> Endpoin
                     path=resolve(section.path),
                     overwrite=section.overwrite,
                     max_buffer_bytes=section.max_buffer_bytes,
+                    flush_s=section.flush_s,
+                    sync=section.sync,
                 ),
                 folder=section.path.endswith("/"),
             )

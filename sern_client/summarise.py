@@ -45,7 +45,9 @@ from sern_core.types import DropReason, Durability, Encoding, PriorityClass, Rel
 from sern_runtime import clock, ros_types
 from sern_runtime.loop import Timer
 from sern_runtime.metrics import Labels, Metrics
+from sern_runtime.optional import OptionalParts
 
+PART: Final = "summaries"
 INLINE_BYTES: Final = 64 * 2**10
 """Smaller bodies are worked on where they come in: it takes less than a millisecond."""
 MAX_WAITING: Final = 64
@@ -100,6 +102,7 @@ class TopicSummary:
         executor: ThreadPoolExecutor,
         source: OutChannel,
         maker: PatchMaker | None = None,
+        parts: OptionalParts | None = None,
     ) -> None:
         """`channels` and `sends` are the streams that `work` names by index; the last one is the summary's own.
         `source` is that of raw messages."""
@@ -117,6 +120,7 @@ class TopicSummary:
         self.cpu_s = 0.0
         self.beside = spec.beside
         self.shares_topic = spec.shares_topic
+        self._parts = parts or OptionalParts(PART)
         self._channels = channels
         self._sends = sends
         self._work = work
@@ -130,6 +134,11 @@ class TopicSummary:
         self._last_stamp_ns = 0
         self._offers = 0
         self._closed = False
+
+    @property
+    def failures(self) -> int:
+        """Faults of ours, of all topics."""
+        return self._parts.failures.get(PART, 0)
 
     @property
     def stream(self) -> TopicName:
@@ -220,6 +229,9 @@ class TopicSummary:
             bodies = self._work(job)
         except BodyError as error:
             return Result((), time.thread_time() - begun_s, str(error))
+        except Exception as error:  # noqa: BLE001  (a fault of ours: counted, and the message is treated as unreadable)
+            self._parts.failed(PART, error)
+            return Result((), time.thread_time() - begun_s, f"its maker has failed ({type(error).__name__})")
         return Result(bodies, time.thread_time() - begun_s)
 
     def _start(self, job: Job) -> bool:
@@ -227,7 +239,11 @@ class TopicSummary:
             return self._sends[0](job.body, job.stamp_ns, job.born_s)
         if len(job.body) <= INLINE_BYTES:
             return self._finish(job, self._run(job))
-        self._running = asyncio.get_running_loop().run_in_executor(self._executor, self._run, job)
+        try:
+            self._running = asyncio.get_running_loop().run_in_executor(self._executor, self._run, job)
+        except RuntimeError as error:  # its thread is dead, or there is no room for one
+            self._parts.failed(PART, error)
+            return self._finish(job, self._run(job))
         self._running.add_done_callback(lambda future: self._done(job, future))
         return True
 
@@ -429,6 +445,8 @@ class SummarisedTopic:
         self._channel = channel
         self._raw = raw
         self._cap = cap
+        self._newest: tuple[bytes, int, float] | None = None  # held back by the cap: body, stamp, when it came
+        self._timer: Timer | None = None
 
     @property
     def sends_raw(self) -> bool:
@@ -440,14 +458,32 @@ class SummarisedTopic:
     def sink(self, body: bytes, stamp_ns: int) -> bool:
         """A `Sink`. False: what counts most was refused, the topic itself or its only summary."""
         now = clock.now()
-        if not self._cap.allows(now):
-            self._core.drop(self._channel, len(body), DropReason.RATE_CAP, now=now)
-            return True
+        if self._newest is not None:
+            self._drop_newest(DropReason.RATE_CAP)
+        if self._cap.allows(now):
+            return self._pass(body, stamp_ns, now)
+        self._newest = (body, stamp_ns, now)  # the last of a series goes when its time comes
+        if self._timer is None:
+            self._timer = Timer(self._due)
+        self._timer.arm(self._cap.next_s)
+        return True
+
+    def _due(self) -> None:
+        if self._newest is not None and self._cap.allows(clock.now()):
+            newest, self._newest = self._newest, None
+            self._pass(*newest)
+
+    def _pass(self, body: bytes, stamp_ns: int, born_s: float) -> bool:
         raw = self.sends_raw
-        if raw and not self._raw(body, stamp_ns, now):
+        if raw and not self._raw(body, stamp_ns, born_s):
             return False
-        accepted = [output.offer(body, stamp_ns, now) for output in self.outputs]
+        accepted = [output.offer(body, stamp_ns, born_s) for output in self.outputs]
         return raw or len(accepted) > 1 or accepted[0]
+
+    def _drop_newest(self, reason: DropReason) -> None:
+        newest, self._newest = self._newest, None
+        if newest is not None:
+            self._core.drop(self._channel, len(newest[0]), reason, now=clock.now())
 
     def owns(self, stream: StreamId) -> bool:
         return any(output.owns(stream) for output in self.outputs)
@@ -458,7 +494,7 @@ class SummarisedTopic:
 
     @property
     def pending(self) -> int:
-        return sum(output.pending for output in self.outputs)
+        return (self._newest is not None) + sum(output.pending for output in self.outputs)
 
     def audience_changed(self) -> None:
         for output in self.outputs:
@@ -471,6 +507,9 @@ class SummarisedTopic:
 
     def close(self) -> None:
         now = clock.now()
+        if self._timer is not None:
+            self._timer.cancel()
+        self._drop_newest(DropReason.SHUTDOWN)
         for output in self.outputs:
             output.close()
             if output.channel is not self._channel:
@@ -480,9 +519,11 @@ class SummarisedTopic:
 class Summaries:
     """The summaries of one client, and the thread they are made in. `close` once."""
 
-    def __init__(self, sender: Callable[[OutChannel, TopicInfo], Send]) -> None:
-        """`sender(channel, info)` makes what puts messages of the type `info` into a channel."""
+    def __init__(self, sender: Callable[[OutChannel, TopicInfo], Send], parts: OptionalParts | None = None) -> None:
+        """`sender(channel, info)` makes what puts messages of the type `info` into a channel. What fails is counted in
+        `parts`, under PART."""
         self._sender = sender
+        self._parts = parts or OptionalParts(PART)
         self._topics: list[SummarisedTopic] = []
         self._executor = ThreadPoolExecutor(max_workers=1, thread_name_prefix="summary")
 
@@ -538,6 +579,7 @@ class Summaries:
                     executor=self._executor,
                     source=channel,
                     maker=maker,
+                    parts=self._parts,
                 )
             )
         cap = RateCap(resolved.spec.max_rate_hz)

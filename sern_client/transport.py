@@ -231,6 +231,8 @@ class RelayTransport:
         self.link.disconnected(now=clock.now(), reason=reason)
 
     def received(self, data: wire.Datagram) -> None:
+        if not self.link.reads:
+            return
         try:
             self.link.receive(data, now=clock.now())
         except RemoteError as error:

@@ -105,6 +105,8 @@ class ClientLane:
             self._socket.rebind()
 
     def _received(self, data: bytes, now: float) -> None:
+        if not self.core.link.reads:
+            return
         try:
             self.core.link.receive(data, now=now, lane=LANE_UDP)
         except RemoteError as error:

@@ -116,6 +116,7 @@ class ClientCore:
         self._latched: dict[StreamId, LatchedCache] = {}  # for a relay that comes back with nothing
         self._open: set[StreamId] = set()
         self._undecodable: set[TopicName] = set()
+        self._held: dict[StreamId, dict[int, None]] = {}  # handed on, and not to be confirmed yet
         self.coder = coder or Coder(max_bytes=link.max_message_bytes)
         self._decoder = Decoder[InStream](
             self.coder, lambda stream: stream.stream, self._handle, self._failed, self._settled, fault=self.fault
@@ -134,6 +135,7 @@ class ClientCore:
             lossless=lossless,
         )
         self.link.on_tidy = self._tidy
+        self.link.on_stray = self.received.stray
         if coder is not None:
             self.link.encode_with(coder)
 
@@ -332,12 +334,13 @@ class ClientCore:
     def on_retract(self, link: Link, stream: InStream, *, now: float) -> None:
         if stream.stream.id in self._open:
             self._decoder.forget(stream.stream.id, now=now)
+            self._held.pop(stream.stream.id, None)
             self._open.discard(stream.stream.id)
             self._tell(self.events.stream_closed, stream.stream)
 
     def on_message(self, link: Link, stream: InStream, message: Message, *, now: float) -> None:
         self._decoder.message(stream, message, now=now)
-        stream.unhandled = self._decoder.oldest(message.stream)
+        stream.unhandled = self._oldest(message.stream)
 
     def _handle(self, stream: InStream, message: Message, now: float) -> None:
         """A message has had its turn and is decoded."""
@@ -376,7 +379,36 @@ class ClientCore:
         identity = stream.stream.id
         current = self.link.streams.get(identity)
         if current is not None:
-            self.link.handled(current, self._decoder.oldest(identity))
+            self.link.handled(current, self._oldest(identity))
+
+    def _oldest(self, identity: StreamId) -> int:
+        """The seq of the oldest message of a stream that has had its turn and is not dealt with, 0: none."""
+        decoding = self._decoder.oldest(identity)
+        if not self._held:
+            return decoding
+        held = next(iter(self._held.get(identity, ())), 0)
+        return min(decoding, held) if decoding and held else decoding or held
+
+    def hold(self, identity: StreamId, seq: int) -> None:
+        """Called for the reliable message that is just being handed on: it is not confirmed before `release`."""
+        self._held.setdefault(identity, {})[seq] = None
+
+    def release(self, identity: StreamId, seq: int, *, lost: DropReason | None = None, now: float) -> None:
+        """A message that was held has been dealt with, or was `lost` after all; then its origin is told."""
+        held = self._held.get(identity)
+        if held is None or seq not in held:
+            return  # the stream has ended
+        del held[seq]
+        if not held:
+            del self._held[identity]
+        stream = self.link.streams.get(identity)
+        if stream is None:
+            return
+        if lost is not None:
+            self.trace.record(now, identity.topic, TraceEvent.DROPPED, seq=seq, reason=lost, peer=self.link.peer)
+            self.link.report_drop(stream, seq, lost, self.name, now=now)
+            self.events.expired(stream.stream, seq, lost)
+        self._settled(stream)
 
     def on_in_drop(self, link: Link, stream: InStream, reason: DropReason, nbytes: int) -> None:
         self.received.of(stream.stream).drop_arrived(reason)

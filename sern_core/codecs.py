@@ -281,21 +281,33 @@ class Coder:
         self.undecodable = 0
         self.unencodable = 0
         """Bodies that a mode could not take; they were sent as they were."""
+        self.on_fault: Callable[[Exception], None] = lambda _error: None
+        """Told of what a codec raised that it must not; in any thread."""
 
     def encode(self, mode: Compression, body: bytes, topic: LossyTopic | None = None) -> Encoded:
         """What cannot be encoded comes back as it was."""
         start_s = self.clock()
         try:
             codec, encoded = encode(mode, body, topic)
-        except Exception:  # noqa: BLE001  (whatever a library makes of a body, it can go as it is; counted)
+        except CodecError:
             self.unencodable += 1
+            codec, encoded = Codec.NONE, body
+        except Exception as error:  # noqa: BLE001  (a library's fault must not hold the link: it goes as it is)
+            self.unencodable += 1
+            self.on_fault(error)
             codec, encoded = Codec.NONE, body
         return Encoded(codec, encoded, self.clock() - start_s)
 
     def decode(self, codec: int, body: bytes) -> tuple[bytes, float]:
         """The raw body and the seconds it took. Raises CodecError."""
         start_s = self.clock()
-        raw = decode(codec, body, max_bytes=self.max_bytes)
+        try:
+            raw = decode(codec, body, max_bytes=self.max_bytes)
+        except CodecError:
+            raise
+        except Exception as error:
+            self.on_fault(error)
+            raise CodecError(f"its decoder has failed ({type(error).__name__})") from error
         return raw, self.clock() - start_s
 
 

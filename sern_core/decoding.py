@@ -175,7 +175,14 @@ class Decoder(Generic[Context]):
             self.coder.undecodable += 1
             self._failed(request.context, message, DropReason.UNDECODABLE, request.problem, now)
         else:
-            self._decoded(request.context, message, request.raw, request.elapsed_s, now)
+            try:
+                self._decoded(request.context, message, request.raw, request.elapsed_s, now)
+            except Exception as error:
+                problem = f"it could not be handed on ({type(error).__name__})"
+                self._failed(request.context, message, DropReason.UNDECODABLE, problem, now)
+                self._advance(stream, waiting, now)
+                self._settled(request.context)
+                raise
         self._advance(stream, waiting, now)
         self._settled(request.context)
 

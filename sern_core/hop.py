@@ -78,6 +78,8 @@ class Hop(Sender):
             known = self.incoming.get(channel)
             if known is None:
                 self.strays += 1
+                if offset == 0 and self.on_stray is not None:
+                    self.on_stray()
                 return
             stream = known
         wide = wire.widen_seq(seq, stream.delivered)
@@ -273,6 +275,8 @@ class Hop(Sender):
     def _data_deadline(self, lane: Lane) -> float:
         """When `handle_timeout` or `next_datagram` has something to do on this lane by time alone."""
         deadline = lane.ping_due_s
+        if lane is self.lane and self._held_back_due_s < deadline:
+            deadline = self._held_back_due_s
         if lane.id == LANE_ZMQ and self._sweep_due_s < deadline:
             deadline = self._sweep_due_s
         arrivals = lane.arrivals
@@ -311,6 +315,8 @@ class Hop(Sender):
             self.trace.record(now, LINK, TraceEvent.LINK_DOWN, peer=self.peer, reason=reason)
             if len(self.lanes) > 1:
                 self._choose_lane(now)
+        if now >= self._held_back_due_s:
+            self._release_held_back(now)
         if now >= lane.ping_due_s:
             lane.ping = True
             lane.ping_due_s = now + PING_INTERVAL_S
@@ -321,6 +327,8 @@ class Hop(Sender):
     def _sweep(self, now: float) -> None:
         """Expire what nobody will send, also while the link is down."""
         self._sweep_due_s = now + SWEEP_INTERVAL_S
+        if now >= self._held_back_due_s:
+            self._release_held_back(now)
         for channel in list(self.channels.values()):
             watermark = channel.watermark
             channel.sweep(now, up=self.established)

@@ -146,6 +146,7 @@ class Hub(LocalStreams):
                 lossless=self._lossless,
                 auto_confirm=False,
             )
+            link.on_stray = self.received.stray
             self._limit(client, now)
             self._absent_since[client] = now
         return link

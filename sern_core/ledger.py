@@ -175,7 +175,7 @@ class SendLedger:
 
 
 class ReceiveLedger:
-    """Counters of what arrives, by topic; `strays` is data of streams that are unknown here, by count."""
+    """Counters of what arrives, by topic. What belongs to no stream that is known here is counted for OTHER_TOPIC."""
 
     def __init__(self) -> None:
         self.topics: dict[TopicName, ReceiveCounters] = {}
@@ -188,9 +188,15 @@ class ReceiveLedger:
             self.topics.setdefault(OTHER_TOPIC, ReceiveCounters(OTHER_TOPIC, counters.priority)).add(counters)
 
     def of(self, stream: StreamInfo) -> ReceiveCounters:
-        topic = stream.id.topic
+        return self._named(stream.id.topic, stream.spec.priority)
+
+    def stray(self) -> None:
+        """A message of a stream that was never announced, or has ended."""
+        self._named(OTHER_TOPIC, PriorityClass.BULK).drop_arrived(DropReason.UNKNOWN_CHANNEL)
+
+    def _named(self, topic: TopicName, priority: PriorityClass) -> ReceiveCounters:
         name = topic if topic in self.topics or len(self.topics) < MAX_TOPICS else OTHER_TOPIC
         counters = self.topics.get(name)
         if counters is None:
-            counters = self.topics[name] = ReceiveCounters(name, stream.spec.priority)
+            counters = self.topics[name] = ReceiveCounters(name, priority)
         return counters

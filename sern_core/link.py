@@ -316,7 +316,8 @@ class Link(Answering):
                 announcement.stream, self.reassembly, self._deliver, self._in_drop, first=announcement.first
             )
             if replaced is not None:  # the origin was configured anew: what was delivered stays delivered
-                stream.delivered = stream.confirmed = replaced.delivered
+                stream.delivered, stream.confirmed = replaced.delivered, replaced.confirmed
+                stream.unhandled = replaced.unhandled
                 replaced.close()
             self.streams[identity] = stream
         self._missing.pop(identity, None)

@@ -1,6 +1,7 @@
 """The sending side of one stream on one hop: its bounded queue, what is in flight, and what must be kept.
 
-Best effort: keep-last `depth`, a newer message takes the oldest one's place unless that has begun transmission.
+Best effort: keep-last `depth`, a newer message takes the oldest one's place unless that has begun transmission. What a
+rate cap holds back is kept while it is the newest, and goes when its time comes (`release`).
 Reliable: every message is kept until the peer's delivered watermark passes it, or until its lifespan or retention
 ends, when a one-byte tombstone takes its place so that order survives and nothing is lost silently. Overflow of a
 reliable queue is refused to the caller.
@@ -11,6 +12,7 @@ reason. `OutChannel.validate` checks that the counters agree.
 
 from collections import deque
 from collections.abc import Callable, Sequence
+from math import inf
 from typing import Final
 
 from sern_core.encoding import ChannelCodec, Coding
@@ -23,6 +25,9 @@ from sern_core.types import DROP_REASONS, DropReason
 MESSAGE_OVERHEAD_BYTES: Final = 256
 """What a retained message counts for beside its body, about what its objects take: else the bound of a stream of many
 small ones would not bound memory."""
+
+SHARE_HOLD_S: Final = 1.0
+"""The longest that the newest message is held back by a `share`."""
 
 OnDrop = Callable[[OutMessage, DropReason], None]
 
@@ -55,6 +60,13 @@ class OutChannel:
         """Messages that may wait, at most the topic's own depth (`adapt`)."""
         self.thinned = 0
         """Messages that `share` left out."""
+        self.newest: OutMessage | None = None
+        """Best effort: the newest message, held back by `max_rate_hz` or `share` until `newest_due_s`."""
+        self.newest_due_s = inf
+        self.left_out = 0
+        """Seq of the message that the last call left out for a newer one; 0: none."""
+        self.newest_thinned = False
+        self._arrived_s = -inf
         self._owed_share = 0.0
         self._cap = RateCap(stream.spec.max_rate_hz)
         self.wanted: bool | None = None  # None until the peer has answered
@@ -96,13 +108,17 @@ class OutChannel:
             if self.wanted is False:
                 counters.drop(DropReason.UNWANTED, size)
                 return True
+            if self.newest is not None:
+                self._leave_out()
             if not forced and not self._cap.allows(now):
-                counters.drop(DropReason.RATE_CAP, size)
+                self._hold_back(message, self._cap.next_s, thinned=False)
                 return True
-            if self.share < 1.0 and not self._share_allows():
-                self.thinned += 1
-                counters.drop(DropReason.RATE_CAP, size)
-                return True
+            if self.share < 1.0:
+                gap_s, self._arrived_s = now - self._arrived_s, now
+                if not self._share_allows():
+                    due_s = now + min(SHARE_HOLD_S, max(2.0, 1.0 / max(self.share, 1e-3)) * gap_s)
+                    self._hold_back(message, due_s, thinned=True)
+                    return True
             while len(self.queue) >= self.depth:
                 self._drop(self._pop_queue(), DropReason.SUPERSEDED)
             out = OutMessage(message)
@@ -127,7 +143,7 @@ class OutChannel:
         """Put latched messages (oldest first, marked as replays) ahead of everything; nothing has been sent yet."""
         limit = self.retained[0].seq if self.retained else self.next_seq
         if not self.reliable:
-            limit = self.queue[0].seq if self.queue else self.next_seq
+            limit = self.queue[0].seq if self.queue else self.newest.seq if self.newest is not None else self.next_seq
         fresh = [OutMessage(message) for message in replays if message.seq < limit]
         fresh = [out for out in fresh if not self._expired(out, now)]
         if not self.reliable:
@@ -147,6 +163,44 @@ class OutChannel:
             self.gaps.extendleft(
                 (out.seq, seq) for out, seq in reversed([*zip(fresh, after, strict=True)]) if seq > out.seq + 1
             )
+
+    def _hold_back(self, message: Message, due_s: float, *, thinned: bool) -> None:
+        self.newest = OutMessage(message)
+        self.newest_due_s = due_s
+        self.newest_thinned = thinned
+
+    def _leave_out(self) -> None:
+        """A newer message came before the one that was held back could go."""
+        out = self.newest
+        assert out is not None
+        self.newest, self.newest_due_s = None, inf
+        self.thinned += self.newest_thinned
+        self.left_out = out.seq
+        self.counters.drop(DropReason.RATE_CAP, out.offered_bytes)
+
+    def release(self, now: float) -> bool:
+        """Let the message that was held back into the queue if its time has come. True: it did."""
+        out = self.newest
+        if out is None or now < self.newest_due_s:
+            return False
+        self.newest, self.newest_due_s = None, inf
+        if self._expired(out, now):
+            self._drop(out, DropReason.LIFESPAN)
+            return False
+        if not self.newest_thinned:
+            self._cap.allows(now)
+        while len(self.queue) >= self.depth:
+            self._drop(self._pop_queue(), DropReason.SUPERSEDED)
+        self._keep(out)
+        return True
+
+    def _drop_newest(self, reason: DropReason) -> int:
+        out = self.newest
+        if out is None:
+            return 0
+        self.newest, self.newest_due_s = None, inf
+        self._drop(out, reason)
+        return out.size
 
     def _keep(self, out: OutMessage) -> None:
         if self.reliable:
@@ -258,7 +312,7 @@ class OutChannel:
         whose tombstone goes on. Returns the bytes that are free now, 0 when there is none."""
         if not self.reliable:
             if not self.queue:
-                return 0
+                return self._drop_newest(reason)
             out = self._pop_queue()
             self._drop(out, reason)
             return out.size
@@ -283,7 +337,10 @@ class OutChannel:
     @property
     def held_bytes(self) -> int:
         """Bytes that wait here or are under way, and would have to be sent again to a peer that has lost them."""
-        return self.retained_bytes if self.reliable else self.queued_bytes + sum(o.size for o in self.flying.values())
+        if self.reliable:
+            return self.retained_bytes
+        held_back = 0 if self.newest is None else self.newest.size
+        return self.queued_bytes + held_back + sum(o.size for o in self.flying.values())
 
     def begin(self, out: OutMessage, now: float) -> None:
         """`out` was the head of the queue and its first bytes leave now, or once its body is encoded."""
@@ -468,6 +525,8 @@ class OutChannel:
     def sweep(self, now: float, *, up: bool) -> None:
         """Expire what nobody will send: lifespan and retention, also while the link is down."""
         if not self.reliable:
+            if self.newest is not None and self._expired(self.newest, now):
+                self._drop_newest(DropReason.LIFESPAN)
             if self.spec.lifespan_s is not None:
                 while self.queue and self._expired(self.queue[0], now):
                     self._drop(self._pop_queue(), DropReason.LIFESPAN)
@@ -502,7 +561,7 @@ class OutChannel:
         """The lowest seq that may still come: what an announcement promises."""
         if self.reliable:
             return self.retained[0].seq if self.retained else self.next_seq
-        candidates = [out.seq for out in (*self.flying.values(), *self.queue)]
+        candidates = [out.seq for out in (*self.flying.values(), *self.queue, *filter(None, (self.newest,)))]
         return min(candidates) if candidates else self.next_seq
 
     def set_wanted(self, wanted: bool, reason: DropReason = DropReason.UNWANTED) -> None:
@@ -547,6 +606,7 @@ class OutChannel:
         else:
             for out in (*self.flying.values(), *self.queue):
                 self._drop(out, reason)
+            self._drop_newest(reason)
         self.flying.clear()
         self.active.clear()
         self.queue.clear()
@@ -561,7 +621,7 @@ class OutChannel:
             queued = [out for out in self.retained if not out.started and not out.counted]
             flying = [out for out in self.retained if out.started and not out.counted]
         else:
-            queued, flying = list(self.queue), list(self.flying.values())
+            queued, flying = [*self.queue, *filter(None, (self.newest,))], list(self.flying.values())
         queued_bytes, flying_bytes = sum(o.offered_bytes for o in queued), sum(o.offered_bytes for o in flying)
         return len(queued), queued_bytes, len(flying), flying_bytes
 
@@ -576,6 +636,11 @@ class OutChannel:
         )
         if not self.reliable:
             check(len(self.queue) <= self.spec.depth, f"{name}: queue deeper than its depth")
+            check((self.newest is None) == (self.newest_due_s == inf), f"{name}: a message held back has no due time")
+            check(
+                self.newest is None or all(out.seq < self.newest.seq for out in self.queue),
+                f"{name}: a message is held back behind a newer one",
+            )
             unsent = [out for out in self.flying.values() if out.has_unsent]
             check(all(out in self.active for out in unsent), f"{name}: bytes to send are forgotten")
             check(

@@ -1,5 +1,7 @@
-"""A cap on the rate of a topic that jitter does not halve."""
+"""A cap on the rate of a topic that jitter does not halve. Whoever asks it keeps the newest sample that it holds back,
+and offers it again at `next_s`: the last of a series always passes."""
 
+from math import inf
 from typing import Final
 
 RATE_CAP_SLACK: Final = 0.25
@@ -14,6 +16,11 @@ class RateCap:
     def __init__(self, max_rate_hz: float | None) -> None:
         self.max_rate_hz = max_rate_hz
         self._next_allowed_s: float | None = None
+
+    @property
+    def next_s(self) -> float:
+        """When the next sample may pass at the latest; -inf: now."""
+        return -inf if self._next_allowed_s is None else self._next_allowed_s
 
     def allows(self, now: float) -> bool:
         """Whether a sample may pass now; it is taken to pass."""

@@ -7,6 +7,7 @@ class.
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from math import inf
 from typing import Any, Final, NamedTuple
 
 from sern_core import wire
@@ -115,7 +116,9 @@ class Sender(ABC):
         """Called when the peer has a message whole: channel, message, now."""
         self.wire_bytes = 0
         """Bytes of numbered datagrams sent so far, second copies and headers included."""
-        self.strays = 0  # fragments of streams that are unknown here (drop reason `unknown_channel`)
+        self.strays = 0  # fragments of streams that are unknown here
+        self.on_stray: Callable[[], None] | None = None
+        """Called for each message of a stream that is unknown here (drop reason `unknown_channel`)."""
         self.channels: dict[int, OutChannel] = {}
         self.incoming: dict[int, InStream] = {}
         """Streams of the session by the peer's channel number."""
@@ -132,6 +135,8 @@ class Sender(ABC):
         self._up_since_s = now
         self.cadences = Cadences()
         """When class 0 will want the link again."""
+        self._held_back: set[int] = set()  # channels with a message that a rate cap holds back
+        self._held_back_due_s = inf  # when one of them may go, or earlier
         self._watermarks: dict[int, int] = {}  # channel -> delivered, not yet on the wire
         self._rx_stamp_us = 0
         self._rx_delay: tuple[float, float] | None = None  # of the datagram at hand, and its uncertainty
@@ -200,21 +205,42 @@ class Sender(ABC):
         if channel.spec.priority is PriorityClass.CONTROL and not message.replay:
             self.cadences.arrived(channel.slot, now=now)
         backlog = channel.offered
-        capped, thinned = channel.counters.by_reason[DropReason.RATE_CAP], channel.thinned
+        thinned = channel.thinned
         accepted = channel.submit(message, now=now, forced=forced)
+        if channel.newest is not None:
+            self._held_back.add(channel.slot)
+            self._held_back_due_s = min(self._held_back_due_s, channel.newest_due_s)
+            self.dirty = True  # the owner looks at the deadline again
         if self.trace.enabled:
-            event = TraceEvent.QUEUED if accepted else TraceEvent.REFUSED
-            if channel.thinned > thinned:
-                why = f"the adaptation lets {channel.share:.0%} of the messages in"
-                self.trace.record(now, message.stream.topic, TraceEvent.RATE_CAPPED, seq=message.seq, reason=why)
-            elif channel.counters.by_reason[DropReason.RATE_CAP] > capped:
-                why = "max_rate_hz"
-                self.trace.record(now, message.stream.topic, TraceEvent.RATE_CAPPED, seq=message.seq, reason=why)
+            topic = message.stream.topic
+            if channel.left_out:
+                why = _why_capped(channel, channel.thinned > thinned)
+                self.trace.record(now, topic, TraceEvent.RATE_CAPPED, seq=channel.left_out, reason=why)
+            if channel.newest is not None:
+                why = _why_capped(channel, channel.newest_thinned)
+                self.trace.record(now, topic, TraceEvent.HELD, seq=message.seq, reason=why, peer=self.peer)
             else:
-                self.trace.record(now, message.stream.topic, event, seq=message.seq, peer=self.peer)
+                event = TraceEvent.QUEUED if accepted else TraceEvent.REFUSED
+                self.trace.record(now, topic, event, seq=message.seq, peer=self.peer)
+        channel.left_out = 0
         if not backlog or channel.coalesced:
             self._refresh(channel, now)
         return accepted
+
+    def _release_held_back(self, now: float) -> None:
+        """Messages that a rate cap held back, and that nothing newer has replaced, go on when their time comes."""
+        due_s = inf
+        for slot in list(self._held_back):
+            channel = self.channels.get(slot)
+            if channel is not None and channel.release(now):
+                topic = channel.stream.id.topic
+                self.trace.record(now, topic, TraceEvent.QUEUED, seq=channel.queue[-1].seq, peer=self.peer)
+                self._refresh(channel, now)
+            if channel is None or channel.newest is None:
+                self._held_back.discard(slot)
+            else:
+                due_s = min(due_s, channel.newest_due_s)
+        self._held_back_due_s = due_s
 
     def reject(self, channel: OutChannel, message: Message, reason: DropReason, *, now: float) -> None:
         """Drop a message on its way in; of a reliable stream a tombstone goes on in its place."""
@@ -511,6 +537,10 @@ class Sender(ABC):
         frames.append(head)
         frames.append(message.body if end - start == out.size else message.body[start:end])
         return size + len(head) + end - start
+
+
+def _why_capped(channel: OutChannel, thinned: bool) -> str:
+    return f"the adaptation lets {channel.share:.0%} of the messages in" if thinned else "max_rate_hz"
 
 
 def _class_of(channel: OutChannel, out: OutMessage) -> PriorityClass:

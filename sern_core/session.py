@@ -58,6 +58,8 @@ class Session(Hop):
         self.initiator = initiator
         self.peer_boot: int | None = None
         self.transport_up = False
+        self.reads = True
+        """False: the owner is about to end the session; what comes now is for the process after it."""
         self._handshake_out: deque[bytes] = deque()
         self._hello_due_s: float | None = None
         self._hello_stamp_us = -1

@@ -85,6 +85,7 @@ class DropReason(StrEnum):
     UNDECODABLE = "undecodable"  # its body cannot be decoded: damaged, above the limit, of another layout or codec
     UNCONFIRMED = "unconfirmed"  # sent whole, given up without an acknowledgement: it may have arrived
     FAULT = "fault"  # an error of the program where it was taken; it may have been acted on in part
+    STORAGE = "storage"  # the recording could not take it: disk full or gone
 
 
 _UNUSED_CODE: Final = 14  # a stream that comes back to its origin is not wanted there: no message is dropped for that

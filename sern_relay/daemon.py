@@ -39,6 +39,7 @@ from sern_runtime.keys import KeyDirectory, KeyStatus, load_secret
 from sern_runtime.link_metrics import AgeHistograms, register_codecs, register_links, register_received
 from sern_runtime.loop import Shutdown
 from sern_runtime.metrics import Metrics
+from sern_runtime.optional import OptionalParts
 from sern_runtime.sdnotify import Notifier, Watchdog
 from sern_runtime.topics_view import link_summary, received_summary
 from sern_runtime.zap import TemporaryRefusal, ZapHandler, self_test
@@ -103,7 +104,8 @@ class RelayDaemon:
             wall_ns=lambda _now: time.time_ns(),
             now=clock.now(),
         )
-        self.codecs = CodecPool(after=self._after)
+        self.parts = OptionalParts("adaptation", "codecs", "feed", "http", "metrics", "objects", "summary")
+        self.codecs = CodecPool(after=self._after, parts=self.parts)
         self.coder = make_coder(model.link.params(), self.codecs)
         self._decoder = Decoder[StreamInfo](
             self.coder, lambda stream: stream, self._deliver, self._undecodable, fault=self.errors.core
@@ -113,7 +115,11 @@ class RelayDaemon:
         if model.adaptation is not None:
             with blamed_on(loaded.path, "adaptation"):
                 self.adaptation = Adaptation(
-                    model.adaptation, lambda: list(self.hub.links.values()), coder=None, kick=self._after
+                    model.adaptation,
+                    lambda: list(self.hub.links.values()),
+                    coder=None,
+                    kick=self._after,
+                    parts=self.parts,
                 )
         self.zap: ZapHandler | None = None
         self.server: RelayServer | None = None
@@ -145,7 +151,7 @@ class RelayDaemon:
                 self._http = self._make_http(model.http.listen)
                 await self._http.start()
         self._ctx = zmq.Context()
-        self.transforms = TransformObjects(self.hub.objects)
+        self.transforms = TransformObjects(self.hub.objects, parts=self.parts)
         if keys is not None:
             self.zap = ZapHandler(self._ctx)
             self.zap.add_domain(ZAP_DOMAIN, self._lookup)
@@ -176,7 +182,8 @@ class RelayDaemon:
                 self.feed = RelayFeed(self._ctx, self.hub, model.feed_roles(), after=self._after, refused=self.refused)
         self.tasks.append(asyncio.create_task(self._tick(), name="relay-tick"))
         if self.adaptation is not None:
-            self.tasks.append(asyncio.create_task(self.adaptation.run(), name="adaptation"))
+            kept = self.parts.keep("adaptation", self.adaptation.run, reset=self.adaptation.reset)
+            self.tasks.append(asyncio.create_task(kept, name="adaptation"))
         self._ready = True
         self.notifier.ready(f"{model.name} on {', '.join(relay.listen)}")
         _log.info("relay %s listens on %s", model.name, ", ".join(relay.listen))
@@ -236,7 +243,8 @@ class RelayDaemon:
             if self.server is not None:
                 self.server.express.look()
             if self.feed is not None:
-                self.feed.sweep(now=now)
+                with self.parts.survive("feed"):
+                    self.feed.sweep(now=now)
             self._flush()
             if self.zap is not None:
                 self.zap.ping()
@@ -264,7 +272,8 @@ class RelayDaemon:
         now = clock.now()
         self.hub.revoke(access, now=now)
         if self.feed is not None:
-            self._update_feed(loaded.model, now)
+            with self.parts.survive("feed"):
+                self._update_feed(loaded.model, now)
         if self.server is not None:
             self.server.cut_unbound()  # admitted by the old keys, and silent so far
         self._end_lapsed()
@@ -283,6 +292,7 @@ class RelayDaemon:
         register_codecs(metrics, self.coder)
         self.errors.register(metrics)
         adaptation = self.adaptation
+        self.parts.register(metrics)
         if adaptation is not None:
             adaptation.register(metrics)
         metrics.gauge("sern_relay_clients", "Clients with a session.",
@@ -321,6 +331,7 @@ class RelayDaemon:
                 "/api/topics": self.topics,
                 **({} if adaptation is None else {"/api/mmcf": adaptation.to_json}),
             },
+            parts=self.parts,
         )
 
     def _auth(self) -> list[tuple[tuple[str, ...], float]]:
@@ -449,22 +460,28 @@ class RelayDaemon:
 
     def stream_added(self, stream: StreamInfo) -> None:
         _log.info("%s announces %s (%s)", stream.id.origin, stream.id.topic, stream.info.type_name)
-        if self.feed is not None:
-            self.feed.owners_changed()
+        self._owners_changed()
 
     def stream_removed(self, stream: StreamInfo) -> None:
         _log.info("%s of %s has ended", stream.id.topic, stream.id.origin)
         self._decoder.forget(stream.id, now=clock.now())
         if self.transforms is not None:
-            self.transforms.stream_removed(stream)
+            with self.parts.survive("objects"):
+                self.transforms.stream_removed(stream)
+        self._owners_changed()
+
+    def _owners_changed(self) -> None:
         if self.feed is not None:
-            self.feed.owners_changed()
+            with self.parts.survive("feed"):
+                self.feed.owners_changed()
 
     def message(self, stream: StreamInfo, message: Message, *, now: float) -> None:
-        self.ages.observe(stream.spec.priority, now - message.born_s)
-        if message.codec and not self._reads(stream):
-            return  # it goes on as it is
-        self._decoder.message(stream, message, now=now)
+        try:
+            self.ages.observe(stream.spec.priority, now - message.born_s)
+            if not message.codec or self._reads(stream):  # else it goes on as it is
+                self._decoder.message(stream, message, now=now)
+        except Exception as error:  # noqa: BLE001  (none of it is needed for the message's own way)
+            self.parts.failed("metrics", error)
 
     def _reads(self, stream: StreamInfo) -> bool:
         """Whether anything here, beside the clients' links, wants the stream's messages."""
@@ -480,10 +497,16 @@ class RelayDaemon:
 
     def _deliver(self, stream: StreamInfo, message: Message, now: float) -> None:
         """A message in its turn, decoded, for what reads messages at the relay itself."""
-        if self.transforms is not None:
-            self.transforms.message(stream, message, now=now)
-        if self.feed is not None:
-            self.feed.publish(stream, message, now=now)
+        try:
+            if self.transforms is not None:
+                self.transforms.message(stream, message, now=now)
+        except Exception as error:  # noqa: BLE001  (of the registry alone)
+            self.parts.failed("objects", error)
+        try:
+            if self.feed is not None:
+                self.feed.publish(stream, message, now=now)
+        except Exception as error:  # noqa: BLE001  (of the feed alone)
+            self.parts.failed("feed", error)
 
     def refused(self, client: ClientName, code: str, text: str) -> None:
         self.refusals[code if code in REFUSAL_CODES else OTHER_CODE] += 1

@@ -29,6 +29,7 @@ from sern_core.types import ClientName, Encoding, ObjectKind
 from sern_runtime import ros_types
 from sern_runtime.clock import now
 from sern_runtime.loop import Timer
+from sern_runtime.optional import OptionalParts
 
 RATE_HZ: Final = 5.0
 MAX_WAITING: Final = 64
@@ -61,7 +62,14 @@ class _Stream:
 class TransformObjects:
     """Keeps the registry's transforms up to date. `close` once."""
 
-    def __init__(self, registry: ObjectRegistry, *, clock: Callable[[], float] = now) -> None:
+    def __init__(
+        self,
+        registry: ObjectRegistry,
+        *,
+        clock: Callable[[], float] = now,
+        parts: OptionalParts | None = None,
+    ) -> None:
+        self._parts = parts or OptionalParts("objects")
         self.refused: dict[tuple[ClientName, str], int] = {}
         """By client and reason: undecodable, too_large, not_finite, too_many_transforms, or what the registry says."""
         self._registry = registry
@@ -70,6 +78,11 @@ class TransformObjects:
         self._writers: dict[str, StreamId] = {}  # object -> the stream that wrote it last
         self._pairs: dict[ClientName, int] = {}
         self._timer = Timer(self._read_due, clock=clock)
+
+    @property
+    def failures(self) -> int:
+        """Readings that failed by a fault of ours."""
+        return self._parts.failures["objects"]
 
     def close(self) -> None:
         self._timer.cancel()
@@ -111,7 +124,9 @@ class TransformObjects:
         for known in self._streams.values():
             if known.waiting and known.due_s <= now:
                 known.due_s = now + 1.0 / RATE_HZ
-                self._read(known, now)
+                with self._parts.survive("objects"):
+                    self._read(known, now)
+                known.waiting.clear()
             elif known.waiting:
                 next_s = min(next_s, known.due_s)
         if next_s < math.inf:
@@ -133,7 +148,6 @@ class TransformObjects:
                 if object_id not in seen:
                     seen.add(object_id)
                     self._put(known, object_id, parent, child, transform, message, now)
-        known.waiting.clear()
 
     def _put(
         self, known: _Stream, object_id: str, parent: str, child: str, transform: Any, message: Message, now: float

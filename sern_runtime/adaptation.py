@@ -11,14 +11,18 @@ from sern_core.link import Link
 from sern_core.mmcf.adapter import SAMPLES, HopAdapter
 from sern_core.mmcf.levels import Summarised
 from sern_core.mmcf.report import adapter_json, step_json
+from sern_core.out_message import OutMessage
+from sern_core.queues import OutChannel
 from sern_core.rules import TopicRule
 from sern_core.types import CLASS_LABELS, CLASSES
 from sern_runtime import clock
 from sern_runtime.config.adaptation import AdaptationSection
 from sern_runtime.metrics import Labels, Metrics
+from sern_runtime.optional import BACKOFF_S, OptionalParts
 
 HISTORY: Final = 60
 """Intervals that /api/mmcf tells of."""
+PART: Final = "adaptation"
 TERMS: Final = ("latency", "unreliability", "compute", "bandwidth")
 
 _log = logging.getLogger(__name__)
@@ -36,10 +40,14 @@ class Adaptation:
         kick: Callable[[], None],
         rules: Iterable[TopicRule] = (),
         summaries: Callable[[], Sequence[Summarised]] = list,
+        parts: OptionalParts | None = None,
     ) -> None:
-        """`rules` say of which classes summaries may be chosen, `summaries` are those there are now."""
+        """`rules` say of which classes summaries may be chosen, `summaries` are those there are now. What fails is
+        counted in `parts`, under PART."""
         encodes = coder is not None
         self._section = section
+        self._parts = parts or OptionalParts(PART)
+        self._resting: dict[Link, tuple[float, float]] = {}  # links whose adapter failed: until when, and the pause
         self._links = links
         self._coder = coder
         self._kick = kick
@@ -62,21 +70,60 @@ class Adaptation:
     def tick(self, *, step: bool) -> None:
         now = clock.now()
         links = self._links()
-        for gone in self._adapters.keys() - set(links):
-            del self._adapters[gone]
+        for gone in (self._adapters.keys() | self._resting.keys()) - set(links):
+            self._adapters.pop(gone, None)
             self._history.pop(gone, None)
+            self._resting.pop(gone, None)
         for link in links:
-            adapter = self._adapters.get(link)
-            if adapter is None:
-                adapter = HopAdapter(
-                    link, self._make_policy(), self._params, coder=self._coder, now=now, summaries=self._summaries
-                )
-                self._adapters[link] = adapter
-            adapter.sample()
-            if step:
-                self._step(adapter, now)
+            until_s, pause_s = self._resting.get(link, (now, BACKOFF_S[0]))
+            if now < until_s:
+                continue
+            try:
+                self._tick(link, now, step=step)
+            except Exception as error:  # noqa: BLE001  (of one link; it goes without adaptation for a while)
+                self._parts.failed(PART, error)
+                self._resting[link] = (now + pause_s, min(2.0 * pause_s, BACKOFF_S[1]))
+                with self._parts.survive(PART):
+                    self._leave(link)
         if step and links:
             self._kick()
+
+    def _tick(self, link: Link, now: float, *, step: bool) -> None:
+        adapter = self._adapters.get(link)
+        if adapter is None:
+            adapter = HopAdapter(
+                link, self._make_policy(), self._params, coder=self._coder, now=now, summaries=self._summaries
+            )
+            self._adapters[link] = adapter
+            link.on_arrived = self._guarded(adapter)
+        adapter.sample()
+        if step:
+            self._step(adapter, now)
+
+    def _guarded(self, adapter: HopAdapter) -> Callable[[OutChannel, OutMessage, float], None]:
+        """What an adapter is told while a datagram is read: no fault of it may keep the rest from being read."""
+
+        def arrived(channel: OutChannel, out: OutMessage, now: float) -> None:
+            try:
+                adapter.note_arrival(channel, out, now)
+            except Exception as error:  # noqa: BLE001  (as above)
+                self._parts.failed(PART, error)
+
+        return arrived
+
+    def _leave(self, link: Link) -> None:
+        """Give a link's topics back what their rules say."""
+        self._history.pop(link, None)
+        adapter = self._adapters.pop(link, None)
+        link.on_arrived = None
+        if adapter is not None:
+            adapter.close()
+
+    def reset(self) -> None:
+        """Give back everything; the next tick begins anew."""
+        for link in list(self._adapters):
+            with self._parts.survive(PART):
+                self._leave(link)
 
     def _step(self, adapter: HopAdapter, now: float) -> None:
         done = adapter.step(now=now)

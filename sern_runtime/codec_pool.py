@@ -1,29 +1,31 @@
 """Threads that encode and decode large bodies beside the event loop. Both libraries release the interpreter lock."""
 
 import asyncio
-import logging
 import os
 import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from heapq import heappop, heappush
 from typing import Final
 
 from sern_core.codecs import Coder, Work
 from sern_core.params import LinkParams
 from sern_runtime import clock
+from sern_runtime.optional import OptionalParts
 
 WORKERS: Final = 2
 """One body being decoded does not keep another from being encoded."""
 NICE: Final = 5
 """The loop's own thread goes first when there are fewer cores than work."""
 
-_log = logging.getLogger(__name__)
+PART: Final = "codecs"
 
 
 def _step_back() -> None:
-    os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICE)
+    with suppress(OSError):  # then they run beside the loop's thread, not behind it
+        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICE)
 
 
 class CodecPool:
@@ -33,15 +35,25 @@ class CodecPool:
     loop; work that has not begun by then is forgotten.
     """
 
-    def __init__(self, *, after: Callable[[], None], workers: int = WORKERS) -> None:
+    def __init__(
+        self, *, after: Callable[[], None], workers: int = WORKERS, parts: OptionalParts | None = None
+    ) -> None:
+        self._parts = parts or OptionalParts(PART)
         self._after = after
         self._workers = workers
         self._loop = asyncio.get_running_loop()
-        self._executor = ThreadPoolExecutor(workers, thread_name_prefix="codec", initializer=_step_back)
+        self._executor = self._new_executor()
         self._waiting: list[tuple[int, int, Work]] = []
         self._count = 0
         self._running = 0
         self._closed = False
+
+    def fault(self, error: Exception) -> None:
+        """A codec raised what it must not; in any thread."""
+        self._parts.failed(PART, error)
+
+    def _new_executor(self) -> ThreadPoolExecutor:
+        return ThreadPoolExecutor(self._workers, thread_name_prefix="codec", initializer=_step_back)
 
     def take(self, work: Work) -> None:
         """What `Coder.offload` calls."""
@@ -58,26 +70,41 @@ class CodecPool:
     def _start(self) -> None:
         while self._running < self._workers and self._waiting and not self._closed:
             self._running += 1
-            self._executor.submit(self._run, heappop(self._waiting)[2])
+            work = heappop(self._waiting)[2]
+            try:
+                self._executor.submit(self._run, work)
+            except RuntimeError as error:  # its threads are dead, or there is no room for them
+                self._parts.failed(PART, error)
+                self._executor.shutdown(wait=False)
+                self._executor = self._new_executor()
+                self._loop.call_soon(self._run, work)  # here, this once
 
     def _run(self, work: Work) -> None:
         """In a thread. Whatever goes wrong there, the message must not wait for ever."""
+        problem: Exception | None = None
         try:
             work.run()
-        except Exception:  # noqa: BLE001  (a fault of one body; the daemon goes on)
-            _log.exception("a body could not be worked on")
+        except Exception as error:  # noqa: BLE001  (a fault of one body; the daemon goes on)
+            problem = error
         finally:
-            self._loop.call_soon_threadsafe(self._done, work)
+            self._loop.call_soon_threadsafe(self._done, work, problem)
 
-    def _done(self, work: Work) -> None:
+    def _done(self, work: Work, problem: Exception | None) -> None:
         self._running -= 1
+        if problem is not None:
+            self._parts.failed(PART, problem)
         if self._closed:
             return
         self._start()
-        work.done(now=clock.now())
+        try:
+            work.done(now=clock.now())
+        except Exception as error:  # noqa: BLE001  (of one body; the loop goes on)
+            self.fault(error)
         self._after()
 
 
 def make_coder(link: LinkParams, pool: CodecPool) -> Coder:
     """The coder of a daemon: with a stopwatch, and with threads for what is large."""
-    return Coder(max_bytes=link.max_message_bytes, clock=time.perf_counter, offload=pool.take)
+    coder = Coder(max_bytes=link.max_message_bytes, clock=time.perf_counter, offload=pool.take)
+    coder.on_fault = pool.fault
+    return coder

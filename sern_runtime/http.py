@@ -12,6 +12,7 @@ from prometheus_client import CollectorRegistry
 from prometheus_client.exposition import choose_encoder
 
 from sern_core.errors import ConfigError, UsageError
+from sern_runtime.optional import OptionalParts
 
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 JsonSource = Callable[[], object]
@@ -29,6 +30,7 @@ class JsonQuery(NamedTuple):
 
 
 _SHUTDOWN_S: Final = 1.0
+PART: Final = "http"
 _log = logging.getLogger(__name__)
 
 
@@ -92,13 +94,15 @@ class HttpServer:
         health: HealthCheck,
         ready: HealthCheck,
         json_routes: Mapping[str, JsonSource | JsonQuery] | None = None,
+        parts: OptionalParts | None = None,
     ) -> None:
+        self._parts = parts or OptionalParts(PART)
         self.listen = listen
         self._host, self._port = parse_listen(listen)
         self._registry = registry
         self._runner: web.AppRunner | None = None
         self._requests = _RequestLog()
-        self._app = web.Application()
+        self._app = web.Application(middlewares=[self._survive])
         self._app.router.add_get("/metrics", self._metrics)
         self._app.router.add_get("/healthz", _health_route(health))
         self._app.router.add_get("/readyz", _health_route(ready))
@@ -109,7 +113,7 @@ class HttpServer:
         """Add a JSON route. Before `start`."""
         if self._runner is not None:
             raise UsageError("routes are added before the server is started")
-        self._app.router.add_get(path, _json_route(path, source))
+        self._app.router.add_get(path, _json_route(source))
 
     @property
     def port(self) -> int:
@@ -140,6 +144,20 @@ class HttpServer:
         if self._runner is not None:
             runner, self._runner = self._runner, None
             await runner.cleanup()
+
+    @web.middleware
+    async def _survive(self, request: web.Request, handler: Handler) -> web.StreamResponse:
+        """An answer that fails is told to its reader and the log, and ends nothing."""
+        try:
+            return await handler(request)
+        except web.HTTPException:
+            raise
+        except Exception as error:  # noqa: BLE001  (counted and said)
+            self._parts.failed(PART, error)
+            text = "internal error, see the log"
+            if request.path.startswith("/api/"):
+                return web.json_response({"error": text}, status=500)
+            return web.Response(status=500, text=text + "\n")
 
     async def _metrics(self, request: web.Request) -> web.Response:
         encode, content_type = choose_encoder(request.headers.get("Accept", ""))
@@ -174,7 +192,7 @@ def _asked(source: JsonQuery, query: Mapping[str, str]) -> object:
     return source.read({name: query[name] for name in query})
 
 
-def _json_route(path: str, source: JsonSource | JsonQuery) -> Handler:
+def _json_route(source: JsonSource | JsonQuery) -> Handler:
     async def handle(request: web.Request) -> web.Response:
         try:
             if isinstance(source, JsonQuery) and source.prepare is not None:
@@ -182,9 +200,6 @@ def _json_route(path: str, source: JsonSource | JsonQuery) -> Handler:
             text = json.dumps(_asked(source, request.query) if isinstance(source, JsonQuery) else source())
         except UsageError as error:
             return web.json_response({"error": str(error)}, status=400)
-        except Exception:  # noqa: BLE001  (a view that fails is told to its reader and the log, and ends nothing)
-            _log.exception("%s could not be answered", path)
-            return web.json_response({"error": "internal error, see the log"}, status=500)
         return web.Response(text=text, content_type="application/json", headers={"Cache-Control": "no-store"})
 
     return handle

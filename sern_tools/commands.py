@@ -7,6 +7,7 @@ from sern_tools.demo import demo
 from sern_tools.echo import echo
 from sern_tools.explain import explain
 from sern_tools.lab.cli import app as lab_app
+from sern_tools.recover import recover
 from sern_tools.topics import topics
 
 app = typer.Typer(
@@ -23,3 +24,4 @@ app.command("check")(check.check_command)
 app.command()(topics)
 app.command()(echo)
 app.command()(explain)
+app.command()(recover)

@@ -28,9 +28,11 @@ from rosbags.interfaces import (
 from rosbags.rosbag1 import Reader as Reader1
 from rosbags.rosbag2 import Reader as Reader2
 
+from sern_client.endpoints.bag_faults import why
 from sern_client.endpoints.base import Publisher, Sink, TopicEvents
 from sern_client.endpoints.clock import Clock, SystemClock
 from sern_client.endpoints.held import HeldSubscription
+from sern_client.endpoints.leftovers import ACTIVE
 from sern_core.errors import ConfigError, UsageError
 from sern_core.message import TopicInfo
 from sern_core.patterns import PatternError, PatternSet
@@ -196,6 +198,10 @@ class BagEndpoint:
         path = self.options.path
         if not path.exists():
             raise self._error("no such file; give a .bag, a .mcap, a .db3 or a rosbag2 directory")
+        if path.suffix == ACTIVE:
+            raise self._error(
+                f"the recording was not finished; `sern recover {path}` does that, if nobody records there"
+            )
         if path.is_file() and path.suffix not in {".bag", ".mcap", ".db3"}:
             raise self._error(f"unknown kind of file {path.suffix!r}; give a .bag, a .mcap, a .db3 or a directory")
         try:
@@ -204,7 +210,7 @@ class BagEndpoint:
         except PermissionError:
             raise self._error("permission denied; make the file readable for this user") from None
         except Exception as error:  # a damaged file makes the readers raise almost anything
-            raise self._error(f"cannot be read ({one_line(error)}); {self._cure()}") from error
+            raise self._error(f"cannot be read: {why(path, error)}; {self._cure()}") from error
         self._reader = reader
         self._select(reader.connections)
 
@@ -283,7 +289,7 @@ class BagEndpoint:
                 if len(batch) >= BATCH_MESSAGES or size >= BATCH_BYTES:
                     return _Batch(batch, end=False, problem=None)
         except Exception as error:  # noqa: BLE001  a damaged file makes the readers raise almost anything
-            return _Batch(batch, end=True, problem=one_line(error))
+            return _Batch(batch, end=True, problem=why(self.options.path, error))
         return _Batch(batch, end=True, problem=None)
 
     def _close(self) -> None:

@@ -5,7 +5,7 @@ its business. All calls happen on the event-loop thread; an endpoint with thread
 `call_soon_threadsafe`.
 """
 
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final, Protocol, runtime_checkable
 
@@ -99,6 +99,48 @@ class CountingEndpoint(Protocol):
     def drops(self) -> Mapping[DropReason, int]:
         """Messages it has dropped so far, by reason."""
         ...
+
+
+KeptUpTo = Callable[[int, Mapping[int, DropReason]], None]
+"""`told(upto, lost)`, on the event loop: of the messages that an endpoint has taken, all up to number `upto` are where
+they are to be kept, but for those in `lost`, by number, which were dropped."""
+
+
+@runtime_checkable
+class KeepingEndpoint(Protocol):
+    """An endpoint that keeps messages some time after `publish`: a recording, whose file is written in pieces."""
+
+    @property
+    def taken(self) -> int:
+        """Messages that its publishers were given so far."""
+        ...
+
+    def watch_kept(self, told: KeptUpTo) -> None:
+        """Whom to tell; once, before `start`."""
+        ...
+
+    def flush(self) -> None:
+        """Keep what was taken so far now."""
+        ...
+
+    def keep_soon(self) -> None:
+        """Somebody waits for what was taken so far: keep it, unless that would cost too much to be done often."""
+        ...
+
+
+@runtime_checkable
+class KeepingMembers(Protocol):
+    """An endpoint of several, of which some keep messages."""
+
+    @property
+    def keepers(self) -> Sequence[KeepingEndpoint]: ...
+
+
+def keepers_of(endpoint: Endpoint) -> Sequence[KeepingEndpoint]:
+    """Everything in an endpoint that keeps messages."""
+    if isinstance(endpoint, KeepingMembers):
+        return endpoint.keepers
+    return [endpoint] if isinstance(endpoint, KeepingEndpoint) else []
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,6 +8,7 @@ from sern_client.conversion import Converter, serve
 from sern_client.endpoints.base import (
     CountingEndpoint,
     Endpoint,
+    KeepingEndpoint,
     Publisher,
     ServiceEndpoint,
     ServiceEvents,
@@ -180,6 +181,11 @@ class CompositeEndpoint:
                 for reason, count in member.drops.items():
                     total[reason] = total.get(reason, 0) + count
         return total
+
+    @property
+    def keepers(self) -> list[KeepingEndpoint]:
+        """The members that keep messages."""
+        return [member for member in self._members if isinstance(member, KeepingEndpoint)]
 
     @property
     def exhausted(self) -> bool:

@@ -1,8 +1,11 @@
 """Records what arrives: ROS 1 topics into `<stem>.bag`, ROS 2 (CDR) topics into `<stem>.mcap`, byte for byte.
 
 Files grow under `<name>.active` and get their own name when they are complete, so a file with its own name is always
-readable. One thread writes; the event loop only appends to a bounded buffer. When the disk refuses, the file is
-finished with what it already holds, and everything later is counted as dropped.
+readable. One thread writes; the event loop only appends to a bounded buffer. What was written is flushed to the
+operating system at each megabyte, `flush_s` after it came, and when asked, and said to be kept from then on
+(`KeepingEndpoint`): it survives the end of this process, however that comes, and with `sync` that of the machine. What
+a killed process left is finished by the next one, under a name of its own (leftovers.py). When the disk refuses, the
+file is finished with what it already holds, and everything later is counted as dropped.
 """
 
 import asyncio
@@ -10,17 +13,25 @@ import atexit
 import logging
 import threading
 import time
+from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
+from enum import Enum, auto
 from pathlib import Path
-from queue import SimpleQueue
+from queue import Empty, SimpleQueue
+from tempfile import TemporaryFile
 from typing import Final, NamedTuple
 
+from rosbags.rosbag1 import WriterError as WriterError1
+from rosbags.rosbag2 import WriterError as WriterError2
+
 from sern_client.endpoints.bag_files import BagFile, McapFile, RecordFile, active_path
-from sern_client.endpoints.base import Sink, Subscription, TopicEvents
+from sern_client.endpoints.base import KeptUpTo, Sink, Subscription, TopicEvents
+from sern_client.endpoints.leftovers import ACTIVE, finish, in_use, put_aside
 from sern_core.errors import ConfigError, UsageError
 from sern_core.message import TopicInfo
-from sern_core.types import Encoding, TopicName
-from sern_runtime import ros_types
+from sern_core.types import DropReason, Encoding, TopicName
+from sern_runtime import clock, ros_types
 from sern_runtime.ros_types import one_line
 
 MAX_STAMP_NS: Final = 2**32 * 10**9 - 1
@@ -37,12 +48,15 @@ _SUFFIXES: Final = {Encoding.ROS1: ".bag", Encoding.CDR: ".mcap"}
 @dataclass(frozen=True, slots=True)
 class RecordOptions:
     """Where to. `path`: a `.bag` or `.mcap` (the other encoding goes beside it under the same stem), an existing
-    folder (named by date), or a name without suffix. `max_buffer_bytes` bounds what waits for the disk.
+    folder (named by date), or a name without suffix. `max_buffer_bytes` bounds what waits for the disk. A message waits
+    for `flush_s` at most before it is flushed; `sync`: to the disk.
     """
 
     path: Path
     overwrite: bool = False
     max_buffer_bytes: int = 64 * 2**20
+    flush_s: float = 1.0
+    sync: bool = False
 
 
 @dataclass(slots=True)
@@ -54,10 +68,23 @@ class RecordCounters:
     errors: int = 0
 
 
+class _Order(Enum):
+    """What the writer thread is told beside messages and topics."""
+
+    FLUSH = auto()
+
+
 class _Job(NamedTuple):
     info: TopicInfo
     stamp_ns: int
     body: bytes
+
+
+class _Numbered(NamedTuple):
+    """A message that was taken; they count from 1."""
+
+    number: int
+    job: _Job
 
 
 class _Publisher:
@@ -83,7 +110,7 @@ class RecordEndpoint:
         self.problem: str | None = None
         """The last thing that went wrong, in one line; None while all is well."""
         self._stem: Path | None = None
-        self._jobs: SimpleQueue[_Job | TopicInfo | None] = SimpleQueue()
+        self._jobs: SimpleQueue[_Numbered | TopicInfo | _Order | None] = SimpleQueue()
         # Each counter has one writer (event loop, thread), so their difference needs no lock.
         self._taken_bytes = 0
         self._done_bytes = 0
@@ -94,6 +121,16 @@ class RecordEndpoint:
         self._mcap_hashes: dict[str, str] = {}
         self._thread: threading.Thread | None = None
         self._open = False
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._told: KeptUpTo | None = None
+        self._taken = 0
+        self._refused: dict[int, DropReason] = {}  # numbers of what did not get into the buffer, not told of yet
+        self._drops: dict[DropReason, int] = dict.fromkeys((DropReason.QUEUE_FULL, DropReason.STORAGE), 0)
+        # Of the writer thread:
+        self._lost: dict[int, DropReason] = {}  # by number, not told of yet
+        self._unsafe: dict[Encoding, list[int]] = {}  # numbers of messages that are written and not flushed
+        self._done = 0  # number of the last message that was dealt with
+        self._flush_due_s: float | None = None
 
     # Life cycle
 
@@ -105,8 +142,17 @@ class RecordEndpoint:
             self._stem.parent.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise self._error(f"its folder cannot be made ({error.strerror}); choose another path") from None
+        try:
+            with TemporaryFile(dir=self._stem.parent):
+                pass
+        except OSError as error:
+            raise self._error(
+                f"nothing can be written in {self._stem.parent} ({_reason(error)}); make room, give this user the "
+                "right to write there, or choose another path"
+            ) from None
         for encoding in named:
             self._claim(encoding)
+        self._loop = asyncio.get_running_loop()
         self._thread = threading.Thread(target=self._write_all, name="sern-record", daemon=True)
         self._thread.start()
         self._open = True
@@ -154,20 +200,53 @@ class RecordEndpoint:
         """The final names of the files begun so far."""
         return {encoding: self._path(encoding) for encoding, file in self._files.items() if file is not None}
 
+    @property
+    def drops(self) -> Mapping[DropReason, int]:
+        """Messages that are in no file, by reason."""
+        return self._drops
+
+    @property
+    def taken(self) -> int:
+        """Messages that were published here."""
+        return self._taken
+
+    def watch_kept(self, told: KeptUpTo) -> None:
+        """Whom to tell what is flushed."""
+        self._told = told
+
+    def flush(self) -> None:
+        """Flush what was taken so far, without waiting for `flush_s`."""
+        self._jobs.put(_Order.FLUSH)
+
+    def keep_soon(self) -> None:
+        """Flush what was taken so far; to the disk itself (`sync`) only every `flush_s`."""
+        if not self.options.sync:
+            self.flush()
+
     def take(self, job: _Job) -> None:
         """Buffer one message for the writer thread; called by this recorder's publishers on the event loop."""
+        self._taken += 1
         cost = len(job.body) + _OVERHEAD_BYTES
         full = self._taken_bytes - self._done_bytes + cost > self.options.max_buffer_bytes
         if full and not self._overflowing:
             self._complain("the disk is slower than the messages; dropping until it catches up")
         self._overflowing = full
         if full or not self._open or not 0 <= job.stamp_ns <= MAX_STAMP_NS:
-            self._count_dropped()
+            reason = DropReason.QUEUE_FULL if full else DropReason.STORAGE
+            self._count_dropped(reason)
+            if not self._refused:
+                self.flush()  # tells of it, too
+            self._refused[self._taken] = reason
             return
         self._taken_bytes += cost
-        self._jobs.put(job)
+        self._jobs.put(_Numbered(self._taken, job))
 
     # On the event loop
+
+    def _tell(self, upto: int, lost: dict[int, DropReason]) -> None:
+        refused, self._refused = self._refused, {}
+        if self._told is not None:
+            self._told(upto, refused | lost)
 
     def _resolve(self, path: Path) -> tuple[Path, tuple[Encoding, ...]]:
         """(stem without suffix, encodings whose file must not be in the way)."""
@@ -188,10 +267,10 @@ class RecordEndpoint:
         if encoding in self._claimed:
             return
         path = self._path(encoding)
-        for taken in (path, active_path(path)):
-            if taken.exists() and not self.options.overwrite:
-                left = " (left by a recording that did not finish)" if taken != path else ""
-                raise ConfigError(f"exists already{left}; move it away or set `overwrite`", file=str(taken))
+        if path.exists() and not self.options.overwrite:
+            raise ConfigError("exists already; move it away or set `overwrite`", file=str(path))
+        if in_use(active_path(path)):
+            raise ConfigError("another process is recording there; choose another path", file=str(active_path(path)))
         self._claimed.add(encoding)
 
     def _complete(self, info: TopicInfo) -> TopicInfo:
@@ -225,39 +304,118 @@ class RecordEndpoint:
 
     def _write_all(self) -> None:
         try:
-            while (job := self._jobs.get()) is not None:
-                if isinstance(job, _Job):
-                    self._write(job)
-                    self._done_bytes += len(job.body) + _OVERHEAD_BYTES
-                elif (file := self._file(job.encoding)) is not None:
-                    file.add(job)
+            self._finish_leftovers()
+            while (job := self._next_job()) is not None:
+                if isinstance(job, _Numbered):
+                    self._write(job.number, job.job)
+                    self._done = job.number
+                    self._done_bytes += len(job.job.body) + _OVERHEAD_BYTES
+                elif isinstance(job, TopicInfo):
+                    self._add(job)
+                if job is _Order.FLUSH or (self._flush_due_s is not None and clock.now() >= self._flush_due_s):
+                    self._flush()
         finally:
+            self._flush()
             for encoding, file in self._files.items():
                 self._finish(encoding, file)
+
+    def _next_job(self) -> _Numbered | TopicInfo | _Order | None:
+        """The next one, or the order to flush when it is time for that."""
+        if self._flush_due_s is None:
+            return self._jobs.get()
+        try:
+            return self._jobs.get(timeout=max(0.0, self._flush_due_s - clock.now()))
+        except Empty:
+            return _Order.FLUSH
+
+    def _finish_leftovers(self) -> None:
+        """What killed processes left in the way, or in our folder of recordings."""
+        assert self._stem is not None
+        actives = {active_path(self._path(encoding)) for encoding in _SUFFIXES}
+        if self._folder or self.options.path.is_dir():
+            actives.update(self._stem.parent.glob(f"sern_*{ACTIVE}"))
+        for active in sorted(actives):
+            if not active.exists() or in_use(active):
+                continue
+            try:
+                left = finish(active, spare=active.name.startswith(f"{self._stem.name}."))
+                if left.messages is None:
+                    _LOG.error("%s: nothing of it can be read (%s); it is kept as %s", active, left.problem, left.path)
+                else:
+                    _LOG.warning(
+                        "%s was left by a recording that did not finish; its %d messages are in %s now",
+                        active, left.messages, left.path,
+                    )  # fmt: skip
+            except Exception as error:  # noqa: BLE001  (whatever it is, it must not be in the way of this recording)
+                self._put_aside(active, error)
+
+    def _put_aside(self, active: Path, error: Exception) -> None:
+        try:
+            aside = put_aside(active)
+        except OSError as second:
+            _LOG.error("%s is in the way and cannot be moved (%s)", active, _reason(second))
+        else:
+            _LOG.error("%s cannot be finished (%s); `sern recover %s` tries it again", active, _reason(error), aside)
+
+    def _add(self, info: TopicInfo) -> None:
+        file = self._file(info.encoding)
+        if file is None:
+            return
+        try:
+            file.add(info)
+        except Exception as error:  # noqa: BLE001  (of one topic; what comes of it is counted as dropped)
+            self._complain(f"{info.name} is not recorded ({_reason(error)})", info.encoding)
 
     def _file(self, encoding: Encoding) -> RecordFile | None:
         if encoding not in self._files:
             self._files[encoding] = None
             try:
-                self._files[encoding] = (BagFile if encoding is Encoding.ROS1 else McapFile)(self._path(encoding))
-            except OSError as error:
+                kind = BagFile if encoding is Encoding.ROS1 else McapFile
+                self._files[encoding] = kind(self._path(encoding), sync=self.options.sync)
+            except (OSError, WriterError1, WriterError2) as error:
                 self._complain(f"cannot be written ({_reason(error)}); nothing is recorded there", encoding)
         return self._files[encoding]
 
-    def _write(self, job: _Job) -> None:
-        file = self._files[job.info.encoding]
-        if file is None or file.full:
-            self._count_dropped()
-            return
-        try:
-            file.write(job.info, job.stamp_ns, job.body)
-            self.counters.written += 1
-        except OSError as error:
-            lost = file.give_up()
-            self.counters.written -= lost - 1  # this one had not been counted yet
-            self._count_dropped(lost)
-            what = f"writing failed ({_reason(error)}); the recording ends here, make room and start a new one"
-            self._complain(what, job.info.encoding)
+    def _write(self, number: int, job: _Job) -> None:
+        encoding = job.info.encoding
+        file = self._files[encoding]
+        if file is None or file.full or not file.knows(job.info):
+            self._count_dropped(DropReason.STORAGE)
+            self._lost[number] = DropReason.STORAGE
+        else:
+            self._unsafe.setdefault(encoding, []).append(number)
+            try:
+                self.counters.written += 1
+                if file.write(job.info, job.stamp_ns, job.body):
+                    self._unsafe[encoding].clear()
+            except Exception as error:  # noqa: BLE001  (whatever it is, it ends this file and not the thread)
+                self._failed(encoding, file, error)
+        if self._flush_due_s is None:
+            self._flush_due_s = clock.now() + self.options.flush_s
+
+    def _failed(self, encoding: Encoding, file: RecordFile, error: Exception) -> None:
+        lost = file.give_up()
+        self.counters.written -= lost
+        self._count_dropped(DropReason.STORAGE, lost)
+        self._lost.update(dict.fromkeys(self._unsafe.pop(encoding, ()), DropReason.STORAGE))
+        cure = "start a new one" if file.gone else "make room and start a new one"
+        self._complain(f"writing failed ({_reason(error)}); the recording ends here, {cure}", encoding)
+
+    def _flush(self) -> None:
+        """Everything so far is safe from now on, or was dropped; tell whoever waits for that."""
+        self._flush_due_s = None
+        for encoding, file in self._files.items():
+            if file is None or file.full:
+                continue
+            try:
+                file.flush()
+            except Exception as error:  # noqa: BLE001  (as above)
+                self._failed(encoding, file, error)
+        self._unsafe.clear()
+        lost, self._lost = self._lost, {}
+        assert self._loop is not None
+        with suppress(RuntimeError):  # the loop is closed: nobody waits any more
+            self._loop.call_soon_threadsafe(self._tell, self._done, lost)
 
     def _finish(self, encoding: Encoding, file: RecordFile | None) -> None:
         if file is None:
@@ -269,14 +427,15 @@ class RecordEndpoint:
             return
         if lost:
             self.counters.written -= lost
-            self._count_dropped(lost)
+            self._count_dropped(DropReason.STORAGE, lost)
             self._complain(f"the disk is full; its last {lost} messages are missing", encoding)
 
     # On both
 
-    def _count_dropped(self, count: int = 1) -> None:
+    def _count_dropped(self, reason: DropReason, count: int = 1) -> None:
         with self._lock:
             self.counters.dropped += count
+            self._drops[reason] += count
 
     def _complain(self, problem: str, encoding: Encoding | None = None) -> None:
         path = self.options.path if encoding is None else self._path(encoding)
@@ -295,5 +454,5 @@ class RecordEndpoint:
         return ConfigError(problem, file=str(self.options.path))
 
 
-def _reason(error: OSError) -> str:
-    return error.strerror or one_line(error)
+def _reason(error: Exception) -> str:
+    return (error.strerror if isinstance(error, OSError) else None) or one_line(error)

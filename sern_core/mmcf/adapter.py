@@ -41,6 +41,8 @@ MEMORY: Final = 3
 """Intervals that demand is told from."""
 FULL: Final = 0.85
 """A link of which such a share was used is called saturated."""
+MIN_DEADLINE_S: Final = 1e-3
+"""A peer may announce a lifespan of 0: its messages are as good as late, which costs what it costs."""
 LOSSY_MODE: Final = "lossy"
 """z: what each topic allows to be lost is (point clouds through Draco, images as JPEG), the others Zstandard."""
 ARRIVAL_CV2: Final = 0.1
@@ -148,7 +150,7 @@ class HopAdapter:
         self._arrived: dict[PriorityClass, _ClassCount] = {priority: _ClassCount() for priority in CLASSES}
         self._samples: deque[float] = deque(maxlen=SAMPLES)
         self._measured: Measurement | None = None
-        link.on_arrived = self._note_arrival
+        link.on_arrived = self.note_arrival
 
     def close(self) -> None:
         """Give every topic back what its rule says."""
@@ -161,7 +163,7 @@ class HopAdapter:
 
     # --- measuring ------------------------------------------------------------------------------------------------
 
-    def _note_arrival(self, channel: OutChannel, out: OutMessage, now: float) -> None:
+    def note_arrival(self, channel: OutChannel, out: OutMessage, now: float) -> None:
         message = out.message
         if message.replay or message.tombstone:
             return
@@ -175,7 +177,7 @@ class HopAdapter:
     def _deadline_s(self, channel: OutChannel) -> float:
         deadline_s = self.params.deadlines_s[channel.spec.priority]
         lifespan_s = channel.spec.lifespan_s
-        return deadline_s if lifespan_s is None else min(deadline_s, lifespan_s)
+        return deadline_s if lifespan_s is None else max(MIN_DEADLINE_S, min(deadline_s, lifespan_s))
 
     def _rtt_s(self) -> float:
         rtt_s = self.link.lane.estimator.rtprop_s
@@ -276,7 +278,7 @@ class HopAdapter:
                     topics=len(weighed),
                     depth=max(1, round(mean(lambda offer: _depth(offer.channel)))),
                     needed=self.params.needed[priority],
-                    thinnable=mean(lambda offer: float(offer.channel.thinnable)),
+                    thinnable=min(1.0, mean(lambda offer: float(offer.channel.thinnable))),
                     protected=priority is PriorityClass.CONTROL and not self.link.lane.lossless,
                     codecs={mode: _class_profile(mode, weighed) for mode in self.params.modes if mode != NO_CODEC},
                     prepare_s=mean(lambda offer: offer.prepare_s),

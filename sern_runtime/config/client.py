@@ -1,5 +1,6 @@
 """The file of a client daemon (`sern-client`): who it is, its relay, its endpoints, and what to do with which topic."""
 
+import re
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -145,6 +146,10 @@ class LossSection(Section):
     """Without a fresh command for so long, whatever the cause; repeated at 10 Hz for 1 s."""
 
 
+_COMMAND: Final = re.compile("cmd|command|joy|teleop|twist", re.IGNORECASE)
+"""What the names of command topics have in them."""
+
+
 class TopicSection(Section):
     """One rule. The first rule that matches a topic holds for it."""
 
@@ -177,7 +182,8 @@ class TopicSection(Section):
     deadline_s: Seconds | None = None
     """Expected time between messages: longer gaps are reported; null: no expectation."""
     max_rate_hz: Hertz | None = None
-    """Faster messages are thinned to this rate; null: all."""
+    """Faster messages of a best-effort topic are thinned to this rate; null: all. The newest waits for its turn, so the
+    last one always goes. Leave commands without: they would wait, too."""
     retention_s: Seconds | None = None
     """How long an undelivered reliable message is kept; null: `link.retention_s`."""
     max_queue_bytes: Bytes = DEFAULT_RELIABLE_QUEUE_BYTES
@@ -237,6 +243,14 @@ class TopicSection(Section):
                 allowed = ", ".join(sorted(COMMAND_TYPES))
                 raise fault(f"is only for {allowed}; type {self.type!r} matches neither", "on_link_loss")
         return self
+
+    def rate_problem(self) -> str | None:
+        """What a limit on the rate does here that is hardly meant; None when it does what it says."""
+        if self.reliability == "reliable" and not self.merge_tf:
+            return "has no effect on a reliable topic, of which every message counts; leave it out, or use best_effort"
+        if self.priority == "control" and _COMMAND.search(self.match):
+            return f"lets a command wait for up to {1.0 / (self.max_rate_hz or 1.0):.3g} s; leave it out"
+        return None
 
     def _takes_commands(self) -> bool:
         pattern = compile_pattern(self.type or ".*")
@@ -468,6 +482,9 @@ class ClientFile(FileModel):
         several = isinstance(self.endpoint, tuple)
         for index, endpoint in enumerate(self.endpoints):
             yield from endpoint.file_problems(base_dir, ("endpoint", index) if several else ("endpoint",))
+        for index, section in enumerate(self.topics):
+            if section.max_rate_hz is not None and (problem := section.rate_problem()) is not None:
+                yield FileProblem(("topics", index, "max_rate_hz"), problem, warning=True)
         yield from output_problems(base_dir, self.message_log, ("message_log",))
         yield from output_problems(base_dir, self.summary, ("summary",))
 

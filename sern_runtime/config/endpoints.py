@@ -159,6 +159,12 @@ class RecordEndpoint(EndpointBase):
     """Replace files that exist."""
     max_buffer_bytes: Annotated[int, Field(ge=1 << 20, le=1 << 36)] = 64 * 2**20
     """What may wait for the disk; beyond, messages are dropped and counted."""
+    flush_s: Annotated[float, Field(gt=0, le=60)] = 1.0
+    """Longest time, in seconds, before a message is given to the operating system and so survives the end of this
+    process, however it ends. A reliable message is confirmed to its sender then; without `sync` that is done after
+    some milliseconds. At a megabyte it is done earlier."""
+    sync: bool = False
+    """Have each flush written to the disk itself (fsync), so that what is confirmed survives a power cut as well."""
 
     def file_problems(self, base_dir: Path, loc: Loc) -> Iterator[FileProblem]:
         path = resolve(base_dir, self.path)

@@ -122,3 +122,29 @@ def test_the_relay_lets_through_what_a_client_needs(name: str) -> None:
     for topic in ("/cmd_vel", "/move_base/goal", "/dock/_call/site1"):
         assert table.may_subscribe(own, TopicName(robot + topic))
     assert not table.may_subscribe(own, TopicName("/other1/cmd_vel"))
+
+
+def test_no_example_caps_a_command() -> None:
+    """A limit on the rate makes a command wait for its turn, and does nothing to a reliable topic."""
+    for path in sorted(EXAMPLES.glob("*.yaml")):
+        if path.stem.startswith("relay"):
+            continue
+        model = load_client(path, files=False).model
+        assert [s.match for s in model.topics if s.max_rate_hz is not None and s.rate_problem() is not None] == []
+
+
+def test_a_capped_command_and_a_capped_reliable_topic_are_warned_of(tmp_path: Path) -> None:
+    path = tmp_path / "site.yaml"
+    path.write_text(
+        "client: {name: site1}\n"
+        "relay: {endpoint: 'tcp://127.0.0.1:5555', insecure: true}\n"
+        "endpoint: {kind: synthetic, role: operator}\n"
+        "topics:\n"
+        "  - {match: /cmd_vel, class: control, max_rate_hz: 20}\n"
+        "  - {match: /map, class: state, reliability: reliable, max_rate_hz: 1}\n"
+        "  - {match: /imu, class: control, max_rate_hz: 20}\n"
+    )
+    warnings = load_client(path).warnings
+    assert len(warnings) == 2
+    assert "lets a command wait for up to 0.05 s" in warnings[0] and "site.yaml:5" in warnings[0]
+    assert "has no effect on a reliable topic" in warnings[1]

@@ -294,7 +294,53 @@ async def test_the_topic_itself_goes_at_level_raw_or_beside(bench: Bench) -> Non
     assert raw == [b"b", b"c", b"d"] and bench.sent == [b"A", b"D"]
     capped = SummarisedTopic(bench.core, channel, send_raw, [summary], RateCap(0.001))
     assert capped.sink(b"e", 5) and capped.sink(b"f", 6)
-    assert raw[-1] == b"e" and bench.dropped(channel) == {DropReason.RATE_CAP: 1}
+    assert raw[-1] == b"e" and bench.dropped(channel) == {} and capped.pending == 1
+    assert capped.sink(b"g", 7) and bench.dropped(channel) == {DropReason.RATE_CAP: 1}
+    capped.close()
+    assert raw[-1] == b"e" and bench.dropped(channel) == {DropReason.RATE_CAP: 1, DropReason.SHUTDOWN: 1}
+
+
+@pytest.mark.parametrize("size", [10, 200_000])
+async def test_a_fault_of_ours_is_counted_and_the_message_is_unreadable(bench: Bench, size: int) -> None:
+    own = bench.channel("/robot1/points/voxel")
+
+    def work(job: Job) -> tuple[tuple[int, bytes], ...]:
+        if job.stamp_ns == 1:
+            raise ZeroDivisionError("injected")
+        return ((0, b"made"),)
+
+    summary = bench.summary(VoxelParams(), (own,), work=work)
+    assert summary.offer(bytes(size), 1, 0.0)
+    await until(lambda: not summary.pending)
+    assert summary.undecodable == summary.failures == 1 and bench.dropped(own) == {DropReason.UNDECODABLE: 1}
+    assert summary.offer(bytes(size), 2, 0.0)
+    await until(lambda: bench.sent == [b"made"])
+
+
+async def test_a_dead_thread_is_done_without(bench: Bench) -> None:
+    own = bench.channel("/robot1/points/voxel")
+    summary = bench.summary(VoxelParams(), (own,), work=lambda _job: ((0, b"made"),))
+    bench.executor.shutdown()
+    assert summary.offer(bytes(200_000), 1, 0.0) and bench.sent == [b"made"] and summary.failures == 1
+
+
+async def test_the_last_of_a_capped_series_goes_when_its_time_comes(bench: Bench) -> None:
+    channel = bench.channel()
+    raw: list[tuple[bytes, int]] = []
+
+    def send_raw(body: bytes, stamp_ns: int, born_s: float) -> bool:
+        raw.append((body, stamp_ns))
+        return True
+
+    summary = bench.summary(VoxelParams(), (bench.channel("/robot1/points/voxel"),))
+    summary.set_level(RAW)
+    capped = SummarisedTopic(bench.core, channel, send_raw, [summary], RateCap(20.0))
+    for number in range(5):
+        capped.sink(b"%d" % number, number)
+    await until(lambda: not capped.pending)
+    assert raw[0] == (b"0", 0) and raw[-1] == (b"4", 4)
+    assert len(raw) + bench.dropped(channel).get(DropReason.RATE_CAP, 0) == 5
+    capped.close()
 
 
 async def test_merged_transforms_wait_while_one_is_queued_and_none_is_lost(bench: Bench) -> None:

@@ -183,3 +183,23 @@ def test_a_coder_measures_with_the_clock_it_is_given() -> None:
     assert encoded.codec is Codec.LZ4
     assert encoded.elapsed_s == 1.0
     assert coder.decode(encoded.codec, encoded.body) == (TEXT, 1.0)
+
+
+def test_a_fault_of_a_codec_is_told_and_costs_one_body(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever a library raises: what is to be encoded goes as it is, what is to be decoded is undecodable."""
+    from sern_core import codecs
+
+    def broken(*_: object, **__: object) -> tuple[Codec, bytes]:
+        raise ZeroDivisionError("injected")
+
+    told: list[Exception] = []
+    coder = Coder(max_bytes=10_000)
+    coder.on_fault = told.append
+    body = b"a" * 1000
+    packed = coder.encode(Compression.ZSTD, body)
+    monkeypatch.setattr(codecs, "encode", broken)
+    monkeypatch.setattr(codecs, "decode", broken)
+    assert coder.encode(Compression.ZSTD, body)[:2] == (Codec.NONE, body) and coder.unencodable == 1
+    with pytest.raises(CodecError, match="its decoder has failed"):
+        coder.decode(packed.codec, packed.body)
+    assert [type(error) for error in told] == [ZeroDivisionError, ZeroDivisionError]

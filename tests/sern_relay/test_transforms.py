@@ -72,6 +72,22 @@ async def test_a_pair_of_frames_is_an_object(encoding: Encoding) -> None:
     world.transforms.close()
 
 
+async def test_a_fault_costs_one_reading_and_not_the_stream(monkeypatch: pytest.MonkeyPatch) -> None:
+    world = World()
+
+    def broken(*_: object) -> None:
+        raise ZeroDivisionError("injected")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(ros_types, "deserialise", broken)
+        world.send(stream(), body(("odom", "base_link", 1.5)))
+        await until(lambda: world.transforms.failures == 1)
+    world.now_s += 1.0
+    world.send(stream(), body(("odom", "base_link", 2.5)))
+    await world.read("tf:odom>base_link@jackal1")
+    world.transforms.close()
+
+
 async def test_a_fast_stream_is_read_at_the_rate_and_all_its_pairs_are_there() -> None:
     world = World()
     tf = stream()

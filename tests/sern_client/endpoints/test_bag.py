@@ -3,6 +3,7 @@
 import asyncio
 import itertools
 import logging
+import re
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ from typing import Any
 import pytest
 
 from sern_client.endpoints.bag import BagEndpoint, BagOptions
+from sern_client.endpoints.bag_faults import why
 from sern_core.errors import ConfigError, UsageError
 from sern_core.types import Encoding, TopicName
 from sern_runtime.ros_types import hash_of, topic_info
@@ -224,6 +226,35 @@ async def test_truncated_file(kind: str, keep: float, make_bag: Make, events: An
         problem = str(error)
     assert problem is not None and "\n" not in problem
     assert str(path) in problem and ("reindex" in problem or "recover" in problem)
+    assert re.search("it is empty|cut off|not finished|it is not|end is missing|damaged|malformed|corrupt", problem), (
+        problem
+    )
+    assert not re.search(r"\b[A-Z]\w*(Error|Exception)\b", problem), problem  # a class of ours is no reason
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "said"),
+    [
+        ("x.bag", b"", "it is empty"),
+        ("x.bag", b"hello", "it is not a ROS 1 bag"),
+        ("x.bag", b"#ROSBAG V2.0\nhello", "its header is damaged"),
+        ("x.mcap", b"hello", "it is not an MCAP file"),
+        ("x.mcap", b"\x89MCAP0\r\nhello", "its end is missing"),
+        ("x.db3", b"hello", "it is not an SQLite database"),
+    ],
+)
+async def test_a_broken_file_says_why(name: str, content: bytes, said: str, tmp_path: Path, events: Any) -> None:
+    path = tmp_path / name
+    path.write_bytes(content)
+    with pytest.raises(ConfigError) as caught:
+        await BagEndpoint(BagOptions(path, rate=0)).start(events)
+    text = str(caught.value)
+    assert said in text and str(path) in text and "; try `" in text and "\n" not in text
+
+
+def test_an_error_without_words_is_damage() -> None:
+    assert why(Path(__file__), AssertionError()) == "its bytes are damaged"
+    assert why(Path(__file__), KeyError(3)) == "its bytes are damaged: 3"
 
 
 async def test_damage_found_while_playing(

@@ -1,0 +1,71 @@
+"""Every reason for which a message may be dropped is made to happen in a test, has a code and is explained."""
+
+import ast
+from pathlib import Path
+from typing import Final
+
+from sern_core.ledger import OTHER_TOPIC
+from sern_core.types import DROP_CODES, DropReason
+from tests.fuzz.test_hostile_peer import Hostile, _piece, _whole
+from tests.world import World
+
+ROOT: Final = Path(__file__).resolve().parents[2]
+PROOFS: Final = {
+    DropReason.LIFESPAN: "test_queues.py::test_what_is_held_back_has_a_lifespan_and_an_end",
+    DropReason.SUPERSEDED: "test_queues.py::test_keep_last_drops_the_oldest_that_has_not_begun",
+    DropReason.RATE_CAP: "test_rate_cap.py::test_the_last_value_arrives_within_a_period",
+    DropReason.UNWANTED: "test_system_reliable.py",
+    DropReason.REFUSED: "test_system_reliable.py",
+    DropReason.FORBIDDEN: "test_hub.py",
+    DropReason.RETENTION: "test_system_reliable.py",
+    DropReason.STALE: "test_system_service.py",
+    DropReason.LOST: "test_fragments.py",
+    DropReason.DUPLICATE: "test_fragments.py",
+    DropReason.TOO_LARGE: "test_system_reliable.py",
+    DropReason.UNKNOWN_CHANNEL: "test_drop_reasons.py::test_a_message_of_no_stream_is_counted_as_such",
+    DropReason.REASSEMBLY: "test_fragments.py",
+    DropReason.DISCONNECTED: "test_system_reliable.py",
+    DropReason.SHUTDOWN: "test_queues.py",
+    DropReason.QUEUE_FULL: "test_bound.py",
+    DropReason.UNDECODABLE: "test_compression.py",
+    DropReason.UNCONFIRMED: "test_queues.py",
+    DropReason.STORAGE: "test_holding.py::test_what_was_lost_is_reported_to_its_origin_before_it_is_confirmed",
+}
+"""Where each is made to happen and asserted."""
+
+
+def asserted(path: Path, name: str, reason: DropReason) -> bool:
+    """Whether a test function of the file asserts something with the reason in it."""
+    for node in ast.parse(path.read_text()).body:
+        if isinstance(node, ast.FunctionDef) and node.name.startswith("test_") and name in ("", node.name):
+            text = ast.unparse(node)
+            if f"DropReason.{reason.name}" in text and "assert" in text:
+                return True
+    return False
+
+
+def test_every_reason_has_a_proof() -> None:
+    assert PROOFS.keys() == set(DropReason)
+    here = Path(__file__).parent
+    missing = [
+        reason
+        for reason, proof in PROOFS.items()
+        if not asserted(here / proof.partition("::")[0], proof.partition("::")[2], reason)
+    ]
+    assert missing == []
+
+
+def test_every_reason_is_explained_with_its_code() -> None:
+    guide, wire = (ROOT / "docs/operations.md").read_text(), (ROOT / "schemas/wire.md").read_text()
+    assert [reason for reason in DropReason if f"\n| `{reason}` |" not in guide] == []
+    assert [reason for reason in DropReason if f"\n| {DROP_CODES[reason]} | `{reason}` |" not in wire] == []
+
+
+def test_a_message_of_no_stream_is_counted_as_such() -> None:
+    """Once a message, not once a fragment, where the guide says."""
+    world = World()
+    peer = Hostile(world, "mallory")
+    peer.say(_whole(77, 1), _piece(77, 2, 0, 2), _piece(77, 2, 1, 2))
+    received = world.relay.hub.received.topics[OTHER_TOPIC]
+    assert received.by_reason[DropReason.UNKNOWN_CHANNEL] == 2 and received.delivered == 0
+    assert world.relay.hub.links[peer.name].strays == 3
