@@ -15,6 +15,7 @@ from prometheus_client import CollectorRegistry
 
 from sern_client.actions import GoalWatch
 from sern_client.bridge import Bridge
+from sern_client.checks import TableCheck
 from sern_client.endpoints.base import CountingEndpoint, Endpoint, ServiceEndpoint
 from sern_client.express import ClientExpress
 from sern_client.factory import make_endpoint
@@ -105,6 +106,7 @@ class ClientDaemon:
             coder=make_coder(model.link.params(), self.codecs),
         )
         self.bridge.attach(self.core)
+        self.check = TableCheck(self.bridge, now=now)
         self.core.subscribe(model.subscribe_patterns(), now=now)
         self._serve_services(endpoint)
         if model.actions.use:
@@ -238,6 +240,7 @@ class ClientDaemon:
                 self._lane.tick()
             if self._express is not None:
                 self._express.tick()
+            self.check.tick(now=time.monotonic())
             if watchdog.interval_s is not None:
                 watchdog.check()
             state = "up" if link.established and not link.lane.stalled else f"down: {self.reason}"
@@ -283,6 +286,16 @@ class ClientDaemon:
             "Messages that were dropped between this site's nodes and its endpoint.",
             ("reason",),
             endpoint_drops,
+        )
+        metrics.gauge(
+            "sern_endpoint_differences",
+            "Differences between what this client holds open at its endpoint and what is open there, at the last look.",
+            read=lambda: [((), float(len(self.check.found)))],
+        )
+        metrics.counter(
+            "sern_endpoint_differences_total",
+            "Differences that were ever found there; each is a line in the log.",
+            read=lambda: [((), float(self.check.total))],
         )
         adaptation = self.adaptation
         if adaptation is not None:
@@ -348,6 +361,8 @@ class ClientDaemon:
 
     def _ready(self) -> Health:
         if self.core.link.established:
+            if self.check.found:
+                return Health(ok=False, reason=f"what is here is not what should be: {self.check.found[0]}")
             return Health(ok=True, reason=f"connected to {self.core.link.peer}")
         return Health(ok=False, reason=self.bridge.rejected_reason or self.reason)
 

@@ -4,7 +4,8 @@ The shell (sern_client) feeds it endpoint messages and lane bytes, and is told t
 appear and which messages have their turn. Everything about bandwidth, order, replay and loss is in the link below.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
+from dataclasses import replace
 from typing import Protocol
 
 from sern_core import wire
@@ -71,6 +72,12 @@ class ClientEvents(Protocol):
         """The body of a message could not be decoded: it is dropped. Said once for each topic."""
 
 
+def _announced(stream: StreamInfo) -> StreamInfo:
+    """What its origin says of a stream, without what is filled in here."""
+    attributes = {key: value for key, value in stream.attributes.items() if key != "definition"}
+    return StreamInfo(stream.id, replace(stream.info, definition=""), stream.spec, attributes)
+
+
 class ClientCore:
     """One client. `boot` is a random 63-bit number of this process, `now` any monotonic time in seconds.
 
@@ -102,7 +109,8 @@ class ClientCore:
         """Metadata of this node, for the object registry."""
         self._generations: dict[StreamId, int] = {}
         self._latched: dict[StreamId, LatchedCache] = {}  # for a relay that comes back with nothing
-        self._open: set[StreamId] = set()
+        self._open: dict[StreamId, StreamInfo] = {}  # as they were announced
+        self._refused: set[StreamId] = set()  # announced, but this site could not publish them
         self._undecodable: set[TopicName] = set()
         self.coder = coder or Coder(max_bytes=link.max_message_bytes)
         self._decoder = Decoder[InStream](
@@ -248,6 +256,15 @@ class ClientCore:
     def on_announce(self, link: Link, announcement: Announcement, *, now: float) -> bool | None:
         stream = link.streams[announcement.stream.id]
         digest = announcement.definition_hash
+        identity = stream.stream.id
+        link.outlived(identity.origin, identity.boot, now=now)
+        opened = self._open.get(identity)
+        if opened is not None and opened != _announced(announcement.stream):
+            # Its origin ended it and began it anew while we were away, as something else.
+            self._close_stream(stream, now)
+            stream.stream = replace(announcement.stream, attributes={**announcement.stream.attributes})
+            if digest:
+                stream.stream.attributes["definition"] = digest
         if digest and digest not in self.definitions:
             return None  # asked for; answered when it is here
         return self._open_stream(stream)
@@ -268,13 +285,38 @@ class ClientCore:
                 info.latched,
                 info.reliable,
             )
+            announced = _announced(stream.stream)
             stream.stream = StreamInfo(identity, complete, stream.stream.spec, stream.stream.attributes)
             try:
                 self.events.stream_opened(stream.stream)
             except ConfigError:
+                self._refused.add(identity)
                 return False  # the shell has logged it; nothing else stops
-            self._open.add(identity)
+            self._refused.discard(identity)
+            self._open[identity] = announced
         return True
+
+    def reconsider(self, *, now: float) -> None:
+        """Open what this site could not publish when it was announced, if it can now: another stream may have been in
+        its way, which has ended."""
+        for stream in list(self.link.incoming.values()):
+            if stream.stream.id in self._refused and self._open_stream(stream):
+                self.link.answer(stream, True, now=now)
+
+    @property
+    def refused(self) -> Collection[StreamId]:
+        """The streams from elsewhere that there are, and that this site could not publish."""
+        return self._refused
+
+    @property
+    def opened(self) -> Collection[StreamId]:
+        """The streams from elsewhere that are open here."""
+        return self._open.keys()
+
+    def _close_stream(self, stream: InStream, now: float) -> None:
+        self._decoder.forget(stream.stream.id, now=now)
+        del self._open[stream.stream.id]
+        self.events.stream_closed(stream.stream)
 
     def on_definition(self, link: Link, digest: str, *, now: float) -> None:
         for stream in list(link.incoming.values()):
@@ -282,10 +324,9 @@ class ClientCore:
                 link.answer(stream, self._open_stream(stream), now=now)
 
     def on_retract(self, link: Link, stream: InStream, *, now: float) -> None:
+        self._refused.discard(stream.stream.id)
         if stream.stream.id in self._open:
-            self._decoder.forget(stream.stream.id, now=now)
-            self._open.discard(stream.stream.id)
-            self.events.stream_closed(stream.stream)
+            self._close_stream(stream, now)
 
     def on_message(self, link: Link, stream: InStream, message: Message, *, now: float) -> None:
         self._decoder.message(stream, message, now=now)

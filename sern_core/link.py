@@ -290,6 +290,9 @@ class Link(Session):
         stream = self.streams.get(identity)
         if self.incoming.get(slot, stream) is not stream or (stream and stream.channel_id not in (None, slot)):
             raise WireError(f"channel {slot} or its stream {identity.topic!r} is announced twice")
+        if stream is not None and not _same_type(stream.stream, announcement):
+            self._retract(stream, now)  # the name came back with another type: that is another stream
+            stream = None
         if stream is None or stream.stream.spec != announcement.stream.spec:
             replaced = stream
             stream = InStream(
@@ -389,6 +392,11 @@ class Link(Session):
                     self._missing.setdefault(identity, now)
                 else:
                     self._retract(stream, now)
+
+    def outlived(self, origin: ClientName, boot: int, *, now: float) -> None:
+        """A process of `origin` is there, `boot`: what a new relay has not been told of the ones before is gone."""
+        for identity in [each for each in self._missing if each.origin == origin and each.boot != boot]:
+            self._retract(self.streams[identity], now)
 
     def _retract(self, stream: InStream, now: float) -> None:
         self.streams.pop(stream.stream.id, None)
@@ -595,3 +603,14 @@ class Link(Session):
         self.scheduler.validate()
         check(len(self.by_stream) == len(self.channels), "channel tables differ")
         check(self._watermarks.keys() <= self.incoming.keys(), "watermarks of streams that are gone")
+
+
+def _same_type(known: StreamInfo, announced: Announcement) -> bool:
+    """Whether bodies of both are to be read in the same way."""
+    one, other = known.info, announced.stream.info
+    return (
+        one.type_name == other.type_name
+        and one.encoding is other.encoding
+        and one.type_hash == other.type_hash
+        and known.attributes.get("definition", "") == announced.definition_hash
+    )

@@ -10,13 +10,14 @@ import atexit
 import logging
 import threading
 import time
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 from queue import SimpleQueue
 from typing import Final, NamedTuple
 
 from sern_client.endpoints.bag_files import BagFile, McapFile, RecordFile, active_path
-from sern_client.endpoints.base import Sink, Subscription, TopicEvents
+from sern_client.endpoints.base import Difference, Held, Sink, Subscription, TopicEvents
 from sern_core.errors import ConfigError, UsageError
 from sern_core.message import TopicInfo
 from sern_core.types import Encoding, TopicName
@@ -66,11 +67,15 @@ class _Publisher:
         self._info: TopicInfo | None = info
 
     def publish(self, body: bytes, stamp_ns: int) -> None:
-        if self._info is not None:
+        if self._info is None:
+            self._recorder.count_dropped()
+        else:
             self._recorder.take(_Job(self._info, stamp_ns, body))
 
     def close(self) -> None:
-        self._info = None
+        info, self._info = self._info, None
+        if info is not None:
+            self._recorder.publishers[info.name] -= 1
 
 
 class RecordEndpoint:
@@ -82,6 +87,8 @@ class RecordEndpoint:
         self.counters = RecordCounters()
         self.problem: str | None = None
         """The last thing that went wrong, in one line; None while all is well."""
+        self.publishers: Counter[TopicName] = Counter()
+        """How many are open, by topic."""
         self._stem: Path | None = None
         self._jobs: SimpleQueue[_Job | TopicInfo | None] = SimpleQueue()
         # Each counter has one writer (event loop, thread), so their difference needs no lock.
@@ -134,7 +141,19 @@ class RecordEndpoint:
         info = self._complete(info)
         self._claim(info.encoding)
         self._jobs.put(info)
+        self.publishers[info.name] += 1
         return _Publisher(self, info)
+
+    def validate(self, held: Held) -> list[Difference]:
+        """Nothing is written any more: that is a difference of every topic."""
+        found = held.differences(Held(+self.publishers))
+        if self._open and (self._thread is None or not self._thread.is_alive()):
+            found.append(Difference(TopicName(""), f"{self.options.path}: the thread that records has ended"))
+        return found
+
+    def count_dropped(self) -> None:
+        """A message came to a publisher that is closed."""
+        self._count_dropped()
 
     def interest(self, name: TopicName, wanted: bool) -> None:
         """Makes no difference here."""

@@ -7,6 +7,7 @@ that off, for a chain of two links with a domain in the middle.
 
 import asyncio
 import logging
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -20,13 +21,13 @@ from cyclonedds.pub import DataWriter, Publisher
 from cyclonedds.sub import DataReader, Subscriber
 from cyclonedds.topic import Topic
 
-from sern_client.endpoints.base import ServiceEvents, ServiceHandler, ServiceInfo, Sink, TopicEvents
+from sern_client.endpoints.base import Difference, Held, ServiceEvents, ServiceHandler, ServiceInfo, Sink, TopicEvents
 from sern_client.endpoints.dds import names, node_info, raw
 from sern_client.endpoints.dds.definitions import Definitions
 from sern_client.endpoints.dds.domain import DomainOptions, close_domain, open_domain
 from sern_client.endpoints.dds.graph import MAX_COMPLAINTS, Graph, Local, Participant, Remote
 from sern_client.endpoints.dds.idl import TypeMaker
-from sern_client.endpoints.dds.names import DISCOVERY_TOPIC, SERN_KEY, RosName, user_data
+from sern_client.endpoints.dds.names import DISCOVERY_TOPIC, SERN_KEY, Role, RosName, user_data
 from sern_client.endpoints.dds.qos import (
     INFINITE_NS,
     EndpointQos,
@@ -73,7 +74,7 @@ class DdsOptions:
 class DdsCounters:
     """Messages by fate. Dropped: the event loop was too slow (`overrun`), slow reliable readers left a writer no room
     (`blocked`), too many calls of a service were under way (`calls`), or what came was no call (`unreadable`). What the
-    link did not take (`refused`), the link counts."""
+    link did not take (`refused`), the link counts. `closed`: given to a writer that is no more."""
 
     received: int = 0
     overrun: int = 0
@@ -82,6 +83,7 @@ class DdsCounters:
     blocked: int = 0
     calls: int = 0
     unreadable: int = 0
+    closed: int = 0
 
 
 class _Subscription:
@@ -110,6 +112,11 @@ class _Subscription:
         asked = replace(reader_for(writers), type_hash=self.info.type_hash)
         resolved = ros_types.resolve(self.info.type_name, self.info.definition, Encoding.CDR)
         self._reader = self._endpoint.open_reader(self.dds_topic, resolved, asked, self._deliver)
+
+    @property
+    def lacks_reader(self) -> bool:
+        """It is to have one and has none."""
+        return self._reader is None and (self.wanted or self.info.latched)
 
     @property
     def matched(self) -> int:
@@ -177,6 +184,7 @@ class _Writer:
 
     def publish(self, body: bytes, stamp_ns: int) -> None:
         if self._writer is None:
+            self._endpoint.counters.closed += 1
             return
         # A lifespan is judged by the time stamp: only one of this host says how old a sample is here.
         result = raw.write(self._writer, body, stamp_ns if self._stamped else None)
@@ -310,6 +318,24 @@ class DdsEndpoint:
                 f"{resolved.text.type_hash}; both sides need the same version of the type"
             )
         return resolved
+
+    def validate(self, held: Held) -> list[Difference]:
+        """A wanted topic without a reader differs too. Without the thread that waits for DDS nothing is received: that
+        is a difference of every topic."""
+        here = Held(subscriptions=Counter(name for name, them in self._subscriptions.items() for _ in them))
+        for guid in self._writers:
+            name = names.from_dds(self.graph.locals[guid].topic)
+            if name is not None and name.role is Role.TOPIC:
+                here.publishers[name.name] += 1
+        found = held.differences(here)
+        found += [
+            Difference(name, "no reader in this domain takes it")
+            for name, subscriptions in self._subscriptions.items()
+            if any(subscription.lacks_reader for subscription in subscriptions)
+        ]
+        if self._joined is not None and not self._joined.worker.alive:
+            found.append(Difference(TopicName(""), "the thread that waits for DDS has ended; start the client again"))
+        return found
 
     def interest(self, name: TopicName, wanted: bool) -> None:
         """Nobody wants it: nothing is received either, unless the topic is latched."""
@@ -454,6 +480,7 @@ class DdsEndpoint:
         counted = {
             DropReason.QUEUE_FULL: self.overruns() + self.counters.blocked + self.counters.calls,
             DropReason.UNDECODABLE: self.counters.unreadable,
+            DropReason.DISCONNECTED: self.counters.closed,
         }
         return {reason: count for reason, count in counted.items() if count}
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
-from sern_client.endpoints.base import Publisher, Sink, Subscription, TopicEvents
+from sern_client.endpoints.base import Difference, Held, Publisher, Sink, Subscription, TopicEvents
 from sern_client.endpoints.zenoh import names
 from sern_client.endpoints.zenoh.names import Entity, Kind, Qos
 from sern_client.endpoints.zenoh.services import Services
@@ -64,6 +64,7 @@ class ZenohEndpoint(Services):
         self._events: TopicEvents | None = None
         self._entities = itertools.count(1)
         self._topics: dict[TopicName, _Topic] = {}
+        self._left_out: dict[TopicName, dict[str, Entity]] = {}  # publishers of another type, by their key
         self._open: list[_Declared] = []
         self._said: set[str] = set()
         self._miss: asyncio.TimerHandle | None = None
@@ -160,7 +161,7 @@ class ZenohEndpoint(Services):
         else:
             subscriber = session.opened.declare_subscriber(key, arrived, allowed_origin=zenoh.Locality.REMOTE)
         token = self._declare_token(Kind.SUBSCRIPTION, name, topic.dds_type, topic.type_hash, qos)
-        declared = _Declared(self, token, subscriber)
+        declared = _Declared(self, name, token, subscriber)
         return declared
 
     def advertise(self, info: TopicInfo) -> Publisher:
@@ -184,7 +185,17 @@ class ZenohEndpoint(Services):
         else:
             publisher = self.session.opened.declare_publisher(key, encoding=CDR, congestion_control=blocking)
         token = self._declare_token(Kind.PUBLISHER, info.name, dds_name, type_hash, qos)
-        return _ZenohPublisher(self, token, publisher)
+        return _ZenohPublisher(self, info.name, token, publisher)
+
+    def validate(self, held: Held) -> list[Difference]:
+        """Without the thread that writes nothing is published: that is a difference of every topic."""
+        here = Held()
+        for declared in self._open:
+            (here.publishers if isinstance(declared, _ZenohPublisher) else here.subscriptions)[declared.name] += 1
+        found = held.differences(here)
+        if (problem := self.session.problem) is not None:
+            found.append(Difference(TopicName(""), problem))
+        return found
 
     def _hash_of(self, info: TopicInfo) -> str:
         definition = info.definition or self.types.message(info.type_name)
@@ -225,6 +236,7 @@ class ZenohEndpoint(Services):
         if topic is None:
             topic = self._topics[entity.name] = _Topic(entity.dds_type, entity.type_hash)
         elif (topic.dds_type, topic.type_hash) != (entity.dds_type, entity.type_hash):
+            self._left_out.setdefault(entity.name, {})[entity.key] = entity
             raise ConfigError(
                 f"{entity.name}: {entity.node} publishes {type_name} {entity.type_hash}, others "
                 f"{names.ros_type(topic.dds_type)} {topic.type_hash}; {entity.node} is left out"
@@ -241,11 +253,20 @@ class ZenohEndpoint(Services):
 
     def _publisher_went(self, entity: Entity) -> None:
         assert self._events is not None
+        left_out = self._left_out.get(entity.name, {})
+        left_out.pop(entity.key, None)
+        if not left_out:
+            self._left_out.pop(entity.name, None)
         topic = self._topics.get(entity.name)
         if topic is None or topic.publishers.pop(entity.key, None) is None or topic.publishers:
             return
         del self._topics[entity.name]
         self._events.topic_removed(entity.name)
+        for other in self._left_out.pop(entity.name, {}).values():  # now it is their turn
+            try:
+                self._publisher_appeared(other)
+            except ConfigError as error:
+                self._say_once(str(error))
 
     def _definition(self, entity: Entity, type_name: str) -> str:
         """Empty where unknown: bytes pass through all the same, only conversion needs it."""
@@ -291,8 +312,9 @@ class ZenohEndpoint(Services):
 class _Declared:
     """Something declared in the session, with its token."""
 
-    def __init__(self, owner: ZenohEndpoint, token: Any, thing: Any) -> None:
+    def __init__(self, owner: ZenohEndpoint, name: TopicName, token: Any, thing: Any) -> None:
         self.closed = False
+        self.name = name
         self._owner = owner
         self._token = token
         self._thing = thing
@@ -306,20 +328,25 @@ class _Declared:
         token, thing = self._token, self._thing
 
         def undeclare() -> None:
-            thing.undeclare()
-            token.undeclare()
+            try:
+                thing.undeclare()
+            finally:  # or the graph would name it for ever
+                token.undeclare()
 
         self._owner.session.put(undeclare, 0)  # after what it has still to send
 
 
 class _ZenohPublisher(_Declared):
-    def __init__(self, owner: ZenohEndpoint, token: Any, publisher: Any) -> None:
-        super().__init__(owner, token, publisher)
+    def __init__(self, owner: ZenohEndpoint, name: TopicName, token: Any, publisher: Any) -> None:
+        super().__init__(owner, name, token, publisher)
         self._publisher = publisher
         self._gid = secrets.token_bytes(names.GID_BYTES)
         self._seq = itertools.count(1)
 
     def publish(self, body: bytes, stamp_ns: int) -> None:
+        if self.closed:
+            self._owner.session.refused()
+            return
         attachment = names.pack_attachment(next(self._seq), stamp_ns, self._gid)
         publisher = self._publisher
         put: Callable[[], None] = lambda: publisher.put(body, attachment=attachment)  # noqa: E731
