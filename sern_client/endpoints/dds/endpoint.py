@@ -27,7 +27,7 @@ from sern_client.endpoints.dds.definitions import Definitions
 from sern_client.endpoints.dds.domain import DomainOptions, close_domain, open_domain
 from sern_client.endpoints.dds.graph import MAX_COMPLAINTS, Graph, Local, Participant, Remote
 from sern_client.endpoints.dds.idl import TypeMaker
-from sern_client.endpoints.dds.names import DISCOVERY_TOPIC, SERN_KEY, Role, RosName, user_data
+from sern_client.endpoints.dds.names import DISCOVERY_TOPIC, SERN_KEY, RosName, user_data
 from sern_client.endpoints.dds.qos import (
     INFINITE_NS,
     EndpointQos,
@@ -37,7 +37,9 @@ from sern_client.endpoints.dds.qos import (
     writer_for,
 )
 from sern_client.endpoints.dds.services import DdsServices
+from sern_client.endpoints.dds.stream import Stream
 from sern_client.endpoints.dds.worker import Inbox, Sample, Worker
+from sern_client.endpoints.first import LEARN_S, FirstMessages, Readers
 from sern_core.errors import ConfigError, UsageError
 from sern_core.message import TopicInfo
 from sern_core.types import DropReason, Encoding, TopicName
@@ -169,7 +171,7 @@ class _Reader:
 
 
 class _Writer:
-    """A writer in use. Also the `Publisher` of a stream that comes in."""
+    """A writer in use."""
 
     def __init__(self, endpoint: "DdsEndpoint", writer: DataWriter[Any], guid: UUID, *, stamped: bool) -> None:
         self._endpoint = endpoint
@@ -181,6 +183,11 @@ class _Writer:
     def matched(self) -> int:
         """How many readers it has."""
         return 0 if self._writer is None else len(self._writer.get_matched_subscriptions())
+
+    def readers(self, known: set[int]) -> Readers:
+        """How many of the `known` readers, by their handles, it has."""
+        mine = () if self._writer is None else raw.matched_readers(self._writer)
+        return Readers(len(known), len(known.intersection(mine)))
 
     def publish(self, body: bytes, stamp_ns: int) -> None:
         if self._writer is None:
@@ -228,6 +235,10 @@ class DdsEndpoint:
         self._subscriptions: dict[TopicName, list[_Subscription]] = {}
         self._readers: dict[UUID, _Reader] = {}
         self._writers: dict[UUID, _Writer] = {}
+        self._streams: list[Stream] = []
+        self._ending: list[FirstMessages] = []  # of streams that are closed
+        self._first_dropped: Counter[DropReason] = Counter()
+        self._started_s = 0.0
         self._info_writer: _Writer | None = None
         self._info_due = False
         self._said: set[str] = set()
@@ -249,6 +260,7 @@ class DdsEndpoint:
                 "too many participants on this host, or no such interface"
             ) from None
         self._events = events
+        self._started_s = asyncio.get_running_loop().time()
         self.graph.own = participant.guid
         worker = Worker(participant, self, max_buffer_bytes=options.max_buffer_bytes)
         self._joined = _Joined(participant, Publisher(participant), Subscriber(participant), worker)
@@ -267,6 +279,10 @@ class DdsEndpoint:
                 subscription.close()
         for reader in list(self._readers.values()):
             reader.close()
+        for stream in list(self._streams):
+            stream.close()
+        for first in list(self._ending):
+            first.close()
         for writer in list(self._writers.values()):
             writer.close()
         self._events = None
@@ -299,12 +315,45 @@ class DdsEndpoint:
         self._refresh(subscription)
         return subscription
 
-    def advertise(self, info: TopicInfo) -> _Writer:
+    def advertise(self, info: TopicInfo) -> Stream:
         """ConfigError for another encoding than CDR, a type nobody defines, or one with another hash than here."""
         resolved = self._resolve(info)
         offered = replace(writer_for(info, lifespan=self.options.offer_lifespan), type_hash=resolved.text.type_hash)
         depth = info.depth or (10 if offered.reliable else 1)
-        return self.open_writer(names.to_dds(info.name), resolved, offered, depth=depth)
+        topic = names.to_dds(info.name)
+        writer = self.open_writer(topic, resolved, offered, depth=depth)
+        first = FirstMessages(
+            info.name,
+            readers=lambda: writer.readers(self._waiting_readers(topic, names.type_to_dds(resolved.name), offered)),
+            write=writer.publish,
+            dropped=self._drop_first,
+            max_messages=max(depth, self.options.queue_depth) if offered.reliable else depth,
+            max_bytes=self.options.max_buffer_bytes,
+            overflow=DropReason.QUEUE_FULL if offered.reliable else DropReason.SUPERSEDED,
+            learning_s=self._started_s + LEARN_S - asyncio.get_running_loop().time(),
+        )
+        stream = Stream(info.name, writer, first, self._stream_closed)
+        self._streams.append(stream)
+        return stream
+
+    def _stream_closed(self, stream: Stream) -> None:
+        """It takes no more; its writer lasts until its first messages are written."""
+        self._streams.remove(stream)
+        if len(stream.first):
+            self._ending = [first for first in self._ending if not first.over] + [stream.first]
+
+    def _drop_first(self, why: DropReason) -> None:
+        self._first_dropped[why] += 1
+
+    def _waiting_readers(self, topic: str, type_name: str, offered: EndpointQos) -> set[int]:
+        """The readers of others that will match such a writer and get nothing that was written before, by handle."""
+        return {
+            reader.handle
+            for reader in self.graph.readers(topic)
+            if reader.type_name == type_name
+            and not (offered.transient_local and reader.qos.transient_local)
+            and not mismatches(offered, reader.qos)
+        }
 
     def _resolve(self, info: TopicInfo) -> ResolvedType:
         if info.encoding is not Encoding.CDR:
@@ -323,10 +372,7 @@ class DdsEndpoint:
         """A wanted topic without a reader differs too. Without the thread that waits for DDS nothing is received: that
         is a difference of every topic."""
         here = Held(subscriptions=Counter(name for name, them in self._subscriptions.items() for _ in them))
-        for guid in self._writers:
-            name = names.from_dds(self.graph.locals[guid].topic)
-            if name is not None and name.role is Role.TOPIC:
-                here.publishers[name.name] += 1
+        here.publishers.update(stream.name for stream in self._streams if stream.writer.guid in self._writers)
         found = held.differences(here)
         found += [
             Difference(name, "no reader in this domain takes it")
@@ -482,7 +528,7 @@ class DdsEndpoint:
             DropReason.UNDECODABLE: self.counters.unreadable,
             DropReason.DISCONNECTED: self.counters.closed,
         }
-        return {reason: count for reason, count in counted.items() if count}
+        return {reason: count for reason, count in (Counter(counted) + self._first_dropped).items() if count}
 
     def overruns(self) -> int:
         """Messages dropped because the event loop was too slow, of all readers there are and were."""

@@ -10,16 +10,19 @@ import itertools
 import logging
 import secrets
 import time
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from math import inf
 from pathlib import Path
 from typing import Any, Final
 
 from sern_client.endpoints.base import Difference, Held, Publisher, Sink, Subscription, TopicEvents
+from sern_client.endpoints.first import LEARN_S, FirstMessages, Readers
 from sern_client.endpoints.zenoh import names
 from sern_client.endpoints.zenoh.names import Entity, Kind, Qos
 from sern_client.endpoints.zenoh.services import Services
-from sern_client.endpoints.zenoh.session import SessionOptions, ZenohSession
+from sern_client.endpoints.zenoh.session import MAX_WAITING_BYTES, SessionOptions, ZenohSession
 from sern_core.errors import ConfigError, UsageError, WireError
 from sern_core.message import TopicInfo
 from sern_core.types import DropReason, Encoding, TopicName
@@ -30,6 +33,8 @@ CDR: Final = "application/cdr"
 ROUTER_WAIT_S: Final = 3.0
 """After so long without a router and without a peer we say so."""
 MAX_COMPLAINTS: Final = 256
+FIRST_MESSAGES: Final = 100
+"""Messages of a reliable topic that may wait for its first subscribers."""
 
 _log = logging.getLogger(__name__)
 
@@ -65,6 +70,9 @@ class ZenohEndpoint(Services):
         self._entities = itertools.count(1)
         self._topics: dict[TopicName, _Topic] = {}
         self._left_out: dict[TopicName, dict[str, Entity]] = {}  # publishers of another type, by their key
+        self._subscribers: dict[TopicName, dict[str, tuple[str, str]]] = {}  # of others: their types by their keys
+        self._first_dropped: Counter[DropReason] = Counter()
+        self._started_s = 0.0
         self._open: list[_Declared] = []
         self._said: set[str] = set()
         self._miss: asyncio.TimerHandle | None = None
@@ -84,13 +92,14 @@ class ZenohEndpoint(Services):
             DropReason.QUEUE_FULL: self.session.put_dropped + (self.session.handover.dropped if self._events else 0),
             DropReason.DISCONNECTED: self.session.put_failed,
         }
-        return {reason: count for reason, count in counted.items() if count}
+        return {reason: count for reason, count in (Counter(counted) + self._first_dropped).items() if count}
 
     async def start(self, events: TopicEvents) -> None:
         """ConfigError when zenoh does not take the settings. A router that is not there yet is waited for."""
         await self.session.open()
         self._events = events
         self._loop = asyncio.get_running_loop()
+        self._started_s = self._loop.time()
         try:
             self._join()
         except self.session.zenoh.ZError as error:
@@ -122,6 +131,7 @@ class ZenohEndpoint(Services):
             self._miss.cancel()
         for declared in list(self._open):
             declared.close()
+            declared.hurry()
         await self.end_services()
         await self.session.close()
 
@@ -185,12 +195,33 @@ class ZenohEndpoint(Services):
         else:
             publisher = self.session.opened.declare_publisher(key, encoding=CDR, congestion_control=blocking)
         token = self._declare_token(Kind.PUBLISHER, info.name, dds_name, type_hash, qos)
-        return _ZenohPublisher(self, info.name, token, publisher)
+        return _ZenohPublisher(
+            self,
+            info,
+            token,
+            publisher,
+            None if info.latched else lambda: self._readers(info.name, dds_name, type_hash),
+        )
+
+    def _readers(self, name: TopicName, dds_name: str, type_hash: str) -> int:
+        """How many subscribers of others the graph knows."""
+        return sum(kind == (dds_name, type_hash) for kind in self._subscribers.get(name, {}).values())
+
+    @property
+    def learning_s(self) -> float:
+        """How much longer the graph may be incomplete."""
+        return max(0.0, self._started_s + LEARN_S - self._loop.time())
+
+    def drop_first(self, why: DropReason) -> None:
+        """Count a message that waited for its first subscribers in vain."""
+        self._first_dropped[why] += 1
 
     def validate(self, held: Held) -> list[Difference]:
         """Without the thread that writes nothing is published: that is a difference of every topic."""
         here = Held()
         for declared in self._open:
+            if isinstance(declared, _ZenohPublisher) and declared.ending:
+                continue  # until its first messages are written
             (here.publishers if isinstance(declared, _ZenohPublisher) else here.subscriptions)[declared.name] += 1
         found = held.differences(here)
         if (problem := self.session.problem) is not None:
@@ -223,6 +254,13 @@ class ZenohEndpoint(Services):
                     self._publisher_appeared(entity)
                 else:
                     self._publisher_went(entity)
+            elif entity.kind is Kind.SUBSCRIPTION:
+                there = self._subscribers.setdefault(entity.name, {})
+                there.pop(entity.key, None)
+                if alive:
+                    there[entity.key] = entity.dds_type, entity.type_hash
+                elif not there:
+                    del self._subscribers[entity.name]
             elif entity.kind is Kind.SERVER:
                 self.server_changed(entity, alive)
         except (WireError, ConfigError) as error:
@@ -320,6 +358,9 @@ class _Declared:
         self._thing = thing
         owner.opened(self)
 
+    def hurry(self) -> None:
+        """Be closed now, if it is to be."""
+
     def close(self) -> None:
         if self.closed:
             return
@@ -337,20 +378,70 @@ class _Declared:
 
 
 class _ZenohPublisher(_Declared):
-    def __init__(self, owner: ZenohEndpoint, name: TopicName, token: Any, publisher: Any) -> None:
-        super().__init__(owner, name, token, publisher)
+    """An `AgingPublisher`. `known` says how many subscribers the graph knows; None: whoever comes later gets what it
+    has missed from a cache."""
+
+    def __init__(
+        self, owner: ZenohEndpoint, info: TopicInfo, token: Any, publisher: Any, known: Callable[[], int] | None
+    ) -> None:
+        super().__init__(owner, info.name, token, publisher)
         self._publisher = publisher
         self._gid = secrets.token_bytes(names.GID_BYTES)
         self._seq = itertools.count(1)
+        self._known = known
+        self.ending = False
+        """It takes no more, and is closed when its first messages are written."""
+        best_effort = info.reliable is False
+        self._first: FirstMessages | None = None
+        if known is not None:
+            self._first = FirstMessages(
+                info.name,
+                readers=self._readers,
+                write=self._put,
+                dropped=owner.drop_first,
+                max_messages=(info.depth or 1) if best_effort else FIRST_MESSAGES,
+                max_bytes=MAX_WAITING_BYTES,
+                overflow=DropReason.SUPERSEDED if best_effort else DropReason.QUEUE_FULL,
+                learning_s=owner.learning_s,
+            )
+
+    def _readers(self) -> Readers:
+        known = 0 if self._known is None else self._known()
+        try:
+            matching = known and self._publisher.matching_status.matching
+        except self._owner.session.zenoh.ZError:
+            matching = False  # the session has ended
+        return Readers(known, known if matching else 0)
 
     def publish(self, body: bytes, stamp_ns: int) -> None:
-        if self.closed:
+        self.publish_within(body, stamp_ns, inf)
+
+    def publish_within(self, body: bytes, stamp_ns: int, left_s: float) -> None:
+        if self.closed or self.ending:
             self._owner.session.refused()
-            return
+        elif self._first is None or self._first.over:
+            self._put(body, stamp_ns)
+        else:
+            self._first.publish(body, stamp_ns, left_s)
+
+    def _put(self, body: bytes, stamp_ns: int) -> None:
         attachment = names.pack_attachment(next(self._seq), stamp_ns, self._gid)
         publisher = self._publisher
         put: Callable[[], None] = lambda: publisher.put(body, attachment=attachment)  # noqa: E731
         self._owner.session.put(put, len(body))
+
+    def close(self) -> None:
+        """What was published before is still written: the last of it may be a stop command."""
+        if not self.ending:
+            self.ending = True
+            if self._first is None:
+                super().close()
+            else:
+                self._first.end(super().close)
+
+    def hurry(self) -> None:
+        if self._first is not None:
+            self._first.close()
 
 
 def _offered(topic: _Topic) -> Qos:
