@@ -2,14 +2,24 @@
 
 import logging
 import time
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from math import inf
 from typing import Final
 
 from sern_client.actions import GoalWatch
 from sern_client.conversion import Converter
-from sern_client.endpoints.base import Endpoint, Publisher, Subscription, keepers_of, publisher_within
+from sern_client.endpoints.base import (
+    Difference,
+    Endpoint,
+    Held,
+    Publisher,
+    Sink,
+    Subscription,
+    keepers_of,
+    publisher_within,
+)
 from sern_client.endpoints.composite import CompositeEndpoint
 from sern_client.frames import FramePrefixer, Rewrite
 from sern_client.guard import Guard
@@ -39,42 +49,50 @@ from sern_runtime.loop import Timer
 from sern_runtime.optional import OptionalParts
 
 MAX_PROBLEMS: Final = 256
+AGAIN_S: Final = (1.0, 60.0)
+"""First and longest pause before a stream that could not be published here is tried again."""
 
 _log = logging.getLogger(__name__)
 
 
 class Outgoing:
-    """A local topic that is offered to the link; `source` makes something else of it before."""
+    """A local topic that is offered to the link; `source` makes something else of it before. Its messages go to
+    `sink`."""
 
-    __slots__ = ("channel", "source", "subscription")
+    __slots__ = ("channel", "sink", "source", "subscription")
 
-    def __init__(self, channel: OutChannel, subscription: Subscription, source: Source | None) -> None:
+    def __init__(self, channel: OutChannel, subscription: Subscription, source: Source | None, sink: Sink) -> None:
         self.channel = channel
+        self.sink = sink
         self.subscription = subscription
         self.source = source
 
 
 class Incoming:
-    """A stream from elsewhere that is published here. `stop` is the body that a lost link makes us publish.
+    """A stream from elsewhere that is published here, as `info`. `stop` is the body that a lost link makes us publish.
     `publisher` None: it is of use to another stream only. `guarded`: what the guard calls it; None: it has none."""
 
-    __slots__ = ("guarded", "lease", "local", "publish", "publisher", "rewrite", "stop")
+    __slots__ = ("guarded", "info", "lease", "local", "publish", "publisher", "rewrite", "stop")
 
     def __init__(
         self,
-        local: TopicName,
+        info: TopicInfo,
         publisher: Publisher | None,
         lease: CommandLease | None,
         stop: bytes | None,
         rewrite: Rewrite | None,
     ) -> None:
-        self.local = local
-        self.publisher = publisher
-        self.publish = None if publisher is None else publisher_within(publisher)
+        self.info = info
+        self.local = info.name
+        self.use(publisher)
         self.lease = lease
         self.stop = stop
         self.rewrite = rewrite
         self.guarded: int | None = None
+
+    def use(self, publisher: Publisher | None) -> None:
+        self.publisher = publisher
+        self.publish = None if publisher is None else publisher_within(publisher)
 
 
 class Bridge:
@@ -131,6 +149,9 @@ class Bridge:
         self._last_arrival_s: dict[StreamId, float] = {}
         self._timer = fine_timer(self._leases_due)  # one that is due while the machine sleeps is due when it wakes
         self.summaries = Summaries(self._sender, self.parts)
+        self._unreceived: dict[StreamId, str] = {}  # streams that could not be published here, and why
+        self._again = Timer(self._reconsider)
+        self._again_s = AGAIN_S[0]
         self.rebuilds = Rebuilds()
         self._asked: tuple[str, ...] | None = None  # the patterns we were started with
         self.keeping = Keeping(keepers_of(endpoint), self._hold, self._release_kept, self._keep_in)
@@ -167,6 +188,7 @@ class Bridge:
         self._outgoing.clear()
         self._timer.close()
         self._keep_timer.cancel()
+        self._again.cancel()
         if self.goals is not None:
             self.goals.close()
         for incoming in self._incoming.values():
@@ -179,8 +201,15 @@ class Bridge:
             self._publish(incoming, incoming.stop, time.time_ns())
         if self.guard is not None and incoming.guarded is not None:
             self.guard.closed(incoming.guarded)
+        self._close_publisher(incoming)
+
+    def _close_publisher(self, incoming: Incoming) -> None:
         if incoming.publisher is not None:
-            incoming.publisher.close()
+            try:
+                incoming.publisher.close()
+            except Exception:  # noqa: BLE001  a fault of one topic, as in `_publish`
+                self.publish_failures += 1
+                _log.exception("%s could not be ended here", incoming.local)
 
     def _publish(self, incoming: Incoming, body: bytes, stamp_ns: int, left_s: float = inf) -> None:
         """`left_s`: how much longer the message is young enough."""
@@ -216,8 +245,21 @@ class Bridge:
         sink = self._sink(channel, self.frames.outgoing(info)) if source is None else source.sink
         if self.goals is not None:
             sink = self.goals.outgoing(info, channel, sink)
-        self._outgoing[info.name] = Outgoing(channel, self.endpoint.subscribe(info.name, sink), source)
+        try:
+            subscription = self.endpoint.subscribe(info.name, sink)
+        except UsageError as error:
+            _log.error("%s cannot be taken: %s", info.name, error)
+            self._withdraw(channel, source)
+            return
+        self._outgoing[info.name] = Outgoing(channel, subscription, source, sink)
         self._kick()
+
+    def _withdraw(self, channel: OutChannel, source: Source | None) -> None:
+        """Offer a topic no more."""
+        if source is not None:
+            source.close()
+            self.summaries.forget(source)
+        self.core.unpublish(channel, now=clock.now())
 
     def _offer(self, info: TopicInfo, resolved: ResolvedTopic, name: TopicName) -> tuple[OutChannel, Source | None]:
         """Offer a topic to the link, with what its rule makes of it. UsageError when it cannot be."""
@@ -246,10 +288,7 @@ class Bridge:
             if self.goals is not None:
                 self.goals.withdrawn(name)
             outgoing.subscription.close()
-            if outgoing.source is not None:
-                outgoing.source.close()
-                self.summaries.forget(outgoing.source)
-            self.core.unpublish(outgoing.channel, now=clock.now())
+            self._withdraw(outgoing.channel, outgoing.source)
             self._kick()
 
     def _sink(self, channel: OutChannel, rewrite: Rewrite | None) -> Callable[[bytes, int], bool]:
@@ -315,10 +354,11 @@ class Bridge:
                 raise ConfigError(f"{local} is only sent from here (direction: send); not received")
             publisher = None
             if self._published_here(stream):
-                publisher = self.converter.advertise(self.endpoint, info)
+                publisher = self._advertise(info)
         except ConfigError as error:
-            _log.error("%s from %s is not received: %s", stream.id.topic, stream.id.origin, error)
+            self._not_received(stream, str(error))
             raise
+        self._unreceived.pop(stream.id, None)
         lease = stop = None
         if resolved.lease is not None:
             stop = ros_types.zero_message(info.type_name, info.encoding)
@@ -326,7 +366,7 @@ class Bridge:
                 _log.error("%s is %s: on_link_loss cannot stop it; no lease", local, info.type_name)
             else:
                 lease = CommandLease(resolved.lease.after_s)
-        incoming = Incoming(local, publisher, lease, stop, self.frames.incoming(info))
+        incoming = Incoming(info, publisher, lease, stop, self.frames.incoming(info))
         if self.guard is not None and stop is not None:
             incoming.guarded = self.guard.opened(info, stop)
         self._incoming[stream.id] = incoming
@@ -336,6 +376,32 @@ class Bridge:
         if updates is not None:
             self._ask_for(updates)
         _log.info("receiving %s from %s as %s", stream.id.topic, stream.id.origin, local)
+
+    def _advertise(self, info: TopicInfo) -> Publisher:
+        """ConfigError whatever goes wrong: the streams beside it must go on."""
+        try:
+            return self.converter.advertise(self.endpoint, info)
+        except ConfigError:
+            raise
+        except Exception as error:
+            self.publish_failures += 1
+            _log.exception("%s cannot be published here", info.name)
+            raise ConfigError(f"{info.name}: cannot be published here: {ros_types.one_line(error)}") from error
+
+    def _not_received(self, stream: StreamInfo, problem: str) -> None:
+        """Said once; tried again, because what is in its way may go: another stream of that name, for one."""
+        if self._unreceived.get(stream.id) != problem:
+            _log.error("%s from %s is not received: %s", stream.id.topic, stream.id.origin, problem)
+        self._unreceived[stream.id] = problem
+        if self._again.deadline_s is None and not self._closed:
+            self._again.arm(clock.now() + self._again_s)
+
+    def _reconsider(self) -> None:
+        refused = self.core.refused
+        self._unreceived = {stream: problem for stream, problem in self._unreceived.items() if stream in refused}
+        self._again_s = min(2 * self._again_s, AGAIN_S[1])
+        self.core.reconsider(now=clock.now())
+        self._kick()
 
     def _published_here(self, stream: StreamInfo) -> bool:
         """Of patches, the updates are only taken to make whole grids of, unless somebody here has asked for them."""
@@ -363,6 +429,9 @@ class Bridge:
 
     def stream_closed(self, stream: StreamInfo) -> None:
         self.rebuilds.closed(stream)
+        if self.core.refused and not self._closed:  # it may have been in their way
+            self._again_s = AGAIN_S[0]
+            self._again.arm(clock.now())
         if self.services is not None:
             self.services.stream_closed(stream)
         incoming = self._incoming.pop(stream.id, None)
@@ -480,6 +549,46 @@ class Bridge:
             _log.error("the relay refuses a subscription (%s): %s", code, text)
             if len(self.subscription_problems) < MAX_PROBLEMS:
                 self.subscription_problems[text] = code
+
+    # --- consistency ------------------------------------------------------------------------------------------------
+
+    def validate(self) -> list[Difference]:
+        """Compare our tables with the core's and the endpoint's: what is not as it should be. Something under way may
+        show for a moment."""
+        streams = {stream for stream in self.core.opened if parse_service(stream.topic) is None}
+        halves = (("the core", streams - self._incoming.keys()), ("the bridge", self._incoming.keys() - streams))
+        found = [
+            Difference(stream.topic, f"a stream of {stream.origin} is open in {where} only")
+            for where, only_there in halves
+            for stream in sorted(only_there)
+        ]
+        found += [
+            Difference(name, "it is offered to nobody: its channel is closed")
+            for name, outgoing in self._outgoing.items()
+            if outgoing.channel.stream.id not in self.core.link.by_stream
+        ]
+        publishers = Counter(incoming.local for incoming in self._incoming.values() if incoming.publisher is not None)
+        return found + self.endpoint.validate(Held(publishers, Counter(self._outgoing.keys())))
+
+    def repair(self, differences: Sequence[Difference]) -> None:
+        """Open anew at the endpoint what is not open there as it should be."""
+        for name in {difference.name for difference in differences if difference.kind == "publisher"}:
+            for incoming in [each for each in self._incoming.values() if each.local == name]:
+                if incoming.publisher is not None:
+                    self._close_publisher(incoming)
+                    try:
+                        incoming.use(self._advertise(incoming.info))
+                    except ConfigError as error:
+                        _log.error("%s cannot be published again: %s", name, error)
+        for name in {difference.name for difference in differences if difference.kind == "subscription"}:
+            outgoing = self._outgoing.get(name)
+            if outgoing is not None:
+                outgoing.subscription.close()
+                try:
+                    outgoing.subscription = self.endpoint.subscribe(name, outgoing.sink)
+                except UsageError as error:
+                    _log.error("%s cannot be taken again: %s", name, error)
+                    self.topic_removed(name)
 
     # --- leases -----------------------------------------------------------------------------------------------------
 

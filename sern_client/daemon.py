@@ -15,6 +15,7 @@ from prometheus_client import CollectorRegistry
 
 from sern_client.actions import GoalWatch
 from sern_client.bridge import Bridge
+from sern_client.checks import TableCheck
 from sern_client.endpoints.base import CountingEndpoint, Endpoint, ServiceEndpoint
 from sern_client.express import ClientExpress
 from sern_client.factory import make_endpoint
@@ -114,6 +115,7 @@ class ClientDaemon:
         )
         self.bridge.attach(self.core)
         self.bridge.guard = self.guard = Guard.of(loaded)
+        self.check = TableCheck(self.bridge, now=now)
         self.core.subscribe(model.subscribe_patterns(), now=now)
         self._serve_services(endpoint)
         if model.actions.use:
@@ -253,6 +255,7 @@ class ClientDaemon:
                 self._lane.tick()
             if self._express is not None:
                 self._express.tick()
+            self.check.tick(now=clock.now())
             if watchdog.interval_s is not None:
                 watchdog.check()
             state = "up" if link.established and not link.lane.stalled else f"down: {self.reason}"
@@ -301,6 +304,16 @@ class ClientDaemon:
             endpoint_drops,
         )
         self.parts.register(metrics)
+        metrics.gauge(
+            "sern_endpoint_differences",
+            "Differences between what this client holds open at its endpoint and what is open there, at the last look.",
+            read=lambda: [((), float(len(self.check.found)))],
+        )
+        metrics.counter(
+            "sern_endpoint_differences_total",
+            "Differences that were ever found there; each is a line in the log.",
+            read=lambda: [((), float(self.check.total))],
+        )
         adaptation = self.adaptation
         if adaptation is not None:
             adaptation.register(metrics)
@@ -376,6 +389,8 @@ class ClientDaemon:
 
     def _ready(self) -> Health:
         if self.core.link.established:
+            if self.check.found:
+                return Health(ok=False, reason=f"what is here is not what should be: {self.check.found[0]}")
             return Health(ok=True, reason=f"connected to {self.core.link.peer}")
         return Health(ok=False, reason=self.bridge.rejected_reason or self.reason)
 

@@ -4,7 +4,7 @@ The shell (sern_client) feeds it endpoint messages and lane bytes, and is told t
 appear and which messages have their turn. Everything about bandwidth, order, replay and loss is in the link below.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from typing import ParamSpec, Protocol
@@ -81,6 +81,11 @@ class ClientEvents(Protocol):
         count it. What it was about is given up, everything else goes on."""
 
 
+def _announced(stream: StreamInfo) -> StreamInfo:
+    """What its origin says of a stream, without what is filled in here."""
+    return replace(stream, info=replace(stream.info, definition=""), definition_hash="")
+
+
 class ClientCore:
     """One client. `boot` is a random 63-bit number of this process, `now` any monotonic time in seconds.
 
@@ -114,7 +119,8 @@ class ClientCore:
         """Metadata of this node, for the object registry."""
         self._numbering = Numbering()  # of topics that were offered before
         self._latched: dict[StreamId, LatchedCache] = {}  # for a relay that comes back with nothing
-        self._open: set[StreamId] = set()
+        self._open: dict[StreamId, StreamInfo] = {}  # as they were announced
+        self._refused: set[StreamId] = set()  # announced, but this site could not publish them
         self._undecodable: set[TopicName] = set()
         self._held: dict[StreamId, dict[int, None]] = {}  # handed on, and not to be confirmed yet
         self.coder = coder or Coder(max_bytes=link.max_message_bytes)
@@ -286,6 +292,14 @@ class ClientCore:
     def on_announce(self, link: Link, announcement: Announcement, *, now: float) -> bool | None:
         stream = link.streams[announcement.stream.id]
         digest = announcement.definition_hash
+        identity = stream.stream.id
+        link.outlived(identity.origin, identity.boot, now=now)
+        opened = self._open.get(identity)
+        if opened is not None and opened != _announced(announcement.stream):
+            # Its origin ended it and began it anew while we were away, as something else.
+            self._close_stream(stream, now)
+            stream.stream = replace(announcement.stream, attributes={**announcement.stream.attributes})
+            stream.stream.definition_hash = digest
         if digest and digest not in self.definitions:
             return None  # asked for; answered when it is here
         return self._open_stream(stream)
@@ -306,10 +320,13 @@ class ClientCore:
                 info.latched,
                 info.reliable,
             )
+            announced = _announced(stream.stream)
             stream.stream = replace(stream.stream, info=complete)
             if not self._opened(stream.stream):
+                self._refused.add(identity)
                 return False
-            self._open.add(identity)
+            self._refused.discard(identity)
+            self._open[identity] = announced
         return True
 
     def _opened(self, stream: StreamInfo) -> bool:
@@ -326,17 +343,38 @@ class ClientCore:
                 return True
         return False
 
+    def reconsider(self, *, now: float) -> None:
+        """Open what this site could not publish when it was announced, if it can now: another stream may have been in
+        its way, which has ended."""
+        for stream in list(self.link.incoming.values()):
+            if stream.stream.id in self._refused and self._open_stream(stream):
+                self.link.answer(stream, True, now=now)
+
+    @property
+    def refused(self) -> Collection[StreamId]:
+        """The streams from elsewhere that there are, and that this site could not publish."""
+        return self._refused
+
+    @property
+    def opened(self) -> Collection[StreamId]:
+        """The streams from elsewhere that are open here."""
+        return self._open.keys()
+
+    def _close_stream(self, stream: InStream, now: float) -> None:
+        self._decoder.forget(stream.stream.id, now=now)
+        self._held.pop(stream.stream.id, None)
+        del self._open[stream.stream.id]
+        self._tell(self.events.stream_closed, stream.stream)
+
     def on_definition(self, link: Link, digest: str, *, now: float) -> None:
         for stream in list(link.incoming.values()):
             if stream.stream.definition_hash == digest:
                 link.answer(stream, self._open_stream(stream), now=now)
 
     def on_retract(self, link: Link, stream: InStream, *, now: float) -> None:
+        self._refused.discard(stream.stream.id)
         if stream.stream.id in self._open:
-            self._decoder.forget(stream.stream.id, now=now)
-            self._held.pop(stream.stream.id, None)
-            self._open.discard(stream.stream.id)
-            self._tell(self.events.stream_closed, stream.stream)
+            self._close_stream(stream, now)
 
     def on_message(self, link: Link, stream: InStream, message: Message, *, now: float) -> None:
         self._decoder.message(stream, message, now=now)

@@ -463,6 +463,11 @@ class Link(Answering):
             if stream.channel_id is None and identity not in self._missing:
                 self._retract(stream, now)
 
+    def outlived(self, origin: ClientName, boot: int, *, now: float) -> None:
+        """A process of `origin` is there, `boot`: what a new relay has not been told of the ones before is gone."""
+        for identity in [each for each in self._missing if each.origin == origin and each.boot != boot]:
+            self._retract(self.streams[identity], now)
+
     def _retract(self, stream: InStream, now: float) -> None:
         self._hand_on(now)
         self.streams.pop(stream.stream.id, None)

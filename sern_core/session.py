@@ -36,6 +36,10 @@ RESET_INTERVAL_S: Final = 0.5
 REFUSED_INTERVAL_S: Final = 5.0
 ABORT_INTERVAL_S: Final = 1.0
 """Sessions that end because something went wrong follow each other no faster: else both ends would do nothing else."""
+SHORT_SESSION_S: Final = 5.0
+"""A session that is taken from us sooner than this was short."""
+DISPLACED_S: Final = (0.5, 10.0)
+"""First and longest pause after the second short session in a row, and those that follow."""
 NUMBER_AND_STAMP: Final = struct.Struct("!IQ")
 
 
@@ -65,6 +69,7 @@ class Session(Hop):
         self._hello_stamp_us = -1
         self._reset_due_s = -float("inf")
         self._abort_due_s = -float("inf")
+        self._short_sessions = 0  # in a row
         self._resumed = False
         self._data_prefix = b""  # how a data datagram of the session begins
         self._fresh: deque[tuple[InStream, Message, int]] = deque()
@@ -153,6 +158,14 @@ class Session(Hop):
         self.tag = self.tag % 255 + 1
         self._hello_due_s = due_s
         self.dirty = True
+
+    def _displaced_pause_s(self, now: float) -> float:
+        """How long to wait before a session that was taken from us is asked for again. Sessions that end soon, one
+        after another, mean that somebody else has our name, and of two that take turns neither has any use."""
+        self._short_sessions = self._short_sessions + 1 if now - self._up_since_s < SHORT_SESSION_S else 0
+        if self._short_sessions < 2:
+            return 0.0
+        return min(DISPLACED_S[0] * 2.0 ** min(self._short_sessions - 2, 16), DISPLACED_S[1])
 
     def _hello(self, now: float) -> bytes:
         self._hello_due_s = now + HELLO_INTERVAL_S
@@ -439,4 +452,4 @@ class Session(Hop):
             self._greet(now + REFUSED_INTERVAL_S, now)
             self._session_refused(code, text, now)
         elif kind is wire.Kind.RESET and self.established:
-            self._greet(now, now)
+            self._greet(now + self._displaced_pause_s(now), now)

@@ -4,6 +4,8 @@ import asyncio
 from collections.abc import Awaitable, Callable
 
 from sern_client.endpoints.base import (
+    Difference,
+    Held,
     Publisher,
     ServiceEvents,
     ServiceHandler,
@@ -54,6 +56,10 @@ class Services:
 
     def advertise(self, info: TopicInfo) -> Publisher:
         raise ConfigError(f"{info.name}: no topics here")
+
+    def validate(self, held: Held) -> list[Difference]:
+        del held
+        return []
 
     def interest(self, name: TopicName, wanted: bool) -> None:
         raise AssertionError(f"no topic {name} here, {wanted}")

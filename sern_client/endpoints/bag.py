@@ -11,7 +11,7 @@ same base, so there is no drift. A refused message with `on_refused="wait"` move
 import asyncio
 import logging
 import re
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -29,7 +29,7 @@ from rosbags.rosbag1 import Reader as Reader1
 from rosbags.rosbag2 import Reader as Reader2
 
 from sern_client.endpoints.bag_faults import why
-from sern_client.endpoints.base import Publisher, Sink, TopicEvents
+from sern_client.endpoints.base import Difference, Held, Publisher, Sink, TopicEvents
 from sern_client.endpoints.clock import Clock, SystemClock
 from sern_client.endpoints.held import HeldSubscription
 from sern_client.endpoints.leftovers import ACTIVE
@@ -177,6 +177,10 @@ class BagEndpoint:
 
     def advertise(self, info: TopicInfo) -> Publisher:
         raise ConfigError(f"{info.name}: a bag being played takes no messages", file=str(self.options.path))
+
+    def validate(self, held: Held) -> list[Difference]:
+        given = Counter(name for name, topic in self._topics.items() for _ in topic.subscriptions)
+        return held.differences(Held(subscriptions=given))
 
     def interest(self, name: TopicName, wanted: bool) -> None:
         (self._wanted.add if wanted else self._wanted.discard)(name)

@@ -5,8 +5,9 @@ its business. All calls happen on the event-loop thread; an endpoint with thread
 `call_soon_threadsafe`.
 """
 
+from collections import Counter
 from collections.abc import Awaitable, Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final, Protocol, runtime_checkable
 
 from sern_core.message import TopicInfo
@@ -36,7 +37,9 @@ class Subscription(Protocol):
 class Publisher(Protocol):
     """Publishes on a local topic that came from the far side."""
 
-    def publish(self, body: bytes, stamp_ns: int) -> None: ...
+    def publish(self, body: bytes, stamp_ns: int) -> None:
+        """Once nobody can be reached any more (it is closed, or the endpoint is), a message is a counted drop."""
+        ...
 
     def close(self) -> None: ...
 
@@ -59,6 +62,39 @@ def publisher_within(publisher: Publisher) -> PublishWithin:
     return lambda body, stamp_ns, _left_s: publisher.publish(body, stamp_ns)
 
 
+@dataclass(frozen=True, slots=True)
+class Held:
+    """What the user of an endpoint holds open there: how many of each, by local topic name."""
+
+    publishers: Counter[TopicName] = field(default_factory=Counter)
+    subscriptions: Counter[TopicName] = field(default_factory=Counter)
+
+    def differences(self, here: "Held") -> list["Difference"]:
+        """Where the endpoint's own tables, `here`, say otherwise."""
+        return [
+            Difference(name, f"{what}s held by the bridge: {held[name]}, known to the endpoint: {known[name]}", what)
+            for what, held, known in (
+                ("publisher", self.publishers, here.publishers),
+                ("subscription", self.subscriptions, here.subscriptions),
+            )
+            for name in sorted(held.keys() | known.keys())
+            if held[name] != known[name]
+        ]
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """A local topic whose state is not what it is to be, and how, in a few words. `name` empty: all of them. `kind`
+    publisher or subscription: of what the endpoint knows another number than is held open."""
+
+    name: TopicName
+    what: str
+    kind: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.name}: {self.what}" if self.name else self.what
+
+
 class Endpoint(Protocol):
     """Life cycle: `start` once, any calls, `stop` once. `stop` flushes files and leaves nothing running.
 
@@ -79,6 +115,13 @@ class Endpoint(Protocol):
 
         A recording can wait for its audience; an endpoint that need not know does nothing.
         """
+
+    def validate(self, held: Held) -> list[Difference]:
+        """Compare what is `held` open here with the endpoint's own tables, and with what its middleware says as far as
+        that is known. Something under way (a registration) may show as a difference for a moment. Cheap enough for once
+        a minute; changes nothing.
+        """
+        ...
 
     @property
     def encoding(self) -> Encoding | None:

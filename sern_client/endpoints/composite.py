@@ -1,15 +1,23 @@
 """Several endpoints as one: topics from any of them, publications to all that accept them."""
 
+import asyncio
 import logging
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field
+from math import inf
+from typing import Final
 
 from sern_client.conversion import Converter, serve
 from sern_client.endpoints.base import (
     CountingEndpoint,
+    Difference,
     Endpoint,
+    Held,
     KeepingEndpoint,
     Publisher,
+    PublishWithin,
     ServiceEndpoint,
     ServiceEvents,
     ServiceHandler,
@@ -24,7 +32,17 @@ from sern_core.errors import ConfigError, ServiceError, UsageError
 from sern_core.message import TopicInfo
 from sern_core.types import DropReason, TopicName
 
+AGAIN_S: Final = 1.0
+"""A member that cannot take a topic because of another one may be able to so long after that has ended."""
+
 _LOG = logging.getLogger(__name__)
+
+
+def close_all(closes: Sequence[Callable[[], None]]) -> None:
+    """Call each of them, the last first, also when one fails; its failure is raised then."""
+    with ExitStack() as stack:
+        for close in closes:
+            stack.callback(close)
 
 
 @dataclass(slots=True, eq=False)
@@ -38,9 +56,8 @@ class _Joined:
 
     def close(self) -> None:
         self.owner.forget(self)
-        for part in self.parts.values():
-            part.close()
-        self.parts.clear()
+        parts, self.parts = self.parts, {}
+        close_all([part.close for part in parts.values()])
 
 
 class _Members:
@@ -58,21 +75,41 @@ class _Members:
 
 
 class _Publishers:
-    def __init__(self, publishers: list[Publisher]) -> None:
-        self._publishers = publishers
-        self._within = [publisher_within(publisher) for publisher in publishers]
+    """One publisher of the daemon: a publisher at every member that takes the topic, by the member's index."""
+
+    def __init__(self, owner: "CompositeEndpoint", info: TopicInfo) -> None:
+        self.info = info
+        self.name = info.name
+        self.parts: dict[int, Publisher] = {}
+        self.closed = False
+        self._owner = owner
+        self._within: list[PublishWithin] = []
+
+    def add(self, index: int, publisher: Publisher) -> None:
+        self.parts[index] = publisher
+        self._within.append(publisher_within(publisher))
 
     def publish(self, body: bytes, stamp_ns: int) -> None:
-        for publisher in self._publishers:
-            publisher.publish(body, stamp_ns)
+        self.publish_within(body, stamp_ns, inf)
 
     def publish_within(self, body: bytes, stamp_ns: int, left_s: float) -> None:
+        """Also to the others where one of them fails, whose failure is raised then."""
+        failure: Exception | None = None
         for publish in self._within:
-            publish(body, stamp_ns, left_s)
+            try:
+                publish(body, stamp_ns, left_s)
+            except Exception as error:  # noqa: BLE001  raised below
+                failure = failure or error
+        if failure is not None:
+            raise failure
 
     def close(self) -> None:
-        for publisher in self._publishers:
-            publisher.close()
+        if not self.closed:
+            self.closed = True
+            try:
+                close_all([publisher.close for publisher in self.parts.values()])
+            finally:
+                self._owner.closed(self)
 
 
 class _ServiceMembers:
@@ -113,7 +150,9 @@ class CompositeEndpoint:
         self._events: TopicEvents | None = None
         self._started: list[Endpoint] = []
         self._givers: dict[TopicName, dict[int, TopicInfo]] = {}  # members in the order they announced
+        self._left_out: dict[TopicName, dict[int, TopicInfo]] = {}  # members that give it with another type
         self._joined: list[_Joined] = []
+        self._opened: list[_Publishers] = []
         self._service_events: ServiceEvents | None = None
         self._servers: dict[TopicName, list[ServiceEndpoint]] = {}  # members in the order they announced
 
@@ -150,22 +189,60 @@ class CompositeEndpoint:
 
     def advertise(self, info: TopicInfo) -> Publisher:
         """At every member that takes it. ConfigError, with every reason, when none does."""
-        publishers: list[Publisher] = []
-        refusals: list[ConfigError] = []
-        for member in self._members:
-            try:
-                publishers.append(self.converter.advertise(member, info))
-            except ConfigError as error:
-                refusals.append(error)
-        if publishers:
-            return _Publishers(publishers)
+        publishers = _Publishers(self, info)
+        with ExitStack() as failed:
+            failed.callback(publishers.close)
+            refusals = self._offer(publishers)
+            failed.pop_all()
+        if publishers.parts:
+            self._opened.append(publishers)
+            for refusal in refusals:
+                _LOG.info("%s is not published everywhere: %s", info.name, refusal)
+            return publishers
         if len(refusals) == 1:
             raise refusals[0]
         raise ConfigError("; ".join(dict.fromkeys(str(error) for error in refusals)))
 
+    def _offer(self, publishers: _Publishers) -> list[ConfigError]:
+        """At the members that have it not yet; the refusals of those that do not take it."""
+        refusals: list[ConfigError] = []
+        for index, member in enumerate(self._members):
+            if index not in publishers.parts:
+                try:
+                    publishers.add(index, self.converter.advertise(member, publishers.info))
+                except ConfigError as error:
+                    refusals.append(error)
+        return refusals
+
+    def closed(self, publishers: _Publishers) -> None:
+        """One is no more: a member that refused another of its name, for its sake, may take that now."""
+        if publishers in self._opened:
+            self._opened.remove(publishers)
+            if any(len(other.parts) < len(self._members) for other in self._opened if other.name == publishers.name):
+                loop = asyncio.get_running_loop()
+                loop.call_soon(self._offer_again, publishers.name)
+                loop.call_later(AGAIN_S, self._offer_again, publishers.name)
+
+    def _offer_again(self, name: TopicName) -> None:
+        for publishers in [each for each in self._opened if each.name == name]:
+            self._offer(publishers)
+
     def interest(self, name: TopicName, wanted: bool) -> None:
         for index in self._givers.get(name, ()):
             self._members[index].interest(name, wanted)
+
+    def validate(self, held: Held) -> list[Difference]:
+        """Also of each member, with what is held open there."""
+        publishers = Counter(opened.name for opened in self._opened)
+        found = held.differences(Held(publishers, Counter(joined.name for joined in self._joined)))
+        for index, member in enumerate(self._members):
+            found += member.validate(
+                Held(
+                    Counter(opened.name for opened in self._opened if index in opened.parts),
+                    Counter(joined.name for joined in self._joined if index in self._givers.get(joined.name, ())),
+                )
+            )
+        return found
 
     @property
     def encoding(self) -> None:
@@ -256,6 +333,7 @@ class CompositeEndpoint:
                 "%s: two endpoints give it, as %s (%s) and as %s (%s); the second is left out",
                 info.name, first.type_name, first.encoding, info.type_name, info.encoding,
             )  # fmt: skip
+            self._left_out.setdefault(info.name, {})[index] = info
             return
         known = index in givers
         givers[index] = info
@@ -265,6 +343,10 @@ class CompositeEndpoint:
 
     def member_removed(self, index: int, name: TopicName) -> None:
         assert self._events is not None
+        left_out = self._left_out.get(name, {})
+        left_out.pop(index, None)
+        if not left_out:
+            self._left_out.pop(name, None)
         givers = self._givers.get(name, {})
         if givers.pop(index, None) is None:
             return
@@ -274,6 +356,8 @@ class CompositeEndpoint:
         if not givers:
             del self._givers[name]
             self._events.topic_removed(name)
+            for other, info in self._left_out.pop(name, {}).items():  # now it is their turn
+                self.member_added(other, info)
 
     def forget(self, joined: _Joined) -> None:
         if joined in self._joined:

@@ -7,12 +7,13 @@ stub of rclpy's interface (`stubs/rclpy`) and a stand-in in the tests, not again
 import asyncio
 import logging
 import time
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 from threading import Thread
 from typing import TYPE_CHECKING, Final
 
-from sern_client.endpoints.base import GUARD_SUFFIX, Publisher, Sink, Subscription, TopicEvents
+from sern_client.endpoints.base import GUARD_SUFFIX, Difference, Held, Publisher, Sink, Subscription, TopicEvents
 from sern_client.endpoints.handover import Handover
 from sern_core.errors import ConfigError, UsageError
 from sern_core.message import TopicInfo
@@ -51,6 +52,10 @@ class RclpyEndpoint:
         self.options = options
         self.types = TypeFiles(options.type_paths)
         self._announced: dict[TopicName, str] = {}  # to its type
+        self._publishers: list[_Publisher] = []
+        self._subscriptions: list[_Subscription] = []
+        self._handover: Handover | None = None
+        self._closed_drops = 0
         self._said: set[str] = set()
 
     @property
@@ -63,9 +68,10 @@ class RclpyEndpoint:
 
     @property
     def drops(self) -> dict[DropReason, int]:
-        """Messages dropped because the event loop was behind."""
-        dropped = self._handover.dropped
-        return {DropReason.QUEUE_FULL: dropped} if dropped else {}
+        """Messages dropped because the event loop was behind, or nobody can be reached any more."""
+        behind = 0 if self._handover is None else self._handover.dropped
+        counted = {DropReason.QUEUE_FULL: behind, DropReason.DISCONNECTED: self._closed_drops}
+        return {reason: count for reason, count in counted.items() if count}
 
     async def start(self, events: TopicEvents) -> None:
         try:
@@ -98,7 +104,8 @@ class RclpyEndpoint:
         self._executor.shutdown()
         rclpy.shutdown(context=self._context)
         await asyncio.to_thread(self._thread.join)
-        self._handover.close()
+        if self._handover is not None:
+            self._handover.close()
         self._node.destroy_node()
 
     def interest(self, name: TopicName, wanted: bool) -> None:
@@ -109,6 +116,7 @@ class RclpyEndpoint:
         if type_name is None:
             raise UsageError(f"{name}: no such topic was announced")
         handover = self._handover
+        assert handover is not None, "a topic was announced, so we were started"
 
         def arrived(body: bytes) -> None:
             stamp_ns = time.time_ns()
@@ -116,13 +124,41 @@ class RclpyEndpoint:
 
         message_type = self._message_type(name, type_name)
         qos = self._qos(name)
-        opened = _Subscription(self._node, self._node.create_subscription(message_type, name, arrived, qos, raw=True))
+        opened = _Subscription(
+            self, name, self._node, self._node.create_subscription(message_type, name, arrived, qos, raw=True)
+        )
+        self._subscriptions.append(opened)
         return opened
 
     def advertise(self, info: TopicInfo) -> Publisher:
         message_type = self._message_type(info.name, info.type_name)
         profile = _profile(reliable=info.reliable is not False, latched=info.latched, depth=LATCHED_DEPTH)
-        return _Publisher(self._node, self._node.create_publisher(message_type, info.name, profile))
+        opened = _Publisher(self, info.name, self._node, self._node.create_publisher(message_type, info.name, profile))
+        self._publishers.append(opened)
+        return opened
+
+    def validate(self, held: Held) -> list[Difference]:
+        """Without the thread that spins nothing is received: that is a difference of every topic."""
+        found = held.differences(
+            Held(
+                Counter(publisher.name for publisher in self._publishers),
+                Counter(subscription.name for subscription in self._subscriptions),
+            )
+        )
+        if not self._thread.is_alive():
+            found.append(Difference(TopicName(""), "the thread of rclpy has ended; start the client again"))
+        return found
+
+    def closed(self, part: "_Publisher | _Subscription") -> None:
+        """A publisher or subscription of ours is no more."""
+        if isinstance(part, _Publisher):
+            self._publishers.remove(part)
+        else:
+            self._subscriptions.remove(part)
+
+    def dropped(self) -> None:
+        """A message came to a publisher that is closed."""
+        self._closed_drops += 1
 
     def _message_type(self, name: TopicName, type_name: str) -> type[object]:
         from rosidl_runtime_py.utilities import get_message
@@ -180,9 +216,13 @@ class RclpyEndpoint:
             if len(type_names) > 1:
                 self._say_once(f"{name} is published with several types ({', '.join(type_names)}); left out")
                 continue
-            found.add(name)
-            if name in self._announced:
+            if self._announced.get(name) == type_names[0]:
+                found.add(name)
                 continue
+            if name in self._announced:  # with another type: that is another topic
+                del self._announced[name]
+                self._events.topic_removed(name)
+            found.add(name)
             try:
                 self._message_type(name, type_names[0])
             except ConfigError as error:
@@ -221,30 +261,38 @@ class RclpyEndpoint:
 
 
 class _Subscription:
-    def __init__(self, node: "Node", subscription: "RosSubscription") -> None:
+    def __init__(self, owner: RclpyEndpoint, name: TopicName, node: "Node", subscription: "RosSubscription") -> None:
         self.closed = False
+        self.name = name
+        self._owner = owner
         self._node = node
         self._subscription = subscription
 
     def close(self) -> None:
         if not self.closed:
             self.closed = True
+            self._owner.closed(self)
             self._node.destroy_subscription(self._subscription)
 
 
 class _Publisher:
-    def __init__(self, node: "Node", publisher: "RosPublisher") -> None:
+    def __init__(self, owner: RclpyEndpoint, name: TopicName, node: "Node", publisher: "RosPublisher") -> None:
+        self.name = name
+        self._owner = owner
         self._node = node
         self._publisher: RosPublisher | None = publisher
 
     def publish(self, body: bytes, stamp_ns: int) -> None:
         del stamp_ns  # rclpy stamps what it publishes itself
-        if self._publisher is not None:
+        if self._publisher is None:
+            self._owner.dropped()
+        else:
             self._publisher.publish(body)
 
     def close(self) -> None:
         publisher, self._publisher = self._publisher, None
         if publisher is not None:
+            self._owner.closed(self)
             self._node.destroy_publisher(publisher)
 
 

@@ -13,6 +13,7 @@ import atexit
 import logging
 import threading
 import time
+from collections import Counter
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
@@ -26,7 +27,7 @@ from rosbags.rosbag1 import WriterError as WriterError1
 from rosbags.rosbag2 import WriterError as WriterError2
 
 from sern_client.endpoints.bag_files import BagFile, McapFile, RecordFile, active_path
-from sern_client.endpoints.base import KeptUpTo, Sink, Subscription, TopicEvents
+from sern_client.endpoints.base import Difference, Held, KeptUpTo, Sink, Subscription, TopicEvents
 from sern_client.endpoints.leftovers import ACTIVE, finish, in_use, put_aside
 from sern_core.errors import ConfigError, UsageError
 from sern_core.message import TopicInfo
@@ -93,11 +94,15 @@ class _Publisher:
         self._info: TopicInfo | None = info
 
     def publish(self, body: bytes, stamp_ns: int) -> None:
-        if self._info is not None:
+        if self._info is None:
+            self._recorder.count_dropped()
+        else:
             self._recorder.take(_Job(self._info, stamp_ns, body))
 
     def close(self) -> None:
-        self._info = None
+        info, self._info = self._info, None
+        if info is not None:
+            self._recorder.publishers[info.name] -= 1
 
 
 class RecordEndpoint:
@@ -109,6 +114,8 @@ class RecordEndpoint:
         self.counters = RecordCounters()
         self.problem: str | None = None
         """The last thing that went wrong, in one line; None while all is well."""
+        self.publishers: Counter[TopicName] = Counter()
+        """How many are open, by topic."""
         self._stem: Path | None = None
         self._jobs: SimpleQueue[_Numbered | TopicInfo | _Order | None] = SimpleQueue()
         # Each counter has one writer (event loop, thread), so their difference needs no lock.
@@ -180,7 +187,19 @@ class RecordEndpoint:
         info = self._complete(info)
         self._claim(info.encoding)
         self._jobs.put(info)
+        self.publishers[info.name] += 1
         return _Publisher(self, info)
+
+    def validate(self, held: Held) -> list[Difference]:
+        """Nothing is written any more: that is a difference of every topic."""
+        found = held.differences(Held(+self.publishers))
+        if self._open and (self._thread is None or not self._thread.is_alive()):
+            found.append(Difference(TopicName(""), f"{self.options.path}: the thread that records has ended"))
+        return found
+
+    def count_dropped(self) -> None:
+        """A message came to a publisher that is closed."""
+        self._count_dropped(DropReason.DISCONNECTED)
 
     def interest(self, name: TopicName, wanted: bool) -> None:
         """Makes no difference here."""

@@ -7,14 +7,14 @@ commands it receives. The operator gives commands and goals, and keeps what it r
 import asyncio
 import heapq
 import logging
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from random import Random
 from typing import Any, Final, Literal
 
-from sern_client.endpoints.base import Sink, TopicEvents
+from sern_client.endpoints.base import Difference, Held, Sink, TopicEvents
 from sern_client.endpoints.clock import Clock, SystemClock
 from sern_client.endpoints.held import HeldSubscription
 from sern_client.endpoints.jackal import JACKAL, JackalSource, OperatorSource, Plan, Sizes
@@ -75,6 +75,7 @@ class SyntheticCounters:
     refused: int = 0  # offers answered with no
     dropped: int = 0  # refused messages that are not offered again
     bad_commands: int = 0
+    late: int = 0  # came to a publisher that was closed
 
 
 @dataclass(slots=True)
@@ -110,15 +111,31 @@ _Subscription = HeldSubscription[_Topic]
 
 
 class _Publisher:
-    def __init__(self, receive: Callable[[bytes, int], None]) -> None:
+    """Open while it is in `publishers`, those of its endpoint."""
+
+    def __init__(
+        self,
+        name: TopicName,
+        receive: Callable[[bytes, int], None],
+        counters: SyntheticCounters,
+        publishers: "list[_Publisher]",
+    ) -> None:
+        self.name = name
         self._receive: Callable[[bytes, int], None] | None = receive
+        self._counters = counters
+        self._publishers = publishers
+        publishers.append(self)
 
     def publish(self, body: bytes, stamp_ns: int) -> None:
-        if self._receive is not None:
+        if self._receive is None:
+            self._counters.late += 1
+        else:
             self._receive(body, stamp_ns)
 
     def close(self) -> None:
-        self._receive = None
+        if self._receive is not None:
+            self._receive = None
+            self._publishers.remove(self)
 
 
 class SyntheticEndpoint:
@@ -142,6 +159,7 @@ class SyntheticEndpoint:
             self._source = OperatorSource(random, self._encoding)
         self._topics = {topic.info.name: topic for topic in self._plan_topics()}
         self._received: dict[TopicName, Received] = {}
+        self._publishers: list[_Publisher] = []
         self._task: asyncio.Task[None] | None = None
         self._start_s = 0.0
         self._start_ns = 0
@@ -194,7 +212,15 @@ class SyntheticEndpoint:
             if commands:
                 self._obey(info, body)
 
-        return _Publisher(receive)
+        return _Publisher(info.name, receive, self.counters, self._publishers)
+
+    def validate(self, held: Held) -> list[Difference]:
+        return held.differences(
+            Held(
+                Counter(publisher.name for publisher in self._publishers),
+                Counter(name for name, topic in self._topics.items() for _ in topic.subscriptions),
+            )
+        )
 
     def interest(self, name: TopicName, wanted: bool) -> None:
         """Makes no difference here."""

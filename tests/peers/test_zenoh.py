@@ -9,7 +9,7 @@ from typing import Any, Self
 
 import pytest
 
-from sern_client.endpoints.base import Endpoint, ServiceEndpoint, ServiceInfo
+from sern_client.endpoints.base import Endpoint, Held, ServiceEndpoint, ServiceInfo
 from sern_client.endpoints.zenoh.endpoint import ZenohEndpoint, ZenohOptions
 from sern_client.endpoints.zenoh.session import SessionOptions
 from sern_core.errors import ConfigError, ServiceError, UsageError
@@ -194,6 +194,21 @@ async def test_what_is_published_here_reaches_a_node(endpoint: tuple[ZenohEndpoi
     assert events.infos == {}, "our own publisher is not announced to us"
     publisher.close()
     assert ours.drops == {}
+
+
+async def test_the_first_messages_wait_for_the_subscribers_there_are(
+    endpoint: tuple[ZenohEndpoint, Events], peer: Peer
+) -> None:
+    ours, _ = endpoint
+    await peer.do("subscriber", name=CHAT)
+    for number in range(3):  # each time a stream of a moment
+        publisher = ours.advertise(chat())
+        for letter in "abc":
+            publisher.publish(text(f"{number}{letter}"), 1)
+        publisher.close()
+    await until(lambda: len(peer.got) == 9, "all arrive")
+    assert [data for _, data in peer.got] == [f"{number}{letter}" for number in range(3) for letter in "abc"]
+    assert ours.drops == {} and ours.validate(Held()) == []
 
 
 async def test_late_joiners_get_what_is_latched(endpoint: tuple[ZenohEndpoint, Events], peer: Peer) -> None:

@@ -14,7 +14,7 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
 from sern_client.conversion import Converter, converted, converted_service
-from sern_client.endpoints.base import Publisher, ServiceInfo, Sink, Subscription, TopicEvents
+from sern_client.endpoints.base import Difference, Held, Publisher, ServiceInfo, Sink, Subscription, TopicEvents
 from sern_core.errors import ConfigError, UsageError
 from sern_core.message import TopicInfo
 from sern_core.types import Encoding, TopicName
@@ -264,6 +264,10 @@ class Taking:
 
     def subscribe(self, name: TopicName, sink: Sink) -> Subscription:
         raise UsageError(f"{name}: gives nothing")
+
+    def validate(self, held: Held) -> list[Difference]:
+        del held
+        return []
 
     def interest(self, name: TopicName, wanted: bool) -> None: ...
 

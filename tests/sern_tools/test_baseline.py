@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from sern_client.endpoints.base import Publisher, Sink, Subscription, TopicEvents
+from sern_client.endpoints.base import Difference, Held, Publisher, Sink, Subscription, TopicEvents
 from sern_core.errors import UsageError
 from sern_core.message import TopicInfo
 from sern_core.types import Encoding, TopicName
@@ -41,6 +41,10 @@ class Source:
     def subscribe(self, name: TopicName, sink: Sink) -> Subscription:
         self.sinks[name] = sink
         return _Closing(self.sinks, name)
+
+    def validate(self, held: Held) -> list[Difference]:
+        del held
+        return []
 
     def interest(self, name: TopicName, wanted: bool) -> None:
         assert wanted and name in self.sinks

@@ -7,6 +7,7 @@ that off, for a chain of two links with a domain in the middle.
 
 import asyncio
 import logging
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -20,7 +21,16 @@ from cyclonedds.pub import DataWriter, Publisher
 from cyclonedds.sub import DataReader, Subscriber
 from cyclonedds.topic import Topic
 
-from sern_client.endpoints.base import GUARD_SUFFIX, ServiceEvents, ServiceHandler, ServiceInfo, Sink, TopicEvents
+from sern_client.endpoints.base import (
+    GUARD_SUFFIX,
+    Difference,
+    Held,
+    ServiceEvents,
+    ServiceHandler,
+    ServiceInfo,
+    Sink,
+    TopicEvents,
+)
 from sern_client.endpoints.dds import names, node_info, raw
 from sern_client.endpoints.dds.definitions import Definitions
 from sern_client.endpoints.dds.domain import DomainOptions, close_domain, open_domain
@@ -36,7 +46,9 @@ from sern_client.endpoints.dds.qos import (
     writer_for,
 )
 from sern_client.endpoints.dds.services import DdsServices
+from sern_client.endpoints.dds.stream import Stream
 from sern_client.endpoints.dds.worker import Inbox, Sample, Worker
+from sern_client.endpoints.first import LEARN_S, FirstMessages, Readers
 from sern_core.errors import ConfigError, UsageError
 from sern_core.message import TopicInfo
 from sern_core.types import DropReason, Encoding, TopicName
@@ -73,7 +85,7 @@ class DdsOptions:
 class DdsCounters:
     """Messages by fate. Dropped: the event loop was too slow (`overrun`), slow reliable readers left a writer no room
     (`blocked`), too many calls of a service were under way (`calls`), or what came was no call (`unreadable`). What the
-    link did not take (`refused`), the link counts."""
+    link did not take (`refused`), the link counts. `closed`: given to a writer that is no more."""
 
     received: int = 0
     overrun: int = 0
@@ -82,6 +94,7 @@ class DdsCounters:
     blocked: int = 0
     calls: int = 0
     unreadable: int = 0
+    closed: int = 0
 
 
 class _Subscription:
@@ -110,6 +123,11 @@ class _Subscription:
         asked = replace(reader_for(writers), type_hash=self.info.type_hash)
         resolved = ros_types.resolve(self.info.type_name, self.info.definition, Encoding.CDR)
         self._reader = self._endpoint.open_reader(self.dds_topic, resolved, asked, self._deliver)
+
+    @property
+    def lacks_reader(self) -> bool:
+        """It is to have one and has none."""
+        return self._reader is None and (self.wanted or self.info.latched)
 
     @property
     def matched(self) -> int:
@@ -162,7 +180,7 @@ class _Reader:
 
 
 class _Writer:
-    """A writer in use. Also the `Publisher` of a stream that comes in."""
+    """A writer in use."""
 
     def __init__(self, endpoint: "DdsEndpoint", writer: DataWriter[Any], guid: UUID, *, stamped: bool) -> None:
         self._endpoint = endpoint
@@ -175,8 +193,14 @@ class _Writer:
         """How many readers it has."""
         return 0 if self._writer is None else len(self._writer.get_matched_subscriptions())
 
+    def readers(self, known: set[int]) -> Readers:
+        """How many of the `known` readers, by their handles, it has."""
+        mine = () if self._writer is None else raw.matched_readers(self._writer)
+        return Readers(len(known), len(known.intersection(mine)))
+
     def publish(self, body: bytes, stamp_ns: int) -> None:
         if self._writer is None:
+            self._endpoint.counters.closed += 1
             return
         # A lifespan is judged by the time stamp: only one of this host says how old a sample is here.
         result = raw.write(self._writer, body, stamp_ns if self._stamped else None)
@@ -221,6 +245,10 @@ class DdsEndpoint:
         self._subscriptions: dict[TopicName, list[_Subscription]] = {}
         self._readers: dict[UUID, _Reader] = {}
         self._writers: dict[UUID, _Writer] = {}
+        self._streams: list[Stream] = []
+        self._ending: list[FirstMessages] = []  # of streams that are closed
+        self._first_dropped: Counter[DropReason] = Counter()
+        self._started_s = 0.0
         self._info_writer: _Writer | None = None
         self._info_due = False
         self._said: set[str] = set()
@@ -242,6 +270,7 @@ class DdsEndpoint:
                 "too many participants on this host, or no such interface"
             ) from None
         self._events = events
+        self._started_s = asyncio.get_running_loop().time()
         self.graph.own = participant.guid
         worker = Worker(participant, self, max_buffer_bytes=options.max_buffer_bytes)
         self._joined = _Joined(participant, Publisher(participant), Subscriber(participant), worker)
@@ -260,6 +289,10 @@ class DdsEndpoint:
                 subscription.close()
         for reader in list(self._readers.values()):
             reader.close()
+        for stream in list(self._streams):
+            stream.close()
+        for first in list(self._ending):
+            first.close()
         for writer in list(self._writers.values()):
             writer.close()
         self._events = None
@@ -292,12 +325,45 @@ class DdsEndpoint:
         self._refresh(subscription)
         return subscription
 
-    def advertise(self, info: TopicInfo) -> _Writer:
+    def advertise(self, info: TopicInfo) -> Stream:
         """ConfigError for another encoding than CDR, a type nobody defines, or one with another hash than here."""
         resolved = self._resolve(info)
         offered = replace(writer_for(info, lifespan=self.options.offer_lifespan), type_hash=resolved.text.type_hash)
         depth = info.depth or (10 if offered.reliable else 1)
-        return self.open_writer(names.to_dds(info.name), resolved, offered, depth=depth)
+        topic = names.to_dds(info.name)
+        writer = self.open_writer(topic, resolved, offered, depth=depth)
+        first = FirstMessages(
+            info.name,
+            readers=lambda: writer.readers(self._waiting_readers(topic, names.type_to_dds(resolved.name), offered)),
+            write=writer.publish,
+            dropped=self._drop_first,
+            max_messages=max(depth, self.options.queue_depth) if offered.reliable else depth,
+            max_bytes=self.options.max_buffer_bytes,
+            overflow=DropReason.QUEUE_FULL if offered.reliable else DropReason.SUPERSEDED,
+            learning_s=self._started_s + LEARN_S - asyncio.get_running_loop().time(),
+        )
+        stream = Stream(info.name, writer, first, self._stream_closed)
+        self._streams.append(stream)
+        return stream
+
+    def _stream_closed(self, stream: Stream) -> None:
+        """It takes no more; its writer lasts until its first messages are written."""
+        self._streams.remove(stream)
+        if len(stream.first):
+            self._ending = [first for first in self._ending if not first.over] + [stream.first]
+
+    def _drop_first(self, why: DropReason) -> None:
+        self._first_dropped[why] += 1
+
+    def _waiting_readers(self, topic: str, type_name: str, offered: EndpointQos) -> set[int]:
+        """The readers of others that will match such a writer and get nothing that was written before, by handle."""
+        return {
+            reader.handle
+            for reader in self.graph.readers(topic)
+            if reader.type_name == type_name
+            and not (offered.transient_local and reader.qos.transient_local)
+            and not mismatches(offered, reader.qos)
+        }
 
     def _resolve(self, info: TopicInfo) -> ResolvedType:
         if info.encoding is not Encoding.CDR:
@@ -311,6 +377,21 @@ class DdsEndpoint:
                 f"{resolved.text.type_hash}; both sides need the same version of the type"
             )
         return resolved
+
+    def validate(self, held: Held) -> list[Difference]:
+        """A wanted topic without a reader differs too. Without the thread that waits for DDS nothing is received: that
+        is a difference of every topic."""
+        here = Held(subscriptions=Counter(name for name, them in self._subscriptions.items() for _ in them))
+        here.publishers.update(stream.name for stream in self._streams if stream.writer.guid in self._writers)
+        found = held.differences(here)
+        found += [
+            Difference(name, "no reader in this domain takes it")
+            for name, subscriptions in self._subscriptions.items()
+            if any(subscription.lacks_reader for subscription in subscriptions)
+        ]
+        if self._joined is not None and not self._joined.worker.alive:
+            found.append(Difference(TopicName(""), "the thread that waits for DDS has ended; start the client again"))
+        return found
 
     def interest(self, name: TopicName, wanted: bool) -> None:
         """Nobody wants it: nothing is received either, unless the topic is latched."""
@@ -455,8 +536,9 @@ class DdsEndpoint:
         counted = {
             DropReason.QUEUE_FULL: self.overruns() + self.counters.blocked + self.counters.calls,
             DropReason.UNDECODABLE: self.counters.unreadable,
+            DropReason.DISCONNECTED: self.counters.closed,
         }
-        return {reason: count for reason, count in counted.items() if count}
+        return {reason: count for reason, count in (Counter(counted) + self._first_dropped).items() if count}
 
     def overruns(self) -> int:
         """Messages dropped because the event loop was too slow, of all readers there are and were."""

@@ -40,6 +40,11 @@ def write(writer: DataWriter[Any], body: bytes, stamp_ns: int | None) -> int:
     return int(_clayer.ddspy_write_ts(writer._ref, body, stamp_ns))
 
 
+def matched_readers(writer: DataWriter[Any]) -> list[int]:
+    """The handles of the readers that a writer has, as discovery tells them: the binding makes them signed here."""
+    return [handle & 2**64 - 1 for handle in writer.get_matched_subscriptions()]
+
+
 class Waiter:
     """A wait set that says which of its entities are ready, each by the number it was attached with."""
 

@@ -129,6 +129,11 @@ class Worker:
         self._jobs.append(job)
         self._guard.set(True)
 
+    @property
+    def alive(self) -> bool:
+        """Whether the thread runs."""
+        return self._thread.is_alive()
+
     async def stop(self) -> None:
         """Ends the thread; it has let go of all readers then."""
         self._stopping = True

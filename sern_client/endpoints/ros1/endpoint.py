@@ -18,14 +18,23 @@ import logging
 import os
 import re
 import socket
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from ipaddress import ip_address
 from itertools import count
 from typing import Final
 
-from sern_client.endpoints.base import GUARD_SUFFIX, ServiceEvents, ServiceHandler, ServiceInfo, Sink, TopicEvents
+from sern_client.endpoints.base import (
+    GUARD_SUFFIX,
+    Difference,
+    Held,
+    ServiceEvents,
+    ServiceHandler,
+    ServiceInfo,
+    Sink,
+    TopicEvents,
+)
 from sern_client.endpoints.ros1.graph import Graph, Registration
 from sern_client.endpoints.ros1.master import Master, SystemState
 from sern_client.endpoints.ros1.publication import Ended, Handle, Limits, Publication
@@ -182,7 +191,9 @@ class Ros1Endpoint:
 
     def advertise(self, info: TopicInfo) -> Handle:
         """ConfigError when the topic is outside our namespace, is no ROS 1 topic, or its hash is another type's than
-        its definition's or than that of another stream of the same name."""
+        its definition's or than that of another stream of the same name; or when this node has left the master."""
+        if self.problem is not None:
+            raise ConfigError(f"{info.name}: {self.problem}")
         info = self._complete(info)
         name = self._at_master(info.name)
         publication = self._publications.get(name)
@@ -191,9 +202,11 @@ class Ros1Endpoint:
             publication = None
         if publication is None:
             publication = self._publications[name] = Publication(name, info, self.caller, self._limits, self._ended)
+            handle = Handle(publication)  # first: a publication without one ends as soon as nobody is waited for
             self._tell_subscribers(publication)
             self._graph.poll_now()
-        elif not publication.fits(info):
+            return handle
+        if not publication.fits(info):
             raise ConfigError(
                 f"{info.name}: {info.type_name} with md5sum {info.type_hash} is not what is published here already, "
                 f"{publication.info.type_name} with {publication.info.type_hash}"
@@ -204,6 +217,22 @@ class Ros1Endpoint:
         for topic in self._topics.values():
             if topic.local == name:
                 topic.interest(wanted)
+
+    def validate(self, held: Held) -> list[Difference]:
+        """Publishers that the master does not list differ too, unless there is no master."""
+        here = Held()
+        for name, publication in self._publications.items():
+            if not publication.closed:
+                here.publishers[TopicName(self._local(name))] += len(publication.handles)
+        for topic in self._topics.values():
+            here.subscriptions[TopicName(topic.local)] += len(topic.sinks)
+        found = held.differences(Held(+here.publishers, +here.subscriptions))
+        found += [
+            Difference(TopicName(self._local(name)), f"{self.caller} is not listed as its {kind} at {self.master_uri}")
+            for kind, name in self._graph.unlisted
+            if kind != "service"
+        ]
+        return found if self.problem is None else [Difference(TopicName(""), self.problem), *found]
 
     @property
     def encoding(self) -> Encoding:
@@ -265,23 +294,21 @@ class Ros1Endpoint:
 
     # What the graph asks and tells
 
-    def desired(self) -> Iterable[Registration]:
+    def desired(self) -> dict[Registration, str]:
         if self._off:
-            return
-        for name in self._publications:
-            yield Registration("publisher", name)
-        for topic in self._topics.values():
-            if topic.sinks:
-                yield Registration("subscriber", topic.topic)
-        for name in self._host_of_services.served:
-            yield Registration("service", name)
+            return {}
+        return (
+            {Registration("publisher", name): publication.type_name for name, publication in self._publications.items()}
+            | {Registration("subscriber", topic.topic): "" for topic in self._topics.values() if topic.sinks}
+            | dict.fromkeys((Registration("service", name) for name in self._host_of_services.served), "")
+        )
 
-    async def register(self, registration: Registration) -> None:
+    async def register(self, registration: Registration, detail: str) -> None:
         kind, name = registration
         if kind == "service":
             await self._master.register_service(name, self._service_uri)
-        elif kind == "publisher" and (publication := self._publications.get(name)) is not None:
-            await self._master.register_publisher(name, publication.type_name)
+        elif kind == "publisher":
+            await self._master.register_publisher(name, detail)
         elif kind == "subscriber" and (topic := self._topics.get(name)) is not None:
             await self._master.register_subscriber(name, _type_of(topic))
 
@@ -398,6 +425,7 @@ class Ros1Endpoint:
         self._services.update({})
         for publication in list(self._publications.values()):
             publication.close()
+        self._publications.clear()
         self._graph.poll_now()
 
 

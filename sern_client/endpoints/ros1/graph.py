@@ -4,14 +4,18 @@ The master's word is not enough. A node that crashed stays registered, so every 
 by an idle connection to its API port: when that ends and the port refuses a new one, the node is dead, whatever the
 master says. It is looked for again, because a node that comes back under its name may have another port.
 
-The poll costs next to nothing while nothing changes: an answer that is the same in every byte is not read. What we
-registered and the master does not list (it was restarted) is registered again. While there is no master, what is
-connected stays so.
+The poll costs next to nothing while nothing changes: an answer that is the same in every byte is not read. While there
+is no master, what is connected stays so.
+
+What we are registered for is made to be what is desired, whatever happened on the way: one task does it, one call after
+another, by comparing what the master lists with what is desired now. What it does not list (it was restarted) is
+registered again, what it lists and nobody desires is unregistered, and once in `RECONCILE_S` all of it is looked at
+anew.
 """
 
 import asyncio
 import logging
-from collections.abc import Awaitable, Callable, Iterable
+from collections.abc import Awaitable, Callable, Mapping
 from contextlib import suppress
 from typing import Final, NamedTuple, Protocol
 
@@ -28,6 +32,8 @@ MASTER_AGAIN_S: Final = 0.5
 GATHER_S: Final = 0.02
 """The master tells of one change several times (once a topic); one poll answers all."""
 RUN_ID_S: Final = 1.0
+RECONCILE_S: Final = 60.0
+"""How often a state that has not changed is read all the same, and what was refused is tried again."""
 
 _log = logging.getLogger(__name__)
 
@@ -52,9 +58,11 @@ class Registration(NamedTuple):
 class Registrar(Protocol):
     """What we are to be registered for, and how."""
 
-    def desired(self) -> Iterable[Registration]: ...
+    def desired(self) -> Mapping[Registration, str]:
+        """Each with what it says besides its name (a type): where that changes, it is registered again."""
+        ...
 
-    def register(self, registration: Registration) -> Awaitable[None]: ...
+    def register(self, registration: Registration, detail: str) -> Awaitable[None]: ...
 
     def unregister(self, registration: Registration) -> Awaitable[None]: ...
 
@@ -173,8 +181,10 @@ class Graph:
         self._registrar = registrar
         self._changed = changed
         self._poll_s = poll_s
-        self._registered: set[Registration] = set()
-        self._refused: set[Registration] = set()
+        self._registered: dict[Registration, str | None] = {}  # None: listed, but not known with what
+        self._refused: dict[Registration, str] = {}
+        self._listed: set[Registration] = set()
+        self._reconcile_s = 0.0
         self._seen = b""
         self._problem = ""
         self._run_id: str | None = None
@@ -204,6 +214,11 @@ class Graph:
     def poll_now(self) -> None:
         """Something changed, here or there."""
         self._now.set()
+
+    @property
+    def unlisted(self) -> list[Registration]:
+        """What is desired and the master, when it last answered, did not list; empty while there is no master."""
+        return sorted(self._registrar.desired().keys() - self._listed) if self.connected else []
 
     def attach(self, node_name: str, member: Member) -> None:
         node = self.nodes.get(node_name)
@@ -255,33 +270,54 @@ class Graph:
         self._run_id_s = -RUN_ID_S
 
     async def _register(self) -> None:
-        desired = list(dict.fromkeys(self._registrar.desired()))
-        for registration in desired:
-            if registration not in self._registered and registration not in self._refused:
-                try:
-                    await self._registrar.register(registration)
-                    self._registered.add(registration)
-                except UnreachableError:
-                    raise
-                except CallError as error:
-                    self._refused.add(registration)
-                    _log.error("%s: cannot be registered as %s: %s", registration.name, registration.kind, error)
-        for registration in self._registered.difference(desired):
-            with suppress(CallError):  # a master that has lost us has nothing to unregister
+        desired = dict(self._registrar.desired())
+        for registration, detail in desired.items():
+            if detail in (self._registered.get(registration), self._refused.get(registration)):
+                continue
+            self._seen = b""  # what the master lists is compared again after every change of ours
+            try:
+                await self._registrar.register(registration, detail)
+                self._registered[registration] = detail
+            except UnreachableError:
+                raise
+            except CallError as error:
+                self._refused[registration] = detail
+                _log.error("%s: cannot be registered as %s: %s", registration.name, registration.kind, error)
+        for registration in self._registered.keys() - desired.keys():
+            self._seen = b""
+            try:
                 await self._registrar.unregister(registration)
-            self._registered.discard(registration)
-        self._refused.intersection_update(desired)
+            except UnreachableError:
+                raise  # it may come back, and list it still
+            except CallError as error:  # it has lost us: there is nothing to unregister
+                _log.debug("%s: was not registered as %s any more: %s", registration.name, registration.kind, error)
+            del self._registered[registration]
+        for registration in self._refused.keys() - desired.keys():
+            del self._refused[registration]
 
     async def _poll(self) -> None:
         await self._check_run_id()
+        now = asyncio.get_running_loop().time()
+        if now - self._reconcile_s >= RECONCILE_S:
+            self._reconcile_s = now
+            self._seen = b""
+            self._refused.clear()
         answer = await self._master.state()
         if answer == self._seen:
             return
         state = self._master.read_state(answer)
         kinds = {"publisher": state.publishers, "subscriber": state.subscribers, "service": state.services}
-        missing = {r for r in self._registered if self._master.caller not in kinds[r.kind].get(r.name, ())}
-        if missing:
-            self._registered -= missing
+        self._listed = {
+            Registration(kind, name)
+            for kind, table in kinds.items()
+            for name, nodes in table.items()
+            if self._master.caller in nodes
+        }
+        if self._listed != self._registered.keys():
+            for registration in self._registered.keys() - self._listed:
+                del self._registered[registration]
+            # What else it lists is unregistered unless it is desired, and registered as it should be then.
+            self._registered |= dict.fromkeys(self._listed - self._registered.keys())
             self._now.set()
         self._seen = answer
         self._changed(state)

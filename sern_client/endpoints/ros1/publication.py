@@ -128,6 +128,8 @@ class Publication:
         self.limits = limits
         self.feeds: set[Feed] = set()
         self.handles: list[Handle] = []
+        self.closed = False
+        """Nobody can be served any more."""
         self.latched = info.latched or is_static_tf(topic, info.type_name)
         self._static = TfLatch(Encoding.ROS1) if is_static_tf(topic, info.type_name) else None
         self._last: dict[Handle, bytes] = {}
@@ -191,6 +193,9 @@ class Publication:
         return list(self._last.values())
 
     def publish(self, handle: "Handle", body: bytes, left_s: float = inf) -> None:
+        if self.closed:
+            self.limits.drop(DropReason.DISCONNECTED)
+            return
         if self.latched:
             self._latch(handle, body)
         self.hold.keep(body, left_s)
@@ -228,6 +233,7 @@ class Publication:
             self.hold.hurry()
 
     def close(self) -> None:
+        self.closed = True
         self.hold.close()
         for feed in list(self.feeds):
             feed.close()
@@ -238,6 +244,7 @@ class Handle:
 
     def __init__(self, publication: Publication) -> None:
         self._publication: Publication | None = publication
+        self._limits = publication.limits
         publication.handles.append(self)
 
     def publish(self, body: bytes, stamp_ns: int) -> None:
@@ -245,7 +252,9 @@ class Handle:
 
     def publish_within(self, body: bytes, stamp_ns: int, left_s: float) -> None:
         del stamp_ns  # TCPROS carries no time beside the message
-        if self._publication is not None:
+        if self._publication is None:
+            self._limits.drop(DropReason.DISCONNECTED)
+        else:
             self._publication.publish(self, body, left_s)
 
     def close(self) -> None:

@@ -10,16 +10,19 @@ import itertools
 import logging
 import secrets
 import time
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from math import inf
 from pathlib import Path
 from typing import Any, Final
 
-from sern_client.endpoints.base import GUARD_SUFFIX, Publisher, Sink, Subscription, TopicEvents
+from sern_client.endpoints.base import GUARD_SUFFIX, Difference, Held, Publisher, Sink, Subscription, TopicEvents
+from sern_client.endpoints.first import LEARN_S, FirstMessages, Readers
 from sern_client.endpoints.zenoh import names
 from sern_client.endpoints.zenoh.names import Entity, Kind, Qos
 from sern_client.endpoints.zenoh.services import Services
-from sern_client.endpoints.zenoh.session import SessionOptions, ZenohSession
+from sern_client.endpoints.zenoh.session import MAX_WAITING_BYTES, SessionOptions, ZenohSession
 from sern_core.errors import ConfigError, UsageError, WireError
 from sern_core.message import TopicInfo
 from sern_core.types import DropReason, Encoding, TopicName
@@ -30,6 +33,8 @@ CDR: Final = "application/cdr"
 ROUTER_WAIT_S: Final = 3.0
 """After so long without a router and without a peer we say so."""
 MAX_COMPLAINTS: Final = 256
+FIRST_MESSAGES: Final = 100
+"""Messages of a reliable topic that may wait for its first subscribers."""
 
 _log = logging.getLogger(__name__)
 
@@ -64,6 +69,10 @@ class ZenohEndpoint(Services):
         self._events: TopicEvents | None = None
         self._entities = itertools.count(1)
         self._topics: dict[TopicName, _Topic] = {}
+        self._left_out: dict[TopicName, dict[str, Entity]] = {}  # publishers of another type, by their key
+        self._subscribers: dict[TopicName, dict[str, tuple[str, str]]] = {}  # of others: their types by their keys
+        self._first_dropped: Counter[DropReason] = Counter()
+        self._started_s = 0.0
         self._open: list[_Declared] = []
         self._said: set[str] = set()
         self._miss: asyncio.TimerHandle | None = None
@@ -83,13 +92,14 @@ class ZenohEndpoint(Services):
             DropReason.QUEUE_FULL: self.session.put_dropped + (self.session.handover.dropped if self._events else 0),
             DropReason.DISCONNECTED: self.session.put_failed,
         }
-        return {reason: count for reason, count in counted.items() if count}
+        return {reason: count for reason, count in (Counter(counted) + self._first_dropped).items() if count}
 
     async def start(self, events: TopicEvents) -> None:
         """ConfigError when zenoh does not take the settings. A router that is not there yet is waited for."""
         await self.session.open()
         self._events = events
         self._loop = asyncio.get_running_loop()
+        self._started_s = self._loop.time()
         try:
             self._join()
         except self.session.zenoh.ZError as error:
@@ -121,6 +131,7 @@ class ZenohEndpoint(Services):
             self._miss.cancel()
         for declared in list(self._open):
             declared.close()
+            declared.hurry()
         await self.end_services()
         await self.session.close()
 
@@ -160,7 +171,7 @@ class ZenohEndpoint(Services):
         else:
             subscriber = session.opened.declare_subscriber(key, arrived, allowed_origin=zenoh.Locality.REMOTE)
         token = self._declare_token(Kind.SUBSCRIPTION, name, topic.dds_type, topic.type_hash, qos)
-        declared = _Declared(self, token, subscriber)
+        declared = _Declared(self, name, token, subscriber)
         return declared
 
     def advertise(self, info: TopicInfo) -> Publisher:
@@ -184,7 +195,38 @@ class ZenohEndpoint(Services):
         else:
             publisher = self.session.opened.declare_publisher(key, encoding=CDR, congestion_control=blocking)
         token = self._declare_token(Kind.PUBLISHER, info.name, dds_name, type_hash, qos)
-        return _ZenohPublisher(self, token, publisher)
+        return _ZenohPublisher(
+            self,
+            info,
+            token,
+            publisher,
+            None if info.latched else lambda: self._readers(info.name, dds_name, type_hash),
+        )
+
+    def _readers(self, name: TopicName, dds_name: str, type_hash: str) -> int:
+        """How many subscribers of others the graph knows."""
+        return sum(kind == (dds_name, type_hash) for kind in self._subscribers.get(name, {}).values())
+
+    @property
+    def learning_s(self) -> float:
+        """How much longer the graph may be incomplete."""
+        return max(0.0, self._started_s + LEARN_S - self._loop.time())
+
+    def drop_first(self, why: DropReason) -> None:
+        """Count a message that waited for its first subscribers in vain."""
+        self._first_dropped[why] += 1
+
+    def validate(self, held: Held) -> list[Difference]:
+        """Without the thread that writes nothing is published: that is a difference of every topic."""
+        here = Held()
+        for declared in self._open:
+            if isinstance(declared, _ZenohPublisher) and declared.ending:
+                continue  # until its first messages are written
+            (here.publishers if isinstance(declared, _ZenohPublisher) else here.subscriptions)[declared.name] += 1
+        found = held.differences(here)
+        if (problem := self.session.problem) is not None:
+            found.append(Difference(TopicName(""), problem))
+        return found
 
     def _hash_of(self, info: TopicInfo) -> str:
         definition = info.definition or self.types.message(info.type_name)
@@ -212,6 +254,13 @@ class ZenohEndpoint(Services):
                     self._publisher_appeared(entity)
                 else:
                     self._publisher_went(entity)
+            elif entity.kind is Kind.SUBSCRIPTION:
+                there = self._subscribers.setdefault(entity.name, {})
+                there.pop(entity.key, None)
+                if alive:
+                    there[entity.key] = entity.dds_type, entity.type_hash
+                elif not there:
+                    del self._subscribers[entity.name]
             elif entity.kind is Kind.SERVER:
                 self.server_changed(entity, alive)
         except (WireError, ConfigError) as error:
@@ -225,6 +274,7 @@ class ZenohEndpoint(Services):
         if topic is None:
             topic = self._topics[entity.name] = _Topic(entity.dds_type, entity.type_hash)
         elif (topic.dds_type, topic.type_hash) != (entity.dds_type, entity.type_hash):
+            self._left_out.setdefault(entity.name, {})[entity.key] = entity
             raise ConfigError(
                 f"{entity.name}: {entity.node} publishes {type_name} {entity.type_hash}, others "
                 f"{names.ros_type(topic.dds_type)} {topic.type_hash}; {entity.node} is left out"
@@ -241,11 +291,20 @@ class ZenohEndpoint(Services):
 
     def _publisher_went(self, entity: Entity) -> None:
         assert self._events is not None
+        left_out = self._left_out.get(entity.name, {})
+        left_out.pop(entity.key, None)
+        if not left_out:
+            self._left_out.pop(entity.name, None)
         topic = self._topics.get(entity.name)
         if topic is None or topic.publishers.pop(entity.key, None) is None or topic.publishers:
             return
         del self._topics[entity.name]
         self._events.topic_removed(entity.name)
+        for other in self._left_out.pop(entity.name, {}).values():  # now it is their turn
+            try:
+                self._publisher_appeared(other)
+            except ConfigError as error:
+                self._say_once(str(error))
 
     def _definition(self, entity: Entity, type_name: str) -> str:
         """Empty where unknown: bytes pass through all the same, only conversion needs it."""
@@ -291,12 +350,16 @@ class ZenohEndpoint(Services):
 class _Declared:
     """Something declared in the session, with its token."""
 
-    def __init__(self, owner: ZenohEndpoint, token: Any, thing: Any) -> None:
+    def __init__(self, owner: ZenohEndpoint, name: TopicName, token: Any, thing: Any) -> None:
         self.closed = False
+        self.name = name
         self._owner = owner
         self._token = token
         self._thing = thing
         owner.opened(self)
+
+    def hurry(self) -> None:
+        """Be closed now, if it is to be."""
 
     def close(self) -> None:
         if self.closed:
@@ -306,24 +369,79 @@ class _Declared:
         token, thing = self._token, self._thing
 
         def undeclare() -> None:
-            thing.undeclare()
-            token.undeclare()
+            try:
+                thing.undeclare()
+            finally:  # or the graph would name it for ever
+                token.undeclare()
 
         self._owner.session.put(undeclare, 0)  # after what it has still to send
 
 
 class _ZenohPublisher(_Declared):
-    def __init__(self, owner: ZenohEndpoint, token: Any, publisher: Any) -> None:
-        super().__init__(owner, token, publisher)
+    """An `AgingPublisher`. `known` says how many subscribers the graph knows; None: whoever comes later gets what it
+    has missed from a cache."""
+
+    def __init__(
+        self, owner: ZenohEndpoint, info: TopicInfo, token: Any, publisher: Any, known: Callable[[], int] | None
+    ) -> None:
+        super().__init__(owner, info.name, token, publisher)
         self._publisher = publisher
         self._gid = secrets.token_bytes(names.GID_BYTES)
         self._seq = itertools.count(1)
+        self._known = known
+        self.ending = False
+        """It takes no more, and is closed when its first messages are written."""
+        best_effort = info.reliable is False
+        self._first: FirstMessages | None = None
+        if known is not None:
+            self._first = FirstMessages(
+                info.name,
+                readers=self._readers,
+                write=self._put,
+                dropped=owner.drop_first,
+                max_messages=(info.depth or 1) if best_effort else FIRST_MESSAGES,
+                max_bytes=MAX_WAITING_BYTES,
+                overflow=DropReason.SUPERSEDED if best_effort else DropReason.QUEUE_FULL,
+                learning_s=owner.learning_s,
+            )
+
+    def _readers(self) -> Readers:
+        known = 0 if self._known is None else self._known()
+        try:
+            matching = known and self._publisher.matching_status.matching
+        except self._owner.session.zenoh.ZError:
+            matching = False  # the session has ended
+        return Readers(known, known if matching else 0)
 
     def publish(self, body: bytes, stamp_ns: int) -> None:
+        self.publish_within(body, stamp_ns, inf)
+
+    def publish_within(self, body: bytes, stamp_ns: int, left_s: float) -> None:
+        if self.closed or self.ending:
+            self._owner.session.refused()
+        elif self._first is None or self._first.over:
+            self._put(body, stamp_ns)
+        else:
+            self._first.publish(body, stamp_ns, left_s)
+
+    def _put(self, body: bytes, stamp_ns: int) -> None:
         attachment = names.pack_attachment(next(self._seq), stamp_ns, self._gid)
         publisher = self._publisher
         put: Callable[[], None] = lambda: publisher.put(body, attachment=attachment)  # noqa: E731
         self._owner.session.put(put, len(body))
+
+    def close(self) -> None:
+        """What was published before is still written: the last of it may be a stop command."""
+        if not self.ending:
+            self.ending = True
+            if self._first is None:
+                super().close()
+            else:
+                self._first.end(super().close)
+
+    def hurry(self) -> None:
+        if self._first is not None:
+            self._first.close()
 
 
 def _offered(topic: _Topic) -> Qos:

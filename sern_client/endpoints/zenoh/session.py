@@ -87,6 +87,7 @@ class ZenohSession:
         self._waiting_bytes = 0
         self._wake = Condition()
         self._stopping = False
+        self._faulty = False
         self._writer = Thread(target=self._write, name="zenoh-writer", daemon=True)
 
     async def open(self) -> None:
@@ -126,6 +127,18 @@ class ZenohSession:
         assert self._handover is not None, "the session is open between `open` and `close`"
         return self._handover
 
+    @property
+    def problem(self) -> str | None:
+        """Why nothing is published any more, in one line; None while all is well."""
+        if self._session is not None and not self._stopping and not self._writer.is_alive():
+            return "the thread that writes to zenoh has ended; start the client again"
+        return None
+
+    def refused(self) -> None:
+        """Count a message that zenoh cannot take."""
+        with self._wake:
+            self.put_failed += 1
+
     def put(self, put: Callable[[], None], nbytes: int) -> None:
         """Do `put` in the writer's thread, in order: zenoh blocks the one who puts while its queue is full."""
         with self._wake:
@@ -158,7 +171,11 @@ class ZenohSession:
                 self._waiting_bytes -= nbytes
             try:
                 put()
-            except self.zenoh.ZError as error:
+            except Exception as error:  # noqa: BLE001  whatever a library raises: the next message must go on
                 if nbytes:
-                    self.put_failed += 1
-                _log.debug("zenoh did not take a message: %s", error)
+                    self.refused()
+                if isinstance(error, self.zenoh.ZError):
+                    _log.debug("zenoh did not take a message: %s", error)
+                elif not self._faulty:
+                    self._faulty = True
+                    _log.exception("a fault in writing to zenoh")

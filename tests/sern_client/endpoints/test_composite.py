@@ -10,7 +10,9 @@ import pytest
 
 from sern_client.endpoints.bag import BagEndpoint, BagOptions
 from sern_client.endpoints.base import (
+    Difference,
     Endpoint,
+    Held,
     Publisher,
     ServiceEndpoint,
     ServiceInfo,
@@ -64,6 +66,10 @@ class Fake:
                 fake.sinks.remove(sink)
 
         return Part()
+
+    def validate(self, held: Held) -> list[Difference]:
+        del held
+        return []
 
     def interest(self, name: TopicName, wanted: bool) -> None:
         self.interests.append((name, wanted))
@@ -249,6 +255,44 @@ async def test_services_are_called_where_they_are_and_served_where_they_are_take
     second.refuse = "nor here"
     with pytest.raises(ConfigError, match="not here; nor here"):
         composite.serve(mode, first.echo)
+
+
+async def test_who_was_left_out_has_its_turn_when_the_first_is_gone(events: Any) -> None:
+    first, second = Fake(), Fake()
+    composite = CompositeEndpoint([first, second])
+    await composite.start(events)
+    assert first.events is not None and second.events is not None
+    first.events.topic_added(TopicInfo(TopicName("/a"), "std_msgs/msg/String", Encoding.ROS1))
+    second.events.topic_added(TopicInfo(TopicName("/a"), "std_msgs/msg/Int32", Encoding.ROS1))
+    assert events.infos[TopicName("/a")].type_name == "std_msgs/msg/String"
+    first.events.topic_removed(TopicName("/a"))
+    assert events.infos[TopicName("/a")].type_name == "std_msgs/msg/Int32"
+    second.events.topic_removed(TopicName("/a"))
+    assert events.infos == {}
+    await composite.stop()
+
+
+async def test_a_member_that_fails_keeps_no_message_from_the_others() -> None:
+    class Broken(Fake):
+        def advertise(self, info: TopicInfo) -> Publisher:
+            class Out:
+                def publish(self, body: bytes, stamp_ns: int) -> None:
+                    raise OSError("no room")
+
+                def close(self) -> None:
+                    raise OSError("no way")
+
+            return Out()
+
+    sound = Fake()
+    composite = CompositeEndpoint([Broken(), sound])
+    publisher = composite.advertise(TopicInfo(TopicName("/a"), "std_msgs/msg/String", Encoding.ROS1))
+    with pytest.raises(OSError, match="no room"):
+        publisher.publish(b"body", 0)
+    assert sound.got == [b"body"]
+    with pytest.raises(OSError, match="no way"):
+        publisher.close()
+    assert composite.validate(Held()) == []
 
 
 def test_services_need_a_member_that_knows_them() -> None:

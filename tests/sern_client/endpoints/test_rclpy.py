@@ -77,7 +77,7 @@ class Graph:
         self, kind: type, topic: str, callback: Callable[[bytes], None], profile: Any, *, raw: bool
     ) -> Any:
         assert raw, "bytes, not messages"
-        assert kind.__name__ == "String"
+        assert kind.__name__ in {"String", "Int32"}
         self.subscriptions[topic] = (callback, profile)
         return topic
 
@@ -88,10 +88,14 @@ class Graph:
     def create_publisher(self, kind: type, topic: str, profile: Any) -> Any:
         self.offer(topic, f"std_msgs/msg/{kind.__name__}", node="sern")
         self.profiles[topic] = profile
-        return SimpleNamespace(topic=topic, publish=lambda body: self.published.append((topic, body)))
+        offer = self.publishers[topic][-1]
+        return SimpleNamespace(topic=topic, offer=offer, publish=lambda body: self.published.append((topic, body)))
 
     def destroy_publisher(self, publisher: Any) -> bool:
-        del self.publishers[publisher.topic]
+        offers = self.publishers[publisher.topic]
+        offers.remove(publisher.offer)
+        if not offers:
+            del self.publishers[publisher.topic]
         return True
 
     def destroy_node(self) -> None:
@@ -118,9 +122,10 @@ def graph(monkeypatch: pytest.MonkeyPatch) -> Graph:
             return True
 
     def get_message(name: str) -> type:
-        if name != STRING:
+        package, _, kind = name.rpartition("/")
+        if package != "std_msgs/msg":
             raise ModuleNotFoundError(f"No module named {name.partition('/')[0]!r}")
-        return type("String", (), {})
+        return type(kind, (), {})
 
     modules: dict[str, dict[str, Any]] = {
         "rclpy": {"init": lambda **_: None, "shutdown": lambda **_: None},

@@ -47,6 +47,10 @@ class FakeMaster:
         self.tables: tuple[dict[str, list[str]], ...] = ({}, {}, {})
         self.nodes: dict[str, str] = {}
         self.services: dict[str, str] = {}
+        self.types: dict[str, str] = {}
+        """Of topics, as they were registered last."""
+        self.refused: set[str] = set()
+        """Methods that it answers with no."""
         self.run_id = "one"
         self.calls: dict[str, int] = {}
         self.port = 0
@@ -83,6 +87,8 @@ class FakeMaster:
 
     def _dispatch(self, method: str, params: tuple[Any, ...]) -> Any:
         self.calls[method] = self.calls.get(method, 0) + 1
+        if method in self.refused:
+            return 0, "not now", 0
         match method, params:
             case "getSystemState", (_,):
                 return 1, "", [[[name, nodes] for name, nodes in table.items()] for table in self.tables]
@@ -92,8 +98,9 @@ class FakeMaster:
                 return (1, "", self.nodes[node]) if node in self.nodes else (-1, "unknown node", "")
             case "lookupService", (_, name):
                 return (1, "", self.services[name]) if name in self.services else (-1, "no provider", "")
-            case "registerPublisher", (caller, topic, _, uri):
+            case "registerPublisher", (caller, topic, kind, uri):
                 self.add(0, topic, caller, uri)
+                self.types[topic] = kind
             case "registerSubscriber", (caller, topic, _, uri):
                 self.add(1, topic, caller, uri)
             case "registerService", (caller, name, service_uri, uri):

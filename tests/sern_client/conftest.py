@@ -1,0 +1,3 @@
+from tests.sern_client.endpoints.ros1.conftest import master
+
+__all__ = ["master"]
