@@ -35,6 +35,10 @@ MAX_PEER_DEFINITION_BYTES: Final = 16 * 2**20
 """Texts that one peer may add; all types of a ROS distribution together have less than 2 MB."""
 MAX_OWED: Final = 8192
 """Names in lists that have begun and not ended."""
+ATTACHMENT_BURST_BYTES: Final = 6 * 2**20
+ATTACHMENT_BYTES_PER_S: Final = 64 * 2**20
+"""What a peer's attachments may unpack to at once and after that: zlib makes a kilobyte of a megabyte of blank lines,
+and takes 2 ms to unpack it."""
 MAX_UNHEARD: Final = 20_000
 """Control messages that a peer may have answered, beside four for each channel, before it reads an answer."""
 
@@ -119,6 +123,8 @@ class Link(Session):
         self._peer_definitions = self._peer_definition_bytes = 0
         self._unheard = 0  # answers since the peer acknowledged the one of number `_unheard_seq`
         self._unheard_seq = 0
+        self._attachments_left = float(ATTACHMENT_BURST_BYTES)
+        self._attachments_s = 0.0
         self._owed_parts: dict[tuple[str, int], tuple[str, ...]] = {}  # by message and channel: more will come
         self._announcing: deque[tuple[int, OutChannel]] = deque()  # may send once that control message is on its way
         self._missing: dict[StreamId, float] = {}  # not announced by a new peer, and since when
@@ -412,8 +418,12 @@ class Link(Session):
     # --- control messages -------------------------------------------------------------------------------------------
 
     def _control_message(self, stream: InStream, message: Message) -> None:
-        envelope, attachment = wire.decode_control(message.body)
         now = self._now
+        room = self._attachments_left + (now - self._attachments_s) * ATTACHMENT_BYTES_PER_S
+        self._attachments_left, self._attachments_s = min(room, float(ATTACHMENT_BURST_BYTES)), now
+        most = min(int(self._attachments_left), wire.MAX_ATTACHMENT_BYTES)
+        envelope, attachment = wire.decode_control(message.body, max_bytes=most)
+        self._attachments_left -= len(attachment)
         kind = wire.take_str(envelope, "t", max_length=16)
         before = self._control.next_seq
         self._handle_control(kind, envelope, attachment, now)

@@ -20,8 +20,8 @@ from rosbags.interfaces.typing import FieldDesc, Typesdict
 from sern_core.errors import BodyError, ConfigError
 from sern_core.types import Encoding
 
-MAX_STEPS: Final = 48_000
-"""Texts and groups of fields in one body: about 12 ms. A path of 9600 poses, or as many transforms."""
+MAX_STEPS: Final = 24_000
+"""Texts and groups of fields in one body: about 8 ms. A path of 4800 poses, or as many transforms."""
 
 _HEADER: Final = "std_msgs/msg/Header"
 _FILLER: Final = "structure_needs_at_least_one_member"

@@ -28,10 +28,11 @@ from sern_core.message import TopicInfo
 from sern_core.types import Encoding, TopicName
 from sern_runtime import ros_text
 
+MAX_IDL_TEXT: Final = 2**16
 MAX_IDL_CHARACTERS: Final = 3_000
 MAX_IDL_ARRAYS: Final = 4
-"""An IDL text above either, comments, annotations and constants not counted, is refused: its parser takes 5 µs a
-character and 1.5 ms a constant expression. .msg texts have the limits of `ros_text`."""
+"""An IDL text above the first, or without comments, annotations and constants above the others, is refused: its parser
+takes 5 µs a character and 1.5 ms a constant expression. .msg texts have the limits of `ros_text`."""
 MAX_GENERATED_FIELDS: Final = 300
 MAX_GENERATED_TYPES: Final = 8
 """Custom types, and fields in all of them, for which code is generated at once: 4 ms a type and 0.1 ms a field. Only
@@ -451,9 +452,24 @@ def zero(desc: FieldDesc, store: Typestore) -> Any:
     return [zero(item, store) for _ in range(length)]
 
 
-@lru_cache(maxsize=64)
 def _parse(type_name: str, definition: str) -> Typesdict:
     """The types of a definition. ConfigError where it cannot be read, or not within the limits."""
+    types = _parsed(type_name, definition)
+    if isinstance(types, str):
+        raise ConfigError(types)
+    return types
+
+
+@lru_cache(maxsize=64)
+def _parsed(type_name: str, definition: str) -> Typesdict | str:
+    """The types, or what is wrong: that, too, is found out once."""
+    try:
+        return _parse_anew(type_name, definition)
+    except ConfigError as error:
+        return str(error)
+
+
+def _parse_anew(type_name: str, definition: str) -> Typesdict:
     if definition.startswith(_IDL_MARK):
         types = _parse_idl(type_name, definition)
     else:
@@ -467,7 +483,7 @@ def _parse(type_name: str, definition: str) -> Typesdict:
 
 
 def _parse_idl(type_name: str, definition: str) -> Typesdict:
-    _text_within(type_name, len(definition), ros_text.MAX_CHARACTERS, "characters")
+    _text_within(type_name, len(definition), MAX_IDL_TEXT, "characters")
     bare = _IDL_CONSTANTS.sub("", _IDL_UNREAD.sub(" ", definition.replace("\r", "")))
     bare = re.sub(r"\s*\n\s*", "\n", bare)
     _text_within(type_name, len(bare), MAX_IDL_CHARACTERS, "characters of IDL")
