@@ -1,7 +1,8 @@
 """Between ROS 1 and ROS 2 (CDR): where a stream's encoding is not the one its endpoint takes, at the egress only.
 
-Everywhere else bodies pass through unread. Small messages take 5 to 25 µs, a cloud of 1 MB about 0.1 ms to CDR and 1 ms
-to ROS 1, so it is done inline. What the two sides do not have in common:
+Everywhere else bodies pass through unread. Small messages take 1 to 10 µs, a cloud of 1 MB 30 µs, and nothing that a
+body may hold takes more than about 15 ms (`sern_runtime/ros_bodies.py`), so it is done inline. What the two sides do
+not have in common:
 
 - `seq` of a ROS 1 Header does not exist in ROS 2: it is counted here, per topic, from 1.
 - Range, SolidPrimitive and Marker have fields in ROS 2 that ROS 1 lacks: zero one way, lost the other.
@@ -29,19 +30,22 @@ from sern_client.endpoints.base import (
     ServiceServer,
     publisher_within,
 )
-from sern_core.errors import ConfigError, ServiceError
+from sern_core.errors import BodyError, ConfigError, ServiceError
 from sern_core.message import TopicInfo
 from sern_core.types import Encoding
-from sern_runtime import ros_services, ros_types
+from sern_runtime import ros_bodies, ros_services, ros_types
 from sern_runtime.ros_types import Counterpart, ResolvedType, one_line
 
 Convert = Callable[[bytes], bytes]
 """Body in one encoding in, body in the other out. ConfigError for bytes that are not a message of the type."""
 
+MAX_BY_VALUE_STEPS: Final = 2_000
+"""Texts and groups of fields of a big endian body, which is read value by value: 5 µs each."""
+
 _HEADER: Final = "std_msgs/msg/Header"
 _LITTLE_ENDIAN: Final = b"\x00\x01"
 _SEQ: Final = struct.Struct("<I")
-_UNREADABLE: Final = (SerdeError, AssertionError, IndexError, ValueError, OverflowError, struct.error)
+_UNREADABLE: Final = (BodyError, SerdeError, AssertionError, IndexError, ValueError, OverflowError, struct.error)
 """What a converter raises for bytes that are not a message of its type."""
 
 _log = logging.getLogger(__name__)
@@ -82,11 +86,10 @@ def converted_service(info: ServiceInfo, wanted: Encoding) -> tuple[ServiceInfo,
 
 def body_converter(source: ResolvedType, target: Counterpart) -> Convert:
     """Turns bodies of one type into the other encoding; keeps the `seq` counter of a topic that goes to ROS 1."""
-    by_value = _by_value(source, target.type)
     if source.encoding is Encoding.ROS1:
-        convert = _ros1_to_cdr(target.type) if target.same_layout else by_value
+        convert = _ros1_to_cdr(source, target.type)
     else:
-        convert = _cdr_to_ros1(source, by_value) if target.same_layout else by_value
+        convert = _cdr_to_ros1(source, target.type)
     if target.type.encoding is Encoding.ROS1 and _begins_with_header(target.type):
         convert = _numbered(convert)
 
@@ -188,22 +191,21 @@ def _mismatch(topic: str, type_name: str, offered: str, computed: str) -> Config
     )
 
 
-def _ros1_to_cdr(target: ResolvedType) -> Convert:
-    store, name = target.store, target.name
-
-    def convert(body: bytes) -> bytes:
-        return bytes(store.ros1_to_cdr(body, name))
-
-    return convert
+def _ros1_to_cdr(source: ResolvedType, target: ResolvedType) -> Convert:
+    plan = ros_bodies.plan(target.name, target.store.fielddefs, ros1=source.store.fielddefs)
+    return lambda body: ros_bodies.convert(plan, body, Encoding.ROS1, Encoding.CDR)
 
 
-def _cdr_to_ros1(source: ResolvedType, otherwise: Convert) -> Convert:
-    store, name = source.store, source.name
+def _cdr_to_ros1(source: ResolvedType, target: ResolvedType) -> Convert:
+    plan = ros_bodies.plan(source.name, source.store.fielddefs, ros1=target.store.fielddefs)
+    parts = ros_bodies.plan(source.name, source.store.fielddefs, one_by_one=True)
+    by_value = _by_value(source, target)
 
     def convert(body: bytes) -> bytes:
         if body[:2] != _LITTLE_ENDIAN:
-            return otherwise(body)
-        return bytes(store.cdr_to_ros1(body, name))
+            ros_bodies.check_steps(parts, body, Encoding.CDR, MAX_BY_VALUE_STEPS)
+            return by_value(body)
+        return ros_bodies.convert(plan, body, Encoding.CDR, Encoding.ROS1)
 
     return convert
 

@@ -7,15 +7,17 @@ heard of.
 """
 
 from collections.abc import Hashable
-from typing import Any, Final
+from typing import Final
 
+from sern_core.errors import BodyError, ConfigError
+from sern_core.summaries.transforms import Transform, read_transforms, write_transforms
 from sern_core.types import Encoding
 from sern_runtime import ros_types
 
 TF_STATIC: Final = "/tf_static"
 TF_TYPE: Final = "tf2_msgs/msg/TFMessage"
-MAX_TRANSFORMS: Final = 10_000
-"""Static transforms kept at most, the newest; robots have tens to hundreds."""
+MAX_TRANSFORMS: Final = 2_000
+"""Static transforms kept at most, the newest, and read of one message (8 ms); robots have tens to hundreds."""
 
 
 def is_static_tf(name: str, type_name: str) -> bool:
@@ -28,8 +30,9 @@ class TfLatch:
 
     def __init__(self, encoding: Encoding) -> None:
         self._encoding = encoding
-        self._kept: dict[tuple[str, str], tuple[Hashable, Any]] = {}
+        self._kept: dict[tuple[str, str], tuple[Hashable, Transform]] = {}
         self._last: tuple[Hashable, bytes] | None = None  # while there is only one message, it goes as it came
+        self._merged: bytes | None = None  # what `merged` made last; None: not made since something changed
 
     def __len__(self) -> int:
         return len(self._kept)
@@ -37,21 +40,29 @@ class TfLatch:
     def add(self, source: Hashable, body: bytes) -> bytes:
         """Take a message; all that is known now, as one message: the very same bytes when it says everything.
 
-        ConfigError when the bytes are no TFMessage; nothing has changed then.
+        ConfigError when the bytes are no TFMessage of at most MAX_TRANSFORMS; nothing has changed then.
         """
-        transforms = ros_types.deserialise(body, TF_TYPE, self._encoding).transforms
+        self.keep(source, body)
+        return self.merged() or body
+
+    def keep(self, source: Hashable, body: bytes) -> None:
+        """As `add`, for whoever asks for the whole later."""
+        try:
+            transforms = read_transforms(body, self._encoding, at_most=MAX_TRANSFORMS)
+        except BodyError as error:
+            raise ConfigError(f"type {TF_TYPE}: {error}") from None
         for transform in transforms:
-            pair = (_bare(transform.header.frame_id), _bare(transform.child_frame_id))
-            self._kept.pop(pair, None)
-            self._kept[pair] = (source, transform)
+            self._kept.pop(transform.pair, None)
+            self._kept[transform.pair] = (source, transform)
         while len(self._kept) > MAX_TRANSFORMS:
             del self._kept[next(iter(self._kept))]
         self._last = (source, body) if len(self._kept) == len(transforms) else None
-        return self.merged() or body
+        self._merged = None
 
     def drop(self, source: Hashable) -> None:
         """Forget what a source said that nobody has said since."""
         self._kept = {pair: kept for pair, kept in self._kept.items() if kept[0] != source}
+        self._merged = None
         if self._last is not None and self._last[0] == source:
             self._last = None
 
@@ -61,9 +72,6 @@ class TfLatch:
             return None
         if self._last is not None:
             return self._last[1]
-        message = ros_types.new(TF_TYPE, self._encoding, transforms=[transform for _, transform in self._kept.values()])
-        return ros_types.serialise(message, TF_TYPE, self._encoding)
-
-
-def _bare(frame_id: str) -> str:
-    return frame_id.removeprefix("/")
+        if self._merged is None:
+            self._merged = write_transforms([transform for _, transform in self._kept.values()], self._encoding)
+        return self._merged

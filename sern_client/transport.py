@@ -12,6 +12,7 @@ from sern_core import wire
 from sern_core.errors import ConfigError, RemoteError
 from sern_core.link import Link
 from sern_runtime import clock
+from sern_runtime.inflow import Inflow
 from sern_runtime.monitor import TcpHandle, TransportWatch
 from sern_runtime.pump import LANE_MESSAGE_BYTES, Pump
 from sern_runtime.zmq_socket import TOS_EXPEDITED, CurvePair, DealerSocket, SendResult, make_client
@@ -73,6 +74,8 @@ class Dialer:
         self._rebuild: asyncio.TimerHandle | None = None
         self._socket: DealerSocket | None = None
         self._watch: TransportWatch | None = None
+        self._handle: TcpHandle | None = None
+        self._inflow: Inflow[TcpHandle] | None = None
 
     def open(self) -> None:
         """Connect for the first time. Raises ConfigError."""
@@ -93,6 +96,7 @@ class Dialer:
         self._socket = DealerSocket(
             raw, self._events.received, on_view=self._events.received, on_writable=self._events.writable
         )
+        self._inflow = Inflow(self._socket, self._taken, self._endless)
 
     def _reopen(self) -> None:
         self._rebuild = None
@@ -107,6 +111,9 @@ class Dialer:
         if self._watch is not None:
             self._watch.close()
             self._watch = None
+        if self._inflow is not None:
+            self._inflow.close()
+            self._inflow = None
         if self._socket is not None:
             self._socket.close()
             self._socket = None
@@ -121,7 +128,17 @@ class Dialer:
             return SendResult.FULL
         return self._socket.send(datagram)
 
+    def _taken(self) -> list[tuple[TcpHandle, int]]:
+        if self._handle is None or self._socket is None:
+            return []
+        return [(self._handle, self._socket.messages)]
+
+    def _endless(self, handle: TcpHandle) -> None:
+        del handle
+        _log.warning("%s sends a message without end; the connection is cut", self._endpoint)
+
     def _up(self, handle: TcpHandle | None) -> None:
+        self._handle = handle
         if handle is not None:
             handle.prepare(express=self._express)
         self._backoff_s = REBUILD_MIN_S

@@ -7,7 +7,8 @@ State is kept per `StreamId`, across sessions and peers: that is what makes "onc
 new process and everything is sent again.
 """
 
-from collections import deque
+from bisect import bisect_right
+from collections import OrderedDict, deque
 from collections.abc import Callable
 from itertools import islice
 from typing import Final
@@ -23,8 +24,12 @@ newest one is waited for: on a slow link its next fragment may have to wait for 
 the others have arrived, would take it for delivered."""
 MAX_PARTIALS: Final = 256
 """Half-received best-effort messages of a stream; each whole one that arrives looks through them."""
-MAX_SPANS: Final = 1024
-"""Pieces of a half-received message: more gaps than a sender has packets in flight."""
+MAX_PIECES: Final = 2048
+"""Pieces of a half-received message: more gaps than a sender has packets in flight, twice."""
+PIECE_BYTES: Final = 128
+"""What a piece of a half-received message costs beside its bytes."""
+PIECES_PAID: Final = 16
+"""Pieces are charged for so many at a time."""
 HELD_OVERHEAD_BYTES: Final = 512
 """What a half-received or waiting message costs beside its body: without it, small ones could fill the memory."""
 MAX_REPORTS: Final = 16_384
@@ -37,63 +42,142 @@ SEEN_MASK: Final = (1 << SEEN_BITS) - 1
 
 
 class Partial:
-    """One message of which some fragments have arrived."""
+    """One message of which some fragments have arrived.
 
-    __slots__ = ("body", "born_s", "codec", "error_s", "spans", "stamp_ns", "touched_s")
+    The price of a fragment is its own bytes and a bisection, in whatever order fragments come: nothing is sorted, and
+    nothing is allocated for a size that is only claimed. Pieces that touch are put together when the later one is at
+    most twice as long, so that a byte is moved a logarithmic number of times, and a run without gaps has a
+    logarithmic number of pieces.
+    """
+
+    __slots__ = (
+        "_end",
+        "_missing",
+        "_pieces",
+        "_starts",
+        "born_s",
+        "codec",
+        "error_s",
+        "held_bytes",
+        "paid_pieces",
+        "stamp_ns",
+        "total",
+        "touched_s",
+    )
 
     def __init__(self, total: int) -> None:
-        self.body = bytearray(total)
-        self.spans: list[tuple[int, int]] = []  # merged [start, end) that have arrived
+        self.total = total
+        self.held_bytes = total + HELD_OVERHEAD_BYTES  # as `Reassembly` counts it
+        self.paid_pieces = HELD_OVERHEAD_BYTES // PIECE_BYTES
         self.born_s: float | None = None  # known with the first fragment
         self.error_s = 0.0
         self.codec = 0
         self.stamp_ns = 0
         self.touched_s = 0.0
+        self._missing = total
+        self._starts = [0]  # where each piece begins, ascending; the first may be empty
+        self._pieces = [bytearray()]
+        self._end = 0  # where the last piece ends
 
-    def add(self, offset: int, data: Datagram) -> None:
-        end = offset + len(data)
-        self.body[offset:end] = data
-        spans = self.spans
-        if spans and spans[-1][1] == offset:
-            spans[-1] = (spans[-1][0], end)
-            return
-        spans.append((offset, end))
-        if len(spans) > 1:
-            spans.sort()
-            merged = [spans[0]]
-            for start, stop in spans[1:]:
-                if start <= merged[-1][1]:
-                    merged[-1] = (merged[-1][0], max(merged[-1][1], stop))
+    def add(self, offset: int, data: Datagram) -> bool:
+        """Take a fragment in. True: it was not the next one in order. What has arrived already stays as it is."""
+        if offset == self._end:
+            self._pieces[-1] += data
+            size = len(data)
+            self._end += size
+            self._missing -= size
+            return False
+        self._insert(offset, data)
+        return True
+
+    def _insert(self, at: int, data: Datagram) -> None:
+        """Put the parts of `data` that are missing into the gaps where they belong."""
+        starts, pieces = self._starts, self._pieces
+        first, end = at, at + len(data)
+        index = bisect_right(starts, at) - 1
+        while at < end:
+            reach = starts[index] + len(pieces[index])
+            following = starts[index + 1] if index + 1 < len(starts) else self.total
+            if at < reach:
+                at = reach
+            elif at == following:
+                index += 1
+            else:
+                stop = min(end, following)
+                part = data[at - first : stop - first]
+                self._missing -= len(part)
+                if at == reach:
+                    pieces[index] += part
                 else:
-                    merged.append((start, stop))
-            if len(merged) > MAX_SPANS:
-                raise WireError(f"a message of {len(self.body)} bytes in more than {MAX_SPANS} pieces")
-            self.spans = merged
+                    if len(starts) >= MAX_PIECES:
+                        raise WireError(f"a message of {self.total} bytes in more than {MAX_PIECES} pieces")
+                    index += 1
+                    starts.insert(index, at)
+                    pieces.insert(index, bytearray(part))
+                at = stop
+                if at == following:
+                    self._join(index)
+        self._end = starts[-1] + len(pieces[-1])
+
+    def _join(self, index: int) -> None:
+        """Append the pieces that follow one without a gap, as long as that is cheap."""
+        starts, pieces = self._starts, self._pieces
+        piece = pieces[index]
+        while (
+            index + 1 < len(starts)
+            and starts[index] + len(piece) == starts[index + 1]
+            and len(pieces[index + 1]) <= 2 * len(piece)
+        ):
+            piece += pieces.pop(index + 1)
+            del starts[index + 1]
+
+    @property
+    def pieces(self) -> int:
+        return len(self._pieces)
 
     @property
     def complete(self) -> bool:
-        return self.born_s is not None and len(self.spans) == 1 and self.spans[0] == (0, len(self.body))
+        return not self._missing and self.born_s is not None
+
+    def body(self) -> bytes:
+        """The whole message, once it is complete."""
+        pieces = self._pieces
+        return bytes(pieces[0]) if len(pieces) == 1 else b"".join(pieces)
 
 
 class Reassembly:
     """Memory that half-received and waiting messages of one link may hold in all, and how much is to be reported."""
 
-    __slots__ = ("held_bytes", "holders", "limit_bytes", "reports")
+    __slots__ = ("held_bytes", "holders", "latest", "limit_bytes", "reports")
 
     def __init__(self, limit_bytes: int) -> None:
         self.reports = 0  # drop reports that the peer has not heard, of all streams
         self.limit_bytes = limit_bytes
         self.held_bytes = 0
-        self.holders: dict[InStream, None] = {}  # best-effort streams with half-received messages
+        self.holders: OrderedDict[InStream, None] = OrderedDict()
+        """Best-effort streams with half-received messages, untouched for longest first."""
+        self.latest: InStream | None = None  # the last of them
 
     def make_room(self, nbytes: int) -> bool:
-        """Take `nbytes` into account; best-effort messages untouched for longest make way. False: it is too much."""
+        """Take `nbytes` into account; best-effort streams untouched for longest make way. False: it is too much."""
         while self.held_bytes + nbytes > self.limit_bytes:
             if not self.holders:
                 return False
-            min(self.holders, key=InStream.stalest_s).evict()
+            next(iter(self.holders)).evict()
         self.held_bytes += nbytes
         return True
+
+    def touch(self, stream: "InStream") -> None:
+        """A best-effort stream got a fragment of a message that it has not whole: it is the last to make way."""
+        self.holders[stream] = None
+        self.holders.move_to_end(stream)
+        self.latest = stream
+
+    def gone(self, stream: "InStream") -> None:
+        """A stream has no half-received messages any more."""
+        self.holders.pop(stream, None)
+        if self.latest is stream:
+            self.latest = None
 
 
 class DropReport:
@@ -138,6 +222,7 @@ class InStream:
         self.reports: deque[DropReport] = deque()  # drops that the peer may not know of yet
         self._seen = 0  # best effort: bit i set when seq delivered-1-i arrived
         self._partials: dict[int, Partial] = {}  # best effort: untouched for longest first
+        self._lowest = 0  # no half-received message has a seq below it
         self._waiting: dict[int, Message] = {}
         self._reassembly = reassembly
         self._deliver = deliver
@@ -191,38 +276,34 @@ class InStream:
             self._arrived(Message(self.stream.id, seq, bytes(body), stamp_ns, born_s, 0, replay, error_s, codec))
             return
         partial = self._partials.get(seq)
-        if partial is None or len(partial.body) != total:
+        if partial is None or partial.total != total:
             self._discard_partial(seq)
             if not self.reliable and len(self._partials) >= MAX_PARTIALS:
                 self.evict()
             if not self._reassembly.make_room(total + HELD_OVERHEAD_BYTES):
                 self.give_up(seq, DropReason.REASSEMBLY, len(body), now)
                 return
-            try:
-                partial = Partial(total)
-            except MemoryError:  # the machine has less than our own bound
-                self._reassembly.held_bytes -= total + HELD_OVERHEAD_BYTES
-                self.give_up(seq, DropReason.REASSEMBLY, len(body), now)
-                return
-            self._partials[seq] = partial
-            if not self.reliable:
-                self._reassembly.holders[self] = None
+            if not self._partials or seq < self._lowest:
+                self._lowest = seq
+            partial = self._partials[seq] = Partial(total)
         elif not self.reliable and len(self._partials) > 1:
             self._partials[seq] = self._partials.pop(seq)  # the last to be evicted
+        if not self.reliable and self._reassembly.latest is not self:
+            self._reassembly.touch(self)
         partial.touched_s = now
-        partial.add(offset, body)
+        if partial.add(offset, body) and partial.pieces > partial.paid_pieces and not self._pay(seq, partial):
+            return
         if offset == 0:
             partial.born_s, partial.error_s, partial.stamp_ns = born_s, error_s, stamp_ns
             partial.codec = codec
         if partial.complete:
             assert partial.born_s is not None
             self._discard_partial(seq)
-            whole = bytes(partial.body)
             self._arrived(
                 Message(
                     self.stream.id,
                     seq,
-                    whole,
+                    partial.body(),
                     partial.stamp_ns,
                     partial.born_s,
                     0,
@@ -269,6 +350,20 @@ class InStream:
         if self._reassembly.reports > MAX_REPORTS and self.channel_id is not None:  # not of the control stream
             raise WireError(f"the peer goes on sending and does not read {self._reassembly.reports} reports of drops")
 
+    def _pay(self, seq: int, partial: Partial) -> bool:
+        """Take the pieces of a message into account. False: there was no room for them, and it is lost."""
+        nbytes = PIECES_PAID * PIECE_BYTES
+        if self._reassembly.make_room(nbytes):
+            if self._partials.get(seq) is partial:
+                partial.held_bytes += nbytes
+                partial.paid_pieces += PIECES_PAID
+                return True
+            self._reassembly.held_bytes -= nbytes  # it made way itself
+            return False
+        self._discard_partial(seq)
+        self.give_up(seq, DropReason.REASSEMBLY, partial.total, self._now)
+        return False
+
     def give_up(self, seq: int, reason: DropReason, nbytes: int, now: float) -> None:
         """Message `seq` cannot be taken here: best effort loses it, of a reliable stream a tombstone takes its turn."""
         self._now = now
@@ -292,24 +387,20 @@ class InStream:
         code = DROP_CODES[reason]
         return Message(self.stream.id, seq, bytes([code]), stamp_ns, born_s, code)
 
-    def stalest_s(self) -> float:
-        """When the half-received message that was untouched for longest got its last fragment; there must be one."""
-        return next(iter(self._partials.values())).touched_s
-
     def evict(self) -> None:
         """Lose the half-received best-effort message that was untouched for longest."""
         self._lose(next(iter(self._partials)), DropReason.REASSEMBLY)
 
     def _lose(self, seq: int, reason: DropReason) -> None:
-        self._on_drop(self, reason, len(self._partials[seq].body), 0)
+        self._on_drop(self, reason, self._partials[seq].total, 0)
         self._discard_partial(seq)
 
     def _discard_partial(self, seq: int) -> None:
         partial = self._partials.pop(seq, None) if self._partials else None
         if partial is not None:
-            self._reassembly.held_bytes -= len(partial.body) + HELD_OVERHEAD_BYTES
+            self._reassembly.held_bytes -= partial.held_bytes
             if not self._partials:
-                self._reassembly.holders.pop(self, None)
+                self._reassembly.gone(self)
 
     def _late(self, seq: int, size: int) -> None:
         if self.reliable:
@@ -332,11 +423,12 @@ class InStream:
             else:
                 self._seen = (self._seen << ahead | 1 << (ahead - 1)) & SEEN_MASK if ahead <= SEEN_BITS else 0
             self.delivered = seq
-            if self._partials:
+            if self._partials and self._lowest <= seq:
                 for stale in [s for s in self._partials if s <= seq]:
                     self._lose(stale, DropReason.LOST)
                     if 0 <= seq - 1 - stale < SEEN_BITS:
                         self._seen |= 1 << (seq - 1 - stale)  # the rest of it is no news
+                self._lowest = min(self._partials, default=0)
             self._turn(message)
             return
         if self._reassembly.reports > MAX_REPORTS:
@@ -416,7 +508,7 @@ class InStream:
     @property
     def held_bytes(self) -> int:
         """Memory of half-received and waiting messages."""
-        partial_bytes = sum(len(partial.body) + HELD_OVERHEAD_BYTES for partial in self._partials.values())
+        partial_bytes = sum(partial.held_bytes for partial in self._partials.values())
         return partial_bytes + self._waiting_bytes()
 
     def validate(self, check: Callable[[bool, str], None]) -> None:

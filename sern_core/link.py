@@ -40,6 +40,10 @@ TIDY_S: Final = 60.0
 MAX_TOLD_BYTES: Final = 4 * 2**20
 MAX_TOLD_CHANNEL_BYTES: Final = 1024
 """Control messages that may wait for a peer, beside so much for each channel: more than any leaves that reads."""
+ATTACHMENT_BURST_BYTES: Final = 6 * 2**20
+ATTACHMENT_BYTES_PER_S: Final = 64 * 2**20
+"""What a peer's attachments may unpack to at once and after that: zlib makes a kilobyte of a megabyte of blank lines,
+and takes 2 ms to unpack it."""
 MAX_UNHEARD: Final = 20_000
 """Control messages that a peer may have answered, beside four for each channel, before it reads an answer."""
 
@@ -135,6 +139,8 @@ class Link(Answering):
         self._next_channel = 1
         self._unheard = 0  # answers since the peer acknowledged the one of number `_unheard_seq`
         self._unheard_seq = 0
+        self._attachments_left = float(ATTACHMENT_BURST_BYTES)
+        self._attachments_s = 0.0
         self._announcing: deque[tuple[int, OutChannel]] = deque()  # may send once that control message is on its way
         self._missing: dict[StreamId, float] = {}  # not announced by a new peer, and since when
         self.faults = 0
@@ -498,8 +504,12 @@ class Link(Answering):
     # --- control messages -------------------------------------------------------------------------------------------
 
     def _control_message(self, stream: InStream, message: Message) -> None:
-        envelope, attachment = wire.decode_control(message.body)
         now = self._now
+        room = self._attachments_left + (now - self._attachments_s) * ATTACHMENT_BYTES_PER_S
+        self._attachments_left, self._attachments_s = min(room, float(ATTACHMENT_BURST_BYTES)), now
+        most = min(int(self._attachments_left), wire.MAX_ATTACHMENT_BYTES)
+        envelope, attachment = wire.decode_control(message.body, max_bytes=most)
+        self._attachments_left -= len(attachment)
         kind = wire.take_str(envelope, "t", max_length=16)
         before = self._control.next_seq
         self._handle_control(kind, envelope, attachment, now)

@@ -363,7 +363,8 @@ def encode_control(envelope: Envelope, attachment: bytes = b"") -> bytes:
     return struct.pack("!H", len(head)) + head + (zlib.compress(attachment, 9) if attachment else b"")
 
 
-def decode_control(body: bytes) -> tuple[Envelope, bytes]:
+def decode_control(body: bytes, *, max_bytes: int = MAX_ATTACHMENT_BYTES) -> tuple[Envelope, bytes]:
+    """Envelope and attachment. Raises WireError, also for an attachment that unpacks to more than `max_bytes`."""
     if len(body) < 2:
         raise WireError("truncated control message")
     (length,) = struct.unpack_from("!H", body)
@@ -376,11 +377,11 @@ def decode_control(body: bytes) -> tuple[Envelope, bytes]:
     unpacker = zlib.decompressobj()
     try:
         # One byte more than is allowed: the end of a stream that fills the limit exactly is read as well.
-        attachment = unpacker.decompress(packed, MAX_ATTACHMENT_BYTES + 1)
+        attachment = unpacker.decompress(packed, max_bytes + 1)
     except zlib.error as error:
         raise WireError("bad zlib data in a control attachment") from error
-    if len(attachment) > MAX_ATTACHMENT_BYTES:
-        raise WireError(f"control attachment unpacks to more than {MAX_ATTACHMENT_BYTES} bytes")
+    if len(attachment) > max_bytes:
+        raise WireError(f"control attachment unpacks to more than {max_bytes} bytes")
     if not unpacker.eof:
         raise WireError("truncated control attachment")
     if unpacker.unused_data:

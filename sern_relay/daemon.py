@@ -348,7 +348,7 @@ class RelayDaemon:
             "handshake": table.handshake_failed,
             "accept": table.accept_failed,
             "routing_id": socket.refused_routing_ids,
-            "multipart": socket.malformed,
+            "multipart": socket.malformed + server.inflow.endless,
             "revoked": server.revoked,
             "join": server.express.refused,
         }

@@ -1,6 +1,7 @@
 """The relay's end of the express lanes: further connections of a client, for class control alone."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from typing import Final, NamedTuple
 
@@ -22,12 +23,14 @@ JOIN: Final = bytes((wire.Kind.JOIN,))
 """The third byte of a datagram that joins."""
 
 
-class Joined(NamedTuple):
+@dataclass(slots=True, eq=False)
+class Joined:
     """A connection that belongs to a client's session; `client` is bound to its key."""
 
     client: ClientName
     fd: int
     connection: Connection | None
+    taken: int = 0  # messages that have come in
 
 
 class _Lane(NamedTuple):

@@ -1,7 +1,7 @@
 """The relay's lane: one ROUTER for all clients, one port of the hub for each connection."""
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import zmq
 
@@ -14,7 +14,8 @@ from sern_core.rules import client_name
 from sern_core.types import ClientName
 from sern_relay.express import JOIN, Joined, RelayExpress
 from sern_runtime import clock
-from sern_runtime.monitor import ConnectionTable
+from sern_runtime.inflow import Inflow
+from sern_runtime.monitor import ConnectionTable, TcpHandle
 from sern_runtime.pump import LANE_MESSAGE_BYTES, Pump
 from sern_runtime.zmq_socket import CurvePair, RouterSocket, SendResult, make_server
 
@@ -24,13 +25,14 @@ _log = logging.getLogger(__name__)
 class Session:
     """One connection: its port of the hub and the pump that serves it."""
 
-    __slots__ = ("connection", "fd", "port", "pump")
+    __slots__ = ("connection", "fd", "port", "pump", "taken")
 
     def __init__(self, port: HubPort, pump: Pump, fd: int, connection: object) -> None:
         self.port = port
         self.pump = pump
         self.fd = fd
         self.connection = connection
+        self.taken = 0  # messages that have come in
 
 
 class RelayServer:
@@ -78,12 +80,14 @@ class RelayServer:
             raw, self._received, on_view=self._received, identified=keys is not None, on_writable=self._writable
         )
         self.socket.on_refused = self._refused
+        self.inflow = Inflow(self.socket, self._taken, self._endless)
 
     def close(self) -> None:
         for session in self._sessions.values():
             session.pump.close()
         self._sessions.clear()
         self.express.close()
+        self.inflow.close()
         self.connections.close()
         self.socket.close()
 
@@ -100,6 +104,7 @@ class RelayServer:
         elif not self._insecure and user != session.port.client:
             self._cut(routing_id, session, f"its identity changed to {user!r}")
             return
+        session.taken += 1
         try:
             session.port.receive(data, now=clock.now())
         except RemoteError as error:
@@ -114,6 +119,17 @@ class RelayServer:
         _log.warning("connection from %s closed: %s", details.address, why)
         self.connections.cut(details.fd)
 
+    def _taken(self) -> Iterator[tuple[TcpHandle, int]]:
+        """Every connection, and how many messages came out of it."""
+        taken = {session.fd: session.taken for session in self._sessions.values()}
+        taken |= {joined.fd: joined.taken for joined in self.express.joined.values()}
+        return ((handle, taken.get(handle.fd, 0)) for handle in self.connections.handles())
+
+    def _endless(self, handle: TcpHandle) -> None:
+        connection = self.connections.by_fd(handle.fd)
+        whose = connection.user if connection is not None and connection.user else handle.peer[0]
+        _log.warning("connection of %s closed: a message without end", whose)
+
     def _received_express(self, routing_id: bytes, joined: Joined, user: str, data: wire.Datagram) -> None:
         if not self._insecure and user != joined.client:
             problem = f"its identity changed to {user!r}"
@@ -124,6 +140,7 @@ class RelayServer:
                 self.bad_frames += 1
                 problem = f"bad frame: {error}"
             else:
+                joined.taken += 1
                 self._after()
                 return
         _log.warning("connection of %s for class control closed: %s", joined.client, problem)

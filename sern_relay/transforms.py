@@ -10,23 +10,25 @@ owned by the stream's client:
     ros_stamp_ns  the transform's own stamp; wall_ns and seq those of the message
 
 Messages only wait here; they are read at most `RATE_HZ` times a second for each stream, outside their way to the
-subscribers. Of a faster stream the newest `MAX_WAITING` are read each time. What cannot be taken is counted by client
-and reason in `refused`, and the first of each is logged.
+subscribers. Of a faster stream the newest `MAX_WAITING` are read each time, up to `MAX_READ` transforms. They are read
+in slices of `SLICE_COST` with a pause between them: whatever is sent, it holds the loop for some milliseconds at a time
+and takes a fraction of it in all. What cannot be taken is counted by client and reason in `refused`, and the first of
+each is logged.
 """
 
 import json
 import logging
 import math
 from collections import deque
-from collections.abc import Callable
-from typing import Any, Final
+from collections.abc import Callable, Iterator
+from typing import Final
 
-from sern_core.errors import ConfigError, RefusedError
+from sern_core.errors import BodyError, RefusedError
 from sern_core.message import Message, StreamId, StreamInfo
 from sern_core.objects import ObjectRegistry
 from sern_core.rules import plain_type
+from sern_core.summaries.transforms import Transform, read_transforms
 from sern_core.types import ClientName, Encoding, ObjectKind
-from sern_runtime import ros_types
 from sern_runtime.clock import now
 from sern_runtime.loop import Timer
 from sern_runtime.optional import OptionalParts
@@ -41,8 +43,15 @@ MAX_PAIRS: Final = 1_000
 MAX_REFUSED: Final = 4_096
 OTHER_CLIENT: Final = ClientName("other")
 """Clients and reasons that are counted apart; under which name the others are."""
+MAX_READ: Final = 2_000
+"""Transforms of one stream that are read each time, the newest; older ones are of no more interest."""
+SLICE_COST: Final = 1_000
+"""What is done in one turn of the loop, in transforms read (4 µs each); the message it ends in is read whole."""
+PUT_COST: Final = 8
+"""What it costs to write an object, in transforms read."""
+PAUSE_S: Final = 0.02
+"""Between two slices."""
 
-_MESSAGE: Final = "tf2_msgs/msg/TFMessage"
 _STREAMS: Final = frozenset({"tf2_msgs/TFMessage", "tf/tfMessage"})  # the older one has the same layout
 _log = logging.getLogger(__name__)
 
@@ -50,13 +59,14 @@ _log = logging.getLogger(__name__)
 class _Stream:
     """A stream of transforms: what waits, and the objects it wrote last."""
 
-    __slots__ = ("due_s", "ids", "info", "waiting")
+    __slots__ = ("due_s", "ids", "info", "reading", "waiting")
 
     def __init__(self, info: StreamInfo) -> None:
         self.info = info
         self.waiting: deque[Message] = deque(maxlen=MAX_WAITING)
         self.ids: set[str] = set()
         self.due_s = -math.inf
+        self.reading: Iterator[int] | None = None  # what is being read; yields what each step cost
 
 
 class TransformObjects:
@@ -120,51 +130,69 @@ class TransformObjects:
 
     def _read_due(self) -> None:
         now = self._clock()
+        cost = 0
         next_s = math.inf
-        for known in self._streams.values():
-            if known.waiting and known.due_s <= now:
+        for known in list(self._streams.values()):
+            if known.reading is None and known.waiting and known.due_s <= now and cost < SLICE_COST:
                 known.due_s = now + 1.0 / RATE_HZ
-                with self._parts.survive("objects"):
-                    self._read(known, now)
+                known.reading = self._read(known, list(known.waiting), now)
                 known.waiting.clear()
+            if known.reading is not None and cost < SLICE_COST:
+                self._streams[known.info.id] = self._streams.pop(known.info.id)  # next time others go first
+                while cost < SLICE_COST and known.reading is not None:
+                    step: int | None = None  # as it stays when reading fails
+                    with self._parts.survive("objects"):
+                        step = next(known.reading, None)
+                    if step is None:
+                        known.reading = None
+                    else:
+                        cost += step
+            if known.reading is not None:
+                next_s = now + PAUSE_S
             elif known.waiting:
-                next_s = min(next_s, known.due_s)
+                next_s = min(next_s, max(known.due_s, now + PAUSE_S))
         if next_s < math.inf:
             self._timer.arm(next_s)
 
-    def _read(self, known: _Stream, now: float) -> None:
-        """Newest first, so that of each pair only the latest is written."""
+    def _read(self, known: _Stream, messages: list[Message], now: float) -> Iterator[int]:
+        """Newest first, so that of each pair only the latest is written. Yields what each step cost."""
         stream = known.info
         seen: set[str] = set()
-        for message in reversed(known.waiting):
+        left = MAX_READ
+        for message in reversed(messages):
             try:
-                transforms = ros_types.deserialise(message.body, _MESSAGE, stream.info.encoding).transforms
-            except ConfigError as error:
+                transforms = read_transforms(message.body, stream.info.encoding)
+            except BodyError as error:
                 self._refuse(stream, "undecodable", str(error))
+                yield 1
                 continue
+            left -= len(transforms)
+            yield len(transforms)
             for transform in reversed(transforms):
-                parent, child = transform.header.frame_id, transform.child_frame_id
-                object_id = f"tf:{parent}>{child}@{stream.id.origin}"
+                object_id = f"tf:{transform.header.frame_id}>{transform.child}@{stream.id.origin}"
                 if object_id not in seen:
                     seen.add(object_id)
-                    self._put(known, object_id, parent, child, transform, message, now)
+                    self._put(known, object_id, transform, message, now)
+                    yield PUT_COST
+            if left <= 0:
+                return
 
-    def _put(
-        self, known: _Stream, object_id: str, parent: str, child: str, transform: Any, message: Message, now: float
-    ) -> None:
+    def _put(self, known: _Stream, object_id: str, transform: Transform, message: Message, now: float) -> None:
         stream = known.info
         owner = stream.id.origin
-        move, turn = transform.transform.translation, transform.transform.rotation
-        numbers = (move.x, move.y, move.z, turn.x, turn.y, turn.z, turn.w)
-        if not all(map(math.isfinite, numbers)):
+        parent, child = transform.header.frame_id, transform.child
+        if not object_id.isascii() and not _is_text(object_id):
+            self._refuse(stream, "undecodable", "a name of a frame is not UTF-8")
+            return
+        if not all(map(math.isfinite, (*transform.translation, *transform.rotation))):
+            numbers = (*transform.translation, *transform.rotation)
             self._refuse(stream, "not_finite", f"{parent} to {child} is {numbers}")
             return
         new = object_id not in self._writers
         if new and self._pairs.get(owner, 0) >= MAX_PAIRS:
             self._refuse(stream, "too_many_transforms", f"{owner} has {MAX_PAIRS} pairs of frames, which is the limit")
             return
-        value = {"translation": numbers[:3], "rotation": numbers[3:]}
-        stamp = transform.header.stamp
+        value = {"translation": transform.translation, "rotation": transform.rotation}
         static = stream.spec.latched or stream.id.topic.endswith("/tf_static")
         try:
             self._registry.put(
@@ -180,7 +208,7 @@ class TransformObjects:
                 },
                 value=json.dumps(value, separators=(",", ":")).encode(),
                 seq=message.seq,
-                ros_stamp_ns=stamp.sec * 10**9 + stamp.nanosec,
+                ros_stamp_ns=transform.header.stamp_ns,
                 wall_ns=message.stamp_ns,
                 now=now,
             )
@@ -199,3 +227,12 @@ class TransformObjects:
         if key not in self.refused:
             _log.warning("%s of %s: a transform is not taken as an object: %s", stream.id.topic, stream.id.origin, text)
         self.refused[key] = self.refused.get(key, 0) + 1
+
+
+def _is_text(name: str) -> bool:
+    """Whether a name was UTF-8: `read_transforms` lets other bytes through."""
+    try:
+        name.encode()
+    except UnicodeEncodeError:
+        return False
+    return True

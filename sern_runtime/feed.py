@@ -363,6 +363,8 @@ class _Inlet(DrainedSocket):
                 body = recv(_NOBLOCK, copy=False)
                 if body.more:
                     aligned = self._realign(topic, header, body)
+                    if self._skipping:
+                        return True
                     if aligned is None:
                         continue
                     topic, header, body = aligned
@@ -400,16 +402,18 @@ class _Inlet(DrainedSocket):
 
     def _realign(self, topic: bytes, header: bytes, body: zmq.Frame) -> tuple[bytes, bytes, zmq.Frame] | None:
         """Read up to the boundary; the last three frames are the message, if it was not too long for one."""
-        self.counters.malformed += 1
         tail: deque[bytes | zmq.Frame] = deque((topic, header, body), maxlen=3)
         frame = body
         extra = 0
         while frame.more:
+            if extra == MAX_FRAMES:
+                self.counters.malformed += 1
+                self._skip_rest(frame)
+                return None
             frame = self.socket.recv(_NOBLOCK, copy=False)
             tail.append(frame)
             extra += 1
-        if extra > MAX_FRAMES:
-            return None
+        self.counters.malformed += 1
         first, second, _ = tail
         return _bytes_of(first), _bytes_of(second), frame
 

@@ -7,11 +7,14 @@ open after libzmq closed it.
 """
 
 import errno
+import fcntl
 import logging
 import os
 import socket as socketlib
 import stat
 import struct
+import sys
+import termios
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -53,6 +56,7 @@ RTO_MAX_MS: Final = 1000
 _log = logging.getLogger(__name__)
 _monitor_numbers = count(1)
 _EVENT: Final = struct.Struct("=HI")
+_RECEIVED: Final = struct.Struct("=128xQ")  # struct tcp_info up to tcpi_bytes_received
 _TCP_INFO: Final = struct.Struct("=8x24I2Q2Q6IQ")  # struct tcp_info up to tcpi_delivery_rate
 
 
@@ -159,6 +163,26 @@ class TcpHandle:
                 return None
             raw = connection.getsockopt(socketlib.IPPROTO_TCP, socketlib.TCP_INFO, 256)
         return _parse_tcp_info(raw)
+
+    def read_bytes(self) -> int | None:
+        """How many bytes have been read from the connection since it began; None where the kernel does not say.
+
+        Takes 3 µs: without a duplicate, and so of another connection if the number has been reused.
+        """
+        connection = None
+        try:
+            connection = socketlib.socket(socketlib.AF_INET, socketlib.SOCK_STREAM, 0, fileno=self.fd)
+            raw = connection.getsockopt(socketlib.IPPROTO_TCP, socketlib.TCP_INFO, _RECEIVED.size)
+            unread = fcntl.ioctl(self.fd, termios.FIONREAD, bytes(4))
+        except OSError:
+            return None
+        finally:
+            if connection is not None:
+                connection.detach()  # the number is libzmq's to close
+        if len(raw) < _RECEIVED.size:
+            return None
+        received: int = _RECEIVED.unpack(raw)[0]
+        return received - int.from_bytes(unread, sys.byteorder)
 
     def congestion(self) -> str | None:
         """The name of the congestion control, for example `cubic`."""
@@ -409,6 +433,9 @@ class ConnectionTable:
         if connection is not None:
             connection.user = user
             self._not_half_open(fd, connection)
+
+    def handles(self) -> list[TcpHandle]:
+        return [c.handle for c in self._connections.values() if c.handle is not None]
 
     def cut(self, fd: int) -> None:
         """End one connection; `fd` from a frame that came over it."""

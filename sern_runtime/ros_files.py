@@ -13,11 +13,9 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Final
 
-from rosbags.typesys import TypesysError, get_types_from_msg
-
 from sern_core.errors import ConfigError
 from sern_core.types import Encoding
-from sern_runtime import ros_services, ros_types
+from sern_runtime import ros_services, ros_text, ros_types
 
 _SEPARATOR: Final = "=" * 80 + "\n"
 _DIVIDER: Final = "---"
@@ -111,10 +109,7 @@ class TypeFiles:
     def _collect(self, name: str, text: str, sections: dict[str, str], encoding: Encoding) -> None:
         package, _, base = name.split("/")
         parsed_as = f"{package}/msg/{base}"
-        try:
-            types = get_types_from_msg(text, parsed_as)
-        except TypesysError as error:
-            raise ConfigError(f"type {name}: its definition cannot be parsed: {ros_types.one_line(error)}") from None
+        types = ros_text.parse(parsed_as, text)
         for used in ros_types.uses(types[parsed_as][1]):
             if used in sections or used == name:
                 continue

@@ -9,7 +9,8 @@ connection headers carry: the type itself, then every type it uses below a line 
 """
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import cache, lru_cache
 from hashlib import md5
 from typing import Any, Final, NamedTuple
@@ -18,18 +19,33 @@ import numpy as np
 from rosbags.interfaces import Nodetype
 from rosbags.interfaces.typing import BaseDesc, Basetype, Fielddefs, FieldDesc, NameDesc, Typesdict
 from rosbags.serde import SerdeError
-from rosbags.typesys import Stores, TypesysError, get_types_from_idl, get_types_from_msg, get_typestore
+from rosbags.typesys import Stores, get_types_from_idl, get_typestore
 from rosbags.typesys.base import normalize_fieldname
 from rosbags.typesys.store import Typestore
 
 from sern_core.errors import ConfigError, UsageError
 from sern_core.message import TopicInfo
 from sern_core.types import Encoding, TopicName
+from sern_runtime import ros_text
 
-MAX_DEFINITION_BYTES: Final = 2**20
-"""A definition text above this is refused: the largest in a ROS desktop install is about 50 kB."""
+MAX_IDL_TEXT: Final = 2**16
+MAX_IDL_CHARACTERS: Final = 3_000
+MAX_IDL_ARRAYS: Final = 4
+"""An IDL text above the first, or without comments, annotations and constants above the others, is refused: its parser
+takes 5 µs a character and 1.5 ms a constant expression. .msg texts have the limits of `ros_text`."""
+MAX_GENERATED_FIELDS: Final = 300
+MAX_GENERATED_TYPES: Final = 8
+"""Custom types, and fields in all of them, for which code is generated at once: 4 ms a type and 0.1 ms a field. Only
+what is read value by value needs code (actions, simulated robots, big endian bodies): nothing else has the limit."""
 
-_SEPARATOR: Final = "=" * 80
+_SEPARATOR: Final = ros_text.SEPARATOR
+_IDL_MARK: Final = f"{_SEPARATOR}\nIDL: "
+_IDL_UNREAD: Final = re.compile(
+    r"""//[^\n]*|/\*.*?\*/|\#[^\n]*|@\w+(?:\s*\((?:"(?:\\.|[^"\\])*"|[^()"])*\))?"""
+    r"""|\bconst\s(?:"(?:\\.|[^"\\])*"|[^;"])*;""",
+    re.DOTALL,
+)
+_IDL_CONSTANTS: Final = re.compile(r"\bmodule\s+\w+_Constants\s*\{\s*\}\s*;")
 _NAME: Final = re.compile(r"[A-Za-z]\w*/(?:(?:msg|srv|action)/)?[A-Za-z]\w*", re.ASCII)
 _EXTRA: Final = {
     "tf2_msgs/msg/TFMessage": "geometry_msgs/TransformStamped[] transforms\n",
@@ -97,7 +113,7 @@ def typestore(encoding: Encoding) -> Typestore:
     store = get_typestore(Stores.ROS1_NOETIC if encoding is Encoding.ROS1 else Stores.ROS2_JAZZY)
     for name, text in _EXTRA.items():
         if name not in store.fielddefs:
-            store.register(get_types_from_msg(text, name))
+            store.register(ros_text.parse(name, text))
     return store
 
 
@@ -133,16 +149,11 @@ def hash_of(type_name: str, definition: str, encoding: Encoding) -> str:
     """
     name = canonical(type_name)
     types = _parse(name, definition)
-    try:
+    with _documented(f"type {name}: its definition uses a type it does not define"):
         if encoding is Encoding.ROS1:
             return md5(ros1_md5_text(name, definition).encode(), usedforsecurity=False).hexdigest()
-        scratch = get_typestore(Stores.EMPTY)
         # rosbag2 texts may leave out types that every ROS 2 install has.
-        scratch.fielddefs.update(typestore(Encoding.CDR).fielddefs)
-        scratch.fielddefs.update(types)
-        return rihs01(scratch, name)
-    except (KeyError, RecursionError) as error:
-        raise ConfigError(f"type {name}: its definition uses a type it does not define ({error})") from None
+        return rihs01_of({**typestore(Encoding.CDR).fielddefs, **types}, name)
 
 
 def register(type_name: str, definition: str, encoding: Encoding) -> None:
@@ -159,10 +170,9 @@ def register(type_name: str, definition: str, encoding: Encoding) -> None:
         if known is not None and known.type_hash != offered:
             raise ConfigError(f"type {name}: offered hash {offered} differs from the known {known.type_hash}")
         return
-    try:
+    _check_generated(name, types)
+    with _documented(f"type {name}"):
         store.register(types)
-    except TypesysError as error:
-        raise ConfigError(f"type {name}: {one_line(error)}") from None
     describe.cache_clear()
 
 
@@ -181,7 +191,9 @@ def resolve(type_name: str, definition: str, encoding: Encoding) -> ResolvedType
             raise ConfigError(f"type {name} is unknown here, and its definition did not come with it")
         return ResolvedType(name, encoding, shared, text)
     text = TypeText(definition, hash_of(name, definition, encoding))
-    return ResolvedType(name, encoding, _store_with(_parse(name, definition), shared), text)
+    types = _parse(name, definition)
+    with _documented(f"type {name}: its definition uses a type it does not define"):
+        return ResolvedType(name, encoding, _store_with(name, types, shared), text)
 
 
 @lru_cache(maxsize=512)
@@ -203,35 +215,87 @@ def counterpart(type_name: str, definition: str, encoding: Encoding) -> Counterp
             same_layout &= _same_layout(name, fields[1], shared.fielddefs[name][1], other)
         else:
             made[name] = (fields[0], _translated(name, fields[1], other))
-    store = _store_with(made, shared)
-    try:
+    with _documented(f"type {source.name} cannot be converted to {other}"):
+        store = _store_with(source.name, made, shared)
         definition, md5sum = store.generate_msgdef(source.name, ros_version=1 if other is Encoding.ROS1 else 2)
-    except (TypesysError, RecursionError) as error:
-        raise ConfigError(f"type {source.name} cannot be converted to {other}: {one_line(error)}") from None
-    type_hash = md5sum if other is Encoding.ROS1 else rihs01(store, source.name)
+        type_hash = md5sum if other is Encoding.ROS1 else rihs01(store, source.name)
     return Counterpart(ResolvedType(source.name, other, store, TypeText(definition, type_hash)), same_layout)
 
 
-def _store_with(types: Typesdict, shared: Typestore) -> Typestore:
+class _OwnStore(Typestore):
+    """A type that is known nowhere, and what it uses. Its code is generated when a message is first made or read:
+    most are only named and hashed."""
+
+    def __init__(self, name: str, made: Typesdict, shared: Typestore) -> None:
+        super().__init__()
+        known = {**shared.fielddefs, **made}
+        used = used_by(name, known)
+        self.fielddefs = {used_name: known[used_name] for used_name in used}
+        made = {used_name: known[used_name] for used_name in used if used_name in made}
+        self.types = _Generated(
+            name, made, {used_name: shared.types[used_name] for used_name in used if used_name not in made}
+        )
+
+
+class _Generated(dict[str, Any]):
+    """Classes of messages by type; those of `made` come to be when one of them is asked for. ConfigError then."""
+
+    def __init__(self, name: str, made: Typesdict, known: dict[str, Any]) -> None:
+        super().__init__(known)
+        self._name = name
+        self._made = made
+
+    def __missing__(self, key: str) -> Any:
+        if key not in self._made:
+            raise KeyError(key)
+        _check_generated(self._name, self._made)
+        scratch = Typestore()
+        with _documented(f"type {self._name}"):
+            scratch.register(self._made)
+        self.update(scratch.types)
+        return self[key]
+
+
+def _check_generated(name: str, types: Typesdict) -> None:
+    """ConfigError for types whose code would take long to generate."""
+    fields = sum(len(fields) for _, fields in types.values())
+    for count, limit, what in (
+        (fields, MAX_GENERATED_FIELDS, "fields"),
+        (len(types), MAX_GENERATED_TYPES, "types"),
+    ):
+        if count > limit:
+            raise ConfigError(f"type {name} is not read here: {count} {what} in all, up to {limit} are read")
+
+
+def _store_with(name: str, types: Typesdict, shared: Typestore) -> Typestore:
     """`shared` where it has these types or none of them is given, else a store of their own on top of it."""
-    if all(name in shared.fielddefs and shared.fielddefs[name][1] == types[name][1] for name in types):
+    if all(key in shared.fielddefs and shared.fielddefs[key][1] == types[key][1] for key in types):
         return shared
-    own = get_typestore(Stores.EMPTY)
-    own.fielddefs.update({key: value for key, value in shared.fielddefs.items() if key not in types})
-    own.types.update({key: value for key, value in shared.types.items() if key not in types})
+    return _OwnStore(name, types, shared)
+
+
+@contextmanager
+def _documented(problem: str) -> Iterator[None]:
+    """Any exception inside becomes a ConfigError: what a peer's definition may make of code that was not written for
+    it cannot be listed."""
     try:
-        own.register(types)
-    except (TypesysError, SyntaxError) as error:
-        raise ConfigError(f"type {next(iter(types))}: {one_line(error)}") from None
-    return own
+        yield
+    except ConfigError:
+        raise
+    except Exception as error:  # noqa: BLE001
+        raise ConfigError(f"{problem}: {one_line(error)}") from None
 
 
 def used_by(type_name: str, fielddefs: Typesdict) -> list[str]:
     """A type and every type it uses, each once, itself first."""
-    found = [type_name]
-    for name in found:
-        found += [used for used in uses(fielddefs[name][1]) if used not in found]
-    return found
+    found = {type_name: None}
+    order = [type_name]
+    for name in order:
+        for used in uses(fielddefs[name][1]):
+            if used not in found:
+                found[used] = None
+                order.append(used)
+    return order
 
 
 def uses(fields: Fielddefs) -> list[str]:
@@ -296,9 +360,14 @@ def _each_base(desc: FieldDesc, change: Callable[[Basetype], Basetype], *, bound
 
 def rihs01(store: Typestore, type_name: str) -> str:
     """The RIHS01 hash (REP 2011). ROS 2 makes uint8 of a .msg's `char` before it hashes, the typestore does not."""
+    return rihs01_of(store.fielddefs, type_name)
+
+
+def rihs01_of(fielddefs: Typesdict, type_name: str) -> str:
+    """As `rihs01`, of types that are in no store."""
     scratch = get_typestore(Stores.EMPTY)
-    for name in used_by(type_name, store.fielddefs):
-        constants, fields = store.fielddefs[name]
+    for name in used_by(type_name, fielddefs):
+        constants, fields = fielddefs[name]
         scratch.fielddefs[name] = (constants, [(key, _each_base(desc, _char_as_uint8)) for key, desc in fields])
     return scratch.hash_rihs01(type_name)
 
@@ -384,22 +453,61 @@ def zero(desc: FieldDesc, store: Typestore) -> Any:
 
 
 def _parse(type_name: str, definition: str) -> Typesdict:
-    if len(definition) > MAX_DEFINITION_BYTES:
-        raise ConfigError(f"type {type_name}: its definition of {len(definition)} characters is over the limit")
-    idl_mark = f"{_SEPARATOR}\nIDL: "
+    """The types of a definition. ConfigError where it cannot be read, or not within the limits."""
+    types = _parsed(type_name, definition)
+    if isinstance(types, str):
+        raise ConfigError(types)
+    return types
+
+
+@lru_cache(maxsize=64)
+def _parsed(type_name: str, definition: str) -> Typesdict | str:
+    """The types, or what is wrong: that, too, is found out once."""
     try:
-        types: Typesdict = {}
-        if not definition.startswith(idl_mark):
-            # The parser knows messages only; half of a service is one of another name.
-            parsed = type_name.replace("/srv/", "/msg/")
-            types = get_types_from_msg(definition, parsed)
-            types[type_name] = types.pop(parsed)
-        else:
-            for part in definition.split(f"{_SEPARATOR}\n")[1:]:
-                types.update(get_types_from_idl(part.partition("\n")[2]))
-        return {name: (constants, fields or _NO_FIELDS) for name, (constants, fields) in types.items()}
-    except (TypesysError, RecursionError) as error:
-        raise ConfigError(f"type {type_name}: its definition cannot be parsed: {one_line(error)}") from None
+        return _parse_anew(type_name, definition)
+    except ConfigError as error:
+        return str(error)
+
+
+def _parse_anew(type_name: str, definition: str) -> Typesdict:
+    if definition.startswith(_IDL_MARK):
+        types = _parse_idl(type_name, definition)
+    else:
+        # A name alone in half of a service is of the package's messages.
+        parsed = type_name.replace("/srv/", "/msg/")
+        types = ros_text.parse(parsed, definition)
+        types = {type_name if name == parsed else name: value for name, value in types.items()}
+    types = {name: (constants, fields or _NO_FIELDS) for name, (constants, fields) in types.items()}
+    ros_text.check_size(type_name, types)
+    return types
+
+
+def _parse_idl(type_name: str, definition: str) -> Typesdict:
+    _text_within(type_name, len(definition), MAX_IDL_TEXT, "characters")
+    bare = _IDL_CONSTANTS.sub("", _IDL_UNREAD.sub(" ", definition.replace("\r", "")))
+    bare = re.sub(r"\s*\n\s*", "\n", bare)
+    _text_within(type_name, len(bare), MAX_IDL_CHARACTERS, "characters of IDL")
+    _text_within(type_name, bare.count("["), MAX_IDL_ARRAYS, "arrays in IDL")
+    if "<<" in bare or type_name not in definition:
+        raise ConfigError(f"type {type_name}: its definition cannot be parsed: this is not its IDL")
+    types: Typesdict = {}
+    with _documented(f"type {type_name}: its definition cannot be parsed"):
+        for part in bare.split(f"{_SEPARATOR}\n")[1:]:
+            types.update(get_types_from_idl(part.partition("\n")[2]))
+    for _, fields in types.values():
+        for key, desc in fields:
+            if desc[0] == Nodetype.ARRAY:
+                _text_within(type_name, int(desc[1][1]), ros_text.MAX_ARRAY, f"elements in {key}")
+    if type_name not in types:
+        raise ConfigError(
+            f"type {type_name}: its definition cannot be parsed: it defines {', '.join(types) or 'nothing'}"
+        )
+    return types
+
+
+def _text_within(type_name: str, value: int, limit: int, what: str) -> None:
+    if value > limit:
+        raise ConfigError(f"type {type_name}: its definition is too large: {value} {what}, up to {limit} are read")
 
 
 def ros1_md5_text(type_name: str, definition: str) -> str:
@@ -408,27 +516,19 @@ def ros1_md5_text(type_name: str, definition: str) -> str:
 
     Worked out from the text, not from the parsed types: a constant counts as it is spelt (`0x0F`, `1e-3`).
     """
-    texts = {ros1_name(type_name): ""}
-    current = ros1_name(type_name)
-    for line in definition.splitlines():
-        if line.startswith("MSG: "):
-            current = line[5:].strip()
-            texts.setdefault(current, "")  # a type may have no fields
-        elif line.rstrip() != _SEPARATOR:
-            texts[current] += line + "\n"
-    sums: dict[str, str] = {}
-    return _ros1_md5_text(ros1_name(type_name), texts, sums)
+    name = ros1_name(type_name)
+    return _ros1_md5_text(name, ros_text.sections(name, definition), {})
 
 
-def _ros1_md5_of(name: str, texts: dict[str, str], sums: dict[str, str]) -> str:
+def _ros1_md5_of(name: str, texts: dict[str, list[str]], sums: dict[str, str]) -> str:
     if name not in sums:
         sums[name] = md5(_ros1_md5_text(name, texts, sums).encode(), usedforsecurity=False).hexdigest()
     return sums[name]
 
 
-def _ros1_md5_text(name: str, texts: dict[str, str], sums: dict[str, str]) -> str:
+def _ros1_md5_text(name: str, texts: dict[str, list[str]], sums: dict[str, str]) -> str:
     constants, fields = [], []
-    for line in texts[name].splitlines():
+    for line in texts[name]:
         clean = line.partition("#")[0].strip()
         if not clean:
             continue

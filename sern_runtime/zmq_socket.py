@@ -31,6 +31,7 @@ from typing import Final, NamedTuple, Protocol, cast
 import zmq
 
 from sern_core.errors import ConfigError, UsageError
+from sern_runtime.inflow import trim_memory
 
 HEARTBEAT_IVL_MS: Final = 500
 """A ZMTP ping twice a second: keeps NAT bindings, and finds a dead TCP connection within the timeout."""
@@ -58,6 +59,8 @@ TOS_EXPEDITED: Final = 0xB8
 
 BATCH: Final = 200
 """Messages taken in one callback, about 0.3 ms: others in the loop get their turn."""
+SKIP_FRAMES: Final = 2000
+"""Frames of an unwanted message that are dropped in one callback, about 1 ms."""
 TICK_S: Final = 0.2
 ZERO_COPY_BYTES: Final = 32 * 1024
 """Bodies from this size on are sent without a copy (measured: it pays above 16–64 kB)."""
@@ -138,6 +141,8 @@ class DrainedSocket(ABC):
         """Messages dropped whole because their frames were not what this socket takes."""
         self.drains = 0
         """Counts every look at the socket, the tick's included: the liveness of this socket's reader."""
+        self.emptied = 0
+        """Counts every time that nothing was left to take."""
         self.late = 0
         """Messages that only the tick found. Stays 0 while the edge rule is kept."""
         self._loop = loop or asyncio.get_running_loop()
@@ -146,6 +151,7 @@ class DrainedSocket(ABC):
         self._scheduled: asyncio.Handle | None = None
         self._blocked = False
         self._closed = False
+        self._skipping = False  # inside a message that is not wanted
         self._fd = int(socket.FD)
         self._loop.add_reader(self._fd, self.drain)
         self._tick = self._loop.call_later(tick_s, self._on_tick)
@@ -223,9 +229,13 @@ class DrainedSocket(ABC):
         self.drains += 1
         more = True  # also when a handler raises: the edge is used up, so the rest must be asked for
         try:
-            more = self._take(self._batch)
+            if not self._skipping:
+                more = self._take(self._batch)
+            elif self._skip():
+                trim_memory()
         except zmq.Again:
             more = False
+            self.emptied += 1
         except zmq.ZMQError as error:
             more = False
             _raise_if_alive(self.socket, error)
@@ -241,10 +251,23 @@ class DrainedSocket(ABC):
         """Receive and hand over up to `count` messages. True: there may be more. zmq.Again: all taken."""
 
     def _skip_rest(self, frame: zmq.Frame) -> None:
-        """Drop the remaining frames of a message, without which they would pass for a message of their own."""
+        """Drop the remaining frames of a message, without which they would pass for a message of their own.
+
+        There may be very many: `_take` must return True while `_skipping`, and the next callback goes on.
+        """
         self.malformed += 1
-        while frame.more:
-            frame = self.socket.recv(_NOBLOCK, copy=False)
+        self._skipping = bool(frame.more)
+        if self._skipping:
+            self._skip()
+
+    def _skip(self) -> bool:
+        """Drop some frames. True: these were the last of their message."""
+        recv = self.socket.recv
+        for _ in range(SKIP_FRAMES):
+            if not recv(_NOBLOCK, copy=False).more:
+                self._skipping = False
+                return True
+        return False
 
 
 class RouterSocket(DrainedSocket):
@@ -309,8 +332,10 @@ class RouterSocket(DrainedSocket):
                 self.messages += 1
                 self._frame = frame
                 if frame.more:
-                    self._skip_rest(frame)
                     self._refuse("a message of several frames")
+                    self._skip_rest(frame)
+                    if self._skipping:
+                        return True
                 elif len(routing_id) != AUTO_ROUTING_ID_BYTES or routing_id[0] != 0:
                     self.refused_routing_ids += 1
                     self._refuse("a routing id of its own choice")
@@ -359,6 +384,8 @@ class DealerSocket(DrainedSocket):
             self.messages += 1
             if frame.more:
                 self._skip_rest(frame)
+                if self._skipping:
+                    return True
             else:
                 if on_view is not None and len(frame) >= VIEW_BYTES:
                     on_view(frame.buffer)
@@ -401,6 +428,9 @@ class FrameSocket(DrainedSocket):
                 if len(frames) == max_frames:
                     self._skip_rest(frame)
                     frames = []
+                    if self._skipping:
+                        self.messages += 1
+                        return True
                     break
                 frames.append(frame)
             self.messages += 1

@@ -40,12 +40,12 @@ class Transform:
         return self.header.frame_id.removeprefix("/"), self.child.removeprefix("/")
 
 
-def read_transforms(body: bytes, encoding: Encoding) -> list[Transform]:
-    """BodyError."""
+def read_transforms(body: bytes, encoding: Encoding, *, at_most: int = MAX_TRANSFORMS) -> list[Transform]:
+    """BodyError, also for more than `at_most`: before any of them is read."""
     reader = BodyReader(body, encoding)
     count = reader.u32()
-    if count > MAX_TRANSFORMS:
-        raise BodyError(f"{count} transforms in one message; up to {MAX_TRANSFORMS} are read")
+    if count > at_most:
+        raise BodyError(f"{count} transforms in one message; up to {at_most} are read")
     transforms = [Transform(reader.header(), reader.text(), reader.f64s(3), reader.f64s(4)) for _ in range(count)]
     reader.end()
     return transforms

@@ -66,10 +66,25 @@ def test_bytes_that_are_no_transforms_change_nothing(encoding: Encoding) -> None
     assert latch.merged() == body
 
 
-def test_only_so_many_are_kept() -> None:
+def test_only_so_many_are_kept_and_read() -> None:
     latch = TfLatch(Encoding.ROS1)
-    latch.add("a", message(Encoding.ROS1, *(("base", f"frame{n}") for n in range(MAX_TRANSFORMS + 5))))
+    half = MAX_TRANSFORMS // 2 + 5
+    for source in "ab":
+        latch.add(source, message(Encoding.ROS1, *(("base", f"{source}{n}") for n in range(half))))
     assert len(latch) == MAX_TRANSFORMS
+    with pytest.raises(ConfigError, match="up to 2000 are read"):
+        latch.add("c", message(Encoding.ROS1, *(("base", f"c{n}") for n in range(MAX_TRANSFORMS + 1))))
+    assert len(latch) == MAX_TRANSFORMS
+
+
+def test_the_whole_is_made_when_it_is_asked_for_and_once() -> None:
+    latch = TfLatch(Encoding.ROS1)
+    latch.keep("a", message(Encoding.ROS1, ("base", "lidar")))
+    latch.keep("b", message(Encoding.ROS1, ("base", "imu")))
+    merged = latch.merged()
+    assert latch.merged() is merged
+    latch.keep("b", message(Encoding.ROS1, ("base", "camera")))
+    assert [child for _, child, _ in read(latch.merged() or b"", Encoding.ROS1)] == ["lidar", "imu", "camera"]
 
 
 def test_which_topics_these_are() -> None:

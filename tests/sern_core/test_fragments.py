@@ -1,12 +1,24 @@
 """Reassembly: pieces in any order, repeated, overlapping; order, once, limits and tombstones."""
 
+import random
+import tracemalloc
 from itertools import pairwise
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sern_core.fragments import HELD_OVERHEAD_BYTES, MAX_PARTIALS, PARTIAL_IDLE_S, InStream, Reassembly
+from sern_core.errors import WireError
+from sern_core.fragments import (
+    HELD_OVERHEAD_BYTES,
+    MAX_PARTIALS,
+    MAX_PIECES,
+    PARTIAL_IDLE_S,
+    PIECE_BYTES,
+    InStream,
+    Partial,
+    Reassembly,
+)
 from sern_core.message import Message, StreamId, StreamInfo, TopicInfo
 from sern_core.types import DROP_CODES, ClientName, DropReason, Encoding, TopicName
 from sern_core.wire import FLAG_TOMBSTONE
@@ -216,3 +228,93 @@ def test_bodies_are_kept_as_bytes_of_their_own(cuts: tuple[int, ...]) -> None:
     assert [message.body for message in receiver.turns] == [_body(1, 40)]
     assert type(receiver.turns[0].body) is bytes
     receiver.check()
+
+
+def _orders(count: int) -> dict[str, list[int]]:
+    shuffled = list(range(count))
+    random.Random(3).shuffle(shuffled)
+    return {
+        "in order": list(range(count)),
+        "in reverse": list(reversed(range(count))),
+        "the odd ones first": [*range(1, count, 2), *range(0, count, 2)],
+        "the odd ones first, then back": [*range(1, count, 2), *reversed(range(0, count, 2))],
+        "shuffled": shuffled,
+    }
+
+
+@pytest.mark.parametrize("order", list(_orders(1)))
+def test_a_byte_is_moved_a_logarithmic_number_of_times(order: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    size, count = 100, 1200
+    moved = 0
+
+    def count_moved(partial: Partial, index: int) -> None:
+        nonlocal moved
+        before = len(partial._pieces[index])
+        join(partial, index)
+        moved += len(partial._pieces[index]) - before
+
+    join = Partial._join
+    monkeypatch.setattr(Partial, "_join", count_moved)
+    partial = Partial(size * count)
+    whole = _body(1, size * count)
+    most = 0
+    for number in _orders(count)[order]:
+        partial.add(number * size, whole[number * size : (number + 1) * size])
+        most = max(most, partial.pieces)
+    partial.born_s = 0.0
+    assert partial.complete
+    assert partial.body() == whole
+    assert moved <= 18 * size * count  # log of 1200 to the base 1.5
+    assert most <= count // 2 + 20
+
+
+def test_what_is_only_claimed_costs_nothing() -> None:
+    receiver = Receiver(limit_bytes=128 * 2**20)
+    tracemalloc.start()
+    try:
+        for seq in range(1, 5):
+            receiver.piece(seq, 0, 10, 30_000_000)
+            receiver.stream.fragment(0, seq, 29_000_000, 30_000_000, b"x" * 10, 7, 0.0, 0.0, 0.0)
+        held, _ = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert receiver.room.held_bytes > 120e6  # there is room for them when they come
+    assert held < 50_000
+
+
+def test_pieces_are_bounded_and_taken_into_account() -> None:
+    receiver = Receiver(reliable=True, limit_bytes=10**9)
+    total = 10**6
+    for number in range(MAX_PIECES - 1):
+        receiver.stream.fragment(0, 1, 2 + 2 * number, total, b"x", 7, 0.0, 0.0, 0.0)
+    assert receiver.room.held_bytes >= total + MAX_PIECES * PIECE_BYTES
+    receiver.check()
+    with pytest.raises(WireError, match="pieces"):
+        receiver.stream.fragment(0, 1, total - 1, total, b"x", 7, 0.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize("reliable", [True, False])
+def test_a_message_whose_pieces_find_no_room_is_given_up(reliable: bool) -> None:
+    receiver = Receiver(reliable=reliable, limit_bytes=1000 + HELD_OVERHEAD_BYTES)
+    for start in range(2, 100, 2):
+        receiver.piece(1, start, start + 1, 1000)
+    assert receiver.drops[0] == (DropReason.REASSEMBLY, 1 if reliable else 0)
+    assert receiver.seqs == ([1] if reliable else [])
+    receiver.whole(2)
+    assert receiver.seqs[-1] == 2
+
+
+def test_the_stream_untouched_for_longest_makes_way_whatever_there_are() -> None:
+    """Of a thousand streams with half a message each the first to be found costs no search."""
+    streams = [Receiver() for _ in range(4)]
+    room = Reassembly(3 * (100 + HELD_OVERHEAD_BYTES))
+    for receiver in streams:
+        receiver.room = receiver.stream._reassembly = room
+    for receiver in streams[:3]:
+        receiver.stream.fragment(0, 1, 0, 100, b"x" * 10, 7, 0.0, 0.0, 0.0)
+    streams[0].stream.fragment(0, 1, 10, 100, b"x" * 10, 7, 0.0, 0.0, 0.0)
+    streams[3].stream.fragment(0, 1, 0, 100, b"x" * 10, 7, 0.0, 0.0, 0.0)
+    assert [bool(receiver.drops) for receiver in streams] == [False, True, False, False]
+    for receiver in streams:
+        receiver.stream.close()
+    assert room.held_bytes == 0 and not room.holders and room.latest is None

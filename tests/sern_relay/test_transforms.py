@@ -7,6 +7,7 @@ import pytest
 
 from sern_core.message import Message, StreamId, StreamInfo, TopicInfo
 from sern_core.objects import ObjectRegistry
+from sern_core.summaries.transforms import Transform, read_transforms
 from sern_core.types import ClientName, Encoding, ObjectKind, TopicName
 from sern_relay import transforms
 from sern_relay.transforms import TransformObjects
@@ -170,4 +171,45 @@ async def test_other_topics_are_not_looked_at() -> None:
     assert world.transforms._timer.deadline_s is None
     world.send(stream("/jackal1/tf", "tf/tfMessage"), body(("a", "b", 0.0)))  # the name before tf2
     await world.read("tf:a>b@jackal1")
+    world.transforms.close()
+
+
+async def test_many_tiny_transforms_are_read_in_slices(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Compressed, 64 messages of 500 transforms are a few kilobytes on the link."""
+    read = 0
+
+    def count_read(data: bytes, encoding: Encoding) -> list[Transform]:
+        nonlocal read
+        found = read_transforms(data, encoding)
+        read += len(found)
+        return found
+
+    monkeypatch.setattr(transforms, "read_transforms", count_read)
+    world = World()
+    tf, other = stream(), stream("/jackal1/other/tf")
+    for _ in range(transforms.MAX_WAITING):
+        world.send(tf, body(*(("", f"b{number}", 0.0) for number in range(500))))
+    world.send(other, body(("a", "b", 1.0)))
+    world.transforms._timer.cancel()
+    slices = []
+    for _ in range(20):
+        before = read, world.registry.version
+        world.transforms._read_due()
+        written = world.registry.version - before[1]
+        slices.append(read - before[0] + transforms.PUT_COST * written)
+        world.now_s += transforms.PAUSE_S
+        if not world.transforms._streams[tf.id].reading:
+            break
+    assert max(slices) <= transforms.SLICE_COST + 500
+    assert read <= transforms.MAX_READ + 500 + 1  # older ones are not looked at
+    assert len(world.ids()) == 501
+    world.transforms.close()
+
+
+async def test_a_frame_that_is_no_text_is_refused() -> None:
+    world = World()
+    tf = stream()
+    world.send(tf, body(("a", "bad", 0.0), ("a", "b", 0.0)).replace(b"bad", b"\xff\xfe\xfd"))
+    await world.read("tf:a>b@jackal1")
+    assert world.transforms.refused == {(JACKAL, "undecodable"): 1}
     world.transforms.close()

@@ -103,8 +103,8 @@ def test_register_a_type_that_came_with_its_topic() -> None:
     [
         ("not { a definition", "cannot be parsed"),
         ("my_msgs/Missing part\n", "does not define"),
-        ("x" * (2**20 + 1), "over the limit"),
-        ("A a\n" + "=" * 80 + "\nMSG: my_msgs/A\nmy_msgs/A a\n", "does not define"),
+        ("x" * (2**20 + 1), "too large"),
+        ("A a\n" + "=" * 80 + "\nMSG: my_msgs/A\nmy_msgs/A a\n", "contains itself"),
     ],
 )
 @pytest.mark.parametrize("encoding", [ROS1, CDR])

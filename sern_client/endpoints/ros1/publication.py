@@ -206,7 +206,7 @@ class Publication:
     def _latch(self, handle: "Handle", body: bytes) -> None:
         if self._static is not None:
             try:
-                self._static.add(handle, body)
+                self._static.keep(handle, body)
                 return
             except ConfigError as error:
                 if not self._unreadable:

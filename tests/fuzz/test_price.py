@@ -1,0 +1,542 @@
+"""Whatever a peer sends has a bounded price: in processor time of the event loop, and in memory beside its own size.
+
+Times are processor time of this thread, the best of a few tries, against a budget of 20 ms on the machine the limits
+were measured on; a slower machine has the time that it needs more for a reference loop, and noise has MARGIN.
+"""
+
+import random
+import struct
+import time
+import tracemalloc
+import zlib
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Final
+
+import pytest
+
+from sern_client import conversion
+from sern_client.frames import FramePrefixer
+from sern_client.tf_latch import TfLatch
+from sern_core import wire
+from sern_core.announce import Announcement, definition_hash, encode_announcement
+from sern_core.codecs import Compression, encode
+from sern_core.errors import BodyError, ConfigError, WireError
+from sern_core.message import StreamId, StreamInfo, TopicInfo
+from sern_core.summaries import transforms
+from sern_core.types import Encoding, TopicName
+from sern_runtime import ros_services, ros_text, ros_types
+from tests.fuzz.test_hostile_peer import Hostile, _piece, _whole
+from tests.world import spec
+
+BUDGET_S: Final = 0.020
+REFERENCE_S: Final = 0.0020
+"""What `_reference` takes where the limits were measured."""
+TRIES: Final = 2
+MARGIN: Final = 3.0
+MULTIPLE: Final = 24
+"""Bytes of memory that an input may hold for each of its own, and..."""
+BASE_BYTES: Final = 2 * 2**20
+"""... what it may hold whatever its size: caches that fill, what one attachment unpacks to."""
+
+
+def _reference() -> float:
+    start_s = time.thread_time()
+    table: dict[int, bytes] = {}
+    for number in range(20_000):
+        table[number & 1023] = b"%d" % number
+    return time.thread_time() - start_s
+
+
+def _slowness() -> float:
+    return max(1.0, min(_reference() for _ in range(5)) / REFERENCE_S)
+
+
+@dataclass
+class Input:
+    """What is sent, and its size. Made anew for every try: what is known already costs nothing."""
+
+    nbytes: int
+    take: Callable[[], object]
+
+
+Make = Callable[[], Input]
+INPUTS: dict[str, Make] = {}
+
+
+def price_s(make: Make) -> float:
+    """The processor time of one input, the best of some tries."""
+    best_s = float("inf")
+    for _ in range(TRIES):
+        given = make()
+        start_s = time.thread_time()
+        given.take()
+        best_s = min(best_s, time.thread_time() - start_s)
+    return best_s
+
+
+def within_budget(make: Make) -> bool:
+    spent_s = price_s(make)
+    return spent_s <= BUDGET_S or spent_s <= MARGIN * BUDGET_S * _slowness()
+
+
+def held_bytes(make: Make) -> tuple[int, int]:
+    """What an input adds to memory at most, and its size."""
+    given = make()
+    tracemalloc.start()
+    try:
+        before = tracemalloc.get_traced_memory()[0]
+        kept = given.take()
+        peak = tracemalloc.get_traced_memory()[1] - before
+        del kept
+    finally:
+        tracemalloc.stop()
+    return peak, given.nbytes
+
+
+# --- datagrams -------------------------------------------------------------------------------------------------------
+
+Prepare = Callable[[Hostile], list[bytes]]
+ROOM: Final = 64_000
+
+
+def datagram(prepare: Prepare) -> Prepare:
+    """One datagram to a relay, made of frames; `prepare` may say more before, which costs nothing here."""
+
+    def make() -> Input:
+        peer = Hostile()
+        peer.hub.links[peer.name].reassembly.limit_bytes = 64 * 2**20
+        frames = b"".join(prepare(peer))
+        assert len(frames) <= wire.MAX_DATAGRAM_BYTES - wire.HEADER_BYTES
+
+        def take() -> object:
+            with suppress(WireError):  # then its session ends
+                peer.say(frames)
+            return peer
+
+        return Input(len(frames), take)
+
+    INPUTS[f"datagram: {prepare.__name__}"] = make
+    return prepare
+
+
+def filled(piece: Callable[[int], bytes]) -> list[bytes]:
+    """As many frames as a datagram takes."""
+    frames: list[bytes] = []
+    size = index = 0
+    while True:
+        frame = piece(index)
+        size += len(frame)
+        if size > ROOM:
+            return frames
+        frames.append(frame)
+        index += 1
+
+
+@datagram
+def small_messages(peer: Hostile) -> list[bytes]:
+    peer.announce(1, "/robot/a")
+    return filled(lambda index: _whole(1, index + 1))
+
+
+@datagram
+def pieces_that_repeat(peer: Hostile) -> list[bytes]:
+    peer.announce(1, "/robot/a", reliable=True)
+    for start in range(0, 1000, 50):
+        peer.say(*(_piece(1, 1, 4 + 2 * (start + index), 10**6) for index in range(50)))
+    return filled(lambda index: _piece(1, 1, 4 + 2 * (index % 1000), 10**6))
+
+
+@datagram
+def pieces_in_reverse(peer: Hostile) -> list[bytes]:
+    peer.announce(1, "/robot/a", reliable=True)
+    return filled(lambda index: _piece(1, 1, 10**6 - 1 - index, 10**6))
+
+
+@datagram
+def pieces_with_gaps(peer: Hostile) -> list[bytes]:
+    peer.announce(1, "/robot/a", reliable=True)
+    return filled(lambda index: _piece(1, 1, 2 + 2 * (index % 2000) + index // 2000, 10**6))
+
+
+@datagram
+def claims_of_large_messages(peer: Hostile) -> list[bytes]:
+    peer.announce(1, "/robot/a")
+    return filled(lambda index: _piece(1, index + 1, 0, 30_000_000))
+
+
+@datagram
+def one_message_of_ever_another_size(peer: Hostile) -> list[bytes]:
+    peer.announce(1, "/robot/a", reliable=True)
+    return filled(lambda index: _piece(1, 1, 0, 20_000_000 + index))
+
+
+@datagram
+def many_streams_that_make_way(peer: Hostile) -> list[bytes]:
+    for channel in range(1, 400):
+        peer.announce(channel, f"/robot/t{channel}")
+        peer.say(_piece(channel, 1, 0, 160_000))
+    return filled(lambda index: _piece(1 + index % 399, 2 + index // 399, 0, 10**6))
+
+
+@datagram
+def messages_behind_half_received_ones(peer: Hostile) -> list[bytes]:
+    peer.announce(1, "/robot/a")
+    for start in range(0, 256, 32):
+        peer.say(*(_piece(1, 10**6 + start + index, 0, 1000) for index in range(32)))
+    return filled(lambda index: _whole(1, index + 1))
+
+
+@datagram
+def messages_and_half_received_ones_in_turn(peer: Hostile) -> list[bytes]:
+    peer.announce(1, "/robot/a")
+    for start in range(0, 256, 32):
+        peer.say(*(_piece(1, 10**6 + start + index, 0, 1000) for index in range(32)))
+    return filled(lambda index: _whole(1, index + 1) if index % 2 else _piece(1, index + 1, 0, 50))
+
+
+@datagram
+def messages_out_of_order(peer: Hostile) -> list[bytes]:
+    peer.announce(1, "/robot/a", reliable=True)
+    return filled(lambda index: _whole(1, 10_000 - index))
+
+
+@datagram
+def tombstones(peer: Hostile) -> list[bytes]:
+    peer.announce(1, "/robot/a", reliable=True)
+    return filled(lambda index: _whole(1, index + 1, b"\x01", flags=wire.FLAG_TOMBSTONE))
+
+
+@datagram
+def messages_of_channels_that_do_not_exist(peer: Hostile) -> list[bytes]:
+    return filled(lambda index: _whole(7 + index, index + 1))
+
+
+@datagram
+def pings(peer: Hostile) -> list[bytes]:
+    return [wire.PING_FRAME] * 60_000
+
+
+@datagram
+def watermarks(peer: Hostile) -> list[bytes]:
+    return filled(lambda index: wire.encode_watermark(1 + index % 100, index))
+
+
+@datagram
+def acknowledgements(peer: Hostile) -> list[bytes]:
+    return [wire.encode_ack(0, 1, 2**64 - 1, 0, 0, 10**9)] * wire.MAX_ACK_FRAMES
+
+
+def control(peer: Hostile, body: bytes) -> bytes:
+    peer.control_seq += 1
+    return wire.encode_data_first(0, 0, peer.control_seq, len(body), len(body), 0, 0.0, 0) + body
+
+
+@datagram
+def attachments_that_unpack_to_a_megabyte(peer: Hostile) -> list[bytes]:
+    head = wire.encode_envelope({"t": "define", "hash": "00" * 16})
+    body = struct.pack("!H", len(head)) + head + zlib.compress(bytes(wire.MAX_ATTACHMENT_BYTES), 9)
+    return filled(lambda _: control(peer, body))
+
+
+@datagram
+def definitions_of_a_megabyte(peer: Hostile) -> list[bytes]:
+    text = "#" * (wire.MAX_ATTACHMENT_BYTES - 8)
+    return filled(lambda _: control(peer, wire.encode_control(
+        {"t": "define", "dh": definition_hash(text)}, text.encode())))  # fmt: skip
+
+
+@datagram
+def attachments_where_none_belongs(peer: Hostile) -> list[bytes]:
+    body = wire.encode_control({"t": "retract", "ch": 9}, bytes(wire.MAX_ATTACHMENT_BYTES))
+    return filled(lambda _: control(peer, body))
+
+
+@datagram
+def attachments_that_unpack_to_more(peer: Hostile) -> list[bytes]:
+    head = wire.encode_envelope({"t": "define", "hash": "00" * 16})
+    body = struct.pack("!H", len(head)) + head + zlib.compress(bytes(40 * 2**20), 9)[:60_000]
+    return [control(peer, body)]
+
+
+@datagram
+def envelopes_of_many_items(peer: Hostile) -> list[bytes]:
+    inner = {f"k{index:02}": [index] * 12 for index in range(60)}
+    return filled(lambda index: control(peer, wire.encode_control({"t": "nothing", "x": inner})))
+
+
+@datagram
+def envelopes_within_each_other(peer: Hostile) -> list[bytes]:
+    nested = b"\x81\xa1t" + b"\x91" * 4000 + b"\xc0"
+    return [control(peer, struct.pack("!H", len(nested)) + nested)]
+
+
+@datagram
+def announcements(peer: Hostile) -> list[bytes]:
+    def announcement(index: int) -> bytes:
+        info = TopicInfo(TopicName(f"/robot/t{index}"), "a/b", Encoding.CDR)
+        stream = StreamInfo(StreamId(peer.name, peer.boot, info.name), info, spec())
+        return control(peer, wire.encode_control(encode_announcement(Announcement(1 + index, stream, "", 1, ()))))
+
+    return filled(announcement)
+
+
+@datagram
+def noise(peer: Hostile) -> list[bytes]:
+    return [random.Random(4).randbytes(ROOM)]
+
+
+def encoded(mode: Compression, raw: bytes) -> Prepare:
+    def prepare(peer: Hostile) -> list[bytes]:
+        peer.announce(1, "/robot/a")
+        codec, body = encode(mode, raw)
+        size = len(body)
+        return filled(lambda index: wire.encode_data_first(0, 1, index + 1, size, size, 0, 0.0, codec) + body)
+
+    prepare.__name__ = f"{mode} of {len(raw)} zeros"
+    return datagram(prepare)
+
+
+encoded(Compression.LZ4, bytes(8192))
+encoded(Compression.ZSTD, bytes(8192))
+
+# --- definitions -----------------------------------------------------------------------------------------------------
+
+SEP: Final = ros_text.SEPARATOR
+_serial = iter(range(10**9))
+
+
+def definition(label: str, text: str) -> None:
+    """A definition, read for everything that is done with one. A name of its own each time: no cache knows it."""
+    for encoding in (Encoding.ROS1, Encoding.CDR):
+        other = Encoding.CDR if encoding is Encoding.ROS1 else Encoding.ROS1
+
+        def make(encoding: Encoding = encoding, other: Encoding = other) -> Input:
+            name = f"evil/msg/T{next(_serial)}"
+            info = TopicInfo(TopicName("/evil"), name, encoding, "", text.replace("evil/msg/A", name))
+
+            def take() -> object:
+                for use in (
+                    lambda: conversion.converted(info, other),
+                    lambda: FramePrefixer("robot/").incoming(info),
+                    lambda: ros_services.resolve(name.replace("/msg/", "/srv/"), info.definition, encoding),
+                ):
+                    try:
+                        use()
+                    except ConfigError:
+                        continue
+                return None
+
+            return Input(len(text), take)
+
+        INPUTS[f"definition: {label}, {encoding}"] = make
+
+
+definition("blank lines", "\n" * 2**18)
+definition("few blank lines", "\n" * 7_900 + "int32 x\n")
+definition("spaces", " " * 2**18)
+definition("comments", ("#" * 30 + "\n") * 7_900)
+definition("fields", "".join(f"float64[] x{n}\n" for n in range(ros_text.MAX_MEMBERS)))
+definition("too many fields", "".join(f"float64[] x{n}\n" for n in range(7_000)))
+definition("constants", "".join(f"string X{n}='{n}'\n" for n in range(ros_text.MAX_MEMBERS)))
+definition(
+    "types",
+    "".join(f"B{n} x{n}\n" for n in range(255))
+    + "".join(f"{SEP}\nMSG: evil/B{n}\nint32 x\nHeader y\n" for n in range(254)),
+)
+definition("arrays of texts", "string[4900] x\n")
+definition("arrays of numbers", "float64[1048576] x\n" * 1)
+definition("huge arrays", "uint8[4294967295] x\n")
+definition("in each other", "B0 x\n" + "".join(f"{SEP}\nMSG: evil/B{n}\nB{n + 1} x\nB{n + 1} y\n" for n in range(30)))
+definition("a long number", "int32 X=" + "9" * 100_000 + "\n")
+definition("quotes", ("string X='" + "\\\\" * 1_900 + "\n") * 60)
+definition("underscores", ("a_" * 2_000 + "\n") * 60)
+definition("headings", f"{SEP}\nMSG: a/B\n" * 2_700)
+IDL: Final = f"{SEP}\nIDL: evil/msg/A\nmodule evil {{ module msg {{ struct A {{ "
+definition("IDL members", IDL + "".join(f"long x{n}; " for n in range(200)) + "}; }; };\n")
+definition("IDL annotations", IDL + '@verbatim (language="comment", text="abc") ' * 60 + "long x; }; }; };\n")
+definition("IDL open quotes", IDL + '@a("' * 60_000)
+definition("IDL shifts", IDL + "long x[1<<1<<29]; }; }; };\n")
+definition("IDL dimensions", IDL + "long x" + "[2]" * 300 + "; }; }; };\n")
+definition("IDL parentheses", IDL + "long x[" + "(" * 400 + "; }; }; };\n")
+definition("IDL names", IDL + "a::" * 900 + "b x; }; }; };\n")
+definition("IDL comments", IDL + "/*" * 100_000)
+
+# --- bodies ----------------------------------------------------------------------------------------------------------
+
+HEAD: Final = struct.pack("<IIII", 0, 0, 0, 0)
+HEADER_TEXT: Final = f"{SEP}\nMSG: std_msgs/Header\nuint32 seq\ntime stamp\nstring frame_id\n"
+
+
+def body(label: str, type_name: str, text: str, data: bytes) -> None:
+    """A body of ROS 1 that is converted, and whose frame ids change."""
+
+    def make() -> Input:
+        info = TopicInfo(TopicName("/evil"), type_name, Encoding.ROS1, "", text)
+        _, convert = conversion.converted(info, Encoding.CDR)
+        rewrite = FramePrefixer("robot/").incoming(info)
+        assert rewrite is not None
+
+        def take() -> object:
+            try:
+                return convert(data), rewrite(data)
+            except ConfigError:
+                return rewrite(data)
+
+        return Input(len(data), take)
+
+    INPUTS[f"body: {label}"] = make
+
+
+EMPTY: Final = f"Header header\nEmpty[] x\n{SEP}\nMSG: evil/Empty\n{HEADER_TEXT}"
+body("messages without fields", "evil/msg/A", EMPTY, HEAD + struct.pack("<I", 2**32 - 1))
+body("many of them", "evil/msg/A", EMPTY, HEAD + struct.pack("<I", 20_000))
+body(
+    "texts",
+    "evil/msg/A",
+    "Header header\nstring[] x\n" + HEADER_TEXT,
+    HEAD + struct.pack("<I", 40_000) + bytes(160_000),
+)
+body("numbers", "evil/msg/A", "Header header\nfloat64[] x\n" + HEADER_TEXT, HEAD + b"\xff\xff\xff\xff")
+body("array", "evil/msg/A", "Header header\nfloat64[1048576] x\n" + HEADER_TEXT, HEAD)
+body(
+    "transforms",
+    "tf2_msgs/msg/TFMessage",
+    "",
+    struct.pack("<I", 60_000) + (bytes(12) + struct.pack("<I", 0) * 2 + bytes(56)) * 60_000,
+)
+body(
+    "poses",
+    "nav_msgs/msg/Path",
+    "",
+    HEAD + struct.pack("<I", 4_700) + (HEAD + bytes(56)) * 4_700,
+)
+
+
+def transforms_of(count: int) -> None:
+    def make() -> Input:
+        data = struct.pack("<I", count) + (bytes(12) + struct.pack("<I", 0) * 2 + bytes(56)) * count
+
+        def take() -> object:
+            latch, merger = TfLatch(Encoding.ROS1), transforms.TransformMerger(Encoding.ROS1)
+            for use in (lambda: latch.add("a", data), lambda: merger.add(data, now=0.0)):
+                try:
+                    use()
+                except (BodyError, ConfigError):
+                    continue
+            return latch, merger
+
+        return Input(len(data), take)
+
+    INPUTS[f"body: {count} transforms to merge"] = make
+
+
+transforms_of(1_900)
+transforms_of(10**5)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def warm() -> None:
+    """What is loaded once in a process is no input's price."""
+    for encoding in (Encoding.ROS1, Encoding.CDR):
+        ros_types.typestore(encoding)
+    INPUTS["definition: fields, ros1"]().take()
+
+
+@pytest.mark.parametrize("name", list(INPUTS))
+def test_an_input_holds_the_loop_for_a_bounded_time(name: str) -> None:
+    assert within_budget(INPUTS[name])
+
+
+@pytest.mark.parametrize("name", list(INPUTS))
+def test_an_input_adds_a_bounded_multiple_of_its_size_to_memory(name: str) -> None:
+    peak, nbytes = held_bytes(INPUTS[name])
+    assert peak <= BASE_BYTES + MULTIPLE * nbytes
+
+
+# --- anything --------------------------------------------------------------------------------------------------------
+
+WORDS: Final = (
+    "int32 x\n", "string[] y\n", "B[3] z\n", "Header h\n", "float64 X=1e9\n", "\n", " ", "=" * 80 + "\n",
+    "MSG: evil/B\n", "IDL: evil/msg/A\n", "module evil { module msg { struct A { long x; }; }; };", "[", "]", "<=", "#",
+    "'", '"', "\\", "a/", "time t\n", "string<=9[<=9] s\n", "uint8[1000000] b\n", "@", "\t", "\r\n", "\0", "9" * 50,
+    "B b\n",
+)  # fmt: skip
+
+
+def fuzzed_definition(rng: random.Random) -> Make:
+    text = "".join(rng.choice(WORDS) * rng.choice((1, 1, 1, 2, 50, 900)) for _ in range(rng.randrange(40)))
+    encoding = rng.choice((Encoding.ROS1, Encoding.CDR))
+    data = rng.randbytes(rng.randrange(64)) + bytes(rng.randrange(2000))
+
+    def take() -> object:
+        """All that is done with a definition and a body of its type; nothing but the documented error comes of it."""
+        info = TopicInfo(TopicName("/evil"), "evil/msg/A", encoding, "", text)
+        rewrite = FramePrefixer("robot/").incoming(info)
+        if rewrite is not None:
+            rewrite(data)
+        with suppress(ConfigError):
+            _, convert = conversion.converted(info, Encoding.CDR if encoding is Encoding.ROS1 else Encoding.ROS1)
+            convert(data)
+        return None
+
+    return lambda: Input(len(text), take)
+
+
+def fuzzed_datagram(rng: random.Random) -> Make:
+    seed = rng.random()
+
+    def make() -> Input:
+        peer = Hostile()
+        rng = random.Random(seed)
+        frames = b""
+        for channel in range(1, 4):
+            peer.announce(channel, f"/robot/t{channel}", reliable=channel == 1)
+        for _ in range(rng.randrange(1, 6)):
+            piece = fuzzed_frame(rng, peer)
+            frames += piece * rng.choice((1, 1, 20, ROOM // len(piece)))
+        frames = frames[:ROOM]
+        if rng.random() < 0.3:
+            frames = frames[: rng.randrange(len(frames) + 1)]
+
+        def take() -> object:
+            with suppress(WireError):
+                peer.say(frames)
+            return peer
+
+        return Input(len(frames), take)
+
+    return make
+
+
+def fuzzed_frame(rng: random.Random, peer: Hostile) -> bytes:
+    channel, seq = rng.randrange(5), rng.choice((1, 2, 3, 1000, 2**31))
+    what = rng.randrange(6)
+    if what == 0:
+        return _whole(channel, seq, rng.randbytes(rng.randrange(1, 200)))
+    if what == 1:
+        total = rng.choice((10, 10**4, 30_000_000))
+        offset = rng.randrange(total)
+        return _piece(channel, seq, offset, total, rng.randbytes(1 + rng.randrange(min(50, total - offset))))
+    if what == 2:
+        fields = {"ch": rng.randrange(9), "dh": "0" * 32, "seq": 7, "id": "a", "op": "put", "on": True}
+        envelope: wire.Envelope = {key: value for key, value in fields.items() if rng.random() < 0.5}
+        kinds = ("announce", "subscribe", "object", "define", "need", "want", "first", "synced")
+        envelope["t"] = rng.choice(kinds)
+        return control(peer, wire.encode_control(envelope, bytes(rng.choice((0, 100, 10**6)))))
+    if what == 3:
+        return wire.encode_watermark(channel, seq)
+    if what == 4:
+        return wire.encode_ack(0, rng.randrange(3), rng.getrandbits(64), rng.getrandbits(63), rng.getrandbits(63), seq)
+    return bytes([rng.randrange(6)]) + rng.randbytes(rng.randrange(40))
+
+
+@pytest.mark.parametrize("seed", range(120))
+@pytest.mark.parametrize("kind", [fuzzed_definition, fuzzed_datagram])
+def test_anything_has_a_bounded_price(kind: Callable[[random.Random], Make], seed: int) -> None:
+    make = kind(random.Random(seed))
+    assert within_budget(make)
+    if seed % 8 == 0:  # counting memory is slow
+        peak, nbytes = held_bytes(make)
+        assert peak <= BASE_BYTES + MULTIPLE * nbytes
