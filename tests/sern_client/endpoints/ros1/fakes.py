@@ -49,6 +49,8 @@ class FakeMaster:
         self.services: dict[str, str] = {}
         self.run_id = "one"
         self.calls: dict[str, int] = {}
+        self.mute = ""
+        """A method that fails."""
         self.port = 0
         self._server = XmlRpcServer(self._dispatch)
 
@@ -83,6 +85,8 @@ class FakeMaster:
 
     def _dispatch(self, method: str, params: tuple[Any, ...]) -> Any:
         self.calls[method] = self.calls.get(method, 0) + 1
+        if method == self.mute:
+            raise LookupError(method)
         match method, params:
             case "getSystemState", (_,):
                 return 1, "", [[[name, nodes] for name, nodes in table.items()] for table in self.tables]
