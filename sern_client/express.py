@@ -41,7 +41,7 @@ class ClientExpress:
     ) -> None:
         self.core = core
         self.bad_frames = 0
-        self.paths: ExpressPaths[_Connection] = ExpressPaths(redundancy)
+        self.paths: ExpressPaths[_Connection] = ExpressPaths(redundancy, core.link.may_copy)
         self._transport = transport
         self._wait_s = DATAGRAMS_FIRST_S if datagrams else 0.0
         self._kick = kick

@@ -105,9 +105,10 @@ class CapacityEstimator(ABC):
 class Pacer:
     """Spreads what the window allows over time. Class 0 does not wait for it, but counts."""
 
-    __slots__ = ("_next_s", "due_s")
+    __slots__ = ("_bps", "_next_s", "due_s")
 
     def __init__(self) -> None:
+        self._bps = 0.0  # the pace of the latest datagram
         self._next_s = 0.0
         self.due_s = 0.0
         """When the next datagram may leave. May be put off: what is not used then is made good like a late timer."""
@@ -124,3 +125,12 @@ class Pacer:
             own_s = 8 * nbytes / pacing_bps
             begin_s = self._next_s if self._next_s > earliest_s else earliest_s
             self.due_s = self._next_s = max(begin_s, min(begin_s + own_s, now + max(own_s, PACING_DEBT_S)))
+            self._bps = pacing_bps
+
+    def paced(self, *, now: float, pacing_bps: float | None) -> None:
+        """What the pace is from now on. A long wait that a slower one had asked for gets shorter: before much was sent
+        a pace may say seconds for a datagram, and be known better a moment later."""
+        left_s = self._next_s - now
+        if left_s > PACING_DEBT_S and pacing_bps is not None and pacing_bps > self._bps:
+            self.due_s = self._next_s = now + left_s * self._bps / pacing_bps
+            self._bps = pacing_bps

@@ -134,15 +134,16 @@ class Hop(Sender):
                         now,
                         rtt_s,
                         sum([packet.nbytes for packet in packets]),
-                        flight.inflight_bytes,
+                        state.under_way_bytes,
                         received_s,
-                        cum_bytes,
+                        state.arrived(cum_bytes),
                         newest is not None and newest.app_limited,
                         sent_s,
                         newest.nbytes if newest is not None and named else 0,
                     )
                 )
-                if state is self.lane and now >= self._rate_due_s:
+                state.pacer.paced(now=now, pacing_bps=state.estimator.pacing_bps)
+                if (state is self.lane or state is self.express) and now >= self._rate_due_s:
                     self._rate_known(now)
         if packets:
             state.resolved(acked=len(packets))
@@ -287,7 +288,7 @@ class Hop(Sender):
             None if lane.lossless else lane.flight.loss_deadline(),
             self._service_deadline(lane) if lane is self.lane and self._backlog else None,
             lane.copies[0][0] if lane.copies else None,
-            self.scheduler.control_deadline() if lane is self.express else None,
+            self._express_deadline(lane) if lane is self.express else None,
         ):
             if candidate is not None and candidate < deadline:
                 deadline = candidate
@@ -302,6 +303,13 @@ class Hop(Sender):
             return pacing_s if bucket_s is None or pacing_s < bucket_s else bucket_s
         return self.scheduler.next_deadline(now=now, window_open=lane.open_at(now))
 
+    def _express_deadline(self, lane: Lane) -> float | None:
+        """The same for class control on its own connections."""
+        bucket_s = self.scheduler.control_deadline()
+        if bucket_s is not None and lane.window_open and not lane.pacer.ready(self._now):
+            return min(bucket_s, lane.pacing_deadline())
+        return bucket_s
+
     def _data_timeout(self, lane: Lane, now: float) -> None:
         self._now = now
         self._find_losses(lane, now)
@@ -310,7 +318,8 @@ class Hop(Sender):
             lane.stalled = True
             lane.proofs = 0
             lane.probe_due_s = now
-            lane.estimator.on_stall(now=now)
+            if lane.beside is None or not lane.beside.usable:
+                lane.estimator.on_stall(now=now)
             reason = f"{lane.name}: no acknowledgement"
             self.trace.record(now, LINK, TraceEvent.LINK_DOWN, peer=self.peer, reason=reason)
             if len(self.lanes) > 1:

@@ -41,19 +41,47 @@ would have had no copy."""
 LOSS_GAIN: Final = 0.01
 
 
-class Lane:
-    """State of one lane of one link. `lossless`: a stream (TCP) underneath."""
+def _estimator(params: LinkParams) -> CapacityEstimator:
+    if params.window.algorithm is WindowAlgorithm.FIXED:
+        return FixedWindow(params.window.fixed_bytes)
+    return HybridWindow(fragment_bytes=MIN_FRAGMENT_BYTES + OVERHEAD_BYTES)
 
-    def __init__(self, lane: int, params: LinkParams, *, lossless: bool) -> None:
+
+class Path:
+    """What the lanes over one path have in common: one window, one pace, and one count of what has arrived.
+
+    The express lane shares the path of the stream that it is beside. With a window of its own each of them would take
+    the other's traffic for a slower link, and class control would have none while the stream has nothing to send.
+    """
+
+    __slots__ = ("arrived_bytes", "estimator", "held", "pacer")
+
+    def __init__(self, estimator: CapacityEstimator) -> None:
+        self.estimator = estimator
+        self.pacer = Pacer()
+        self.arrived_bytes = 0
+        self.held = False
+        """Something has waited for the window or the pace since the last datagram left: that left because there was
+        room again, and not because there was something to send, even if nothing is left behind it."""
+
+
+class Lane:
+    """State of one lane of one link. `lossless`: a stream (TCP) underneath. `beside`: the lane whose path it shares,
+    until `leave`."""
+
+    def __init__(self, lane: int, params: LinkParams, *, lossless: bool, beside: "Lane | None" = None) -> None:
         self.id = lane
         self.lossless = lossless
         self.fragment_bytes_max = params.fragment_bytes_max if lossless else DATAGRAM_BYTES
-        self.estimator: CapacityEstimator
-        if params.window.algorithm is WindowAlgorithm.FIXED:
-            self.estimator = FixedWindow(params.window.fixed_bytes)
-        else:
-            self.estimator = HybridWindow(fragment_bytes=MIN_FRAGMENT_BYTES + OVERHEAD_BYTES)
-        self.pacer = Pacer()
+        self.beside = beside
+        """The other lane of the path; None: there is none."""
+        self.path: Path = Path(_estimator(params)) if beside is None else beside.path
+        self.estimator = self.path.estimator
+        self.pacer = self.path.pacer
+        self.acknowledged_bytes = 0
+        """What has arrived of this lane's datagrams in the session, as the peer said last."""
+        if beside is not None:
+            beside.beside = self
         self.flight = Flight(lossless=lossless)
         self.arrivals = Arrivals(lossless=lossless)
         self.stalled = False
@@ -72,6 +100,8 @@ class Lane:
         """What the adaptation says of them, where the configuration leaves it open (`auto`); None: the loss decides."""
         self._unheard_bytes = 0.0
         """What arrives between two acknowledgements of a fast stream, beyond the two fragments that make one due."""
+        self.spare = True
+        """Whether a second copy of the latest datagram keeps nobody waiting, or is within class control's share."""
         self._redundancy = params.redundancy
         self.fragment_bytes = self._fragment_bytes(None)
 
@@ -89,10 +119,31 @@ class Lane:
         self._unheard_bytes = max(0.0, self.arrivals.spacing_s * (rate_bps or 0.0) / 8 - 2 * self.fragment_bytes)
         return rate_bps
 
+    def leave(self) -> None:
+        """The lane beside goes on alone."""
+        if self.beside is not None:
+            self.beside.beside = None
+            self.beside = None
+
+    @property
+    def under_way_bytes(self) -> int:
+        """Bytes in flight on the path: here, and on the lane beside unless that waits for a lost segment."""
+        beside = self.beside
+        nbytes = self.flight.inflight_bytes
+        return nbytes if beside is None or beside.stalled else nbytes + beside.flight.inflight_bytes
+
+    def arrived(self, cum_bytes: int) -> int:
+        """The peer has got so many bytes of this lane in all; returns the bytes that it has got over the path."""
+        if cum_bytes > self.acknowledged_bytes:
+            self.path.arrived_bytes += cum_bytes - self.acknowledged_bytes
+            self.acknowledged_bytes = cum_bytes
+        return self.path.arrived_bytes
+
     @property
     def window_open(self) -> bool:
-        """Whether the bytes in flight leave room; class 0 does not ask, and the pacer has a word as well."""
-        return not self.stalled and self.flight.inflight_bytes < self.estimator.window_bytes + self._unheard_bytes
+        """Whether the bytes in flight leave room; class 0 asks only when its token bucket is spent, and the pacer has
+        a word as well."""
+        return not self.stalled and self.under_way_bytes < self.estimator.window_bytes + self._unheard_bytes
 
     def open_at(self, now: float) -> bool:
         """Whether a datagram below class 0 may leave now."""
@@ -149,5 +200,7 @@ class Lane:
         self.copies.clear()
         self.flight = Flight(lossless=self.lossless)
         self.arrivals = Arrivals(lossless=self.lossless)
-        self.pacer = Pacer()
+        self.acknowledged_bytes = 0
+        if self.beside is None:
+            self.pacer = self.path.pacer = Pacer()
         self.stalled = False

@@ -321,19 +321,26 @@ class Scheduler:
             return bulk.best(now)
         return control.best(now) if control.slots else None  # spent, but nobody else wants the link
 
-    def pick_control(self, *, now: float) -> int | None:
-        """The slot of class control to serve next on a connection of its own: its share of the link is the limit.
+    def pick_control(self, *, now: float, window_open: bool) -> int | None:
+        """The slot of class control to serve next on a connection of its own: beyond its share of the link it goes by
+        the window, and only where nobody else wants the link.
 
         Ordering `class` only, like `pick_rest`.
         """
         control = self._control
-        if control.slots and (now >= self._bucket.ready_s or not (self._state.slots or self._bulk.slots)):
+        if control.slots and (
+            now >= self._bucket.ready_s or (window_open and not (self._state.slots or self._bulk.slots))
+        ):
             return control.best(now)
         return None
 
     def control_deadline(self) -> float | None:
-        """When `pick_control`, None by now, can name a slot by time alone."""
+        """When `pick_control`, None by now with the window closed, can name a slot by time alone."""
         return self._bucket.ready_s if self._control.slots else None
+
+    def within_share(self, now: float) -> bool:
+        """Whether class 0 has something left of its share of the link."""
+        return now >= self._bucket.ready_s
 
     def pick_rest(self, *, now: float) -> int | None:
         """The slot to serve next when class control has a connection of its own."""

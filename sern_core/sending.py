@@ -351,6 +351,8 @@ class Sender(ABC):
                 except Exception:
                     self._give_back(lane, items, now)  # what was taken would be neither in flight nor waiting
                     raise
+                if not items and not lane.path.held and not lane.open_at(now) and self._backlog:
+                    lane.path.held = not lane.stalled
             # A stream delivers what is under way, so one question at a time is enough there.
             if not items and (lane.ping or lane.stalled) and not (lane.lossless and lane.flight.packets):
                 frames.append(wire.PING_FRAME)
@@ -377,10 +379,13 @@ class Sender(ABC):
         datagram = b"".join((self._header(flight.next_number, now), *frames))
         nbytes = len(datagram) + OVERHEAD_BYTES
         estimator = lane.estimator
-        inflight_bytes = flight.inflight_bytes + nbytes
+        inflight_bytes = lane.under_way_bytes + nbytes
         # What could be picked if window and pacer let it is held back by them; ordering `paper` holds back by itself.
-        waits = lane is self.lane and (self._control_waits or self._pick(now, window_open=True) is not None)
-        app_limited = inflight_bytes < estimator.window_bytes and not waits
+        waits = (lane is self.lane or lane is self.express) and (
+            self._control_waits or self.scheduler.pick(now=now, window_open=True) is not None
+        )
+        app_limited = inflight_bytes < estimator.window_bytes and not (waits or lane.path.held)
+        lane.path.held = False
         flight.sent(now=now, nbytes=nbytes, items=items, app_limited=app_limited)
         estimator.on_sent(now=now, nbytes=nbytes, inflight_bytes=inflight_bytes)
         pacer = lane.pacer
@@ -395,9 +400,20 @@ class Sender(ABC):
             self.dirty = waits or bool(self._watermarks)
         else:
             self.dirty = bool(self._watermarks) or (waits and self._pick(now, window_open=False) is not None)
-        if lane.redundant and any(type(item) is SentData and _urgent(item.channel) for item in items):
+        lane.spare = not waits or self.scheduler.within_share(now)
+        if lane.redundant and lane.spare and any(type(item) is SentData and _urgent(item.channel) for item in items):
             lane.copies.append((now + COPY_DELAY_S, flight.next_number - 1, datagram))
         return datagram
+
+    def may_copy(self, nbytes: int) -> bool:
+        """Whether the express lane's latest datagram, of `nbytes`, may go over its second connection as well; then it
+        counts as class control's. While something waits for the link copies come out of that class's share."""
+        if self.express is not None:
+            if not self.express.spare:
+                return False
+            self.scheduler.charge(PriorityClass.CONTROL, nbytes, now=self._now)
+            self.wire_bytes += nbytes + OVERHEAD_BYTES
+        return True
 
     def _header(self, number: int, now: float) -> bytes:
         return wire.encode_header(wire.Kind.DATA, self.tag, number, microseconds(now), version=self.version)
@@ -427,7 +443,7 @@ class Sender(ABC):
         """
         limit = lane.fragment_bytes - (wire.ACK.size if lane.arrivals.unacked else 0)
         express = lane is self.express
-        window_open = not express and lane.open_at(now)
+        window_open = lane.open_at(now)
         size = wire.HEADER_BYTES
         if self._watermarks and not express:
             size = self._put_watermarks(frames, items, size)
@@ -435,11 +451,15 @@ class Sender(ABC):
         served: PriorityClass | None = None
         full = limit - max(wire.DATA_FIRST_BYTES + MIN_SHARE_BYTES, limit // CRUMB)
         while size <= full:
-            chosen = self.scheduler.pick_control(now=now) if express else self._pick(now, window_open=window_open)
+            if express:
+                chosen = self.scheduler.pick_control(now=now, window_open=window_open)
+            else:
+                chosen = self._pick(now, window_open=window_open)
             channel = self.channels[chosen] if chosen is not None else None
             rides = served is PriorityClass.CONTROL and not window_open and not express
             if (
-                self._control_waits
+                not express
+                and self._control_waits
                 and (rides or (window_open and (channel is None or channel.spec.priority is not PriorityClass.CONTROL)))
                 and (order := control.head(now)) is not None
             ):

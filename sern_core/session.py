@@ -131,13 +131,17 @@ class Session(Hop):
 
     def open_lane(self, *, now: float, lane_id: int = LANE_UDP) -> None:
         """Another lane has a transport (admitted in the session): ask whether it works, then use it."""
-        lane = self.lanes[lane_id] = Lane(lane_id, self.params, lossless=False)
+        beside = self.lanes[LANE_ZMQ] if lane_id == LANE_EXPRESS else None
+        if (old := self.lanes.get(lane_id)) is not None:
+            old.leave()
+        lane = self.lanes[lane_id] = Lane(lane_id, self.params, lossless=False, beside=beside)
         lane.up = True
         lane.new_session(now)
         stream_rtt = self.lanes[LANE_ZMQ].flight.rtt
         if stream_rtt.samples:
             lane.flight.rtt.sample(stream_rtt.srtt_s, now=now)
-        lane.estimator.on_reset(now=now)
+        if beside is None:
+            lane.estimator.on_reset(now=now)
         self.dirty = True
 
     def close_lane(self, *, now: float, lane_id: int = LANE_UDP, reason: str = "both lanes are gone") -> None:
@@ -150,6 +154,7 @@ class Session(Hop):
             self._use_lane(self.lanes[LANE_ZMQ], now)
         self._choose_express(now)
         self._recall(lane, now)
+        lane.leave()
         if self.established and not self.transport_up:
             self._end_session(reason, now)
 
@@ -302,7 +307,8 @@ class Session(Hop):
         self.incoming.clear()
         self._watermarks.clear()
         udp = self.lanes.pop(LANE_UDP, None)  # its keys end with the session
-        self.lanes.pop(LANE_EXPRESS, None)
+        if (express := self.lanes.pop(LANE_EXPRESS, None)) is not None:
+            express.leave()
         self.express = None
         if not self.established:
             return

@@ -46,9 +46,13 @@ class SegmentLoss:
 
 
 class ExpressPaths(Generic[Key]):
-    """Sends each datagram over the first connection that takes it, or over all of them. Call `look` now and then."""
+    """Sends each datagram over the first connection that takes it, or over all of them. Call `look` now and then.
 
-    def __init__(self, redundancy: Redundancy) -> None:
+    `may_copy(nbytes)` is asked before each copy: on a full link copies would make the losses that they are sent for.
+    """
+
+    def __init__(self, redundancy: Redundancy, may_copy: Callable[[int], bool]) -> None:
+        self._may_copy = may_copy
         self.copying = redundancy is Redundancy.ALWAYS
         self._redundancy = redundancy
         self._paths: dict[Key, tuple[Callable[[bytes], SendResult], SegmentLoss]] = {}
@@ -82,6 +86,8 @@ class ExpressPaths(Generic[Key]):
         """OK when one connection took it; a connection that is gone is its owner's to discard."""
         taken = SendResult.FULL
         for send, _loss in self._paths.values():
+            if taken is SendResult.OK and not self._may_copy(len(datagram)):
+                break
             if send(datagram):
                 taken = SendResult.OK
                 if not self.copying:

@@ -13,9 +13,10 @@ is cut; libzmq then throws the frames away.
 import asyncio
 import ctypes
 import threading
-import time
 from collections.abc import Callable, Iterable
 from typing import Final, Generic, Protocol, TypeVar
+
+from sern_runtime.clock import now
 
 LIMIT_BYTES: Final = 256 * 1024
 """Four of the largest datagrams."""
@@ -73,7 +74,7 @@ class Inflow(Generic[H]):
         *,
         limit_bytes: int = LIMIT_BYTES,
         period_s: float = PERIOD_S,
-        clock: Callable[[], float] = time.monotonic,
+        clock: Callable[[], float] = now,
     ) -> None:
         self.endless = 0
         """Connections that were cut."""

@@ -14,6 +14,7 @@ from math import isfinite
 from random import Random
 from typing import Final, NamedTuple
 
+from sern_core.errors import UsageError
 from sern_sim.models import SEGMENT_BYTES, Jitter, LinkModel
 
 NS: Final = 1_000_000_000
@@ -70,13 +71,26 @@ class LinkStats(NamedTuple):
         return 8 * self.delivered_bytes / self.elapsed_s if self.elapsed_s > 0.0 else 0.0
 
 
+class Bottleneck:
+    """When the link, or those that share it, have sent what was given to them."""
+
+    __slots__ = ("busy_ns",)
+
+    def __init__(self) -> None:
+        self.busy_ns = 0
+
+
 class Link:
-    """The state of one direction: queue, rate, loss and order. `random` is this link's own."""
+    """The state of one direction: queue, rate, loss and order. `random` is this link's own.
+
+    `beside`: another connection over the same path; its packets and ours leave in the order in which they came. Both
+    models must be of the same rates, and a datagram's queue limit counts those of its own link.
+    """
 
     __slots__ = (
+        "_bottleneck",
         "_burst",
         "_burst_bad",
-        "_busy_ns",
         "_carried_bytes",
         "_delay_ns",
         "_departures",
@@ -97,6 +111,7 @@ class Link:
         "_rate_index",
         "_rates",
         "_reorder_ns",
+        "_shared",
         "_sizes",
         "_stall_ns",
         "_window_ends",
@@ -118,8 +133,10 @@ class Link:
         "twice",
     )
 
-    def __init__(self, model: LinkModel, random: Random) -> None:
-        self.model = model
+    def __init__(self, model: LinkModel, random: Random, beside: "Link | None" = None) -> None:
+        if beside is not None and _schedule(beside.model) != _schedule(model):
+            raise UsageError("links that share a bottleneck need the same rates, blackouts and flaps")
+        self.model: LinkModel = model
         self.send: Callable[[int, int], int] = self._send_stream if model.streaming else self._send_datagram
         """`send(size_bytes, t_ns) -> arrival_ns`, or LOST. Calls come in order of time."""
         self.twice = False  # the packet just sent arrives twice, at the same time
@@ -150,7 +167,10 @@ class Link:
 
         self._departures: deque[int] = deque()  # when each packet in the queue leaves it
         self._sizes: deque[int] = deque()  # and its bytes on the wire
-        self._busy_ns = 0
+        self._shared = beside is not None
+        self._bottleneck: Bottleneck = beside._bottleneck if beside is not None else Bottleneck()
+        if beside is not None:
+            beside._shared = True
         self._last_arrival_ns = 0
         self._carried_bytes = 0
         self.sent_packets = self.sent_bytes = 0
@@ -177,9 +197,10 @@ class Link:
         if len(departures) >= self._queue_packets:
             self.queue_drops += 1
             return LOST
-        start_ns = self._busy_ns if self._busy_ns > t_ns else t_ns
+        bottleneck = self._bottleneck
+        start_ns = bottleneck.busy_ns if bottleneck.busy_ns > t_ns else t_ns
         departure_ns = self._serialise(start_ns, wire_bytes)
-        self._busy_ns = departure_ns
+        bottleneck.busy_ns = departure_ns
         if departure_ns > t_ns:
             departures.append(departure_ns)
             self._sizes.append(wire_bytes)
@@ -223,9 +244,10 @@ class Link:
         segments = 1 if size_bytes <= SEGMENT_BYTES else -(-size_bytes // SEGMENT_BYTES)
         wire_bytes = size_bytes + segments * self.model.overhead_bytes
         self._settle_queue(t_ns)
-        start_ns = self._busy_ns if self._busy_ns > t_ns else t_ns
+        bottleneck = self._bottleneck
+        start_ns = bottleneck.busy_ns if bottleneck.busy_ns > t_ns else t_ns
         departure_ns = self._serialise_frozen(start_ns, wire_bytes)
-        self._busy_ns = departure_ns
+        bottleneck.busy_ns = departure_ns
         self._departures.append(departure_ns)
         self._sizes.append(wire_bytes)
         path_ns = self._delay_ns
@@ -364,9 +386,11 @@ class Link:
         self._settle_queue(t_ns)
         self._departures.clear()
         self._sizes.clear()
-        self._busy_ns = min(self._busy_ns, t_ns)
+        bottleneck = self._bottleneck
+        if not self._shared:  # the others' packets, and ours between them, keep their places
+            bottleneck.busy_ns = min(bottleneck.busy_ns, t_ns)
         self._last_arrival_ns = min(self._last_arrival_ns, t_ns)
-        self._seek_rate(self._busy_ns)
+        self._seek_rate(bottleneck.busy_ns)
 
     def backlog_packets(self, t_ns: int) -> int:
         """Packets waiting for the bottleneck or passing it."""
@@ -402,6 +426,10 @@ class Link:
             stalls=self.stalls,
             capacity_bits=self.model.capacity_bits(0.0, t_ns / NS),
         )
+
+
+def _schedule(model: LinkModel) -> tuple[object, ...]:
+    return model.rate_bps, model.rate_steps, model.blackouts, model.flap
 
 
 def _step_time(step: tuple[int, int]) -> int:

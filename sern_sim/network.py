@@ -156,8 +156,10 @@ class Network:
         backward: LinkModel,
         *,
         name: str = "",
+        beside: Hop | None = None,
     ) -> Hop:
-        """Connect two ports; `forward` carries a to b. A node of None: the port stands alone.
+        """Connect two ports; `forward` carries a to b. A node of None: the port stands alone. `beside`: another hop
+        whose bottlenecks, one each way, this one shares.
 
         Both ports get `connected` as the next event, or for a stream as soon as the path is there.
         Raises UsageError when a port is joined already, is not of its node, or the modes of the links differ.
@@ -167,8 +169,9 @@ class Network:
         name = name or f"hop{len(self.hops)}"
         slot_a = self._add_slot(port_a, node_a, f"{name}.a")
         slot_b = self._add_slot(port_b, node_b, f"{name}.b")
-        link_f = Link(forward, Random(self._random.getrandbits(64)))
-        link_b = Link(backward, Random(self._random.getrandbits(64)))
+        shared = (beside.forward.link, beside.backward.link) if beside is not None else (None, None)
+        link_f = Link(forward, Random(self._random.getrandbits(64)), shared[0])
+        link_b = Link(backward, Random(self._random.getrandbits(64)), shared[1])
         hop = Hop(self, name, slot_a, slot_b, link_f, link_b)
         self.hops.append(hop)
         self._schedule_connect(hop, 0)

@@ -11,13 +11,15 @@ from typing import Final
 from benchmarks.common import Report
 from benchmarks.link import figures, peers, plots
 from benchmarks.link.junk import JUNK_HZ, Junk
-from benchmarks.link.load import Load
+from benchmarks.link.load import Kind, Load
 from benchmarks.link.runs import Outcome, Step, run
 from sern_core.errors import SernError
 from sern_sim.models import LinkModel
 from sern_tools.lab.lab import Lab
 
 SERN: Final = ("sern-udp", "sern-zmq")
+ONE: Final = "sern-one"
+"""The stream lane without connections of their own for class control."""
 ALL: Final = (*SERN, "zmq", "zenoh", "zenoh-multilink", "zenoh-multilink-bbr", "tcpros")
 QUICK: Final = (*SERN, "zmq", "zenoh-multilink")
 MULTILINK: Final = ("zenoh-multilink", "zenoh-multilink-bbr")
@@ -31,6 +33,11 @@ OVERLOAD: Final = Load(cloud_bytes=100_000)
 """8 Mbit/s of clouds."""
 HEAVY: Final = Load(cloud_bytes=150_000)
 FAST: Final = Load(cloud_bytes=500_000)
+THIN: Final = LinkModel(rate_bps=2 * MEGABIT, delay_s=0.025, queue_packets=100)
+FLOODS: Final = (1.3, 2.0, 4.0, 13.0)
+"""Class control, times what the link carries."""
+FLOOD_AGE_S: Final = 0.2
+"""Four round trips."""
 
 
 @dataclass
@@ -85,7 +92,7 @@ class Bench:
         try:
             return work()
         except SernError as error:
-            if system in SERN:
+            if system in (*SERN, ONE):
                 raise
             self.report.note(f"{case}: {error}")
             return None
@@ -302,6 +309,24 @@ def junk(bench: Bench) -> None:
         bench.plot(f"junk-{name.replace(' ', '-')}", attacked, [outcome], None)
 
 
+def flood(bench: Bench) -> None:
+    """2 Mbit/s, 50 ms, class control alone above what it carries, and beside clouds; heartbeats of the same class."""
+    loads = [(f"{times:g}x", Load(flood_bps=times * 2 * MEGABIT)) for times in FLOODS[:: 3 if bench.quick else 1]]
+    loads.append(("2x beside clouds", Load(flood_bps=4 * MEGABIT, cloud_bytes=50_000)))
+    for name, load in loads:
+        case = f"2 Mbit/s 50 ms, class control {name}"
+        for system in (*bench.wanted(SERN), *((ONE,) if "sern-zmq" in bench.systems else ())):
+            outcome = bench.run(case, system, THIN, load, 7.0 if bench.quick else 17.0)
+            for kind in (Kind.FLOOD, Kind.POSE):
+                p99_s = figures.quantile(figures.latencies_ms(outcome, kind), 0.99) / 1000
+                bench.report.reach(f"{case}, {system}: {kind.name.lower()} p99 [s]", p99_s, FLOOD_AGE_S)
+            arrived = figures.delivered_share(outcome)
+            bench.report.reach(f"{case}, {system}: heartbeats that arrive", arrived, 0.99, at_least=True)
+            share = figures.goodput_bps(outcome) / figures.flood_ceiling_bps(outcome)
+            name = f"{case}, {system}: goodput, share of what the link can carry"
+            bench.report.reach(name, share, 0.9, at_least=True)
+
+
 CASES: Final[dict[str, Callable[[Bench], None]]] = {
     "idle": idle,
     "overload": overload,
@@ -311,6 +336,7 @@ CASES: Final[dict[str, Callable[[Bench], None]]] = {
     "blackout-30": blackout_30,
     "long": long_path,
     "junk": junk,
+    "flood": flood,
 }
 QUICK_CASES: Final = ("idle", "overload", "loss", "steps", "blackout-10", "long", "junk")
 

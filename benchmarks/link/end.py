@@ -21,6 +21,7 @@ ENDS: Final[dict[str, tuple[End, End]]] = {
     "tcpros": (peers.ros_sender, peers.ros_receiver),
     "sern-udp": (sern.sender, sern.receiver),
     "sern-zmq": (sern.sender, sern.receiver),
+    "sern-one": (sern.sender, sern.receiver),
 }
 """Sender and receiver of each system."""
 

@@ -5,7 +5,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.link.load import Kind, Records
+from benchmarks.link.load import FLOOD_BYTES, Kind, Records
 from benchmarks.link.runs import Outcome
 from benchmarks.link.sern import SAMPLE_COLUMNS, TOPICS
 from sern_core import wire
@@ -95,6 +95,13 @@ def ceiling_bps(outcome: Outcome) -> float:
     return whole_bps * (1 - model.mean_loss)
 
 
+def flood_ceiling_bps(outcome: Outcome) -> float:
+    """What a link can carry of messages of `FLOOD_BYTES`, one in a datagram."""
+    assert outcome.model.rate_bps is not None
+    overhead_bytes = wire.HEADER_BYTES + wire.DATA_FIRST_BYTES + OVERHEAD_BYTES + ETHERNET_BYTES
+    return outcome.model.rate_bps * FLOOD_BYTES / (FLOOD_BYTES + overhead_bytes)
+
+
 def link_use(outcome: Outcome) -> float:
     """Bytes that left the link, of those it could have carried."""
     assert outcome.model.rate_bps is not None
@@ -142,7 +149,10 @@ def metrics(outcome: Outcome) -> dict[str, float]:
             "pose_p99_ms": quantile(poses, 0.99),
         }
     found["poses_percent"] = 100 * delivered_share(outcome)
-    if outcome.load.cloud_bytes:
+    if outcome.load.flood_bps:
+        floods = latencies_ms(outcome, Kind.FLOOD)
+        found |= {"flood_p50_ms": quantile(floods, 0.50), "flood_p99_ms": quantile(floods, 0.99)}
+    if outcome.load.cloud_bytes or outcome.load.flood_bps:
         found["goodput_Mbps"] = goodput_bps(outcome) / 1e6
         found["wire_percent"] = 100 * link_use(outcome)
     for role, label in (("robot", "robot_cpu"), ("relay", "relay_cpu"), ("site", "site_cpu")):

@@ -29,11 +29,13 @@ Records = NDArray[np.int64]
 
 
 class Kind(IntEnum):
-    """Most urgent first; the values are those of `PriorityClass`."""
+    """Most urgent first; the values of the first three are those of `PriorityClass`."""
 
     POSE = 0
     MAP = 1
     BULK = 2
+    FLOOD = 3
+    """Class control as well, as much of it as the case wants."""
 
 
 class Flow(NamedTuple):
@@ -44,17 +46,27 @@ class Flow(NamedTuple):
 
 POSES: Final = Flow(Kind.POSE, 50.0, 100)
 MAPS: Final = Flow(Kind.MAP, 5.0, 20_000)
+HEARTBEATS: Final = Flow(Kind.POSE, 10.0, 50)
+FLOOD_BYTES: Final = 1000
+FLOOD_PAUSE_S: Final = 0.002
+"""Several are offered at once rather than a processor kept busy: a loop's timers are no finer than a millisecond."""
 
 
 @dataclass(frozen=True)
 class Load:
-    """Poses at 50 Hz; beside them maps and clouds, unless `cloud_bytes` is 0."""
+    """Poses at 50 Hz; beside them maps and clouds, unless `cloud_bytes` is 0. With `flood_bps` heartbeats in place of
+    the poses, and messages of the same class beside them."""
 
     cloud_bytes: int = 0
     seed: int = 1
+    flood_bps: float = 0.0
 
     @property
     def flows(self) -> tuple[Flow, ...]:
+        if self.flood_bps:
+            flood = Flow(Kind.FLOOD, self.flood_bps / (8 * FLOOD_BYTES), FLOOD_BYTES)
+            clouds = (Flow(Kind.BULK, 10.0, self.cloud_bytes),) if self.cloud_bytes else ()
+            return (HEARTBEATS, flood, *clouds)
         return (POSES, MAPS, Flow(Kind.BULK, 10.0, self.cloud_bytes)) if self.cloud_bytes else (POSES,)
 
     def schedule(self, duration_s: float) -> Iterator[tuple[float, Flow, int]]:
@@ -64,7 +76,7 @@ class Load:
     def _times(self, flow: Flow, duration_s: float) -> Iterator[tuple[float, Flow, int]]:
         chance = random.Random(f"{self.seed} {flow.kind}")
         for number in range(1, int(duration_s * flow.rate_hz) + 1):
-            late_s = chance.random() * JITTER_S if flow.kind is not Kind.POSE else 0.0
+            late_s = chance.random() * JITTER_S if flow.kind in (Kind.MAP, Kind.BULK) else 0.0
             yield (number - 1) / flow.rate_hz + late_s, flow, number
 
 
@@ -137,12 +149,13 @@ def offer(load: Load, duration_s: float, orders: Orders, log: Log, send: Send) -
         orders.poll()
     padding = {flow.kind: os.urandom(flow.size_bytes - _HEAD.size) for flow in load.flows}
     start_ns = orders.start_ns or 0
+    least_s = FLOOD_PAUSE_S if load.flood_bps else 0.0
     for at_s, flow, number in load.schedule(duration_s):
         if orders.stopped:
             return
         due_ns = start_ns + int(at_s * 1e9)
         while (left_ns := due_ns - time.monotonic_ns()) > 0:
-            yield left_ns / 1e9
+            yield max(left_ns / 1e9, least_s)
         stamp_ns = time.monotonic_ns()
         log.sent(flow, number, stamp_ns, due_ns)
         send(flow.kind, _HEAD.pack(flow.kind, number, stamp_ns) + padding[flow.kind])

@@ -5,6 +5,7 @@ import os
 import socket
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final
 
@@ -43,7 +44,12 @@ def _listen(orders: Orders, log: Log, wait: Any) -> None:
 def udp_sender(spec: Spec, load: Load, orders: Orders, log: Log) -> dict[str, Any]:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
         sock.connect((spec.address, PORT))
-        _drive(spec, load, orders, log, lambda _kind, body: sock.send(body))
+
+        def send(_kind: Kind, body: bytes) -> None:
+            with suppress(ConnectionRefusedError):  # the other end stops first
+                sock.send(body)
+
+        _drive(spec, load, orders, log, send)
     return NOTHING
 
 

@@ -26,7 +26,13 @@ from sern_runtime.topics_view import both_ways
 RELAY_PORT: Final = 5555
 SAMPLE_S: Final = 0.02
 """How often the sender writes down what its link thinks."""
-LIFESPANS_S: Final = {Kind.POSE: 1.0, Kind.MAP: 5.0, Kind.BULK: 5.0}
+LIFESPANS_S: Final = {Kind.POSE: 1.0, Kind.MAP: 5.0, Kind.BULK: 5.0, Kind.FLOOD: 1.0}
+CLASSES: Final = {
+    Kind.POSE: PriorityClass.CONTROL,
+    Kind.MAP: PriorityClass.STATE,
+    Kind.BULK: PriorityClass.BULK,
+    Kind.FLOOD: PriorityClass.CONTROL,
+}
 TOPICS: Final = {kind: TopicName(f"/bench/{kind.name.lower()}") for kind in Kind}
 SAMPLE_COLUMNS: Final = ("at_ns", "rate_bps", "window_bytes", "inflight_bytes", "srtt_s", "queue_s", "udp", "stalled")
 
@@ -78,6 +84,8 @@ class End:
     def connected(self) -> bool:
         """On the lane that is to be measured."""
         link = self.core.link
+        if self.spec.system == "sern-one":
+            return link.established
         if self._lane is None:
             return link.established and link.express is not None
         return link.established and link.lane.name == "udp"
@@ -87,7 +95,8 @@ class End:
             await asyncio.sleep(TICK_S)
             if self._lane is not None:
                 self._lane.tick()
-            self._express.tick()
+            if self.spec.system != "sern-one":
+                self._express.tick()
 
     async def sample(self) -> None:
         while True:
@@ -180,8 +189,8 @@ async def _send(end: End, load: Load, orders: Orders) -> None:
         flow.kind: end.core.publish(
             TopicInfo(TOPICS[flow.kind], "bench/Bytes", Encoding.RAW),
             TopicSpec(
-                priority=PriorityClass(flow.kind),
-                weight=KAPPA[flow.kind],
+                priority=CLASSES[flow.kind],
+                weight=KAPPA[CLASSES[flow.kind]],
                 lifespan_s=LIFESPANS_S[flow.kind],
             ),
             now=clock.now(),

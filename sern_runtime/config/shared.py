@@ -75,7 +75,8 @@ class LinkSection(Section):
     retention_s: Seconds = _LINK.retention_s
     """How long an undelivered reliable message is kept when its topic has no `retention_s`."""
     redundancy: Redundancy = _LINK.redundancy
-    """Class control sent twice over the datagram lane: `auto` while it loses packets, `always`, or `off`."""
+    """Class control sent twice over the datagram lane: `auto` while it loses packets, `always`, or `off`. While
+    something waits for the link, what exceeds class control's share of it is not copied."""
     max_message_bytes: Annotated[int, Field(ge=1024, le=1 << 30)] = _LINK.max_message_bytes
     """Larger messages are dropped and counted as `too_large`."""
     drain_s: Annotated[float, Field(ge=0, le=3600)] = 20.0

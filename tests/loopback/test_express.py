@@ -111,7 +111,8 @@ class Paths:
         self.handles = {name: Counters(-1, 0, ("", 0), ("", 0)) for name in "ab"}
         self.answers = dict.fromkeys("ab", SendResult.OK)
         self.sent: list[str] = []
-        self.paths: ExpressPaths[str] = ExpressPaths(redundancy)
+        self.spare = True
+        self.paths: ExpressPaths[str] = ExpressPaths(redundancy, lambda nbytes: nbytes == 1 and self.spare)
         for name, handle in self.handles.items():
             self.paths.add(name, lambda _data, name=name: self._send(name), handle)  # type: ignore[misc]
 
@@ -151,6 +152,17 @@ def test_configuration_decides_about_copies(redundancy: Redundancy, taken: str) 
     paths.handles["a"].sent, paths.handles["a"].again = 100, 50 if redundancy is Redundancy.OFF else 0
     paths.paths.look()
     assert paths.send() == taken
+
+
+def test_a_full_link_has_no_room_for_copies() -> None:
+    paths = Paths(Redundancy.ALWAYS)
+    paths.spare = False
+    assert paths.send() == "a"
+    paths.answers["a"] = SendResult.FULL
+    assert paths.send() == "b"  # which is no copy
+    paths.spare = True
+    paths.answers["a"] = SendResult.OK
+    assert paths.send() == "ab"
 
 
 def test_the_other_takes_what_the_first_does_not() -> None:

@@ -272,6 +272,20 @@ def test_class_control_that_exceeds_a_low_pace_holds_nobody_back_for_long() -> N
     assert pacer.due_s >= 3.0 - 1e-9
 
 
+def test_a_pace_that_turns_out_too_low_holds_nobody_back() -> None:
+    """Before much was sent the estimate may be a kilobit a second, for which a datagram takes seconds."""
+    pacer = Pacer()
+    pacer.sent(now=0.0, nbytes=1250, pacing_bps=1000.0)
+    pacer.paced(now=0.05, pacing_bps=500.0)  # slower: what has left keeps its time
+    assert pacer.due_s == pytest.approx(10.0, abs=0.01)
+    pacer.paced(now=0.05, pacing_bps=2e6)
+    assert pacer.due_s < 0.06
+    pacer.sent(now=1.0, nbytes=1250, pacing_bps=1e6)
+    due_s = pacer.due_s
+    pacer.paced(now=1.0, pacing_bps=2e6)  # a short wait is not worth it
+    assert pacer.due_s == due_s
+
+
 def test_the_pacer_gives_back_what_a_late_timer_lost() -> None:
     pacer = Pacer()
     left, now = 0, 0.0

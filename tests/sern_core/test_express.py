@@ -152,6 +152,58 @@ def test_a_lost_connection_loses_no_command() -> None:
     express.check()
 
 
+def test_both_lanes_of_the_path_share_one_window() -> None:
+    express = Express(second=stream())
+    express.run(5.0)
+    link = express.core.link
+    zmq, fast = link.lanes[LANE_ZMQ], link.lanes[LANE_EXPRESS]
+    assert fast.estimator is zmq.estimator
+    assert fast.pacer is zmq.pacer
+    assert zmq.under_way_bytes == fast.under_way_bytes == zmq.flight.inflight_bytes + fast.flight.inflight_bytes > 0
+    window_bytes = zmq.estimator.window_bytes
+    link.close_lane(now=express.robot.now, lane_id=LANE_EXPRESS)
+    assert zmq.beside is None
+    assert zmq.under_way_bytes == zmq.flight.inflight_bytes
+    assert zmq.estimator.window_bytes == window_bytes  # the path is the same
+    express.far.close_lane(now=express.world.relay.now, lane_id=LANE_EXPRESS)
+    express.run(2.0)
+    express.check()
+
+
+def test_a_stalled_stream_neither_fills_the_window_nor_makes_the_path_unknown() -> None:
+    express = Express(second=stream(), main=stream(Window(5.0, 7.0)))
+    express.run(6.8)
+    zmq = express.core.link.lanes[LANE_ZMQ]
+    fast = express.core.link.lanes[LANE_EXPRESS]
+    assert zmq.stalled
+    assert not fast.stalled
+    assert zmq.flight.inflight_bytes > 0
+    assert fast.under_way_bytes == fast.flight.inflight_bytes
+    assert fast.window_open
+    assert fast.estimator.bound_bps is not None
+    express.run(3.0)
+    express.check()
+
+
+def test_copies_are_sent_only_where_they_keep_nobody_waiting() -> None:
+    express = Express(second=stream())
+    express.run(5.0)
+    link = express.core.link
+    assert link.may_copy(200)  # poses and commands are within their share
+    flood = express.robot.publish("/robot/flood", spec(PriorityClass.CONTROL))
+    express.run(1.0)
+    answers: list[bool] = []
+    every = express.world.network.every
+    every(0.001, lambda now: express.core.send(flood, b"f" * 1000, 0, now=now), node=express.robot)
+    every(0.001, lambda _now: answers.append(link.express is not None and link.express.spare))
+    express.run(3.0)
+    assert sum(answers[1000:]) < 0.7 * len(answers[1000:])
+    before_bytes = link.scheduler.class0_tokens_bytes(now=express.robot.now)
+    if link.may_copy(200):  # and then they count
+        assert link.scheduler.class0_tokens_bytes(now=express.robot.now) < before_bytes
+    express.check()
+
+
 def test_a_new_session_must_be_joined_anew() -> None:
     express = Express(second=stream())
     express.run(5.0)

@@ -50,6 +50,34 @@ def test_a_packet_takes_its_serialisation_time_and_the_delay() -> None:
     assert elapsed(network, b) == [1.033, 1.041, 1.042]
 
 
+@pytest.mark.parametrize("streams", [False, True])
+def test_hops_beside_each_other_share_the_bottleneck(streams: bool) -> None:
+    a, b, c, d = Wire(), Wire(), Wire(), Wire()
+    model = LinkModel(rate_bps=1_000_000, delay_s=0.025, overhead_bytes=28)
+    model = model.as_stream() if streams else model
+    network, hop = joined(model, a, b, backward=model)
+    beside = network.join(c, None, d, None, model, model, name="beside", beside=hop)
+    send_at(network, a, 1.0, bytes(972), bytes(972))
+    send_at(network, c, 1.001, bytes(972))
+    send_at(network, a, 1.002, bytes(972))
+    network.run_until(2.0)
+    assert elapsed(network, b) == [1.033, 1.041, 1.057]
+    assert elapsed(network, d) == [1.049]
+    send_at(network, a, 2.0, bytes(972), bytes(972))
+    network.at(2.001, lambda _now: hop.break_connection())
+    send_at(network, c, 2.002, bytes(972))
+    network.run_until(2.1)
+    assert elapsed(network, d)[-1] == 2.049  # what the broken one had sent is still ahead of it
+    assert beside.forward.stats.carried_bytes == 2000
+
+
+def test_links_that_share_a_bottleneck_are_of_one_rate() -> None:
+    network, hop = joined(LinkModel(rate_bps=1_000_000), Wire(), Wire())
+    other = LinkModel(rate_bps=2_000_000)
+    with pytest.raises(UsageError, match="same rates"):
+        network.join(Wire(), None, Wire(), None, other, other, beside=hop)
+
+
 def test_a_rate_change_in_the_middle_of_a_packet_is_exact() -> None:
     a, b = Wire(), Wire()
     model = LinkModel(rate_bps=8_000, rate_steps=(RateStep(1.5, 80_000), RateStep(3.0, None)))

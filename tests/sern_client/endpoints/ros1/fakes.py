@@ -53,6 +53,8 @@ class FakeMaster:
         """Methods that it answers with no."""
         self.run_id = "one"
         self.calls: dict[str, int] = {}
+        self.mute = ""
+        """A method that fails."""
         self.port = 0
         self._server = XmlRpcServer(self._dispatch)
 
@@ -89,6 +91,8 @@ class FakeMaster:
         self.calls[method] = self.calls.get(method, 0) + 1
         if method in self.refused:
             return 0, "not now", 0
+        if method == self.mute:
+            raise LookupError(method)
         match method, params:
             case "getSystemState", (_,):
                 return 1, "", [[[name, nodes] for name, nodes in table.items()] for table in self.tables]
