@@ -291,7 +291,13 @@ class InStream:
         if not self.reliable and self._reassembly.latest is not self:
             self._reassembly.touch(self)
         partial.touched_s = now
-        if partial.add(offset, body) and partial.pieces > partial.paid_pieces and not self._pay(seq, partial):
+        try:
+            separate = partial.add(offset, body)
+        except MemoryError:  # the machine has less than our own bound
+            self._discard_partial(seq)
+            self.give_up(seq, DropReason.REASSEMBLY, total, now)
+            return
+        if separate and partial.pieces > partial.paid_pieces and not self._pay(seq, partial):
             return
         if offset == 0:
             partial.born_s, partial.error_s, partial.stamp_ns = born_s, error_s, stamp_ns

@@ -29,6 +29,7 @@ PROOFS: Final = {
     DropReason.QUEUE_FULL: "test_bound.py",
     DropReason.UNDECODABLE: "test_compression.py",
     DropReason.UNCONFIRMED: "test_queues.py",
+    DropReason.FAULT: "test_faults.py::test_a_reliable_message_that_a_site_fails_at_is_reported_and_the_stream_goes_on",
     DropReason.STORAGE: "test_holding.py::test_what_was_lost_is_reported_to_its_origin_before_it_is_confirmed",
 }
 """Where each is made to happen and asserted."""

@@ -419,10 +419,10 @@ def test_memory_that_cannot_be_had_costs_one_message(monkeypatch: pytest.MonkeyP
     channel = robot.publish("/robot/log", spec(reliable=True))
     world.run(1.0)
 
-    def refuse(self: Partial, total: int) -> None:
+    def refuse(self: Partial, offset: int, data: bytes) -> bool:
         raise MemoryError
 
-    monkeypatch.setattr(Partial, "__init__", refuse)
+    monkeypatch.setattr(Partial, "add", refuse)
     robot.send(channel, b"x" * 100_000)
     world.run(1.0)
     monkeypatch.undo()

@@ -27,6 +27,7 @@ STATIC = frozenset(
     {
         ".access._cache",  # decisions, at most CACHE_ENTRIES
         ".access._grants",
+        ".access._grants[][]._exact",
         ".objects._deletions",  # a ring
         ".received.topics[].by_reason",  # one row with all topics that have ended
     }
