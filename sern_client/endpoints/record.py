@@ -132,7 +132,8 @@ class RecordEndpoint:
         self._told: KeptUpTo | None = None
         self._taken = 0
         self._refused: dict[int, DropReason] = {}  # numbers of what did not get into the buffer, not told of yet
-        self._drops: dict[DropReason, int] = dict.fromkeys((DropReason.QUEUE_FULL, DropReason.STORAGE), 0)
+        reasons = (DropReason.QUEUE_FULL, DropReason.STORAGE, DropReason.DISCONNECTED)
+        self._drops: dict[DropReason, int] = dict.fromkeys(reasons, 0)
         # Of the writer thread:
         self._lost: dict[int, DropReason] = {}  # by number, not told of yet
         self._unsafe: dict[Encoding, list[int]] = {}  # numbers of messages that are written and not flushed

@@ -104,11 +104,11 @@ CASES: dict[str, Any] = {
     ),
     "a recording of nothing": (
         lambda lab: lab.client_file("robot1", {"kind": "bag", "path": str(_empty(lab.directory / "empty.bag"))}),
-        r"sern-client: {dir}/empty\.bag: cannot be read \(.+\); try `rosbag reindex {dir}/empty\.bag` on a copy",
+        r"sern-client: {dir}/empty\.bag: cannot be read: it is empty; try `rosbag reindex {dir}/empty\.bag` on a copy",
     ),
     "a recording cut off": (
         lambda lab: lab.client_file("robot1", {"kind": "bag", "path": str(_cut_off(lab.directory / "cut.bag"))}),
-        r"sern-client: {dir}/cut\.bag: cannot be read \(.+\); try `rosbag reindex {dir}/cut\.bag` on a copy",
+        r"sern-client: {dir}/cut\.bag: cannot be read: it is cut off.+; try `rosbag reindex {dir}/cut\.bag` on a copy",
     ),
     "a message log that is a directory": (
         lambda lab: lab.client_file("robot1", ROBOT, message_log="clients"),

@@ -119,8 +119,8 @@ IMPOSSIBLE: tuple[tuple[Callable[[Cell], bool], str, str], ...] = (
     (
         lambda cell: cell.lanes is Lanes.STREAM and cell.load is Load.THIRTEEN and path_of(cell).lossy,
         "/robot/costmap",
-        "lost segments leave a stream as little as 150 to 400 kbit/s, of which a costmap of 100 kB within 3 s is most: of "
-        "the twenty that are offered one to three arrive, and with bad luck none",
+        "lost segments leave a stream as little as 150 to 400 kbit/s, of which a costmap of 100 kB within 3 s is most: "
+        "of the twenty that are offered one to three arrive, and with bad luck none",
     ),
 )
 """What may not work: in which cells, of which topic nothing may arrive, and the reason. It is still promised there that

@@ -80,7 +80,7 @@ async def test_a_fault_costs_one_reading_and_not_the_stream(monkeypatch: pytest.
         raise ZeroDivisionError("injected")
 
     with monkeypatch.context() as patch:
-        patch.setattr(ros_types, "deserialise", broken)
+        patch.setattr(transforms, "read_transforms", broken)
         world.send(stream(), body(("odom", "base_link", 1.5)))
         await until(lambda: world.transforms.failures == 1)
     world.now_s += 1.0

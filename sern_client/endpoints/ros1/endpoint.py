@@ -204,7 +204,9 @@ class Ros1Endpoint:
             publication = self._publications[name] = Publication(name, info, self.caller, self._limits, self._ended)
             handle = Handle(publication)  # first: a publication without one ends as soon as nobody is waited for
             self._tell_subscribers(publication)
-            self._graph.poll_now()
+            # A subscriber whose connection ended comes back only when the master tells it of a publisher; of a topic
+            # that ended and begins again before the master has heard of it, it would not.
+            self._graph.again(Registration("publisher", name))
             return handle
         if not publication.fits(info):
             raise ConfigError(

@@ -215,6 +215,12 @@ class Graph:
         """Something changed, here or there."""
         self._now.set()
 
+    def again(self, registration: Registration) -> None:
+        """Register it once more even if it is listed: the master tells its subscribers then."""
+        if registration in self._registered:
+            self._registered[registration] = None
+        self.poll_now()
+
     @property
     def unlisted(self) -> list[Registration]:
         """What is desired and the master, when it last answered, did not list; empty while there is no master."""
@@ -275,12 +281,14 @@ class Graph:
             if detail in (self._registered.get(registration), self._refused.get(registration)):
                 continue
             self._seen = b""  # what the master lists is compared again after every change of ours
+            self._registered[registration] = detail  # before the call: during it, it may be wanted `again`
             try:
                 await self._registrar.register(registration, detail)
-                self._registered[registration] = detail
             except UnreachableError:
+                self._registered.pop(registration, None)
                 raise
             except CallError as error:
+                self._registered.pop(registration, None)
                 self._refused[registration] = detail
                 _log.error("%s: cannot be registered as %s: %s", registration.name, registration.kind, error)
         for registration in self._registered.keys() - desired.keys():

@@ -33,6 +33,22 @@ async def test_a_stream_that_begins_as_soon_as_it_ended_is_published(master: Fak
         assert endpoint.validate(held) == []
 
 
+async def registered(master: FakeMaster, times: int) -> None:
+    await until(lambda: master.calls["registerPublisher"] == times)
+
+
+async def test_subscribers_are_told_of_a_topic_that_ended_and_begins_again(master: FakeMaster) -> None:
+    """They lost their connections, and rospy looks for a publisher only when the master says that there is one."""
+    async with running(master) as (endpoint, _):
+        stream = endpoint.advertise(STRING)
+        await until(lambda: endpoint.waited_for == 0 and master.tables[0].get("/chat") == ["/sern"])
+        for told in range(2, 5):
+            stream.close()
+            stream = endpoint.advertise(STRING)
+            await registered(master, told)
+        assert endpoint.advertise(STRING) and master.calls.get("unregisterPublisher", 0) == 0
+
+
 async def test_the_master_is_told_of_another_type(master: FakeMaster) -> None:
     async with running(master) as (endpoint, _):
         first = endpoint.advertise(STRING)
