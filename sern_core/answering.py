@@ -12,7 +12,6 @@ from sern_core.announce import Want, encode_dropped
 from sern_core.errors import WireError
 from sern_core.fragments import InStream
 from sern_core.interest import Interest
-from sern_core.lanes import Lane
 from sern_core.params import LinkParams, SchedulerParams
 from sern_core.queues import OutChannel
 from sern_core.session import Session
@@ -115,9 +114,8 @@ class Answering(Session):
         )
         self._unsaid = bool(self._interest or self._reporting)
 
-    def _data_deadline(self, lane: Lane) -> float:
-        deadline_s = super()._data_deadline(lane)
-        return min(deadline_s, self._interest.deadline_s) if self._unsaid else deadline_s
+    def _say_deadline(self) -> float:
+        return self._interest.deadline_s
 
     def report_drop(self, stream: InStream, seq: int, reason: DropReason, where: str, *, now: float) -> None:
         """Tell the origin's side that a reliable message was dropped here or further on: before the watermark passes

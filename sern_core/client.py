@@ -377,8 +377,9 @@ class ClientCore:
             self._close_stream(stream, now)
 
     def on_message(self, link: Link, stream: InStream, message: Message, *, now: float) -> None:
-        self._decoder.message(stream, message, now=now)
-        stream.unhandled = self._oldest(message.stream)
+        decoder = self._decoder
+        decoder.message(stream, message, now=now)
+        stream.unhandled = self._oldest(message.stream) if decoder.running or self._held else 0
 
     def _handle(self, stream: InStream, message: Message, now: float) -> None:
         """A message has had its turn and is decoded."""

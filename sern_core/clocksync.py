@@ -151,7 +151,8 @@ class ClockSync:
         """The peer's clock cannot be ahead of ours by more than this and the drift since the best sample: `witness`."""
         self._stepped: deque[tuple[float, float]] = deque(maxlen=MAX_SHIFTS)  # peer's time, and what its clock lost
         self._shifted: deque[tuple[float, float]] = deque(maxlen=MAX_SHIFTS)  # the same, within the bounds
-        self._behind_until_s = -math.inf  # the newest of these times
+        self.behind_until_s = -math.inf
+        """The newest of these times: of what was born later `behind_s` is 0."""
         self._filter: deque[_Sample] = deque(maxlen=FILTER_SAMPLES)
         self._stage_s = 0.0  # when the newest stage began
         self._best: _Sample | None = None
@@ -210,13 +211,13 @@ class ClockSync:
     def behind_s(self, born_peer_s: float) -> float:
         """How much older than it looks something may be that was born at `born_peer_s`, as the peer's clock was slow,
         stood still or was set back since then. To be added to the error of its age."""
-        if born_peer_s > self._behind_until_s:
+        if born_peer_s > self.behind_until_s:
             return 0.0
         return sum(lost_s for at_s, lost_s in (*self._stepped, *self._shifted) if born_peer_s <= at_s)
 
     def _fell_behind(self, losses: deque[tuple[float, float]], at_peer_s: float, lost_s: float) -> None:
         losses.append((at_peer_s, lost_s))
-        self._behind_until_s = at_peer_s
+        self.behind_until_s = at_peer_s
 
     def reset(self) -> None:
         """Forget everything: the peer is another process, or the path another one. The counters stay."""

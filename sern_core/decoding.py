@@ -77,16 +77,21 @@ class Decoder(Generic[Context]):
         self._fault = fault
         self._max_waiting_bytes = max_waiting_bytes
         self._waiting: dict[StreamId, deque[tuple[Context, Message]]] = {}  # of streams with a body at work elsewhere
-        self._running: dict[StreamId, int] = {}
+        self.running: dict[StreamId, int] = {}
+        """The seq that another thread works on, by stream: the oldest that has not been handed on."""
 
     def message(self, context: Context, message: Message, *, now: float) -> None:
         """One message in its turn, encoded or not."""
         waiting = self._waiting.get(message.stream) if self._waiting else None
         if waiting is None:
-            if not message.codec:
-                self._hand_on(context, message, now)
-            else:
+            if message.codec:
                 self._begin(context, message, now)
+                return
+            try:
+                self._deliver(context, message, now)
+            except Exception as error:  # noqa: BLE001  (as in `_hand_on`)
+                self._fault(error)
+                self._failed(context, message, DropReason.FAULT, "", now)
             return
         spec = self.stream_of(context).spec
         if not spec.reliable and len(waiting) >= spec.depth:
@@ -103,11 +108,11 @@ class Decoder(Generic[Context]):
 
     def oldest(self, stream: StreamId) -> int:
         """The seq of the oldest message of a stream that has not been handed on, 0 when there is none."""
-        return self._running.get(stream, 0)
+        return self.running.get(stream, 0)
 
     def forget(self, stream: StreamId, *, now: float) -> None:
         """The stream has ended: what still waits of it is dropped."""
-        self._running.pop(stream, None)
+        self.running.pop(stream, None)
         for context, message in self._waiting.pop(stream, ()):
             self.waiting_bytes -= len(message.body)
             self._failed(context, message, DropReason.DISCONNECTED, "the stream has ended", now)
@@ -130,7 +135,7 @@ class Decoder(Generic[Context]):
             self._failed(context, message, DropReason.FAULT, "", now)
             return True
         waiting = self._waiting.setdefault(message.stream, deque())
-        self._running[message.stream] = message.seq
+        self.running[message.stream] = message.seq
         try:
             coder.offload(DecodeRequest(self, context, message, waiting))
         except Exception as error:  # noqa: BLE001  (no thread can be had, for example)
@@ -138,7 +143,7 @@ class Decoder(Generic[Context]):
             self._failed(context, message, DropReason.FAULT, "", now)
             if not waiting:
                 del self._waiting[message.stream]
-                del self._running[message.stream]
+                del self.running[message.stream]
             return True
         return False
 
@@ -199,7 +204,7 @@ class Decoder(Generic[Context]):
                 return
         if self._waiting.get(stream) is waiting:
             del self._waiting[stream]
-            del self._running[stream]
+            del self.running[stream]
 
 
 _UNKEPT: Final = -1

@@ -92,11 +92,13 @@ class Hop(Sender):
         born_s = now
         if offset == 0:
             if self._rx_delay is None:
-                self._rx_delay = self.clock.one_way_delay_s(self._rx_stamp_us * 1e-6, now)
-            delay_s, uncertainty_s = self._rx_delay
+                stamp_s = self._rx_stamp_us * 1e-6
+                self._rx_delay = (*self.clock.one_way_delay_s(stamp_s, now), stamp_s - self.clock.behind_until_s)
+            delay_s, uncertainty_s, in_step_s = self._rx_delay
             born_s = now - age_s - delay_s
-            # Infinite before the first round trip; and what the peer's clock has lost since the message was born.
-            error_s += uncertainty_s + self.clock.behind_s(self._rx_stamp_us * 1e-6 - age_s)
+            error_s += uncertainty_s  # infinite before the first round trip
+            if age_s >= in_step_s:
+                error_s += self.clock.behind_s(self._rx_stamp_us * 1e-6 - age_s)  # what the peer's clock lost meanwhile
         try:
             stream.fragment(flags, wide, offset, total, body, stamp_ns, born_s, error_s, now, codec)
         except RemoteError:
@@ -126,6 +128,7 @@ class Hop(Sender):
             # When it left we know better than the peer, unless it was given up meanwhile.
             sent_s = newest.sent_s if newest is not None and named else echo_us * 1e-6
             stamp_s, received_s = self._rx_stamp_us * 1e-6, received_us * 1e-6
+            self._rx_delay = None
             if self.clock.sample(sent_s, received_s, stamp_s, now):  # else no two clocks can have given these stamps
                 rtt_s = max(1e-6, now - sent_s - (stamp_s - received_s))
                 flight.rtt.sample(rtt_s, now=now)
@@ -280,6 +283,8 @@ class Hop(Sender):
             deadline = self._held_back_due_s
         if lane.id == LANE_ZMQ and self._sweep_due_s < deadline:
             deadline = self._sweep_due_s
+        if self._unsaid and (due_s := self._say_deadline()) < deadline:
+            deadline = due_s
         arrivals = lane.arrivals
         if arrivals.unacked and (due_s := arrivals.deadline_s()) < deadline:
             deadline = due_s

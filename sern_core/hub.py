@@ -557,15 +557,19 @@ class Hub(LocalStreams):
         """Offer a message to all who get it. True: with that, the stream may be delivered further than before."""
         stream = relayed.stream
         behind = not relayed.outs
-        for out_link, channel in relayed.outs.values():
-            ahead = message.seq - channel.next_seq
+        for client, (out_link, channel) in relayed.outs.items():
             try:
-                if ahead < 0:
-                    self.received.of(stream.stream).drop_arrived(DropReason.DUPLICATE)  # it has gone that way before
-                    continue
-                if ahead and stream.reliable:
-                    out_link.skip(channel, message.seq, now=now)  # what lies between was given up before it came here
-                self._submit(out_link, channel, message, now)
+                if message.seq != channel.next_seq:
+                    if message.seq < channel.next_seq:
+                        self.received.of(stream.stream).drop_arrived(DropReason.DUPLICATE)  # it has gone that way
+                        continue
+                    if stream.reliable:
+                        out_link.skip(channel, message.seq, now=now)  # what lies between was given up before that
+                bound = self._bounds.get(client)
+                if bound is None:
+                    out_link.submit(channel, message, now=now, forced=True)
+                else:
+                    bound.submit(out_link, channel, message, now=now)
             except Exception as error:  # noqa: BLE001  (of that client's link: the others get theirs)
                 self._not_taken(relayed, out_link, channel, message, error, now)
             behind = behind or channel.watermark >= message.seq
@@ -594,13 +598,6 @@ class Hub(LocalStreams):
             link.fault(again)
             if channel.reliable and relayed.source is not None:
                 relayed.source.report_drop(relayed.stream, message.seq, DropReason.FAULT, link.peer, now=now)
-
-    def _submit(self, link: Link, channel: OutChannel, message: Message, now: float) -> None:
-        bound = self._bounds.get(link.peer)
-        if bound is None:
-            link.submit(channel, message, now=now, forced=True)
-        else:
-            bound.submit(link, channel, message, now=now)
 
     def on_in_drop(self, link: Link, stream: InStream, reason: DropReason, nbytes: int) -> None:
         self.received.of(stream.stream).drop_arrived(reason)

@@ -89,7 +89,10 @@ class HubPort:
     def next_deadline(self) -> float | None:
         if self.link is None or not self.current:
             return None
-        deadline_s, match_s = self.link.next_deadline(), self.hub.matching.due_s.get(self.client)
+        deadline_s, due_s = self.link.next_deadline(), self.hub.matching.due_s
+        if not due_s:
+            return deadline_s
+        match_s = due_s.get(self.client)
         return deadline_s if match_s is None or (deadline_s is not None and deadline_s < match_s) else match_s
 
     def handle_timeout(self, *, now: float) -> None:

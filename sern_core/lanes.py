@@ -143,7 +143,10 @@ class Lane:
     def window_open(self) -> bool:
         """Whether the bytes in flight leave room; class 0 asks only when its token bucket is spent, and the pacer has
         a word as well."""
-        return not self.stalled and self.under_way_bytes < self.estimator.window_bytes + self._unheard_bytes
+        if self.stalled:
+            return False
+        nbytes = self.flight.inflight_bytes if self.beside is None else self.under_way_bytes
+        return nbytes < self.estimator.window_bytes + self._unheard_bytes
 
     def open_at(self, now: float) -> bool:
         """Whether a datagram below class 0 may leave now."""

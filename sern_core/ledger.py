@@ -188,7 +188,8 @@ class ReceiveLedger:
             self.topics.setdefault(OTHER_TOPIC, ReceiveCounters(OTHER_TOPIC, counters.priority)).add(counters)
 
     def of(self, stream: StreamInfo) -> ReceiveCounters:
-        return self._named(stream.id.topic, stream.spec.priority)
+        topic = stream.id.topic
+        return self.topics.get(topic) or self._named(topic, stream.spec.priority)
 
     def stray(self) -> None:
         """A message of a stream that was never announced, or has ended."""

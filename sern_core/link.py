@@ -389,15 +389,12 @@ class Link(Answering):
             self._fresh.append((stream, message, self.clock.steps))
             self.dirty = True
             return
-        self._hand_over(stream, message)
-        if stream.reliable:
-            self._confirm_own(stream)
-
-    def _hand_over(self, stream: InStream, message: Message) -> None:
         try:
             self.handler.on_message(self, stream, message, now=self._now)
         except Exception as error:  # noqa: BLE001  (of one message: the stream goes on, whatever its bodies do)
             self._undelivered(stream, message, error)
+        if stream.reliable:
+            self._confirm_own(stream)
 
     def _hand_on(self, now: float) -> None:
         self._now = now
@@ -405,8 +402,11 @@ class Link(Answering):
             stream, message, steps = self._fresh.popleft()
             if steps != self.clock.steps:
                 self._tell(self.handler.on_in_drop, self, stream, DropReason.LIFESPAN, len(message.body))
-            else:
-                self._hand_over(stream, message)
+                continue
+            try:
+                self.handler.on_message(self, stream, message, now=now)
+            except Exception as error:  # noqa: BLE001  (as in `_deliver`)
+                self._undelivered(stream, message, error)
 
     def _undelivered(self, stream: InStream, message: Message, error: Exception) -> None:
         """The owner failed at a message: it is given up, and its tombstone has the turn."""

@@ -81,6 +81,7 @@ class _Entry:
         "ros_stamp_ns",
         "seq",
         "sha256",
+        "share",
         "stream",
         "type_name",
         "updated_s",
@@ -89,9 +90,10 @@ class _Entry:
         "wall_ns",
     )
 
-    def __init__(self, object_id: str, owner: ClientName, now: float) -> None:
+    def __init__(self, object_id: str, owner: ClientName, share: list[int], now: float) -> None:
         self.id = object_id
         self.owner = owner
+        self.share = share  # of the owner, in the registry's total and held bytes
         self.kind = ObjectKind.TOPIC
         self.type_name = ""
         self.definition = ""
@@ -203,7 +205,7 @@ class ObjectRegistry:
                     "delete objects or shorten definitions",
                 )
         if entry is None:
-            entry = _Entry(object_id, owner, now)
+            entry = _Entry(object_id, owner, self._bytes_of.setdefault(owner, [0, 0]), now)
             self._entries[object_id] = entry
             self._owned.setdefault(owner, set()).add(object_id)
         self._count(entry, fixed_bytes - entry.fixed_bytes)
@@ -280,7 +282,10 @@ class ObjectRegistry:
         entry.seq = seq
         entry.wall_ns = wall_ns
         entry.ros_stamp_ns = ros_stamp_ns
-        self._set_value(entry, body, codec)
+        if entry.value_bytes == len(body) and entry.body is not None and not (codec or entry.codec):
+            entry.body, entry.sha256 = body, None  # of the same size: what the budgets hold stays
+        else:
+            self._set_value(entry, body, codec)
         self._touch(entry, now)
         return True
 
@@ -459,39 +464,37 @@ class ObjectRegistry:
         limits = self.limits
         self._forget_value(entry)
         size = len(body)
-        own_bytes, own_held_bytes = self._bytes_of[entry.owner]
-        may_hold = (
-            self._held_bytes + size <= limits.max_held_bytes and own_held_bytes + size <= limits.max_held_per_owner
-        )
-        if codec:
-            if may_hold:
-                self._count_held(entry, size)
-                entry.body, entry.codec = body, codec
-            return
-        entry.value_bytes = size
-        if size <= limits.max_value_bytes:
+        own_bytes, own_held_bytes = share = entry.share
+        if size <= limits.max_value_bytes and not codec:
+            entry.value_bytes = size
             if self._total_bytes + size <= limits.max_total_bytes and own_bytes + size <= limits.max_bytes_per_owner:
-                self._count(entry, size)
+                self._total_bytes += size  # `_count`, for every message
+                share[0] = own_bytes + size
                 entry.body = body
-        elif may_hold:
+            return
+        if not codec:
+            entry.value_bytes = size
+        if self._held_bytes + size <= limits.max_held_bytes and own_held_bytes + size <= limits.max_held_per_owner:
             self._count_held(entry, size)
-            entry.body = body
+            entry.body, entry.codec = body, codec
 
     def _count(self, entry: _Entry, nbytes: int) -> None:
         self._total_bytes += nbytes
-        self._bytes_of.setdefault(entry.owner, [0, 0])[0] += nbytes
+        entry.share[0] += nbytes
 
     def _count_held(self, entry: _Entry, nbytes: int) -> None:
         self._held_bytes += nbytes
-        self._bytes_of[entry.owner][1] += nbytes
+        entry.share[1] += nbytes
 
     def _forget_value(self, entry: _Entry) -> None:
         old = entry.body
         if old is not None:
-            if not entry.codec and len(old) <= self.limits.max_value_bytes:
-                self._count(entry, -len(old))
+            size = len(old)
+            if not entry.codec and size <= self.limits.max_value_bytes:
+                self._total_bytes -= size  # `_count`, for every message
+                entry.share[0] -= size
             else:
-                self._count_held(entry, -len(old))
+                self._count_held(entry, -size)
             entry.body = None
         entry.codec = 0
         entry.value_bytes = -1

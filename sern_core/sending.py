@@ -139,7 +139,8 @@ class Sender(ABC):
         self._held_back_due_s = inf  # when one of them may go, or earlier
         self._watermarks: dict[int, int] = {}  # channel -> delivered, not yet on the wire
         self._rx_stamp_us = 0
-        self._rx_delay: tuple[float, float] | None = None  # of the datagram at hand, and its uncertainty
+        self._rx_delay: tuple[float, float, float] | None = None
+        """Of the datagram at hand: its delay, that one's uncertainty, and for how long the clocks had not shifted."""
         self._now = now
         self._control, self._control_in = self._control_streams()
 
@@ -158,6 +159,10 @@ class Sender(ABC):
     @abstractmethod
     def _say(self, now: float) -> None:
         """Queue control messages with answers and reports that are due."""
+
+    @abstractmethod
+    def _say_deadline(self) -> float:
+        """When `_say` has something to say by time alone."""
 
     @abstractmethod
     def _watermark_moved(self, channel: OutChannel) -> None: ...
@@ -347,11 +352,11 @@ class Sender(ABC):
             if lane is self.lane or lane is self.express:
                 self.dirty = False
                 try:
-                    self._compose(lane, frames, items, now)
+                    window_open = self._compose(lane, frames, items, now)
                 except Exception:
                     self._give_back(lane, items, now)  # what was taken would be neither in flight nor waiting
                     raise
-                if not items and not lane.path.held and not lane.open_at(now) and self._backlog:
+                if not items and not window_open and not lane.path.held and self._backlog:
                     lane.path.held = not lane.stalled
             # A stream delivers what is under way, so one question at a time is enough there.
             if not items and (lane.ping or lane.stalled) and not (lane.lossless and lane.flight.packets):
@@ -379,13 +384,15 @@ class Sender(ABC):
         datagram = b"".join((self._header(flight.next_number, now), *frames))
         nbytes = len(datagram) + OVERHEAD_BYTES
         estimator = lane.estimator
-        inflight_bytes = lane.under_way_bytes + nbytes
+        inflight_bytes = nbytes + (flight.inflight_bytes if lane.beside is None else lane.under_way_bytes)
         # What could be picked if window and pacer let it is held back by them; ordering `paper` holds back by itself.
-        waits = (lane is self.lane or lane is self.express) and (
-            self._control_waits or self.scheduler.pick(now=now, window_open=True) is not None
+        control = self._control
+        waits = (lane is self.lane or lane is self.express) and bool(
+            control.queue or control.active or self.scheduler.pick(now=now, window_open=True) is not None
         )
-        app_limited = inflight_bytes < estimator.window_bytes and not (waits or lane.path.held)
-        lane.path.held = False
+        path = lane.path
+        app_limited = not waits and not path.held and inflight_bytes < estimator.window_bytes
+        path.held = False
         flight.sent(now=now, nbytes=nbytes, items=items, app_limited=app_limited)
         estimator.on_sent(now=now, nbytes=nbytes, inflight_bytes=inflight_bytes)
         pacer = lane.pacer
@@ -400,9 +407,11 @@ class Sender(ABC):
             self.dirty = waits or bool(self._watermarks)
         else:
             self.dirty = bool(self._watermarks) or (waits and self._pick(now, window_open=False) is not None)
-        lane.spare = not waits or self.scheduler.within_share(now)
-        if lane.redundant and lane.spare and any(type(item) is SentData and _urgent(item.channel) for item in items):
-            lane.copies.append((now + COPY_DELAY_S, flight.next_number - 1, datagram))
+        redundant = lane.redundant
+        if redundant or lane is self.express:
+            lane.spare = not waits or self.scheduler.within_share(now)
+            if redundant and lane.spare and any(type(item) is SentData and _urgent(item.channel) for item in items):
+                lane.copies.append((now + COPY_DELAY_S, flight.next_number - 1, datagram))
         return datagram
 
     def may_copy(self, nbytes: int) -> bool:
@@ -435,11 +444,12 @@ class Sender(ABC):
 
     def _compose(
         self, lane: Lane, frames: list[bytes], items: list[SentData | SentWatermark | SentPing], now: float
-    ) -> None:
+    ) -> bool:
         """Fill one datagram: watermarks, then what the scheduler picks, of one class; control ahead of all but class 0.
 
         Control keeps to the window like everything below class 0, as a thousand announcements must not fill the path;
-        but a little of it rides in each datagram of class 0, at the cost of that class's share.
+        but a little of it rides in each datagram of class 0, at the cost of that class's share. Returns whether window
+        and pacer were open to the other classes.
         """
         limit = lane.fragment_bytes - (wire.ACK.size if lane.arrivals.unacked else 0)
         express = lane is self.express
@@ -458,8 +468,8 @@ class Sender(ABC):
             channel = self.channels[chosen] if chosen is not None else None
             rides = served is PriorityClass.CONTROL and not window_open and not express
             if (
-                not express
-                and self._control_waits
+                (control.queue or control.active)
+                and not express
                 and (rides or (window_open and (channel is None or channel.spec.priority is not PriorityClass.CONTROL)))
                 and (order := control.head(now)) is not None
             ):
@@ -495,6 +505,7 @@ class Sender(ABC):
             self._refresh(channel, now)
             if lane.stalled:
                 break
+        return window_open
 
     def _cut(self, lane: Lane, limit: int, now: float) -> int:
         """Bytes of a datagram without class 0: so many that the link is free when class 0 wants it next."""

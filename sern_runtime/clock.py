@@ -9,11 +9,13 @@ then is told in sern_core/clocksync.py.
 """
 
 import time
+from collections.abc import Callable
+from functools import partial
 from typing import Final
 
 CLOCK: Final = time.CLOCK_BOOTTIME if hasattr(time, "CLOCK_BOOTTIME") else time.CLOCK_MONOTONIC
 
 
-def now() -> float:
-    """Seconds since the machine was started, suspended or not. The same in all its processes."""
-    return time.clock_gettime(CLOCK)
+now: Final[Callable[[], float]] = partial(time.clock_gettime, CLOCK)
+"""Seconds since the machine was started, suspended or not. The same in all its processes. It is asked for every
+message: a function of ours around the call would take twice as long as the call."""
