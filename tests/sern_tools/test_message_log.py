@@ -30,11 +30,11 @@ def test_refused_expired_and_an_unfinished_last_line(tmp_path: Path) -> None:
     path = tmp_path / "robot.csv"
     path.write_text(
         HEAD
-        + "offered,10,/map,state,1,5,10,7,,\n"
-        + "offered,20,/map,state,2,5,20,7,,\n"
-        + "refused,30,/map,state,3,5,30,7,,refused\n"
-        + "expired,40,/map,state,2,5,20,7,1.5,retention\n"
-        + "delivered,50,/map,state,1,5,10,7,0.25,\n"
+        + "offered,10,/map,state,1,5,10,7,,,\n"
+        + "offered,20,/map,state,2,5,20,7,,,\n"
+        + "refused,30,/map,state,3,5,30,7,,refused,\n"
+        + "expired,40,/map,state,2,5,20,7,1.5,retention,\n"
+        + "delivered,50,/map,state,1,5,10,7,0.25,,\n"
         + "delivered,60,/map,sta"
     )
     log = read_logs([("robot", path)])["/map"]
@@ -49,9 +49,9 @@ def test_refused_expired_and_an_unfinished_last_line(tmp_path: Path) -> None:
     [
         ("", ":1"),
         ("event,wall_ns\n", ":1"),
-        (HEAD + "offered,10,/map,state,1,5,10,7,,\nlost,10,/map,state,1,5,10,7,,\n", ":3"),
+        (HEAD + "offered,10,/map,state,1,5,10,7,,,\nlost,10,/map,state,1,5,10,7,,,\n", ":3"),
         (HEAD + "offered,10,/map\n", ":2"),
-        (HEAD + "offered,ten,/map,state,1,5,10,7,,\n", ":2"),
+        (HEAD + "offered,ten,/map,state,1,5,10,7,,,\n", ":2"),
     ],
 )
 def test_something_else_is_refused_with_its_line(tmp_path: Path, text: str, line: str) -> None:
