@@ -24,7 +24,6 @@ from sern_client.endpoints.composite import CompositeEndpoint
 from sern_client.frames import FramePrefixer, Rewrite
 from sern_client.guard import Guard
 from sern_client.keeping import Keeping
-from sern_client.message_log import MessageLog
 from sern_client.rebuild import Rebuilds
 from sern_client.services import ServiceBridge
 from sern_client.summarise import Send, Source, Summaries
@@ -46,6 +45,7 @@ from sern_runtime import clock, ros_types
 from sern_runtime.fine_timer import fine_timer
 from sern_runtime.link_metrics import AgeHistograms
 from sern_runtime.loop import Timer
+from sern_runtime.message_log import MessageLog
 from sern_runtime.optional import OptionalParts
 
 MAX_PROBLEMS: Final = 256

@@ -20,7 +20,6 @@ from sern_client.endpoints.base import CountingEndpoint, Endpoint, ServiceEndpoi
 from sern_client.express import ClientExpress
 from sern_client.factory import make_endpoint
 from sern_client.guard import Guard
-from sern_client.message_log import MessageLog
 from sern_client.services import ServiceBridge
 from sern_client.summarise import register_summaries
 from sern_client.transport import RelayTransport
@@ -44,6 +43,7 @@ from sern_runtime.internal_errors import InternalErrors
 from sern_runtime.keys import load_public, load_secret
 from sern_runtime.link_metrics import register_codecs, register_links, register_received
 from sern_runtime.loop import Shutdown
+from sern_runtime.message_log import LoggedFates, MessageLog
 from sern_runtime.metrics import Metrics
 from sern_runtime.optional import OptionalParts
 from sern_runtime.sdnotify import Notifier, Watchdog
@@ -113,6 +113,8 @@ class ClientDaemon:
             now=now,
             coder=make_coder(model.link.params(), self.codecs),
         )
+        if self.message_log is not None:
+            self.core.link.fates = LoggedFates(self.message_log, self.parts)
         self.bridge.attach(self.core)
         self.bridge.guard = self.guard = Guard.of(loaded)
         self.check = TableCheck(self.bridge, now=now)
@@ -459,9 +461,9 @@ class ClientDaemon:
             stack.callback(self.errors.unwatch, asyncio.get_running_loop())
             stack.callback(self.notifier.close)
             stack.callback(self._write_summary)
-            stack.callback(self._give_up)
             if self.message_log is not None:
                 stack.callback(self.message_log.close)
+            stack.callback(self._give_up)
             if self._ctx is not None:
                 stack.callback(self._ctx.destroy, linger=0)
             if self._http is not None:

@@ -195,8 +195,8 @@ class DropReport:
 
 
 Deliver = Callable[["InStream", Message], None]
-OnInDrop = Callable[["InStream", DropReason, int, int], None]
-"""Stream, reason, bytes, and the seq of a reliable message that was given up here (its tombstone follows) or 0."""
+OnInDrop = Callable[["InStream", DropReason, int, int, bool], None]
+"""Stream, reason, bytes, seq, and whether its tombstone follows: a reliable message that was given up here."""
 
 
 class InStream:
@@ -265,7 +265,7 @@ class InStream:
         if self._partials and (flags & FLAG_TOMBSTONE or len(body) == total):
             self._discard_partial(seq)
         if self._waiting and seq in self._waiting:
-            self._on_drop(self, DropReason.DUPLICATE, len(body), 0)
+            self._on_drop(self, DropReason.DUPLICATE, len(body), seq, False)
             return
         if flags & FLAG_TOMBSTONE:
             code = body[0] if body[0] in DROP_REASONS else DROP_CODES[DropReason.LOST]
@@ -376,10 +376,10 @@ class InStream:
         if seq <= self.delivered or seq in self._waiting:
             return
         if not self.reliable:
-            self._on_drop(self, reason, nbytes, 0)
+            self._on_drop(self, reason, nbytes, seq, False)
             return
         self._check_heard()
-        self._on_drop(self, reason, nbytes, seq)
+        self._on_drop(self, reason, nbytes, seq, True)
         self._arrived(self.tombstone(seq, reason, 0, now))
 
     def fail(self, seq: int, nbytes: int, now: float) -> None:
@@ -398,7 +398,7 @@ class InStream:
         self._lose(next(iter(self._partials)), DropReason.REASSEMBLY)
 
     def _lose(self, seq: int, reason: DropReason) -> None:
-        self._on_drop(self, reason, self._partials[seq].total, 0)
+        self._on_drop(self, reason, self._partials[seq].total, seq, False)
         self._discard_partial(seq)
 
     def _discard_partial(self, seq: int) -> None:
@@ -410,15 +410,15 @@ class InStream:
 
     def _late(self, seq: int, size: int) -> None:
         if self.reliable:
-            self._on_drop(self, DropReason.DUPLICATE, size, 0)
+            self._on_drop(self, DropReason.DUPLICATE, size, seq, False)
             return
         bit = self.delivered - 1 - seq
         if seq == self.delivered or (0 <= bit < SEEN_BITS and self._seen >> bit & 1):
-            self._on_drop(self, DropReason.DUPLICATE, size, 0)
+            self._on_drop(self, DropReason.DUPLICATE, size, seq, False)
         else:
             if 0 <= bit < SEEN_BITS:
                 self._seen |= 1 << bit
-            self._on_drop(self, DropReason.SUPERSEDED, size, 0)
+            self._on_drop(self, DropReason.SUPERSEDED, size, seq, False)
 
     def _arrived(self, message: Message) -> None:
         seq = message.seq
@@ -449,7 +449,7 @@ class InStream:
         if not self._reassembly.make_room(size + HELD_OVERHEAD_BYTES):
             # Without the message before it this one cannot be kept; its tombstone can.
             if not message.tombstone:
-                self._on_drop(self, DropReason.REASSEMBLY, size, seq)
+                self._on_drop(self, DropReason.REASSEMBLY, size, seq, True)
                 message = self.tombstone(seq, DropReason.REASSEMBLY, message.stamp_ns, message.born_s)
             if not self._reassembly.make_room(len(message.body) + HELD_OVERHEAD_BYTES):
                 raise WireError(f"more messages out of order than {self._reassembly.limit_bytes} bytes hold")
@@ -476,9 +476,9 @@ class InStream:
             # Late as far as can be known: where the clocks' offset is uncertain, the worst of it counts.
             size = len(message.body)
             if not self.reliable:
-                self._on_drop(self, DropReason.LIFESPAN, size, 0)
+                self._on_drop(self, DropReason.LIFESPAN, size, message.seq, False)
                 return
-            self._on_drop(self, DropReason.LIFESPAN, size, message.seq)
+            self._on_drop(self, DropReason.LIFESPAN, size, message.seq, True)
             message = self.tombstone(message.seq, DropReason.LIFESPAN, message.stamp_ns, message.born_s)
         self.known = True
         self._deliver(self, message)

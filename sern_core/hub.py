@@ -22,6 +22,7 @@ from sern_core.bound import QueueBound
 from sern_core.definitions import DefinitionStore
 from sern_core.draining import Draining
 from sern_core.errors import RefusedError, UsageError, WireError
+from sern_core.fates import Fates
 from sern_core.fragments import InStream
 from sern_core.hub_events import GuardedEvents, HubEvents, Relayed
 from sern_core.hub_local import LocalStreams
@@ -97,6 +98,8 @@ class Hub(LocalStreams):
         self.links: dict[ClientName, Link] = {}
         self.port_of: dict[ClientName, HubPort] = {}
         self.relayed: dict[StreamId, Relayed] = {}
+        self.fates: Fates | None = None
+        """Told what becomes of each message here; set before the first client comes."""
         self._link_params = link
         self._scheduler_params = scheduler
         self._lossless = lossless
@@ -147,6 +150,7 @@ class Hub(LocalStreams):
                 auto_confirm=False,
             )
             link.on_stray = self.received.stray
+            link.fates = self.fates
             self._limit(client, now)
             self._absent_since[client] = now
         return link
@@ -540,18 +544,35 @@ class Hub(LocalStreams):
             return
         nbytes = len(message.body)
         if not self._guards[link.peer].admit(nbytes, now=now):
-            self.received.of(stream.stream).drop_arrived(DropReason.RATE_CAP)
+            self._discarded(link, stream, message.seq, DropReason.RATE_CAP)
             if not stream.reliable:
                 return
             code = DROP_CODES[DropReason.RATE_CAP]
             message = Message(message.stream, message.seq, bytes([code]), message.stamp_ns, message.born_s, code)
             link.report_drop(stream, message.seq, DropReason.RATE_CAP, self.name, now=now)
         elif message.tombstone:
-            self.received.of(stream.stream).drop_arrived(message.drop_reason)
+            self._discarded(link, stream, message.seq, message.drop_reason)
         else:
             self.received.of(stream.stream).arrived(nbytes, now - message.born_s, now)
+            if self.fates is not None:
+                self.fates.received(stream.stream, message, link.peer)
+            if not relayed.outs:
+                self._taken_by_nobody(relayed, link, message.seq)
         if self._forward(relayed, message, now) and stream.reliable:
             self._confirm(relayed)
+
+    def _discarded(self, link: Link, stream: InStream, seq: int, reason: DropReason) -> None:
+        self.received.of(stream.stream).drop_arrived(reason)
+        if self.fates is not None:
+            self.fates.discarded(stream.stream, seq, reason, link.peer)
+
+    def _taken_by_nobody(self, relayed: Relayed, link: Link, seq: int) -> None:
+        """Who wanted it has left while it was under way. It is dropped, unless it is kept, or read here."""
+        stream = relayed.stream
+        if relayed.cache is None and not self.tap(stream.stream):
+            self._discarded(link, stream, seq, DropReason.UNWANTED)
+        elif self.fates is not None:
+            self.fates.held(stream.stream, seq, ClientName(""), exposed=False)
 
     def _forward(self, relayed: Relayed, message: Message, now: float) -> bool:
         """Offer a message to all who get it. True: with that, the stream may be delivered further than before."""

@@ -57,7 +57,7 @@ class LocalStreams(ABC):
             StreamInfo(identity, info, spec),
             Reassembly(0),
             lambda _stream, _message: None,
-            lambda _stream, _reason, _nbytes, _seq: None,
+            lambda _stream, _reason, _nbytes, _seq, _reported: None,
             first=self._numbering.last(identity) + 1,
         )
         if held is not None:

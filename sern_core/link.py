@@ -15,6 +15,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from typing import Final, ParamSpec, Protocol
 
 from sern_core import wire
@@ -28,6 +29,7 @@ from sern_core.announce import (
 from sern_core.answering import Answering
 from sern_core.definitions import DefinitionStore, PeerDefinitions
 from sern_core.errors import RefusedError, RemoteError, UsageError, WireError
+from sern_core.fates import Fates
 from sern_core.fragments import InStream
 from sern_core.message import Message, StreamId, StreamInfo
 from sern_core.out_message import OutMessage
@@ -145,6 +147,8 @@ class Link(Answering):
         self._missing: dict[StreamId, float] = {}  # not announced by a new peer, and since when
         self.faults = 0
         """Errors of ours on this link so far."""
+        self.fates: Fates | None = None
+        """Told what becomes of each message here; set before the first channel is opened."""
         super().__init__(
             name=name,
             boot=boot,
@@ -232,6 +236,8 @@ class Link(Answering):
         channel.owed = owed
         channel.wanted = wanted
         channel.codec = self._new_codec(stream)
+        if self.fates is not None:
+            channel.on_count = partial(self._counted, self.fates, stream)
         channel.prime(replays, now=now)
         self.channels[slot] = channel
         self.by_stream[stream.id] = channel
@@ -239,6 +245,9 @@ class Link(Answering):
         if self.established:
             self._announce(channel, now)
         return channel
+
+    def _counted(self, fates: Fates, stream: StreamInfo, seq: int, reason: DropReason) -> None:
+        fates.dropped(stream, seq, reason, self.peer)
 
     def _reporter(self, slot: int) -> Callable[[OutMessage, DropReason], None]:
         def dropped(out: OutMessage, reason: DropReason) -> None:
@@ -401,7 +410,7 @@ class Link(Answering):
         while self._fresh:
             stream, message, steps = self._fresh.popleft()
             if steps != self.clock.steps:
-                self._tell(self.handler.on_in_drop, self, stream, DropReason.LIFESPAN, len(message.body))
+                self._in_drop(stream, DropReason.LIFESPAN, len(message.body), message.seq, reported=False)
                 continue
             try:
                 self.handler.on_message(self, stream, message, now=now)
@@ -414,24 +423,26 @@ class Link(Answering):
         if message.tombstone:
             lost = message
         elif stream.reliable:
-            self._in_drop(stream, DropReason.FAULT, len(message.body), message.seq)
+            self._in_drop(stream, DropReason.FAULT, len(message.body), message.seq, reported=True)
             lost = stream.tombstone(message.seq, DropReason.FAULT, message.stamp_ns, message.born_s)
         else:
-            self._in_drop(stream, DropReason.FAULT, len(message.body), 0)
+            self._in_drop(stream, DropReason.FAULT, len(message.body), message.seq, reported=False)
             return
         try:
             self.handler.on_message(self, stream, lost, now=self._now)
         except Exception as again:  # noqa: BLE001
             self.fault(again)
 
-    def _in_drop(self, stream: InStream, reason: DropReason, nbytes: int, seq: int) -> None:
+    def _in_drop(self, stream: InStream, reason: DropReason, nbytes: int, seq: int, reported: bool) -> None:
         if stream is self._control_in:
             return
-        if seq:
+        if reported:
             self.report_drop(stream, seq, reason, self.name, now=self._now)  # its tombstone tells the handler
             self._answered(1)
         else:
             self._tell(self.handler.on_in_drop, self, stream, reason, nbytes)
+            if self.fates is not None and reason is not DropReason.DUPLICATE:
+                self.fates.discarded(stream.stream, seq, reason, self.peer)
 
     def skip(self, channel: OutChannel, first: int, *, now: float, silent: bool = False) -> None:
         """The stream goes on at seq `first`: what lies between will not come, and the peer must not wait for it.

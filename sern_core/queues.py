@@ -75,6 +75,8 @@ class OutChannel:
         self.offered = False  # the scheduler knows of a pending message
         self.owed: tuple[str, ...] = ()  # reliable subscribers behind the peer, as it told us
         self.codec: ChannelCodec | None = None  # None: bodies go as they come
+        self.on_count: Callable[[int, DropReason], None] | None = None
+        """Told of every drop that is counted, by seq; for audits."""
 
     # --- entry ------------------------------------------------------------------------------------------------
 
@@ -95,18 +97,19 @@ class OutChannel:
                 counters.deliver(size)  # the peer has it already, from an earlier run of this relay
                 return True
             if self.wanted is False and not self.retained:
-                counters.drop(DROP_REASONS[message.tombstone] if message.tombstone else DropReason.UNWANTED, size)
+                reason = DROP_REASONS[message.tombstone] if message.tombstone else DropReason.UNWANTED
+                self._count(message.seq, reason, size)
                 self.watermark = message.seq
                 return True
             out = OutMessage(message)
             if message.tombstone:
                 out.counted = True
-                counters.drop(DROP_REASONS[message.tombstone], size)
+                self._count(message.seq, DROP_REASONS[message.tombstone], size)
         else:
             counters.offer(size)
             self.next_seq = message.seq + 1
             if self.wanted is False:
-                counters.drop(DropReason.UNWANTED, size)
+                self._count(message.seq, DropReason.UNWANTED, size)
                 return True
             if self.newest is not None:
                 self._leave_out()
@@ -134,7 +137,7 @@ class OutChannel:
         if not self.reliable or message.seq <= self.watermark:
             self._drop(out, reason)
             return
-        self.counters.drop(reason, size)
+        self._count(message.seq, reason, size)
         out.entomb(reason)
         self._keep(out)
         self.on_drop(out, reason)
@@ -176,7 +179,7 @@ class OutChannel:
         self.newest, self.newest_due_s = None, inf
         self.thinned += self.newest_thinned
         self.left_out = out.seq
-        self.counters.drop(DropReason.RATE_CAP, out.offered_bytes)
+        self._count(out.seq, DropReason.RATE_CAP, out.offered_bytes)
 
     def release(self, now: float) -> bool:
         """Let the message that was held back into the queue if its time has come. True: it did."""
@@ -234,12 +237,17 @@ class OutChannel:
         self.queued_bytes -= out.size
         return out
 
+    def _count(self, seq: int, reason: DropReason, nbytes: int) -> None:
+        self.counters.drop(reason, nbytes)
+        if self.on_count is not None:
+            self.on_count(seq, reason)
+
     def _drop(self, out: OutMessage, reason: DropReason) -> None:
         """Whatever the reason to give it up: one that may have arrived must not be counted as if it had not."""
         if out.exposed:
             reason = DropReason.UNCONFIRMED
         out.coding = Coding.DONE  # whatever another thread makes of it
-        self.counters.drop(reason, out.offered_bytes)
+        self._count(out.seq, reason, out.offered_bytes)
         self.on_drop(out, reason)
 
     # --- service ------------------------------------------------------------------------------------------------
@@ -290,7 +298,7 @@ class OutChannel:
         self.retained_bytes -= size - 1
         reported = out.counted
         if not reported:
-            self.counters.drop(reason, out.offered_bytes)
+            self._count(out.seq, reason, out.offered_bytes)
         out.entomb(reason)
         if not reported:
             self.on_drop(out, reason)
@@ -478,9 +486,9 @@ class OutChannel:
         if message.seq <= self.watermark:
             self.counters.deliver(size)
         elif message.tombstone:
-            self.counters.drop(message.drop_reason, size)  # reported where it was dropped
+            self._count(message.seq, message.drop_reason, size)  # reported where it was dropped
         else:
-            self.counters.drop(reason, size)
+            self._count(message.seq, reason, size)
             self.on_drop(OutMessage(message), reason)
         self.skip_to(message.seq + 1)
 
@@ -517,7 +525,7 @@ class OutChannel:
             if out.seq >= seq + count:
                 break
             if out.seq >= seq and not out.counted:
-                self.counters.drop(reason, out.offered_bytes)
+                self._count(out.seq, reason, out.offered_bytes)
                 out.counted = True
                 out.lost_to = where
                 self.on_drop(out, reason)
@@ -613,6 +621,12 @@ class OutChannel:
         self.queued_bytes = 0
 
     # --- accounting -----------------------------------------------------------------------------------------------
+
+    def undelivered(self) -> list[OutMessage]:
+        """What is queued or in flight; counted tombstones are neither."""
+        if self.reliable:
+            return [out for out in self.retained if not out.counted]
+        return [*self.flying.values(), *self.queue, *filter(None, (self.newest,))]
 
     def held(self) -> tuple[int, int, int, int]:
         """(messages queued, bytes queued, messages in flight, bytes in flight), bytes as they were offered; counted

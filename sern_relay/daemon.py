@@ -38,6 +38,7 @@ from sern_runtime.internal_errors import InternalErrors
 from sern_runtime.keys import KeyDirectory, KeyStatus, load_secret
 from sern_runtime.link_metrics import AgeHistograms, register_codecs, register_links, register_received
 from sern_runtime.loop import Shutdown
+from sern_runtime.message_log import LoggedFates, MessageLog
 from sern_runtime.metrics import Metrics
 from sern_runtime.optional import OptionalParts
 from sern_runtime.sdnotify import Notifier, Watchdog
@@ -104,7 +105,13 @@ class RelayDaemon:
             wall_ns=lambda _now: time.time_ns(),
             now=clock.now(),
         )
-        self.parts = OptionalParts("adaptation", "codecs", "feed", "http", "metrics", "objects", "summary")
+        self.parts = OptionalParts(
+            "adaptation", "codecs", "feed", "http", "message_log", "metrics", "objects", "summary"
+        )
+        self.message_log = MessageLog(loaded.resolve(model.message_log)) if model.message_log else None
+        self.fates: LoggedFates | None = None
+        if self.message_log is not None:
+            self.fates = self.hub.fates = LoggedFates(self.message_log, self.parts)
         self.codecs = CodecPool(after=self._after, parts=self.parts)
         self.coder = make_coder(model.link.params(), self.codecs)
         self._decoder = Decoder[StreamInfo](
@@ -242,6 +249,9 @@ class RelayDaemon:
             self.hub.sweep(now=now)
             if self.server is not None:
                 self.server.express.look()
+            if self.message_log is not None:
+                with self.parts.survive("message_log"):
+                    self.message_log.flush()
             if self.feed is not None:
                 with self.parts.survive("feed"):
                     self.feed.sweep(now=now)
@@ -414,6 +424,9 @@ class RelayDaemon:
             stack.callback(self.errors.unwatch, asyncio.get_running_loop())
             stack.callback(self.notifier.close)
             stack.callback(self._write_summary)
+            if self.message_log is not None and self.fates is not None:
+                stack.callback(self.message_log.close)
+                stack.callback(self.fates.all_held, self.hub.links.values())
             if self._ctx is not None:
                 stack.callback(self._ctx.destroy, linger=0)
             for part in (self.zap, self.server, self.lanes, self.feed, self.transforms):

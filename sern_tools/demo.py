@@ -250,7 +250,7 @@ class Demo:
                         raise child.failure()
             finally:
                 link.close()
-        return replace(run, files={name: directory / "config" / f"{name}.csv" for name in (ROBOT, SITE)})
+        return replace(run, files={name: directory / "config" / f"{name}.csv" for name in (ROBOT, RELAY, SITE)})
 
     async def _until(self, children: Children, what: str, condition: Callable[[], Awaitable[bool]]) -> None:
         deadline_s = time.monotonic() + START_S
@@ -323,6 +323,8 @@ class Demo:
             blackouts=tuple(RateSchedule.of(self.scenario.profile.up, until_s=duration_s).blackouts(duration_s)),
             reliable_topics=frozenset(name for name, log in logs.items() if log.priority == "state"),
             command_lifespans_s={COMMAND_TOPIC: self.scenario.command_lifespan_s},
+            relay=RELAY,
+            takers={ROBOT: SITE, SITE: ROBOT},
             pose_topic=POSE_TOPIC if POSE_TOPIC in poses else max(poses, key=poses.__getitem__, default=""),
         )
 

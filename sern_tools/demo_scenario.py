@@ -187,6 +187,7 @@ def _relay(ports: Ports) -> dict[str, Any]:
             {"client": SITE, "publish": [COMMAND_TOPIC], "subscribe": [f"/{ROBOT}/.*"]},
         ],
         "http": {"listen": f"{HOST}:{ports.relay_http}"},
+        "message_log": f"{RELAY}.csv",
         "summary": "relay.summary.json",
     }
 

@@ -1,8 +1,10 @@
-"""Reading message logs: CSV files in which a client writes one line per message offered, refused, delivered, expired.
+"""Reading message logs: CSV files in which clients and relays write a line for whatever happens to a message there
+(`sern_runtime/message_log.py` says what).
 
 The baseline writes the same format, so that one analysis reads both. Columns (`HEADER`): `wall_ns` is the wall time
 of the event; `stamp_ns` the wall time at which the origin took the message; `seq` counts per topic from 1; `crc32` is
-of the body; `age_s` is what SERN believed the age to be at delivery (empty where unknown).
+of the body; `age_s` is what SERN believed the age to be at delivery (empty where unknown); `peer` is the other end of
+the hop.
 """
 
 import csv
@@ -15,7 +17,7 @@ from typing import Final, NamedTuple, TextIO
 
 from sern_core.errors import ConfigError
 
-HEADER: Final = ("event", "wall_ns", "topic", "class", "seq", "bytes", "stamp_ns", "crc32", "age_s", "reason")
+HEADER: Final = ("event", "wall_ns", "topic", "class", "seq", "bytes", "stamp_ns", "crc32", "age_s", "reason", "peer")
 
 
 class Event(StrEnum):
@@ -23,6 +25,10 @@ class Event(StrEnum):
     REFUSED = "refused"
     DELIVERED = "delivered"
     EXPIRED = "expired"
+    RECEIVED = "received"
+    DROPPED = "dropped"
+    DISCARDED = "discarded"
+    HELD = "held"
 
 
 class Offer(NamedTuple):
@@ -48,7 +54,7 @@ class Delivery(NamedTuple):
 
 @dataclass(slots=True)
 class TopicLog:
-    """What both ends wrote about one topic. `origin` names the log that holds its offers."""
+    """What all who have to do with one topic wrote about it. `origin` names the log that holds its offers."""
 
     topic: str
     priority: str
@@ -57,6 +63,12 @@ class TopicLog:
     refused: set[int] = field(default_factory=set)
     expired: dict[int, str] = field(default_factory=dict)  # seq: reason
     deliveries: list[Delivery] = field(default_factory=list)  # in the order of arrival
+    received: dict[str, set[int]] = field(default_factory=dict)  # by relay
+    # By place and the other end of its hop: reasons by seq, and how many lines have each reason.
+    dropped: dict[tuple[str, str], dict[int, str]] = field(default_factory=dict)
+    discarded: dict[tuple[str, str], dict[int, str]] = field(default_factory=dict)
+    held: dict[tuple[str, str], dict[int, str]] = field(default_factory=dict)
+    lines: dict[Event, Counter[tuple[str, str]]] = field(default_factory=dict)  # place and reason
 
     @property
     def offered(self) -> int:
@@ -67,7 +79,7 @@ class TopicLog:
 
 
 def read_logs(files: Iterable[tuple[str, Path]]) -> dict[str, TopicLog]:
-    """Merge the logs of several clients, given as (client name, file).
+    """Merge the logs of several daemons, given as (name, file).
 
     Raises ConfigError with file and line for anything that is not a message log. A last line without its end is left
     out: a process that is killed while it writes leaves one.
@@ -92,7 +104,7 @@ def read_logs(files: Iterable[tuple[str, Path]]) -> dict[str, TopicLog]:
 
 
 def _take(topics: dict[str, TopicLog], client: str, row: list[str]) -> None:
-    event, wall_ns, topic, priority, seq_text, size, stamp_ns, crc, age, reason = row
+    event, wall_ns, topic, priority, seq_text, size, stamp_ns, crc, age, reason, peer = row
     log = topics.get(topic)
     if log is None:
         log = topics[topic] = TopicLog(topic, priority)
@@ -106,6 +118,13 @@ def _take(topics: dict[str, TopicLog], client: str, row: list[str]) -> None:
             log.refused.add(seq)
         case Event.EXPIRED:
             log.expired[seq] = reason
+            log.lines.setdefault(Event.EXPIRED, Counter())[client, reason] += 1
+        case Event.RECEIVED:
+            log.received.setdefault(client, set()).add(seq)
+        case Event.DROPPED | Event.DISCARDED | Event.HELD as kind:
+            table = {Event.DROPPED: log.dropped, Event.DISCARDED: log.discarded, Event.HELD: log.held}[kind]
+            table.setdefault((client, peer), {})[seq] = reason
+            log.lines.setdefault(kind, Counter())[client, reason] += 1
         case Event.DELIVERED:
             log.deliveries.append(
                 Delivery(int(wall_ns), seq, int(size), int(crc), int(stamp_ns), float(age) if age else None)
@@ -122,11 +141,11 @@ class MessageLog:
 
     def offered(self, topic: str, priority: str, offer: Offer) -> None:
         row = (Event.OFFERED, offer.wall_ns, topic, priority, offer.seq, offer.size_bytes, offer.wall_ns, offer.crc32)
-        self._writer.writerow((*row, "", ""))
+        self._writer.writerow((*row, "", "", ""))
 
     def delivered(self, topic: str, priority: str, delivery: Delivery) -> None:
         wall_ns, seq, size, crc, stamp_ns, _ = delivery
-        self._writer.writerow((Event.DELIVERED, wall_ns, topic, priority, seq, size, stamp_ns, crc, "", ""))
+        self._writer.writerow((Event.DELIVERED, wall_ns, topic, priority, seq, size, stamp_ns, crc, "", "", ""))
 
     def flush(self) -> None:
         self._file.flush()

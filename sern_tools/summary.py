@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from sern_core.types import CLASS_LABELS
 from sern_tools.counters import Counters
-from sern_tools.message_log import TopicLog
+from sern_tools.fates import NO_DROP, UNCONFIRMED, Fates, Route, fates
+from sern_tools.message_log import Event, TopicLog
 
 FRESH_S: Final = 0.5
 """A pose counts as fresh when it is no older than this above the link's floor."""
@@ -38,6 +39,8 @@ class RunFacts:
     reliable_topics: frozenset[str] = frozenset()
     command_lifespans_s: Mapping[str, float] = field(default_factory=dict)
     pose_topic: str = ""
+    relay: str = "relay"  # under which name its log was read
+    takers: Mapping[str, str] = field(default_factory=dict)  # who gets the messages of each origin
 
 
 @dataclass(slots=True)
@@ -106,9 +109,9 @@ class Result:
     first_fresh_pose_s: list[float]  # per blackout that ended in the run; inf when none came
     accounting_gap: int | None = None  # messages that no counter accounts for; None without counters
     accounting_notes: list[str] = field(default_factory=list)
-    given_up_but_arrived: int = (
-        0  # of those whose fate their sender or receiver could not know: accounted for elsewhere
-    )
+    fates: dict[str, Fates] = field(default_factory=dict)  # by topic; with counters only
+    unconfirmed: int = 0  # messages whose fate a sender could not know
+    unconfirmed_arrived: int = 0  # those of them of which the next place says it
 
     def arrivals(self, priority: str) -> tuple[Floats, Floats]:
         """(time of delivery, latency) of every delivery of a class, by time; both in seconds."""
@@ -243,52 +246,61 @@ def _first_fresh_pose(logs: Mapping[str, TopicLog], facts: RunFacts) -> list[flo
     return found
 
 
-SENDER_UNSURE: Final = frozenset({"unconfirmed"})
-"""What a sender counts without knowing whether it arrived: the acknowledgement is missing."""
-RELIABLE_UNSURE: Final = SENDER_UNSURE | {"retention", "lifespan"}
-"""The same for the origin of a reliable stream, which waits for its subscribers and may miss their last word."""
-RECEIVER_UNSURE: Final = frozenset({"lost", "reassembly", "too_large", "unwanted", "disconnected", "superseded"})
-"""What a receiver counts of which it had a part (`superseded`: one that came after a newer message), or nobody to give
-it to: the sender may count it as well."""
-NO_LOSS: Final = frozenset({"duplicate", "refused"})
+NOT_DROPPED: Final = frozenset({"duplicate", "refused"})
+"""What counters have among the reasons that is no drop: it came twice, or its caller was told."""
 
 
 def _account(result: Result, counters: Mapping[str, Sequence[Counters]]) -> None:
-    """Every message offered has one fate: delivered, refused, dropped for a reason, or still waiting; and the logs say
-    the same. None may be missing, none counted twice, except as the counters themselves say that nobody can know.
-
-    Of a reliable stream its origin learns every drop, whoever drops, so its counters are the ones to add up.
-    """
+    """Every message that was offered has one fate, by its seq (`sern_tools/fates.py`), and the daemons' counters say
+    of every place what the logs say of it, reason by reason. Nothing is tolerated."""
     result.accounting_gap = 0
+    facts = result.facts
     for name, log in sorted(result.logs.items()):
+        topic = result.topics[name]
+        route = Route(log.origin, facts.relay, facts.takers.get(log.origin, ""))
+        found = fates(log, route, reliable=name in facts.reliable_topics)
+        topic.dropped, topic.under_way = found.dropped(), found.waiting
+        result.fates[name] = found
+        given_up = log.dropped.get((route.origin, route.relay), {}), log.dropped.get((route.relay, route.taker), {})
+        result.unconfirmed += sum(UNCONFIRMED in (sent.get(seq) for sent in given_up) for seq in found.by_seq)
+        result.unconfirmed_arrived += sum(
+            UNCONFIRMED in (sent.get(seq) for sent in given_up) and fate.what != UNCONFIRMED
+            for seq, fate in found.by_seq.items()
+        )
+        gaps = Counter(found.faults.values())
+        for seq, what in sorted(found.faults.items())[:1]:
+            result.accounting_notes.append(f"{name}: {len(found.faults)} without one fate, first {seq}: {what}")
         entries = counters.get(name, ())
-        senders = [c for c in entries if c.direction == "send"]
-        offered = sum(c.offered for c in senders)
-        delivered = sum(c.delivered for c in entries if c.direction == "receive")
-        reliable = name in result.facts.reliable_topics
-        holders = senders if reliable else [c for c in entries if c.direction in ("send", "onward")]
-        others = () if reliable else [c for c in entries if c.direction in ("receive", "inward")]
-        sure, unsure = 0, 0
-        for group, doubtful in ((holders, RELIABLE_UNSURE if reliable else SENDER_UNSURE), (others, RECEIVER_UNSURE)):
-            for reason, count in ((reason, n) for c in group for reason, n in c.dropped.items()):
-                if reason in doubtful:
-                    unsure += count
-                elif reason not in NO_LOSS:
-                    sure += count
-        in_flight, in_queue = sum(c.in_flight for c in holders), sum(c.in_queue for c in holders)
-        open_ = offered - delivered - sum(c.refused for c in senders) - sure - in_queue
-        result.topics[name].under_way = max(0, min(in_flight, open_)) + in_queue
-        result.given_up_but_arrived += max(0, unsure - max(0, open_))
-        gaps = {
-            "offered and not accounted for": max(0, open_ - unsure - in_flight),
-            "accounted for more than once": max(0, -open_),
-            "offered in the log but not in the counters": log.offered - offered,
-            "delivered in the log but not in the counters": len(log.deliveries) - delivered,
+        said = {
+            "offered": (log.offered, sum(c.offered + c.refused for c in entries if c.direction == "send")),
+            "delivered": (len(log.deliveries), sum(c.delivered for c in entries if c.direction == "receive")),
         }
-        for what, gap in gaps.items():
-            if gap:
-                result.accounting_gap += abs(gap)
-                result.accounting_notes.append(f"{name}: {gap} {what}")
+        for direction, events in _LINES_OF.items():
+            lines: Counter[str] = Counter()
+            for event in events:
+                for (place, reason), count in log.lines.get(event, Counter()).items():
+                    if (place == facts.relay) == (direction in ("onward", "inward")):
+                        lines[reason] += count
+            counted: Counter[str] = Counter()
+            for entry in entries:
+                if entry.direction == direction:
+                    counted.update({reason: n for reason, n in entry.dropped.items() if reason not in NOT_DROPPED})
+            for reason in lines.keys() | counted.keys():
+                said[f"dropped ({direction}, {reason})"] = (lines[reason], counted[reason])
+        result.accounting_gap += gaps.total()
+        for what, (logged, counted_) in said.items():
+            if logged != counted_:
+                result.accounting_gap += abs(logged - counted_)
+                result.accounting_notes.append(f"{name}: {logged} {what} in the logs, {counted_} in the counters")
+
+
+_LINES_OF: Final = {
+    "send": (Event.DROPPED,),
+    "onward": (Event.DROPPED,),
+    "inward": (Event.DISCARDED,),
+    "receive": (Event.DISCARDED, Event.EXPIRED),
+}
+"""Which lines of the message logs the counters of one direction count."""
 
 
 def judge(
@@ -303,15 +315,11 @@ def judge(
     """The promises of a run. A promise that the run could not put to the test is not in the list."""
     verdicts = [_reliable(sern), _intact(sern), *_order(sern, overtaken_share_limits), *_commands(sern, late_log_s)]
     if sern.accounting_gap is not None:
-        notes = sern.accounting_notes[:4]
-        if sern.given_up_but_arrived:
-            notes.append(
-                f"{sern.given_up_but_arrived} given up without an acknowledgement had arrived, or broke off there"
-            )
+        notes = [*sern.accounting_notes[:4], *_sum_words(sern)]
         verdicts.append(
             Verdict(
                 "uncounted_messages",
-                "every drop is counted: offered = delivered + dropped by reason + still queued or in flight",
+                "every drop is counted, message by message: offered = delivered + refused + dropped + waiting",
                 sern.accounting_gap,
                 0,
                 sern.accounting_gap == 0,
@@ -343,6 +351,21 @@ def judge(
             )
         )
     return verdicts
+
+
+def _sum_words(result: Result) -> list[str]:
+    """The sum, in words, and what became of those whose sender could not know."""
+    total = sum(found.decided.total() + len(found.faults) for found in result.fates.values())
+    parts: Counter[str] = Counter()
+    for found in result.fates.values():
+        for fate, count in found.decided.items():
+            parts[fate.what if fate.what in NO_DROP else f"dropped at the {fate.place}"] += count
+    notes = [f"{total} offered = " + " + ".join(f"{count} {what}" for what, count in parts.most_common())]
+    if result.unconfirmed:
+        notes.append(
+            f"{result.unconfirmed} given up unconfirmed, of which the next place knows {result.unconfirmed_arrived}"
+        )
+    return notes
 
 
 def _ordinal(factor: float) -> str:

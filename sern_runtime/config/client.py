@@ -420,7 +420,7 @@ class ClientFile(FileModel):
     log: LogSection = LogSection()
     """The log."""
     message_log: PathText | None = None
-    """CSV file with a line for every message offered and delivered; null: none. For trials: it grows without end."""
+    """CSV file with a line for each message offered, delivered, dropped; null: none. For trials: grows without end."""
     summary: PathText | None = None
     """JSON file with the counters, written at exit; null: none."""
 

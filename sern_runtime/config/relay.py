@@ -277,6 +277,8 @@ class RelayFile(FileModel):
     """Metrics and health over HTTP."""
     log: LogSection = LogSection()
     """The log."""
+    message_log: PathText | None = None
+    """CSV file with a line for every message received and dropped; null: none. For trials: it grows without end."""
     summary: PathText | None = None
     """JSON file with the counters, written at exit; null: none."""
 
@@ -318,6 +320,7 @@ class RelayFile(FileModel):
         return tuple(section.role() for section in self.feed.roles)
 
     def file_problems(self, base_dir: Path) -> Iterator[FileProblem]:
+        yield from output_problems(base_dir, self.message_log, ("message_log",))
         yield from output_problems(base_dir, self.summary, ("summary",))
         if self.relay.secret_key_file is not None:
             loc = ("relay", "secret_key_file")

@@ -127,8 +127,10 @@ class Stage:
             reliable_topics=frozenset({COUNTER, MAP}),
             command_lifespans_s={COMMAND_TOPIC: self.scenario.command_lifespan_s},
             pose_topic=POSE_TOPIC,
+            relay=RELAY,
+            takers={ROBOT: SITE, SITE: ROBOT},
         )
-        logs = read_logs([(name, self.files[name].with_suffix(".csv")) for name in (ROBOT, SITE)])
+        logs = read_logs([(name, self.files[name].with_suffix(".csv")) for name in (ROBOT, RELAY, SITE)])
         counters = read_counters([file.with_suffix(".summary.json") for file in self.files.values()])
         return Run(analyse("SERN", logs, facts, counters), 8 * (after.bytes - before.bytes) / took_s)
 

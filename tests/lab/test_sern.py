@@ -102,8 +102,10 @@ async def run(lab: Lab, directory: Path, profile: LinkProfile, *, overload: floa
         reliable_topics=frozenset({COUNTER, MAP}),
         command_lifespans_s={COMMAND_TOPIC: scenario.command_lifespan_s},
         pose_topic=POSE_TOPIC,
+        relay=RELAY,
+        takers={ROBOT: SITE, SITE: ROBOT},
     )
-    logs = read_logs([(name, files[name].with_suffix(".csv")) for name in (ROBOT, SITE)])
+    logs = read_logs([(name, files[name].with_suffix(".csv")) for name in (ROBOT, RELAY, SITE)])
     counters = read_counters([files[name].with_suffix(".summary.json") for name in files])
     return Run(analyse("SERN", logs, facts, counters), 8 * (after.bytes - before.bytes) / took_s)
 

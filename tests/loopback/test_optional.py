@@ -7,13 +7,13 @@ import aiohttp
 import pytest
 
 from sern_client.daemon import ClientDaemon
-from sern_client.message_log import MessageLog
 from sern_core.mmcf.adapter import HopAdapter
 from sern_relay.daemon import RelayDaemon
 from sern_relay.feed import RelayFeed
 from sern_relay.transforms import TransformObjects
 from sern_runtime.adaptation import Adaptation
 from sern_runtime.link_metrics import AgeHistograms
+from sern_runtime.message_log import MessageLog
 from tests.daemons import Lab
 from tests.support import until
 

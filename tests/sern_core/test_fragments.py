@@ -43,8 +43,9 @@ class Receiver:
     def _turn(self, stream: InStream, message: Message) -> None:
         self.turns.append(message)
 
-    def _drop(self, stream: InStream, reason: DropReason, nbytes: int, seq: int) -> None:
-        self.drops.append((reason, seq))
+    def _drop(self, stream: InStream, reason: DropReason, nbytes: int, seq: int, reported: bool) -> None:
+        assert seq > 0
+        self.drops.append((reason, seq if reported else 0))
 
     def piece(self, seq: int, start: int, end: int, total: int, *, now: float = 0.0, born_s: float = 0.0) -> None:
         self.stream.fragment(0, seq, start, total, _body(seq, total)[start:end], 7, born_s, 0.0, now)

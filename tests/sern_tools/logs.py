@@ -1,9 +1,10 @@
 """Hand-written message logs: a short run that keeps every promise, for tests to spoil."""
 
+from collections import Counter
 from dataclasses import dataclass, field, replace
 
 from sern_tools.counters import Counters
-from sern_tools.message_log import Delivery, Offer, TopicLog
+from sern_tools.message_log import Delivery, Event, Offer, TopicLog
 from sern_tools.summary import Result, RunFacts, analyse
 
 ORIGIN_NS = 1_700_000_000_000_000_000
@@ -19,7 +20,13 @@ FACTS = RunFacts(
     reliable_topics=frozenset({MAP}),
     command_lifespans_s={COMMAND: 0.3},
     pose_topic=POSE,
+    takers={"robot": "site", "site": "robot"},
 )
+
+
+def ends(topic: str) -> tuple[str, str]:
+    """The origin of a topic, and who takes it."""
+    return ("site", "robot") if topic == COMMAND else ("robot", "site")
 
 
 @dataclass
@@ -31,7 +38,7 @@ class Run:
 
     def offer(self, topic: str, seq: int, at_ms: float, size: int = 100) -> None:
         log = self.logs.setdefault(topic, TopicLog(topic, PRIORITIES[topic]))
-        log.origin = "site" if topic == COMMAND else "robot"
+        log.origin = ends(topic)[0]
         log.offers[seq] = Offer(ORIGIN_NS + int(at_ms * MS), seq, size, seq * 7)
 
     def deliver(self, topic: str, seq: int, at_ms: float) -> None:
@@ -40,15 +47,48 @@ class Run:
         self.logs[topic].deliveries.append(delivery)
 
     def count(self) -> None:
-        """Counters that agree with the logs: what was not delivered was dropped by its lifespan."""
+        """What agrees with the offers and deliveries: the rest was dropped at its origin, by its lifespan. What an
+        earlier call has written is written anew."""
         for topic, log in self.logs.items():
-            sender, receiver = ("site", "robot") if topic == COMMAND else ("robot", "site")
-            missing = log.offered - len(log.deliveries)
+            sender, receiver = ends(topic)
+            delivered = {delivery.seq for delivery in log.deliveries}
+            log.dropped.clear()
+            log.lines.clear()
+            log.received = {"relay": delivered}
             self.counters[topic] = [
-                Counters(sender, "send", offered=log.offered, dropped={"lifespan": missing}),
-                Counters("relay", "relay", dropped={"duplicate": 3}),
+                Counters(sender, "send", offered=log.offered),
+                Counters("relay", "onward"),
                 Counters(receiver, "receive", delivered=len(log.deliveries)),
+                Counters("relay", "inward", dropped={"duplicate": 3}),
             ]
+            for seq in log.offers.keys() - delivered:
+                self.drop(topic, seq, "lifespan")
+
+    def drop(self, topic: str, seq: int, reason: str, *, at: str = "origin", counted: bool = True) -> None:
+        """A drop in a log and in the counters. `at`: origin, onward (at the relay), inward (there too), or taker."""
+        sender, receiver = ends(topic)
+        place, peer, event, index = {
+            "origin": (sender, "relay", Event.DROPPED, 0),
+            "onward": ("relay", receiver, Event.DROPPED, 1),
+            "taker": (receiver, "relay", Event.DISCARDED, 2),
+            "inward": ("relay", sender, Event.DISCARDED, 3),
+        }[at]
+        log = self.logs[topic]
+        table = log.dropped if event is Event.DROPPED else log.discarded
+        table.setdefault((place, peer), {})[seq] = reason
+        log.lines.setdefault(event, Counter())[place, reason] += 1
+        if counted:
+            entry = self.counters[topic][index]
+            by_reason = Counter(entry.dropped) + Counter({reason: 1})
+            self.counters[topic][index] = replace(entry, dropped=dict(by_reason))
+
+    def lose(self, topic: str, seq: int, *, received: bool) -> None:
+        """Nobody has delivered message `seq`; whether the relay had it."""
+        log = self.logs[topic]
+        log.deliveries = [delivery for delivery in log.deliveries if delivery.seq != seq]
+        with_counter(self, topic, 2, delivered=len(log.deliveries))
+        if not received:
+            log.received["relay"].discard(seq)
 
     def analyse(self, system: str = "sern", facts: RunFacts = FACTS) -> Result:
         return analyse(system, self.logs, facts, self.counters or None)

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from sern_core.errors import ConfigError
-from sern_tools.message_log import HEADER, Delivery, MessageLog, Offer, read_logs
+from sern_tools.message_log import HEADER, Delivery, Event, MessageLog, Offer, read_logs
 
 HEAD = ",".join(HEADER) + "\n"
 
@@ -30,11 +30,11 @@ def test_refused_expired_and_an_unfinished_last_line(tmp_path: Path) -> None:
     path = tmp_path / "robot.csv"
     path.write_text(
         HEAD
-        + "offered,10,/map,state,1,5,10,7,,\n"
-        + "offered,20,/map,state,2,5,20,7,,\n"
-        + "refused,30,/map,state,3,5,30,7,,refused\n"
-        + "expired,40,/map,state,2,5,20,7,1.5,retention\n"
-        + "delivered,50,/map,state,1,5,10,7,0.25,\n"
+        + "offered,10,/map,state,1,5,10,7,,,\n"
+        + "offered,20,/map,state,2,5,20,7,,,\n"
+        + "refused,30,/map,state,3,5,30,7,,refused,\n"
+        + "expired,40,/map,state,2,5,20,7,1.5,retention,\n"
+        + "delivered,50,/map,state,1,5,10,7,0.25,,\n"
         + "delivered,60,/map,sta"
     )
     log = read_logs([("robot", path)])["/map"]
@@ -44,14 +44,31 @@ def test_refused_expired_and_an_unfinished_last_line(tmp_path: Path) -> None:
     assert [d.age_s for d in log.deliveries] == [0.25]
 
 
+def test_what_places_say_of_a_message_is_kept_by_place_and_peer(tmp_path: Path) -> None:
+    path = tmp_path / "relay.csv"
+    path.write_text(
+        HEAD
+        + "received,10,/map,state,1,0,10,0,,,robot\n"
+        + "dropped,20,/map,state,1,0,0,0,,superseded,site\n"
+        + "discarded,30,/map,state,2,0,0,0,,lost,robot\n"
+        + "held,40,/map,state,3,0,0,0,,unconfirmed,site\n"
+    )
+    log = read_logs([("relay", path)])["/map"]
+    assert log.received == {"relay": {1}}
+    assert log.dropped == {("relay", "site"): {1: "superseded"}}
+    assert log.discarded == {("relay", "robot"): {2: "lost"}}
+    assert log.held == {("relay", "site"): {3: "unconfirmed"}}
+    assert log.lines[Event.DROPPED] == {("relay", "superseded"): 1}
+
+
 @pytest.mark.parametrize(
     ("text", "line"),
     [
         ("", ":1"),
         ("event,wall_ns\n", ":1"),
-        (HEAD + "offered,10,/map,state,1,5,10,7,,\nlost,10,/map,state,1,5,10,7,,\n", ":3"),
+        (HEAD + "offered,10,/map,state,1,5,10,7,,,\nlost,10,/map,state,1,5,10,7,,,\n", ":3"),
         (HEAD + "offered,10,/map\n", ":2"),
-        (HEAD + "offered,ten,/map,state,1,5,10,7,,\n", ":2"),
+        (HEAD + "offered,ten,/map,state,1,5,10,7,,,\n", ":2"),
     ],
 )
 def test_something_else_is_refused_with_its_line(tmp_path: Path, text: str, line: str) -> None:
