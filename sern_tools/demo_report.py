@@ -350,10 +350,10 @@ def _notes(report: Report) -> list[str]:
     notes += [
         "<i>Unwanted</i> are messages that were offered before anybody had subscribed to them; <i>superseded</i> ones "
         "made way for a newer sample of the same topic.",
-        "Every message is followed by its number through the logs of robot, relay and site, and has one fate: delivered, "
-        "refused, dropped at one place for one reason, or waiting at the end. <i>Unconfirmed</i> are messages that were "
-        "sent whole and given up without an acknowledgement, and of which the next place has nothing to say: they were "
-        "lost on the way. Those of which it has are counted as what became of them.",
+        "Every message is followed by its number through the logs of robot, relay and site, and has one fate: "
+        "delivered, refused, dropped at one place for one reason, or waiting at the end. <i>Unconfirmed</i> are those "
+        "that were sent whole and given up without an acknowledgement, and of which the next place has nothing to say: "
+        "they were lost on the way. Those of which it has are counted as what became of them.",
         "<i>Idle link</i> is the one-way latency of a 100-byte message over plain ZMQ through the same proxy before "
         "any load: nothing can be faster.",
         "A message is <i>overtaken</i> when a less urgent one from the same origin, offered at least 10 ms later, "
