@@ -409,7 +409,9 @@ class Link(Answering):
         self._now = now
         while self._fresh:
             stream, message, steps = self._fresh.popleft()
-            if steps != self.clock.steps:
+            lifespan_s = stream.lifespan_s
+            aged = lifespan_s is not None and now - message.born_s + message.error_s > lifespan_s  # while it lay here
+            if aged or steps != self.clock.steps:
                 self._in_drop(stream, DropReason.LIFESPAN, len(message.body), message.seq, reported=False)
                 continue
             try:

@@ -15,7 +15,7 @@ from sern_core.hub_port import HubPort
 from sern_core.link import Link
 from sern_core.message import Message, StreamInfo, TopicInfo
 from sern_core.params import SchedulerParams
-from sern_core.types import Encoding, PriorityClass, TopicName
+from sern_core.types import DropReason, Encoding, PriorityClass, TopicName
 from tests.world import Clock, SimClient, World, spec
 
 LIFESPAN_S: Final = 0.3
@@ -155,3 +155,19 @@ def test_no_command_is_obeyed_too_late_whoever_was_paused(pause: Pause) -> None:
 @pytest.mark.parametrize("who", NODES)
 def test_nor_after_an_hour(who: str) -> None:
     Scene(Pause(who, 3600.0, 1.0, 0.02)).play().check()
+
+
+def test_a_command_that_becomes_too_old_in_the_last_turn_is_not_obeyed() -> None:
+    """The loop may be busy between the turn in which it arrives and the one in which it is handed on."""
+    world = World()
+    robot = world.client("robot", patterns=["/op/.*"])
+    channel = world.client("op").publish("/op/cmd", spec(PriorityClass.CONTROL, lifespan_s=LIFESPAN_S))
+    world.run(2.0)
+    assert channel.wanted
+    link, now = robot.core.link, robot.now
+    stream = next(iter(link.incoming.values()))
+    for seq, age_s in ((1, 0.1), (2, LIFESPAN_S - 0.01)):
+        link._deliver(stream, Message(channel.stream.id, seq, b"go", 0, now - age_s))
+    link.next_datagram(now=now + 0.02)
+    assert [got.seq for got in robot.on("/op/cmd")] == [1]
+    assert robot.core.received.topics[TopicName("/op/cmd")].by_reason[DropReason.LIFESPAN] == 1
