@@ -40,7 +40,7 @@ MERGED_REPORTS: Final = 8
 SLICE_US: Final = 6000
 """What reading may cost before others get their turn, in microseconds as they are charged here and by the owner."""
 TURN_US: Final = 4
-"""A message that has its turn, without what its owner does with it."""
+"""A message that waited and has its turn, without what its owner does with it."""
 SEEN_BITS: Final = 64
 SEEN_MASK: Final = (1 << SEEN_BITS) - 1
 
@@ -493,6 +493,7 @@ class InStream:
         """A message that waited for those before it."""
         message = self._waiting.pop(seq)
         self._reassembly.held_bytes -= len(message.body) + HELD_OVERHEAD_BYTES
+        self._reassembly.work_us += TURN_US
         self.delivered = seq
         self._turn(message)
 
@@ -511,7 +512,6 @@ class InStream:
             self._on_drop(self, DropReason.LIFESPAN, size, message.seq, True)
             message = self.tombstone(message.seq, DropReason.LIFESPAN, message.stamp_ns, message.born_s)
         self.known = True
-        self._reassembly.work_us += TURN_US
         self._deliver(self, message)
 
     def sweep(self, now: float, up_since_s: float) -> None:

@@ -54,14 +54,14 @@ class Hop(Sender):
             if arrivals.due or arrivals.unacked <= 2:
                 self.dirty = True  # an acknowledgement is owed; of the third and later ones the deadline is known
         position = wire.decode_frames(data, self, position or wire.HEADER_BYTES)
-        if self.reassembly.work_us > SLICE_US:
+        if position:
             self._pause_reading(lane, number, stamp_us, data, position, now)
 
     @abstractmethod
     def _pause_reading(
         self, lane: Lane, number: int, stamp_us: int, data: wire.Datagram, position: int, now: float
     ) -> None:
-        """So much was read that others get their turn; the frames from `position` on are left, none if that is 0."""
+        """So much was read that others get their turn; the frames from `position` on are left."""
 
     def on_data(
         self,

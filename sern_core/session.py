@@ -430,7 +430,7 @@ class Session(Hop):
     def _pause_reading(
         self, lane: Lane, number: int, stamp_us: int, data: wire.Datagram, position: int, now: float
     ) -> None:
-        if position and self.established:
+        if self.established:
             self._half_read = True
             self._unread_bytes += len(data) + UNREAD_OVERHEAD_BYTES
             self._unread.appendleft((lane.id, number, stamp_us, bytes(data), position))
