@@ -209,6 +209,10 @@ OnInDrop = Callable[["InStream", DropReason, int, int, bool], None]
 class InStream:
     """One stream as it arrives. `delivered` is the highest seq up to which everything has had its turn."""
 
+    # Seldom set: there are thousands of streams.
+    _below: list[int] | None = None  # of what waits: what lies below `_first`, falling
+    _first = 0  # nothing below it will come; 0: that is done
+
     def __init__(
         self, stream: StreamInfo, reassembly: Reassembly, deliver: Deliver, on_drop: OnInDrop, *, first: int
     ) -> None:
@@ -231,8 +235,6 @@ class InStream:
         self._partials: dict[int, Partial] = {}  # best effort: untouched for longest first
         self._lowest = 0  # no half-received message has a seq below it
         self._waiting: dict[int, Message] = {}
-        self._below: list[int] | None = None  # of those: what lies below `_first`, falling
-        self._first = 0  # nothing below it will come; 0: that is done
         self._reassembly = reassembly
         self._deliver = deliver
         self._on_drop = on_drop
@@ -538,7 +540,8 @@ class InStream:
             self._lose(seq, reason)
         self._reassembly.held_bytes -= self._waiting_bytes()
         self._waiting.clear()
-        self._below = None
+        if self._below:
+            self._below = None
         self._advance()
 
     def _waiting_bytes(self) -> int:
