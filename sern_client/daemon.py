@@ -371,6 +371,11 @@ class ClientDaemon:
             "Frames from the relay that were not valid.",
             read=lambda: [((), float(self._transport.bad_frames if self._transport else 0))],
         )
+        metrics.counter(
+            "sern_http_refused_total",
+            "Requests to the HTTP server that were none.",
+            read=lambda: [((), float(self._http.refused if self._http else 0))],
+        )
         return HttpServer(
             listen,
             registry,

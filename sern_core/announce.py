@@ -27,6 +27,7 @@ MAX_ATTRIBUTE_CHARS: Final = 256
 MAX_ATTRIBUTE_BYTES: Final = 1024
 """All attributes of a stream. With the bounds on the names every announcement fits into an envelope."""
 MAX_CHANNEL: Final = 0xFFFF
+_ENCODINGS: Final = frozenset(Encoding)
 _DIGEST: Final = re.compile(rf"(?:[0-9a-f]{{{DEFINITION_HASH_CHARS}}})?")
 
 
@@ -111,7 +112,8 @@ def check_onwards(stream: StreamInfo) -> None:
     if not (stream.info.type_name.isascii() and stream.info.type_hash.isascii()):
         raise WireError(f"type {stream.info.type_name[:80]!r} or its hash holds something else than ASCII")
     onwards = Announcement(MAX_CHANNEL, stream, stream.definition_hash, wire.MAX_SEQ)
-    envelope, _ = wire.decode_control(wire.encode_control(encode_announcement(onwards)))
+    envelope = encode_announcement(onwards)
+    wire.encode_envelope(envelope)  # it is not too long; what was packed is what would be unpacked
     decode_announcement(envelope)
 
 
@@ -125,7 +127,7 @@ def decode_announcement(envelope: wire.Envelope) -> Announcement:
         max_bytes=MAX_ATTRIBUTE_BYTES,
     )
     encoding = wire.take_str(envelope, "enc", max_length=8)
-    if encoding not in set(Encoding):
+    if encoding not in _ENCODINGS:
         raise WireError(f"unknown encoding {encoding!r}")
     # Whether it is a ROS name is for the routing table to say: it refuses the stream, not the connection.
     topic = TopicName(wire.take_str(envelope, "topic"))

@@ -24,6 +24,9 @@ MAX_NAMED: Final = 0x10000
 """Price of the answers of one datagram, beside that of one for each open channel: a few bytes name many channels."""
 ANSWER_PRICE: Final = 16
 """What an answer about an open channel costs, next to one about a channel that is closed."""
+NAMED_PER_US: Final = 16
+ANSWER_US: Final = 6
+"""What naming channels, and answers about open ones, are charged with (`Reassembly.work_us`)."""
 MAX_REPORTS_UNHEARD: Final = 64
 """Control messages that may wait for the peer's acknowledgement before reports of drops wait as well."""
 
@@ -158,10 +161,12 @@ class Answering(Session):
         owed = None if want.owed is None else self._owed_so_far(("want", first), want.owed, more=False)
         for first, last in want.runs:
             self._charge(last - first + 1, now)
+            self.reassembly.work_us += (last - first + 1) // NAMED_PER_US
             for slot in range(first, last + 1):
                 channel = self.channels.get(slot)
                 if channel is not None:  # else closed meanwhile
                     self._charge(ANSWER_PRICE, now)
+                    self.reassembly.work_us += ANSWER_US
                     self._answer_came(channel, want, owed, now)
 
     def _charge(self, price: int, now: float) -> None:

@@ -37,6 +37,10 @@ MAX_REPORTS: Final = 16_384
 behind it is kept at its end."""
 MERGED_REPORTS: Final = 8
 """Latest reports of a stream that one more drop may belong to: of so many subscribers the runs are found."""
+SLICE_US: Final = 6000
+"""What reading may cost before others get their turn, in microseconds as they are charged here and by the owner."""
+TURN_US: Final = 4
+"""A message that waited and has its turn, without what its owner does with it."""
 SEEN_BITS: Final = 64
 SEEN_MASK: Final = (1 << SEEN_BITS) - 1
 
@@ -148,7 +152,7 @@ class Partial:
 class Reassembly:
     """Memory that half-received and waiting messages of one link may hold in all, and how much is to be reported."""
 
-    __slots__ = ("held_bytes", "holders", "latest", "limit_bytes", "reports")
+    __slots__ = ("behind", "held_bytes", "holders", "latest", "limit_bytes", "reports", "work_us")
 
     def __init__(self, limit_bytes: int) -> None:
         self.reports = 0  # drop reports that the peer has not heard, of all streams
@@ -157,6 +161,9 @@ class Reassembly:
         self.holders: OrderedDict[InStream, None] = OrderedDict()
         """Best-effort streams with half-received messages, untouched for longest first."""
         self.latest: InStream | None = None  # the last of them
+        self.work_us = 0  # what the reading under way has cost so far
+        self.behind: OrderedDict[InStream, None] = OrderedDict()
+        """Streams with messages whose turn has come; nothing else is read before they have had it."""
 
     def make_room(self, nbytes: int) -> bool:
         """Take `nbytes` into account; best-effort streams untouched for longest make way. False: it is too much."""
@@ -202,6 +209,10 @@ OnInDrop = Callable[["InStream", DropReason, int, int, bool], None]
 class InStream:
     """One stream as it arrives. `delivered` is the highest seq up to which everything has had its turn."""
 
+    # Seldom set: there are thousands of streams.
+    _below: list[int] | None = None  # of what waits: what lies below `_first`, falling
+    _first = 0  # nothing below it will come; 0: that is done
+
     def __init__(
         self, stream: StreamInfo, reassembly: Reassembly, deliver: Deliver, on_drop: OnInDrop, *, first: int
     ) -> None:
@@ -230,17 +241,17 @@ class InStream:
         self._now = 0.0
 
     def skip_to(self, first: int, now: float) -> int:
-        """The sender says that nothing below `first` will come. Returns how many messages that leaves out."""
+        """The sender says that nothing below `first` will come. Returns how many messages that leaves out; what waited
+        may have its turn later (`Reassembly.behind`)."""
         left_out = first - 1 - self.delivered
         if left_out <= 0 or not self.reliable:
             return 0
         self._now = now
         for seq in [seq for seq in self._partials if seq < first]:
             self._discard_partial(seq)
-        for seq in sorted(seq for seq in self._waiting if seq < first):
-            left_out -= 1
-            self._take_turn(seq)
-        self.delivered = first - 1
+        self._below = sorted((seq for seq in self._waiting if seq < first), reverse=True) or None
+        self._first = first
+        left_out -= len(self._below or ())
         self._advance()
         return left_out
 
@@ -455,14 +466,36 @@ class InStream:
                 raise WireError(f"more messages out of order than {self._reassembly.limit_bytes} bytes hold")
         self._waiting[seq] = message
 
+    def go_on(self, now: float) -> None:
+        """Go on with the messages whose turn has come."""
+        self._now = now
+        self._advance()
+
     def _advance(self) -> None:
-        while self.delivered + 1 in self._waiting:
-            self._take_turn(self.delivered + 1)
+        """Hand out what waited and waits for nothing more, at most so much that others do not wait for it."""
+        reassembly, waiting = self._reassembly, self._waiting
+        while True:
+            if self._below:
+                seq = self._below[-1]
+            else:
+                if self._first:
+                    self.delivered, self._first = max(self.delivered, self._first - 1), 0
+                seq = self.delivered + 1
+                if seq not in waiting:
+                    reassembly.behind.pop(self, None)
+                    return
+            if reassembly.work_us > SLICE_US:
+                reassembly.behind[self] = None
+                return
+            if self._below:
+                self._below.pop()
+            self._take_turn(seq)
 
     def _take_turn(self, seq: int) -> None:
         """A message that waited for those before it."""
         message = self._waiting.pop(seq)
         self._reassembly.held_bytes -= len(message.body) + HELD_OVERHEAD_BYTES
+        self._reassembly.work_us += TURN_US
         self.delivered = seq
         self._turn(message)
 
@@ -507,6 +540,9 @@ class InStream:
             self._lose(seq, reason)
         self._reassembly.held_bytes -= self._waiting_bytes()
         self._waiting.clear()
+        if self._below:
+            self._below = None
+        self._advance()
 
     def _waiting_bytes(self) -> int:
         return sum(len(message.body) + HELD_OVERHEAD_BYTES for message in self._waiting.values())
@@ -521,6 +557,8 @@ class InStream:
         name = self.stream.id.topic
         check(all(seq > self.delivered for seq in self._waiting), f"{name}: a delivered message still waits")
         check(all(seq > self.delivered for seq in self._partials), f"{name}: a stale partial message is kept")
-        check(self.delivered + 1 not in self._waiting, f"{name}: a message waits for nothing")
+        behind = self in self._reassembly.behind
+        check(behind or self.delivered + 1 not in self._waiting, f"{name}: a message waits for nothing")
+        check(behind or not (self._below or self._first), f"{name}: it was to go on at {self._first}")
         check(not self._partials.keys() & self._waiting.keys(), f"{name}: a whole message is half-received as well")
         check(self.confirmed <= self.delivered, f"{name}: more was confirmed than had its turn")

@@ -4,13 +4,14 @@
 `Session` and `Link` add the control plane: handshake, announcements, interest.
 """
 
+from abc import abstractmethod
 from typing import Any, Final
 
 from sern_core import wire
 from sern_core.capacity import AckSample
 from sern_core.codecs import KNOWN_CODECS
 from sern_core.errors import RemoteError, WireError
-from sern_core.fragments import InStream
+from sern_core.fragments import SLICE_US, InStream
 from sern_core.lanes import (
     LANE_EXPRESS,
     LANE_UDP,
@@ -28,6 +29,7 @@ from sern_core.types import (
 
 MAX_CONTROL_BYTES: Final = 2 + wire.MAX_ENVELOPE_BYTES + wire.MAX_ATTACHMENT_BYTES + 1024
 """A control message: envelope and packed attachment (what cannot be packed grows a little)."""
+WATERMARK_US: Final = 4
 
 
 class Hop(Sender):
@@ -35,21 +37,31 @@ class Hop(Sender):
 
     # --- bytes in -------------------------------------------------------------------------------------------------
 
-    def _receive_data(self, lane: Lane, number: int, stamp_us: int, data: wire.Datagram, now: float) -> None:
-        """A kind-16 datagram of the session."""
+    def _receive_data(
+        self, lane: Lane, number: int, stamp_us: int, data: wire.Datagram, now: float, position: int = 0
+    ) -> None:
+        """A kind-16 datagram of the session; `position`: it was read up to there before."""
         self._rx_lane = lane
         self._rx_stamp_us = stamp_us
         self._rx_delay = None
         self._now = now
         if stamp_us * 1e-6 - now > self.clock.ahead_s:
             self.clock.witness(stamp_us * 1e-6, now)
-        if number:
+        if number and not position:
             arrivals = lane.arrivals
             if not arrivals.arrived(number, stamp_us, len(data) + OVERHEAD_BYTES, now=now):
                 return
             if arrivals.due or arrivals.unacked <= 2:
                 self.dirty = True  # an acknowledgement is owed; of the third and later ones the deadline is known
-        wire.decode_frames(data, self)
+        position = wire.decode_frames(data, self, position or wire.HEADER_BYTES)
+        if position:
+            self._pause_reading(lane, number, stamp_us, data, position, now)
+
+    @abstractmethod
+    def _pause_reading(
+        self, lane: Lane, number: int, stamp_us: int, data: wire.Datagram, position: int, now: float
+    ) -> None:
+        """So much was read that others get their turn; the frames from `position` on are left."""
 
     def on_data(
         self,
@@ -63,7 +75,7 @@ class Hop(Sender):
         age_s: float,
         codec: int,
         error_s: float,
-    ) -> None:
+    ) -> bool | None:
         """FrameSink: one fragment."""
         now = self._now
         if codec and (codec not in KNOWN_CODECS or channel == CONTROL_CHANNEL or flags & wire.FLAG_TOMBSTONE):
@@ -80,7 +92,7 @@ class Hop(Sender):
                 self.strays += 1
                 if offset == 0 and self.on_stray is not None:
                     self.on_stray()
-                return
+                return None
             stream = known
         wide = wire.widen_seq(seq, stream.delivered)
         if wide >= wire.MAX_SEQ:
@@ -88,7 +100,7 @@ class Hop(Sender):
         if total > self.params.max_message_bytes:
             if offset == 0:
                 stream.give_up(wide, DropReason.TOO_LARGE, total, now)
-            return
+            return None
         born_s = now
         if offset == 0:
             if self._rx_delay is None:
@@ -108,6 +120,7 @@ class Hop(Sender):
                 raise  # what follows it depends on it: the session ends
             self.fault(error)
             stream.fail(wide, total, now)
+        return self.reassembly.work_us > SLICE_US
 
     def on_ack(self, lane: int, highest: int, sack: int, echo_us: int, received_us: int, cum_bytes: int) -> None:
         """FrameSink: an acknowledgement of what we sent."""
@@ -249,17 +262,19 @@ class Hop(Sender):
             else:
                 lane.ping = True
 
-    def on_watermark(self, channel: int, delivered: int) -> None:
+    def on_watermark(self, channel: int, delivered: int) -> bool | None:
         """FrameSink: everything of a reliable channel up to `delivered` has had its turn at the far side."""
         out_channel = self.channels.get(channel)
         if out_channel is None or not out_channel.reliable:
-            return
+            return None
         # It may lie beyond what was submitted here: the peer had more from an earlier relay (`OutChannel.submit`).
         wide = wire.widen_seq(delivered, out_channel.watermark)
         if wide > out_channel.watermark:
             out_channel.delivered_to(wide)
             self._refresh(out_channel, self._now)
             self._watermark_moved(out_channel)
+            self.reassembly.work_us += WATERMARK_US
+        return self.reassembly.work_us > SLICE_US
 
     def on_ping(self) -> None:
         """FrameSink: the peer asks for an acknowledgement now."""
@@ -286,7 +301,7 @@ class Hop(Sender):
         if self._unsaid and (due_s := self._say_deadline()) < deadline:
             deadline = due_s
         arrivals = lane.arrivals
-        if arrivals.unacked and (due_s := arrivals.deadline_s()) < deadline:
+        if arrivals.unacked and not self._half_read and (due_s := arrivals.deadline_s()) < deadline:
             deadline = due_s
         for candidate in (
             lane.probe_due_s if lane.stalled else lane.stall_deadline(),

@@ -38,11 +38,17 @@ from sern_core.out_message import OutMessage
 from sern_core.params import LinkParams, SchedulerParams
 from sern_core.queues import OutChannel
 from sern_core.replay import ReplayStore
-from sern_core.routing import BadPatternError, RouteChange, RoutingTable
+from sern_core.routing import UNIT_S, BadPatternError, RouteChange, RoutingTable
 from sern_core.rules import is_client_name, name_problem
 from sern_core.trace import DecisionTrace
 from sern_core.types import DROP_CODES, ClientName, DropReason, TopicName
 
+STREAM_US: Final = 50
+CHANNEL_US: Final = 80
+FORWARD_US: Final = 5
+CONFIRMED_PER_US: Final = 8
+"""What work for a client is charged to it, in microseconds: to take or end a stream, to open or close a channel, to
+hand on a message to a subscriber, and how many subscribers are asked for their share of a confirmation."""
 MAX_SUBSCRIPTION_PARTS: Final = 64
 ORPHAN_S: Final = 60.0
 """A session that a blackout cost its TCP connection has ended when its datagram lane says nothing for so long: longer
@@ -114,6 +120,9 @@ class Hub(LocalStreams):
         self._absent_since: dict[ClientName, float] = {}
         self._draining = Draining(self._end_channel)
         self._tidy_due_s = now + TIDY_S
+        self.after: Callable[[], None] = lambda: None
+        """Called when something was done by time that may have given any client's link something to send; set by the
+        shell."""
         self.tap: Callable[[StreamInfo], bool] = lambda _stream: False
         """Whether the relay itself wants a stream (a subscriber of the feed); set by the shell."""
 
@@ -151,9 +160,13 @@ class Hub(LocalStreams):
             )
             link.on_stray = self.received.stray
             link.fates = self.fates
+            link.on_read = self._was_read
             self._limit(client, now)
             self._absent_since[client] = now
         return link
+
+    def _was_read(self) -> None:
+        self.after()
 
     def _limit(self, client: ClientName, now: float) -> None:
         """Put the limits of the access rules in force."""
@@ -501,6 +514,8 @@ class Hub(LocalStreams):
             if refused is not None and refused.cache is not None:
                 self.replays.close(refused.cache)
             raise
+        if source is not None:
+            self._charge(source, change)
         relayed.keep_latched(self.replays)
         if change.added:
             self.events.stream_added(stream.stream)
@@ -535,14 +550,26 @@ class Hub(LocalStreams):
                 self.matching.look(client, now=now)
 
     def on_retract(self, link: Link, stream: InStream, *, now: float) -> None:
+        relayed = self.relayed.get(stream.stream.id)
+        if relayed is not None:
+            link.reassembly.work_us += STREAM_US + CHANNEL_US * len(relayed.outs)
         self._apply(self.routing.withdraw(stream.stream.id), now)
         self._remove(stream.stream.id, now)
+
+    def _charge(self, link: Link, change: RouteChange) -> None:
+        """What an announcement has cost is on the account of who made it."""
+        channels = len(change.matched) + len(change.unmatched)
+        for identity in (*change.updated, *change.removed):
+            channels += len(self.routing.subscribers(identity))
+        matching_us = int(self.routing.spent_units * UNIT_S * 1e6)
+        link.reassembly.work_us += STREAM_US + CHANNEL_US * channels + matching_us
 
     def on_message(self, link: Link, stream: InStream, message: Message, *, now: float) -> None:
         relayed = self.relayed.get(stream.stream.id)
         if relayed is None:
             return
         nbytes = len(message.body)
+        link.reassembly.work_us += FORWARD_US * len(relayed.outs)
         if not self._guards[link.peer].admit(nbytes, now=now):
             self._discarded(link, stream, message.seq, DropReason.RATE_CAP)
             if not stream.reliable:
@@ -638,6 +665,7 @@ class Hub(LocalStreams):
     def on_delivered(self, link: Link, channel: OutChannel, *, now: float) -> None:
         relayed = self.relayed.get(channel.stream.id)
         if relayed is not None:
+            link.reassembly.work_us += len(relayed.outs) // CONFIRMED_PER_US
             self._confirm(relayed)
 
     def on_refused(self, link: Link, channel: OutChannel, code: str, text: str, *, now: float) -> None:
@@ -656,6 +684,7 @@ class Hub(LocalStreams):
         """Nothing depends on it here: what a client subscribed to it gets."""
 
     def on_definition(self, link: Link, digest: str, *, now: float) -> None:
+        link.reassembly.work_us += len(self.links)
         for client, other in self.links.items():
             self._for(client, now, partial(other.definition_known, digest, now=now))
 

@@ -100,6 +100,7 @@ class HubPort:
             self.link.handle_timeout(now=now)
             if now >= self.hub.matching.due_s.get(self.client, math.inf):
                 self.hub.matching.go_on(self.client, now=now)
+                self.hub.after()
 
     @property
     def dirty(self) -> bool:

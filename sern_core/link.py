@@ -30,7 +30,7 @@ from sern_core.answering import Answering
 from sern_core.definitions import DefinitionStore, PeerDefinitions
 from sern_core.errors import RefusedError, RemoteError, UsageError, WireError
 from sern_core.fates import Fates
-from sern_core.fragments import InStream
+from sern_core.fragments import SLICE_US, InStream
 from sern_core.message import Message, StreamId, StreamInfo
 from sern_core.out_message import OutMessage
 from sern_core.params import LinkParams, SchedulerParams
@@ -46,6 +46,11 @@ ATTACHMENT_BURST_BYTES: Final = 6 * 2**20
 ATTACHMENT_BYTES_PER_S: Final = 64 * 2**20
 """What a peer's attachments may unpack to at once and after that: zlib makes a kilobyte of a megabyte of blank lines,
 and takes 2 ms to unpack it."""
+CONTROL_US: Final = 30
+CONTROL_BYTES_PER_US: Final = 16
+ATTACHMENT_BYTES_PER_US: Final = 250
+RETAINED_PER_US: Final = 16
+"""What a control message is charged with: itself, its size, what its attachment unpacks to, what it looks through."""
 MAX_UNHEARD: Final = 20_000
 """Control messages that a peer may have answered, beside four for each channel, before it reads an answer."""
 
@@ -144,6 +149,8 @@ class Link(Answering):
         self._attachments_left = float(ATTACHMENT_BURST_BYTES)
         self._attachments_s = 0.0
         self._announcing: deque[tuple[int, OutChannel]] = deque()  # may send once that control message is on its way
+        self._gone: deque[InStream] = deque()  # streams that the peer no longer has, to be retracted
+        self._skipping: dict[InStream, int] = {}  # how many messages a stream leaves out that goes on in a while
         self._missing: dict[StreamId, float] = {}  # not announced by a new peer, and since when
         self.faults = 0
         """Errors of ours on this link so far."""
@@ -179,6 +186,7 @@ class Link(Answering):
         self._tell(self.handler.on_wanted, self, channel, now=now)
 
     def _session_ended(self, reason: str, now: float) -> None:
+        self._gone.clear()
         self._tell(self.handler.on_down, self, reason, now=now)
 
     def _lane_closed(self) -> None:
@@ -378,6 +386,12 @@ class Link(Answering):
 
     def _skip(self, stream: InStream, first: int, now: float) -> None:
         left_out = stream.skip_to(first, now)
+        if stream in self.reassembly.behind:
+            self._skipping[stream] = left_out
+        else:
+            self._skipped(stream, left_out, now)
+
+    def _skipped(self, stream: InStream, left_out: int, now: float) -> None:
         if left_out:
             self._tell(self.handler.on_skipped, self, stream, left_out, now=now)
             self._confirm_own(stream)
@@ -478,9 +492,26 @@ class Link(Answering):
     def _synced(self, now: float) -> None:
         """The peer has announced all it has. What it left out is gone, unless it is a relay that is still learning:
         a stream it has not been told of yet keeps its delivered count here, so that "once" survives its restart."""
-        for identity, stream in list(self.streams.items()):
+        for identity, stream in self.streams.items():
             if stream.channel_id is None and identity not in self._missing:
-                self._retract(stream, now)
+                self._gone.append(stream)
+        self._go_on(now)
+
+    def _go_on(self, now: float) -> bool:
+        reassembly = self.reassembly
+        while reassembly.behind:
+            stream = next(iter(reassembly.behind))
+            stream.go_on(now)
+            if stream in reassembly.behind:
+                return False
+            self._confirm_own(stream)
+            if stream in self._skipping:
+                self._skipped(stream, self._skipping.pop(stream), now)
+        while self._gone:
+            if reassembly.work_us > SLICE_US:
+                return False
+            self._retract(self._gone.popleft(), now)
+        return True
 
     def outlived(self, origin: ClientName, boot: int, *, now: float) -> None:
         """A process of `origin` is there, `boot`: what a new relay has not been told of the ones before is gone."""
@@ -496,6 +527,7 @@ class Link(Answering):
             self.incoming.pop(stream.channel_id, None)
             self._watermarks.pop(stream.channel_id, None)
         self._forget_answers(stream)
+        self._skipping.pop(stream, None)
         self._tell(self.handler.on_retract, self, stream, now=now)
         stream.close()
         stream.channel_id = None
@@ -518,11 +550,13 @@ class Link(Answering):
 
     def _control_message(self, stream: InStream, message: Message) -> None:
         now = self._now
+        self.reassembly.work_us += CONTROL_US + len(message.body) // CONTROL_BYTES_PER_US
         room = self._attachments_left + (now - self._attachments_s) * ATTACHMENT_BYTES_PER_S
         self._attachments_left, self._attachments_s = min(room, float(ATTACHMENT_BURST_BYTES)), now
         most = min(int(self._attachments_left), wire.MAX_ATTACHMENT_BYTES)
         envelope, attachment = wire.decode_control(message.body, max_bytes=most)
         self._attachments_left -= len(attachment)
+        self.reassembly.work_us += len(attachment) // ATTACHMENT_BYTES_PER_US
         kind = wire.take_str(envelope, "t", max_length=16)
         before = self._control.next_seq
         self._handle_control(kind, envelope, attachment, now)
@@ -578,6 +612,7 @@ class Link(Answering):
         if kind == "dropped":
             reason = DROP_REASONS.get(wire.take_int(envelope, "code"), DropReason.LOST)
             where = wire.take_str(envelope, "to", max_length=64, default="")
+            self.reassembly.work_us += len(channel.retained) // RETAINED_PER_US
             count = wire.take_int(envelope, "n", low=1, high=wire.MAX_SEQ, default=1)
             channel.reported(wire.take_int(envelope, "seq"), reason, where, count)
         else:
@@ -601,6 +636,7 @@ class Link(Answering):
         for stream in self.streams.values():
             stream.close()
         self.streams.clear()
+        self._skipping.clear()
         self.incoming.clear()
         self._missing.clear()
         self.texts.close()

@@ -150,7 +150,7 @@ class RoutingTable:
         self._retired: dict[ClientName, deque[int]] = {}
         self._interests: dict[ClientName, _Interest] = {}
         self.spent_units = 0
-        """What the last `subscribe`, `go_on` or `set_access` has cost."""
+        """What the last `announce`, `subscribe`, `go_on` or `set_access` has cost."""
 
     # Look-ups --------------------------------------------------------------------------------------------------------
 
@@ -213,6 +213,7 @@ class RoutingTable:
         Raises RefusedError with code `bad_name`, `forbidden`, `name_taken`, `type_mismatch`, `old_boot` or
         `too_many_streams`.
         """
+        self.spent_units = 0
         origin, boot, _ = stream.id
         known = self._infos.get(stream.id)
         if known is not None and _same(known, stream):

@@ -122,6 +122,7 @@ class Sender(ABC):
         self.channels: dict[int, OutChannel] = {}
         self.incoming: dict[int, InStream] = {}
         """Streams of the session by the peer's channel number."""
+        self._half_read = False  # a datagram, of which nothing may be acknowledged
         self.reassembly = Reassembly(max(64 * 2**20, 2 * link.max_message_bytes))
         self.established = False
         self.version = wire.VERSION_MAX
@@ -366,7 +367,7 @@ class Sender(ABC):
             if lane.stalled:
                 lane.probe_due_s = now + PROBE_INTERVAL_S
         arrivals = lane.arrivals
-        if arrivals.unacked and (items or arrivals.due or now >= arrivals.deadline_s()):
+        if arrivals.unacked and not self._half_read and (items or arrivals.due or now >= arrivals.deadline_s()):
             # In front: the receiver's clock estimate has the newest sample before it judges the age of what follows.
             frames.insert(
                 0,

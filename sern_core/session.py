@@ -17,12 +17,13 @@ and what had its turn is known. A lane alone would not do: what was said after i
 import struct
 from abc import abstractmethod
 from collections import deque
+from collections.abc import Callable
 from typing import Final
 
 from sern_core import wire
 from sern_core.clocksync import ClockSync
 from sern_core.errors import RemoteError, WireError
-from sern_core.fragments import InStream
+from sern_core.fragments import SLICE_US, InStream
 from sern_core.hop import Hop
 from sern_core.lanes import LANE_EXPRESS, LANE_UDP, LANE_ZMQ, Lane
 from sern_core.message import Message
@@ -40,6 +41,10 @@ SHORT_SESSION_S: Final = 5.0
 """A session that is taken from us sooner than this was short."""
 DISPLACED_S: Final = (0.5, 10.0)
 """First and longest pause after the second short session in a row, and those that follow."""
+MAX_UNREAD_BYTES: Final = 32 * 2**20
+UNREAD_OVERHEAD_BYTES: Final = 256
+"""Datagrams of a peer that wait to be read, each with so much beside it: far more than any window lets a peer send that
+hears of none."""
 NUMBER_AND_STAMP: Final = struct.Struct("!IQ")
 
 
@@ -77,6 +82,13 @@ class Session(Hop):
         what arrives in the same turn may tell that our clock stood still while they lay here."""
         self.cut_off = False
         """The stream lane ended when the datagram lane was silent already: the path is gone, not the peer's process."""
+        self._unread: deque[tuple[int, int, int, bytes, int]] = deque()  # lane, number, stamp, datagram, where to go on
+        self._unread_bytes = 0
+        self.read_due_s: float | None = None
+        """When to go on reading; None: nothing that has arrived waits to be read."""
+        self._unreadable: RemoteError | None = None  # found at a time when nobody could be told
+        self.on_read: Callable[[], None] | None = None
+        """Called after something was read by time, as its owner does itself after `receive`."""
         super().__init__(
             name=name, boot=boot, peer=peer, link=link, scheduler=scheduler, trace=trace, now=now, lossless=lossless
         )
@@ -90,6 +102,10 @@ class Session(Hop):
     @abstractmethod
     def _hand_on(self, now: float) -> None:
         """Deliver what is in `_fresh`: everything that had arrived has been looked at."""
+
+    @abstractmethod
+    def _go_on(self, now: float) -> bool:
+        """Do more of what has to be done before the next frame is read. True: all of it is done."""
 
     @abstractmethod
     def _lane_closed(self) -> None:
@@ -306,6 +322,10 @@ class Session(Hop):
             stream.pause_seq = 0
         self.incoming.clear()
         self._watermarks.clear()
+        self._unread.clear()
+        self._unread_bytes = 0
+        self._half_read = False
+        self.reassembly.behind.pop(self._control_in, None)
         udp = self.lanes.pop(LANE_UDP, None)  # its keys end with the session
         if (express := self.lanes.pop(LANE_EXPRESS, None)) is not None:
             express.leave()
@@ -371,7 +391,11 @@ class Session(Hop):
                 state = self.lanes.get(lane)
                 if state is not None:
                     number, stamp_us = NUMBER_AND_STAMP.unpack_from(data, 4)
-                    self._receive_data(state, number, stamp_us, data, now)
+                    if self.read_due_s is None:
+                        self.reassembly.work_us = 0
+                        self._receive_data(state, number, stamp_us, data, now)
+                    else:
+                        self._read_later(lane, number, stamp_us, bytes(data))
             else:
                 self._receive_other(bytes(data), lane, now)
         except RemoteError:
@@ -382,6 +406,9 @@ class Session(Hop):
 
     def _receive_other(self, data: bytes, lane: int, now: float) -> None:
         """What is no datagram of the session."""
+        if self._unreadable is not None:
+            error, self._unreadable = self._unreadable, None
+            raise error
         header = wire.decode_header(data)
         if header.kind != wire.Kind.DATA:
             if lane != LANE_ZMQ:
@@ -395,8 +422,54 @@ class Session(Hop):
             # Of another session; if that one is the peer's latest, it does not know yet that it is over.
             self._send_reset(header.tag, now)
 
+    # What a peer says may cost much more than its bytes: one announcement, a channel for each of fifty subscribers. So
+    # reading stops when that has cost `SLICE_US`, and goes on after as long a rest, at the very frame: what follows
+    # depends on it. Nothing of a datagram that is half read is acknowledged, and nothing of those behind it, so that a
+    # session that ends meanwhile loses nothing; a peer that waits for acknowledgements is slowed down by it.
+
+    def _pause_reading(
+        self, lane: Lane, number: int, stamp_us: int, data: wire.Datagram, position: int, now: float
+    ) -> None:
+        if self.established:
+            self._half_read = True
+            self._unread_bytes += len(data) + UNREAD_OVERHEAD_BYTES
+            self._unread.appendleft((lane.id, number, stamp_us, bytes(data), position))
+        self.read_due_s = now + self.reassembly.work_us * 1e-6
+        self.dirty = True
+
+    def _read_later(self, lane: int, number: int, stamp_us: int, data: bytes) -> None:
+        self._unread_bytes += len(data) + UNREAD_OVERHEAD_BYTES
+        if self._unread_bytes > MAX_UNREAD_BYTES:
+            raise WireError(f"{self.peer} goes on sending although {len(self._unread)} datagrams wait to be read")
+        self._unread.append((lane, number, stamp_us, data, 0))
+
+    def _read_on(self, now: float) -> None:
+        self._now = now
+        reassembly = self.reassembly
+        reassembly.work_us = 0
+        self.read_due_s = None
+        done = self._go_on(now)
+        while done and self._unread and reassembly.work_us <= SLICE_US:
+            lane, number, stamp_us, data, position = self._unread.popleft()
+            self._unread_bytes -= len(data) + UNREAD_OVERHEAD_BYTES
+            if position:
+                self._half_read = False
+                self.dirty = True
+            state = self.lanes.get(lane)
+            if state is not None:  # else it is closed, and what came over it comes again
+                self._receive_data(state, number, stamp_us, data, now, position)
+            done = self.read_due_s is None
+        if not done or self._unread:
+            self.read_due_s = now + reassembly.work_us * 1e-6
+        if self.on_read is not None:
+            self.on_read()
+
     def next_deadline(self, lane: int = LANE_ZMQ) -> float | None:
         """When to call `handle_timeout` and `next_datagram` at the latest, if nothing else happens."""
+        deadline_s, read_due_s = self._lane_deadline(lane), self.read_due_s
+        return deadline_s if read_due_s is None or (deadline_s is not None and deadline_s < read_due_s) else read_due_s
+
+    def _lane_deadline(self, lane: int) -> float | None:
         state = self.lanes.get(lane)
         if lane != LANE_ZMQ:
             return self._data_deadline(state) if self.established and state is not None else None
@@ -407,15 +480,20 @@ class Session(Hop):
         return self._sweep_due_s
 
     def handle_timeout(self, *, now: float, lane: int = LANE_ZMQ) -> None:
-        state = self.lanes.get(lane)
         try:
             if self._fresh:
                 self._hand_on(now)
+            if self.read_due_s is not None and now >= self.read_due_s:
+                self._read_on(now)
+            state = self.lanes.get(lane)
             if self.established and state is not None and state.up and not (lane == LANE_ZMQ and self._hello_due_s):
                 self._data_timeout(state, now)
             elif lane == LANE_ZMQ and now >= self._sweep_due_s:
                 self._now = now
                 self._sweep(now)
+        except RemoteError as error:
+            self._unreadable = error
+            self._abort(f"what it sent could not be read: {error}", now)
         except Exception as error:  # noqa: BLE001  (as in `receive`)
             self.failed(error, now=now)
         self.dirty = True

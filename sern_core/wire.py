@@ -126,7 +126,7 @@ Datagram = bytes | memoryview
 
 
 class FrameSink(Protocol):
-    """What a decoder of kind-16 datagrams reports to, frame by frame, in order."""
+    """What a decoder of kind-16 datagrams reports to, frame by frame, in order. True: no more frames for now."""
 
     def on_data(
         self,
@@ -140,11 +140,11 @@ class FrameSink(Protocol):
         age_s: float,
         codec: int,
         error_s: float,
-    ) -> None: ...
+    ) -> bool | None: ...
 
     def on_ack(self, lane: int, highest: int, sack: int, echo_us: int, received_us: int, cum_bytes: int) -> None: ...
 
-    def on_watermark(self, channel: int, delivered: int) -> None: ...
+    def on_watermark(self, channel: int, delivered: int) -> bool | None: ...
 
     def on_ping(self) -> None: ...
 
@@ -173,12 +173,12 @@ def decode_header(data: bytes) -> Header:
     return Header(version, kind, tag, number, stamp_us)
 
 
-def decode_frames(data: Datagram, sink: FrameSink) -> None:
-    """Walk the frames of a kind-16 datagram whose header was checked.
+def decode_frames(data: Datagram, sink: FrameSink, position: int = HEADER_BYTES) -> int:
+    """Walk the frames of a kind-16 datagram whose header was checked, from `position` on.
 
-    Raises WireError at the first bad byte; the frames before it have been reported.
+    Returns where the next frame begins if the sink has had enough for now, else 0. Raises WireError at the first bad
+    byte; the frames before it have been reported.
     """
-    position = HEADER_BYTES
     end = len(data)
     acks = 0
     unpack_data = DATA_FIXED.unpack_from
@@ -211,9 +211,10 @@ def decode_frames(data: Datagram, sink: FrameSink) -> None:
             if flags & FLAG_TOMBSTONE and total != 1:
                 raise WireError("a tombstone carries exactly one byte")
             position += length
-            sink.on_data(
+            if sink.on_data(
                 flags, channel, seq, offset, total, body, stamp_ns, age * AGE_UNIT_S, codec, AGE_ERRORS_S[error]
-            )
+            ):
+                return position
         elif kind == FRAME_ACK:
             if position + ACK.size > end:
                 raise WireError("truncated ACK frame")
@@ -228,12 +229,14 @@ def decode_frames(data: Datagram, sink: FrameSink) -> None:
                 raise WireError("truncated WATERMARK frame")
             _, channel, delivered = WATERMARK.unpack_from(data, position)
             position += WATERMARK.size
-            sink.on_watermark(channel, delivered)
+            if sink.on_watermark(channel, delivered):
+                return position
         elif kind == FRAME_PING:
             position += 1
             sink.on_ping()
         else:
             raise WireError(f"unknown frame type {kind}")
+    return 0
 
 
 def encode_data_first(
@@ -334,6 +337,9 @@ def decode_envelope(data: bytes) -> Envelope:
     return cast(Envelope, _plain(value, MAX_ENVELOPE_DEPTH))
 
 
+_PLAIN: Final = frozenset((bool, int, float, type(None)))
+
+
 def _plain(value: object, depth: int) -> object:
     """Bytes become text, maps become dicts. Raises WireError for what an envelope may not hold."""
     if isinstance(value, bytes):
@@ -346,7 +352,14 @@ def _plain(value: object, depth: int) -> object:
     if depth == 0:
         raise WireError(f"envelope is nested deeper than {MAX_ENVELOPE_DEPTH}")
     if isinstance(value, _Map):
-        result = {_plain(key, 0): _plain(item, depth - 1) for key, item in value}
+        try:  # nearly all of it is text and numbers, and this is where the time goes that an announcement takes
+            result = {
+                key.decode(): item.decode() if type(item) is bytes else item if type(item) in _PLAIN
+                else _plain(item, depth - 1)
+                for key, item in value
+            }  # fmt: skip
+        except UnicodeDecodeError:
+            raise WireError("text in an envelope is not UTF-8") from None
         if len(result) != len(value):
             raise WireError("an envelope repeats a key")
         return result

@@ -105,6 +105,7 @@ class RelayDaemon:
             wall_ns=lambda _now: time.time_ns(),
             now=clock.now(),
         )
+        self.hub.after = self._after
         self.parts = OptionalParts(
             "adaptation", "codecs", "feed", "http", "message_log", "metrics", "objects", "summary"
         )
@@ -330,6 +331,8 @@ class RelayDaemon:
                         ("role", "result"), self._fed)  # fmt: skip
         metrics.counter("sern_relay_reload_failures_total", "Reloads that kept the old configuration.",
                         read=lambda: [((), float(self.reloads_failed))])  # fmt: skip
+        metrics.counter("sern_http_refused_total", "Requests to the HTTP server that were none.",
+                        read=lambda: [((), float(self._http.refused if self._http else 0))])  # fmt: skip
         return HttpServer(
             listen,
             registry,

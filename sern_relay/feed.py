@@ -120,6 +120,7 @@ class RelayFeed:
                 ("forbidden", fed.forbidden),
                 ("malformed", fed.malformed),
                 ("limited", fed.limited),
+                ("endless", fed.endless),
                 ("injected", injected.injected),
                 ("untyped", injected.untyped),
                 ("dropped", injected.dropped),

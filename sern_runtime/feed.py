@@ -36,6 +36,7 @@ from sern_core.access import RateGuard
 from sern_core.rules import FeedRole
 from sern_core.types import CLASSES, PriorityClass, TopicName
 from sern_runtime.clock import now
+from sern_runtime.feed_inflow import TOLD_BYTES, FeedInflow
 from sern_runtime.zmq_socket import (
     BACKLOG,
     ZERO_COPY_BYTES,
@@ -111,6 +112,7 @@ class FeedCounters:
     forbidden: int = 0  # the role may not publish that topic, or not in that class
     malformed: int = 0
     limited: int = 0  # more than the role's limits let in
+    endless: int = 0  # connections that were cut: bytes arrived on them, and no message did
 
 
 Accept = Callable[[FeedRole, TopicName], bool]
@@ -149,7 +151,7 @@ class Feed:
         self.wall_ns = wall_ns
         self._ctx = ctx
         self._keys = keys
-        self._max_message_bytes = max_message_bytes
+        self.max_message_bytes = max_message_bytes
         self._outlets: dict[str, _Outlet] = {}
         self._inlets: dict[str, _Inlet] = {}
         try:
@@ -233,9 +235,7 @@ class Feed:
     def _bound(self, kind: int, role: FeedRole, endpoint: str) -> "zmq.Socket[bytes]":
         socket = self._ctx.socket(kind)
         try:
-            apply_common_options(
-                socket, max_message_bytes=self._max_message_bytes, sndhwm=HIGH_WATER, rcvhwm=HIGH_WATER
-            )
+            apply_common_options(socket, max_message_bytes=self.max_message_bytes, sndhwm=HIGH_WATER, rcvhwm=HIGH_WATER)
             socket.setsockopt(zmq.HEARTBEAT_IVL, 0)  # not every implementation answers ZMTP pings; TCP looks instead
             socket.setsockopt(zmq.TCP_KEEPALIVE, 1)
             socket.setsockopt(zmq.BACKLOG, BACKLOG)
@@ -263,8 +263,16 @@ class _Outlet(FrameSocket):
         self.counters = FeedCounters()
         self.prefixes: set[bytes] = set()
         self._feed = feed
+        self.inflow = FeedInflow(role.name, self, socket, self._endless)
         self._untracked = 0
         self._wanted: dict[bytes, bool] = {}
+
+    def _endless(self) -> None:
+        self.counters.endless += 1
+
+    def close(self) -> None:
+        self.inflow.close()
+        super().close()
 
     def wants(self, frame: bytes, name: TopicName) -> bool:
         wanted = self._wanted.get(frame)
@@ -335,7 +343,16 @@ class _Inlet(DrainedSocket):
         self.counters = feed.counters()[role.name]
         self._feed = feed
         self._guard = _guard_of(role, feed.clock())
+        self.messages = 0
+        self.inflow = FeedInflow(role.name, self, socket, self._endless, max_message_bytes=feed.max_message_bytes)
         socket.send(b"\1")  # everything: what the role may publish is decided here, by pattern and not by prefix
+
+    def _endless(self) -> None:
+        self.counters.endless += 1
+
+    def close(self) -> None:
+        self.inflow.close()
+        super().close()
 
     def adopt(self, role: FeedRole) -> None:
         """Go by this role from now on; other limits than before begin with full buckets."""
@@ -352,15 +369,18 @@ class _Inlet(DrainedSocket):
         counters = self.counters
         on_publish = self._feed.on_publish
         guard = self._guard
-        received = received_bytes = 0
+        received = received_bytes = begun = 0
         topic = b""
+        inflow = self.inflow
         used: set[_Outlet] = set()
         try:
-            for _ in range(count):
+            for begun in range(count):  # noqa: B007  (told below, where the last one ended early, too)
                 topic = b""
                 topic = recv(_NOBLOCK)
                 header = recv(_NOBLOCK)
                 body = recv(_NOBLOCK, copy=False)
+                if inflow.watching or len(body) >= TOLD_BYTES:
+                    inflow.came(int(body.get(zmq.SRCFD)))
                 if body.more:
                     aligned = self._realign(topic, header, body)
                     if self._skipping:
@@ -394,6 +414,7 @@ class _Inlet(DrainedSocket):
                 counters.malformed += 1  # the frames ended before the third, and nothing came after them
             raise
         finally:
+            self.messages += begun
             counters.received += received
             counters.received_bytes += received_bytes
             for outlet in used:

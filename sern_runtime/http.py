@@ -30,6 +30,8 @@ class JsonQuery(NamedTuple):
 
 
 _SHUTDOWN_S: Final = 1.0
+IDLE_S: Final = 75.0
+"""A connection without a whole request for so long is closed, half a request or none; longer than between scrapes."""
 PART: Final = "http"
 _log = logging.getLogger(__name__)
 
@@ -95,7 +97,9 @@ class HttpServer:
         ready: HealthCheck,
         json_routes: Mapping[str, JsonSource | JsonQuery] | None = None,
         parts: OptionalParts | None = None,
+        idle_s: float = IDLE_S,
     ) -> None:
+        self._idle_s = idle_s
         self._parts = parts or OptionalParts(PART)
         self.listen = listen
         self._host, self._port = parse_listen(listen)
@@ -130,7 +134,12 @@ class HttpServer:
     async def start(self) -> None:
         """Raises ConfigError of one line when it cannot listen."""
         runner = web.AppRunner(
-            self._app, access_log=None, handle_signals=False, shutdown_timeout=_SHUTDOWN_S, logger=self._requests
+            self._app,
+            access_log=None,
+            handle_signals=False,
+            shutdown_timeout=_SHUTDOWN_S,
+            keepalive_timeout=self._idle_s,  # from the connection's beginning on, too
+            logger=self._requests,
         )
         self._runner = runner
         await runner.setup()

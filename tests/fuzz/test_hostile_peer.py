@@ -31,6 +31,7 @@ class Hostile:
         self.tag = 1
         self.number = 0
         self.control_seq = 0
+        self.said_bytes = 0
         self.hello()
         self.hub.links[self.name].reassembly.limit_bytes = HELD_BYTES
 
@@ -41,6 +42,7 @@ class Hostile:
     def say(self, *frames: bytes, number: int | None = None) -> None:
         self.number = self.number + 1 if number is None else number
         head = wire.encode_header(wire.Kind.DATA, self.tag, self.number, int(self.now * 1e6))
+        self.said_bytes += sum(map(len, frames))
         self.port.receive(head + b"".join(frames), now=self.now)
         self.now += 1e-4
 

@@ -4,6 +4,7 @@ Times are processor time of this thread, the best of a few tries, against a budg
 were measured on; a slower machine has the time that it needs more for a reference loop, and noise has MARGIN.
 """
 
+import gc
 import random
 import struct
 import time
@@ -28,7 +29,7 @@ from sern_core.summaries import transforms
 from sern_core.types import Encoding, TopicName
 from sern_runtime import ros_services, ros_text, ros_types
 from tests.fuzz.test_hostile_peer import Hostile, _piece, _whole
-from tests.world import spec
+from tests.world import World, spec
 
 BUDGET_S: Final = 0.020
 REFERENCE_S: Final = 0.0020
@@ -37,6 +38,8 @@ TRIES: Final = 2
 MARGIN: Final = 3.0
 MULTIPLE: Final = 24
 """Bytes of memory that an input may hold for each of its own, and..."""
+MULTIPLE_EACH: Final = 40
+"""... and for each client that gets what is announced in it: a channel with its queue and counters takes 7 kB."""
 BASE_BYTES: Final = 2 * 2**20
 """... what it may hold whatever its size: caches that fill, what one attachment unpacks to."""
 
@@ -59,6 +62,9 @@ class Input:
 
     nbytes: int
     take: Callable[[], object]
+    clients: int = 0
+    rest: Callable[[], bool] = lambda: False
+    """Does one more slice of it, in another turn of the loop; False: there was none."""
 
 
 Make = Callable[[], Input]
@@ -66,13 +72,27 @@ INPUTS: dict[str, Make] = {}
 
 
 def price_s(make: Make) -> float:
-    """The processor time of one input, the best of some tries."""
+    """The processor time of the longest slice of one input, the best of some tries."""
     best_s = float("inf")
     for _ in range(TRIES):
         given = make()
-        start_s = time.thread_time()
-        given.take()
-        best_s = min(best_s, time.thread_time() - start_s)
+        longest_s = 0.0
+        gc.collect()
+        gc.disable()  # a collection costs what there is in the process, and not what came
+        try:
+            start_s = time.thread_time()
+            given.take()
+            longest_s = time.thread_time() - start_s
+            more = True
+            while more:
+                start_s = time.thread_time()
+                more = given.rest()
+                longest_s = max(longest_s, time.thread_time() - start_s)
+        finally:
+            gc.enable()
+        best_s = min(best_s, longest_s)
+        if best_s <= BUDGET_S:
+            break
     return best_s
 
 
@@ -82,32 +102,56 @@ def within_budget(make: Make) -> bool:
 
 
 def held_bytes(make: Make) -> tuple[int, int]:
-    """What an input adds to memory at most, and its size."""
+    """What an input adds to memory at most, and what its size allows."""
     given = make()
     tracemalloc.start()
     try:
         before = tracemalloc.get_traced_memory()[0]
         kept = given.take()
+        while given.rest():
+            pass
         peak = tracemalloc.get_traced_memory()[1] - before
         del kept
     finally:
         tracemalloc.stop()
-    return peak, given.nbytes
+    return peak, given.nbytes * (MULTIPLE + MULTIPLE_EACH * given.clients)
 
 
 # --- datagrams -------------------------------------------------------------------------------------------------------
+
+
+def one_more_slice(peer: Hostile) -> bool:
+    """What the relay goes on with for this client when its time comes."""
+    due_s = peer.hub.links[peer.name].read_due_s
+    match_s = peer.hub.matching.due_s.get(peer.name)
+    times = [at for at in (due_s, match_s) if at is not None]
+    if not times:
+        return False
+    peer.now = max(peer.now, min(times))
+    peer.port.handle_timeout(now=peer.now)
+    return True
+
 
 Prepare = Callable[[Hostile], list[bytes]]
 ROOM: Final = 64_000
 
 
-def datagram(prepare: Prepare) -> Prepare:
-    """One datagram to a relay, made of frames; `prepare` may say more before, which costs nothing here."""
+def datagram(
+    prepare: Prepare, *, clients: int = 0, patterns: tuple[str, ...] = (".*",), sets_off: bool = False
+) -> Prepare:
+    """One datagram to a relay, made of frames; `prepare` may say more before, which costs nothing here. So many
+    `clients` want what their `patterns` say. `sets_off`: it is what the peer has said before that has its turn now, and
+    its size counts."""
 
     def make() -> Input:
-        peer = Hostile()
+        world = World()
+        peer = Hostile(world)
+        for number in range(clients):
+            reader = Hostile(world, f"reader{number}")
+            reader.control({"t": "subscribe", "patterns": list(patterns), "more": False})
         peer.hub.links[peer.name].reassembly.limit_bytes = 64 * 2**20
         frames = b"".join(prepare(peer))
+        before = peer.said_bytes if sets_off else 0
         assert len(frames) <= wire.MAX_DATAGRAM_BYTES - wire.HEADER_BYTES
 
         def take() -> object:
@@ -115,10 +159,22 @@ def datagram(prepare: Prepare) -> Prepare:
                 peer.say(frames)
             return peer
 
-        return Input(len(frames), take)
+        return Input(len(frames) + before, take, clients, lambda: one_more_slice(peer))
 
-    INPUTS[f"datagram: {prepare.__name__}"] = make
+    to = f", for {clients} clients of {len(patterns[0])} characters" if clients else ""
+    INPUTS[f"datagram: {prepare.__name__}{to}"] = make
     return prepare
+
+
+def said(peer: Hostile, *frames: bytes) -> None:
+    """Say it, and let all of it be read."""
+    peer.say(*frames)
+    while one_more_slice(peer):
+        pass
+
+
+def for_fifty(prepare: Prepare) -> Prepare:
+    return datagram(prepare, clients=50)
 
 
 def filled(piece: Callable[[int], bytes]) -> list[bytes]:
@@ -280,6 +336,97 @@ def announcements(peer: Hostile) -> list[bytes]:
         return control(peer, wire.encode_control(encode_announcement(Announcement(1 + index, stream, "", 1, ()))))
 
     return filled(announcement)
+
+
+for_fifty(small_messages)
+for_fifty(watermarks)
+for_fifty(announcements)
+HOSTILE_PATTERN: Final = "/.*(a|b)" + "[a-z]{0,60}" * 8 + "x"
+datagram(announcements, clients=50, patterns=(HOSTILE_PATTERN,))
+
+
+@datagram
+def patterns_against_two_hundred_topics(peer: Hostile) -> list[bytes]:
+    for index in range(200):
+        peer.announce(1 + index, f"/robot/{'abcdefghij' * 8}{index}")
+    return filled(lambda index: control(peer, wire.encode_control(
+        {"t": "subscribe", "patterns": [HOSTILE_PATTERN[:-1] + chr(97 + index % 26)], "more": False})))  # fmt: skip
+
+
+def with_channels(peer: Hostile, count: int) -> None:
+    """The relay has so many streams for the peer, which wants them."""
+    other = Hostile(peer.world, "other")
+    for index in range(count):
+        other.announce(1 + index, f"/other/t{index}", reliable=True)
+    peer.control({"t": "subscribe", "patterns": ["/other/.*"], "more": False})
+    while one_more_slice(peer):
+        pass
+
+
+@for_fifty
+def answers_about_many_channels(peer: Hostile) -> list[bytes]:
+    with_channels(peer, 400)
+    return filled(lambda index: control(peer, wire.encode_control(
+        {"t": "want", "ch": 1, "on": bool(index % 2), "chs": [2, 0xFFFF]})))  # fmt: skip
+
+
+@for_fifty
+def runs_of_dropped_messages(peer: Hostile) -> list[bytes]:
+    other = Hostile(peer.world, "other")
+    other.announce(1, "/other/log", reliable=True)
+    peer.control({"t": "subscribe", "patterns": ["/other/.*"], "more": False})
+    for start in range(1, 3000, 500):
+        said(other, *(_whole(1, seq) for seq in range(start, start + 500)))
+    return filled(lambda index: control(peer, wire.encode_control(
+        {"t": "dropped", "ch": 1, "seq": 1 + index % 3000, "code": 1, "to": "x", "n": 3000})))  # fmt: skip
+
+
+@for_fifty
+def objects_as_large_as_they_may_be(peer: Hostile) -> list[bytes]:
+    return filled(lambda index: control(peer, wire.encode_control(
+        {"t": "object", "op": "put", "id": f"robot/o{index}", "type": "a/b"}, bytes(wire.MAX_ATTACHMENT_BYTES)
+    )))  # fmt: skip
+
+
+@for_fifty
+def definitions_that_fifty_may_wait_for(peer: Hostile) -> list[bytes]:
+    texts = [f"{index}" + "#" * (wire.MAX_ATTACHMENT_BYTES - 9) for index in range(4)]
+    for index, text in enumerate(texts):
+        peer.announce(1 + index, f"/robot/t{index}", digest=definition_hash(text))
+    return filled(lambda index: control(peer, wire.encode_control(
+        {"t": "define", "dh": definition_hash(texts[index % 4])}, texts[index % 4].encode())))  # fmt: skip
+
+
+@for_fifty
+def streams_that_are_gone(peer: Hostile) -> list[bytes]:
+    for index in range(300):
+        peer.announce(1 + index, f"/robot/t{index}")
+    return filled(lambda index: control(peer, wire.encode_control({"t": "retract", "ch": 1 + index})))
+
+
+def all_streams_at_once(peer: Hostile) -> list[bytes]:
+    for index in range(300):
+        peer.announce(1 + index, f"/robot/t{index}")
+    peer.hello(2)
+    peer.tag, peer.control_seq = 2, 0
+    return [control(peer, wire.encode_control({"t": "synced", "batch": True}))]
+
+
+def the_one_they_wait_for(peer: Hostile) -> list[bytes]:
+    peer.announce(1, "/robot/a", reliable=True)
+    for start in range(2, 8_000, 1000):
+        said(peer, *(_whole(1, seq) for seq in range(start, start + 1000)))
+    return [_whole(1, 1)]
+
+
+def none_below(peer: Hostile) -> list[bytes]:
+    the_one_they_wait_for(peer)
+    return [control(peer, wire.encode_control({"t": "first", "ch": 1, "seq": 100_000}))]
+
+
+for set_off in (all_streams_at_once, the_one_they_wait_for, none_below):
+    datagram(set_off, sets_off=True)
+    datagram(set_off, sets_off=True, clients=50)
 
 
 @datagram
@@ -451,8 +598,8 @@ def test_an_input_holds_the_loop_for_a_bounded_time(name: str) -> None:
 
 @pytest.mark.parametrize("name", list(INPUTS))
 def test_an_input_adds_a_bounded_multiple_of_its_size_to_memory(name: str) -> None:
-    peak, nbytes = held_bytes(INPUTS[name])
-    assert peak <= BASE_BYTES + MULTIPLE * nbytes
+    peak, allowed_bytes = held_bytes(INPUTS[name])
+    assert peak <= BASE_BYTES + allowed_bytes
 
 
 # --- anything --------------------------------------------------------------------------------------------------------
@@ -538,5 +685,5 @@ def test_anything_has_a_bounded_price(kind: Callable[[random.Random], Make], see
     make = kind(random.Random(seed))
     assert within_budget(make)
     if seed % 8 == 0:  # counting memory is slow
-        peak, nbytes = held_bytes(make)
-        assert peak <= BASE_BYTES + MULTIPLE * nbytes
+        peak, allowed_bytes = held_bytes(make)
+        assert peak <= BASE_BYTES + allowed_bytes

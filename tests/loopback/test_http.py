@@ -11,7 +11,7 @@ from prometheus_client import CollectorRegistry
 from prometheus_client.parser import text_string_to_metric_families
 
 from sern_core.errors import ConfigError, UsageError
-from sern_runtime.http import Health, HttpServer, parse_listen
+from sern_runtime.http import IDLE_S, Health, HttpServer, parse_listen
 from sern_runtime.metrics import Metrics
 from tests.support import until
 
@@ -19,7 +19,7 @@ from tests.support import until
 class Daemon:
     """A server and what it is asked about."""
 
-    def __init__(self, listen: str = "127.0.0.1:0") -> None:
+    def __init__(self, listen: str = "127.0.0.1:0", *, idle_s: float = IDLE_S) -> None:
         self.registry = CollectorRegistry()
         self.metrics = Metrics(self.registry, process=False)
         self.health = Health(ok=True, reason="ok")
@@ -33,6 +33,7 @@ class Daemon:
                 "/api/link": lambda: {"up": True, "rtt_s": 0.025},
                 "/api/broken": lambda: dict[str, int]()["no such key"],
             },
+            idle_s=idle_s,
         )
 
     async def get(self, path: str, **headers: str) -> tuple[int, str, str]:
@@ -184,3 +185,16 @@ async def test_half_a_request_is_nothing_to_speak_of(caplog: pytest.LogCaptureFi
     assert await daemon.get("/healthz") == (200, "text/plain", "ok\n")
     await daemon.server.stop()
     assert [record.getMessage() for record in caplog.records] == []
+
+
+@pytest.mark.parametrize("part", [b"", b"GET /heal", b"GET /healthz HTTP/1.1\r\nHost: x\r\n"])
+async def test_a_connection_without_a_whole_request_is_closed(part: bytes) -> None:
+    daemon = Daemon(idle_s=0.05)
+    await daemon.server.start()
+    reader, writer = await asyncio.open_connection("127.0.0.1", daemon.server.port)
+    writer.write(part)
+    async with asyncio.timeout(30.0):
+        assert await reader.read() == b""
+    writer.close()
+    assert await daemon.get("/healthz") == (200, "text/plain", "ok\n")
+    await daemon.server.stop()
