@@ -174,7 +174,7 @@ class Link(Answering):
         self._unheard = self._unheard_seq = 0
         self._begin_answers()
         self._announcing.clear()
-        if self.initiator and not resumed:  # whatever becomes of this session: a new relay has yet to learn of them
+        if self.initiator and not resumed:  # a new relay has yet to learn of them
             for identity in self.streams:
                 self._missing.setdefault(identity, now)
         self.handler.on_up(self, resumed=resumed, now=now)

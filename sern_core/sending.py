@@ -354,7 +354,7 @@ class Sender(ABC):
                 self.dirty = False
                 try:
                     window_open = self._compose(lane, frames, items, now)
-                except Exception:
+                except Exception:  # goes on to whoever called; only the state is put right here
                     self._give_back(lane, items, now)  # what was taken would be neither in flight nor waiting
                     raise
                 if not items and not window_open and not lane.path.held and self._backlog:

@@ -306,7 +306,7 @@ class Session(Hop):
         self.trace.record(now, LINK, TraceEvent.LINK_UP, peer=self.peer)
         try:
             self._session_began(resumed, now)
-        except Exception:
+        except Exception:  # goes on to whoever called; only the state is put right here
             self.peer_boot = None  # the owner may not have begun: to it the next session is the first with that peer
             raise
 

@@ -104,7 +104,7 @@ class Pump:
         now = clock.now()
         try:
             self._serve(now)
-        except Exception:
+        except Exception:  # goes on to the loop's handler, which counts it
             self._timer.arm(now + AGAIN_S)  # whatever it was, the port is asked again
             raise
 

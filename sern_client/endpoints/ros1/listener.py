@@ -1,10 +1,11 @@
 """What the two ports of a node have in common: one listening socket, from `start` to `stop`."""
 
 import asyncio
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 
 
-class Listener:
+class Listener(ABC):
     """`protocol` makes the protocol of each connection that is accepted."""
 
     def __init__(self, protocol: Callable[[], asyncio.BaseProtocol]) -> None:
@@ -24,5 +25,6 @@ class Listener:
             await self._end_connections()
             await server.wait_closed()
 
+    @abstractmethod
     async def _end_connections(self) -> None:
-        raise NotImplementedError
+        """End every connection that was accepted, and wait for its end."""
