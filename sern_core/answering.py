@@ -5,18 +5,16 @@ and become runs of messages meanwhile; they survive the session.
 """
 
 from abc import abstractmethod
-from typing import Final
+from typing import Final, Unpack
 
 from sern_core import wire
 from sern_core.announce import Want, encode_dropped
 from sern_core.errors import WireError
 from sern_core.fragments import InStream
 from sern_core.interest import Interest
-from sern_core.params import LinkParams, SchedulerParams
 from sern_core.queues import OutChannel
-from sern_core.session import Session
-from sern_core.trace import DecisionTrace
-from sern_core.types import DROP_CODES, ClientName, DropReason
+from sern_core.session import Session, SessionArguments
+from sern_core.types import DROP_CODES, DropReason
 
 MAX_OWED: Final = 8192
 """Names in lists that have begun and not ended, and of one stream."""
@@ -34,34 +32,12 @@ MAX_REPORTS_UNHEARD: Final = 64
 class Answering(Session):
     """`Session` with answers and reports. `Link` adds what they are about."""
 
-    def __init__(
-        self,
-        *,
-        name: ClientName,
-        boot: int,
-        peer: ClientName,
-        initiator: bool,
-        link: LinkParams,
-        scheduler: SchedulerParams,
-        trace: DecisionTrace,
-        now: float,
-        lossless: bool,
-    ) -> None:
+    def __init__(self, **session: Unpack[SessionArguments]) -> None:
         self._interest = Interest()
         self._reporting: dict[InStream, None] = {}  # streams with drops that the peer is still to be told of
         self._owed_parts: dict[tuple[str, int], tuple[str, ...]] = {}  # by message and channel: more will come
         self._price = self._priced_us = 0  # of the answers that came at this time
-        super().__init__(
-            name=name,
-            boot=boot,
-            peer=peer,
-            initiator=initiator,
-            link=link,
-            scheduler=scheduler,
-            trace=trace,
-            now=now,
-            lossless=lossless,
-        )
+        super().__init__(**session)
 
     @abstractmethod
     def send_control(self, envelope: wire.Envelope, attachment: bytes = b"", *, now: float) -> int: ...

@@ -18,7 +18,7 @@ import struct
 from abc import abstractmethod
 from collections import deque
 from collections.abc import Callable
-from typing import Final
+from typing import Final, TypedDict
 
 from sern_core import wire
 from sern_core.clocksync import ClockSync
@@ -46,6 +46,20 @@ UNREAD_OVERHEAD_BYTES: Final = 256
 """Datagrams of a peer that wait to be read, each with so much beside it: far more than any window lets a peer send that
 hears of none."""
 NUMBER_AND_STAMP: Final = struct.Struct("!IQ")
+
+
+class SessionArguments(TypedDict):
+    """What a session is made with; those who add to it pass it on."""
+
+    name: ClientName
+    boot: int
+    peer: ClientName
+    initiator: bool
+    link: LinkParams
+    scheduler: SchedulerParams
+    trace: DecisionTrace
+    now: float
+    lossless: bool
 
 
 class Session(Hop):
