@@ -2,6 +2,7 @@
 
 import pytest
 
+from sern_client.endpoints.base import Endpoint
 from sern_client.endpoints.dds.domain import DomainOptions
 from sern_client.endpoints.dds.endpoint import DdsEndpoint, DdsOptions
 from sern_client.endpoints.zenoh.endpoint import ZenohEndpoint, ZenohOptions
@@ -21,13 +22,8 @@ def seen(changes: Changes, others: Events) -> bool:
     return {str(name): info.type_name for name, info in others.infos.items()} == wanted
 
 
-@pytest.mark.parametrize("seed", SEEDS)
-async def test_dds(seed: int) -> None:
-    domain = DomainOptions(free_domain(), localhost_only=True, lease_s=3.0)
-    endpoint, observer = DdsEndpoint(DdsOptions(domain)), DdsEndpoint(DdsOptions(domain, heed_sern=True))
-    events = Events()
-    await endpoint.start(Events())
-    await observer.start(events)
+async def agree(endpoint: Endpoint, events: Events, seed: int) -> None:
+    """After random changes, what `events` were told of is what is wanted."""
     changes = Changes(endpoint, seed, encoding=Encoding.CDR)
     try:
         await changes.run()
@@ -35,6 +31,18 @@ async def test_dds(seed: int) -> None:
         await until(lambda: seen(changes, events), "the other endpoint sees what is wanted")
     finally:
         changes.close()
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+async def test_dds(seed: int) -> None:
+    domain = DomainOptions(free_domain(), localhost_only=True, lease_s=3.0)
+    endpoint, observer = DdsEndpoint(DdsOptions(domain)), DdsEndpoint(DdsOptions(domain, heed_sern=True))
+    events = Events()
+    await endpoint.start(Events())
+    await observer.start(events)
+    try:
+        await agree(endpoint, events, seed)
+    finally:
         await observer.stop()
         await endpoint.stop()
 
@@ -48,12 +56,8 @@ async def test_zenoh(seed: int) -> None:
     events = Events()
     await observer.start(events)
     await endpoint.start(Events())
-    changes = Changes(endpoint, seed, encoding=Encoding.CDR)
     try:
-        await changes.run()
-        await changes.at_rest()
-        await until(lambda: seen(changes, events), "the other endpoint sees what is wanted")
+        await agree(endpoint, events, seed)
     finally:
-        changes.close()
         await endpoint.stop()
         await observer.stop()
