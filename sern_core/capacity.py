@@ -75,6 +75,12 @@ class CapacityEstimator(ABC):
         """Round-trip time of the empty path; None while unknown."""
 
     @property
+    def eased_s(self) -> float:
+        """When packets were last seen to take clearly less time than the link as it is known can have given them: it
+        may have got faster, though there was too little to send to tell by how much. -inf: never."""
+        return -inf
+
+    @property
     def pacing_bps(self) -> float | None:
         """How fast to send while the window is open; None: at once."""
         return None

@@ -27,7 +27,7 @@ from math import inf
 from typing import Final
 
 from sern_core.capacity import AckSample, CapacityEstimator, Receiver
-from sern_core.control.parts import BaseDelay, Cubic, GreatestRate, LatelyArrived, Swing, Train
+from sern_core.control.parts import BaseDelay, Cubic, Eased, GreatestRate, LatelyArrived, Swing, Train
 
 MIN_EPOCH_S: Final = 0.040
 MIN_EPOCH_SAMPLES: Final = 4
@@ -56,6 +56,8 @@ FIRST_GROWTH: Final = 0.02
 MAX_GROWTH: Final = 0.25
 CUT: Final = 0.95
 EMERGENCY_CUT: Final = 0.9
+WENT: Final = 0.25
+"""Of the longest queue since the link got slower; one that came down to so much as we made way was ours."""
 SLOWER: Final = 0.8
 """Less than this share of the known rate through a queue that stays: the link got slower."""
 EMERGENCY_S: Final = 0.050
@@ -130,6 +132,7 @@ class HybridWindow(CapacityEstimator):
         self._startup = True
         self._cubic: Cubic | None = None  # while somebody else keeps the queue
         self._loss_floor = 0.0
+        self._eased = Eased()
         self._lost_s = -inf
         self._restart()
 
@@ -138,6 +141,7 @@ class HybridWindow(CapacityEstimator):
         self._epoch_s: float | None = None
         self._samples: list[tuple[float, float]] = []  # (queue, way back) of the epoch
         self._limited = 0
+        self._longest = 0  # bytes of a packet
         self._lost_bytes = self._acked_bytes = 0
         self._inflight = 0
         self._small.epoch.clear()
@@ -145,6 +149,7 @@ class HybridWindow(CapacityEstimator):
         self._mark: tuple[float, int] | None = None
         self._span_limited = False
         self._faster_rate: float | None = None  # before the link seemed to get slower
+        self._most_queue_s: float | None = None  # since then, whatever share of it we had
         self._full: tuple[float, int] | None = None  # (time, bytes) at the receiver since which a queue never went
         self._arrived = LatelyArrived()
         self._busy_s: float | None = None
@@ -190,6 +195,10 @@ class HybridWindow(CapacityEstimator):
         return 8 * self._pacing if self._pacing is not None else None
 
     @property
+    def eased_s(self) -> float:
+        return self._eased.at_s
+
+    @property
     def rtprop_s(self) -> float | None:
         return self._rtt_s
 
@@ -205,6 +214,7 @@ class HybridWindow(CapacityEstimator):
     # --- what it sees ---------------------------------------------------------------------------------------------
 
     def on_sent(self, *, now: float, nbytes: int, inflight_bytes: int) -> None:
+        self._longest = max(self._longest, nbytes)
         if nbytes > self._fragment:
             if self._peak and self._saturated:
                 self._large.shift((nbytes - self._fragment) / self._peak)
@@ -243,6 +253,10 @@ class HybridWindow(CapacityEstimator):
         least = base.least
         queue_s = delay_s - least[0][1] if least else 0.0
         self._samples.append((queue_s, back_s))
+        if self._saturated and self._rate is not None:
+            size = nbytes or self._fragment
+            queued = not sample.app_limited or queue_s > self._fragment / self._rate
+            self._eased.note(now, receiver_s - sent_s, size, self._rate, queued=queued)
         if not sample.app_limited:
             self._limited += 1
             self._busy_s = now  # the pacer may hold back what the window would let go
@@ -318,17 +332,35 @@ class HybridWindow(CapacityEstimator):
     def _forget_rate(self, now: float, rate: float) -> None:
         if self._faster_rate is None and self._rate is not None and self._rate >= self._peak / 2:
             self._faster_rate = self._rate  # we had most of the link
+        if self._most_queue_s is None and self._rate is not None and rate < SLOWER * self._rate:
+            self._most_queue_s = 0.0
         self._rates.clear()
         self._note_rate(now, rate)
 
-    def _emptied_slower(self) -> None:
+    def _went(self, queue_s: float) -> bool:
+        """Whether the queue of a link that got slower came down to the least that we have under way. On a link that is
+        a hundred times slower that is long against what a packet took before, and no queue seems ever to go."""
+        most_s = self._most_queue_s
+        if most_s is None or self._rate is None:
+            return False
+        self._most_queue_s = max(most_s, queue_s)
+        room = 2 * self._fragment
+        least = self._window <= room and queue_s * self._rate < self._window + room
+        return least and queue_s < WENT * most_s
+
+    def _emptied_slower(self, now: float) -> None:
         """The queue went as we made way, so it was ours, and the link is slower: what a packet takes on it is none."""
-        faster, rate = self._faster_rate, self._rate
-        self._faster_rate = None
-        if faster is None or rate is None or rate >= faster:
+        faster, rate = self._faster_rate or self._peak, self._rate
+        self._faster_rate = self._most_queue_s = None
+        if not faster or rate is None or rate >= faster:
             return
         self._peak = rate
-        self._large.shift(self._fragment / rate - self._fragment / faster)
+        self._small.keep_least(now)
+        self._large.keep_least(now)
+        # The fragments of a stream get shorter with its rate.
+        fragment = min(self._fragment, max(self._longest, self._first_fragment_bytes))
+        self._large.shift(fragment / rate - self._fragment / faster)
+        self._fragment = fragment
 
     def _draining(self, now: float) -> bool:
         """Whether what arrives now may have been sent while draining."""
@@ -414,8 +446,10 @@ class HybridWindow(CapacityEstimator):
         self._target_s = TARGET_S + packets * min(own_s, 4 * serialise_s) + noise_s + turns_s
         self._high_s = max(0.010, 0.1 * rtt_s) + serialise_s + 1.5 * noise_s
         self._recent.append(queue_s)
-        if self._faster_rate is not None and queue_s <= self._high_s:
-            self._emptied_slower()
+        if (self._faster_rate is not None and queue_s <= self._high_s) or self._went(queue_s):
+            self._emptied_slower(now)
+        elif queue_s <= self._high_s:
+            self._most_queue_s = None
         if self._judging and self._drain_until_s is None:
             self._judging = False
             self._judge(now, queue_s, rtt_s)
@@ -451,7 +485,7 @@ class HybridWindow(CapacityEstimator):
                 self._drain(now, rtt_s)
         self._pace()
         samples.clear()
-        self._limited = 0
+        self._limited = self._longest = 0
         self._lost_bytes = self._acked_bytes = 0
         self._epoch_s = now
 
@@ -574,7 +608,7 @@ class HybridWindow(CapacityEstimator):
         )
 
     def _compete(self, now: float, rtt_s: float) -> None:
-        self._faster_rate = None
+        self._faster_rate = self._most_queue_s = None
         window = max(self._window, self._calm_window, (self._arrived.rate() or 0.0) * rtt_s)
         window = min(window, MAX_WINDOW_BYTES)
         self._cubic = Cubic(now, window, self._fragment)

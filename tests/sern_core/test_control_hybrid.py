@@ -107,6 +107,19 @@ def test_the_estimate_follows_the_capacity(off_s: float, tick_s: float) -> None:
         assert off[-1] - from_s < within_s
 
 
+def test_a_link_that_gets_faster_shows_in_what_little_is_sent_and_nothing_else_does() -> None:
+    model = LinkModel(
+        rate_bps=40e6, delay_s=0.005, overhead_bytes=60, rate_steps=(RateStep(3.0, 0.3e6), RateStep(30.0, 40e6))
+    )
+    world = World(model, seed=1)
+    estimator = HybridWindow()
+    world.flow(estimator, stop_s=12.0)  # from then on only poses
+    world.run(29.9)
+    assert estimator.eased_s == -inf
+    world.run(30.5)
+    assert 0.0 < estimator.eased_s - world.network.start_s - 30.0 < 0.3
+
+
 @pytest.mark.parametrize("gap_s", [10.0, 30.0])
 def test_after_a_blackout_poses_flow_at_once(gap_s: float) -> None:
     model = LinkModel(rate_bps=4e6, delay_s=0.025, overhead_bytes=60, blackouts=(Window(4.0, 4.0 + gap_s),))
