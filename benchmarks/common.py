@@ -15,10 +15,12 @@ import argparse
 import json
 import os
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from math import inf, sqrt
 from pathlib import Path
-from typing import TypeVar
+from statistics import stdev
+from typing import Final, TypeVar
 
 from rich.console import Console
 from rich.table import Table
@@ -148,6 +150,46 @@ def interleaved(systems: Mapping[str, Callable[[], T]], rounds: int) -> dict[str
             results[name].append(systems[name]())
         order.reverse()
     return results
+
+
+def positive(text: str) -> int:
+    """For arguments: a whole number of 1 or more."""
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"{value} is not 1 or more")
+    return value
+
+
+T95: Final = (
+    12.71,
+    4.30,
+    3.18,
+    2.78,
+    2.57,
+    2.45,
+    2.36,
+    2.31,
+    2.26,
+    2.23,
+    2.20,
+    2.18,
+    2.16,
+    2.14,
+    2.13,
+    2.12,
+    2.11,
+    2.10,
+)
+"""The 97.5th percentile of Student's t distribution for 1 to 18 degrees of freedom."""
+
+
+def half_width_95(values: Sequence[float]) -> float:
+    """Half the width of the 95 % confidence interval of the mean of independent values; inf of fewer than two."""
+    count = len(values)
+    if count < 2:
+        return inf
+    t = T95[count - 2] if count - 2 < len(T95) else 1.96 + 2.5 / (count - 1)
+    return t * stdev(values) / sqrt(count)
 
 
 def main(

@@ -22,7 +22,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from benchmarks.common import Report, main, try_realtime
+from benchmarks.common import Report, main, positive, try_realtime
 from benchmarks.link.runs import DRAIN_S, START_S, STOP_S, Running, make_keys, sleep_until, start_relay
 from benchmarks.link.sern import RELAY_PORT
 from benchmarks.mmcf_replay import CLOUD_HZ, EVERY_NTH_POINT, REAL, recorded, tabulate
@@ -60,9 +60,12 @@ class Edge(NamedTuple):
     left_out: Mapping[str, int]
 
 
-def intervals(logs: Mapping[str, TopicLog], edges: Sequence[Edge], params: AdapterParams) -> list[Terms]:
+def intervals(
+    logs: Mapping[str, TopicLog], edges: Sequence[Edge], params: AdapterParams, capacities_bps: Sequence[float]
+) -> list[Terms]:
     """The terms of the cost, one for each interval between two `edges`, by what the far end saw.
 
+    `capacities_bps` are what the link was set to carry in each of them, the same for every policy.
     A message belongs to the interval in which it was offered, and is on time by its topic's deadline; what never came
     is not. Raises SernError when the logs hold no message of the time.
     """
@@ -134,6 +137,7 @@ def intervals(logs: Mapping[str, TopicLog], edges: Sequence[Edge], params: Adapt
                 unreliability=before.unreliability,
                 compute=before.compute,
                 bandwidth_bps=before.bandwidth_bps,
+                capacity_bps=capacities_bps[at],
             )
         )
     return found
@@ -278,6 +282,13 @@ def _stop(running: Running) -> None:
             raise SernError(f"{role} ended with {code}")
 
 
+def rates_bps(duration_s: int) -> list[float]:
+    """What the link is set to carry, second by second: thin in the second third."""
+    assert LINK.rate_bps is not None
+    thin = range(duration_s // 3, 2 * duration_s // 3)
+    return [THIN_BPS if second in thin else LINK.rate_bps for second in range(duration_s)]
+
+
 def run(lab: Lab, directory: Path, section: AdaptationSection, scans: Sequence[Path], duration_s: int) -> list[Terms]:
     """One run over a link that is thin in its second third; intervals of 1 s. `directory` must be empty."""
     make_keys(directory)
@@ -294,13 +305,13 @@ def run(lab: Lab, directory: Path, section: AdaptationSection, scans: Sequence[P
         running.ends[ROBOT] = _start(lab, lab.a, robot)
         _await_connected(running, lab.a, len(specs), directory)
         start_ns = time.monotonic_ns() + int(WARM_S * 1e9)
-        changes = {duration_s // 3: THIN_BPS, 2 * duration_s // 3: LINK.rate_bps}
+        capacities_bps = rates_bps(duration_s)
         edges = []
         for second in range(duration_s + 1):
             sleep_until(start_ns + second * 1_000_000_000)
             edges.append(_edge(lab, running))
-            if second in changes:
-                lab.change(rate_bps=changes[second])
+            if 0 < second < duration_s and capacities_bps[second] != capacities_bps[second - 1]:
+                lab.change(rate_bps=capacities_bps[second])
         (directory / "mmcf.json").write_text(json.dumps(_ask(lab.a, "/api/mmcf")))
         sleep_until(time.monotonic_ns() + int(DRAIN_S * 1e9))
         _stop(running)
@@ -308,16 +319,16 @@ def run(lab: Lab, directory: Path, section: AdaptationSection, scans: Sequence[P
         running.stop()
     params = section.params(encodes=True)
     logs = read_logs([(role, directory / f"{role}.csv") for role in (ROBOT, SITE)])
-    return intervals(logs, edges, params)
+    return intervals(logs, edges, params, capacities_bps)
 
 
-def _runner(lab: Lab, directory: Path, duration_s: int) -> Callable[[AdaptationSection], list[Terms]]:
+def _runner(lab: Lab, directory: Path, duration_s: int) -> Callable[[AdaptationSection, int], list[Terms]]:
     scans = [directory / path.name for path in REAL[1:]]
     for source, scan in zip(REAL[1:], scans, strict=True):
         thin_scan(source, scan, EVERY_NTH_POINT)
 
-    def intervals_of(section: AdaptationSection) -> list[Terms]:
-        mine = directory / f"{section.profile}-{section.policy}"
+    def intervals_of(section: AdaptationSection, number: int) -> list[Terms]:
+        mine = directory / f"{section.profile}-{section.policy}-{number}"
         mine.mkdir()
         return run(lab, mine, section, scans, duration_s)
 
@@ -334,11 +345,12 @@ def measure(options: argparse.Namespace, report: Report) -> None:
         if options.traces is not None:
             options.traces.mkdir(parents=True, exist_ok=True)
             directory = Path(tempfile.mkdtemp(prefix="run-", dir=options.traces)).resolve()
-        tabulate(report, _runner(lab, directory, duration_s))
+        tabulate(report, _runner(lab, directory, duration_s), options.runs)
         report.note(f"lab: {lab.backend}; {note}; {duration_s} s a run, means over intervals of 1 s")
 
 
 def _arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--runs", type=positive, default=1, metavar="N", help="of each policy, in mixed order")
     parser.add_argument("--traces", type=Path, metavar="DIR", help="keep logs and /api/mmcf in a new folder there")
 
 

@@ -53,6 +53,16 @@ class Path:
     def rate_bps(self, t: float) -> float:
         return self.rates[max(0, bisect_right(self.rates, (t, inf)) - 1)][1]
 
+    def mean_rate_bps(self, from_s: float, to_s: float) -> float:
+        """What the link could carry between two times, bits a second."""
+        bits, at_s = 0.0, max(0.0, from_s)
+        begin_s = at_s
+        while at_s < to_s:
+            until_s = min(self.next_change_s(at_s), to_s)
+            bits += self.rate_bps(at_s) * (until_s - at_s)
+            at_s = until_s
+        return bits / (to_s - begin_s)
+
     def next_change_s(self, t: float) -> float:
         index = bisect_right(self.rates, (t, inf))
         return self.rates[index][0] if index < len(self.rates) else inf

@@ -9,16 +9,17 @@ wire. Then the paper's section "Runtime Reconfiguration Evaluation": two robots'
 
 import argparse
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import pairwise
+from math import isfinite
 from pathlib import Path
 from random import Random
 from statistics import fmean
 from time import perf_counter
 
-from benchmarks.common import Report, main
+from benchmarks.common import Report, half_width_95, main, positive
 from sern_client.endpoints.clouds import CLOUD_TYPE, cloud_body, read_ply
 from sern_core.codecs import Coder
 from sern_core.message import TopicInfo, TopicSpec
@@ -95,10 +96,10 @@ def recorded(duration_s: float) -> Load:
     return load
 
 
-def run(load: Load, link: LinkProfile, section: AdaptationSection, duration_s: float) -> list[Step]:
-    """All intervals that were measured."""
+def run(load: Load, link: LinkProfile, section: AdaptationSection, duration_s: float, *, seed: int) -> list[Terms]:
+    """All intervals that were measured. Whatever a policy believed, bandwidth is a share of what the link carried."""
     coder = Coder(max_bytes=2**24, clock=perf_counter)
-    world = ReplayWorld(link, coder=coder)
+    world = ReplayWorld(link, seed=seed, coder=coder)
     channels = {name: world.publish(info, spec) for name, (info, spec) in load.specs.items()}
     params = section.params(encodes=True)
     policy = section.make_policy(encodes=True)()
@@ -108,37 +109,68 @@ def run(load: Load, link: LinkProfile, section: AdaptationSection, duration_s: f
     world.every(params.interval_s, lambda now: steps.append(adapter.step(now=now)))
     world.feed((SETTLE_S + at_s, channels[topic], body) for at_s, topic, body in load.messages)
     world.run(SETTLE_S + duration_s)
-    return [step for step in steps if step.cost is not None]
+    found = []
+    for step in steps:
+        end_s, measurement = step.now - world.network.start_s, step.measurement
+        if measurement is not None:
+            capacity_bps = link.up.capacity_bits(end_s - params.interval_s, end_s) / params.interval_s
+            found.append(
+                params.ranges.terms(
+                    latency_s=measurement.latency_s,
+                    unreliability=measurement.unreliability,
+                    compute=measurement.compute,
+                    bandwidth_bps=measurement.bandwidth_bps,
+                    capacity_bps=capacity_bps if isfinite(capacity_bps) else None,
+                )
+            )
+    return found
 
 
-def tables(report: Report, duration_s: float, links: tuple[str, ...]) -> None:
-    """Policy by profile, with the four terms, over the links."""
+def tables(report: Report, duration_s: float, links: tuple[str, ...], seeds: int) -> None:
+    """Policy by profile, with the four terms, over the links; `seeds` draws of losses and jitter."""
     load = recorded(duration_s)
     report.note(f"{load.note}, {duration_s:g} s on each of {', '.join(links)}; means over intervals of 1 s")
 
-    def intervals(section: AdaptationSection) -> list[Terms]:
-        steps = [step for name in links for step in run(load, load_profile(name), section, duration_s)]
-        return [step.terms for step in steps if step.terms is not None]
+    def intervals(section: AdaptationSection, number: int) -> list[Terms]:
+        parts = [run(load, load_profile(name), section, duration_s, seed=number + 1) for name in links]
+        return [terms for part in parts for terms in part]
 
-    tabulate(report, intervals)
+    tabulate(report, intervals, seeds)
 
 
-def tabulate(report: Report, intervals: Callable[[AdaptationSection], list[Terms]]) -> None:
-    """Policy by profile: the means of the terms over the intervals of a run, and what they cost.
+def tabulate(report: Report, intervals: Callable[[AdaptationSection, int], list[Terms]], runs: int) -> None:
+    """Policy by profile: the means of the terms over the intervals of all runs, and what they cost, with half the width
+    of the 95 % confidence interval over the runs.
 
-    The cost is linear in the terms, so that of their means is the mean of the intervals'.
+    The runs are in mixed order, first to last and last to first in turn, so that what drifts falls on all alike. What
+    came of each order is reported as it is. The cost is linear in the terms, so that of their means is the mean of the
+    intervals'.
     """
-    report.note("terms: 1 is 0.5 s of latency, no reliability, a quarter of a core, 8 Mbit/s")
+    report.note("terms: 1 is 0.5 s of latency, no reliability, a quarter of a core, all that the link carries")
+    cases = [(profile, policy) for profile in PROFILES for policy in POLICIES]
+    sections = {
+        (profile, policy): AdaptationSection.model_validate({"policy": policy, "profile": profile})
+        for profile, policy in cases
+    }
+    found: dict[tuple[str, str], list[Terms]] = {case: [] for case in cases}
+    for number in range(runs):
+        for case in cases if number % 2 == 0 else reversed(cases):
+            found[case].append(mean_terms(intervals(sections[case], number)))
     for profile in PROFILES:
         means: dict[str, float] = {}
         for policy in POLICIES:
-            section = AdaptationSection.model_validate({"policy": policy, "profile": profile})
-            terms = Terms(*(fmean(values) for values in zip(*intervals(section), strict=True)))
-            means[policy] = cost(section.cost_weights(), terms)
+            mine, weights = found[profile, policy], sections[profile, policy].cost_weights()
+            terms = mean_terms(mine)
+            costs = [cost(weights, one) for one in mine]
+            means[policy] = cost(weights, terms)
+            spread = {} if runs < 2 else {"plusminus_1": half_width_95(costs)}
+            orders = {} if runs < 2 else {"forward_1": fmean(costs[::2]), "backward_1": fmean(costs[1::2])}
             report.row(
                 profile,
                 policy,
                 cost_1=means[policy],
+                **spread,
+                **orders,
                 latency_1=terms.latency,
                 reliability_1=1.0 - terms.unreliability,
                 compute_1=terms.compute,
@@ -146,6 +178,10 @@ def tabulate(report: Report, intervals: Callable[[AdaptationSection], list[Terms
             )
         others = min(value for policy, value in means.items() if policy != "mmcf")
         report.reach(f"{profile}: cost of mmcf over the best fixed policy's", means["mmcf"] / others, 1.0)
+
+
+def mean_terms(terms: Iterable[Terms]) -> Terms:
+    return Terms(*(fmean(values) for values in zip(*terms, strict=True)))
 
 
 # --- streams that come and go -----------------------------------------------------------------------------------------
@@ -270,11 +306,13 @@ def draw(path: Path, found: Reconfiguration) -> None:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--seeds", type=positive, metavar="N", help="draws of losses and jitter (default 5, quick 1)")
     parser.add_argument("--plots", type=Path, metavar="DIR", help="draw the reconfiguration into DIR")
 
 
 def measure(options: argparse.Namespace, report: Report) -> None:
-    tables(report, 15.0 if options.quick else 60.0, LINKS[:1] if options.quick else LINKS)
+    duration_s, links = (15.0, LINKS[:1]) if options.quick else (60.0, LINKS)
+    tables(report, duration_s, links, options.seeds or (1 if options.quick else 5))
     found = reconfigure()
     report.row(
         "a third robot",

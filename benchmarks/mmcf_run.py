@@ -146,11 +146,14 @@ def outcome(
         ranges=ranges,
         previous=previous,
     )
+    # Whatever a policy believed: all are priced by what the link could carry.
+    capacity_bps = queues.path.mean_rate_bps(queues.now - INTERVAL_S, queues.now)
     terms = ranges.terms(
         latency_s=measurement.latency_s,
         unreliability=measurement.unreliability,
         compute=measurement.compute,
         bandwidth_bps=measurement.bandwidth_bps,
+        capacity_bps=capacity_bps,
     )
     return cost(weights, terms), terms, measurement
 

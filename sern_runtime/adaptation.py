@@ -141,8 +141,10 @@ class Adaptation:
             "ranges": {
                 "latency_max_s": ranges.latency_max_s,
                 "compute_max": ranges.compute_max,
+                "bandwidth": "capacity" if ranges.share_of_capacity else "fixed",
                 "bandwidth_max_bps": ranges.bandwidth_max_bps,
             },
+            "floors": dict(zip(CLASS_LABELS, self._section.floor_shares(), strict=True)),
             "interval_s": self._params.interval_s,
             "now_s": clock.now(),
             "links": [

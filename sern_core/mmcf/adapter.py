@@ -10,6 +10,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from math import isfinite
+from statistics import fmean
 from typing import Final, NamedTuple
 
 from sern_core.codecs import LOSSLESS, LOSSY, RAW_PROFILE, CodecProfile, Coder, Compression
@@ -29,6 +30,7 @@ from sern_core.mmcf.model import (
 )
 from sern_core.mmcf.policy import Decision, Policy
 from sern_core.mmcf.predict import SERIALISE_S
+from sern_core.mmcf.trial import CapacityTrial
 from sern_core.out_message import OutMessage
 from sern_core.queues import OutChannel
 from sern_core.types import CLASSES, DropReason, PriorityClass, TopicName
@@ -74,6 +76,8 @@ class Step:
     measurement: Measurement | None
     terms: Terms | None
     cost: float | None
+    bandwidth_full_bps: float
+    """What counted 1 in the term of bandwidth: what the link was known to carry in the interval."""
     in_force: Configuration
     """What was in force while it was measured."""
     decision: Decision
@@ -143,6 +147,7 @@ class HopAdapter:
         self._coder = coder
         self._summaries = summaries
         self._probe = RawProbe(params.interval_s)
+        self._trial = CapacityTrial(params.interval_s, assumed_min_bps=params.ranges.bandwidth_max_bps)
         self._since_s = now
         self._wire_bytes = link.wire_bytes
         self._encode_s = self._coder_s()
@@ -198,8 +203,11 @@ class HopAdapter:
             self._samples.append(capacity_bps)
 
     def _capacity_bps(self) -> float | None:
-        """What the path can carry, as far as anybody knows: the estimate, and while there was never enough to send to
-        tell it, what the ranges call a full link, or what was carried where that is more."""
+        """What the path can carry, as far as anybody knows: the estimate, or what is tried; and while there was never
+        enough to send to tell it, what the ranges call a full link, or what was carried where that is more."""
+        return self._trial.read(self._estimate_bps())
+
+    def _estimate_bps(self) -> float | None:
         link = self.link
         if link.lane.stalled or not link.established:
             return None
@@ -299,15 +307,9 @@ class HopAdapter:
         demands = self._demands(offers, elapsed_s)
         items = chosen(self._summaries())
         levels = {level: self._demands(offered, elapsed_s) for level, offered in offers_by_level(offers, items)}
-        situation = Situation(
-            levels.get(level_of(items), demands),
-            LinkState(
-                self._capacity_bps(), self._rtt_s(), link.lane.loss, tuple(self._samples), stream=link.lane.lossless
-            ),
-            levels if items else {},
-        )
         in_force = self.policy.active
         measurement, terms, value = None, None, None
+        carried_bps = fmean(self._samples) if self._samples else self._capacity_bps()
         if link.established and any(count.offered for count in counts.values()):
             measurement = self._measure(counts, demands, elapsed_s)
             terms = params.ranges.terms(
@@ -315,8 +317,26 @@ class HopAdapter:
                 unreliability=measurement.unreliability,
                 compute=measurement.compute,
                 bandwidth_bps=measurement.bandwidth_bps,
+                capacity_bps=carried_bps,
             )
             value = cost(params.weights, terms)
+        if measurement is not None:
+            rates, summarised = in_force.rates, any(in_force.summaries or ())
+            self._trial.judge(
+                self._estimate_bps(),
+                link.lane.estimator.eased_s,
+                measurement.classes,
+                thinned=min(rates) < 1.0,
+                summarised=summarised,
+                now=now,
+            )
+        situation = Situation(
+            levels.get(level_of(items), demands),
+            LinkState(
+                self._capacity_bps(), self._rtt_s(), link.lane.loss, tuple(self._samples), stream=link.lane.lossless
+            ),
+            levels if items else {},
+        )
         self._measured = measurement
         self._since_s, self._wire_bytes, self._encode_s = now, link.wire_bytes, self._coder_s()
         self._samples.clear()
@@ -329,7 +349,8 @@ class HopAdapter:
             apply_levels(self._summaries(), decision.chosen)
             if decision.chosen.summaries is not None:
                 self._probe.start(items, situation.link.capacity_bps, now=now)
-        self.last = Step(now, situation, measurement, terms, value, in_force, decision)
+        full_bps = params.ranges.bandwidth_full_bps(carried_bps)
+        self.last = Step(now, situation, measurement, terms, value, full_bps, in_force, decision)
         return self.last
 
     def _measure(

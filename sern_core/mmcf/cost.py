@@ -1,7 +1,15 @@
 """The cost J = w_l·L + w_r·(1−R) + w_c·C + w_b·B: weights, fixed ranges, and what an interval came to.
 
-R is on time over what was needed, not over what was sent: else the argmin would send next to nothing. The ranges are
-configured, not windowed minima and maxima: else the same interval would cost something else a minute later.
+R is on time over what was needed, not over what was sent: else the argmin would send next to nothing. The ranges of
+latency and computing are configured, not windowed minima and maxima: else the same interval would cost something else a
+minute later.
+
+Bandwidth is a share of what the link can carry. The paper's eq. (comp_band_norm) divides by a fixed b_max. One b_max
+for every link starves a wide one: at 8 Mbit/s for 1, clouds of 8 Mbit/s cost as much on an empty link of 40 Mbit/s as
+on one that they fill, so that six of ten were left out where nobody else wanted the room. And it makes a thin link look
+free: 0.3 Mbit/s filled to the brim would cost 0.04. So b_max is the capacity as it is, and `bandwidth_max_bps` only
+where that is not known. Costs of intervals on different capacities are thus in different units; who compares policies
+prices all of them by the same capacity, that of the link, not by what each believes.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -13,6 +21,8 @@ from sern_core.mmcf.model import CLASS_WEIGHTS, ClassDemand, ClassOutcome, Measu
 from sern_core.types import PriorityClass
 
 SUM_TOLERANCE: Final = 1e-6
+MIN_CAPACITY_BPS: Final = 1e3
+"""A link that carries less is as good as full, whatever is sent."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,6 +55,13 @@ PROFILES: Final = {
     "balanced": Weights(0.25, 0.25, 0.25, 0.25),
 }
 """Mission profiles (the paper's section "MMCF Evaluation" names the first two)."""
+FLOORS: Final = {
+    "teleoperation": (1.0, 1.0, 1.0),
+    "mapping": (1.0, 0.5, 0.5),
+    "balanced": (1.0, 1.0, 0.6),
+}
+"""By profile and class: the share of the offered messages that must arrive in time where the link can carry it. Who
+drives wants all that there is room for; who maps shares the link with others, and half the scans make the map."""
 
 
 def profile(name: str) -> Weights:
@@ -53,6 +70,12 @@ def profile(name: str) -> Weights:
         return PROFILES[name]
     except KeyError:
         raise ConfigError(f"unknown profile {name!r}: use one of {', '.join(PROFILES)}", key="profile") from None
+
+
+def profile_floors(name: str) -> tuple[float, float, float]:
+    """The floors of a named profile, by class. Raises ConfigError."""
+    profile(name)
+    return FLOORS[name]
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,6 +87,9 @@ class Ranges:
     compute_max: float = 0.25
     """CPU seconds a second: a quarter of a core for serialising and compressing."""
     bandwidth_max_bps: float = 8e6
+    """While the capacity of the link is not known; always, unless `share_of_capacity`."""
+    share_of_capacity: bool = True
+    """Bandwidth counts as a share of the link's capacity; False: of `bandwidth_max_bps`, as printed in the paper."""
 
     def __post_init__(self) -> None:
         for name, ok, what in (
@@ -78,13 +104,28 @@ class Ranges:
             if not ok:
                 raise ConfigError(f"{name} is {getattr(self, name):g}: it must be {what}", key=name)
 
-    def terms(self, *, latency_s: float, unreliability: float, compute: float, bandwidth_bps: float) -> Terms:
+    def bandwidth_full_bps(self, capacity_bps: float | None) -> float:
+        """What counts 1 in the term of bandwidth, on a link of this capacity (None: not known)."""
+        if capacity_bps is None or not self.share_of_capacity:
+            return self.bandwidth_max_bps
+        return max(capacity_bps, MIN_CAPACITY_BPS)
+
+    def terms(
+        self,
+        *,
+        latency_s: float,
+        unreliability: float,
+        compute: float,
+        bandwidth_bps: float,
+        capacity_bps: float | None,
+    ) -> Terms:
+        """The four terms of an interval in which the link could carry `capacity_bps`; None: nobody knows."""
         span_s = self.latency_max_s - self.latency_min_s
         return Terms(
             _unit((latency_s - self.latency_min_s) / span_s),
             _unit(unreliability),
             _unit(compute / self.compute_max),
-            _unit(bandwidth_bps / self.bandwidth_max_bps),
+            _unit(bandwidth_bps / self.bandwidth_full_bps(capacity_bps)),
         )
 
 

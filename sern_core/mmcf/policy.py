@@ -7,6 +7,11 @@ few intervals, or at once when it has become infeasible.
 The cost does not know what a summary leaves out (the paper defines no such term), so raw messages come first: a class
 is summarised only where the cheapest configuration that sends it raw does not bring what is needed of it, and where the
 summary costs less than GAIN_TO_SWITCH of that. Back it goes when raw fits with room to spare, whatever that costs.
+
+Nor does the cost know what the mission cannot do without: of two classes it thins the one that pays better. So each
+class has a floor, the share of its offered messages that must arrive in time. What stays below the floor of a class is
+infeasible as long as something feasible keeps it; the floors of more urgent classes come first. It never asks for more
+than the link can carry: where nothing keeps a floor, that floor does not count, and the cost decides.
 """
 
 from abc import ABC, abstractmethod
@@ -29,7 +34,7 @@ from sern_core.mmcf.model import (
     Situation,
 )
 from sern_core.mmcf.playback import CapacityPath
-from sern_core.mmcf.predict import PLANNED_SHARE, RAW_FIRST, Bounds, Grid, Predictions, Predictor
+from sern_core.mmcf.predict import BELOW_FLOOR, PLANNED_SHARE, RAW_FIRST, Bounds, Grid, Predictions, Predictor
 from sern_core.mmcf.queueing import Floats
 from sern_core.mmcf.residuals import Residuals
 from sern_core.types import CLASSES, PriorityClass
@@ -53,6 +58,13 @@ RAW_SERVED: Final = 0.9
 RAW_BACK_SERVED: Final = 0.95
 RAW_BACK_LOAD: Final = 0.8
 """Before a class that is summarised goes back to raw: of what is needed, and the load of the planned capacity."""
+
+FLOOR_KEPT: Final = 0.9
+"""Of a floor: predictions err, and on a lossy link nothing arrives whole."""
+FLOOR_BACK: Final = 0.95
+FLOOR_BACK_LOAD: Final = 0.8
+"""Before a floor that was given up counts again: of the floor, and the load of the planned capacity. In between nothing
+changes for it, so that a link about there is not followed to and fro."""
 
 TURNS_OF_SWING: Final = 3
 """Down, up and down again within the memory, or up, down and up: a link that swings."""
@@ -233,14 +245,17 @@ class Mmcf(Policy):
         weights: Weights,
         ranges: Ranges,
         bounds: Bounds | None = None,
+        floors: Sequence[float] = (0.0,) * len(CLASSES),
         initial: Configuration | None = None,
         memory_s: float = 10.0,
     ) -> None:
+        """`floors`: by class, the share of the offered messages that must arrive in time where it can; 0: none."""
         initial = initial or grid.configurations[0]
         if initial not in grid.index:
             grid = Grid([initial, *grid.configurations])
         self.predictor = Predictor(grid, weights=weights, ranges=ranges, bounds=bounds)
         self.residuals = Residuals()
+        self.floors = tuple(floors)
         self._plan = CapacityPlan(memory_s)
         self._active = initial
         self._stood = INTERVALS_TO_STAND
@@ -314,6 +329,24 @@ class Mmcf(Policy):
             return False
         return bool(mine.on_time[index] >= (RAW_BACK_SERVED if back else RAW_SERVED) * mine.needed[index])
 
+    def _keep_floors(self, predictions: Predictions, active: int) -> None:
+        """Mark what stays below the floor of a class, where something else keeps it; the most urgent class first."""
+        for mine in predictions.classes:
+            floor = self.floors[mine.priority]
+            feasible = predictions.obstacle == 0
+            here = ~np.isnan(mine.on_time)  # else the class has no traffic at that level
+            keeps = feasible & (~here | (mine.on_time >= FLOOR_KEPT * floor))
+            if not keeps[active] and feasible[active]:
+                if self._stood < INTERVALS_TO_STAND:
+                    continue
+                back = (mine.on_time >= FLOOR_BACK * floor) & (predictions.load <= FLOOR_BACK_LOAD)
+                if not (feasible & (~here | back)).any():
+                    continue
+            if keeps.any():
+                below = feasible & ~keeps
+                predictions.obstacle[below] = BELOW_FLOOR
+                predictions.excess[below] = np.inf
+
     def _shortest(self, predictions: Predictions, best: int) -> int:
         """Of what differs from the best one in its queues alone and costs the same, as far as anybody can tell, the one
         with the shortest: when the link gets worse before the next decision, less waits there."""
@@ -327,6 +360,7 @@ class Mmcf(Policy):
 
     def _choose(self, predictions: Predictions, active: int, *, swings: bool) -> Decision:
         self._prefer_raw(predictions, active)
+        self._keep_floors(predictions, active)
         best = self._shortest(predictions, predictions.best())
         current_cost, best_cost = float(predictions.cost[active]), float(predictions.cost[best])
         if swings:

@@ -25,6 +25,7 @@ a summary takes time before the rest, and processor time for every offered messa
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
+from statistics import fmean
 from typing import Any, Final
 
 import numpy as np
@@ -65,10 +66,12 @@ OBSTACLES: Final = (
     "more than the link",
     "nothing to summarise",
     "raw comes first",
+    "below the floor of a class",
 )
 CLASS_ARRAYS: Final = ("load", "drop", "late", "latency_s", "on_time", "needed", "bandwidth_bps")
 NOTHING_TO_SUMMARISE: Final = 5
 RAW_FIRST: Final = 6
+BELOW_FLOOR: Final = 7
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,6 +116,7 @@ class Predictions:
     obstacle: NDArray[np.int64]
     load: Floats  # offered, over planned capacity
     excess: Floats  # by how much bounds are broken, in shares of the link and of the CPU
+    bandwidth_full_bps: float  # what counts 1 in the term of bandwidth
     classes: tuple[ClassArrays, ...] = ()
 
     @property
@@ -309,6 +313,7 @@ class Predictor:
             obstacle=whole(lambda part: part.obstacle),
             load=whole(lambda part: part.load),
             excess=whole(lambda part: part.excess),
+            bandwidth_full_bps=next(iter(parts.values())).bandwidth_full_bps,
             classes=tuple(ClassArrays(p, *(of_class(p, name) for name in CLASS_ARRAYS)) for p in CLASSES if p in seen),
         )
 
@@ -375,6 +380,10 @@ class Predictor:
             bandwidth_bps,
             obstacle,
             excess,
+            # Over a path it is what that carried in the mean, so that all candidates are priced alike.
+            bandwidth_full_bps=self.ranges.bandwidth_full_bps(
+                link.capacity_bps if path is None else fmean(path.capacities_bps) / PLANNED_SHARE
+            ),
             load=offered_load,
             classes=tuple(classes),
         )
@@ -389,6 +398,7 @@ class Predictor:
             raw.bandwidth_bps * factors.bandwidth,
             raw.obstacle,
             raw.excess,
+            bandwidth_full_bps=raw.bandwidth_full_bps,
             load=raw.load,
             classes=raw.classes,
         )
@@ -403,10 +413,11 @@ class Predictor:
         obstacle: NDArray[np.int64],
         excess: Floats,
         *,
+        bandwidth_full_bps: float,
         load: Floats,
         classes: tuple[ClassArrays, ...],
     ) -> Predictions:
-        terms = self._terms(latency_s, unreliability, compute, bandwidth_bps)
+        terms = self._terms(latency_s, unreliability, compute, bandwidth_bps / bandwidth_full_bps)
         weights = self.weights
         cost = (
             weights.latency * terms[0]
@@ -427,11 +438,12 @@ class Predictor:
             obstacle,
             load,
             excess + np.maximum(compute - self.bounds.compute_max, 0.0),
+            bandwidth_full_bps,
             classes,
         )
 
     def _terms(
-        self, latency_s: Floats, unreliability: Floats, compute: Floats, bandwidth_bps: Floats
+        self, latency_s: Floats, unreliability: Floats, compute: Floats, bandwidth: Floats
     ) -> tuple[Floats, Floats, Floats, Floats]:
         ranges = self.ranges
         span_s = ranges.latency_max_s - ranges.latency_min_s
@@ -439,7 +451,7 @@ class Predictor:
             np.clip((latency_s - ranges.latency_min_s) / span_s, 0.0, 1.0),
             np.clip(unreliability, 0.0, 1.0),
             np.clip(compute / ranges.compute_max, 0.0, 1.0),
-            np.clip(bandwidth_bps / ranges.bandwidth_max_bps, 0.0, 1.0),
+            np.clip(bandwidth, 0.0, 1.0),
         )
 
     def _service(

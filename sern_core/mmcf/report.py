@@ -111,11 +111,23 @@ def step_json(step: Step, *, candidates: int = CANDIDATES) -> dict[str, Any]:
         else {
             "cost": None if step.cost is None else round(step.cost, 4),
             "terms": terms_json(step.terms),
+            "bandwidth_full_bps": round(step.bandwidth_full_bps),
             "latency_s": round(measurement.latency_s, 5),
             "unreliability": round(measurement.unreliability, 4),
             "compute": round(measurement.compute, 5),
             "bandwidth_bps": round(measurement.bandwidth_bps),
             "saturated": measurement.saturated,
+            "classes": [
+                {
+                    "class": CLASS_LABELS[part.priority],
+                    "offered": part.offered,
+                    "admitted": part.admitted,
+                    "delivered": part.delivered,
+                    "on_time": part.on_time,
+                }
+                for part in measurement.classes
+                if part.offered
+            ],
         },
         "chosen": configuration_json(decision.chosen),
         "predicted": prediction_json(decision.prediction),

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from sern_core.mmcf.adapter import AdapterParams
-from sern_core.mmcf.cost import SUM_TOLERANCE, Ranges, Weights, profile
+from sern_core.mmcf.cost import SUM_TOLERANCE, Ranges, Weights, profile, profile_floors
 from sern_core.mmcf.model import NO_CODEC, Configuration
 from sern_core.mmcf.policy import FixedPolicy, Mmcf, Policy, fixed_reliability, fixed_throughput
 from sern_core.mmcf.predict import Bounds, Grid, Predictor
@@ -47,18 +47,24 @@ class WeightsSection(Section):
 
 
 class RangesSection(Section):
-    """What counts as 1 in each term of the cost. Fixed, so that the same interval costs the same at any time."""
+    """What counts as 1 in each term of the cost. Bandwidth counts as a share of what the link can carry."""
 
     latency_max_s: Annotated[float, Field(gt=0, le=600)] = _RANGES.latency_max_s
     """A mean latency of this or more."""
     compute_max: Annotated[float, Field(gt=0, le=64)] = _RANGES.compute_max
     """Processor seconds a second spent on serialising and compressing."""
     bandwidth_max_bps: Annotated[float, Field(ge=1000, le=1e11)] = _RANGES.bandwidth_max_bps
-    """Bits per second; also what a link is taken to carry until it has once been full."""
+    """Bits per second; what a link is taken to carry until it has once been full."""
+    bandwidth: Literal["capacity", "fixed"] = "capacity"
+    """What bandwidth is a share of: `capacity`, what the link can carry now; `fixed`, `bandwidth_max_bps` on every
+    link, as printed in the paper (eq. (comp_band_norm)), which starves a wide link."""
 
     def ranges(self) -> Ranges:
         return Ranges(
-            latency_max_s=self.latency_max_s, compute_max=self.compute_max, bandwidth_max_bps=self.bandwidth_max_bps
+            latency_max_s=self.latency_max_s,
+            compute_max=self.compute_max,
+            bandwidth_max_bps=self.bandwidth_max_bps,
+            share_of_capacity=self.bandwidth == "capacity",
         )
 
 
@@ -81,6 +87,21 @@ class NeededSection(SharesSection):
 
     bulk: Share = _PARAMS.needed[2]
     """Class bulk: two clouds of five will do."""
+
+
+class FloorsSection(Section):
+    """What each class gets where the link can carry it: a configuration of which less would arrive in time is not
+    chosen as long as another one brings it. 0: no floor."""
+
+    control: ShareOrZero = 1.0
+    """Class control."""
+    state: ShareOrZero = 1.0
+    """Class state."""
+    bulk: ShareOrZero = 1.0
+    """Class bulk."""
+
+    def values(self) -> tuple[float, float, float]:
+        return self.control, self.state, self.bulk
 
 
 class DeadlinesSection(Section):
@@ -163,6 +184,10 @@ class AdaptationSection(Section):
     needed: NeededSection = NeededSection()
     """Share of the offered messages that must arrive in time. A relay that is not told otherwise needs all: what its
     clients did not need they have left out."""
+    floors: FloorsSection | None = None
+    """Share of the offered messages that each class gets where the link can carry it, instead of the profile's:
+    teleoperation 1, 1, 1; mapping 1, 0.5, 0.5; balanced 1, 1, 0.6 (control, state, bulk). On a link that is too thin
+    for all of them those of more urgent classes come first."""
     deadlines_s: DeadlinesSection = DeadlinesSection()
     """What in time means, by class."""
     rates: RatesSection = RatesSection()
@@ -194,6 +219,10 @@ class AdaptationSection(Section):
     def cost_weights(self) -> Weights:
         return profile(self.profile) if self.weights is None else self.weights.weights()
 
+    def floor_shares(self) -> tuple[float, float, float]:
+        """By class: control, state, bulk."""
+        return profile_floors(self.profile) if self.floors is None else self.floors.values()
+
     def params(self, *, encodes: bool) -> AdapterParams:
         """`encodes`: bodies are encoded here, not forwarded."""
         return AdapterParams(
@@ -223,7 +252,10 @@ class AdaptationSection(Section):
                 codec=NO_CODEC,
                 summaries=(False,) * len(CLASSES) if summarised else None,
             )
-            return lambda: Mmcf(grid, weights=params.weights, ranges=params.ranges, bounds=bounds, initial=initial)
+            floors = self.floor_shares()
+            return lambda: Mmcf(
+                grid, weights=params.weights, ranges=params.ranges, bounds=bounds, floors=floors, initial=initial
+            )
         fixed = {
             "fixed_throughput": fixed_throughput(params.modes),
             "fixed_reliability": fixed_reliability(params.modes),

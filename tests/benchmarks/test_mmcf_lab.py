@@ -7,13 +7,15 @@ import pytest
 
 pytest.importorskip("psutil")
 
+from benchmarks.common import Report, half_width_95
 from benchmarks.link.runs import make_keys
-from benchmarks.mmcf_lab import ROBOT, Edge, intervals, robot_file, site_file, thin_scan
-from benchmarks.mmcf_replay import REAL
+from benchmarks.mmcf_lab import LINK, ROBOT, THIN_BPS, Edge, intervals, rates_bps, robot_file, site_file, thin_scan
+from benchmarks.mmcf_replay import POLICIES, PROFILES, REAL, tabulate
 from sern_client.endpoints.clouds import read_ply
 from sern_core.errors import SernError
 from sern_core.message import TopicSpec
 from sern_core.mmcf.adapter import AdapterParams
+from sern_core.mmcf.model import Terms
 from sern_core.types import PriorityClass
 from sern_runtime.config.adaptation import AdaptationSection
 from sern_runtime.config.client import load_client
@@ -23,6 +25,7 @@ from tests.daemons import recording
 S = 1_000_000_000
 POSE, CLOUD = "/robot/odom", "/robot/points"
 PARAMS = AdapterParams()
+LINK_BPS = 4e6
 
 
 def log(topic: str, priority: str, messages: list[tuple[float, float | None]]) -> TopicLog:
@@ -43,16 +46,19 @@ def edges(*left_out: int, wire_bytes: int = 100_000, cpu_s: float = 0.05) -> lis
 
 def test_terms_are_by_what_arrived_and_by_what_was_used() -> None:
     poses = log(POSE, "control", [(0.1, 0.05), (0.3, 0.15), (0.5, 0.4), (0.7, None), (2.5, 0.1)])
-    (terms,) = intervals({POSE: poses}, edges(0, 0)[:2], PARAMS)
+    (terms,) = intervals({POSE: poses}, edges(0, 0)[:2], PARAMS, [LINK_BPS])
     assert terms.latency == pytest.approx(0.2 / 0.5)
     assert terms.unreliability == pytest.approx(0.5), "one never came, one came after its deadline of 0.3 s"
     assert terms.compute == pytest.approx(0.05 / 0.25)
-    assert terms.bandwidth == pytest.approx(8e5 / 8e6)
+    assert terms.bandwidth == pytest.approx(8e5 / LINK_BPS)
+    (thin,) = intervals({POSE: poses}, edges(0, 0)[:2], PARAMS, [1e6])
+    assert thin.bandwidth == pytest.approx(0.8), "of what the link was set to carry then"
+    assert thin[:3] == terms[:3]
 
 
 def test_a_message_belongs_to_the_interval_in_which_it_was_offered() -> None:
     poses = log(POSE, "control", [(0.9, 0.25), (1.1, 0.05), (2.0, None), (-0.1, None)])
-    first, second = intervals({POSE: poses}, edges(0, 0, 0), PARAMS)
+    first, second = intervals({POSE: poses}, edges(0, 0, 0), PARAMS, [LINK_BPS] * 2)
     assert [first.latency, second.latency] == pytest.approx([0.5, 0.1])
     assert first.unreliability == second.unreliability == 0.0, "what was offered before and after does not count"
 
@@ -62,22 +68,59 @@ def test_what_was_left_out_is_unreliable_and_what_was_lost_is_late_as_well() -> 
     clouds = log(CLOUD, "bulk", [(0.5, None), (1.5, None)])
     logs = {POSE: poses, CLOUD: clouds}
     share = 0.1 / 0.7  # of class bulk beside control
-    out, lost = intervals(logs, edges(0, 1, 1), PARAMS)
+    out, lost = intervals(logs, edges(0, 1, 1), PARAMS, [LINK_BPS] * 2)
     assert [out.latency, out.unreliability] == pytest.approx([0.0, share])
     assert [lost.latency, lost.unreliability] == pytest.approx([share, share])
 
 
 def test_a_share_of_the_clouds_is_enough_and_a_second_copy_counts_once() -> None:
     clouds = log(CLOUD, "bulk", [(0.1, 0.1), (0.3, 0.1), (0.5, None), (0.7, None), (0.9, None)])
-    (terms,) = intervals({CLOUD: clouds}, edges(0, 3), PARAMS)
+    (terms,) = intervals({CLOUD: clouds}, edges(0, 3), PARAMS, [LINK_BPS])
     assert terms.unreliability == 0.0
     clouds.deliveries.append(clouds.deliveries[0]._replace(wall_ns=5 * S))
-    assert intervals({CLOUD: clouds}, edges(0, 3), PARAMS) == [terms]
+    assert intervals({CLOUD: clouds}, edges(0, 3), PARAMS, [LINK_BPS]) == [terms]
 
 
 def test_a_run_without_messages_is_an_error() -> None:
     with pytest.raises(SernError, match="nothing was offered"):
-        intervals({POSE: log(POSE, "control", [(9.0, 0.1)])}, edges(0, 0), PARAMS)
+        intervals({POSE: log(POSE, "control", [(9.0, 0.1)])}, edges(0, 0), PARAMS, [LINK_BPS])
+
+
+def test_the_link_is_thin_in_the_second_third() -> None:
+    assert rates_bps(9) == [LINK.rate_bps] * 3 + [THIN_BPS] * 3 + [LINK.rate_bps] * 3
+
+
+def test_runs_are_in_mixed_order_and_both_orders_are_reported_as_they_are() -> None:
+    """A machine that gets slower: 1 % of the cost with every run that came before."""
+    asked: list[tuple[str, str, int]] = []
+
+    def drifting(section: AdaptationSection, number: int) -> list[Terms]:
+        asked.append((section.profile, section.policy, number))
+        slow = 0.01 * len(asked)
+        return [Terms(slow, slow, slow, slow), Terms(0.5 + slow, 0.5 + slow, 0.5 + slow, 0.5 + slow)]
+
+    report = Report("mmcf_lab")
+    tabulate(report, drifting, 4)
+    cases = [(profile, policy) for profile in PROFILES for policy in POLICIES]
+    assert [case[:2] for case in asked] == [*cases, *reversed(cases), *cases, *reversed(cases)]
+    assert [number for *_, number in asked] == [number for number in range(4) for _ in cases]
+    assert [(row.case, row.system) for row in report.rows] == cases
+    for row in report.rows:
+        costs = [0.25 + 0.01 * (1 + i) for i, case in enumerate(asked) if case[:2] == (row.case, row.system)]
+        assert row.metrics["cost_1"] == pytest.approx(sum(costs) / 4)
+        assert row.metrics["forward_1"] == pytest.approx((costs[0] + costs[2]) / 2)
+        assert row.metrics["backward_1"] == pytest.approx((costs[1] + costs[3]) / 2)
+        assert row.metrics["plusminus_1"] == pytest.approx(half_width_95(costs))
+    means = {row.metrics["cost_1"] for row in report.rows}
+    assert max(means) == pytest.approx(min(means)), "the drift falls on all alike"
+
+
+def test_confidence_intervals_are_students() -> None:
+    assert half_width_95([1.0]) == float("inf")
+    assert half_width_95([1.0, 1.0, 1.0]) == 0.0
+    assert half_width_95([0.0, 2.0]) == pytest.approx(12.71)
+    assert half_width_95([0.0, 1.0] * 10) == pytest.approx(2.093 * (5 / 19) ** 0.5 / 20**0.5, rel=5e-3)
+    assert half_width_95([0.0, 1.0] * 200) == pytest.approx(1.966 * (100 / 399) ** 0.5 / 20.0, rel=5e-3)
 
 
 @pytest.mark.parametrize("columns", [3, 4])

@@ -10,7 +10,7 @@ import pytest
 
 from sern_core.codecs import CodecProfile
 from sern_core.errors import ConfigError, UsageError
-from sern_core.mmcf.cost import PROFILES, Ranges, Weights, cost, measure, profile
+from sern_core.mmcf.cost import PROFILES, Ranges, Weights, cost, measure, profile, profile_floors
 from sern_core.mmcf.model import (
     ClassDemand,
     ClassOutcome,
@@ -21,7 +21,9 @@ from sern_core.mmcf.model import (
     Situation,
     Terms,
 )
+from sern_core.mmcf.playback import CapacityPath
 from sern_core.mmcf.policy import (
+    FLOOR_KEPT,
     CapacityPlan,
     Decision,
     FixedPolicy,
@@ -67,8 +69,16 @@ def as_measured(prediction: Prediction, *, ratios: dict[PriorityClass, float] | 
     )
 
 
-def controller(weights: Weights | None = None, *, grid: Grid = GRID, initial: Configuration | None = None) -> Mmcf:
-    return Mmcf(grid, weights=weights or profile("teleoperation"), ranges=RANGES, initial=initial)
+def controller(
+    weights: Weights | None = None,
+    *,
+    grid: Grid = GRID,
+    ranges: Ranges = RANGES,
+    floors: tuple[float, ...] = (0.0, 0.0, 0.0),
+    initial: Configuration | None = None,
+) -> Mmcf:
+    weights = weights or profile("teleoperation")
+    return Mmcf(grid, weights=weights, ranges=ranges, floors=floors, initial=initial)
 
 
 def predicted(decision: Decision) -> Prediction:
@@ -113,10 +123,46 @@ def test_wrong_ranges_are_refused() -> None:
 
 def test_terms_are_clipped_to_their_ranges_and_weighted() -> None:
     ranges = Ranges(latency_min_s=0.1, latency_max_s=0.5, compute_max=0.25, bandwidth_max_bps=8e6)
-    terms = ranges.terms(latency_s=0.3, unreliability=0.2, compute=0.5, bandwidth_bps=2e6)
+    terms = ranges.terms(latency_s=0.3, unreliability=0.2, compute=0.5, bandwidth_bps=2e6, capacity_bps=None)
     assert terms == pytest.approx((0.5, 0.2, 1.0, 0.25))
     assert cost(Weights(0.4, 0.3, 0.2, 0.1), terms) == pytest.approx(0.2 + 0.06 + 0.2 + 0.025)
-    assert ranges.terms(latency_s=0.0, unreliability=0.0, compute=0.0, bandwidth_bps=0.0) == (0.0, 0.0, 0.0, 0.0)
+    none = ranges.terms(latency_s=0.0, unreliability=0.0, compute=0.0, bandwidth_bps=0.0, capacity_bps=1e6)
+    assert none == (0.0, 0.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("capacity_bps", "share_of_capacity", "full_bps"),
+    [(40e6, True, 40e6), (0.3e6, True, 0.3e6), (None, True, 8e6), (40e6, False, 8e6), (0.0, True, 1e3)],
+)
+def test_bandwidth_is_a_share_of_what_the_link_can_carry(
+    *, capacity_bps: float | None, share_of_capacity: bool, full_bps: float
+) -> None:
+    ranges = Ranges(share_of_capacity=share_of_capacity)
+    assert ranges.bandwidth_full_bps(capacity_bps) == full_bps
+    terms = ranges.terms(
+        latency_s=0.0, unreliability=0.0, compute=0.0, bandwidth_bps=0.25 * full_bps, capacity_bps=capacity_bps
+    )
+    assert terms.bandwidth == pytest.approx(0.25)
+
+
+def test_predictions_are_priced_as_measurements_are() -> None:
+    """Steady, and over a path whose mean is the capacity."""
+    predictor = Predictor(GRID, weights=profile("mapping"), ranges=RANGES)
+    for capacity_bps in (0.6e6, 4e6, 40e6):
+        path = CapacityPath.of(6.0, [PLANNED_SHARE * capacity_bps] * 60, 6)
+        for found in (
+            predictor.predict(situation(capacity_bps)),
+            predictor.predict(situation(capacity_bps), None, path),
+        ):
+            one = found.prediction(5)
+            terms = RANGES.terms(
+                latency_s=one.latency_s,
+                unreliability=one.unreliability,
+                compute=one.compute,
+                bandwidth_bps=one.bandwidth_bps,
+                capacity_bps=capacity_bps,
+            )
+            assert one.terms == pytest.approx(terms)
 
 
 def test_reliability_is_of_what_was_needed_not_of_what_was_sent() -> None:
@@ -368,7 +414,7 @@ def test_noise_about_a_threshold_is_no_swing() -> None:
 
 def test_on_a_link_that_swings_a_small_gain_is_taken_when_it_lasts() -> None:
     """A second of 4 Mbit/s, a second of 0.6: what is right for the one is 7 % too dear for both."""
-    mmcf, decisions = controller(), []
+    mmcf, decisions = controller(ranges=Ranges(share_of_capacity=False)), []
     for second in range(40):
         capacity_bps = 0.6e6 if second % 2 else 4e6
         link = LinkState(capacity_bps, 0.05, samples_bps=(capacity_bps,) * 10)
@@ -394,6 +440,47 @@ def test_the_wave_does_not_make_it_flap() -> None:
         capacity_bps = 4e6 if second // 3 % 2 == 0 else 0.6e6
         switches += mmcf.decide(situation(capacity_bps), None, now=float(second)).switched
     assert switches <= 4
+
+
+# --- floors -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["teleoperation", "mapping", "balanced"])
+def test_every_profile_states_floors_and_keeps_them_where_the_link_can_carry_them(name: str) -> None:
+    floors = profile_floors(name)
+    assert floors[CONTROL] == 1.0 and all(0.0 < floor <= 1.0 for floor in floors)
+    for capacity_bps in (8e6, 40e6, 400e6):
+        kept = controller(profile(name), floors=floors)
+        on_time = [part.on_time for part in predicted(kept.decide(situation(capacity_bps), None, now=0.0)).classes]
+        assert all(share >= 0.9 * floor for share, floor in zip(on_time, floors, strict=True))
+    free = predicted(controller(profile("mapping")).decide(situation(8e6), None, now=0.0)).classes
+    assert free[BULK].on_time < 0.5 * profile_floors("mapping")[BULK], "by the cost alone"
+
+
+def test_a_floor_asks_for_no_more_than_the_link_carries_and_control_comes_first() -> None:
+    thin = situation(0.6e6)
+    free, kept = controller(), controller(floors=(1.0, 1.0, 1.0))
+    assert kept.decide(thin, None, now=0.0).chosen.rates[BULK] < 1.0
+    shares = [part.on_time for part in predicted(kept.decide(thin, None, now=1.0)).classes]
+    before = [part.on_time for part in predicted(free.decide(thin, None, now=0.0)).classes]
+    assert shares[CONTROL] >= 0.9 and shares[CONTROL] >= before[CONTROL] - 0.01
+
+
+def test_what_is_below_a_floor_says_so() -> None:
+    decision = controller(floors=(1.0, 1.0, 1.0)).decide(situation(40e6), None, now=0.0)
+    assert decision.predictions is not None
+    for candidate in decision.candidates():
+        least = min(part.on_time for part in candidate.prediction.classes)
+        assert (candidate.obstacle == "below the floor of a class") == (least < FLOOR_KEPT)
+
+
+def test_a_link_that_hovers_about_a_floor_is_not_followed_to_and_fro() -> None:
+    mmcf = controller(floors=(1.0, 1.0, 1.0))
+    switches = 0
+    for second in range(60):
+        noise = 1.0 + 0.08 * (-1) ** second
+        switches += mmcf.decide(situation(3.0e6 * noise), None, now=float(second)).switched
+    assert switches <= 3
 
 
 # --- corrections ----------------------------------------------------------------------------------------------------
@@ -460,7 +547,7 @@ def test_a_wrong_codec_speed_is_seen_through_by_the_computing_cost() -> None:
     codecs = {"zstd": CodecProfile(0.7, 80e6)}
     claimed = Situation((whole.classes[0], *(replace(d, codecs=codecs) for d in whole.classes[1:])), whole.link)
     grid = Grid([Configuration(codec="zstd"), Configuration(codec="none")])
-    mmcf = Mmcf(grid, weights=Weights(0.0, 0.0, 0.6, 0.4), ranges=Ranges(compute_max=0.12))
+    mmcf = Mmcf(grid, weights=Weights(0.0, 0.0, 0.6, 0.4), ranges=Ranges(compute_max=0.12, share_of_capacity=False))
     decision = mmcf.decide(claimed, None, now=0.0)
     assert decision.chosen.codec == "zstd"
     reality = Predictor(grid, weights=profile("balanced"), ranges=RANGES).predict(claimed)
