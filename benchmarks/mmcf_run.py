@@ -198,17 +198,25 @@ def controlled(policy: Policy, trace: Trace, *, seed: int) -> Chooser:
     return choose
 
 
-def oracle(candidates: Sequence[Configuration], *, ranges: Ranges, weights: Weights) -> Chooser:
-    """Tries every configuration on a copy of the queues, with the link and the losses that will come."""
+def oracle(
+    candidates: Sequence[Configuration],
+    *,
+    ranges: Ranges,
+    weights: Weights,
+    keeps: Callable[[Measurement], bool] = lambda _measurement: True,
+) -> Chooser:
+    """Tries every configuration on a copy of the queues, with the link and the losses that will come. Those whose
+    interval `keeps` come first."""
 
     def choose(queues: Queues, measurement: Measurement | None) -> tuple[Configuration, Decision | None]:
         until_s = round(queues.now) + INTERVAL_S
-        best, lowest = candidates[0], float("inf")
+        best, lowest = candidates[0], (True, float("inf"))
         for configuration in candidates:
             copy = queues.clone()
             copy.apply(configuration)
             copy.run(until_s)
-            value = outcome(copy, ranges, weights, measurement)[0]
+            cost_then, _, came = outcome(copy, ranges, weights, measurement)
+            value = (not keeps(came), cost_then)
             if value < lowest:
                 best, lowest = configuration, value
         return best, None

@@ -49,7 +49,7 @@ def test_json_has_every_term_of_every_interval(tmp_path: Path) -> None:
     assert [step["at_s"] for step in told["steps"]] == pytest.approx(range(7), abs=0.01)
     measured = [step["measured"] for step in told["steps"] if step["measured"] is not None]
     assert measured and all(0.0 <= term <= 1.0 for part in measured for term in part["terms"].values())
-    costs = [candidate["cost"] for candidate in told["steps"][-1]["candidates"]]
+    costs = [candidate["cost"] for candidate in told["steps"][-1]["candidates"] if not candidate["obstacle"]]
     assert len(costs) >= 2 and costs == sorted(costs)
     topics = told["topics"]["/chat"]
     settled = topics["delivered"] + sum(topics["dropped"].values())
@@ -58,7 +58,9 @@ def test_json_has_every_term_of_every_interval(tmp_path: Path) -> None:
 
 def test_the_story_of_one_topic(tmp_path: Path) -> None:
     bag = sparse_bag(tmp_path / "run.bag")
-    text = explain(str(bag), "--duration", "3", "--topic", "/chat")
+    section = {"policy": "fixed", "fixed": {"rates": {"control": 0.2, "state": 0.2, "bulk": 0.2}}}
+    config = Lab(tmp_path, "robot1").client_file("robot1", {"kind": "synthetic", "role": "robot"}, adaptation=section)
+    text = explain(str(bag), "--duration", "3", "--topic", "/chat", "--config", str(config))
     assert text.startswith("/chat message ")
     last = text.splitlines()[-1]
     assert last.startswith("message 3001 is held: the adaptation lets "), "the newest sample waits for its turn"
