@@ -293,7 +293,8 @@ class Mmcf(Policy):
         factors = residuals.factors(predictor.grid.codecs, saturated=saturated)
         path = self._plan.path()
         predictions = predictor.corrected(predictor.predict(situation, residuals.ratios, path), factors)
-        return self._choose(predictions, active, swings=path is not None)
+        lows = 0.0 if path is None else PLANNED_SHARE * link.capacity_bps / max(min(path.capacities_bps), 1.0)
+        return self._choose(predictions, active, swings=path is not None, lows=lows)
 
     def _prefer_raw(self, predictions: Predictions, active: int) -> None:
         """Mark the summaries that raw messages come before. One class at a time, the others' levels being equal."""
@@ -329,13 +330,20 @@ class Mmcf(Policy):
             return False
         return bool(mine.on_time[index] >= (RAW_BACK_SERVED if back else RAW_SERVED) * mine.needed[index])
 
-    def _keep_floors(self, predictions: Predictions, active: int) -> None:
-        """Mark what stays below the floor of a class, where something else keeps it; the most urgent class first."""
+    def _keep_floors(self, predictions: Predictions, active: int, lows: float) -> None:
+        """Mark what stays below the floor of a class, where something else keeps it; the most urgent class first.
+
+        `lows`: the planned capacity over the least one of a link that swings, 0 of one that does not. There a floor
+        counts only if there is room for it in the bad moments too: else it would be followed up and down.
+        """
+        roomy = predictions.load * lows <= FLOOR_BACK_LOAD
         for mine in predictions.classes:
             floor = self.floors[mine.priority]
             feasible = predictions.obstacle == 0
             here = ~np.isnan(mine.on_time)  # else the class has no traffic at that level
             keeps = feasible & (~here | (mine.on_time >= FLOOR_KEPT * floor))
+            if not floor or not (keeps & roomy).any():
+                continue
             if not keeps[active] and feasible[active]:
                 if self._stood < INTERVALS_TO_STAND:
                     continue
@@ -358,9 +366,9 @@ class Mmcf(Policy):
         places = [int(i) for i in np.flatnonzero(same) if grid.configurations[i].summaries == level]
         return min(places, key=lambda i: (float(grid.queues[i].sum()), float(predictions.cost[i])))
 
-    def _choose(self, predictions: Predictions, active: int, *, swings: bool) -> Decision:
+    def _choose(self, predictions: Predictions, active: int, *, swings: bool, lows: float) -> Decision:
         self._prefer_raw(predictions, active)
-        self._keep_floors(predictions, active)
+        self._keep_floors(predictions, active, lows)
         best = self._shortest(predictions, predictions.best())
         current_cost, best_cost = float(predictions.cost[active]), float(predictions.cost[best])
         if swings:

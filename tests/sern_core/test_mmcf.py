@@ -474,6 +474,20 @@ def test_what_is_below_a_floor_says_so() -> None:
         assert (candidate.obstacle == "below the floor of a class") == (least < FLOOR_KEPT)
 
 
+@pytest.mark.parametrize("name", ["teleoperation", "mapping"])
+def test_on_a_link_that_swings_a_floor_is_kept_where_it_fits_all_the_time_and_not_followed(name: str) -> None:
+    for high_bps, low_bps, kept in ((4e6, 0.6e6, False), (40e6, 20e6, True)):
+        mmcf = controller(profile(name), floors=profile_floors(name))
+        switches = 0
+        for second in range(60):
+            capacity_bps = low_bps if second // 2 % 2 else high_bps
+            link = LinkState(capacity_bps, 0.05, samples_bps=(capacity_bps,) * 10)
+            decision = mmcf.decide(replace(situation(), link=link), None, now=float(second))
+            switches += decision.switched
+        assert switches <= 6
+        assert (decision.chosen.rates[BULK] >= 0.9 * profile_floors(name)[BULK]) == kept
+
+
 def test_a_link_that_hovers_about_a_floor_is_not_followed_to_and_fro() -> None:
     mmcf = controller(floors=(1.0, 1.0, 1.0))
     switches = 0
