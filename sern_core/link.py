@@ -152,6 +152,7 @@ class Link(Answering):
         self._gone: deque[InStream] = deque()  # streams that the peer no longer has, to be retracted
         self._skipping: dict[InStream, int] = {}  # how many messages a stream leaves out that goes on in a while
         self._missing: dict[StreamId, float] = {}  # not announced by a new peer, and since when
+        self._on_dropped = self._dropped  # one for all channels
         self.faults = 0
         """Errors of ours on this link so far."""
         self.fates: Fates | None = None
@@ -240,7 +241,7 @@ class Link(Answering):
             slot = slot % 0xFFFF + 1
         self._next_channel = slot % 0xFFFF + 1
         counters = self.ledger.topic(stream.id.topic, stream.spec.priority)
-        channel = OutChannel(slot, stream, counters, self._reporter(slot), first=first)
+        channel = OutChannel(slot, stream, counters, self._on_dropped, first=first)
         channel.owed = owed
         channel.wanted = wanted
         channel.codec = self._new_codec(stream)
@@ -257,15 +258,11 @@ class Link(Answering):
     def _counted(self, fates: Fates, stream: StreamInfo, seq: int, reason: DropReason) -> None:
         fates.dropped(stream, seq, reason, self.peer)
 
-    def _reporter(self, slot: int) -> Callable[[OutMessage, DropReason], None]:
-        def dropped(out: OutMessage, reason: DropReason) -> None:
-            channel = self.channels.get(slot)
-            if channel is not None:
-                topic = channel.stream.id.topic
-                self.trace.record(self._now, topic, TraceEvent.DROPPED, seq=out.seq, reason=reason, peer=self.peer)
-                self._tell(self.handler.on_out_drop, self, channel, out, reason)
-
-        return dropped
+    def _dropped(self, channel: OutChannel, out: OutMessage, reason: DropReason) -> None:
+        if self.channels.get(channel.slot) is channel:
+            topic = channel.stream.id.topic
+            self.trace.record(self._now, topic, TraceEvent.DROPPED, seq=out.seq, reason=reason, peer=self.peer)
+            self._tell(self.handler.on_out_drop, self, channel, out, reason)
 
     def close_channel(self, channel: OutChannel, reason: DropReason, *, now: float) -> None:
         """The stream is gone: tell the peer, drop what is left for `reason`."""
