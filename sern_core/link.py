@@ -152,6 +152,8 @@ class Link(Answering):
         self._gone: deque[InStream] = deque()  # streams that the peer no longer has, to be retracted
         self._skipping: dict[InStream, int] = {}  # how many messages a stream leaves out that goes on in a while
         self._missing: dict[StreamId, float] = {}  # not announced by a new peer, and since when
+        self.finish: Callable[[Link, float], bool] | None = None
+        """Called before more is read: whether all that earlier announcements set off is done by now."""
         self._on_dropped = self._dropped  # one for all channels
         self.faults = 0
         """Errors of ours on this link so far."""
@@ -496,6 +498,8 @@ class Link(Answering):
 
     def _go_on(self, now: float) -> bool:
         reassembly = self.reassembly
+        if self.finish is not None and not self.finish(self, now):
+            return False
         while reassembly.behind:
             stream = next(iter(reassembly.behind))
             stream.go_on(now)
