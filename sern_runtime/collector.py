@@ -29,6 +29,7 @@ class CollectorWatch:
         self.longest_s = [0.0] * len(GENERATIONS)
         self._clock = clock
         self._since_s: float | None = None
+        self._settling = False
         self._thresholds: tuple[int, int, int] | None = None  # as they were; None: nothing is settled
 
     def watch(self) -> None:
@@ -37,12 +38,14 @@ class CollectorWatch:
             gc.callbacks.append(self._pass)
 
     def settle(self) -> None:
-        """What is there now stays: it is not looked at again, and passes become rare. Takes one full pass. It holds for
-        the process, so it is not for a daemon that shares one."""
+        """What is there now stays: it is not looked at again, and passes become rare. Takes one full pass, which
+        is not counted. It holds for the process, so it is not for a daemon that shares one."""
         if self._thresholds is None:
             self._thresholds = gc.get_threshold()
         gc.set_threshold(*THRESHOLDS)
+        self._settling = True
         gc.collect()
+        self._settling = False
         gc.freeze()
 
     def close(self) -> None:
@@ -57,7 +60,7 @@ class CollectorWatch:
 
     def _pass(self, phase: str, info: dict[str, int]) -> None:
         if phase == "start":
-            self._since_s = self._clock()
+            self._since_s = None if self._settling else self._clock()
         elif self._since_s is not None:
             spent_s, self._since_s = self._clock() - self._since_s, None
             generation = info["generation"]
