@@ -25,7 +25,7 @@ from sern_core.errors import RefusedError, UsageError, WireError
 from sern_core.fates import Fates
 from sern_core.fragments import InStream
 from sern_core.hub_events import GuardedEvents, HubEvents, Relayed
-from sern_core.hub_fanout import CHANNEL_US, Fanout
+from sern_core.hub_fanout import Fanout
 from sern_core.hub_local import LocalStreams
 from sern_core.hub_matching import Matching
 from sern_core.hub_port import HubPort
@@ -115,7 +115,7 @@ class Hub(LocalStreams):
         self._bounds: dict[ClientName, QueueBound] = {}
         self._subscriptions: dict[ClientName, list[str]] = {}  # parts that have arrived
         self.matching = Matching(self.routing, self._subscribed, self._apply)
-        self._fanout = Fanout(self._offer, self._told)
+        self._fanout = Fanout(self._offer, self._told, self._let_go)
         self._awaited: dict[ClientName, set[TopicName]] = {}
         self._heard: set[ClientName] = set()  # said what they want, to this run of the relay
         self._absent_since: dict[ClientName, float] = {}
@@ -259,6 +259,7 @@ class Hub(LocalStreams):
 
     def _forget(self, client: ClientName, now: float, *, reason: DropReason = DropReason.DISCONNECTED) -> None:
         link = self.links[client]
+        self._fanout.forget(client, now=now)
         self._apply(self.routing.drop_client(client), now, reason=reason)
         for channel in list(link.channels.values()):
             link.close_channel(channel, reason, now=now)
@@ -320,8 +321,11 @@ class Hub(LocalStreams):
         `source`: whose announcement it was, so that subscribers are told of it in slices."""
         touched: set[StreamId] = set(change.wanted) | set(change.unwanted)
         for identity in change.removed:
-            self._remove(identity, now, drain=reason is not DropReason.FORBIDDEN)
+            self._remove(identity, now, drain=reason is not DropReason.FORBIDDEN, source=source)
+        removed = frozenset(change.removed)
         for client, identity in change.unmatched:
+            if identity in removed:
+                continue  # its channels are closed by now, or will be
             self._close(client, identity, reason, now)
             touched.add(identity)
         for identity in change.updated:  # the origin offers it anew, with other properties: so is it offered onwards
@@ -402,6 +406,7 @@ class Hub(LocalStreams):
         relayed = self.relayed[identity]
         link = self._link(client, now)
         stream = relayed.stream.stream
+        self._fanout.close(client, identity, now=now)  # of the same stream, before it ended
         if first is None:
             first = relayed.stream.delivered + 1
         ended = self._draining.take(client, stream, first, now=now)
@@ -436,8 +441,9 @@ class Hub(LocalStreams):
             self._bounds[client].recount()
         return self.replays.replay(relayed.cache)
 
-    def _remove(self, identity: StreamId, now: float, *, drain: bool = True) -> None:
-        """The stream has ended. `drain`: what was owed of it is still delivered."""
+    def _remove(self, identity: StreamId, now: float, *, drain: bool = True, source: Link | None = None) -> None:
+        """The stream has ended. `drain`: what was owed of it is still delivered; `source`: who said so, so that
+        subscribers are told in slices."""
         relayed = self.relayed.pop(identity, None)
         if relayed is None:
             return
@@ -446,15 +452,26 @@ class Hub(LocalStreams):
             self.replays.close(relayed.cache)
         if relayed.source is None:
             self._closed_local(relayed, now)
-        for client, (link, channel) in relayed.outs.items():
-            if not drain:
-                self._end_channel(client, link, channel, DropReason.FORBIDDEN, now)
-            elif channel.reliable and channel.retained:
-                self._draining.add(client, link, channel, max_bytes=self._max_queue_bytes(client), now=now)
-            else:
-                self._end_channel(client, link, channel, DropReason.DISCONNECTED, now)
+        if source is not None and drain:
+            self._fanout.close_later(relayed)
+        else:
+            for client, (link, channel) in relayed.outs.items():
+                if drain:
+                    self._let_go(client, link, channel, now)
+                else:
+                    self._end_channel(client, link, channel, DropReason.FORBIDDEN, now)
         self.objects.delete_stream(identity)
         self.events.stream_removed(relayed.stream.stream)
+
+    def _let_go(self, client: ClientName, link: Link, channel: OutChannel, now: float) -> None:
+        """The channel's stream has ended: deliver what is still owed, or close it."""
+        stream = channel.stream.id
+        if not channel.reliable or not channel.retained:
+            self._end_channel(client, link, channel, DropReason.DISCONNECTED, now)
+        elif not self._may_drain(client, stream):
+            self._end_channel(client, link, channel, DropReason.FORBIDDEN, now)
+        else:
+            self._draining.add(client, link, channel, max_bytes=self._max_queue_bytes(client), now=now)
 
     def _confirm(self, relayed: Relayed) -> None:
         """Tell the origin how far everybody who is owed has got."""
@@ -595,17 +612,14 @@ class Hub(LocalStreams):
                 self.matching.look(client, now=now)
 
     def on_retract(self, link: Link, stream: InStream, *, now: float) -> None:
-        relayed = self.relayed.get(stream.stream.id)
-        if relayed is not None:
-            link.reassembly.work_us += STREAM_US + CHANNEL_US * len(relayed.outs)
-        self._apply(self.routing.withdraw(stream.stream.id), now)
+        link.reassembly.work_us += STREAM_US
+        self._apply(self.routing.withdraw(stream.stream.id), now, source=link)
         self._remove(stream.stream.id, now)
 
     def _charge(self, link: Link, change: RouteChange) -> None:
-        """What an announcement has cost is on the account of who made it, beside the channels that it opens."""
-        channels = len(change.unmatched)
+        """What an announcement has cost is on the account of who made it, beside the channels that it opens or ends."""
         matching_us = int(self.routing.spent_units * UNIT_S * 1e6)
-        link.reassembly.work_us += STREAM_US + CHANNEL_US * channels + matching_us
+        link.reassembly.work_us += STREAM_US * (1 + len(change.removed)) + matching_us
 
     def on_message(self, link: Link, stream: InStream, message: Message, *, now: float) -> None:
         relayed = self.relayed.get(stream.stream.id)
@@ -801,6 +815,7 @@ class Hub(LocalStreams):
         known = {info.id for info in self.routing.infos()}
         assert known == self.relayed.keys(), f"routes and streams differ: {known ^ self.relayed.keys()}"
         held_channels = {id(pair[1]) for relayed in self.relayed.values() for pair in relayed.outs.values()}
+        held_channels |= self._fanout.closing()
         held_channels |= self._draining.validate(self.links)
         for client, link in self.links.items():
             for channel in link.channels.values():

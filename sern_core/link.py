@@ -153,7 +153,7 @@ class Link(Answering):
         self._skipping: dict[InStream, int] = {}  # how many messages a stream leaves out that goes on in a while
         self._missing: dict[StreamId, float] = {}  # not announced by a new peer, and since when
         self.finish: Callable[[Link, float], bool] | None = None
-        """Called before more is read: whether all that earlier announcements set off is done by now."""
+        """Called before more is read: whether all that came of what was read before is done by now."""
         self._on_dropped = self._dropped  # one for all channels
         self.faults = 0
         """Errors of ours on this link so far."""
@@ -498,7 +498,7 @@ class Link(Answering):
 
     def _go_on(self, now: float) -> bool:
         reassembly = self.reassembly
-        if self.finish is not None and not self.finish(self, now):
+        if not self._finished(now):
             return False
         while reassembly.behind:
             stream = next(iter(reassembly.behind))
@@ -512,7 +512,10 @@ class Link(Answering):
             if reassembly.work_us > SLICE_US:
                 return False
             self._retract(self._gone.popleft(), now)
-        return True
+        return self._finished(now)
+
+    def _finished(self, now: float) -> bool:
+        return self.finish is None or self.finish(self, now)
 
     def outlived(self, origin: ClientName, boot: int, *, now: float) -> None:
         """A process of `origin` is there, `boot`: what a new relay has not been told of the ones before is gone."""

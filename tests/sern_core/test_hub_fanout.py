@@ -200,6 +200,38 @@ def test_a_message_that_is_read_all_the_same_reaches_all() -> None:
     peer.hub.validate()
 
 
+def test_the_streams_of_a_process_that_was_started_anew_end_in_slices() -> None:
+    world = World()
+    readers = reading(world, 20)
+    peer = Hostile(world)
+    for channel in range(1, 41):
+        peer.announce(channel, f"/robot/t{channel}", reliable=True)
+        while due_s(peer) is not None:
+            turn(peer)
+    peer.say(_whole(1, 1))
+    hub, owed = peer.hub, stream_of(peer, "/robot/t1")
+    links = [hub.links[reader.name] for reader in readers]
+    peer.boot, peer.control_seq, peer.tag = 78, 0, 2
+    peer.hello(2)
+    peer.announce(1, "/robot/t1", reliable=True)
+    assert {identity.boot for identity in hub.relayed} == {78}
+    left = [sum(len(link.channels) for link in links)]
+    while due_s(peer) is not None:
+        hub.validate()
+        assert left[-1] <= 20 or not stream_of(peer, "/robot/t1").outs, "a new stream is told before the old ones end"
+        turn(peer)
+        left.append(sum(len(link.channels) for link in links))
+        assert left[-2] - left[-1] <= SLICE_US // hub_fanout.CLOSE_US + 1
+        if len(left) == 2:
+            hub.forget(readers[0].name, "revoked", now=peer.now)
+            links.pop(0)
+            left[-1] = sum(len(link.channels) for link in links)
+    hub.validate()
+    assert len(left) > 3
+    identity = owed.stream.stream.id
+    assert all(len(link.channels) == 2 and link.by_stream[identity].retained for link in links), "what is owed is kept"
+
+
 class Party:
     """An origin and its readers, who do as they like; a slice is two channels."""
 
@@ -293,6 +325,7 @@ class Party:
 @pytest.mark.parametrize("seed", range(40))
 def test_whatever_happens_everybody_gets_all_they_want(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(hub_fanout, "CHANNEL_US", SLICE_US // 2)
+    monkeypatch.setattr(hub_fanout, "CLOSE_US", SLICE_US // 2)
     party = Party(seed)
     party.announce()
     for _ in range(60):
