@@ -33,6 +33,7 @@ from sern_core.types import CLASS_LABELS, DropReason, ObjectKind
 from sern_runtime import clock
 from sern_runtime.adaptation import Adaptation
 from sern_runtime.codec_pool import CodecPool, make_coder
+from sern_runtime.collector import CollectorWatch
 from sern_runtime.config.base import split_tcp
 from sern_runtime.config.client import ClientFile, ServicesSection, load_client
 from sern_runtime.config.load import Loaded
@@ -66,6 +67,7 @@ async def run_client(path: Path, shutdown: Shutdown) -> int:
     daemon = ClientDaemon(loaded)
     try:
         await daemon.start()
+        daemon.collector.settle()
         await serve(shutdown, daemon.tasks)
         daemon.notifier.stopping("draining")
         await daemon.drain()
@@ -83,6 +85,7 @@ class ClientDaemon:
         self.notifier = Notifier.from_environment()
         endpoint = make_endpoint(loaded)
         self.errors = InternalErrors()
+        self.collector = CollectorWatch()
         self.parts = OptionalParts("adaptation", "codecs", "frames", "http", "message_log", "metrics", "summaries")
         self.message_log = MessageLog(loaded.resolve(model.message_log)) if model.message_log else None
         self.bridge = Bridge(
@@ -169,6 +172,7 @@ class ClientDaemon:
 
     async def start(self) -> None:
         self.errors.watch(asyncio.get_running_loop())
+        self.collector.watch()
         model = self.loaded.model
         relay = model.relay
         keys = load_secret(self.loaded.resolve(relay.secret_key_file)) if relay.secret_key_file else None
@@ -287,6 +291,7 @@ class ClientDaemon:
         register_received(metrics, self.core.received, self.bridge.ages)
         register_codecs(metrics, self.core.coder)
         self.errors.register(metrics)
+        self.collector.register(metrics)
         register_summaries(metrics, self.bridge.summaries)
         metrics.counter(
             "sern_patch_gaps_total",
@@ -464,6 +469,7 @@ class ClientDaemon:
         """Ends whatever was started, the last first, also when a part of it fails."""
         async with AsyncExitStack() as stack:
             stack.callback(self.errors.unwatch, asyncio.get_running_loop())
+            stack.callback(self.collector.close)
             stack.callback(self.notifier.close)
             stack.callback(self._write_summary)
             if self.message_log is not None:

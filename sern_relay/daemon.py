@@ -29,6 +29,7 @@ from sern_relay.udp import RelayLanes
 from sern_runtime import clock
 from sern_runtime.adaptation import Adaptation
 from sern_runtime.codec_pool import CodecPool, make_coder
+from sern_runtime.collector import CollectorWatch
 from sern_runtime.config.load import Loaded
 from sern_runtime.config.relay import RelayFile, load_relay
 from sern_runtime.draining import Progress
@@ -67,6 +68,7 @@ async def run_relay(path: Path, shutdown: Shutdown) -> int:
     daemon = RelayDaemon(loaded)
     try:
         await daemon.start()
+        daemon.collector.settle()
         shutdown.on_reload = daemon.reload
         await serve(shutdown, daemon.tasks)
         daemon.notifier.stopping("draining")
@@ -91,6 +93,7 @@ class RelayDaemon:
         self.directory = self._directory(loaded)
         self.ages = AgeHistograms()
         self.errors = InternalErrors()
+        self.collector = CollectorWatch()
         self.refusals = dict.fromkeys((*sorted(REFUSAL_CODES), OTHER_CODE), 0)
         self.reloads_failed = 0
         self.hub = Hub(
@@ -151,6 +154,7 @@ class RelayDaemon:
 
     async def start(self) -> None:
         self.errors.watch(asyncio.get_running_loop())
+        self.collector.watch()
         model = self.loaded.model
         relay = model.relay
         keys = load_secret(self.loaded.resolve(relay.secret_key_file)) if relay.secret_key_file else None
@@ -302,6 +306,7 @@ class RelayDaemon:
         register_received(metrics, self.hub.received, self.ages)
         register_codecs(metrics, self.coder)
         self.errors.register(metrics)
+        self.collector.register(metrics)
         adaptation = self.adaptation
         self.parts.register(metrics)
         if adaptation is not None:
@@ -425,6 +430,7 @@ class RelayDaemon:
         self._ready = False
         async with AsyncExitStack() as stack:
             stack.callback(self.errors.unwatch, asyncio.get_running_loop())
+            stack.callback(self.collector.close)
             stack.callback(self.notifier.close)
             stack.callback(self._write_summary)
             if self.message_log is not None and self.fates is not None:

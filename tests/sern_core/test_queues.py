@@ -26,7 +26,7 @@ class Sender:
         self.drops: list[tuple[int, DropReason]] = []
         counters = self.ledger.topic(info.name, topic_spec.priority)
         self.channel = OutChannel(
-            1, self.stream, counters, lambda out, reason: self.drops.append((out.seq, reason)), first=first
+            1, self.stream, counters, lambda _channel, out, reason: self.drops.append((out.seq, reason)), first=first
         )
         self.channel.wanted = self.channel.ready = True
 
