@@ -178,11 +178,11 @@ HOSTILE = [
 def test_no_pattern_takes_long(text: str) -> None:
     """A backtracking matcher needs seconds to hours for most of these."""
     names = ["/" + "a" * 254, "/" + "ab" * 127, "/" + "anz" * 84, "/" + "a" * 40]
-    begun_s = time.process_time()
+    begun_s = time.thread_time()
     pattern = compile_pattern(text)
     for name in names:
         pattern.fullmatch(name)
-    assert time.process_time() - begun_s < 1.0  # some milliseconds
+    assert time.thread_time() - begun_s < 1.0  # some milliseconds
 
 
 def test_what_cannot_match_costs_no_steps() -> None:

@@ -9,7 +9,7 @@ from tests.scenarios import Run, Scenario, scenarios
     derandomize=True,
     database=None,
     deadline=None,
-    max_examples=60,
+    max_examples=30,
     phases=[Phase.explicit, Phase.generate],  # a scenario reads well as it is; making it smaller takes minutes
     suppress_health_check=[HealthCheck.too_slow],
 )

@@ -405,9 +405,7 @@ class Channel(RuleBasedStateMachine):
 
 
 TestChannel = Channel.TestCase
-TestChannel.settings = settings(
-    derandomize=True, database=None, deadline=None, max_examples=150, stateful_step_count=40
-)
+TestChannel.settings = settings(derandomize=True, database=None, deadline=None, max_examples=75, stateful_step_count=40)
 
 
 @pytest.mark.parametrize("reliable", [False, True])

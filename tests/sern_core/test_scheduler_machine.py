@@ -211,5 +211,5 @@ class SchedulerMachine(RuleBasedStateMachine):
 
 TestSchedulerMachine = SchedulerMachine.TestCase
 TestSchedulerMachine.settings = settings(
-    deadline=None, derandomize=True, database=None, max_examples=150, stateful_step_count=40
+    deadline=None, derandomize=True, database=None, max_examples=75, stateful_step_count=40
 )
