@@ -18,8 +18,8 @@ TRIES: Final = 2
 MARGIN: Final = 3.0
 MULTIPLE: Final = 24
 """Bytes of memory that an input may hold for each of its own, and..."""
-MULTIPLE_EACH: Final = 40
-"""... and for each client that gets what is announced in it: a channel with its queue and counters takes 7 kB."""
+MULTIPLE_EACH: Final = 12
+"""... and for each client that gets what is announced in it: a channel with its queue and counters takes 2 kB."""
 BASE_BYTES: Final = 2 * 2**20
 """... what it may hold whatever its size: caches that fill, what one attachment unpacks to."""
 

@@ -9,7 +9,7 @@ import pytest
 from sern_core.ledger import NO_DROPS, ReceiveCounters, SendCounters
 from sern_core.types import DropReason, PriorityClass, TopicName
 from tests.fuzz.test_hostile_peer import Hostile
-from tests.fuzz.test_price import said
+from tests.fuzz.test_price_datagrams import said
 from tests.world import World
 
 STREAMS: Final = 40
