@@ -26,7 +26,7 @@ from sern_relay.objects_view import objects_view
 from sern_relay.server import RelayServer
 from sern_relay.transforms import TransformObjects
 from sern_relay.udp import RelayLanes
-from sern_runtime import clock
+from sern_runtime import clock, ros_types
 from sern_runtime.adaptation import Adaptation
 from sern_runtime.codec_pool import CodecPool, make_coder
 from sern_runtime.collector import CollectorWatch
@@ -155,6 +155,7 @@ class RelayDaemon:
     async def start(self) -> None:
         self.errors.watch(asyncio.get_running_loop())
         self.collector.watch()
+        ros_types.load()
         model = self.loaded.model
         relay = model.relay
         keys = load_secret(self.loaded.resolve(relay.secret_key_file)) if relay.secret_key_file else None
