@@ -14,21 +14,16 @@ from typing import Final
 import pytest
 import uvloop
 import zmq
-from hypothesis import HealthCheck, settings
 
 from sern_core.types import ClientName
 from sern_runtime.keys import SecretKey, generate
+from tests.exploring import load_profile
 from tests.support import DEADLINE_S, Patience
 
 Context = zmq.Context[zmq.Socket[bytes]]
 PEERS: Final = Path(__file__).parent / "peers"
 
-# The same cases in every run: a failure is one of the change at hand, and is there again in the next run. Nor is a busy
-# machine, which draws and runs them slowly, a failure.
-settings.register_profile(
-    "sern", derandomize=True, database=None, deadline=None, suppress_health_check=[HealthCheck.too_slow]
-)
-settings.load_profile("sern")
+load_profile()
 
 
 @pytest.hookimpl(optionalhook=True)

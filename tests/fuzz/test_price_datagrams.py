@@ -16,6 +16,7 @@ from sern_core.codecs import Compression, encode
 from sern_core.errors import WireError
 from sern_core.message import StreamId, StreamInfo, TopicInfo
 from sern_core.types import Encoding, TopicName
+from tests.exploring import seeds
 from tests.fuzz.price import Input, Make, within_budget, within_memory
 from tests.fuzz.test_hostile_peer import Hostile, _piece, _whole
 from tests.world import World, spec
@@ -415,7 +416,7 @@ def fuzzed_frame(rng: random.Random, peer: Hostile) -> bytes:
     return bytes([rng.randrange(6)]) + rng.randbytes(rng.randrange(40))
 
 
-@pytest.mark.parametrize("seed", range(120))
+@pytest.mark.parametrize("seed", seeds(120))
 def test_any_datagram_has_a_bounded_price(seed: int) -> None:
     make = fuzzed_datagram(random.Random(seed))
     assert within_budget(make)

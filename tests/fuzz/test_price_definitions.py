@@ -15,6 +15,7 @@ from sern_core.message import TopicInfo
 from sern_core.summaries import transforms
 from sern_core.types import Encoding, TopicName
 from sern_runtime import ros_services, ros_text, ros_types
+from tests.exploring import seeds
 from tests.fuzz.price import Input, Make, within_budget, within_memory
 
 INPUTS: Final[dict[str, Make]] = {}
@@ -197,7 +198,7 @@ def fuzzed_definition(rng: random.Random) -> Make:
     return lambda: Input(len(text), take)
 
 
-@pytest.mark.parametrize("seed", range(120))
+@pytest.mark.parametrize("seed", seeds(120))
 def test_any_definition_has_a_bounded_price(seed: int) -> None:
     make = fuzzed_definition(random.Random(seed))
     assert within_budget(make)

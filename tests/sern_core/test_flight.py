@@ -5,6 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sern_core.flight import ACK_DELAY_S, ACK_SPACING_S, FIRST_LOSS_TIMEOUT_S, SACK_BITS, SPACED_BYTES, Arrivals, Flight
+from tests.exploring import cases
 
 
 def flight(count: int, *, lossless: bool = False, rtt_s: float | None = 0.1) -> Flight:
@@ -132,7 +133,7 @@ def test_a_far_jump_of_numbers_costs_nothing() -> None:
     assert arrivals.mask == 0 and arrivals.highest == 0xFFFFFFFF
 
 
-@settings(derandomize=True, database=None, deadline=None, max_examples=200)
+@settings(max_examples=cases(200))
 @given(
     st.lists(st.integers(1, 40), max_size=60),
     st.integers(0, 2**16),

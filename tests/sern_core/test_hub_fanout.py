@@ -9,6 +9,7 @@ from sern_core.fragments import SLICE_US
 from sern_core.hub_events import Relayed
 from sern_core.message import StreamId
 from sern_core.types import ClientName, TopicName
+from tests.exploring import seeds
 from tests.fuzz.test_hostile_peer import Hostile, _whole
 from tests.world import World
 
@@ -322,7 +323,7 @@ class Party:
                     self.hub.validate()
 
 
-@pytest.mark.parametrize("seed", range(40))
+@pytest.mark.parametrize("seed", seeds(40))
 def test_whatever_happens_everybody_gets_all_they_want(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(hub_fanout, "CHANNEL_US", SLICE_US // 2)
     monkeypatch.setattr(hub_fanout, "CLOSE_US", SLICE_US // 2)

@@ -13,6 +13,7 @@ from sern_core.fragments import InStream, Reassembly
 from sern_core.interest import PAUSE_MAX_S, Interest
 from sern_core.message import StreamId, StreamInfo, TopicInfo
 from sern_core.types import ClientName, Encoding, TopicName
+from tests.exploring import seeds
 from tests.fuzz.test_hostile_peer import Hostile
 from tests.make_vectors import Frames
 from tests.world import SimClient, World, spec
@@ -205,7 +206,7 @@ def in_stream(index: int) -> InStream:
 
 
 @pytest.mark.parametrize("batches", [True, False])
-@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("seed", seeds(20))
 def test_whatever_changes_the_peer_ends_up_with_what_is(seed: int, batches: bool) -> None:
     random = Random(seed)
     interest = Interest()

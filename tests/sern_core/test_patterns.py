@@ -10,8 +10,9 @@ from hypothesis import strategies as st
 from sern_core import patterns
 from sern_core.errors import UsageError
 from sern_core.patterns import MAX_CLIENT_PROGRAM, MAX_PROGRAM, PatternError, PatternSet, compile_pattern
+from tests.exploring import cases
 
-PURE = settings(deadline=None, derandomize=True, database=None, max_examples=150)
+PURE = settings(max_examples=cases(150))
 
 
 @pytest.mark.parametrize(
