@@ -119,6 +119,7 @@ class Hub(LocalStreams):
         self._heard: set[ClientName] = set()  # said what they want, to this run of the relay
         self._absent_since: dict[ClientName, float] = {}
         self._draining = Draining(self._end_channel)
+        self._unsubscribed: OutChannel | None = None  # is being closed because its taker wants it no more
         self._tidy_due_s = now + TIDY_S
         self.after: Callable[[], None] = lambda: None
         """Called when something was done by time that may have given any client's link something to send; set by the
@@ -345,7 +346,9 @@ class Hub(LocalStreams):
         relayed.unopened.discard(client)
         pair = relayed.outs.pop(client, None)
         if pair is not None:
+            self._unsubscribed = pair[1] if reason is DropReason.UNWANTED else None
             self._end_channel(client, *pair, reason, now)
+            self._unsubscribed = None
 
     def _end_channel(self, client: ClientName, link: Link, channel: OutChannel, reason: DropReason, now: float) -> None:
         self._for(client, now, partial(link.close_channel, channel, reason, now=now))
@@ -656,8 +659,8 @@ class Hub(LocalStreams):
         relayed = self.relayed.get(channel.stream.id)
         if relayed is None or relayed.source is None:
             return
-        if reason is DropReason.UNWANTED and link.peer not in relayed.outs:
-            return  # it has just unsubscribed: it is owed nothing, and others may have the message
+        if channel is self._unsubscribed or (reason is DropReason.UNWANTED and link.peer not in relayed.outs):
+            return  # it is owed nothing any more, also of what was sent whole, and others may have the message
         now, source = link.now, relayed.source
         report = partial(source.report_drop, relayed.stream, out.seq, reason, link.peer, now=now)
         self._for(source.peer, now, report)
