@@ -10,6 +10,7 @@ dropped, and what it was owed is reported to the origins. One that says goodbye 
 and so is one whose name is revoked.
 """
 
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial
@@ -36,6 +37,7 @@ from sern_core.object_control import apply_object
 from sern_core.objects import ObjectRegistry
 from sern_core.out_message import OutMessage
 from sern_core.params import LinkParams, SchedulerParams
+from sern_core.presence import Presence
 from sern_core.queues import OutChannel
 from sern_core.replay import ReplayStore
 from sern_core.routing import UNIT_S, BadPatternError, RouteChange, RoutingTable
@@ -115,6 +117,7 @@ class Hub(LocalStreams):
         self._bounds: dict[ClientName, QueueBound] = {}
         self._subscriptions: dict[ClientName, list[str]] = {}  # parts that have arrived
         self.matching = Matching(self.routing, self._subscribed, self._apply)
+        self.presence = Presence(self.links, self.local_owners, self._for, self._was_read)
         self._awaited: dict[ClientName, set[TopicName]] = {}
         self._heard: set[ClientName] = set()  # said what they want, to this run of the relay
         self._absent_since: dict[ClientName, float] = {}
@@ -227,6 +230,7 @@ class Hub(LocalStreams):
             self.received.tidy({identity.topic for identity in self.relayed}, now=now)
             self._numbering.tidy(now=now)
         self.matching.sweep(now=now)
+        self.presence.sweep(now=now)
 
     def left(self, client: ClientName, *, now: float) -> None:
         """A client has said goodbye. One that has streams, or wants reliable ones, may come back to them (a daemon that
@@ -346,6 +350,7 @@ class Hub(LocalStreams):
         relayed.unopened.discard(client)
         pair = relayed.outs.pop(client, None)
         if pair is not None:
+            self.presence.parted(identity.origin, client)
             self._unsubscribed = pair[1] if reason is DropReason.UNWANTED else None
             self._end_channel(client, *pair, reason, now)
             self._unsubscribed = None
@@ -368,6 +373,7 @@ class Hub(LocalStreams):
         ended = self._draining.take(client, stream, first, now=now)
         if ended is not None:  # it came back before it was gone
             relayed.outs[client] = ended
+            self.presence.joined(identity.origin, client)
             return
         try:
             channel = link.open_channel(
@@ -386,6 +392,7 @@ class Hub(LocalStreams):
             self.failed(client, error, now=now)
         else:
             relayed.outs[client] = (link, channel)
+            self.presence.joined(identity.origin, client)
 
     def _replays(self, client: ClientName, relayed: Relayed) -> list[Message]:
         """The latched messages that a late joiner may have."""
@@ -407,6 +414,7 @@ class Hub(LocalStreams):
         if relayed.source is None:
             self._closed_local(relayed, now)
         for client, (link, channel) in relayed.outs.items():
+            self.presence.parted(identity.origin, client)
             if not drain:
                 self._end_channel(client, link, channel, DropReason.FORBIDDEN, now)
             elif channel.reliable and channel.retained:
@@ -438,10 +446,12 @@ class Hub(LocalStreams):
             for relayed in self.relayed.values():
                 if link.peer in relayed.outs:
                     relayed.outs[link.peer][1].prime(self._replays(link.peer, relayed), now=now)
+        self.presence.changed(link.peer, now=now)
         self.events.client_up(link.peer, resumed=resumed)
 
     def on_down(self, link: Link, reason: str, *, now: float) -> None:
         self._absent_since[link.peer] = now
+        self.presence.changed(link.peer, now=now)
         self.events.client_down(link.peer, reason)
 
     def on_lane_closed(self, link: Link) -> None:
@@ -713,6 +723,8 @@ class Hub(LocalStreams):
                 raise WireError(f"more than {MAX_SUBSCRIPTION_PARTS * wire.MAX_ENVELOPE_ITEMS} subscription patterns")
             return
         self.matching.ask(client, self._subscriptions.pop(client), now=now)
+        if wire.take_bool(envelope, "peers"):
+            self.presence.watch(client, now=now)
 
     def _subscribed(self, client: ClientName, parts: list[str], now: float) -> None:
         self._awaited.pop(client, None)
@@ -751,6 +763,11 @@ class Hub(LocalStreams):
             for client, (link, channel) in relayed.outs.items():
                 assert self.links.get(client) is link, f"{identity.topic} goes to a link of {client} that is gone"
                 assert link.by_stream.get(identity) is channel, f"{identity.topic}: a closed channel to {client}"
+        taken: dict[ClientName, Counter[ClientName]] = defaultdict(Counter)
+        for identity, relayed in self.relayed.items():
+            for client in relayed.outs if identity.origin not in self.local_owners else ():
+                taken[client][identity.origin] += 1
+        self.presence.validate(taken)
         known = {info.id for info in self.routing.infos()}
         assert known == self.relayed.keys(), f"routes and streams differ: {known ^ self.relayed.keys()}"
         held_channels = {id(pair[1]) for relayed in self.relayed.values() for pair in relayed.outs.values()}

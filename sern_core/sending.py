@@ -440,6 +440,11 @@ class Sender(ABC):
         )
 
     @property
+    def control_heard(self) -> int:
+        """The number of the last control message up to which the peer has acknowledged all."""
+        return self._control.watermark
+
+    @property
     def _control_waits(self) -> bool:
         return bool(self._control.queue or self._control.active)
 
