@@ -22,7 +22,7 @@ from sern_core.message import Message, StreamId, StreamInfo, TopicInfo, TopicSpe
 from sern_core.numbering import Numbering
 from sern_core.out_message import OutMessage
 from sern_core.params import LinkParams, SchedulerParams
-from sern_core.peers import Peers
+from sern_core.peers import Peers, PeerView
 from sern_core.queues import OutChannel
 from sern_core.replay import LatchedCache
 from sern_core.trace import DecisionTrace, TraceEvent
@@ -229,6 +229,12 @@ class ClientCore:
                 self.link.send_control({"t": "subscribe", "patterns": batch, "more": True}, now=now)
                 batch = []
         self.link.send_control({"t": "subscribe", "patterns": batch, "more": False, "peers": True}, now=now)
+
+    def look_at_peers(self, *, now: float) -> list[PeerView]:
+        """Who is there of those whose streams we take, by name. Call about once a second: that the own link has fallen
+        silent is found here."""
+        self.peers.reached(self.link.established and not self.link.lane.stalled, now=now)
+        return self.peers.look(now=now)
 
     def put_object(
         self,

@@ -53,14 +53,15 @@ class PeerChange(NamedTuple):
 
 
 class _Peer:
-    __slots__ = ("lane", "rtt_s", "since_s", "status", "told")
+    __slots__ = ("lane", "rtt_s", "since_s", "status", "up", "up_since_s")
 
     def __init__(self, since_s: float) -> None:
         self.status = PeerStatus.UNKNOWN
         self.since_s = since_s
+        self.up: bool | None = None  # as the relay says in this session; None: it has said nothing
+        self.up_since_s = since_s
         self.lane = ""
         self.rtt_s: float | None = None
-        self.told = False  # in this session
 
 
 class Peers:
@@ -72,20 +73,26 @@ class Peers:
         self._streams: Counter[ClientName] = Counter()  # open here, by origin
         self._heard_s: dict[ClientName, float] = {}
         self._session_s = 0.0
-        self._up = False
+        self._session = False
+        self._believed = False  # the relay answers, so what it said last holds
 
     def session_began(self, *, now: float) -> None:
         """The relay will tell of each peer anew."""
-        self._up = True
+        self._session = self._believed = True
         self._session_s = now
-        for peer in self._peers.values():
-            peer.told = False
 
     def session_ended(self, *, now: float) -> None:
         """Nobody knows of any peer any more."""
-        self._up = False
+        self._session = False
+        for peer in self._peers.values():
+            peer.up = None
+        self.reached(False, now=now)
+
+    def reached(self, answers: bool, *, now: float) -> None:
+        """Whether the relay answers. While it does not, what it said last may not hold any more."""
+        self._believed = answers
         for name, peer in self._peers.items():
-            self._set(name, peer, PeerStatus.UNKNOWN, now, now)
+            self._settle(name, peer, now)
 
     def opened(self, origin: ClientName, *, now: float) -> None:
         """A stream of `origin` is open here."""
@@ -113,7 +120,7 @@ class Peers:
         name = ClientName(wire.take_str(item, "name", max_length=64))
         if "up" not in item:  # we take nothing of it any more
             if name in self._peers:
-                self._peers[name].told = False
+                self._peers[name].up = None
                 self._let_go(name)
             return
         up = wire.take_bool(item, "up")
@@ -123,9 +130,10 @@ class Peers:
         if name not in self._peers and len(self._peers) >= MAX_PEERS:
             raise WireError(f"the relay tells of more than {MAX_PEERS} peers")
         peer = self._known(name, now)
-        peer.told = True
+        if peer.up is not up:
+            peer.up, peer.up_since_s = up, now - for_s
         peer.rtt_s, peer.lane = rtt_s, lane
-        self._set(name, peer, PeerStatus.CONNECTED if up else PeerStatus.GONE, now - for_s, now)
+        self._settle(name, peer, now)
 
     def _known(self, name: ClientName, now: float) -> _Peer:
         peer = self._peers.get(name)
@@ -134,12 +142,16 @@ class Peers:
             self.on_change(PeerChange(name, None, PeerStatus.UNKNOWN, 0.0))
         return peer
 
-    def _set(self, name: ClientName, peer: _Peer, status: PeerStatus, since_s: float, now: float) -> None:
-        if peer.status is status:
-            return
-        old, lasted_s = peer.status, now - peer.since_s
-        peer.status, peer.since_s = status, since_s
-        self.on_change(PeerChange(name, old, status, lasted_s))
+    def _settle(self, name: ClientName, peer: _Peer, now: float) -> None:
+        """Give a peer the status that follows from what is known."""
+        if peer.up is None or not self._believed:
+            status, since_s = PeerStatus.UNKNOWN, now
+        else:
+            status, since_s = PeerStatus.CONNECTED if peer.up else PeerStatus.GONE, peer.up_since_s
+        if status is not peer.status:
+            old, lasted_s = peer.status, now - peer.since_s
+            peer.status, peer.since_s = status, since_s
+            self.on_change(PeerChange(name, old, status, lasted_s))
 
     def _let_go(self, name: ClientName) -> None:
         if name not in self._streams:
@@ -148,8 +160,8 @@ class Peers:
 
     def look(self, *, now: float) -> list[PeerView]:
         """All peers by name. Lets go of those that nothing speaks of any more."""
-        if self._up and now - self._session_s > LET_GO_S:
-            for name in [name for name, peer in self._peers.items() if not peer.told]:
+        if self._session and now - self._session_s > LET_GO_S:
+            for name in [name for name, peer in self._peers.items() if peer.up is None]:
                 self._let_go(name)
         return [self._view(name, peer, now) for name, peer in sorted(self._peers.items())]
 
