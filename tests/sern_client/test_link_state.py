@@ -7,15 +7,17 @@ from typing import Any
 import pytest
 from rosbags.typesys import Stores, get_typestore
 
+from sern_client.bridge import Bridge
 from sern_client.endpoints.base import Publisher
 from sern_client.link_state import LinkState
 from sern_client.link_topics import ARRAY_TYPE, STATUS_TYPE, LinkTopics, LinkView
 from sern_client.withdrawal import MAX_KEPT, Kept, Withdrawal
 from sern_core.client import ClientCore
 from sern_core.errors import ConfigError
-from sern_core.message import StreamId, StreamInfo, TopicInfo
+from sern_core.message import Message, StreamId, StreamInfo, TopicInfo
 from sern_core.params import LinkParams, SchedulerParams
 from sern_core.peers import PeerStatus
+from sern_core.rules import Discovery, DiscoveryMode, RuleSet
 from sern_core.types import ClientName, Encoding, TopicName
 from sern_runtime import clock, ros_types
 from sern_runtime.optional import OptionalParts
@@ -53,6 +55,8 @@ class Opened:
 
 class Endpoint:
     """Keeps what is advertised; refuses names in `refused`."""
+
+    encoding = None
 
     def __init__(self) -> None:
         self.opened: list[Opened] = []
@@ -356,3 +360,32 @@ def test_nothing_is_kept_where_nothing_is_withdrawn() -> None:
     identity = StreamId(ClientName("a"), 1, TopicName("/a"))
     stream = StreamInfo(identity, TopicInfo(identity.topic, "std_msgs/msg/String", Encoding.ROS1), spec(latched=True))
     assert withdrawal.kept(stream) is None
+
+
+async def test_a_message_of_who_is_not_there_brings_its_topic_back() -> None:
+    """The bridge itself: what was latched comes first, nothing twice, and its tables are those of the endpoint."""
+    endpoint: Any = Endpoint()
+    faults: list[Exception] = []
+    bridge = Bridge(
+        endpoint, RuleSet(()), Discovery(DiscoveryMode.MANUAL), "/", log=None, kick=lambda: None,
+        on_up=lambda: None, on_down=lambda _reason: None, on_fault=faults.append,
+    )  # fmt: skip
+    bridge.attach(Site().core)
+    bridge.withdrawal.used = True
+    identity = StreamId(ClientName("jackal1"), 1, TopicName("/jackal1/map"))
+    info = ros_types.topic_info("/jackal1/map", "std_msgs/msg/String", Encoding.ROS1, latched=True)
+    stream = StreamInfo(identity, info, spec(latched=True))
+    bridge.stream_opened(stream)
+    bridge.message(stream, Message(identity, 1, b"old", 1, clock.now()), now=clock.now())
+    bridge.withdrawal.withdraw(ClientName("jackal1"))
+    assert endpoint.open == {}
+    bridge.message(stream, Message(identity, 2, b"new", 2, clock.now()), now=clock.now())
+    assert endpoint.open["/jackal1/map"].bodies == [b"old", b"new"]
+    bridge.withdrawal.withdraw(ClientName("jackal1"))
+    bridge.withdrawal.restore(ClientName("jackal1"))
+    assert endpoint.open["/jackal1/map"].bodies == [b"new"]
+    bridge.withdrawal.withdraw(ClientName("jackal1"))
+    bridge.stream_closed(stream)
+    bridge.withdrawal.restore(ClientName("jackal1"))
+    assert endpoint.open == {} and faults == []
+    bridge.close()
