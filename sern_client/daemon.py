@@ -18,8 +18,9 @@ from sern_client.bridge import Bridge
 from sern_client.checks import TableCheck
 from sern_client.endpoints.base import CountingEndpoint, Endpoint, ServiceEndpoint
 from sern_client.express import ClientExpress
-from sern_client.factory import make_endpoint
+from sern_client.factory import make_endpoint, make_link_topics
 from sern_client.guard import Guard
+from sern_client.link_state import LinkState
 from sern_client.services import ServiceBridge
 from sern_client.summarise import register_summaries
 from sern_client.transport import RelayTransport
@@ -86,7 +87,9 @@ class ClientDaemon:
         endpoint = make_endpoint(loaded)
         self.errors = InternalErrors()
         self.collector = CollectorWatch()
-        self.parts = OptionalParts("adaptation", "codecs", "frames", "http", "message_log", "metrics", "summaries")
+        self.parts = OptionalParts(
+            "adaptation", "codecs", "frames", "http", "link_state", "message_log", "metrics", "summaries"
+        )
         self.message_log = MessageLog(loaded.resolve(model.message_log)) if model.message_log else None
         self.bridge = Bridge(
             endpoint,
@@ -128,6 +131,17 @@ class ClientDaemon:
             self.bridge.goals = GoalWatch(rules, lambda info: self.bridge.converter.advertise(endpoint, info))
         self.adaptation = self._make_adaptation()
         self.reason = "not connected yet"
+        state = model.link_state
+        self.bridge.withdrawal.used = state.withdraw_after_s is not None
+        self.bridge.link_state = self.link_state = LinkState(
+            self.core,
+            make_link_topics(model, lambda info: self.bridge.converter.advertise(endpoint, info)),
+            self.bridge.withdrawal,
+            period_s=state.period_s,
+            withdraw_after_s=state.withdraw_after_s,
+            reason=lambda: self.bridge.rejected_reason or self.reason,
+            parts=self.parts,
+        )
         self._said: set[str] = set()  # since the last session: an attempt that fails as before is no news
         self._ctx: zmq.Context[zmq.Socket[bytes]] | None = None
         self._transport: RelayTransport | None = None
@@ -193,6 +207,7 @@ class ClientDaemon:
         # Before the transport: streams from the relay are advertised at the endpoint as soon as there is a session.
         await self.bridge.endpoint.start(self.bridge)
         self._endpoint_started = True
+        self.link_state.start()
         if self.guard is not None:
             self.guard.start()
         self._ctx = zmq.Context()
@@ -238,12 +253,14 @@ class ClientDaemon:
     def _link_down(self, reason: str) -> None:
         """Told by the transport and by the session on it, usually of the same thing."""
         self.reason = reason
+        self.link_state.soon()
         if reason not in self._said and not self._stopping:
             self._said.add(reason)
             _log.warning("%s: %s; trying again until it works", self.loaded.model.relay.endpoint, reason)
 
     def _link_up(self) -> None:
         self._said.clear()
+        self.link_state.soon()
         self._put_node()
         if self._lane is not None:
             self._lane.ask()
@@ -263,6 +280,7 @@ class ClientDaemon:
             if self._express is not None:
                 self._express.tick()
             self.check.tick(now=clock.now())
+            self.link_state.look()
             if watchdog.interval_s is not None:
                 watchdog.check()
             state = "up" if link.established and not link.lane.stalled else f"down: {self.reason}"
@@ -291,6 +309,7 @@ class ClientDaemon:
         register_links(metrics, lambda: [link])
         register_received(metrics, self.core.received, self.bridge.ages)
         register_codecs(metrics, self.core.coder)
+        self.link_state.register(metrics)
         self.errors.register(metrics)
         self.collector.register(metrics)
         register_summaries(metrics, self.bridge.summaries)
@@ -389,6 +408,7 @@ class ClientDaemon:
             ready=self._ready,
             json_routes={
                 "/api/link": lambda: [link.snapshot()],
+                "/api/peers": self.link_state.to_json,
                 "/api/topics": self.topics,
                 "/api/trace": self.core.trace.to_json,
                 **({} if adaptation is None else {"/api/mmcf": adaptation.to_json}),
@@ -404,7 +424,9 @@ class ClientDaemon:
         if self.core.link.established:
             if self.check.found:
                 return Health(ok=False, reason=f"what is here is not what should be: {self.check.found[0]}")
-            return Health(ok=True, reason=f"connected to {self.core.link.peer}")
+            # A site with one robot of three gone does its job for the other two.
+            said = (f"connected to {self.core.link.peer}", self.link_state.detail())
+            return Health(ok=True, reason="; ".join(filter(None, said)))
         return Health(ok=False, reason=self.bridge.rejected_reason or self.reason)
 
     def topics(self) -> dict[str, TopicView]:
@@ -485,6 +507,7 @@ class ClientDaemon:
             if self.guard is not None:
                 stack.push_async_callback(self.guard.stop)
             stack.callback(self.bridge.close)
+            stack.callback(self.link_state.close)
             if self.bridge.services is not None:
                 stack.push_async_callback(self.bridge.services.stop)
             if self._transport is not None:

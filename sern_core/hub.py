@@ -10,6 +10,7 @@ dropped, and what it was owed is reported to the origins. One that says goodbye 
 and so is one whose name is revoked.
 """
 
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -37,6 +38,7 @@ from sern_core.object_control import apply_object
 from sern_core.objects import ObjectRegistry
 from sern_core.out_message import OutMessage
 from sern_core.params import LinkParams, SchedulerParams
+from sern_core.presence import Presence
 from sern_core.queues import OutChannel
 from sern_core.replay import ReplayStore
 from sern_core.routing import UNIT_S, BadPatternError, RouteChange, RoutingTable
@@ -116,10 +118,12 @@ class Hub(LocalStreams):
         self._subscriptions: dict[ClientName, list[str]] = {}  # parts that have arrived
         self.matching = Matching(self.routing, self._subscribed, self._apply)
         self._fanout = Fanout(self._offer, self._told, self._let_go)
+        self.presence = Presence(self.links, self.local_owners, self._for, self._was_read)
         self._awaited: dict[ClientName, set[TopicName]] = {}
         self._heard: set[ClientName] = set()  # said what they want, to this run of the relay
         self._absent_since: dict[ClientName, float] = {}
         self._draining = Draining(self._end_channel)
+        self._unsubscribed: OutChannel | None = None  # is being closed because its taker wants it no more
         self._tidy_due_s = now + TIDY_S
         self.after: Callable[[], None] = lambda: None
         """Called when something was done by time that may have given any client's link something to send; set by the
@@ -236,6 +240,7 @@ class Hub(LocalStreams):
             if link.read_due_s is None:
                 link.reassembly.work_us = 0
                 self._fanout.go_on(link, now=now)
+        self.presence.sweep(now=now)
 
     def left(self, client: ClientName, *, now: float) -> None:
         """A client has said goodbye. One that has streams, or wants reliable ones, may come back to them (a daemon that
@@ -389,7 +394,10 @@ class Hub(LocalStreams):
         relayed.waiting.pop(client, None)
         pair = relayed.outs.pop(client, None)
         if pair is not None:
+            self.presence.parted(identity.origin, client)
+            self._unsubscribed = pair[1] if reason is DropReason.UNWANTED else None
             self._end_channel(client, *pair, reason, now)
+            self._unsubscribed = None
 
     def _end_channel(self, client: ClientName, link: Link, channel: OutChannel, reason: DropReason, now: float) -> None:
         self._for(client, now, partial(link.close_channel, channel, reason, now=now))
@@ -412,6 +420,7 @@ class Hub(LocalStreams):
         ended = self._draining.take(client, stream, first, now=now)
         if ended is not None:  # it came back before it was gone
             relayed.outs[client] = ended
+            self.presence.joined(identity.origin, client)
             return
         try:
             channel = link.open_channel(
@@ -430,6 +439,7 @@ class Hub(LocalStreams):
             self.failed(client, error, now=now)
         else:
             relayed.outs[client] = (link, channel)
+            self.presence.joined(identity.origin, client)
 
     def _replays(self, client: ClientName, relayed: Relayed) -> list[Message]:
         """The latched messages that a late joiner may have."""
@@ -452,6 +462,8 @@ class Hub(LocalStreams):
             self.replays.close(relayed.cache)
         if relayed.source is None:
             self._closed_local(relayed, now)
+        for client in relayed.outs:
+            self.presence.parted(identity.origin, client)
         if source is not None and drain:
             self._fanout.close_later(relayed)
         else:
@@ -495,10 +507,12 @@ class Hub(LocalStreams):
             for relayed in self.relayed.values():
                 if link.peer in relayed.outs:
                     relayed.outs[link.peer][1].prime(self._replays(link.peer, relayed), now=now)
+        self.presence.changed(link.peer, now=now)
         self.events.client_up(link.peer, resumed=resumed)
 
     def on_down(self, link: Link, reason: str, *, now: float) -> None:
         self._absent_since[link.peer] = now
+        self.presence.changed(link.peer, now=now)
         self.events.client_down(link.peer, reason)
 
     def on_lane_closed(self, link: Link) -> None:
@@ -716,8 +730,8 @@ class Hub(LocalStreams):
         relayed = self.relayed.get(channel.stream.id)
         if relayed is None or relayed.source is None:
             return
-        if reason is DropReason.UNWANTED and link.peer not in relayed.outs:
-            return  # it has just unsubscribed: it is owed nothing, and others may have the message
+        if channel is self._unsubscribed or (reason is DropReason.UNWANTED and link.peer not in relayed.outs):
+            return  # it is owed nothing any more, also of what was sent whole, and others may have the message
         now, source = link.now, relayed.source
         report = partial(source.report_drop, relayed.stream, out.seq, reason, link.peer, now=now)
         self._for(source.peer, now, report)
@@ -770,6 +784,8 @@ class Hub(LocalStreams):
                 raise WireError(f"more than {MAX_SUBSCRIPTION_PARTS * wire.MAX_ENVELOPE_ITEMS} subscription patterns")
             return
         self.matching.ask(client, self._subscriptions.pop(client), now=now)
+        if wire.take_bool(envelope, "peers"):
+            self.presence.watch(client, now=now)
 
     def _subscribed(self, client: ClientName, parts: list[str], now: float) -> None:
         self._awaited.pop(client, None)
@@ -812,6 +828,11 @@ class Hub(LocalStreams):
                 assert link.by_stream.get(identity) is channel, f"{identity.topic}: a closed channel to {client}"
         for origin in self._fanout.origins():
             assert origin in self.links, f"streams of {origin}, who is gone, are to be told of"
+        taken: dict[ClientName, Counter[ClientName]] = defaultdict(Counter)
+        for identity, relayed in self.relayed.items():
+            for client in relayed.outs if identity.origin not in self.local_owners else ():
+                taken[client][identity.origin] += 1
+        self.presence.validate(taken)
         known = {info.id for info in self.routing.infos()}
         assert known == self.relayed.keys(), f"routes and streams differ: {known ^ self.relayed.keys()}"
         held_channels = {id(pair[1]) for relayed in self.relayed.values() for pair in relayed.outs.values()}

@@ -48,6 +48,7 @@ from sern_runtime.config.base import (
     is_local,
 )
 from sern_runtime.config.endpoints import EndpointSection
+from sern_runtime.config.link_state import LinkStateSection
 from sern_runtime.config.load import Loaded, load
 from sern_runtime.config.shared import (
     ClassWord,
@@ -415,6 +416,8 @@ class ClientFile(FileModel):
     """Choose rates, queue limits, compression and redundancy by their predicted cost; null: leave them as they are."""
     link: LinkSection = LinkSection()
     """The link to the relay."""
+    link_state: LinkStateSection = LinkStateSection()
+    """What this site's nodes are told of the link, and of who is there behind it."""
     http: HttpSection = HttpSection()
     """Metrics and health over HTTP; off by default."""
     log: LogSection = LogSection()
