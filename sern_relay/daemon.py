@@ -93,6 +93,7 @@ class RelayDaemon:
         self.errors = InternalErrors()
         self.refusals = dict.fromkeys((*sorted(REFUSAL_CODES), OTHER_CODE), 0)
         self.reloads_failed = 0
+        self._unreloaded: str | None = None  # what the last reload did not put in force, and why
         self.hub = Hub(
             name=model.name,
             boot=secrets.randbits(63),
@@ -261,7 +262,12 @@ class RelayDaemon:
                 self.zap.ping()
             if watchdog.interval_s is not None:
                 watchdog.check()
-            self.notifier.status(f"{self._clients_up()} clients, {len(self.hub.relayed)} streams")
+            self.notifier.status(self._status())
+
+    def _status(self) -> str:
+        """One line for `systemctl status`. A failed reload stays in it until a good one."""
+        state = f"{self._clients_up()} clients, {len(self.hub.relayed)} streams"
+        return state if self._unreloaded is None else f"{state}; {self._unreloaded}"
 
     def _clients_up(self) -> int:
         return sum(link.established for link in self.hub.links.values())
@@ -276,8 +282,10 @@ class RelayDaemon:
         except ConfigError as error:
             self.reloads_failed += 1
             _log.error("reload failed, the old configuration stays: %s", error)
-            self.notifier.ready(f"reload failed: {error}")
+            self._unreloaded = f"reload failed, the old configuration stays: {error}"
+            self.notifier.ready(self._status())
             return
+        self._unreloaded = None
         log_warnings(_log, loaded.warnings)
         self.directory = directory
         now = clock.now()
@@ -292,7 +300,7 @@ class RelayDaemon:
             _log.warning("%s is in the directory no more; what was held for it is dropped", client)
             self.hub.forget(client, "the name is revoked", now=now)
         self._after()
-        self.notifier.ready("reloaded")
+        self.notifier.ready(self._status())
         _log.info("reloaded keys, access rules and feed roles; other changes need a restart")
 
     def _make_http(self, listen: str) -> HttpServer:
@@ -373,6 +381,7 @@ class RelayDaemon:
             self.feed.update(model.feed_roles(), now=now)
         except ConfigError as error:
             self.reloads_failed += 1
+            self._unreloaded = f"reload failed in part, not all of feed.roles are in force: {error}"
             _log.error("%s: feed.roles: not all of them are in force: %s", self.loaded.path, error)
 
     def _transforms_refused(self) -> list[tuple[tuple[str, ...], float]]:
