@@ -10,7 +10,7 @@ dropped, and what it was owed is reported to the origins. One that says goodbye 
 and so is one whose name is revoked.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from typing import Final
@@ -352,6 +352,12 @@ class Hub(LocalStreams):
 
     def _wanted(self, relayed: Relayed) -> bool:
         return bool(relayed.outs) or relayed.cache is not None or self.tap(relayed.stream.stream)
+
+    def announced(self) -> Iterator[tuple[StreamInfo, bool]]:
+        """Every stream there is, and whether anybody takes it: a client, or a program on the feed."""
+        for relayed in self.relayed.values():
+            stream = relayed.stream.stream
+            yield stream, bool(relayed.outs) or self.tap(stream)
 
     def refresh_interest(self, *, now: float) -> None:
         """The answer of `tap` may have changed: tell the origins."""

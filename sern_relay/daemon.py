@@ -42,7 +42,7 @@ from sern_runtime.message_log import LoggedFates, MessageLog
 from sern_runtime.metrics import Metrics
 from sern_runtime.optional import OptionalParts
 from sern_runtime.sdnotify import Notifier, Watchdog
-from sern_runtime.topics_view import link_summary, received_summary
+from sern_runtime.topics_view import announced_summary, link_summary, received_summary
 from sern_runtime.zap import TemporaryRefusal, ZapHandler, self_test
 
 ZAP_DOMAIN: Final = "sern"
@@ -392,9 +392,10 @@ class RelayDaemon:
         return [] if self.feed is None else [(labels, float(n)) for labels, n in self.feed.results()]
 
     def topics(self) -> dict[str, object]:
-        """Counters by client link and topic, and of what arrived."""
+        """Counters by client link and topic, and of what arrived; and what is announced, whether taken or not."""
         now = clock.now()
         return {
+            "announced": announced_summary(self.hub.announced()),
             "links": {name: link_summary(link, direction="send") for name, link in self.hub.links.items()},
             "received": received_summary(self.hub.received, now=now),
         }
