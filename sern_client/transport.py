@@ -13,8 +13,9 @@ from sern_core.errors import ConfigError, RemoteError
 from sern_core.link import Link
 from sern_runtime import clock
 from sern_runtime.inflow import Inflow
-from sern_runtime.monitor import TcpHandle, TransportWatch
+from sern_runtime.monitor import TcpHandle
 from sern_runtime.pump import LANE_MESSAGE_BYTES, Pump
+from sern_runtime.transport_watch import TransportWatch
 from sern_runtime.zmq_socket import TOS_EXPEDITED, CurvePair, DealerSocket, SendResult, make_client
 
 REBUILD_MIN_S: Final = 1.0
@@ -81,7 +82,7 @@ class Dialer:
         """Connect for the first time. Raises ConfigError."""
 
         def attach(socket: "zmq.Socket[bytes]") -> None:
-            self._watch = TransportWatch(socket, self._up, self._down, self._refused)
+            self._watch = TransportWatch(socket, self._up, self._down, self._refused, self._give_up)
 
         raw = make_client(
             self._ctx,
