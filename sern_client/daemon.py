@@ -20,6 +20,7 @@ from sern_client.endpoints.base import CountingEndpoint, Endpoint, ServiceEndpoi
 from sern_client.express import ClientExpress
 from sern_client.factory import make_endpoint
 from sern_client.guard import Guard
+from sern_client.relay_name import RelayName, name_in
 from sern_client.services import ServiceBridge
 from sern_client.summarise import register_summaries
 from sern_client.transport import RelayTransport
@@ -128,6 +129,7 @@ class ClientDaemon:
         self._said: set[str] = set()  # since the last session: an attempt that fails as before is no news
         self._ctx: zmq.Context[zmq.Socket[bytes]] | None = None
         self._transport: RelayTransport | None = None
+        self._name: RelayName | None = None
         self._lane: ClientLane | None = None
         self._express: ClientExpress | None = None
         self._http: HttpServer | None = None
@@ -203,6 +205,10 @@ class ClientDaemon:
                 on_reason=self._link_down,
                 after=self._kick,
             )
+        named = name_in(relay.endpoint)
+        if named is not None:
+            self._name = RelayName(relay.endpoint, *named)
+            self._name.tick(connected=False)
         address = split_tcp(relay.endpoint)
         if relay.udp and keys is not None and address is not None:
             self._lane = ClientLane(self.core, address[0], kick=self._kick)
@@ -260,8 +266,15 @@ class ClientDaemon:
             self.check.tick(now=clock.now())
             if watchdog.interval_s is not None:
                 watchdog.check()
-            state = "up" if link.established and not link.lane.stalled else f"down: {self.reason}"
+            if self._name is not None:
+                self._name.tick(connected=link.established)
+            state = "up" if link.established and not link.lane.stalled else f"down: {self._why()}"
             self.notifier.status(f"link {state}")
+
+    def _why(self) -> str:
+        """Why there is no link, as far as it is known."""
+        unresolved = None if self._name is None else self._name.problem
+        return unresolved or self.bridge.rejected_reason or self.reason
 
     def _put_node(self) -> None:
         """Tell the relay's registry who we are."""
@@ -399,7 +412,7 @@ class ClientDaemon:
             if self.check.found:
                 return Health(ok=False, reason=f"what is here is not what should be: {self.check.found[0]}")
             return Health(ok=True, reason=f"connected to {self.core.link.peer}")
-        return Health(ok=False, reason=self.bridge.rejected_reason or self.reason)
+        return Health(ok=False, reason=self._why())
 
     def topics(self) -> dict[str, TopicView]:
         """Counters of every topic by global name, sent and received."""
@@ -486,6 +499,8 @@ class ClientDaemon:
                 stack.callback(self._express.close)
             if self._lane is not None:
                 stack.callback(self._lane.closed)
+            if self._name is not None:
+                stack.callback(self._name.close)
             stack.callback(self.codecs.close)
             stack.push_async_callback(end_tasks, self.tasks)
 

@@ -4,10 +4,13 @@ from pathlib import Path
 
 import pytest
 
+from sern_client import relay_name
 from sern_core.message import TopicInfo
 from sern_core.types import Encoding, TopicName
 from tests.daemons import Lab, write_bag
+from tests.support import until
 
+ROBOT = {"kind": "synthetic", "role": "robot", "topics": 1}
 CHAT = ({"match": "/chat", "class": "state", "reliability": "reliable"},)
 
 
@@ -24,3 +27,34 @@ async def test_a_topic_that_no_rule_names_is_said_once(tmp_path: Path, caplog: p
         robot.bridge.topic_added(again)
         said = [message for message in caplog.messages if "stays here" in message]
         assert said == ["/chta (std_msgs/msg/String) stays here: no rule in `topics` names it (discovery.mode: manual)"]
+
+
+async def test_a_relay_that_does_not_resolve_is_said_at_once_and_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(relay_name, "ASK_AGAIN_S", 0.0)
+    monkeypatch.setattr(relay_name, "SAY_AGAIN_S", (0.0, 0.0))
+    async with Lab(tmp_path, "robot1") as lab:
+        config = lab.client_file("robot1", ROBOT, relay={"endpoint": f"tcp://relay.example:{lab.port}"})
+        robot = await lab.client(config)
+        await until(lambda: sum("does not resolve" in message for message in caplog.messages) >= 3, "says it again")
+        first, second = [message for message in caplog.messages if "does not resolve" in message][:2]
+        text = "the relay's name relay.example does not resolve: "
+        assert first.startswith(f"tcp://relay.example:{lab.port}: {text}")
+        assert first.endswith("; trying again until it does")
+        assert " s now" in second
+        assert robot._ready().reason.startswith(text)
+        assert robot._name is not None
+
+        async def resolves(_host: str, _port: int) -> None:
+            return None
+
+        monkeypatch.setattr(relay_name, "unresolved", resolves)
+        await until(lambda: any("relay.example resolves again, after" in message for message in caplog.messages))
+        assert "does not resolve" not in robot._ready().reason
+
+
+def test_only_names_are_looked_up() -> None:
+    assert relay_name.name_in("tcp://relay.example:5555") == ("relay.example", 5555)
+    for endpoint in ("tcp://127.0.0.1:5555", "tcp://[::1]:5555", "ipc:///run/sern"):
+        assert relay_name.name_in(endpoint) is None

@@ -35,9 +35,19 @@ def deployed(tmp_path: Path) -> Path:
 
 @pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.yaml")), ids=lambda path: path.name)
 def test_examples_are_right(deployed: Path, path: Path) -> None:
+    text = (deployed / path.name).read_text()
+    (deployed / path.name).write_text(text.replace("tcp://relay.example:", "tcp://127.0.0.1:"))
     code, out, err = ran(deployed / path.name)
     assert (code, err) == (0, "")
     assert out.endswith(f"{path.name}: right\n")
+
+
+def test_a_relay_that_does_not_resolve_is_a_warning(deployed: Path) -> None:
+    code, out, err = ran(deployed / "site.yaml")  # its relay is in .example, which nobody has (RFC 2606)
+    assert (code, err.count("\n")) == (0, 1)
+    assert err.startswith(f"warning: {deployed}/site.yaml:")
+    assert "relay.endpoint: relay.example does not resolve on this machine now: " in err
+    assert out.endswith("site.yaml: right\n")
 
 
 def test_there_are_examples() -> None:
