@@ -39,6 +39,7 @@ from sern_core.patterns import PatternSet
 from sern_core.queues import OutChannel
 from sern_core.rules import Discovery, ResolvedTopic, RuleSet, to_global
 from sern_core.services import parse as parse_service
+from sern_core.session import DISPLACED
 from sern_core.summaries.transforms import is_static
 from sern_core.types import DropReason, Encoding, TopicName
 from sern_runtime import clock, ros_types
@@ -338,7 +339,8 @@ class Bridge:
         self._on_down(reason)
 
     def rejected(self, code: str, text: str) -> None:
-        if text != self.rejected_reason:  # it is asked again every few seconds
+        # It is asked again every few seconds; of a session that was taken from us `link_down` has said it.
+        if text != self.rejected_reason and code != DISPLACED:
             _log.error("the relay refuses us (%s): %s", code, text)
         self.rejected_reason = text
 

@@ -40,6 +40,7 @@ from sern_core.queues import OutChannel
 from sern_core.replay import ReplayStore
 from sern_core.routing import UNIT_S, BadPatternError, RouteChange, RoutingTable
 from sern_core.rules import is_client_name, name_problem
+from sern_core.session import DISPLACED
 from sern_core.trace import DecisionTrace
 from sern_core.types import DROP_CODES, ClientName, DropReason, TopicName
 
@@ -133,10 +134,17 @@ class Hub(LocalStreams):
         link = self._link(port.client, now)
         older = self.port_of.get(port.client)
         another = older is not port
+        tag, rival = link.tag, link.established and wire.take_int(hello, "boot") != link.peer_boot
         if not link.accept(hello, header.tag, header.stamp_us, now=now, another_connection=another):
             return
         if older is not None and older is not port:
             older.link = None
+            if rival:  # its connection is up: it did not end before the other began
+                older.displace(tag, port, now=now)
+                self.events.refused(
+                    port.client, DISPLACED, f"another process connected as {port.client} from {port.address or '?'}; "
+                    f"the one from {older.address or '?'} has no session any more"
+                )  # fmt: skip
         port.link = link
         self.port_of[port.client] = port
         self._absent_since.pop(port.client, None)
@@ -436,6 +444,8 @@ class Hub(LocalStreams):
 
     def on_up(self, link: Link, *, resumed: bool, now: float) -> None:
         self._absent_since.pop(link.peer, None)
+        if link.peer_boot is not None:
+            self.routing.returned(link.peer, link.peer_boot)
         self._subscriptions.pop(link.peer, None)  # half of one that was said in an earlier session
         if not resumed:
             for relayed in self.relayed.values():

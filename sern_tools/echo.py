@@ -33,6 +33,7 @@ from sern_core.errors import ConfigError, RefusedError, SernError, UsageError
 from sern_core.message import Message, StreamId, StreamInfo
 from sern_core.params import LinkParams, SchedulerParams
 from sern_core.rules import client_name, name_problem
+from sern_core.session import DISPLACED
 from sern_core.types import ClientName, DropReason, Encoding, TopicName
 from sern_runtime import clock
 from sern_runtime.config.client import RelayConnection, load_client
@@ -50,6 +51,7 @@ RIVAL_TURNS: Final = 3
 """New sessions on one connection, after which somebody else must be using our name."""
 NEW_SESSION: Final = "new session"
 """The reason that `sern_core.link` gives when the relay has it begin anew on a connection that is up."""
+TAKEN: Final = "another process connected as "
 _CHECK_S: Final = 0.05
 
 
@@ -225,7 +227,7 @@ class Listener:
     def link_down(self, reason: str) -> None:
         if reason == NEW_SESSION:
             self.turns += 1
-        elif not self.done:
+        elif not self.done and not reason.startswith(TAKEN):  # `rejected` says it next
             self._warn(f"link down: {reason}; waiting")
 
     def lane_offered(self, parameters: wire.Envelope) -> None:
@@ -235,6 +237,9 @@ class Listener:
         """There is none."""
 
     def rejected(self, code: str, text: str) -> None:
+        if code == DISPLACED:  # the guest gives way
+            self.problem = RefusedError(code, f"{text}: sern keygen client NAME")
+            return
         self.problem = RefusedError(code, f"the relay refuses us: {text}")
 
     def stream_opened(self, stream: StreamInfo) -> None:

@@ -58,3 +58,27 @@ def test_only_names_are_looked_up() -> None:
     assert relay_name.name_in("tcp://relay.example:5555") == ("relay.example", 5555)
     for endpoint in ("tcp://127.0.0.1:5555", "tcp://[::1]:5555", "ipc:///run/sern"):
         assert relay_name.name_in(endpoint) is None
+
+
+async def test_two_processes_with_one_name_are_told_of_each_other(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    async with Lab(tmp_path, "robot1") as lab:
+        relay = await lab.relay()
+        first = await lab.connected(lab.client_file("robot1", ROBOT))
+        second = await lab.connected(lab.client_file("robot1", ROBOT))
+        said = "another process connected as robot1 from 127.0.0.1:"
+        for daemon in (first, second):
+            await until(lambda daemon=daemon: daemon._ready().reason.startswith(said), "is displaced, and says so")  # type: ignore[misc]
+            assert daemon._why() == daemon._ready().reason
+        # One line for each time that it is displaced, and one at the relay.
+        await lab.end(second)
+        await until(lambda: first._ready().ok, "goes on alone")
+        await until(lambda: len(relay.hub.relayed) == len(first.core.link.channels) > 0, "has its topics again")
+        assert first.bridge.refusals == 0
+        own = [record for record in caplog.records if said in record.getMessage()]
+        assert {record.name for record in own} == {"sern_client.daemon", "sern_relay.daemon"}
+        at_relay = [record for record in own if record.name == "sern_relay.daemon"]
+        assert relay.refusals["displaced"] == len(at_relay) >= 2
+        assert at_relay[0].getMessage().endswith(" has no session any more")
+        assert not any(record.levelname == "ERROR" for record in caplog.records)
