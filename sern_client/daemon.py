@@ -27,6 +27,7 @@ from sern_client.transport import RelayTransport
 from sern_client.udp import ClientLane
 from sern_core.client import ClientCore
 from sern_core.errors import ConfigError
+from sern_core.lanes import LANE_UDP
 from sern_core.lossy import missing
 from sern_core.patterns import compile_pattern
 from sern_core.trace import DecisionTrace
@@ -47,6 +48,7 @@ from sern_runtime.loop import Shutdown
 from sern_runtime.message_log import LoggedFates, MessageLog
 from sern_runtime.metrics import Metrics
 from sern_runtime.optional import OptionalParts
+from sern_runtime.outages import Outages
 from sern_runtime.sdnotify import Notifier, Watchdog
 from sern_runtime.topics_view import TopicView, both_ways
 
@@ -56,6 +58,7 @@ STALL_PATIENCE_S: Final = 5.0
 """The same while it has more to send and a session: a path that has stalled often comes back."""
 PATIENCE_RTTS: Final = 4.0
 TICK_S: Final = 0.5
+SILENT: Final = "the relay does not answer now; the session waits for it"
 
 _log = logging.getLogger(__name__)
 
@@ -127,6 +130,8 @@ class ClientDaemon:
         self.adaptation = self._make_adaptation()
         self.reason = "not connected yet"
         self._said: set[str] = set()  # since the last session: an attempt that fails as before is no news
+        self._down_since_s = now
+        self._outages = Outages(_log, logging.WARNING)
         self._ctx: zmq.Context[zmq.Socket[bytes]] | None = None
         self._transport: RelayTransport | None = None
         self._name: RelayName | None = None
@@ -239,11 +244,19 @@ class ClientDaemon:
     def _link_down(self, reason: str) -> None:
         """Told by the transport and by the session on it, usually of the same thing."""
         self.reason = reason
-        if reason not in self._said and not self._stopping:
+        self._outages.forget()
+        if self._stopping:
+            return
+        if not self._said:
+            self._down_since_s = clock.now()
+        if reason not in self._said:
             self._said.add(reason)
             _log.warning("%s: %s; trying again until it works", self.loaded.model.relay.endpoint, reason)
 
     def _link_up(self) -> None:
+        if self._said:  # in the words and at the level of the loss
+            down_s = clock.now() - self._down_since_s
+            _log.warning("%s: the link is there again, after %.0f s", self.loaded.model.relay.endpoint, down_s)
         self._said.clear()
         self._put_node()
         if self._lane is not None:
@@ -268,11 +281,30 @@ class ClientDaemon:
                 watchdog.check()
             if self._name is not None:
                 self._name.tick(connected=link.established)
+            self._look_at_lanes()
             state = "up" if link.established and not link.lane.stalled else f"down: {self._why()}"
             self.notifier.status(f"link {state}")
 
+    def _look_at_lanes(self) -> None:
+        """Say what has been silent for a while in a session that goes on, and when it is not any more."""
+        link = self.core.link
+        if not link.established:
+            return
+        relay, now = self.loaded.model.relay.endpoint, clock.now()
+        self._outages.look(
+            ("link",), lost=link.lane.stalled, now=now,
+            gone=f"{relay}: {SILENT}", back=f"{relay}: the relay answers again",
+        )  # fmt: skip
+        udp = link.lanes.get(LANE_UDP)
+        self._outages.look(
+            ("udp",), lost=udp is not None and udp.stalled and link.lane is not udp, now=now,
+            gone=f"{relay}: no datagram gets through; data goes over TCP", back=f"{relay}: datagrams get through again",
+        )  # fmt: skip
+
     def _why(self) -> str:
         """Why there is no link, as far as it is known."""
+        if self.core.link.established:
+            return SILENT
         unresolved = None if self._name is None else self._name.problem
         return unresolved or self.bridge.rejected_reason or self.reason
 
@@ -409,6 +441,8 @@ class ClientDaemon:
 
     def _ready(self) -> Health:
         if self.core.link.established:
+            if self.core.link.lane.stalled:
+                return Health(ok=False, reason=SILENT)
             if self.check.found:
                 return Health(ok=False, reason=f"what is here is not what should be: {self.check.found[0]}")
             return Health(ok=True, reason=f"connected to {self.core.link.peer}")

@@ -16,6 +16,7 @@ from sern_core.access import AccessTable
 from sern_core.decoding import Decoder
 from sern_core.errors import ConfigError
 from sern_core.hub import Hub, HubParams
+from sern_core.lanes import LANE_UDP
 from sern_core.ledger import MAX_TOPICS
 from sern_core.link import Link
 from sern_core.message import Message, StreamInfo
@@ -41,6 +42,7 @@ from sern_runtime.loop import Shutdown
 from sern_runtime.message_log import LoggedFates, MessageLog
 from sern_runtime.metrics import Metrics
 from sern_runtime.optional import OptionalParts
+from sern_runtime.outages import Outages
 from sern_runtime.sdnotify import Notifier, Watchdog
 from sern_runtime.topics_view import announced_summary, link_summary, received_summary
 from sern_runtime.zap import TemporaryRefusal, ZapHandler, self_test
@@ -120,6 +122,8 @@ class RelayDaemon:
             self.coder, lambda stream: stream, self._deliver, self._undecodable, fault=self.errors.core
         )
         self._told: set[TopicName] = set()
+        self._away_since_s: dict[ClientName, float] = {}
+        self._outages = Outages(_log, logging.INFO)  # as clients that come and go
         self.adaptation: Adaptation | None = None
         if model.adaptation is not None:
             with blamed_on(loaded.path, "adaptation"):
@@ -262,7 +266,26 @@ class RelayDaemon:
                 self.zap.ping()
             if watchdog.interval_s is not None:
                 watchdog.check()
+            self._look_at_lanes(now)
             self.notifier.status(self._status())
+
+    def _look_at_lanes(self, now: float) -> None:
+        """Say which client has been silent for a while in a session that goes on, and when it is not any more."""
+        for client, link in self.hub.links.items():
+            if not link.established:
+                continue
+            self._outages.look(
+                (client, "link"), lost=link.lane.stalled, now=now,
+                gone=f"{client} does not answer; its session waits for it", back=f"{client} answers again",
+            )  # fmt: skip
+            udp = link.lanes.get(LANE_UDP)
+            self._outages.look(
+                (client, "udp"), lost=udp is not None and udp.stalled and link.lane is not udp, now=now,
+                gone=f"no datagram gets through to {client}; data goes over TCP",
+                back=f"datagrams get through to {client} again",
+            )  # fmt: skip
+        for client in self._away_since_s.keys() - self.hub.links.keys():  # nobody waits for it any more
+            del self._away_since_s[client]
 
     def _status(self) -> str:
         """One line for `systemctl status`. A failed reload stays in it until a good one."""
@@ -285,7 +308,7 @@ class RelayDaemon:
             self._unreloaded = f"reload failed, the old configuration stays: {error}"
             self.notifier.ready(self._status())
             return
-        self._unreloaded = None
+        failed_before, self._unreloaded = self._unreloaded is not None, None
         log_warnings(_log, loaded.warnings)
         self.directory = directory
         now = clock.now()
@@ -301,6 +324,8 @@ class RelayDaemon:
             self.hub.forget(client, "the name is revoked", now=now)
         self._after()
         self.notifier.ready(self._status())
+        if failed_before and self._unreloaded is None:
+            _log.error("the reload works again: what had failed before is in force")
         _log.info("reloaded keys, access rules and feed roles; other changes need a restart")
 
     def _make_http(self, listen: str) -> HttpServer:
@@ -468,7 +493,11 @@ class RelayDaemon:
     # --- HubEvents ----------------------------------------------------------------------------------------------------
 
     def client_up(self, client: ClientName, *, resumed: bool) -> None:
-        _log.info("%s connected%s", client, " again" if resumed else "")
+        away_since_s = self._away_since_s.pop(client, None)
+        if away_since_s is None:
+            _log.info("%s connected%s", client, " again" if resumed else "")
+        else:
+            _log.info("%s connected again, after %.0f s", client, clock.now() - away_since_s)
 
     def lane_asked(self, client: ClientName, ciphers: list[str]) -> None:
         if self.lanes is not None:
@@ -482,6 +511,8 @@ class RelayDaemon:
         self.errors.core(error, client or "")
 
     def client_down(self, client: ClientName, reason: str) -> None:
+        self._away_since_s[client] = clock.now()
+        self._outages.forget(client)
         _log.info("%s is away: %s", client, reason)
 
     def stream_added(self, stream: StreamInfo) -> None:

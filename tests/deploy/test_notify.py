@@ -82,6 +82,7 @@ async def test_the_relay(tmp_path: Path, systemd: Systemd) -> None:
         relay.config.write_text(good)
         relay.signal(signal.SIGHUP)
         await until(lambda: systemd.last_status == "STATUS=0 clients, 0 streams", "says that all is well")
+        await relay.said("ERROR", "the reload works again")
         assert systemd.count("STOPPING=1") == 0
         await ends(relay, systemd)
 

@@ -1,10 +1,12 @@
 """What the daemons say to their operator: in the log, in /readyz and in the status, and that it is so."""
 
+import signal
 from pathlib import Path
 
 import pytest
 
 from sern_client import relay_name
+from sern_client.daemon import SILENT
 from sern_core.message import TopicInfo
 from sern_core.types import Encoding, TopicName
 from tests.daemons import Lab, write_bag
@@ -82,3 +84,31 @@ async def test_two_processes_with_one_name_are_told_of_each_other(
         assert relay.refusals["displaced"] == len(at_relay) >= 2
         assert at_relay[0].getMessage().endswith(" has no session any more")
         assert not any(record.levelname == "ERROR" for record in caplog.records)
+
+
+async def test_a_recovery_is_said_like_the_loss(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("INFO")
+    async with Lab(tmp_path, "robot1") as lab:
+        relay = await lab.relay()
+        robot = await lab.connected(lab.client_file("robot1", ROBOT, relay={"udp": False}))
+        assert not [record for record in caplog.records if "again" in record.getMessage()]
+        assert relay.server is not None
+        relay.server.cut_client("robot1")
+        await until(lambda: any("the link is there again, after " in message for message in caplog.messages))
+        await until(lambda: any("robot1 connected again, after " in message for message in caplog.messages))
+        lines = {record.getMessage().partition(", after")[0]: record.levelname for record in caplog.records}
+        assert lines[f"{lab.endpoint}: the connection to the relay was lost; trying again until it works"] == "WARNING"
+        assert lines[f"{lab.endpoint}: the link is there again"] == "WARNING"
+        await lab.end(robot)
+
+
+async def test_a_relay_that_hangs_is_not_said_to_be_there(tmp_path: Path) -> None:
+    async with Lab(tmp_path, "robot1") as lab:
+        relay = await lab.process(lab.relay_file()).ready()
+        robot = await lab.process(lab.client_file("robot1", ROBOT)).ready()
+        relay.signal(signal.SIGSTOP)
+        await robot.until(lambda: robot.get("/readyz") == (503, f"{SILENT}\n"), "says that it does not answer")
+        await robot.said("WARNING", f"{lab.endpoint}: {SILENT}")
+        relay.signal(signal.SIGCONT)
+        await robot.until(lambda: robot.get("/readyz")[0] == 200, "has it again")
+        await robot.said("WARNING", f"{lab.endpoint}: the ", " again, after ")
