@@ -14,6 +14,7 @@ from rich.text import Text
 
 from sern_client.relay_name import name_in, unresolved
 from sern_core.errors import ConfigError
+from sern_core.types import ClientName
 from sern_runtime import keys
 from sern_runtime.config.base import FileModel
 from sern_runtime.config.client import ClientFile
@@ -46,6 +47,9 @@ def run_check(path: Path, *, out: Console | None = None, err: Console | None = N
     if isinstance(loaded.model, keys.SecretKeyFile):
         warning = keys.secret_warning(path)
         _lines(err, [f"warning: {warning}"] if warning else [])
+    if isinstance(loaded.model, (keys.PublicKeyFile, keys.SecretKeyFile)):
+        odd = keys.misnamed(path, ClientName(loaded.model.name))
+        _lines(err, [f"warning: {odd}"] if odd else [])
     _lines(err, [f"warning: {text}" for text in loaded.warnings])
     if isinstance(loaded.model, ClientFile):
         problem = _unresolved(loaded.model.relay.endpoint)
