@@ -244,7 +244,8 @@ class ClientDaemon:
     def _link_down(self, reason: str) -> None:
         """Told by the transport and by the session on it, usually of the same thing."""
         self.reason = reason
-        self._outages.forget()
+        if not self.core.link.established:  # else the session goes on over the other lane
+            self._outages.forget()
         if self._stopping:
             return
         if not self._said:
@@ -291,13 +292,16 @@ class ClientDaemon:
         if not link.established:
             return
         relay, now = self.loaded.model.relay.endpoint, clock.now()
+        if self._said and link.transport_up:  # a session that outlived its connection has another now
+            self._said.clear()
+            _log.warning("%s: the connection is there again, after %.0f s", relay, now - self._down_since_s)
         self._outages.look(
             ("link",), lost=link.lane.stalled, now=now,
             gone=f"{relay}: {SILENT}", back=f"{relay}: the relay answers again",
         )  # fmt: skip
         udp = link.lanes.get(LANE_UDP)
         self._outages.look(
-            ("udp",), lost=udp is not None and udp.stalled and link.lane is not udp, now=now,
+            ("udp",), lost=udp is not None and udp.stalled and not link.lane.stalled, now=now,
             gone=f"{relay}: no datagram gets through; data goes over TCP", back=f"{relay}: datagrams get through again",
         )  # fmt: skip
 

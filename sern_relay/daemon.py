@@ -280,7 +280,7 @@ class RelayDaemon:
             )  # fmt: skip
             udp = link.lanes.get(LANE_UDP)
             self._outages.look(
-                (client, "udp"), lost=udp is not None and udp.stalled and link.lane is not udp, now=now,
+                (client, "udp"), lost=udp is not None and udp.stalled and not link.lane.stalled, now=now,
                 gone=f"no datagram gets through to {client}; data goes over TCP",
                 back=f"datagrams get through to {client} again",
             )  # fmt: skip

@@ -8,7 +8,7 @@ import pytest
 from rosbags.rosbag1 import Reader
 from ruamel.yaml import YAML
 
-from sern_core.types import Encoding
+from sern_core.types import Encoding, TopicName
 from sern_runtime import ros_types
 from tests.daemons import Lab, bodies, recording
 from tests.support import until
@@ -53,11 +53,9 @@ async def test_what_an_operator_needs_of_a_real_husky_arrives(tmp_path: Path, si
         robot = await lab.connected(here(lab, "husky-noetic", play))
         await until(lambda: {s.topic for s in relay.hub.relayed} >= {f"/husky1{name}" for name in (*NEEDED, *LEFT_OUT)})
         received = target.core.received.topics
+        wanted = {TopicName(f"/husky1{name}") for name in NEEDED}
         await until(
-            lambda: (
-                {name for name in NEEDED if f"/husky1{name}" in received and received[f"/husky1{name}"].delivered}
-                == NEEDED.keys()
-            ),
+            lambda: {name for name, counters in received.items() if counters.delivered} == wanted,
             "every topic that an operator needs arrives",
         )
         await lab.end(robot)

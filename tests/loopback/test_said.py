@@ -7,6 +7,7 @@ import pytest
 
 from sern_client import relay_name
 from sern_client.daemon import SILENT
+from sern_core.lanes import LANE_UDP
 from sern_core.message import TopicInfo
 from sern_core.types import Encoding, TopicName
 from tests.daemons import Lab, write_bag
@@ -111,4 +112,20 @@ async def test_a_relay_that_hangs_is_not_said_to_be_there(tmp_path: Path) -> Non
         await robot.said("WARNING", f"{lab.endpoint}: {SILENT}")
         relay.signal(signal.SIGCONT)
         await robot.until(lambda: robot.get("/readyz")[0] == 200, "has it again")
-        await robot.said("WARNING", f"{lab.endpoint}: the ", " again, after ")
+        ends = ("the relay answers again, after ", "the link is there again, after ")  # if the session did not last
+        await robot.until(lambda: any(end in line for line in robot.lines for end in ends), "says that it is back")
+        assert not any("no datagram gets through" in line for line in robot.lines), robot.text  # nothing got through
+
+
+async def test_a_session_that_outlives_its_connection_says_that_there_is_another(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    async with Lab(tmp_path, "robot1") as lab:
+        relay = await lab.relay()
+        robot = await lab.connected(lab.client_file("robot1", ROBOT))
+        await until(lambda: robot.core.link.lane.id == LANE_UDP, "data goes over UDP")
+        assert relay.server is not None
+        assert relay.server.connections.cut_user("robot1") >= 1
+        await until(lambda: any("the connection is there again, after " in message for message in caplog.messages))
+        assert not any("the link is there again" in message for message in caplog.messages)  # it was never gone
+        assert robot._said == set()
