@@ -51,6 +51,7 @@ from sern_runtime.optional import OptionalParts
 from sern_runtime.outages import Outages
 from sern_runtime.sdnotify import Notifier, Watchdog
 from sern_runtime.topics_view import TopicView, both_ways
+from sern_runtime.transport_watch import NOT_YET, WAITING
 
 PATIENCE_S: Final = 2.0
 """How long a stopping client waits, beside some round trips, for the next sign that what it still owes gets further."""
@@ -128,7 +129,7 @@ class ClientDaemon:
             rules = tuple((compile_pattern(section.match), section.timeout_s) for section in model.actions.use)
             self.bridge.goals = GoalWatch(rules, lambda info: self.bridge.converter.advertise(endpoint, info))
         self.adaptation = self._make_adaptation()
-        self.reason = "not connected yet"
+        self.reason = NOT_YET
         self._said: set[str] = set()  # since the last session: an attempt that fails as before is no news
         self._down_since_s = now
         self._outages = Outages(_log, logging.WARNING)
@@ -310,6 +311,8 @@ class ClientDaemon:
         if self.core.link.established:
             return SILENT
         unresolved = None if self._name is None else self._name.problem
+        if self.reason == NOT_YET and self._transport is not None and self._transport.waiting:
+            return WAITING
         return unresolved or self.bridge.rejected_reason or self.reason
 
     def _put_node(self) -> None:

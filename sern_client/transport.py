@@ -78,6 +78,11 @@ class Dialer:
         self._handle: TcpHandle | None = None
         self._inflow: Inflow[TcpHandle] | None = None
 
+    @property
+    def waiting(self) -> bool:
+        """Whether a connection is there, and its handshake under way."""
+        return self._watch is not None and self._watch.waiting
+
     def open(self) -> None:
         """Connect for the first time. Raises ConfigError."""
 
@@ -219,6 +224,11 @@ class RelayTransport:
     @property
     def rebuilds(self) -> int:
         return self._dialer.rebuilds
+
+    @property
+    def waiting(self) -> bool:
+        """Whether a connection is there, and its handshake under way."""
+        return self._dialer.waiting
 
     def another(self, events: DialerEvents) -> Dialer:
         """Another connection to the same relay, for class control, not opened yet."""

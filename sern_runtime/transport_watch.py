@@ -21,6 +21,8 @@ GREETING_BYTES: Final = 64
 RETRY_GRACE_S: Final = 2.0
 """libzmq says at once that it will try again; what it has not said by then it does not do."""
 
+NOT_YET: Final = "not connected yet"
+WAITING: Final = "connected, and nothing has come back yet"
 LOST: Final = "the connection to the relay was lost"
 NOBODY: Final = "the relay does not answer: connecting failed"
 SILENT: Final = (
@@ -67,7 +69,7 @@ class TransportWatch:
         on_dead: Callable[[str], None],
     ) -> None:
         self.up = False
-        self.reason = "not connected yet"
+        self.reason = NOT_YET
         self._on_up = on_up
         self._on_down = on_down
         self._on_rebuild = on_rebuild
@@ -78,6 +80,11 @@ class TransportWatch:
         self._kept: socketlib.socket | None = None  # while the handshake lasts: what has come is asked at its end
         self._retry: asyncio.TimerHandle | None = None
         self._monitor = SocketMonitor(socket, self._on_event)
+
+    @property
+    def waiting(self) -> bool:
+        """Whether a connection is there, and its handshake under way."""
+        return self._shaking
 
     def close(self) -> None:
         """Before the socket. Idempotent."""

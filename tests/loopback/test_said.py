@@ -1,6 +1,7 @@
 """What the daemons say to their operator: in the log, in /readyz and in the status, and that it is so."""
 
 import signal
+import socket
 from pathlib import Path
 
 import pytest
@@ -10,6 +11,7 @@ from sern_client.daemon import SILENT
 from sern_core.lanes import LANE_UDP
 from sern_core.message import TopicInfo
 from sern_core.types import Encoding, TopicName
+from sern_runtime.transport_watch import WAITING
 from tests.daemons import Lab, write_bag
 from tests.support import until
 
@@ -129,3 +131,14 @@ async def test_a_session_that_outlives_its_connection_says_that_there_is_another
         await until(lambda: any("the connection is there again, after " in message for message in caplog.messages))
         assert not any("the link is there again" in message for message in caplog.messages)  # it was never gone
         assert robot._said == set()
+
+
+async def test_before_anything_has_come_back_nothing_else_is_said(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    async with Lab(tmp_path, "robot1") as lab:
+        with socket.create_server(("127.0.0.1", lab.port)):  # as a relay that was stopped: the kernel takes connections
+            robot = await lab.client(lab.client_file("robot1", ROBOT))
+            await until(lambda: robot._ready().reason == WAITING, "has a connection")
+            assert not [record for record in caplog.records if record.levelname == "WARNING"]
+            await lab.drop(robot)
