@@ -41,6 +41,7 @@ from sern_core.patterns import PatternSet
 from sern_core.queues import OutChannel
 from sern_core.rules import Discovery, ResolvedTopic, RuleSet, to_global
 from sern_core.services import parse as parse_service
+from sern_core.session import DISPLACED
 from sern_core.summaries.transforms import is_static
 from sern_core.types import ClientName, DropReason, Encoding, TopicName
 from sern_runtime import clock, ros_types
@@ -157,6 +158,7 @@ class Bridge:
         self._last_arrival_s: dict[StreamId, float] = {}
         self._timer = fine_timer(self._leases_due)  # one that is due while the machine sleeps is due when it wakes
         self.summaries = Summaries(self._sender, self.parts)
+        self._unnamed: set[TopicName] = set()  # local topics without a rule, of which it was said
         self._unreceived: dict[StreamId, str] = {}  # streams that could not be published here, and why
         self._again = Timer(self._reconsider)
         self._again_s = AGAIN_S[0]
@@ -238,6 +240,8 @@ class Bridge:
             return
         listed = self.rules.find(info.type_name, info.name) is not None
         if not self.discovery.wants(info.name, info.type_name, listed=listed):
+            if self.discovery.wants(info.name, info.type_name, listed=True):  # only a rule is missing
+                self._say_unnamed(info)
             return
         try:
             resolved = self.rules.resolve(info, local_name=info.name)
@@ -263,6 +267,13 @@ class Bridge:
             return
         self._outgoing[info.name] = Outgoing(channel, subscription, source, sink)
         self._kick()
+
+    def _say_unnamed(self, info: TopicInfo) -> None:
+        """Said once for each name: a rule with a typing error looks like a robot without the topic."""
+        if info.name not in self._unnamed and len(self._unnamed) < MAX_TOPICS:
+            self._unnamed.add(info.name)
+            _log.info("%s (%s) stays here: no rule in `topics` names it (discovery.mode: manual)", info.name,
+                      info.type_name)  # fmt: skip
 
     def _withdraw(self, channel: OutChannel, source: Source | None) -> None:
         """Offer a topic no more."""
@@ -338,7 +349,8 @@ class Bridge:
         self._on_down(reason)
 
     def rejected(self, code: str, text: str) -> None:
-        if text != self.rejected_reason:  # it is asked again every few seconds
+        # It is asked again every few seconds; of a session that was taken from us `link_down` has said it.
+        if text != self.rejected_reason and code != DISPLACED:
             _log.error("the relay refuses us (%s): %s", code, text)
         self.rejected_reason = text
 

@@ -21,12 +21,14 @@ from sern_client.express import ClientExpress
 from sern_client.factory import make_endpoint, make_link_topics
 from sern_client.guard import Guard
 from sern_client.link_state import LinkState
+from sern_client.relay_name import RelayName, name_in
 from sern_client.services import ServiceBridge
 from sern_client.summarise import register_summaries
 from sern_client.transport import RelayTransport
 from sern_client.udp import ClientLane
 from sern_core.client import ClientCore
 from sern_core.errors import ConfigError
+from sern_core.lanes import LANE_UDP
 from sern_core.lossy import missing
 from sern_core.patterns import compile_pattern
 from sern_core.trace import DecisionTrace
@@ -48,8 +50,10 @@ from sern_runtime.loop import Shutdown
 from sern_runtime.message_log import LoggedFates, MessageLog
 from sern_runtime.metrics import Metrics
 from sern_runtime.optional import OptionalParts
+from sern_runtime.outages import Outages
 from sern_runtime.sdnotify import Notifier, Watchdog
 from sern_runtime.topics_view import TopicView, both_ways
+from sern_runtime.transport_watch import NOT_YET, WAITING
 
 PATIENCE_S: Final = 2.0
 """How long a stopping client waits, beside some round trips, for the next sign that what it still owes gets further."""
@@ -57,6 +61,7 @@ STALL_PATIENCE_S: Final = 5.0
 """The same while it has more to send and a session: a path that has stalled often comes back."""
 PATIENCE_RTTS: Final = 4.0
 TICK_S: Final = 0.5
+SILENT: Final = "the relay does not answer now; the session waits for it"
 
 _log = logging.getLogger(__name__)
 
@@ -130,7 +135,7 @@ class ClientDaemon:
             rules = tuple((compile_pattern(section.match), section.timeout_s) for section in model.actions.use)
             self.bridge.goals = GoalWatch(rules, lambda info: self.bridge.converter.advertise(endpoint, info))
         self.adaptation = self._make_adaptation()
-        self.reason = "not connected yet"
+        self.reason = NOT_YET
         state = model.link_state
         self.bridge.withdrawal.used = state.withdraw_after_s is not None
         self.bridge.link_state = self.link_state = LinkState(
@@ -139,12 +144,15 @@ class ClientDaemon:
             self.bridge.withdrawal,
             period_s=state.period_s,
             withdraw_after_s=state.withdraw_after_s,
-            reason=lambda: self.bridge.rejected_reason or self.reason,
+            reason=self._why,
             parts=self.parts,
         )
         self._said: set[str] = set()  # since the last session: an attempt that fails as before is no news
+        self._down_since_s = now
+        self._outages = Outages(_log, logging.WARNING)
         self._ctx: zmq.Context[zmq.Socket[bytes]] | None = None
         self._transport: RelayTransport | None = None
+        self._name: RelayName | None = None
         self._lane: ClientLane | None = None
         self._express: ClientExpress | None = None
         self._http: HttpServer | None = None
@@ -223,6 +231,10 @@ class ClientDaemon:
                 on_reason=self._link_down,
                 after=self._kick,
             )
+        named = name_in(relay.endpoint)
+        if named is not None:
+            self._name = RelayName(relay.endpoint, *named)
+            self._name.tick(connected=False)
         address = split_tcp(relay.endpoint)
         if relay.udp and keys is not None and address is not None:
             self._lane = ClientLane(self.core, address[0], kick=self._kick)
@@ -254,11 +266,20 @@ class ClientDaemon:
         """Told by the transport and by the session on it, usually of the same thing."""
         self.reason = reason
         self.link_state.soon()
-        if reason not in self._said and not self._stopping:
+        if not self.core.link.established:  # else the session goes on over the other lane
+            self._outages.forget()
+        if self._stopping:
+            return
+        if not self._said:
+            self._down_since_s = clock.now()
+        if reason not in self._said:
             self._said.add(reason)
             _log.warning("%s: %s; trying again until it works", self.loaded.model.relay.endpoint, reason)
 
     def _link_up(self) -> None:
+        if self._said:  # in the words and at the level of the loss
+            down_s = clock.now() - self._down_since_s
+            _log.warning("%s: the link is there again, after %.0f s", self.loaded.model.relay.endpoint, down_s)
         self._said.clear()
         self.link_state.soon()
         self._put_node()
@@ -283,8 +304,39 @@ class ClientDaemon:
             self.link_state.look()
             if watchdog.interval_s is not None:
                 watchdog.check()
-            state = "up" if link.established and not link.lane.stalled else f"down: {self.reason}"
+            if self._name is not None:
+                self._name.tick(connected=link.established)
+            self._look_at_lanes()
+            state = "up" if link.established and not link.lane.stalled else f"down: {self._why()}"
             self.notifier.status(f"link {state}")
+
+    def _look_at_lanes(self) -> None:
+        """Say what has been silent for a while in a session that goes on, and when it is not any more."""
+        link = self.core.link
+        if not link.established:
+            return
+        relay, now = self.loaded.model.relay.endpoint, clock.now()
+        if self._said and link.transport_up:  # a session that outlived its connection has another now
+            self._said.clear()
+            _log.warning("%s: the connection is there again, after %.0f s", relay, now - self._down_since_s)
+        self._outages.look(
+            ("link",), lost=link.lane.stalled, now=now,
+            gone=f"{relay}: {SILENT}", back=f"{relay}: the relay answers again",
+        )  # fmt: skip
+        udp = link.lanes.get(LANE_UDP)
+        self._outages.look(
+            ("udp",), lost=udp is not None and udp.stalled and not link.lane.stalled, now=now,
+            gone=f"{relay}: no datagram gets through; data goes over TCP", back=f"{relay}: datagrams get through again",
+        )  # fmt: skip
+
+    def _why(self) -> str:
+        """Why there is no link, as far as it is known."""
+        if self.core.link.established:
+            return SILENT
+        unresolved = None if self._name is None else self._name.problem
+        if self.reason == NOT_YET and self._transport is not None and self._transport.waiting:
+            return WAITING
+        return unresolved or self.bridge.rejected_reason or self.reason
 
     def _put_node(self) -> None:
         """Tell the relay's registry who we are."""
@@ -422,12 +474,14 @@ class ClientDaemon:
 
     def _ready(self) -> Health:
         if self.core.link.established:
+            if self.core.link.lane.stalled:
+                return Health(ok=False, reason=SILENT)
             if self.check.found:
                 return Health(ok=False, reason=f"what is here is not what should be: {self.check.found[0]}")
             # A site with one robot of three gone does its job for the other two.
             said = (f"connected to {self.core.link.peer}", self.link_state.detail())
             return Health(ok=True, reason="; ".join(filter(None, said)))
-        return Health(ok=False, reason=self.bridge.rejected_reason or self.reason)
+        return Health(ok=False, reason=self._why())
 
     def topics(self) -> dict[str, TopicView]:
         """Counters of every topic by global name, sent and received."""
@@ -516,6 +570,8 @@ class ClientDaemon:
                 stack.callback(self._express.close)
             if self._lane is not None:
                 stack.callback(self._lane.closed)
+            if self._name is not None:
+                stack.callback(self._name.close)
             stack.callback(self.codecs.close)
             stack.push_async_callback(end_tasks, self.tasks)
 

@@ -13,8 +13,9 @@ from sern_core.errors import ConfigError, RemoteError
 from sern_core.link import Link
 from sern_runtime import clock
 from sern_runtime.inflow import Inflow
-from sern_runtime.monitor import TcpHandle, TransportWatch
+from sern_runtime.monitor import TcpHandle
 from sern_runtime.pump import LANE_MESSAGE_BYTES, Pump
+from sern_runtime.transport_watch import TransportWatch
 from sern_runtime.zmq_socket import TOS_EXPEDITED, CurvePair, DealerSocket, SendResult, make_client
 
 REBUILD_MIN_S: Final = 1.0
@@ -77,11 +78,16 @@ class Dialer:
         self._handle: TcpHandle | None = None
         self._inflow: Inflow[TcpHandle] | None = None
 
+    @property
+    def waiting(self) -> bool:
+        """Whether a connection is there, and its handshake under way."""
+        return self._watch is not None and self._watch.waiting
+
     def open(self) -> None:
         """Connect for the first time. Raises ConfigError."""
 
         def attach(socket: "zmq.Socket[bytes]") -> None:
-            self._watch = TransportWatch(socket, self._up, self._down, self._refused)
+            self._watch = TransportWatch(socket, self._up, self._down, self._refused, self._give_up)
 
         raw = make_client(
             self._ctx,
@@ -218,6 +224,11 @@ class RelayTransport:
     @property
     def rebuilds(self) -> int:
         return self._dialer.rebuilds
+
+    @property
+    def waiting(self) -> bool:
+        """Whether a connection is there, and its handshake under way."""
+        return self._dialer.waiting
 
     def another(self, events: DialerEvents) -> Dialer:
         """Another connection to the same relay, for class control, not opened yet."""

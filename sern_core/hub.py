@@ -11,7 +11,7 @@ and so is one whose name is revoked.
 """
 
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Final
@@ -43,6 +43,7 @@ from sern_core.queues import OutChannel
 from sern_core.replay import ReplayStore
 from sern_core.routing import UNIT_S, BadPatternError, RouteChange, RoutingTable
 from sern_core.rules import is_client_name, name_problem
+from sern_core.session import DISPLACED
 from sern_core.trace import DecisionTrace
 from sern_core.types import DROP_CODES, ClientName, DropReason, TopicName
 
@@ -138,10 +139,17 @@ class Hub(LocalStreams):
         link = self._link(port.client, now)
         older = self.port_of.get(port.client)
         another = older is not port
+        tag, rival = link.tag, link.established and wire.take_int(hello, "boot") != link.peer_boot
         if not link.accept(hello, header.tag, header.stamp_us, now=now, another_connection=another):
             return
         if older is not None and older is not port:
             older.link = None
+            if rival:  # its connection is up: it did not end before the other began
+                older.displace(tag, port, now=now)
+                self.events.refused(
+                    port.client, DISPLACED, f"another process connected as {port.client} from {port.address or '?'}; "
+                    f"the one from {older.address or '?'} has no session any more"
+                )  # fmt: skip
         port.link = link
         self.port_of[port.client] = port
         self._absent_since.pop(port.client, None)
@@ -405,6 +413,12 @@ class Hub(LocalStreams):
     def _wanted(self, relayed: Relayed) -> bool:
         return bool(relayed.outs or relayed.waiting) or relayed.cache is not None or self.tap(relayed.stream.stream)
 
+    def announced(self) -> Iterator[tuple[StreamInfo, bool]]:
+        """Every stream there is, and whether anybody takes it: a client, or a program on the feed."""
+        for relayed in self.relayed.values():
+            stream = relayed.stream.stream
+            yield stream, bool(relayed.outs or relayed.waiting) or self.tap(stream)
+
     def refresh_interest(self, *, now: float) -> None:
         """The answer of `tap` may have changed: tell the origins."""
         for relayed in self.relayed.values():
@@ -502,6 +516,8 @@ class Hub(LocalStreams):
 
     def on_up(self, link: Link, *, resumed: bool, now: float) -> None:
         self._absent_since.pop(link.peer, None)
+        if link.peer_boot is not None:
+            self.routing.returned(link.peer, link.peer_boot)
         self._subscriptions.pop(link.peer, None)  # half of one that was said in an earlier session
         if not resumed:
             for relayed in self.relayed.values():

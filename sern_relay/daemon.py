@@ -16,6 +16,7 @@ from sern_core.access import AccessTable
 from sern_core.decoding import Decoder
 from sern_core.errors import ConfigError
 from sern_core.hub import Hub, HubParams
+from sern_core.lanes import LANE_UDP
 from sern_core.ledger import MAX_TOPICS
 from sern_core.link import Link
 from sern_core.message import Message, StreamInfo
@@ -42,8 +43,9 @@ from sern_runtime.loop import Shutdown
 from sern_runtime.message_log import LoggedFates, MessageLog
 from sern_runtime.metrics import Metrics
 from sern_runtime.optional import OptionalParts
+from sern_runtime.outages import Outages
 from sern_runtime.sdnotify import Notifier, Watchdog
-from sern_runtime.topics_view import link_summary, received_summary
+from sern_runtime.topics_view import announced_summary, link_summary, received_summary
 from sern_runtime.zap import TemporaryRefusal, ZapHandler, self_test
 
 ZAP_DOMAIN: Final = "sern"
@@ -52,9 +54,9 @@ PATIENCE_S: Final = 5.0
 SWEEP_S: Final = 1.0
 OTHER_CODE: Final = "other"
 REFUSAL_CODES: Final = frozenset({
-    "bad_announcement", "bad_id", "bad_name", "bad_pattern", "forbidden", "internal_error", "name_taken", "not_owner",
-    "old_boot", "origin", "registry_full", "too_large", "too_many_objects", "too_many_patterns", "too_many_streams",
-    "type_mismatch",
+    "bad_announcement", "bad_id", "bad_name", "bad_pattern", "displaced", "forbidden", "internal_error", "name_taken",
+    "not_owner", "old_boot", "origin", "registry_full", "too_large", "too_many_objects",
+    "too_many_patterns", "too_many_streams", "type_mismatch",
 })  # fmt: skip
 """What a refusal is counted under; a code that a client made up is counted as `other`."""
 
@@ -96,6 +98,7 @@ class RelayDaemon:
         self.collector = CollectorWatch()
         self.refusals = dict.fromkeys((*sorted(REFUSAL_CODES), OTHER_CODE), 0)
         self.reloads_failed = 0
+        self._unreloaded: str | None = None  # what the last reload did not put in force, and why
         self.hub = Hub(
             name=model.name,
             boot=secrets.randbits(63),
@@ -122,6 +125,8 @@ class RelayDaemon:
             self.coder, lambda stream: stream, self._deliver, self._undecodable, fault=self.errors.core
         )
         self._told: set[TopicName] = set()
+        self._away_since_s: dict[ClientName, float] = {}
+        self._outages = Outages(_log, logging.INFO)  # as clients that come and go
         self.adaptation: Adaptation | None = None
         if model.adaptation is not None:
             with blamed_on(loaded.path, "adaptation"):
@@ -266,7 +271,31 @@ class RelayDaemon:
                 self.zap.ping()
             if watchdog.interval_s is not None:
                 watchdog.check()
-            self.notifier.status(f"{self._clients_up()} clients, {len(self.hub.relayed)} streams")
+            self._look_at_lanes(now)
+            self.notifier.status(self._status())
+
+    def _look_at_lanes(self, now: float) -> None:
+        """Say which client has been silent for a while in a session that goes on, and when it is not any more."""
+        for client, link in self.hub.links.items():
+            if not link.established:
+                continue
+            self._outages.look(
+                (client, "link"), lost=link.lane.stalled, now=now,
+                gone=f"{client} does not answer; its session waits for it", back=f"{client} answers again",
+            )  # fmt: skip
+            udp = link.lanes.get(LANE_UDP)
+            self._outages.look(
+                (client, "udp"), lost=udp is not None and udp.stalled and not link.lane.stalled, now=now,
+                gone=f"no datagram gets through to {client}; data goes over TCP",
+                back=f"datagrams get through to {client} again",
+            )  # fmt: skip
+        for client in self._away_since_s.keys() - self.hub.links.keys():  # nobody waits for it any more
+            del self._away_since_s[client]
+
+    def _status(self) -> str:
+        """One line for `systemctl status`. A failed reload stays in it until a good one."""
+        state = f"{self._clients_up()} clients, {len(self.hub.relayed)} streams"
+        return state if self._unreloaded is None else f"{state}; {self._unreloaded}"
 
     def _clients_up(self) -> int:
         return sum(link.established for link in self.hub.links.values())
@@ -281,8 +310,10 @@ class RelayDaemon:
         except ConfigError as error:
             self.reloads_failed += 1
             _log.error("reload failed, the old configuration stays: %s", error)
-            self.notifier.ready(f"reload failed: {error}")
+            self._unreloaded = f"reload failed, the old configuration stays: {error}"
+            self.notifier.ready(self._status())
             return
+        failed_before, self._unreloaded = self._unreloaded is not None, None
         log_warnings(_log, loaded.warnings)
         self.directory = directory
         now = clock.now()
@@ -297,7 +328,9 @@ class RelayDaemon:
             _log.warning("%s is in the directory no more; what was held for it is dropped", client)
             self.hub.forget(client, "the name is revoked", now=now)
         self._after()
-        self.notifier.ready("reloaded")
+        self.notifier.ready(self._status())
+        if failed_before and self._unreloaded is None:
+            _log.error("the reload works again: what had failed before is in force")
         _log.info("reloaded keys, access rules and feed roles; other changes need a restart")
 
     def _make_http(self, listen: str) -> HttpServer:
@@ -379,6 +412,7 @@ class RelayDaemon:
             self.feed.update(model.feed_roles(), now=now)
         except ConfigError as error:
             self.reloads_failed += 1
+            self._unreloaded = f"reload failed in part, not all of feed.roles are in force: {error}"
             _log.error("%s: feed.roles: not all of them are in force: %s", self.loaded.path, error)
 
     def _transforms_refused(self) -> list[tuple[tuple[str, ...], float]]:
@@ -389,9 +423,10 @@ class RelayDaemon:
         return [] if self.feed is None else [(labels, float(n)) for labels, n in self.feed.results()]
 
     def topics(self) -> dict[str, object]:
-        """Counters by client link and topic, and of what arrived."""
+        """Counters by client link and topic, and of what arrived; and what is announced, whether taken or not."""
         now = clock.now()
         return {
+            "announced": announced_summary(self.hub.announced()),
             "links": {name: link_summary(link, direction="send") for name, link in self.hub.links.items()},
             "received": received_summary(self.hub.received, now=now),
         }
@@ -465,7 +500,11 @@ class RelayDaemon:
     # --- HubEvents ----------------------------------------------------------------------------------------------------
 
     def client_up(self, client: ClientName, *, resumed: bool) -> None:
-        _log.info("%s connected%s", client, " again" if resumed else "")
+        away_since_s = self._away_since_s.pop(client, None)
+        if away_since_s is None:
+            _log.info("%s connected%s", client, " again" if resumed else "")
+        else:
+            _log.info("%s connected again, after %.0f s", client, clock.now() - away_since_s)
 
     def lane_asked(self, client: ClientName, ciphers: list[str]) -> None:
         if self.lanes is not None:
@@ -479,6 +518,8 @@ class RelayDaemon:
         self.errors.core(error, client or "")
 
     def client_down(self, client: ClientName, reason: str) -> None:
+        self._away_since_s[client] = clock.now()
+        self._outages.forget(client)
         _log.info("%s is away: %s", client, reason)
 
     def stream_added(self, stream: StreamInfo) -> None:

@@ -170,7 +170,7 @@ class RelayServer:
         if data[2:3] == JOIN:
             self._join(routing_id, Joined(name, details.fd, connection), data)
             return None
-        port = HubPort(self.hub, name)
+        port = HubPort(self.hub, name, details.address if handle is None else "{}:{}".format(*handle.peer))
 
         def send(datagram: bytes) -> SendResult:
             return self.socket.send_to(routing_id, datagram)

@@ -13,7 +13,7 @@ from sern_core.params import LinkParams, Redundancy, SchedulerParams, WindowAlgo
 from sern_core.types import Ordering
 from sern_runtime.config.base import Bytes, FileProblem, HttpListen, PathText, Seconds, SecondsOrZero, Section, resolve
 from sern_runtime.config.yaml import Loc
-from sern_runtime.keys import load_public, load_secret, secret_warning
+from sern_runtime.keys import PUBLIC_SUFFIX, load_public, load_secret, secret_warning
 
 ClassWord = Literal["control", "state", "bulk"]
 _SCHEDULER = SchedulerParams()
@@ -122,15 +122,21 @@ class LogSection(Section):
     """`text`: a line a person reads; `json`: one object a line."""
 
 
-def public_key_problems(base_dir: Path, text: PathText, loc: Loc) -> Iterator[FileProblem]:
+def public_key_problems(base_dir: Path, text: PathText, loc: Loc, *, client: str) -> Iterator[FileProblem]:
+    """Problems of the relay's public key file, as `client` has it."""
+    path = resolve(base_dir, text)
     try:
-        load_public(resolve(base_dir, text))
+        keys = load_public(path)
     except ConfigError as error:
         yield FileProblem(loc, str(error))
+        return
+    if keys.name == client:
+        yield FileProblem(loc, f"{path} is the key of {client}, this client; the relay's is needed", warning=True)
 
 
 def secret_key_problems(base_dir: Path, text: PathText, loc: Loc, *, owner: str) -> Iterator[FileProblem]:
-    """Problems of the secret key file of `owner`, the name that the configuration gives to this daemon."""
+    """Problems of the secret key file of `owner`, the name that the configuration gives to this daemon, and of the
+    public one beside it, which is what people copy."""
     path = resolve(base_dir, text)
     try:
         key = load_secret(path)
@@ -142,6 +148,22 @@ def secret_key_problems(base_dir: Path, text: PathText, loc: Loc, *, owner: str)
     warning = secret_warning(path)
     if warning is not None:
         yield FileProblem(loc, warning, warning=True)
+    public = path.with_suffix(PUBLIC_SUFFIX)
+    if not public.is_file():
+        return
+    try:
+        keys = load_public(public)
+    except ConfigError as error:
+        yield FileProblem(loc, f"beside it is {error}", warning=True)
+        return
+    if key.public_key not in {entry.key for entry in keys.keys}:
+        problem = (
+            f"{public} is not its public half (it holds the key of {keys.name}): whoever copies it has the wrong one"
+        )
+        yield FileProblem(loc, problem, warning=True)
+    elif keys.name != key.name:
+        problem = f"{public} says that this is the key of {keys.name}, and it is that of {key.name}"
+        yield FileProblem(loc, problem, warning=True)
 
 
 def output_problems(base_dir: Path, text: PathText | None, loc: Loc) -> Iterator[FileProblem]:
