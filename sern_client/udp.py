@@ -10,6 +10,7 @@ from sern_core.client import ClientCore
 from sern_core.errors import RemoteError, SernError
 from sern_core.lane_port import LanePort
 from sern_core.lanes import LANE_UDP, LANE_ZMQ
+from sern_core.link import Link
 from sern_runtime import clock
 from sern_runtime.pump import Pump
 from sern_runtime.seal import SessionParameters, offered_ciphers
@@ -81,6 +82,27 @@ class ClientLane:
         if self._socket is not None:
             self._socket.close()
             self._socket = None
+
+    def problem(self, link: Link, within_s: float) -> str:
+        """What is known about why no datagram passes to and from the relay, as `DatagramWatch` wants it."""
+        socket = self._socket
+        if socket is None:
+            return (
+                f"the relay at {self.host} has offered no datagram lane in {within_s:g} s; using TCP; set "
+                "relay.udp: true there, or relay.udp: false here"
+            )
+        port = socket.parameters.port
+        there = f"{self.host}:{port}/udp"
+        if socket.opener.highest:
+            return (
+                f"datagrams come through from {there}, and it has confirmed none of ours for {within_s:g} s; "
+                f"using TCP; allow outgoing UDP to port {port} here, and datagrams of 1200 bytes on the way"
+            )
+        seen = f" ({socket.problem})" if socket.problem else ""
+        return (
+            f"no datagram came through from {there} in {within_s:g} s{seen}; using TCP; open UDP port {port} "
+            "in the relay's firewall and in its cloud security group, and allow outgoing UDP here"
+        )
 
     def kick(self) -> None:
         if self._pump is not None:

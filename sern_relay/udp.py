@@ -7,6 +7,7 @@ from sern_core.errors import RefusedError, RemoteError
 from sern_core.hub import Hub
 from sern_core.lane_port import LanePort
 from sern_core.lanes import LANE_UDP
+from sern_core.link import Link
 from sern_core.types import ClientName
 from sern_runtime import clock
 from sern_runtime.config.base import split_tcp
@@ -72,6 +73,24 @@ class RelayLanes:
             session, pump = lane
             pump.close()
             self.server.close_session(session)
+
+    def problem(self, link: Link, within_s: float) -> str | None:
+        """What is known about why no datagram passes to and from a client, as `DatagramWatch` wants it; None: the
+        client has asked for no datagram lane, or cannot have one, which was said."""
+        lane = self._lanes.get(link.peer)
+        if lane is None:
+            return None
+        session = lane[0]
+        port = session.parameters.port
+        if session.address is None:
+            return (
+                f"no datagram came through from it to {port}/udp here in {within_s:g} s; using TCP; open UDP port "
+                f"{port} in this host's firewall and in its cloud security group, or allow outgoing UDP in the client's network"
+            )
+        return (
+            f"datagrams come through from it ({session.address[0]}), and it has confirmed none of ours for "
+            f"{within_s:g} s; using TCP; allow this host's UDP port {port} to answer, and datagrams of 1200 bytes"
+        )
 
     def flush(self) -> None:
         """Let every lane that has something to say say it."""
