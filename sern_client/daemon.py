@@ -213,10 +213,11 @@ class ClientDaemon:
                 random=Random(secrets.randbits(64)),
                 on_reason=self._link_down,
                 after=self._kick,
+                marks=model.link.dscp.marks(),
             )
         address = split_tcp(relay.endpoint)
         if relay.udp and keys is not None and address is not None:
-            self._lane = ClientLane(self.core, address[0], kick=self._kick)
+            self._lane = ClientLane(self.core, address[0], kick=self._kick, marks=model.link.dscp.marks())
             self.bridge.lane = self._lane
         if relay.express and address is not None:
             self._express = ClientExpress(

@@ -12,9 +12,11 @@ from sern_core.lane_port import LanePort
 from sern_core.lanes import LANE_UDP, LANE_ZMQ
 from sern_core.link import Link
 from sern_runtime import clock
+from sern_runtime.dscp import Marks
 from sern_runtime.pump import Pump
 from sern_runtime.seal import SessionParameters, offered_ciphers
 from sern_runtime.udp_client import UdpClient
+from sern_runtime.zmq_socket import SendResult
 
 REBIND_S: Final = 2.0
 """While the lane has stalled it tries another source port this often: a lost NAT binding or route raises no error."""
@@ -33,7 +35,8 @@ class ClientLane:
     `host` is the relay's address of the stream lane. Call `tick` about twice a second.
     """
 
-    def __init__(self, core: ClientCore, host: str, *, kick: Callable[[], None]) -> None:
+    def __init__(self, core: ClientCore, host: str, *, kick: Callable[[], None], marks: Marks | None = None) -> None:
+        self._marks = marks or Marks()
         self.core = core
         self.host = host
         self.bad_frames = 0
@@ -56,20 +59,26 @@ class ClientLane:
         parameters = SessionParameters.from_envelope(envelope)
         self.closed()
         try:
-            self._socket = UdpClient(
+            self._socket = socket = UdpClient(
                 self.host,
                 parameters.port,
                 parameters,
                 self._received,
                 on_writable=self._writable,
                 after=self._kick,
+                tos=self._marks.stream_tos,
             )
         except SernError as error:
             _log.warning("no datagram lane: %s", error)
             self._ask_later()
             return
         port = LanePort(self.core.link, LANE_UDP)
-        self._pump = Pump(port, self._socket.send, on_gone=self._used_up, ready=self._socket.ready)
+        tos = self._marks.tos
+
+        def send(datagram: bytes) -> SendResult:
+            return socket.send(datagram, tos[port.priority])
+
+        self._pump = Pump(port, send, on_gone=self._used_up, ready=socket.ready)
         self.core.link.close_lane(now=clock.now())
         self.core.link.open_lane(now=clock.now())
         self._pump.kick()

@@ -346,7 +346,9 @@ class Sender(ABC):
         if lane.copies and (copy := lane.due_copy(now)) is not None:
             self.scheduler.charge(PriorityClass.CONTROL, len(copy), now=now)
             self.wire_bytes += len(copy) + OVERHEAD_BYTES
+            lane.priority = PriorityClass.CONTROL
             return copy
+        lane.priority = PriorityClass.STATE
         frames: list[bytes] = []
         items: list[SentData | SentWatermark | SentPing] = []
         if not lane.stalled or now >= lane.probe_due_s:
@@ -460,6 +462,7 @@ class Sender(ABC):
             size = self._put_watermarks(frames, items, size)
         control = self._control
         served: PriorityClass | None = None
+        spoke = False
         full = limit - max(wire.DATA_FIRST_BYTES + MIN_SHARE_BYTES, limit // CRUMB)
         while size <= full:
             if express:
@@ -477,6 +480,7 @@ class Sender(ABC):
                 before = size
                 end = min(limit, size + wire.DATA_FIRST_BYTES + RIDE_BYTES) if rides else limit
                 size = self._put(control, order, frames, items, size, end, now)
+                spoke = True
                 if not order.has_unsent:
                     self._control_sent(order.seq)
                 if rides:
@@ -506,6 +510,8 @@ class Sender(ABC):
             self._refresh(channel, now)
             if lane.stalled:
                 break
+        if served is PriorityClass.CONTROL or (served is PriorityClass.BULK and not spoke):
+            lane.priority = served
         return window_open
 
     def _cut(self, lane: Lane, limit: int, now: float) -> int:
