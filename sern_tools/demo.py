@@ -11,7 +11,6 @@ Whatever happens, no process and no temporary file is left: children are stopped
 
 import asyncio
 import shlex
-import shutil
 import signal
 import sys
 import tempfile
@@ -49,7 +48,7 @@ from sern_tools.demo_scenario import (
     write_files,
 )
 from sern_tools.message_log import TopicLog, read_logs
-from sern_tools.processes import Child, Children, program
+from sern_tools.processes import Child, Children, program, swept
 from sern_tools.shaping import RateSchedule
 from sern_tools.summary import RunFacts, analyse, judge
 
@@ -391,11 +390,8 @@ def _working_directory(options: Options) -> Iterator[Path]:
         path.mkdir(parents=True)
         yield path
         return
-    path = Path(tempfile.mkdtemp(prefix="sern-demo-"))
-    try:
+    with swept(Path(tempfile.mkdtemp(prefix="sern-demo-"))) as path:
         yield path
-    finally:
-        shutil.rmtree(path, ignore_errors=True)
 
 
 async def run(options: Options, console: Console) -> int:
