@@ -396,7 +396,7 @@ class Sender(ABC):
         path = lane.path
         app_limited = not waits and not path.held and inflight_bytes < estimator.window_bytes
         path.held = False
-        flight.sent(now=now, nbytes=nbytes, items=items, app_limited=app_limited)
+        flight.sent(now=now, nbytes=nbytes, items=items, app_limited=app_limited, priority=lane.priority)
         estimator.on_sent(now=now, nbytes=nbytes, inflight_bytes=inflight_bytes)
         pacer = lane.pacer
         pacer.sent(now=now, nbytes=nbytes, pacing_bps=estimator.pacing_bps)
