@@ -40,6 +40,7 @@ from sern_runtime.collector import CollectorWatch
 from sern_runtime.config.base import split_tcp
 from sern_runtime.config.client import ClientFile, ServicesSection, load_client
 from sern_runtime.config.load import Loaded
+from sern_runtime.datagram_watch import DatagramWatch
 from sern_runtime.draining import Progress
 from sern_runtime.entry import blamed_on, end_tasks, log_warnings, serve
 from sern_runtime.http import Health, HttpServer
@@ -154,6 +155,11 @@ class ClientDaemon:
         self._transport: RelayTransport | None = None
         self._name: RelayName | None = None
         self._lane: ClientLane | None = None
+        self.datagrams = DatagramWatch(
+            lambda: [self.core.link],
+            lambda link, within_s: self._lane.problem(link, within_s) if self._lane is not None else None,
+            lambda link: link.name,
+        )
         self._express: ClientExpress | None = None
         self._http: HttpServer | None = None
         self.tasks: list[asyncio.Task[None]] = []
@@ -230,6 +236,7 @@ class ClientDaemon:
                 random=Random(secrets.randbits(64)),
                 on_reason=self._link_down,
                 after=self._kick,
+                marks=model.link.dscp.marks(),
             )
         named = name_in(relay.endpoint)
         if named is not None:
@@ -237,7 +244,7 @@ class ClientDaemon:
             self._name.tick(connected=False)
         address = split_tcp(relay.endpoint)
         if relay.udp and keys is not None and address is not None:
-            self._lane = ClientLane(self.core, address[0], kick=self._kick)
+            self._lane = ClientLane(self.core, address[0], kick=self._kick, marks=model.link.dscp.marks())
             self.bridge.lane = self._lane
         if relay.express and address is not None:
             self._express = ClientExpress(
@@ -298,6 +305,7 @@ class ClientDaemon:
             link = self.core.link
             if self._lane is not None:
                 self._lane.tick()
+            self.datagrams.tick()
             if self._express is not None:
                 self._express.tick()
             self.check.tick(now=clock.now())
@@ -359,6 +367,7 @@ class ClientDaemon:
         metrics = Metrics(registry)
         link = self.core.link
         register_links(metrics, lambda: [link])
+        self.datagrams.register(metrics)
         register_received(metrics, self.core.received, self.bridge.ages)
         register_codecs(metrics, self.core.coder)
         self.link_state.register(metrics)

@@ -12,11 +12,12 @@ from sern_core import wire
 from sern_core.errors import ConfigError, RemoteError
 from sern_core.link import Link
 from sern_runtime import clock
+from sern_runtime.dscp import Marks
 from sern_runtime.inflow import Inflow
 from sern_runtime.monitor import TcpHandle
 from sern_runtime.pump import LANE_MESSAGE_BYTES, Pump
 from sern_runtime.transport_watch import TransportWatch
-from sern_runtime.zmq_socket import TOS_EXPEDITED, CurvePair, DealerSocket, SendResult, make_client
+from sern_runtime.zmq_socket import CurvePair, DealerSocket, SendResult, make_client
 
 REBUILD_MIN_S: Final = 1.0
 REBUILD_MAX_S: Final = 30.0
@@ -56,6 +57,7 @@ class Dialer:
         *,
         heartbeat_timeout_s: float,
         random: Random,
+        tos: int = 0,
         express: bool = False,
         attempt: int = 0,
     ) -> None:
@@ -71,6 +73,7 @@ class Dialer:
         self._heartbeat_timeout_ms = int(heartbeat_timeout_s * 1000)
         self._random = random
         self._express = express
+        self._tos = tos
         self._backoff_s = REBUILD_MIN_S
         self._rebuild: asyncio.TimerHandle | None = None
         self._socket: DealerSocket | None = None
@@ -96,7 +99,7 @@ class Dialer:
             self._server_keys[self.attempt % len(self._server_keys)] if self._server_keys else None,
             heartbeat_timeout_ms=self._heartbeat_timeout_ms,
             max_message_bytes=LANE_MESSAGE_BYTES,
-            tos=TOS_EXPEDITED if self._express else 0,
+            tos=self._tos,
             before_connect=attach,
         )
         self._socket = DealerSocket(
@@ -146,7 +149,7 @@ class Dialer:
     def _up(self, handle: TcpHandle | None) -> None:
         self._handle = handle
         if handle is not None:
-            handle.prepare(express=self._express)
+            handle.prepare(express=self._express, tos=self._tos)
         self._backoff_s = REBUILD_MIN_S
         self._was_up = True
         self._events.up(handle)
@@ -196,7 +199,9 @@ class RelayTransport:
         random: Random,
         on_reason: Callable[[str], None],
         after: Callable[[], None] = lambda: None,
+        marks: Marks | None = None,
     ) -> None:
+        marks = marks or Marks()
         self.after = after
         self.link = link
         self.endpoint = endpoint
@@ -212,6 +217,7 @@ class RelayTransport:
                 events,
                 heartbeat_timeout_s=heartbeat_timeout_s,
                 random=random,
+                tos=marks.express_tos if express else marks.stream_tos,
                 express=express,
                 attempt=attempt,
             )

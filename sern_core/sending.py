@@ -346,7 +346,9 @@ class Sender(ABC):
         if lane.copies and (copy := lane.due_copy(now)) is not None:
             self.scheduler.charge(PriorityClass.CONTROL, len(copy), now=now)
             self.wire_bytes += len(copy) + OVERHEAD_BYTES
+            lane.priority = PriorityClass.CONTROL
             return copy
+        lane.priority = PriorityClass.STATE
         frames: list[bytes] = []
         items: list[SentData | SentWatermark | SentPing] = []
         if not lane.stalled or now >= lane.probe_due_s:
@@ -394,7 +396,7 @@ class Sender(ABC):
         path = lane.path
         app_limited = not waits and not path.held and inflight_bytes < estimator.window_bytes
         path.held = False
-        flight.sent(now=now, nbytes=nbytes, items=items, app_limited=app_limited)
+        flight.sent(now=now, nbytes=nbytes, items=items, app_limited=app_limited, priority=lane.priority)
         estimator.on_sent(now=now, nbytes=nbytes, inflight_bytes=inflight_bytes)
         pacer = lane.pacer
         pacer.sent(now=now, nbytes=nbytes, pacing_bps=estimator.pacing_bps)
@@ -467,6 +469,7 @@ class Sender(ABC):
         control = self._control
         served: PriorityClass | None = None
         ride = False  # it is the turn of a little control, behind class 0
+        spoke = False
         full = limit - max(wire.DATA_FIRST_BYTES + MIN_SHARE_BYTES, limit // CRUMB)
         while size <= full:
             if express:
@@ -480,6 +483,7 @@ class Sender(ABC):
                 before = size
                 end = min(limit, size + wire.DATA_FIRST_BYTES + RIDE_BYTES) if ride else limit
                 size = self._put(control, said, frames, items, size, end, now)
+                spoke = True
                 if not said.has_unsent:
                     self._control_sent(said.seq)
                 if ride:
@@ -515,6 +519,8 @@ class Sender(ABC):
             self._refresh(channel, now)
             if lane.stalled:
                 break
+        if served is PriorityClass.CONTROL or (served is PriorityClass.BULK and not spoke):
+            lane.priority = served
         return window_open
 
     def _cut(self, lane: Lane, limit: int, now: float) -> int:

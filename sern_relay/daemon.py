@@ -33,6 +33,7 @@ from sern_runtime.codec_pool import CodecPool, make_coder
 from sern_runtime.collector import CollectorWatch
 from sern_runtime.config.load import Loaded
 from sern_runtime.config.relay import RelayFile, load_relay
+from sern_runtime.datagram_watch import DatagramWatch
 from sern_runtime.draining import Progress
 from sern_runtime.entry import blamed_on, end_tasks, log_warnings, serve
 from sern_runtime.http import Health, HttpServer
@@ -141,6 +142,11 @@ class RelayDaemon:
         self.server: RelayServer | None = None
         self.feed: RelayFeed | None = None
         self.lanes: RelayLanes | None = None
+        self.datagrams = DatagramWatch(
+            lambda: list(self.hub.links.values()),
+            lambda link, within_s: self.lanes.problem(link, within_s) if self.lanes is not None else None,
+            lambda link: link.peer,
+        )
         self.transforms: TransformObjects | None = None
         self._ctx: zmq.Context[zmq.Socket[bytes]] | None = None
         self._http: HttpServer | None = None
@@ -186,10 +192,11 @@ class RelayDaemon:
                 max_connections=relay.max_connections,
                 redundancy=model.link.redundancy,
                 after=self._after,
+                marks=model.link.dscp.marks(),
             )
         if keys is not None and relay.udp:
             with blamed_on(self.loaded.path, "relay", "listen"):
-                self.lanes = RelayLanes(self.hub, relay.listen, after=self._after)
+                self.lanes = RelayLanes(self.hub, relay.listen, after=self._after, marks=model.link.dscp.marks())
         if keys is not None and self.zap is not None:
             await self_test(self._ctx, self.zap, relay.listen, keys.public_key)
             _log.info("self-test passed: a stranger's key is refused on %s", ", ".join(relay.listen))
@@ -260,6 +267,7 @@ class RelayDaemon:
             self.hub.sweep(now=now)
             if self.server is not None:
                 self.server.express.look()
+            self.datagrams.tick()
             if self.message_log is not None:
                 with self.parts.survive("message_log"):
                     self.message_log.flush()
@@ -337,6 +345,7 @@ class RelayDaemon:
         registry = CollectorRegistry()
         metrics = Metrics(registry)
         register_links(metrics, lambda: list(self.hub.links.values()))
+        self.datagrams.register(metrics)
         register_received(metrics, self.hub.received, self.ages)
         register_codecs(metrics, self.coder)
         self.errors.register(metrics)

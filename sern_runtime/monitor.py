@@ -25,7 +25,7 @@ from typing import Final, NamedTuple
 import zmq
 
 from sern_runtime.clock import now
-from sern_runtime.zmq_socket import HANDSHAKE_IVL_MS, TOS_EXPEDITED, FrameSocket
+from sern_runtime.zmq_socket import HANDSHAKE_IVL_MS, FrameSocket
 
 EventKind = zmq.Event
 EVENTS: Final = int(
@@ -199,14 +199,14 @@ class TcpHandle:
             raw = connection.getsockopt(socketlib.IPPROTO_TCP, socketlib.TCP_CONGESTION, 16)
         return raw.rstrip(b"\0").decode("ascii", "replace")
 
-    def prepare(self, *, express: bool) -> None:
-        """What a connection of a lane needs; what the kernel does not have or allow is left as it is."""
+    def prepare(self, *, express: bool, tos: int) -> None:
+        """What a connection of a lane needs, with `tos` as its IP byte (DSCP in the upper six bits); what the kernel
+        does not have or allow is left as it is."""
         self.set_congestion(EXPRESS_CONGESTION if express else STREAM_CONGESTION)
         self.set_rto_max()
         self.set_pacing()
-        if express:
-            self._set(socketlib.IP_TOS, TOS_EXPEDITED, level=socketlib.IPPROTO_IP)
-            self._set(socketlib.IPV6_TCLASS, TOS_EXPEDITED, level=socketlib.IPPROTO_IPV6)
+        self._set(socketlib.IP_TOS, tos, level=socketlib.IPPROTO_IP)
+        self._set(socketlib.IPV6_TCLASS, tos, level=socketlib.IPPROTO_IPV6)
 
     def set_congestion(self, name: str) -> bool:
         """Choose the congestion control. False when the kernel does not have it or does not allow it."""
