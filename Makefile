@@ -2,14 +2,17 @@
 PYTHON ?= python3
 VENV   ?= .venv
 BIN    := $(VENV)/bin
+TEST_PROCESSES ?= 2
+RANDOM_TESTS = $(shell grep -rl tests.exploring tests --include='test_*.py' | grep -v tests/peers)
 PACKAGES := sern_core sern_runtime sern_relay sern_client sern_sim sern_tools benchmarks tests
 
-.PHONY: help setup lint format types test lab bench performance demo schemas clean
+.PHONY: help setup lint format types test explore lab bench performance demo schemas clean
 
 help:
 	@echo "make setup    create $(VENV) with pinned dependencies"
 	@echo "make demo     relay, robot and site over a bad link, on this machine, next to plain ZMQ"
 	@echo "make test     every test;  make lint, make types: static checks"
+	@echo "make explore  the tests with random input, with new cases and ten times as many; SEED=... repeats a run"
 	@echo "make lab      the longer runs over tc netem, which need root, and the whole matrix of bad links"
 	@echo "make performance   as root: measure docs/performance.md anew, 20 minutes of a machine that does nothing else"
 	@echo "make bench    the quick benchmarks;  make schemas: regenerate schemas/ and the configuration reference"
@@ -33,8 +36,15 @@ format: setup
 types: setup
 	$(BIN)/mypy
 
+# The lab measures a link: it has the machine for itself.
 test: setup
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n $(TEST_PROCESSES) --dist loadgroup --ignore tests/lab
+	$(BIN)/python -m pytest tests/lab
+
+SEED ?= $(shell date +%s)
+explore: setup
+	@echo "SEED=$(SEED)"
+	SERN_EXPLORE=$(SEED) $(BIN)/python -m pytest -n $(TEST_PROCESSES) --dist loadgroup $(RANDOM_TESTS)
 
 lab: setup
 	$(BIN)/python -m pytest tests/lab tests/matrix -m lab_long

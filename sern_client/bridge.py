@@ -24,11 +24,13 @@ from sern_client.endpoints.composite import CompositeEndpoint
 from sern_client.frames import FramePrefixer, Rewrite
 from sern_client.guard import Guard
 from sern_client.keeping import Keeping
+from sern_client.link_state import LinkState
 from sern_client.rebuild import Rebuilds
 from sern_client.services import ServiceBridge
 from sern_client.summarise import Send, Source, Summaries
 from sern_client.tf_merge import LatchedTransforms, MergedTransforms
 from sern_client.udp import ClientLane
+from sern_client.withdrawal import Kept, Withdrawable, Withdrawal
 from sern_core import wire
 from sern_core.client import ClientCore
 from sern_core.errors import ConfigError, UsageError
@@ -39,8 +41,9 @@ from sern_core.patterns import PatternSet
 from sern_core.queues import OutChannel
 from sern_core.rules import Discovery, ResolvedTopic, RuleSet, to_global
 from sern_core.services import parse as parse_service
+from sern_core.session import DISPLACED
 from sern_core.summaries.transforms import is_static
-from sern_core.types import DropReason, Encoding, TopicName
+from sern_core.types import ClientName, DropReason, Encoding, TopicName
 from sern_runtime import clock, ros_types
 from sern_runtime.fine_timer import fine_timer
 from sern_runtime.link_metrics import AgeHistograms
@@ -72,7 +75,7 @@ class Incoming:
     """A stream from elsewhere that is published here, as `info`. `stop` is the body that a lost link makes us publish.
     `publisher` None: it is of use to another stream only. `guarded`: what the guard calls it; None: it has none."""
 
-    __slots__ = ("guarded", "info", "lease", "local", "publish", "publisher", "rewrite", "stop")
+    __slots__ = ("guarded", "info", "kept", "lease", "local", "publish", "publisher", "rewrite", "stop", "withdrawn")
 
     def __init__(
         self,
@@ -89,6 +92,8 @@ class Incoming:
         self.stop = stop
         self.rewrite = rewrite
         self.guarded: int | None = None
+        self.kept: Kept | None = None
+        self.withdrawn: ClientName | None = None
 
     def use(self, publisher: Publisher | None) -> None:
         self.publisher = publisher
@@ -128,6 +133,8 @@ class Bridge:
         """Services offered and used, where there are rules for them; set by the daemon."""
         self.goals: GoalWatch | None = None
         """Goals of ROS 1 that this site gives to others, where there are rules for them; set by the daemon."""
+        self.link_state: LinkState | None = None
+        """Says at the endpoint who is there; set by the daemon."""
         self.guard: Guard | None = None
         """Publishes stop commands while this process cannot; set by the daemon."""
         self.refusals = 0
@@ -146,9 +153,12 @@ class Bridge:
         self._core: ClientCore | None = None
         self._outgoing: dict[TopicName, Outgoing] = {}
         self._incoming: dict[StreamId, Incoming] = {}
+        self.withdrawal = Withdrawal(self._incoming, self._advertise, self._close_publisher)
+        """Ends the topics of who is not there."""
         self._last_arrival_s: dict[StreamId, float] = {}
         self._timer = fine_timer(self._leases_due)  # one that is due while the machine sleeps is due when it wakes
         self.summaries = Summaries(self._sender, self.parts)
+        self._unnamed: set[TopicName] = set()  # local topics without a rule, of which it was said
         self._unreceived: dict[StreamId, str] = {}  # streams that could not be published here, and why
         self._again = Timer(self._reconsider)
         self._again_s = AGAIN_S[0]
@@ -203,16 +213,18 @@ class Bridge:
             self.guard.closed(incoming.guarded)
         self._close_publisher(incoming)
 
-    def _close_publisher(self, incoming: Incoming) -> None:
+    def _close_publisher(self, incoming: Withdrawable) -> None:
         if incoming.publisher is not None:
             try:
                 incoming.publisher.close()
             except Exception:  # noqa: BLE001  a fault of one topic, as in `_publish`
                 self.publish_failures += 1
-                _log.exception("%s could not be ended here", incoming.local)
+                _log.exception("%s could not be ended here", incoming.info.name)
 
     def _publish(self, incoming: Incoming, body: bytes, stamp_ns: int, left_s: float = inf) -> None:
         """`left_s`: how much longer the message is young enough."""
+        if incoming.withdrawn is not None:
+            self.withdrawal.restore_one(incoming)
         if incoming.publish is None:
             return
         try:
@@ -228,6 +240,8 @@ class Bridge:
             return
         listed = self.rules.find(info.type_name, info.name) is not None
         if not self.discovery.wants(info.name, info.type_name, listed=listed):
+            if self.discovery.wants(info.name, info.type_name, listed=True):  # only a rule is missing
+                self._say_unnamed(info)
             return
         try:
             resolved = self.rules.resolve(info, local_name=info.name)
@@ -253,6 +267,13 @@ class Bridge:
             return
         self._outgoing[info.name] = Outgoing(channel, subscription, source, sink)
         self._kick()
+
+    def _say_unnamed(self, info: TopicInfo) -> None:
+        """Said once for each name: a rule with a typing error looks like a robot without the topic."""
+        if info.name not in self._unnamed and len(self._unnamed) < MAX_TOPICS:
+            self._unnamed.add(info.name)
+            _log.info("%s (%s) stays here: no rule in `topics` names it (discovery.mode: manual)", info.name,
+                      info.type_name)  # fmt: skip
 
     def _withdraw(self, channel: OutChannel, source: Source | None) -> None:
         """Offer a topic no more."""
@@ -328,7 +349,8 @@ class Bridge:
         self._on_down(reason)
 
     def rejected(self, code: str, text: str) -> None:
-        if text != self.rejected_reason:  # it is asked again every few seconds
+        # It is asked again every few seconds; of a session that was taken from us `link_down` has said it.
+        if text != self.rejected_reason and code != DISPLACED:
             _log.error("the relay refuses us (%s): %s", code, text)
         self.rejected_reason = text
 
@@ -367,6 +389,7 @@ class Bridge:
             else:
                 lease = CommandLease(resolved.lease.after_s)
         incoming = Incoming(info, publisher, lease, stop, self.frames.incoming(info))
+        incoming.kept = self.withdrawal.kept(stream)
         if self.guard is not None and stop is not None:
             incoming.guarded = self.guard.opened(info, stop)
         self._incoming[stream.id] = incoming
@@ -426,6 +449,8 @@ class Bridge:
             except Exception as error:  # noqa: BLE001  (as it came is better than not at all)
                 self.parts.failed("frames", error)
         self._publish(incoming, body, stamp_ns, left_s)
+        if incoming.kept is not None:
+            incoming.kept.append((body, stamp_ns))
 
     def stream_closed(self, stream: StreamInfo) -> None:
         self.rebuilds.closed(stream)
@@ -568,11 +593,16 @@ class Bridge:
             if outgoing.channel.stream.id not in self.core.link.by_stream
         ]
         publishers = Counter(incoming.local for incoming in self._incoming.values() if incoming.publisher is not None)
+        if self.link_state is not None:
+            publishers += self.link_state.held
         return found + self.endpoint.validate(Held(publishers, Counter(self._outgoing.keys())))
 
     def repair(self, differences: Sequence[Difference]) -> None:
         """Open anew at the endpoint what is not open there as it should be."""
-        for name in {difference.name for difference in differences if difference.kind == "publisher"}:
+        odd = {difference.name for difference in differences if difference.kind == "publisher"}
+        if self.link_state is not None:
+            self.link_state.repair(odd)
+        for name in odd:
             for incoming in [each for each in self._incoming.values() if each.local == name]:
                 if incoming.publisher is not None:
                     self._close_publisher(incoming)

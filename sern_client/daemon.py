@@ -18,24 +18,29 @@ from sern_client.bridge import Bridge
 from sern_client.checks import TableCheck
 from sern_client.endpoints.base import CountingEndpoint, Endpoint, ServiceEndpoint
 from sern_client.express import ClientExpress
-from sern_client.factory import make_endpoint
+from sern_client.factory import make_endpoint, make_link_topics
 from sern_client.guard import Guard
+from sern_client.link_state import LinkState
+from sern_client.relay_name import RelayName, name_in
 from sern_client.services import ServiceBridge
 from sern_client.summarise import register_summaries
 from sern_client.transport import RelayTransport
 from sern_client.udp import ClientLane
 from sern_core.client import ClientCore
 from sern_core.errors import ConfigError
+from sern_core.lanes import LANE_UDP
 from sern_core.lossy import missing
 from sern_core.patterns import compile_pattern
 from sern_core.trace import DecisionTrace
 from sern_core.types import CLASS_LABELS, DropReason, ObjectKind
-from sern_runtime import clock
+from sern_runtime import clock, ros_types
 from sern_runtime.adaptation import Adaptation
 from sern_runtime.codec_pool import CodecPool, make_coder
+from sern_runtime.collector import CollectorWatch
 from sern_runtime.config.base import split_tcp
 from sern_runtime.config.client import ClientFile, ServicesSection, load_client
 from sern_runtime.config.load import Loaded
+from sern_runtime.datagram_watch import DatagramWatch
 from sern_runtime.draining import Progress
 from sern_runtime.entry import blamed_on, end_tasks, log_warnings, serve
 from sern_runtime.http import Health, HttpServer
@@ -46,8 +51,10 @@ from sern_runtime.loop import Shutdown
 from sern_runtime.message_log import LoggedFates, MessageLog
 from sern_runtime.metrics import Metrics
 from sern_runtime.optional import OptionalParts
+from sern_runtime.outages import Outages
 from sern_runtime.sdnotify import Notifier, Watchdog
 from sern_runtime.topics_view import TopicView, both_ways
+from sern_runtime.transport_watch import NOT_YET, WAITING
 
 PATIENCE_S: Final = 2.0
 """How long a stopping client waits, beside some round trips, for the next sign that what it still owes gets further."""
@@ -55,6 +62,7 @@ STALL_PATIENCE_S: Final = 5.0
 """The same while it has more to send and a session: a path that has stalled often comes back."""
 PATIENCE_RTTS: Final = 4.0
 TICK_S: Final = 0.5
+SILENT: Final = "the relay does not answer now; the session waits for it"
 
 _log = logging.getLogger(__name__)
 
@@ -66,6 +74,7 @@ async def run_client(path: Path, shutdown: Shutdown) -> int:
     daemon = ClientDaemon(loaded)
     try:
         await daemon.start()
+        daemon.collector.settle()
         await serve(shutdown, daemon.tasks)
         daemon.notifier.stopping("draining")
         await daemon.drain()
@@ -83,7 +92,10 @@ class ClientDaemon:
         self.notifier = Notifier.from_environment()
         endpoint = make_endpoint(loaded)
         self.errors = InternalErrors()
-        self.parts = OptionalParts("adaptation", "codecs", "frames", "http", "message_log", "metrics", "summaries")
+        self.collector = CollectorWatch()
+        self.parts = OptionalParts(
+            "adaptation", "codecs", "frames", "http", "link_state", "message_log", "metrics", "summaries"
+        )
         self.message_log = MessageLog(loaded.resolve(model.message_log)) if model.message_log else None
         self.bridge = Bridge(
             endpoint,
@@ -124,11 +136,30 @@ class ClientDaemon:
             rules = tuple((compile_pattern(section.match), section.timeout_s) for section in model.actions.use)
             self.bridge.goals = GoalWatch(rules, lambda info: self.bridge.converter.advertise(endpoint, info))
         self.adaptation = self._make_adaptation()
-        self.reason = "not connected yet"
+        self.reason = NOT_YET
+        state = model.link_state
+        self.bridge.withdrawal.used = state.withdraw_after_s is not None
+        self.bridge.link_state = self.link_state = LinkState(
+            self.core,
+            make_link_topics(model, lambda info: self.bridge.converter.advertise(endpoint, info)),
+            self.bridge.withdrawal,
+            period_s=state.period_s,
+            withdraw_after_s=state.withdraw_after_s,
+            reason=self._why,
+            parts=self.parts,
+        )
         self._said: set[str] = set()  # since the last session: an attempt that fails as before is no news
+        self._down_since_s = now
+        self._outages = Outages(_log, logging.WARNING)
         self._ctx: zmq.Context[zmq.Socket[bytes]] | None = None
         self._transport: RelayTransport | None = None
+        self._name: RelayName | None = None
         self._lane: ClientLane | None = None
+        self.datagrams = DatagramWatch(
+            lambda: [self.core.link],
+            lambda link, within_s: self._lane.problem(link, within_s) if self._lane is not None else None,
+            lambda link: link.name,
+        )
         self._express: ClientExpress | None = None
         self._http: HttpServer | None = None
         self.tasks: list[asyncio.Task[None]] = []
@@ -169,6 +200,8 @@ class ClientDaemon:
 
     async def start(self) -> None:
         self.errors.watch(asyncio.get_running_loop())
+        self.collector.watch()
+        ros_types.load()
         model = self.loaded.model
         relay = model.relay
         keys = load_secret(self.loaded.resolve(relay.secret_key_file)) if relay.secret_key_file else None
@@ -188,6 +221,7 @@ class ClientDaemon:
         # Before the transport: streams from the relay are advertised at the endpoint as soon as there is a session.
         await self.bridge.endpoint.start(self.bridge)
         self._endpoint_started = True
+        self.link_state.start()
         if self.guard is not None:
             self.guard.start()
         self._ctx = zmq.Context()
@@ -202,10 +236,15 @@ class ClientDaemon:
                 random=Random(secrets.randbits(64)),
                 on_reason=self._link_down,
                 after=self._kick,
+                marks=model.link.dscp.marks(),
             )
+        named = name_in(relay.endpoint)
+        if named is not None:
+            self._name = RelayName(relay.endpoint, *named)
+            self._name.tick(connected=False)
         address = split_tcp(relay.endpoint)
         if relay.udp and keys is not None and address is not None:
-            self._lane = ClientLane(self.core, address[0], kick=self._kick)
+            self._lane = ClientLane(self.core, address[0], kick=self._kick, marks=model.link.dscp.marks())
             self.bridge.lane = self._lane
         if relay.express and address is not None:
             self._express = ClientExpress(
@@ -233,12 +272,23 @@ class ClientDaemon:
     def _link_down(self, reason: str) -> None:
         """Told by the transport and by the session on it, usually of the same thing."""
         self.reason = reason
-        if reason not in self._said and not self._stopping:
+        self.link_state.soon()
+        if not self.core.link.established:  # else the session goes on over the other lane
+            self._outages.forget()
+        if self._stopping:
+            return
+        if not self._said:
+            self._down_since_s = clock.now()
+        if reason not in self._said:
             self._said.add(reason)
             _log.warning("%s: %s; trying again until it works", self.loaded.model.relay.endpoint, reason)
 
     def _link_up(self) -> None:
+        if self._said:  # in the words and at the level of the loss
+            down_s = clock.now() - self._down_since_s
+            _log.warning("%s: the link is there again, after %.0f s", self.loaded.model.relay.endpoint, down_s)
         self._said.clear()
+        self.link_state.soon()
         self._put_node()
         if self._lane is not None:
             self._lane.ask()
@@ -255,13 +305,46 @@ class ClientDaemon:
             link = self.core.link
             if self._lane is not None:
                 self._lane.tick()
+            self.datagrams.tick()
             if self._express is not None:
                 self._express.tick()
             self.check.tick(now=clock.now())
+            self.link_state.look()
             if watchdog.interval_s is not None:
                 watchdog.check()
-            state = "up" if link.established and not link.lane.stalled else f"down: {self.reason}"
+            if self._name is not None:
+                self._name.tick(connected=link.established)
+            self._look_at_lanes()
+            state = "up" if link.established and not link.lane.stalled else f"down: {self._why()}"
             self.notifier.status(f"link {state}")
+
+    def _look_at_lanes(self) -> None:
+        """Say what has been silent for a while in a session that goes on, and when it is not any more."""
+        link = self.core.link
+        if not link.established:
+            return
+        relay, now = self.loaded.model.relay.endpoint, clock.now()
+        if self._said and link.transport_up:  # a session that outlived its connection has another now
+            self._said.clear()
+            _log.warning("%s: the connection is there again, after %.0f s", relay, now - self._down_since_s)
+        self._outages.look(
+            ("link",), lost=link.lane.stalled, now=now,
+            gone=f"{relay}: {SILENT}", back=f"{relay}: the relay answers again",
+        )  # fmt: skip
+        udp = link.lanes.get(LANE_UDP)
+        self._outages.look(
+            ("udp",), lost=udp is not None and udp.stalled and not link.lane.stalled, now=now,
+            gone=f"{relay}: no datagram gets through; data goes over TCP", back=f"{relay}: datagrams get through again",
+        )  # fmt: skip
+
+    def _why(self) -> str:
+        """Why there is no link, as far as it is known."""
+        if self.core.link.established:
+            return SILENT
+        unresolved = None if self._name is None else self._name.problem
+        if self.reason == NOT_YET and self._transport is not None and self._transport.waiting:
+            return WAITING
+        return unresolved or self.bridge.rejected_reason or self.reason
 
     def _put_node(self) -> None:
         """Tell the relay's registry who we are."""
@@ -284,9 +367,12 @@ class ClientDaemon:
         metrics = Metrics(registry)
         link = self.core.link
         register_links(metrics, lambda: [link])
+        self.datagrams.register(metrics)
         register_received(metrics, self.core.received, self.bridge.ages)
         register_codecs(metrics, self.core.coder)
+        self.link_state.register(metrics)
         self.errors.register(metrics)
+        self.collector.register(metrics)
         register_summaries(metrics, self.bridge.summaries)
         metrics.counter(
             "sern_patch_gaps_total",
@@ -383,6 +469,7 @@ class ClientDaemon:
             ready=self._ready,
             json_routes={
                 "/api/link": lambda: [link.snapshot()],
+                "/api/peers": self.link_state.to_json,
                 "/api/topics": self.topics,
                 "/api/trace": self.core.trace.to_json,
                 **({} if adaptation is None else {"/api/mmcf": adaptation.to_json}),
@@ -396,10 +483,14 @@ class ClientDaemon:
 
     def _ready(self) -> Health:
         if self.core.link.established:
+            if self.core.link.lane.stalled:
+                return Health(ok=False, reason=SILENT)
             if self.check.found:
                 return Health(ok=False, reason=f"what is here is not what should be: {self.check.found[0]}")
-            return Health(ok=True, reason=f"connected to {self.core.link.peer}")
-        return Health(ok=False, reason=self.bridge.rejected_reason or self.reason)
+            # A site with one robot of three gone does its job for the other two.
+            said = (f"connected to {self.core.link.peer}", self.link_state.detail())
+            return Health(ok=True, reason="; ".join(filter(None, said)))
+        return Health(ok=False, reason=self._why())
 
     def topics(self) -> dict[str, TopicView]:
         """Counters of every topic by global name, sent and received."""
@@ -464,6 +555,7 @@ class ClientDaemon:
         """Ends whatever was started, the last first, also when a part of it fails."""
         async with AsyncExitStack() as stack:
             stack.callback(self.errors.unwatch, asyncio.get_running_loop())
+            stack.callback(self.collector.close)
             stack.callback(self.notifier.close)
             stack.callback(self._write_summary)
             if self.message_log is not None:
@@ -478,6 +570,7 @@ class ClientDaemon:
             if self.guard is not None:
                 stack.push_async_callback(self.guard.stop)
             stack.callback(self.bridge.close)
+            stack.callback(self.link_state.close)
             if self.bridge.services is not None:
                 stack.push_async_callback(self.bridge.services.stop)
             if self._transport is not None:
@@ -486,6 +579,8 @@ class ClientDaemon:
                 stack.callback(self._express.close)
             if self._lane is not None:
                 stack.callback(self._lane.closed)
+            if self._name is not None:
+                stack.callback(self._name.close)
             stack.callback(self.codecs.close)
             stack.push_async_callback(end_tasks, self.tasks)
 

@@ -3,9 +3,10 @@
 from collections.abc import Callable
 from dataclasses import fields
 from pathlib import Path
+from typing import Final
 
 from sern_client.endpoints.bag import BagEndpoint, BagOptions
-from sern_client.endpoints.base import Endpoint
+from sern_client.endpoints.base import Endpoint, Publisher
 from sern_client.endpoints.composite import CompositeEndpoint
 from sern_client.endpoints.rclpy import RclpyEndpoint, RclpyOptions
 from sern_client.endpoints.record import RecordEndpoint, RecordOptions
@@ -13,7 +14,10 @@ from sern_client.endpoints.ros1 import Ros1Endpoint, Ros1Options
 from sern_client.endpoints.synthetic import SyntheticEndpoint, SyntheticOptions
 from sern_client.endpoints.zenoh.endpoint import ZenohEndpoint, ZenohOptions
 from sern_client.endpoints.zenoh.session import SessionOptions
+from sern_client.link_topics import LinkTopics
 from sern_core.errors import ConfigError, UsageError
+from sern_core.message import TopicInfo
+from sern_core.types import Encoding
 from sern_runtime.config import endpoints as sections
 from sern_runtime.config.client import ClientFile
 from sern_runtime.config.load import Loaded
@@ -25,6 +29,30 @@ def make_endpoint(loaded: Loaded[ClientFile]) -> Endpoint:
     """The endpoint of a client: the one its file names, or several as one. Raises ConfigError."""
     made = [make_section(section, loaded.resolve) for section in named_sections(loaded.model)]
     return made[0] if len(made) == 1 else CompositeEndpoint(made)
+
+
+ROS_SECTIONS: Final = (
+    sections.Ros1Endpoint,
+    sections.DdsEndpoint,
+    sections.ZenohEndpoint,
+    sections.RclpyEndpoint,
+)
+
+
+def make_link_topics(model: ClientFile, advertise: Callable[[TopicInfo], Publisher]) -> LinkTopics | None:
+    """What publishes the state of the link, in the encoding of the first endpoint that has one; None: nothing is
+    published."""
+    state = model.link_state
+    ros = [section for section in model.endpoints if isinstance(section, ROS_SECTIONS)]
+    if not (ros if state.publish is None else state.publish):
+        return None
+    first = ros[0] if ros else model.endpoints[0]
+    cdr = not isinstance(first, sections.Ros1Endpoint)
+    if isinstance(first, sections.RecordEndpoint):
+        cdr = first.path.endswith(".mcap")
+    elif isinstance(first, sections.SyntheticEndpoint):
+        cdr = first.encoding == "cdr"
+    return LinkTopics(model.name, Encoding.CDR if cdr else Encoding.ROS1, advertise, diagnostics=state.diagnostics)
 
 
 def named_sections(model: ClientFile) -> list[sections.EndpointSection]:

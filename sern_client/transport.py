@@ -12,10 +12,12 @@ from sern_core import wire
 from sern_core.errors import ConfigError, RemoteError
 from sern_core.link import Link
 from sern_runtime import clock
+from sern_runtime.dscp import Marks
 from sern_runtime.inflow import Inflow
-from sern_runtime.monitor import TcpHandle, TransportWatch
+from sern_runtime.monitor import TcpHandle
 from sern_runtime.pump import LANE_MESSAGE_BYTES, Pump
-from sern_runtime.zmq_socket import TOS_EXPEDITED, CurvePair, DealerSocket, SendResult, make_client
+from sern_runtime.transport_watch import TransportWatch
+from sern_runtime.zmq_socket import CurvePair, DealerSocket, SendResult, make_client
 
 REBUILD_MIN_S: Final = 1.0
 REBUILD_MAX_S: Final = 30.0
@@ -55,6 +57,7 @@ class Dialer:
         *,
         heartbeat_timeout_s: float,
         random: Random,
+        tos: int = 0,
         express: bool = False,
         attempt: int = 0,
     ) -> None:
@@ -70,6 +73,7 @@ class Dialer:
         self._heartbeat_timeout_ms = int(heartbeat_timeout_s * 1000)
         self._random = random
         self._express = express
+        self._tos = tos
         self._backoff_s = REBUILD_MIN_S
         self._rebuild: asyncio.TimerHandle | None = None
         self._socket: DealerSocket | None = None
@@ -77,11 +81,16 @@ class Dialer:
         self._handle: TcpHandle | None = None
         self._inflow: Inflow[TcpHandle] | None = None
 
+    @property
+    def waiting(self) -> bool:
+        """Whether a connection is there, and its handshake under way."""
+        return self._watch is not None and self._watch.waiting
+
     def open(self) -> None:
         """Connect for the first time. Raises ConfigError."""
 
         def attach(socket: "zmq.Socket[bytes]") -> None:
-            self._watch = TransportWatch(socket, self._up, self._down, self._refused)
+            self._watch = TransportWatch(socket, self._up, self._down, self._refused, self._give_up)
 
         raw = make_client(
             self._ctx,
@@ -90,7 +99,7 @@ class Dialer:
             self._server_keys[self.attempt % len(self._server_keys)] if self._server_keys else None,
             heartbeat_timeout_ms=self._heartbeat_timeout_ms,
             max_message_bytes=LANE_MESSAGE_BYTES,
-            tos=TOS_EXPEDITED if self._express else 0,
+            tos=self._tos,
             before_connect=attach,
         )
         self._socket = DealerSocket(
@@ -140,7 +149,7 @@ class Dialer:
     def _up(self, handle: TcpHandle | None) -> None:
         self._handle = handle
         if handle is not None:
-            handle.prepare(express=self._express)
+            handle.prepare(express=self._express, tos=self._tos)
         self._backoff_s = REBUILD_MIN_S
         self._was_up = True
         self._events.up(handle)
@@ -190,7 +199,9 @@ class RelayTransport:
         random: Random,
         on_reason: Callable[[str], None],
         after: Callable[[], None] = lambda: None,
+        marks: Marks | None = None,
     ) -> None:
+        marks = marks or Marks()
         self.after = after
         self.link = link
         self.endpoint = endpoint
@@ -206,6 +217,7 @@ class RelayTransport:
                 events,
                 heartbeat_timeout_s=heartbeat_timeout_s,
                 random=random,
+                tos=marks.express_tos if express else marks.stream_tos,
                 express=express,
                 attempt=attempt,
             )
@@ -218,6 +230,11 @@ class RelayTransport:
     @property
     def rebuilds(self) -> int:
         return self._dialer.rebuilds
+
+    @property
+    def waiting(self) -> bool:
+        """Whether a connection is there, and its handshake under way."""
+        return self._dialer.waiting
 
     def another(self, events: DialerEvents) -> Dialer:
         """Another connection to the same relay, for class control, not opened yet."""

@@ -10,10 +10,13 @@ from sern_core.client import ClientCore
 from sern_core.errors import RemoteError, SernError
 from sern_core.lane_port import LanePort
 from sern_core.lanes import LANE_UDP, LANE_ZMQ
+from sern_core.link import Link
 from sern_runtime import clock
+from sern_runtime.dscp import Marks
 from sern_runtime.pump import Pump
 from sern_runtime.seal import SessionParameters, offered_ciphers
 from sern_runtime.udp_client import UdpClient
+from sern_runtime.zmq_socket import SendResult
 
 REBIND_S: Final = 2.0
 """While the lane has stalled it tries another source port this often: a lost NAT binding or route raises no error."""
@@ -32,7 +35,8 @@ class ClientLane:
     `host` is the relay's address of the stream lane. Call `tick` about twice a second.
     """
 
-    def __init__(self, core: ClientCore, host: str, *, kick: Callable[[], None]) -> None:
+    def __init__(self, core: ClientCore, host: str, *, kick: Callable[[], None], marks: Marks | None = None) -> None:
+        self._marks = marks or Marks()
         self.core = core
         self.host = host
         self.bad_frames = 0
@@ -55,20 +59,26 @@ class ClientLane:
         parameters = SessionParameters.from_envelope(envelope)
         self.closed()
         try:
-            self._socket = UdpClient(
+            self._socket = socket = UdpClient(
                 self.host,
                 parameters.port,
                 parameters,
                 self._received,
                 on_writable=self._writable,
                 after=self._kick,
+                tos=self._marks.stream_tos,
             )
         except SernError as error:
             _log.warning("no datagram lane: %s", error)
             self._ask_later()
             return
         port = LanePort(self.core.link, LANE_UDP)
-        self._pump = Pump(port, self._socket.send, on_gone=self._used_up, ready=self._socket.ready)
+        tos = self._marks.tos
+
+        def send(datagram: bytes) -> SendResult:
+            return socket.send(datagram, tos[port.priority])
+
+        self._pump = Pump(port, send, on_gone=self._used_up, ready=socket.ready)
         self.core.link.close_lane(now=clock.now())
         self.core.link.open_lane(now=clock.now())
         self._pump.kick()
@@ -81,6 +91,27 @@ class ClientLane:
         if self._socket is not None:
             self._socket.close()
             self._socket = None
+
+    def problem(self, link: Link, within_s: float) -> str:
+        """What is known about why no datagram passes to and from the relay, as `DatagramWatch` wants it."""
+        socket = self._socket
+        if socket is None:
+            return (
+                f"the relay at {self.host} has offered no datagram lane in {within_s:g} s; using TCP; set "
+                "relay.udp: true there, or relay.udp: false here"
+            )
+        port = socket.parameters.port
+        there = f"{self.host}:{port}/udp"
+        if socket.opener.highest:
+            return (
+                f"datagrams come through from {there}, and it has confirmed none of ours for {within_s:g} s; "
+                f"using TCP; allow outgoing UDP to port {port} here, and datagrams of 1200 bytes on the way"
+            )
+        seen = f" ({socket.problem})" if socket.problem else ""
+        return (
+            f"no datagram came through from {there} in {within_s:g} s{seen}; using TCP; open UDP port {port} "
+            "in the relay's firewall and in its cloud security group, and allow outgoing UDP here"
+        )
 
     def kick(self) -> None:
         if self._pump is not None:

@@ -22,6 +22,7 @@ from sern_core.message import Message, StreamId, StreamInfo, TopicInfo, TopicSpe
 from sern_core.numbering import Numbering
 from sern_core.out_message import OutMessage
 from sern_core.params import LinkParams, SchedulerParams
+from sern_core.peers import Peers, PeerView
 from sern_core.queues import OutChannel
 from sern_core.replay import LatchedCache
 from sern_core.trace import DecisionTrace, TraceEvent
@@ -114,6 +115,8 @@ class ClientCore:
         """Counters of what arrives, by topic: delivered, and dropped on arrival for a reason."""
         self.faults = 0
         """Errors of ours so far that nobody expects."""
+        self.peers = Peers()
+        """The clients whose streams this one takes, and whether they are there."""
         self.patterns: tuple[str, ...] = ()
         self.attributes: dict[str, str] = {}
         """Metadata of this node, for the object registry."""
@@ -225,7 +228,13 @@ class ClientCore:
             if part is not parts[-1]:
                 self.link.send_control({"t": "subscribe", "patterns": batch, "more": True}, now=now)
                 batch = []
-        self.link.send_control({"t": "subscribe", "patterns": batch, "more": False}, now=now)
+        self.link.send_control({"t": "subscribe", "patterns": batch, "more": False, "peers": True}, now=now)
+
+    def look_at_peers(self, *, now: float) -> list[PeerView]:
+        """Who is there of those whose streams we take, by name. Call about once a second: that the own link has fallen
+        silent is found here."""
+        self.peers.reached(self.link.established and not self.link.lane.stalled, now=now)
+        return self.peers.look(now=now)
 
     def put_object(
         self,
@@ -277,11 +286,13 @@ class ClientCore:
         if not resumed:
             for identity, cache in self._latched.items():
                 link.by_stream[identity].prime(cache.replay(), now=now)
+        self.peers.session_began(now=now)
         self._send_subscription(now)
         self._tell(self.events.link_up, resumed=resumed)
 
     def on_down(self, link: Link, reason: str, *, now: float) -> None:
         self._tell(self.events.link_down, reason)
+        self._tell(self.peers.session_ended, now=now)
 
     def on_lane_closed(self, link: Link) -> None:
         self._tell(self.events.lane_closed)
@@ -327,6 +338,7 @@ class ClientCore:
                 return False
             self._refused.discard(identity)
             self._open[identity] = announced
+            self._tell(self.peers.opened, identity.origin, now=self.link.now)
         return True
 
     def _opened(self, stream: StreamInfo) -> bool:
@@ -364,6 +376,7 @@ class ClientCore:
         self._decoder.forget(stream.stream.id, now=now)
         self._held.pop(stream.stream.id, None)
         del self._open[stream.stream.id]
+        self.peers.closed(stream.stream.id.origin)
         self._tell(self.events.stream_closed, stream.stream)
 
     def on_definition(self, link: Link, digest: str, *, now: float) -> None:
@@ -399,6 +412,8 @@ class ClientCore:
             self._failed(stream, message, DropReason.FAULT, "", now)
         else:
             self.received.of(stream.stream).arrived(len(message.body), now - message.born_s, now)
+            if not message.replay:  # which is the relay's
+                self.peers.arrived(message.stream.origin, now=now)
 
     def _failed(self, stream: InStream, message: Message, reason: DropReason, problem: str, now: float) -> None:
         """A message has had its turn and cannot be handed on."""
@@ -478,6 +493,8 @@ class ClientCore:
         elif kind == "denied":
             code, why = wire.take_str(envelope, "code", max_length=64), wire.take_str(envelope, "why")
             self._tell(self.events.subscription_refused, code, why)
+        elif kind == "peers":
+            self.peers.told(envelope, now=now)
         else:
             raise WireError(f"unknown control message {kind!r}")
 

@@ -1,7 +1,8 @@
 """Sent and not yet acknowledged: the accounting of one lane in one direction.
 
-The sender numbers every acknowledgement-eliciting datagram from 1. A packet is lost when three later ones have been
-acknowledged, or when it is older than max(100 ms, 2 srtt + 30 ms, RTO); on a stream lane (TCP) nothing is lost while
+The sender numbers every acknowledgement-eliciting datagram from 1. A packet is lost when one that is three numbers
+later, and not more urgent, has been acknowledged (a network that heeds marks lets the urgent overtake), or when it is
+older than max(100 ms, 2 srtt + 30 ms, RTO); on a stream lane (TCP) nothing is lost while
 the connection lasts. A round trip is measured from every acknowledgement that names a newer packet, whether or not
 that packet was given up meanwhile: else a path slower than the first guess would never be measured.
 The receiver's half says what to acknowledge and when: every second datagram (large ones of a stream lane
@@ -13,6 +14,7 @@ from math import inf
 from typing import Any, Final
 
 from sern_core.clocksync import RttEstimator
+from sern_core.types import CLASSES, PriorityClass
 
 REORDER_THRESHOLD: Final = 3
 MIN_LOSS_TIMEOUT_S: Final = 0.100
@@ -38,14 +40,17 @@ Items = list[Any]
 class Packet:
     """One packet in flight."""
 
-    __slots__ = ("app_limited", "items", "nbytes", "number", "sent_s")
+    __slots__ = ("app_limited", "items", "nbytes", "number", "priority", "sent_s")
 
-    def __init__(self, number: int, sent_s: float, nbytes: int, items: Items, app_limited: bool) -> None:
+    def __init__(
+        self, number: int, sent_s: float, nbytes: int, items: Items, app_limited: bool, priority: PriorityClass
+    ) -> None:
         self.number = number
         self.sent_s = sent_s
         self.nbytes = nbytes
         self.items = items
         self.app_limited = app_limited
+        self.priority = priority
 
 
 class Flight:
@@ -57,14 +62,25 @@ class Flight:
         self.packets: dict[int, Packet] = {}  # in order of number, which dicts keep
         self.next_number = 1
         self.highest_acked = 0
+        self._heard = [0] * len(CLASSES)
+        """By class: the highest number that was acknowledged of a packet of it, or of a less urgent class."""
         self.rtt = RttEstimator()
         self.waiting_since_s: float | None = None  # last acknowledgement, or the first packet since nothing is owed
 
-    def sent(self, *, now: float, nbytes: int, items: Items, app_limited: bool) -> None:
+    def sent(
+        self,
+        *,
+        now: float,
+        nbytes: int,
+        items: Items,
+        app_limited: bool,
+        priority: PriorityClass = PriorityClass.STATE,
+    ) -> None:
+        """`priority`: the class by which the network knows the packet."""
         number = self.next_number
         if self.waiting_since_s is None:
             self.waiting_since_s = now
-        self.packets[number] = Packet(number, now, nbytes, items, app_limited)
+        self.packets[number] = Packet(number, now, nbytes, items, app_limited, priority)
         self.inflight_bytes += nbytes
         self.next_number = number + 1
 
@@ -90,9 +106,13 @@ class Flight:
                 behind = highest - number - 1
                 if behind < SACK_BITS and sack >> behind & 1:
                     result.append(packet)
+        heard = self._heard
         for packet in result:
             del packets[packet.number]
             self.inflight_bytes -= packet.nbytes
+            for priority in range(packet.priority + 1):
+                if packet.number > heard[priority]:
+                    heard[priority] = packet.number
         if not packets:
             self.waiting_since_s = None
         return result
@@ -110,11 +130,13 @@ class Flight:
         if self.lossless or not self.packets:
             return []
         sent_before_s = now - self.loss_timeout_s()
+        heard = self._heard
+        last = self.highest_acked - REORDER_THRESHOLD
         gone = []
         for packet in self.packets.values():
-            if packet.number <= self.highest_acked - REORDER_THRESHOLD or packet.sent_s <= sent_before_s:
+            if packet.number <= heard[packet.priority] - REORDER_THRESHOLD or packet.sent_s <= sent_before_s:
                 gone.append(packet)
-            else:
+            elif packet.number > last:
                 break
         for packet in gone:
             del self.packets[packet.number]

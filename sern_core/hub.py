@@ -10,7 +10,8 @@ dropped, and what it was owed is reported to the origins. One that says goodbye 
 and so is one whose name is revoked.
 """
 
-from collections.abc import Callable, Iterable
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Final
@@ -25,6 +26,7 @@ from sern_core.errors import RefusedError, UsageError, WireError
 from sern_core.fates import Fates
 from sern_core.fragments import InStream
 from sern_core.hub_events import GuardedEvents, HubEvents, Relayed
+from sern_core.hub_fanout import Fanout
 from sern_core.hub_local import LocalStreams
 from sern_core.hub_matching import Matching
 from sern_core.hub_port import HubPort
@@ -36,19 +38,20 @@ from sern_core.object_control import apply_object
 from sern_core.objects import ObjectRegistry
 from sern_core.out_message import OutMessage
 from sern_core.params import LinkParams, SchedulerParams
+from sern_core.presence import Presence
 from sern_core.queues import OutChannel
 from sern_core.replay import ReplayStore
 from sern_core.routing import UNIT_S, BadPatternError, RouteChange, RoutingTable
 from sern_core.rules import is_client_name, name_problem
+from sern_core.session import DISPLACED
 from sern_core.trace import DecisionTrace
 from sern_core.types import DROP_CODES, ClientName, DropReason, TopicName
 
 STREAM_US: Final = 50
-CHANNEL_US: Final = 80
 FORWARD_US: Final = 5
 CONFIRMED_PER_US: Final = 8
-"""What work for a client is charged to it, in microseconds: to take or end a stream, to open or close a channel, to
-hand on a message to a subscriber, and how many subscribers are asked for their share of a confirmation."""
+"""What work for a client is charged to it, in microseconds: to take or end a stream, to hand on a message to a
+subscriber, and how many subscribers are asked for their share of a confirmation."""
 MAX_SUBSCRIPTION_PARTS: Final = 64
 ORPHAN_S: Final = 60.0
 """A session that a blackout cost its TCP connection has ended when its datagram lane says nothing for so long: longer
@@ -115,10 +118,13 @@ class Hub(LocalStreams):
         self._bounds: dict[ClientName, QueueBound] = {}
         self._subscriptions: dict[ClientName, list[str]] = {}  # parts that have arrived
         self.matching = Matching(self.routing, self._subscribed, self._apply)
+        self._fanout = Fanout(self._offer, self._told, self._let_go)
+        self.presence = Presence(self.links, self.local_owners, self._for, self._was_read)
         self._awaited: dict[ClientName, set[TopicName]] = {}
         self._heard: set[ClientName] = set()  # said what they want, to this run of the relay
         self._absent_since: dict[ClientName, float] = {}
         self._draining = Draining(self._end_channel)
+        self._unsubscribed: OutChannel | None = None  # is being closed because its taker wants it no more
         self._tidy_due_s = now + TIDY_S
         self.after: Callable[[], None] = lambda: None
         """Called when something was done by time that may have given any client's link something to send; set by the
@@ -133,10 +139,17 @@ class Hub(LocalStreams):
         link = self._link(port.client, now)
         older = self.port_of.get(port.client)
         another = older is not port
+        tag, rival = link.tag, link.established and wire.take_int(hello, "boot") != link.peer_boot
         if not link.accept(hello, header.tag, header.stamp_us, now=now, another_connection=another):
             return
         if older is not None and older is not port:
             older.link = None
+            if rival:  # its connection is up: it did not end before the other began
+                older.displace(tag, port, now=now)
+                self.events.refused(
+                    port.client, DISPLACED, f"another process connected as {port.client} from {port.address or '?'}; "
+                    f"the one from {older.address or '?'} has no session any more"
+                )  # fmt: skip
         port.link = link
         self.port_of[port.client] = port
         self._absent_since.pop(port.client, None)
@@ -161,12 +174,16 @@ class Hub(LocalStreams):
             link.on_stray = self.received.stray
             link.fates = self.fates
             link.on_read = self._was_read
+            link.finish = self._finish
             self._limit(client, now)
             self._absent_since[client] = now
         return link
 
     def _was_read(self) -> None:
         self.after()
+
+    def _finish(self, link: Link, now: float) -> bool:
+        return self._fanout.go_on(link, now=now)
 
     def _limit(self, client: ClientName, now: float) -> None:
         """Put the limits of the access rules in force."""
@@ -226,6 +243,12 @@ class Hub(LocalStreams):
             self.received.tidy({identity.topic for identity in self.relayed}, now=now)
             self._numbering.tidy(now=now)
         self.matching.sweep(now=now)
+        for client in self._fanout.origins():  # those who read on when it is due have done so
+            link = self.links[client]
+            if link.read_due_s is None:
+                link.reassembly.work_us = 0
+                self._fanout.go_on(link, now=now)
+        self.presence.sweep(now=now)
 
     def left(self, client: ClientName, *, now: float) -> None:
         """A client has said goodbye. One that has streams, or wants reliable ones, may come back to them (a daemon that
@@ -249,6 +272,7 @@ class Hub(LocalStreams):
 
     def _forget(self, client: ClientName, now: float, *, reason: DropReason = DropReason.DISCONNECTED) -> None:
         link = self.links[client]
+        self._fanout.forget(client, now=now)
         self._apply(self.routing.drop_client(client), now, reason=reason)
         for channel in list(link.channels.values()):
             link.close_channel(channel, reason, now=now)
@@ -298,22 +322,36 @@ class Hub(LocalStreams):
 
     # --- routes -----------------------------------------------------------------------------------------------------
 
-    def _apply(self, change: RouteChange, now: float, *, reason: DropReason = DropReason.UNWANTED) -> None:
-        """Open and close channels as the routes have changed; `reason`: of dropping what no longer has a taker."""
+    def _apply(
+        self,
+        change: RouteChange,
+        now: float,
+        *,
+        reason: DropReason = DropReason.UNWANTED,
+        source: Link | None = None,
+    ) -> None:
+        """Open and close channels as the routes have changed; `reason`: of dropping what no longer has a taker;
+        `source`: whose announcement it was, so that subscribers are told of it in slices."""
         touched: set[StreamId] = set(change.wanted) | set(change.unwanted)
         for identity in change.removed:
-            self._remove(identity, now, drain=reason is not DropReason.FORBIDDEN)
+            self._remove(identity, now, drain=reason is not DropReason.FORBIDDEN, source=source)
+        removed = frozenset(change.removed)
         for client, identity in change.unmatched:
+            if identity in removed:
+                continue  # its channels are closed by now, or will be
             self._close(client, identity, reason, now)
             touched.add(identity)
         for identity in change.updated:  # the origin offers it anew, with other properties: so is it offered onwards
-            for client in self.routing.subscribers(identity):
-                self._close(client, identity, DropReason.DISCONNECTED, now)
-                self._open(client, identity, now)
+            self._offer_all(identity, self.routing.subscribers(identity), source, now)
             touched.add(identity)
+        matched: dict[StreamId, list[ClientName]] = {}
         for client, identity in change.matched:
-            self._open(client, identity, now)
+            matched.setdefault(identity, []).append(client)
+        for identity, clients in matched.items():
+            self._offer_all(identity, clients, source, now)
             touched.add(identity)
+        if source is not None:
+            self._fanout.go_on(source, now=now)
         for identity in sorted(touched):
             relayed = self.relayed.get(identity)
             if relayed is not None:
@@ -324,11 +362,29 @@ class Hub(LocalStreams):
             self.events.refused(denied.client, "forbidden", text)
             self._tell(denied.client, {"t": "denied", "topic": denied.topic, "code": "forbidden", "why": text}, now)
 
+    def _offer_all(self, identity: StreamId, clients: Sequence[ClientName], source: Link | None, now: float) -> None:
+        if source is not None:
+            self._fanout.begin(self.relayed[identity], clients)
+            return
+        for client in clients:
+            self._offer(client, identity, now)
+
+    def _offer(self, client: ClientName, identity: StreamId, now: float, *, first: int | None = None) -> None:
+        """Open a channel, in place of the one there may be. `first`: the seq of its first message; None: what is next
+        from the origin."""
+        self._close(client, identity, DropReason.DISCONNECTED, now)
+        self._open(client, identity, now, first)
+
+    def _told(self, relayed: Relayed, now: float) -> None:
+        """All subscribers have been told of a stream; to some it may have been impossible."""
+        self._answer(relayed, now)
+        self._confirm(relayed)
+
     def _answer(self, relayed: Relayed, now: float) -> None:
         """Tell the origin whether anybody wants its stream."""
         source = relayed.source
         if source is not None:
-            owed = tuple(relayed.outs)
+            owed = relayed.owed()
             wanted = self._wanted(relayed)
             self._for(source.peer, now, partial(source.answer, relayed.stream, wanted, now=now, owed=owed))
 
@@ -343,28 +399,42 @@ class Hub(LocalStreams):
         if relayed is None:
             return
         relayed.unopened.discard(client)
+        relayed.waiting.pop(client, None)
         pair = relayed.outs.pop(client, None)
         if pair is not None:
+            self.presence.parted(identity.origin, client)
+            self._unsubscribed = pair[1] if reason is DropReason.UNWANTED else None
             self._end_channel(client, *pair, reason, now)
+            self._unsubscribed = None
 
     def _end_channel(self, client: ClientName, link: Link, channel: OutChannel, reason: DropReason, now: float) -> None:
         self._for(client, now, partial(link.close_channel, channel, reason, now=now))
 
     def _wanted(self, relayed: Relayed) -> bool:
-        return bool(relayed.outs) or relayed.cache is not None or self.tap(relayed.stream.stream)
+        return bool(relayed.outs or relayed.waiting) or relayed.cache is not None or self.tap(relayed.stream.stream)
+
+    def announced(self) -> Iterator[tuple[StreamInfo, bool]]:
+        """Every stream there is, and whether anybody takes it: a client, or a program on the feed."""
+        for relayed in self.relayed.values():
+            stream = relayed.stream.stream
+            yield stream, bool(relayed.outs or relayed.waiting) or self.tap(stream)
 
     def refresh_interest(self, *, now: float) -> None:
         """The answer of `tap` may have changed: tell the origins."""
         for relayed in self.relayed.values():
             self._answer(relayed, now)
 
-    def _open(self, client: ClientName, identity: StreamId, now: float) -> None:
+    def _open(self, client: ClientName, identity: StreamId, now: float, first: int | None) -> None:
         relayed = self.relayed[identity]
         link = self._link(client, now)
-        stream, first = relayed.stream.stream, relayed.stream.delivered + 1
+        stream = relayed.stream.stream
+        self._fanout.close(client, identity, now=now)  # of the same stream, before it ended
+        if first is None:
+            first = relayed.stream.delivered + 1
         ended = self._draining.take(client, stream, first, now=now)
         if ended is not None:  # it came back before it was gone
             relayed.outs[client] = ended
+            self.presence.joined(identity.origin, client)
             return
         try:
             channel = link.open_channel(
@@ -383,6 +453,7 @@ class Hub(LocalStreams):
             self.failed(client, error, now=now)
         else:
             relayed.outs[client] = (link, channel)
+            self.presence.joined(identity.origin, client)
 
     def _replays(self, client: ClientName, relayed: Relayed) -> list[Message]:
         """The latched messages that a late joiner may have."""
@@ -394,24 +465,39 @@ class Hub(LocalStreams):
             self._bounds[client].recount()
         return self.replays.replay(relayed.cache)
 
-    def _remove(self, identity: StreamId, now: float, *, drain: bool = True) -> None:
-        """The stream has ended. `drain`: what was owed of it is still delivered."""
+    def _remove(self, identity: StreamId, now: float, *, drain: bool = True, source: Link | None = None) -> None:
+        """The stream has ended. `drain`: what was owed of it is still delivered; `source`: who said so, so that
+        subscribers are told in slices."""
         relayed = self.relayed.pop(identity, None)
         if relayed is None:
             return
+        self._fanout.end(relayed)
         if relayed.cache is not None:
             self.replays.close(relayed.cache)
         if relayed.source is None:
             self._closed_local(relayed, now)
-        for client, (link, channel) in relayed.outs.items():
-            if not drain:
-                self._end_channel(client, link, channel, DropReason.FORBIDDEN, now)
-            elif channel.reliable and channel.retained:
-                self._draining.add(client, link, channel, max_bytes=self._max_queue_bytes(client), now=now)
-            else:
-                self._end_channel(client, link, channel, DropReason.DISCONNECTED, now)
+        for client in relayed.outs:
+            self.presence.parted(identity.origin, client)
+        if source is not None and drain:
+            self._fanout.close_later(relayed)
+        else:
+            for client, (link, channel) in relayed.outs.items():
+                if drain:
+                    self._let_go(client, link, channel, now)
+                else:
+                    self._end_channel(client, link, channel, DropReason.FORBIDDEN, now)
         self.objects.delete_stream(identity)
         self.events.stream_removed(relayed.stream.stream)
+
+    def _let_go(self, client: ClientName, link: Link, channel: OutChannel, now: float) -> None:
+        """The channel's stream has ended: deliver what is still owed, or close it."""
+        stream = channel.stream.id
+        if not channel.reliable or not channel.retained:
+            self._end_channel(client, link, channel, DropReason.DISCONNECTED, now)
+        elif not self._may_drain(client, stream):
+            self._end_channel(client, link, channel, DropReason.FORBIDDEN, now)
+        else:
+            self._draining.add(client, link, channel, max_bytes=self._max_queue_bytes(client), now=now)
 
     def _confirm(self, relayed: Relayed) -> None:
         """Tell the origin how far everybody who is owed has got."""
@@ -430,15 +516,19 @@ class Hub(LocalStreams):
 
     def on_up(self, link: Link, *, resumed: bool, now: float) -> None:
         self._absent_since.pop(link.peer, None)
+        if link.peer_boot is not None:
+            self.routing.returned(link.peer, link.peer_boot)
         self._subscriptions.pop(link.peer, None)  # half of one that was said in an earlier session
         if not resumed:
             for relayed in self.relayed.values():
                 if link.peer in relayed.outs:
                     relayed.outs[link.peer][1].prime(self._replays(link.peer, relayed), now=now)
+        self.presence.changed(link.peer, now=now)
         self.events.client_up(link.peer, resumed=resumed)
 
     def on_down(self, link: Link, reason: str, *, now: float) -> None:
         self._absent_since[link.peer] = now
+        self.presence.changed(link.peer, now=now)
         self.events.client_down(link.peer, reason)
 
     def on_lane_closed(self, link: Link) -> None:
@@ -491,7 +581,7 @@ class Hub(LocalStreams):
             relayed.source = None  # one answer for all who are awaited
             self._await(announcement.owed, identity, now)
         relayed.source = link
-        link.answer(stream, self._wanted(relayed), now=now, owed=tuple(relayed.outs))
+        link.answer(stream, self._wanted(relayed), now=now, owed=relayed.owed())
         return None
 
     def _take(self, source: Link | None, stream: InStream, now: float) -> Relayed:
@@ -511,8 +601,10 @@ class Hub(LocalStreams):
         except RefusedError:
             self._apply(self.routing.withdraw(identity), now)
             refused = self.relayed.pop(identity, None)
-            if refused is not None and refused.cache is not None:
-                self.replays.close(refused.cache)
+            if refused is not None:
+                self._fanout.end(refused)
+                if refused.cache is not None:
+                    self.replays.close(refused.cache)
             raise
         if source is not None:
             self._charge(source, change)
@@ -523,7 +615,7 @@ class Hub(LocalStreams):
                 self.objects.put_stream(stream.stream, wall_ns=self._wall_ns(now), now=now)
             except RefusedError as refusal:
                 self.events.refused(identity.origin, refusal.code, str(refusal))
-        self._apply(change, now)
+        self._apply(change, now, source=source)
         return relayed
 
     def _await(self, owed: Iterable[str], identity: StreamId, now: float) -> None:
@@ -550,24 +642,22 @@ class Hub(LocalStreams):
                 self.matching.look(client, now=now)
 
     def on_retract(self, link: Link, stream: InStream, *, now: float) -> None:
-        relayed = self.relayed.get(stream.stream.id)
-        if relayed is not None:
-            link.reassembly.work_us += STREAM_US + CHANNEL_US * len(relayed.outs)
-        self._apply(self.routing.withdraw(stream.stream.id), now)
+        link.reassembly.work_us += STREAM_US
+        self._apply(self.routing.withdraw(stream.stream.id), now, source=link)
         self._remove(stream.stream.id, now)
 
     def _charge(self, link: Link, change: RouteChange) -> None:
-        """What an announcement has cost is on the account of who made it."""
-        channels = len(change.matched) + len(change.unmatched)
-        for identity in (*change.updated, *change.removed):
-            channels += len(self.routing.subscribers(identity))
+        """What an announcement has cost is on the account of who made it, beside the channels that it opens or ends."""
         matching_us = int(self.routing.spent_units * UNIT_S * 1e6)
-        link.reassembly.work_us += STREAM_US + CHANNEL_US * channels + matching_us
+        link.reassembly.work_us += STREAM_US * (1 + len(change.removed)) + matching_us
 
     def on_message(self, link: Link, stream: InStream, message: Message, *, now: float) -> None:
         relayed = self.relayed.get(stream.stream.id)
         if relayed is None:
             return
+        if relayed.waiting:  # nothing is read before they were told, unless an error of ours came in between
+            for client in list(relayed.waiting):
+                self._offer(client, stream.stream.id, now, first=message.seq)
         nbytes = len(message.body)
         link.reassembly.work_us += FORWARD_US * len(relayed.outs)
         if not self._guards[link.peer].admit(nbytes, now=now):
@@ -656,8 +746,8 @@ class Hub(LocalStreams):
         relayed = self.relayed.get(channel.stream.id)
         if relayed is None or relayed.source is None:
             return
-        if reason is DropReason.UNWANTED and link.peer not in relayed.outs:
-            return  # it has just unsubscribed: it is owed nothing, and others may have the message
+        if channel is self._unsubscribed or (reason is DropReason.UNWANTED and link.peer not in relayed.outs):
+            return  # it is owed nothing any more, also of what was sent whole, and others may have the message
         now, source = link.now, relayed.source
         report = partial(source.report_drop, relayed.stream, out.seq, reason, link.peer, now=now)
         self._for(source.peer, now, report)
@@ -710,6 +800,8 @@ class Hub(LocalStreams):
                 raise WireError(f"more than {MAX_SUBSCRIPTION_PARTS * wire.MAX_ENVELOPE_ITEMS} subscription patterns")
             return
         self.matching.ask(client, self._subscriptions.pop(client), now=now)
+        if wire.take_bool(envelope, "peers"):
+            self.presence.watch(client, now=now)
 
     def _subscribed(self, client: ClientName, parts: list[str], now: float) -> None:
         self._awaited.pop(client, None)
@@ -740,7 +832,9 @@ class Hub(LocalStreams):
         self.definitions.validate()
         for identity, relayed in self.relayed.items():
             outs = set(self.routing.subscribers(identity))
-            held = set(relayed.outs) | relayed.unopened
+            held = set(relayed.outs) | relayed.unopened | relayed.waiting.keys()
+            assert not relayed.waiting or self._fanout.holds(relayed), f"{identity.topic}: some are never told of it"
+            assert relayed.unopened.isdisjoint(relayed.waiting), f"{identity.topic}: who waits was told already"
             assert held == outs, f"{identity.topic}: channels {held} but routes {outs}"
             assert not relayed.unopened & set(relayed.outs), f"{identity.topic}: a channel that could not be opened"
             latched = relayed.stream.stream.spec.latched
@@ -748,9 +842,17 @@ class Hub(LocalStreams):
             for client, (link, channel) in relayed.outs.items():
                 assert self.links.get(client) is link, f"{identity.topic} goes to a link of {client} that is gone"
                 assert link.by_stream.get(identity) is channel, f"{identity.topic}: a closed channel to {client}"
+        for origin in self._fanout.origins():
+            assert origin in self.links, f"streams of {origin}, who is gone, are to be told of"
+        taken: dict[ClientName, Counter[ClientName]] = defaultdict(Counter)
+        for identity, relayed in self.relayed.items():
+            for client in relayed.outs if identity.origin not in self.local_owners else ():
+                taken[client][identity.origin] += 1
+        self.presence.validate(taken)
         known = {info.id for info in self.routing.infos()}
         assert known == self.relayed.keys(), f"routes and streams differ: {known ^ self.relayed.keys()}"
         held_channels = {id(pair[1]) for relayed in self.relayed.values() for pair in relayed.outs.values()}
+        held_channels |= self._fanout.closing()
         held_channels |= self._draining.validate(self.links)
         for client, link in self.links.items():
             for channel in link.channels.values():

@@ -88,15 +88,20 @@ class GuardedEvents:
 class Relayed:
     """One stream at the relay: where it comes from (None: the relay itself), where it goes, what is kept of it."""
 
-    __slots__ = ("cache", "outs", "source", "stream", "unopened")
+    __slots__ = ("cache", "outs", "source", "stream", "unopened", "waiting")
 
     def __init__(self, source: Link | None, stream: InStream, replays: ReplayStore) -> None:
         self.source = source
         self.stream = stream
         self.outs: dict[ClientName, tuple[Link, OutChannel]] = {}
+        self.waiting: dict[ClientName, None] = {}  # subscribers that are still to be told of it, in their order
         self.unopened: set[ClientName] = set()  # subscribers towards whom no channel could be opened; they were told
         self.cache: LatchedCache | None = None
         self.keep_latched(replays)
+
+    def owed(self) -> tuple[ClientName, ...]:
+        """Who gets the stream, and who is about to."""
+        return tuple(dict.fromkeys((*self.outs, *self.waiting)) if self.waiting else self.outs)
 
     def keep_latched(self, replays: ReplayStore) -> None:
         """Keep as many messages for late joiners as the stream's properties say by now."""

@@ -11,6 +11,7 @@ from sern_core import wire
 from sern_core.errors import RemoteError, VersionError
 from sern_core.link import Link
 from sern_core.sending import microseconds
+from sern_core.session import DISPLACED
 from sern_core.types import ClientName
 
 if TYPE_CHECKING:
@@ -20,11 +21,13 @@ RESET_INTERVAL_S: Final = 0.5
 
 
 class HubPort:
-    """One transport connection of one client, as the lane below sees it. `client` is bound to the peer's key."""
+    """One transport connection of one client, as the lane below sees it. `client` is bound to the peer's key;
+    `address` is where it comes from, for people."""
 
-    def __init__(self, hub: "Hub", client: ClientName) -> None:
+    def __init__(self, hub: "Hub", client: ClientName, address: str = "") -> None:
         self.hub = hub
         self.client = client
+        self.address = address
         self.link: Link | None = None
         self._out: list[bytes] = []
         self._reset_due_s = -float("inf")
@@ -76,6 +79,12 @@ class HubPort:
         elif header.kind == wire.Kind.DATA and now >= self._reset_due_s:
             self._reset_due_s = now + RESET_INTERVAL_S
             self._out.append(wire.encode_handshake(wire.Kind.RESET, header.tag, microseconds(now), {}))
+
+    def displace(self, tag: int, by: "HubPort", *, now: float) -> None:
+        """Another process has connected under the client's name: say so to the one whose session `tag` was here."""
+        where = f" from {by.address}" if by.address else ""
+        text = f"another process connected as {self.client}{where}; one name has one connection: end one of the two, "
+        self._refuse(tag, DISPLACED, text + "or give it a name and a key of its own", now)
 
     def _refuse(self, tag: int, code: str, text: str, now: float) -> None:
         self._out.clear()

@@ -1,6 +1,7 @@
 """One lane of a link, as whatever moves its datagrams sees it. Pure."""
 
 from sern_core.link import Link
+from sern_core.types import PriorityClass
 
 
 class LanePort:
@@ -15,6 +16,12 @@ class LanePort:
 
     def next_datagram(self, *, now: float) -> bytes | None:
         return self.link.next_datagram(now=now, lane=self.lane)
+
+    @property
+    def priority(self) -> PriorityClass:
+        """The most urgent class in the latest datagram that this port gave."""
+        lane = self.link.lanes.get(self.lane)
+        return PriorityClass.STATE if lane is None else lane.priority
 
     def next_deadline(self) -> float | None:
         return self.link.next_deadline(self.lane)

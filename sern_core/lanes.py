@@ -8,6 +8,7 @@ from sern_core.control.fixed import FixedWindow
 from sern_core.control.hybrid import HybridWindow
 from sern_core.flight import Arrivals, Flight
 from sern_core.params import LinkParams, Redundancy, WindowAlgorithm
+from sern_core.types import PriorityClass
 
 LANE_ZMQ: Final = 0
 LANE_UDP: Final = 1
@@ -100,6 +101,8 @@ class Lane:
         """What the adaptation says of them, where the configuration leaves it open (`auto`); None: the loss decides."""
         self._unheard_bytes = 0.0
         """What arrives between two acknowledgements of a fast stream, beyond the two fragments that make one due."""
+        self.priority = PriorityClass.STATE
+        """The most urgent class in the latest datagram; acknowledgements, questions and control messages are STATE."""
         self.spare = True
         """Whether a second copy of the latest datagram keeps nobody waiting, or is within class control's share."""
         self._redundancy = params.redundancy

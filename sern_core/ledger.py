@@ -4,7 +4,8 @@ Plain integers bumped by the hot path; metrics are collected from them at scrape
 from the moment its stream does, so that a rate over them never misses the first event.
 """
 
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Mapping
+from types import MappingProxyType
 from typing import Final
 
 from sern_core.message import StreamInfo
@@ -17,12 +18,36 @@ without bound, and sums stay what they were."""
 IDLE_S: Final = 3600.0
 """How long the counters of a topic without streams are kept by themselves."""
 
+NO_DROPS: Final[Mapping[DropReason, int]] = MappingProxyType(dict.fromkeys(DropReason, 0))
+"""What the drops by reason are, of every topic that has had none yet: a table each would take more than all else that
+is counted."""
 
-class SendCounters:
+
+class _Drops:
+    """Drops by reason, every one of them from the start on."""
+
+    __slots__ = ("_counts", "by_reason")
+
+    def __init__(self) -> None:
+        self.by_reason: Mapping[DropReason, int] = NO_DROPS
+        self._counts: dict[DropReason, int] | None = None  # what `by_reason` shows since the first drop
+
+    def _count(self, reason: DropReason, count: int = 1) -> None:
+        counts = self._counts
+        if counts is None:
+            counts = self.by_reason = self._counts = dict(NO_DROPS)
+        counts[reason] += count
+
+    def _add(self, other: "_Drops") -> None:
+        if other._counts is not None:
+            for reason, count in other._counts.items():
+                self._count(reason, count)
+
+
+class SendCounters(_Drops):
     """One topic's way out: offered = delivered + dropped + queued + in flight. Refused messages were not offered."""
 
     __slots__ = (
-        "by_reason",
         "delivered",
         "delivered_bytes",
         "dropped",
@@ -36,20 +61,19 @@ class SendCounters:
     )
 
     def __init__(self, topic: TopicName, priority: PriorityClass) -> None:
+        super().__init__()
         self.topic = topic
         self.priority = priority
         self.offered = self.offered_bytes = 0
         self.delivered = self.delivered_bytes = 0
         self.dropped = self.dropped_bytes = 0
         self.refused = self.refused_bytes = 0
-        self.by_reason: dict[DropReason, int] = dict.fromkeys(DropReason, 0)
 
     def add(self, other: "SendCounters") -> None:
         """Take over what another topic's counters say."""
         for name in _SEND_SUMS:
             setattr(self, name, getattr(self, name) + getattr(other, name))
-        for reason, count in other.by_reason.items():
-            self.by_reason[reason] += count
+        self._add(other)
 
     def offer(self, nbytes: int) -> None:
         self.offered += 1
@@ -63,34 +87,33 @@ class SendCounters:
     def drop(self, reason: DropReason, nbytes: int) -> None:
         self.dropped += 1
         self.dropped_bytes += nbytes
-        self.by_reason[reason] += 1
+        self._count(reason)
 
     def refuse(self, nbytes: int) -> None:
         """A reliable queue was full and the caller was told."""
         self.refused += 1
         self.refused_bytes += nbytes
-        self.by_reason[DropReason.REFUSED] += 1
+        self._count(DropReason.REFUSED)
 
 
-class ReceiveCounters:
+class ReceiveCounters(_Drops):
     """One topic's way in. `age_s` is the age of the newest delivered message when it was delivered."""
 
-    __slots__ = ("age_s", "by_reason", "delivered", "delivered_bytes", "last_born_s", "priority", "topic")
+    __slots__ = ("age_s", "delivered", "delivered_bytes", "last_born_s", "priority", "topic")
 
     def __init__(self, topic: TopicName, priority: PriorityClass) -> None:
+        super().__init__()
         self.topic = topic
         self.priority = priority
         self.delivered = self.delivered_bytes = 0
         self.age_s = 0.0
         self.last_born_s: float | None = None
-        self.by_reason: dict[DropReason, int] = dict.fromkeys(DropReason, 0)
 
     def add(self, other: "ReceiveCounters") -> None:
         """Take over what another topic's counters say; what is delivered here stays the latest."""
         self.delivered += other.delivered
         self.delivered_bytes += other.delivered_bytes
-        for reason, count in other.by_reason.items():
-            self.by_reason[reason] += count
+        self._add(other)
 
     def arrived(self, nbytes: int, age_s: float, now: float) -> None:
         self.delivered += 1
@@ -99,7 +122,7 @@ class ReceiveCounters:
         self.last_born_s = now - age_s
 
     def drop_arrived(self, reason: DropReason) -> None:
-        self.by_reason[reason] += 1
+        self._count(reason)
 
     def age_of_information_s(self, now: float) -> float | None:
         """How old the freshest delivered sample is now; None before the first."""

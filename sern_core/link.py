@@ -152,6 +152,9 @@ class Link(Answering):
         self._gone: deque[InStream] = deque()  # streams that the peer no longer has, to be retracted
         self._skipping: dict[InStream, int] = {}  # how many messages a stream leaves out that goes on in a while
         self._missing: dict[StreamId, float] = {}  # not announced by a new peer, and since when
+        self.finish: Callable[[Link, float], bool] | None = None
+        """Called before more is read: whether all that came of what was read before is done by now."""
+        self._on_dropped = self._dropped  # one for all channels
         self.faults = 0
         """Errors of ours on this link so far."""
         self.fates: Fates | None = None
@@ -240,7 +243,7 @@ class Link(Answering):
             slot = slot % 0xFFFF + 1
         self._next_channel = slot % 0xFFFF + 1
         counters = self.ledger.topic(stream.id.topic, stream.spec.priority)
-        channel = OutChannel(slot, stream, counters, self._reporter(slot), first=first)
+        channel = OutChannel(slot, stream, counters, self._on_dropped, first=first)
         channel.owed = owed
         channel.wanted = wanted
         channel.codec = self._new_codec(stream)
@@ -257,15 +260,11 @@ class Link(Answering):
     def _counted(self, fates: Fates, stream: StreamInfo, seq: int, reason: DropReason) -> None:
         fates.dropped(stream, seq, reason, self.peer)
 
-    def _reporter(self, slot: int) -> Callable[[OutMessage, DropReason], None]:
-        def dropped(out: OutMessage, reason: DropReason) -> None:
-            channel = self.channels.get(slot)
-            if channel is not None:
-                topic = channel.stream.id.topic
-                self.trace.record(self._now, topic, TraceEvent.DROPPED, seq=out.seq, reason=reason, peer=self.peer)
-                self._tell(self.handler.on_out_drop, self, channel, out, reason)
-
-        return dropped
+    def _dropped(self, channel: OutChannel, out: OutMessage, reason: DropReason) -> None:
+        if self.channels.get(channel.slot) is channel:
+            topic = channel.stream.id.topic
+            self.trace.record(self._now, topic, TraceEvent.DROPPED, seq=out.seq, reason=reason, peer=self.peer)
+            self._tell(self.handler.on_out_drop, self, channel, out, reason)
 
     def close_channel(self, channel: OutChannel, reason: DropReason, *, now: float) -> None:
         """The stream is gone: tell the peer, drop what is left for `reason`."""
@@ -499,6 +498,8 @@ class Link(Answering):
 
     def _go_on(self, now: float) -> bool:
         reassembly = self.reassembly
+        if not self._finished(now):
+            return False
         while reassembly.behind:
             stream = next(iter(reassembly.behind))
             stream.go_on(now)
@@ -511,7 +512,10 @@ class Link(Answering):
             if reassembly.work_us > SLICE_US:
                 return False
             self._retract(self._gone.popleft(), now)
-        return True
+        return self._finished(now)
+
+    def _finished(self, now: float) -> bool:
+        return self.finish is None or self.finish(self, now)
 
     def outlived(self, origin: ClientName, boot: int, *, now: float) -> None:
         """A process of `origin` is there, `boot`: what a new relay has not been told of the ones before is gone."""

@@ -148,6 +148,16 @@ def compile_pattern(text: str) -> Pattern:
     return Pattern(text)
 
 
+def matches_a_name(text: str) -> bool:
+    """Whether a match of a pattern may begin with '/', as every name does. False: it matches none."""
+    _check_text(text)
+    try:
+        low, high = _compiled(text, text).possiblematchrange(_START_CHARS)
+    except re2.error:  # anything may begin it
+        return True
+    return bool(low[:1] <= b"/" <= high[:1])
+
+
 def _check_text(text: str) -> None:
     """Raises PatternError for a text that is no pattern, before RE2 is asked."""
     if not text:

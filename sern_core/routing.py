@@ -15,7 +15,8 @@ Names
 - A global name has one owner, the first client that announces it, until the owner withdraws it or is dropped.
   Only when every owner declares it `many_writers` may several clients hold it (`/tf`).
 - A client lives in one boot at a time. Announcing under another boot replaces all that it had; boots are drawn at
-  random, so "newer" means "announced later", and a boot that was replaced never comes back.
+  random, so "newer" means "announced later", and a boot that was replaced comes back only with a session (`returned`):
+  of two processes with one name each may.
 
 Who announces is the caller's business: `StreamInfo.id.origin` must be the name bound to the peer's key.
 """
@@ -279,6 +280,12 @@ class RoutingTable:
         if interest is not None:
             self._match_some(client, interest, change)
         return change.result(self._routes)
+
+    def returned(self, client: ClientName, boot: int) -> None:
+        """The process that was replaced is not gone: it has the client's session again, and may announce."""
+        retired = self._retired.get(client)
+        if retired is not None and boot in retired:
+            retired.remove(boot)
 
     def drop_client(self, client: ClientName) -> RouteChange:
         """The client is gone for good: its streams, its names and its interest go. It may come back under any boot."""

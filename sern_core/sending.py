@@ -192,7 +192,7 @@ class Sender(ABC):
         info = TopicInfo(CONTROL_TOPIC, "", Encoding.RAW)
         stream = StreamInfo(StreamId(self.name, self.boot, CONTROL_TOPIC), info, spec)
         counters = SendCounters(CONTROL_TOPIC, PriorityClass.CONTROL)
-        control = OutChannel(CONTROL_CHANNEL, stream, counters, lambda _out, _reason: None, first=1)
+        control = OutChannel(CONTROL_CHANNEL, stream, counters, lambda _channel, _out, _reason: None, first=1)
         control.wanted = control.ready = True
         return control, InStream(stream, self.reassembly, self._control_message, self._in_drop, first=1)
 
@@ -346,7 +346,9 @@ class Sender(ABC):
         if lane.copies and (copy := lane.due_copy(now)) is not None:
             self.scheduler.charge(PriorityClass.CONTROL, len(copy), now=now)
             self.wire_bytes += len(copy) + OVERHEAD_BYTES
+            lane.priority = PriorityClass.CONTROL
             return copy
+        lane.priority = PriorityClass.STATE
         frames: list[bytes] = []
         items: list[SentData | SentWatermark | SentPing] = []
         if not lane.stalled or now >= lane.probe_due_s:
@@ -394,7 +396,7 @@ class Sender(ABC):
         path = lane.path
         app_limited = not waits and not path.held and inflight_bytes < estimator.window_bytes
         path.held = False
-        flight.sent(now=now, nbytes=nbytes, items=items, app_limited=app_limited)
+        flight.sent(now=now, nbytes=nbytes, items=items, app_limited=app_limited, priority=lane.priority)
         estimator.on_sent(now=now, nbytes=nbytes, inflight_bytes=inflight_bytes)
         pacer = lane.pacer
         pacer.sent(now=now, nbytes=nbytes, pacing_bps=estimator.pacing_bps)
@@ -440,6 +442,11 @@ class Sender(ABC):
         )
 
     @property
+    def control_heard(self) -> int:
+        """The number of the last control message up to which the peer has acknowledged all."""
+        return self._control.watermark
+
+    @property
     def _control_waits(self) -> bool:
         return bool(self._control.queue or self._control.active)
 
@@ -449,7 +456,8 @@ class Sender(ABC):
         """Fill one datagram: watermarks, then what the scheduler picks, of one class; control ahead of all but class 0.
 
         Control keeps to the window like everything below class 0, as a thousand announcements must not fill the path;
-        but a little of it rides in each datagram of class 0, at the cost of that class's share. Returns whether window
+        but a little of it rides in each datagram of class 0, at the cost of that class's share: that is its floor, also
+        where class 0 alone has more than the link carries. Returns whether window
         and pacer were open to the other classes.
         """
         limit = lane.fragment_bytes - (wire.ACK.size if lane.arrivals.unacked else 0)
@@ -460,6 +468,8 @@ class Sender(ABC):
             size = self._put_watermarks(frames, items, size)
         control = self._control
         served: PriorityClass | None = None
+        ride = False  # it is the turn of a little control, behind class 0
+        spoke = False
         full = limit - max(wire.DATA_FIRST_BYTES + MIN_SHARE_BYTES, limit // CRUMB)
         while size <= full:
             if express:
@@ -467,19 +477,16 @@ class Sender(ABC):
             else:
                 chosen = self._pick(now, window_open=window_open)
             channel = self.channels[chosen] if chosen is not None else None
-            rides = served is PriorityClass.CONTROL and not window_open and not express
-            if (
-                (control.queue or control.active)
-                and not express
-                and (rides or (window_open and (channel is None or channel.spec.priority is not PriorityClass.CONTROL)))
-                and (order := control.head(now)) is not None
-            ):
+            urgent = channel is not None and channel.spec.priority is PriorityClass.CONTROL
+            said = control.head(now) if self._control_waits and not express else None
+            if said is not None and (ride or (window_open and not urgent)):
                 before = size
-                end = min(limit, size + wire.DATA_FIRST_BYTES + RIDE_BYTES) if rides else limit
-                size = self._put(control, order, frames, items, size, end, now)
-                if not order.has_unsent:
-                    self._control_sent(order.seq)
-                if rides:
+                end = min(limit, size + wire.DATA_FIRST_BYTES + RIDE_BYTES) if ride else limit
+                size = self._put(control, said, frames, items, size, end, now)
+                spoke = True
+                if not said.has_unsent:
+                    self._control_sent(said.seq)
+                if ride:
                     self.scheduler.charge(PriorityClass.CONTROL, size - before, now=now)
                     break
                 continue
@@ -494,18 +501,26 @@ class Sender(ABC):
             priority = _class_of(channel, out)
             if served is None and priority is not PriorityClass.CONTROL:
                 limit = self._cut(lane, limit, now)
+            shared = said is not None and priority is PriorityClass.CONTROL
+            end = limit - wire.DATA_FIRST_BYTES - RIDE_BYTES if shared else limit
             if frames and (
                 (served is not None and priority is not served)
-                or (out.size if out.ranges is None else out.unsent_bytes) > limit - size - wire.DATA_FIRST_BYTES
+                or (out.size if out.ranges is None else out.unsent_bytes) > end - size - wire.DATA_FIRST_BYTES
             ):
+                if shared and served is PriorityClass.CONTROL:
+                    ride = True
+                    continue
                 break
             served = priority
             before = size
-            size = self._put(channel, out, frames, items, size, limit, now)
+            size = self._put(channel, out, frames, items, size, end, now)
+            ride = shared and not window_open
             self.scheduler.charge(priority, size - before, now=now)
             self._refresh(channel, now)
             if lane.stalled:
                 break
+        if served is PriorityClass.CONTROL or (served is PriorityClass.BULK and not spoke):
+            lane.priority = served
         return window_open
 
     def _cut(self, lane: Lane, limit: int, now: float) -> int:

@@ -41,6 +41,8 @@ SHORT_SESSION_S: Final = 5.0
 """A session that is taken from us sooner than this was short."""
 DISPLACED_S: Final = (0.5, 10.0)
 """First and longest pause after the second short session in a row, and those that follow."""
+DISPLACED: Final = "displaced"
+"""The code of the refusal that ends a session because another process connected under its name."""
 MAX_UNREAD_BYTES: Final = 32 * 2**20
 UNREAD_OVERHEAD_BYTES: Final = 256
 """Datagrams of a peer that wait to be read, each with so much beside it: far more than any window lets a peer send that
@@ -89,6 +91,7 @@ class Session(Hop):
         self._reset_due_s = -float("inf")
         self._abort_due_s = -float("inf")
         self._short_sessions = 0  # in a row
+        self._displaced_pauses = 0  # in a row, after refusals that said so
         self._resumed = False
         self._data_prefix = b""  # how a data datagram of the session begins
         self._fresh: deque[tuple[InStream, Message, int]] = deque()
@@ -201,6 +204,15 @@ class Session(Hop):
         if self._short_sessions < 2:
             return 0.0
         return min(DISPLACED_S[0] * 2.0 ** min(self._short_sessions - 2, 16), DISPLACED_S[1])
+
+    def _yield_s(self, now: float) -> float:
+        """How long to wait when the relay has said that another process has our name now. Two that both want it take
+        turns, each as long as the other waits: a session of that length is no sign that the other has gone."""
+        last_s = DISPLACED_S[0] * 2.0**self._displaced_pauses if self._displaced_pauses else 0.0
+        if now - self._up_since_s > 2 * min(last_s, DISPLACED_S[1]) + SHORT_SESSION_S:
+            self._displaced_pauses = 0
+        self._displaced_pauses = min(self._displaced_pauses + 1, 16)
+        return min(DISPLACED_S[0] * 2.0**self._displaced_pauses, DISPLACED_S[1])
 
     def _hello(self, now: float) -> bytes:
         self._hello_due_s = now + HELLO_INTERVAL_S
@@ -547,7 +559,12 @@ class Session(Hop):
             self.lanes[LANE_ZMQ].flight.rtt.sample(max(1e-6, now - echo_us * 1e-6), now=now)
         elif kind is wire.Kind.REFUSE:
             code, text = wire.take_str(envelope, "code", max_length=64), wire.take_str(envelope, "why")
-            self._greet(now + REFUSED_INTERVAL_S, now)
+            if code == DISPLACED:
+                pause_s = self._yield_s(now) if self.established else REFUSED_INTERVAL_S
+                self._end_session(text, now)
+            else:
+                pause_s = REFUSED_INTERVAL_S
+            self._greet(now + pause_s, now)
             self._session_refused(code, text, now)
         elif kind is wire.Kind.RESET and self.established:
             self._greet(now + self._displaced_pause_s(now), now)

@@ -364,7 +364,13 @@ def _plain(value: object, depth: int) -> object:
             raise WireError("an envelope repeats a key")
         return result
     if isinstance(value, list):
-        return [_plain(item, depth - 1) for item in value]
+        try:
+            return [
+                item.decode() if type(item) is bytes else item if type(item) in _PLAIN else _plain(item, depth - 1)
+                for item in value
+            ]
+        except UnicodeDecodeError:
+            raise WireError("text in an envelope is not UTF-8") from None
     raise WireError("an envelope holds an extension type")
 
 
@@ -433,6 +439,16 @@ def _is_text(value: object, max_length: int) -> bool:
     return isinstance(value, str) and len(value) <= max_length and _UNPRINTABLE.search(value) is None
 
 
+def _are_texts(values: list[object], max_length: int) -> bool:
+    """`_is_text` of each: they are searched as one, since a list of names is most of what tells who wants a stream."""
+    texts = cast(list[str], values)
+    return (
+        all(type(text) is str for text in texts)
+        and max(map(len, texts), default=0) <= max_length
+        and _UNPRINTABLE.search("".join(texts)) is None
+    )
+
+
 def take_str(envelope: Envelope, key: str, *, max_length: int = 512, default: str | None = None) -> str:
     value = envelope.get(key, default)
     if not _is_text(value, max_length):
@@ -442,7 +458,7 @@ def take_str(envelope: Envelope, key: str, *, max_length: int = 512, default: st
 
 def take_strings(envelope: Envelope, key: str, *, max_length: int = 512) -> list[str]:
     value = envelope.get(key, [])
-    if not isinstance(value, list) or not all(_is_text(item, max_length) for item in value):
+    if not isinstance(value, list) or not _are_texts(value, max_length):
         raise WireError(f"envelope key {key!r} must be a list of printable strings of at most {max_length} characters")
     return list(value)
 

@@ -16,6 +16,7 @@ from sern_core.access import AccessTable
 from sern_core.decoding import Decoder
 from sern_core.errors import ConfigError
 from sern_core.hub import Hub, HubParams
+from sern_core.lanes import LANE_UDP
 from sern_core.ledger import MAX_TOPICS
 from sern_core.link import Link
 from sern_core.message import Message, StreamInfo
@@ -26,11 +27,13 @@ from sern_relay.objects_view import objects_view
 from sern_relay.server import RelayServer
 from sern_relay.transforms import TransformObjects
 from sern_relay.udp import RelayLanes
-from sern_runtime import clock
+from sern_runtime import clock, ros_types
 from sern_runtime.adaptation import Adaptation
 from sern_runtime.codec_pool import CodecPool, make_coder
+from sern_runtime.collector import CollectorWatch
 from sern_runtime.config.load import Loaded
 from sern_runtime.config.relay import RelayFile, load_relay
+from sern_runtime.datagram_watch import DatagramWatch
 from sern_runtime.draining import Progress
 from sern_runtime.entry import blamed_on, end_tasks, log_warnings, serve
 from sern_runtime.http import Health, HttpServer
@@ -41,8 +44,9 @@ from sern_runtime.loop import Shutdown
 from sern_runtime.message_log import LoggedFates, MessageLog
 from sern_runtime.metrics import Metrics
 from sern_runtime.optional import OptionalParts
+from sern_runtime.outages import Outages
 from sern_runtime.sdnotify import Notifier, Watchdog
-from sern_runtime.topics_view import link_summary, received_summary
+from sern_runtime.topics_view import announced_summary, link_summary, received_summary
 from sern_runtime.zap import TemporaryRefusal, ZapHandler, self_test
 
 ZAP_DOMAIN: Final = "sern"
@@ -51,9 +55,9 @@ PATIENCE_S: Final = 5.0
 SWEEP_S: Final = 1.0
 OTHER_CODE: Final = "other"
 REFUSAL_CODES: Final = frozenset({
-    "bad_announcement", "bad_id", "bad_name", "bad_pattern", "forbidden", "internal_error", "name_taken", "not_owner",
-    "old_boot", "origin", "registry_full", "too_large", "too_many_objects", "too_many_patterns", "too_many_streams",
-    "type_mismatch",
+    "bad_announcement", "bad_id", "bad_name", "bad_pattern", "displaced", "forbidden", "internal_error", "name_taken",
+    "not_owner", "old_boot", "origin", "registry_full", "too_large", "too_many_objects",
+    "too_many_patterns", "too_many_streams", "type_mismatch",
 })  # fmt: skip
 """What a refusal is counted under; a code that a client made up is counted as `other`."""
 
@@ -67,6 +71,7 @@ async def run_relay(path: Path, shutdown: Shutdown) -> int:
     daemon = RelayDaemon(loaded)
     try:
         await daemon.start()
+        daemon.collector.settle()
         shutdown.on_reload = daemon.reload
         await serve(shutdown, daemon.tasks)
         daemon.notifier.stopping("draining")
@@ -91,8 +96,10 @@ class RelayDaemon:
         self.directory = self._directory(loaded)
         self.ages = AgeHistograms()
         self.errors = InternalErrors()
+        self.collector = CollectorWatch()
         self.refusals = dict.fromkeys((*sorted(REFUSAL_CODES), OTHER_CODE), 0)
         self.reloads_failed = 0
+        self._unreloaded: str | None = None  # what the last reload did not put in force, and why
         self.hub = Hub(
             name=model.name,
             boot=secrets.randbits(63),
@@ -119,6 +126,8 @@ class RelayDaemon:
             self.coder, lambda stream: stream, self._deliver, self._undecodable, fault=self.errors.core
         )
         self._told: set[TopicName] = set()
+        self._away_since_s: dict[ClientName, float] = {}
+        self._outages = Outages(_log, logging.INFO)  # as clients that come and go
         self.adaptation: Adaptation | None = None
         if model.adaptation is not None:
             with blamed_on(loaded.path, "adaptation"):
@@ -133,6 +142,11 @@ class RelayDaemon:
         self.server: RelayServer | None = None
         self.feed: RelayFeed | None = None
         self.lanes: RelayLanes | None = None
+        self.datagrams = DatagramWatch(
+            lambda: list(self.hub.links.values()),
+            lambda link, within_s: self.lanes.problem(link, within_s) if self.lanes is not None else None,
+            lambda link: link.peer,
+        )
         self.transforms: TransformObjects | None = None
         self._ctx: zmq.Context[zmq.Socket[bytes]] | None = None
         self._http: HttpServer | None = None
@@ -151,6 +165,8 @@ class RelayDaemon:
 
     async def start(self) -> None:
         self.errors.watch(asyncio.get_running_loop())
+        self.collector.watch()
+        ros_types.load()
         model = self.loaded.model
         relay = model.relay
         keys = load_secret(self.loaded.resolve(relay.secret_key_file)) if relay.secret_key_file else None
@@ -176,10 +192,11 @@ class RelayDaemon:
                 max_connections=relay.max_connections,
                 redundancy=model.link.redundancy,
                 after=self._after,
+                marks=model.link.dscp.marks(),
             )
         if keys is not None and relay.udp:
             with blamed_on(self.loaded.path, "relay", "listen"):
-                self.lanes = RelayLanes(self.hub, relay.listen, after=self._after)
+                self.lanes = RelayLanes(self.hub, relay.listen, after=self._after, marks=model.link.dscp.marks())
         if keys is not None and self.zap is not None:
             await self_test(self._ctx, self.zap, relay.listen, keys.public_key)
             _log.info("self-test passed: a stranger's key is refused on %s", ", ".join(relay.listen))
@@ -250,6 +267,7 @@ class RelayDaemon:
             self.hub.sweep(now=now)
             if self.server is not None:
                 self.server.express.look()
+            self.datagrams.tick()
             if self.message_log is not None:
                 with self.parts.survive("message_log"):
                     self.message_log.flush()
@@ -261,7 +279,31 @@ class RelayDaemon:
                 self.zap.ping()
             if watchdog.interval_s is not None:
                 watchdog.check()
-            self.notifier.status(f"{self._clients_up()} clients, {len(self.hub.relayed)} streams")
+            self._look_at_lanes(now)
+            self.notifier.status(self._status())
+
+    def _look_at_lanes(self, now: float) -> None:
+        """Say which client has been silent for a while in a session that goes on, and when it is not any more."""
+        for client, link in self.hub.links.items():
+            if not link.established:
+                continue
+            self._outages.look(
+                (client, "link"), lost=link.lane.stalled, now=now,
+                gone=f"{client} does not answer; its session waits for it", back=f"{client} answers again",
+            )  # fmt: skip
+            udp = link.lanes.get(LANE_UDP)
+            self._outages.look(
+                (client, "udp"), lost=udp is not None and udp.stalled and not link.lane.stalled, now=now,
+                gone=f"no datagram gets through to {client}; data goes over TCP",
+                back=f"datagrams get through to {client} again",
+            )  # fmt: skip
+        for client in self._away_since_s.keys() - self.hub.links.keys():  # nobody waits for it any more
+            del self._away_since_s[client]
+
+    def _status(self) -> str:
+        """One line for `systemctl status`. A failed reload stays in it until a good one."""
+        state = f"{self._clients_up()} clients, {len(self.hub.relayed)} streams"
+        return state if self._unreloaded is None else f"{state}; {self._unreloaded}"
 
     def _clients_up(self) -> int:
         return sum(link.established for link in self.hub.links.values())
@@ -276,8 +318,10 @@ class RelayDaemon:
         except ConfigError as error:
             self.reloads_failed += 1
             _log.error("reload failed, the old configuration stays: %s", error)
-            self.notifier.ready(f"reload failed: {error}")
+            self._unreloaded = f"reload failed, the old configuration stays: {error}"
+            self.notifier.ready(self._status())
             return
+        failed_before, self._unreloaded = self._unreloaded is not None, None
         log_warnings(_log, loaded.warnings)
         self.directory = directory
         now = clock.now()
@@ -292,16 +336,20 @@ class RelayDaemon:
             _log.warning("%s is in the directory no more; what was held for it is dropped", client)
             self.hub.forget(client, "the name is revoked", now=now)
         self._after()
-        self.notifier.ready("reloaded")
+        self.notifier.ready(self._status())
+        if failed_before and self._unreloaded is None:
+            _log.error("the reload works again: what had failed before is in force")
         _log.info("reloaded keys, access rules and feed roles; other changes need a restart")
 
     def _make_http(self, listen: str) -> HttpServer:
         registry = CollectorRegistry()
         metrics = Metrics(registry)
         register_links(metrics, lambda: list(self.hub.links.values()))
+        self.datagrams.register(metrics)
         register_received(metrics, self.hub.received, self.ages)
         register_codecs(metrics, self.coder)
         self.errors.register(metrics)
+        self.collector.register(metrics)
         adaptation = self.adaptation
         self.parts.register(metrics)
         if adaptation is not None:
@@ -373,6 +421,7 @@ class RelayDaemon:
             self.feed.update(model.feed_roles(), now=now)
         except ConfigError as error:
             self.reloads_failed += 1
+            self._unreloaded = f"reload failed in part, not all of feed.roles are in force: {error}"
             _log.error("%s: feed.roles: not all of them are in force: %s", self.loaded.path, error)
 
     def _transforms_refused(self) -> list[tuple[tuple[str, ...], float]]:
@@ -383,9 +432,10 @@ class RelayDaemon:
         return [] if self.feed is None else [(labels, float(n)) for labels, n in self.feed.results()]
 
     def topics(self) -> dict[str, object]:
-        """Counters by client link and topic, and of what arrived."""
+        """Counters by client link and topic, and of what arrived; and what is announced, whether taken or not."""
         now = clock.now()
         return {
+            "announced": announced_summary(self.hub.announced()),
             "links": {name: link_summary(link, direction="send") for name, link in self.hub.links.items()},
             "received": received_summary(self.hub.received, now=now),
         }
@@ -425,6 +475,7 @@ class RelayDaemon:
         self._ready = False
         async with AsyncExitStack() as stack:
             stack.callback(self.errors.unwatch, asyncio.get_running_loop())
+            stack.callback(self.collector.close)
             stack.callback(self.notifier.close)
             stack.callback(self._write_summary)
             if self.message_log is not None and self.fates is not None:
@@ -458,7 +509,11 @@ class RelayDaemon:
     # --- HubEvents ----------------------------------------------------------------------------------------------------
 
     def client_up(self, client: ClientName, *, resumed: bool) -> None:
-        _log.info("%s connected%s", client, " again" if resumed else "")
+        away_since_s = self._away_since_s.pop(client, None)
+        if away_since_s is None:
+            _log.info("%s connected%s", client, " again" if resumed else "")
+        else:
+            _log.info("%s connected again, after %.0f s", client, clock.now() - away_since_s)
 
     def lane_asked(self, client: ClientName, ciphers: list[str]) -> None:
         if self.lanes is not None:
@@ -472,6 +527,8 @@ class RelayDaemon:
         self.errors.core(error, client or "")
 
     def client_down(self, client: ClientName, reason: str) -> None:
+        self._away_since_s[client] = clock.now()
+        self._outages.forget(client)
         _log.info("%s is away: %s", client, reason)
 
     def stream_added(self, stream: StreamInfo) -> None:

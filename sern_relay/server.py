@@ -14,6 +14,7 @@ from sern_core.rules import client_name
 from sern_core.types import ClientName
 from sern_relay.express import JOIN, Joined, RelayExpress
 from sern_runtime import clock
+from sern_runtime.dscp import Marks
 from sern_runtime.inflow import Inflow
 from sern_runtime.monitor import ConnectionTable, TcpHandle
 from sern_runtime.pump import LANE_MESSAGE_BYTES, Pump
@@ -56,12 +57,14 @@ class RelayServer:
         max_connections: int,
         redundancy: Redundancy,
         after: Callable[[], None],
+        marks: Marks | None = None,
     ) -> None:
         self.hub = hub
         self.bad_frames = 0
         self.revoked = 0
         """Connections that spoke first when their key was no longer known."""
         self._admits = admits
+        self._marks = marks or Marks()
         self._insecure = keys is None
         self._after = after
         self._sessions: dict[bytes, Session] = {}
@@ -166,11 +169,13 @@ class RelayServer:
         connection = self.connections.by_fd(details.fd)
         handle = connection.handle if connection is not None else None
         if handle is not None:
-            handle.prepare(express=data[2:3] == JOIN)
+            express = data[2:3] == JOIN
+            marks = self._marks
+            handle.prepare(express=express, tos=marks.express_tos if express else marks.stream_tos)
         if data[2:3] == JOIN:
             self._join(routing_id, Joined(name, details.fd, connection), data)
             return None
-        port = HubPort(self.hub, name)
+        port = HubPort(self.hub, name, details.address if handle is None else "{}:{}".format(*handle.peer))
 
         def send(datagram: bytes) -> SendResult:
             return self.socket.send_to(routing_id, datagram)

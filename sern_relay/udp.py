@@ -7,12 +7,15 @@ from sern_core.errors import RefusedError, RemoteError
 from sern_core.hub import Hub
 from sern_core.lane_port import LanePort
 from sern_core.lanes import LANE_UDP
+from sern_core.link import Link
 from sern_core.types import ClientName
 from sern_runtime import clock
 from sern_runtime.config.base import split_tcp
+from sern_runtime.dscp import Marks
 from sern_runtime.pump import Pump
 from sern_runtime.udp import UdpServer, UdpSession
 from sern_runtime.udp_socket import Address
+from sern_runtime.zmq_socket import SendResult
 
 _log = logging.getLogger(__name__)
 
@@ -28,8 +31,12 @@ class RelayLanes:
     Raises ConfigError when an address cannot be had. `after` is called whenever something came in.
     """
 
-    def __init__(self, hub: Hub, listen: Sequence[str], *, after: Callable[[], None]) -> None:
+    def __init__(
+        self, hub: Hub, listen: Sequence[str], *, after: Callable[[], None], marks: Marks | None = None
+    ) -> None:
         self.hub = hub
+        marks = marks or Marks()
+        self._tos = marks.tos
         self.bad_frames = 0
         self.moved = 0
         """Times a client's address changed."""
@@ -38,7 +45,12 @@ class RelayLanes:
         self._lanes: dict[ClientName, tuple[UdpSession, Pump]] = {}
         self._ciphers: dict[ClientName, tuple[str, ...]] = {}  # what the client of a lane has offered
         self.server = UdpServer(
-            udp_endpoints(listen), self._received, on_path=self._path, on_writable=self._writable, after=after
+            udp_endpoints(listen),
+            self._received,
+            on_path=self._path,
+            on_writable=self._writable,
+            after=after,
+            tos=marks.stream_tos,
         )
 
     def close(self) -> None:
@@ -58,7 +70,12 @@ class RelayLanes:
             _log.warning("%s gets no datagram lane: %s", client, refusal)
             return
         port = LanePort(link, LANE_UDP)
-        pump = Pump(port, session.send, on_gone=lambda: self._used_up(client, session), ready=session.ready)
+        tos = self._tos
+
+        def send(datagram: bytes) -> SendResult:
+            return session.send(datagram, tos[port.priority])
+
+        pump = Pump(port, send, on_gone=lambda: self._used_up(client, session), ready=session.ready)
         self._lanes[client] = (session, pump)
         self._ciphers[client] = tuple(ciphers)
         self.hub.offer_lane(client, session.parameters.to_envelope(), now=clock.now())
@@ -72,6 +89,24 @@ class RelayLanes:
             session, pump = lane
             pump.close()
             self.server.close_session(session)
+
+    def problem(self, link: Link, within_s: float) -> str | None:
+        """What is known about why no datagram passes to and from a client, as `DatagramWatch` wants it; None: the
+        client has asked for no datagram lane, or cannot have one, which was said."""
+        lane = self._lanes.get(link.peer)
+        if lane is None:
+            return None
+        session = lane[0]
+        port = session.parameters.port
+        if session.address is None:
+            return (
+                f"no datagram came through from it to {port}/udp here in {within_s:g} s; using TCP; open UDP port "
+                f"{port} in this host's firewall and in its cloud security group, or allow outgoing UDP at the client"
+            )
+        return (
+            f"datagrams come through from it ({session.address[0]}), and it has confirmed none of ours for "
+            f"{within_s:g} s; using TCP; allow this host's UDP port {port} to answer, and datagrams of 1200 bytes"
+        )
 
     def flush(self) -> None:
         """Let every lane that has something to say say it."""

@@ -4,15 +4,20 @@ A publisher's message may be one frame as large as the feed takes, so that much 
 message came from is asked for of large ones, and of small ones only while a connection brings much of that. What
 a subscriber sends does not say where it came from: of it, so many bytes are let in over the life of a connection,
 beside a trickle.
+
+As much as one large frame may bring in tiny ones takes thirty times its size, and nobody sees how many frames there
+are. What shows is the process's memory: where that has grown by more than `GROWTH_MULTIPLE` times of what all messages
+under way have brought, and `GROWTH_BYTES`, since a connection's last message, the connection has not sent one large
+frame, or another one has not; each of those that are behind by `LIMIT_BYTES` is cut.
 """
 
 import logging
 from collections.abc import Callable
-from typing import Final
+from typing import Final, NamedTuple
 
 import zmq
 
-from sern_runtime.inflow import LIMIT_BYTES, Inflow, Socket
+from sern_runtime.inflow import LIMIT_BYTES, Inflow, Socket, resident_bytes
 from sern_runtime.monitor import ConnectionTable, TcpHandle
 
 SUBSCRIBER_BYTES: Final = 2**20
@@ -20,7 +25,19 @@ SUBSCRIBER_BYTES: Final = 2**20
 TOLD_BYTES: Final = 2048
 """Of messages from this size on it is always said which connection they came from: it takes a quarter of a
 microsecond, and of smaller ones no loop takes enough between two looks to be mistaken for a message without end."""
+GROWTH_MULTIPLE: Final = 3
+"""One large frame takes its size, and another time that when it has come out; one of two bytes takes 64."""
+GROWTH_BYTES: Final = 64 * 2**20
+"""Beside that: what the rest of the process may come to need meanwhile."""
 _log = logging.getLogger(__name__)
+
+
+class _Seen(NamedTuple):
+    """Of one connection: the messages seen, and what it had brought, and the process's memory, at the last of them."""
+
+    taken: int
+    read_bytes: int
+    memory_bytes: int
 
 
 class FeedInflow:
@@ -34,8 +51,9 @@ class FeedInflow:
         on_endless: Callable[[], None],
         *,
         max_message_bytes: int | None = None,
+        memory: Callable[[], int] = resident_bytes,
     ) -> None:
-        """`max_message_bytes`: of a publisher's frame; None for subscribers."""
+        """`max_message_bytes`: of a publisher's frame; None for subscribers. `memory`: of the process, bytes."""
         self.watching = False
         """Whether the socket is to say which connection each message came from (`came`)."""
         self._role = role
@@ -43,7 +61,8 @@ class FeedInflow:
         self._limit_bytes = SUBSCRIBER_BYTES if max_message_bytes is None else max_message_bytes + LIMIT_BYTES
         self._counts = max_message_bytes is not None
         self._taken: dict[int, int] = {}
-        self._seen: dict[TcpHandle, tuple[int, int]] = {}  # messages seen, and what had been read then
+        self._memory = memory
+        self._seen: dict[TcpHandle, _Seen] = {}
         self.connections = ConnectionTable(raw, max_half_open_per_source=0, max_half_open=0, max_connections=0)
         self._inflow = Inflow(socket, self._connections, self._endless, limit_bytes=self._limit_bytes)
 
@@ -58,17 +77,29 @@ class FeedInflow:
         handles = self.connections.handles()
         if self._counts:
             self._taken = {handle.fd: self._taken.get(handle.fd, 0) for handle in handles}
-            behind = [self._is_behind(handle) for handle in handles]
-            self.watching = any(behind)
-            self._seen = {handle: self._seen[handle] for handle in handles}
+            self._look(handles, self._memory())
         return [(handle, self._taken.get(handle.fd, 0)) for handle in handles]
 
-    def _is_behind(self, handle: TcpHandle) -> bool:
-        read_bytes, taken = handle.read_bytes() or 0, self._taken[handle.fd]
-        known = self._seen.get(handle)
-        if known is None or known[0] != taken:
-            known = self._seen[handle] = (taken, read_bytes)
-        return read_bytes - known[1] > LIMIT_BYTES // 4
+    def _look(self, handles: list[TcpHandle], memory_bytes: int) -> None:
+        behind: dict[TcpHandle, int] = {}
+        seen: dict[TcpHandle, _Seen] = {}
+        for handle in handles:
+            read_bytes, taken = handle.read_bytes() or 0, self._taken[handle.fd]
+            known = self._seen.get(handle)
+            if known is None or known.taken != taken:
+                known = _Seen(taken, read_bytes, memory_bytes)
+            since_bytes = read_bytes - known.read_bytes
+            if since_bytes > LIMIT_BYTES // 4:
+                behind[handle] = since_bytes
+            else:
+                known = known._replace(memory_bytes=memory_bytes)  # what grows now is not its doing
+            seen[handle] = known
+        self._seen = seen
+        self.watching = bool(behind)
+        explained_bytes = GROWTH_MULTIPLE * sum(behind.values()) + GROWTH_BYTES
+        self._inflow.suspects = {
+            handle for handle in behind if memory_bytes - seen[handle].memory_bytes > explained_bytes
+        }
 
     def _endless(self, handle: TcpHandle) -> None:
         self._on_endless()

@@ -218,6 +218,14 @@ def secret_warning(path: Path) -> str | None:
     return None
 
 
+def misnamed(path: Path, name: ClientName) -> str | None:
+    """A phrase when a key file has another's name: it should begin with `name`, then end or go on with another sign, as
+    jackal1.pub and jackal1-2030.pub do for jackal1."""
+    if re.match(re.escape(name) + r"(?![a-z0-9_])", path.stem + " "):
+        return None
+    return f"{path} holds the key of {name}, and by its name that of {path.stem}: who has it connects as {name}"
+
+
 def public_text(keys: PublicKeys) -> str:
     """The content of a public key file."""
     lines = [f"# Public key of {keys.name}: not a secret.", "sern_key: public", f"name: {keys.name}", "keys:"]
@@ -270,7 +278,7 @@ class KeyDirectory:
     """The relay's clients: every `*.pub` file in one directory, read once. A reload makes a new one.
 
     Raises ConfigError for a missing directory, for a bad file (by its name), and for a key that stands in two places.
-    `warnings` names what lies there and is no public key file.
+    `warnings` names what lies there and is no public key file, or has the name of another client's.
     """
 
     def __init__(self, path: Path) -> None:
@@ -295,6 +303,9 @@ class KeyDirectory:
 
     def _add(self, file: Path) -> None:
         keys = load_public(file)
+        odd = misnamed(file, keys.name)
+        if odd is not None:
+            self.warnings = (*self.warnings, odd)
         for key in keys.keys:
             known = self._by_key.get(key.key)
             if known is not None:

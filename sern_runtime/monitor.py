@@ -25,7 +25,7 @@ from typing import Final, NamedTuple
 import zmq
 
 from sern_runtime.clock import now
-from sern_runtime.zmq_socket import HANDSHAKE_IVL_MS, TOS_EXPEDITED, FrameSocket
+from sern_runtime.zmq_socket import HANDSHAKE_IVL_MS, FrameSocket
 
 EventKind = zmq.Event
 EVENTS: Final = int(
@@ -184,6 +184,13 @@ class TcpHandle:
         received: int = _RECEIVED.unpack(raw)[0]
         return received - int.from_bytes(unread, sys.byteorder)
 
+    def kept(self) -> socketlib.socket | None:
+        """A duplicate to close soon: it keeps the connection open when libzmq has closed it. None when it is gone."""
+        with self._connection() as connection:
+            if connection is None:
+                return None
+            return socketlib.socket(fileno=os.dup(connection.fileno()))  # `dup()` would make libzmq's socket blocking
+
     def congestion(self) -> str | None:
         """The name of the congestion control, for example `cubic`."""
         with self._connection() as connection:
@@ -192,14 +199,14 @@ class TcpHandle:
             raw = connection.getsockopt(socketlib.IPPROTO_TCP, socketlib.TCP_CONGESTION, 16)
         return raw.rstrip(b"\0").decode("ascii", "replace")
 
-    def prepare(self, *, express: bool) -> None:
-        """What a connection of a lane needs; what the kernel does not have or allow is left as it is."""
+    def prepare(self, *, express: bool, tos: int) -> None:
+        """What a connection of a lane needs, with `tos` as its IP byte (DSCP in the upper six bits); what the kernel
+        does not have or allow is left as it is."""
         self.set_congestion(EXPRESS_CONGESTION if express else STREAM_CONGESTION)
         self.set_rto_max()
         self.set_pacing()
-        if express:
-            self._set(socketlib.IP_TOS, TOS_EXPEDITED, level=socketlib.IPPROTO_IP)
-            self._set(socketlib.IPV6_TCLASS, TOS_EXPEDITED, level=socketlib.IPPROTO_IPV6)
+        self._set(socketlib.IP_TOS, tos, level=socketlib.IPPROTO_IP)
+        self._set(socketlib.IPV6_TCLASS, tos, level=socketlib.IPPROTO_IPV6)
 
     def set_congestion(self, name: str) -> bool:
         """Choose the congestion control. False when the kernel does not have it or does not allow it."""
@@ -272,99 +279,22 @@ def _parse_tcp_info(raw: bytes) -> TcpInfo:
     )
 
 
+def received_bytes(connection: socketlib.socket) -> int | None:
+    """How many bytes have arrived over a TCP connection, the peer's end of it counting as one; None where the kernel
+    does not say."""
+    raw = connection.getsockopt(socketlib.IPPROTO_TCP, socketlib.TCP_INFO, _RECEIVED.size)
+    if len(raw) < _RECEIVED.size:
+        return None
+    received: int = _RECEIVED.unpack(raw)[0]
+    return received
+
+
 def port_of(endpoint: str) -> int | None:
     """The port of a tcp endpoint, None for others."""
     if endpoint.startswith("tcp://"):
         with suppress(ValueError):
             return int(endpoint.rpartition(":")[2])
     return None
-
-
-class TransportWatch:
-    """A client's transport in three calls.
-
-    `on_up(handle)` after the handshake (`handle` None on ipc); `on_down(reason)` when a transport that was up is
-    gone, or an attempt failed for a new reason; `on_rebuild(reason)` when libzmq has given up for good (the relay
-    said 400, or does not speak our protocol), so that the caller makes a new socket, with jittered backoff.
-    """
-
-    def __init__(
-        self,
-        socket: "zmq.Socket[bytes]",
-        on_up: Callable[[TcpHandle | None], None],
-        on_down: Callable[[str], None],
-        on_rebuild: Callable[[str], None],
-    ) -> None:
-        self.up = False
-        self.reason = "not connected yet"
-        self._on_up = on_up
-        self._on_down = on_down
-        self._on_rebuild = on_rebuild
-        self._handle: TcpHandle | None = None
-        self._shaking = False
-        self._monitor = SocketMonitor(socket, self._on_event)
-
-    def close(self) -> None:
-        """Before the socket. Idempotent."""
-        self._monitor.close()
-
-    def _on_event(self, event: MonitorEvent) -> None:
-        match event.kind:
-            case EventKind.CONNECTED:
-                self._shaking = True
-                self._handle = TcpHandle.of(event.value, peer_port=port_of(event.endpoint))
-            case EventKind.HANDSHAKE_SUCCEEDED:
-                self._shaking = False
-                self.up = True
-                self.reason = ""
-                self._on_up(self._handle)
-            case EventKind.HANDSHAKE_FAILED_AUTH:
-                self._shaking = False
-                self._refused(event.value)
-            case EventKind.HANDSHAKE_FAILED_PROTOCOL:
-                self._shaking = False
-                self._give_up(_protocol_problem(event.value))
-            case EventKind.HANDSHAKE_FAILED_NO_DETAIL:
-                self._shaking = False
-                self._down(_NO_HANDSHAKE)
-            case EventKind.DISCONNECTED if self._shaking:
-                self._shaking = False
-                self._down(_NO_HANDSHAKE)
-            case EventKind.DISCONNECTED if self.up:
-                self._down("the connection to the relay was lost")
-            case EventKind.CLOSED if not self.up:
-                self._down("the relay does not answer: connecting failed")
-            case _:
-                pass
-
-    def _refused(self, status: int) -> None:
-        if status == _ZAP_UNKNOWN_KEY:
-            self._give_up("relay refused our key: it is not in the relay's directory, or has expired")
-        else:  # libzmq 4.3 says nothing to the client in this case and lets the handshake time out
-            self._down("relay refused us for now: it is full or being reconfigured")
-
-    def _give_up(self, reason: str) -> None:
-        self._down(reason)
-        self._on_rebuild(reason)
-
-    def _down(self, reason: str) -> None:
-        if self.up or reason != self.reason:
-            self.up = False
-            self.reason = reason
-            self._on_down(reason)
-
-
-_ZAP_UNKNOWN_KEY: Final = 400
-_MECHANISM_MISMATCH: Final = 0x11000002  # ZMQ_PROTOCOL_ERROR_ZMTP_MECHANISM_MISMATCH
-_NO_HANDSHAKE: Final = (
-    "the relay ended the handshake: its key is not the one in server_key_file, it is full, or this is no SERN relay"
-)
-
-
-def _protocol_problem(code: int) -> str:
-    if code == _MECHANISM_MISMATCH:
-        return "the handshake with the relay failed: one side has keys configured and the other has not"
-    return f"the handshake with the relay failed (libzmq protocol error {code:#x}): is this a SERN relay?"
 
 
 @dataclass(slots=True)

@@ -53,6 +53,7 @@ class OptionalParts:
             with self.survive(part):
                 reset()
             await asyncio.sleep(pause_s)
+            _log.error("%s is started again, after %g s", part, pause_s)
             pause_s = min(2.0 * pause_s, longest_s)
 
     def register(self, metrics: Metrics) -> None:

@@ -117,6 +117,12 @@ def typestore(encoding: Encoding) -> Typestore:
     return store
 
 
+def load() -> None:
+    """Read both typestores now. They take 50 ms each, which no message of a peer may take from everyone else."""
+    typestore(Encoding.ROS1)
+    typestore(Encoding.CDR)
+
+
 @lru_cache(maxsize=1024)
 def describe(type_name: str, encoding: Encoding) -> TypeText | None:
     """Definition and hash of a type the typestore knows; None for one it does not."""

@@ -1,11 +1,13 @@
 """Counters of topics as JSON: for /api/topics, the summaries written at exit, and the tools that read them."""
 
+from collections.abc import Iterable
 from dataclasses import asdict
 from typing import Any
 
 from sern_core.encoding import ChannelCodec
 from sern_core.ledger import ReceiveLedger
 from sern_core.link import Link
+from sern_core.message import StreamInfo
 from sern_core.types import CLASS_LABELS
 
 TopicView = dict[str, Any]
@@ -58,6 +60,15 @@ def _codec_view(codec: ChannelCodec | None) -> TopicView:
             "profiles": {str(mode): asdict(profile) for mode, profile in codec.profiles.items()},
         }
     }
+
+
+def announced_summary(streams: Iterable[tuple[StreamInfo, bool]]) -> dict[str, TopicView]:
+    """Every topic that is announced at a relay, and whether anybody takes it: `taken`, of its streams any."""
+    result: dict[str, TopicView] = {}
+    for stream, taken in streams:
+        view = result.setdefault(stream.id.topic, {"class": CLASS_LABELS[stream.spec.priority], "taken": False})
+        view["taken"] = view["taken"] or taken
+    return result
 
 
 def received_summary(received: ReceiveLedger, *, now: float) -> dict[str, TopicView]:

@@ -108,10 +108,10 @@ class UdpSession(Sealed):
         self._waiting |= not ready
         return ready
 
-    def send(self, data: bytes) -> SendResult:
-        """Send `data`, at most INNER_BYTES, sealed. FULL: `on_writable` follows; the client has not spoken yet, or its
-        new address has had its share until it is validated, or the kernel's buffer is full. GONE: the session is
-        closed, or its key used up."""
+    def send(self, data: bytes, tos: int | None = None) -> SendResult:
+        """Send `data`, at most INNER_BYTES, sealed, with the IP byte `tos` (default: the server's). FULL: `on_writable`
+        follows; the client has not spoken yet, or its new address has had its share until it is validated, or the
+        kernel's buffer is full. GONE: the session is closed, or its key used up."""
         if len(data) > INNER_BYTES:
             raise UsageError(f"{len(data)} bytes do not fit the UDP lane: at most {INNER_BYTES}")
         if self.closed:
@@ -119,12 +119,12 @@ class UdpSession(Sealed):
         if not self.validated and not self._allowed(len(data) + OVERHEAD_BYTES):
             self._waiting = True
             return SendResult.FULL
-        return self._put(TYPE_DATA, data)
+        return self._put(TYPE_DATA, data, tos)
 
     def _allowed(self, nbytes: int) -> bool:
         return self._sent_bytes + nbytes <= AMPLIFICATION * self._received_bytes
 
-    def _put(self, kind: bytes, payload: bytes) -> SendResult:
+    def _put(self, kind: bytes, payload: bytes, tos: int | None = None) -> SendResult:
         listener = self._listener
         if listener is None:
             return SendResult.FULL
@@ -132,7 +132,7 @@ class UdpSession(Sealed):
             datagram = self.sealer.seal(kind + payload)
         except RekeyError:
             return SendResult.GONE
-        result = listener.send(datagram, self.address)
+        result = listener.send(datagram, self.address, self._server.tos if tos is None else tos)
         if result is SendResult.FULL:
             self._waiting = True
         elif not self.validated:
@@ -253,6 +253,7 @@ class UdpServer:
         self.on_datagram = on_datagram
         self.on_path = on_path
         self.on_writable = on_writable
+        self.tos = tos & 0xFC  # the lower two bits are ECN's
         self.sessions: dict[int, UdpSession] = {}
         self.unknown = 0
         """Datagrams of no session that the kernel's filter did not stop."""
@@ -262,13 +263,13 @@ class UdpServer:
         self._narrowing: asyncio.Handle | None = None
         try:
             for endpoint in listen:
-                self._listen(endpoint, tos, after)
+                self._listen(endpoint, after)
         except BaseException:
             self.close()
             raise
         self._narrow()
 
-    def _listen(self, endpoint: str, tos: int, after: Callable[[], None]) -> None:
+    def _listen(self, endpoint: str, after: Callable[[], None]) -> None:
         def received(view: memoryview, address: Address) -> bool:
             session = self.sessions.get(_ID.unpack_from(view)[0])
             if session is None:
@@ -287,7 +288,7 @@ class UdpServer:
             for session in list(self.sessions.values()):
                 session._listener_writable(listener)
 
-        socket = bound_socket(endpoint, tos=tos)
+        socket = bound_socket(endpoint)
         listener = DatagramSocket(socket, received, after=after, on_writable=writable, on_error=ignore)
         self.listeners.append(listener)
 

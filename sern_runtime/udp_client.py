@@ -71,7 +71,7 @@ class UdpClient(Sealed):
         self._host = host
         self._port = port
         self._after = after
-        self._tos = tos
+        self._tos = tos & 0xFC  # the lower two bits are ECN's
         self._loop = asyncio.get_running_loop()
         self._socket: DatagramSocket | None = None
         self._old: DatagramSocket | None = None
@@ -98,13 +98,14 @@ class UdpClient(Sealed):
         self._waiting |= not ready
         return ready
 
-    def send(self, data: bytes) -> SendResult:
-        """Send `data`, at most INNER_BYTES, sealed. FULL: `on_writable` follows. GONE: closed, or the key used up."""
+    def send(self, data: bytes, tos: int | None = None) -> SendResult:
+        """Send `data`, at most INNER_BYTES, sealed, with the IP byte `tos` (default: the client's). FULL: `on_writable`
+        follows. GONE: closed, or the key used up."""
         if len(data) > INNER_BYTES:
             raise UsageError(f"{len(data)} bytes do not fit the UDP lane: at most {INNER_BYTES}")
         if self.closed:
             return SendResult.GONE
-        return self._put(TYPE_DATA, data)
+        return self._put(TYPE_DATA, data, tos)
 
     def rebind(self) -> None:
         """Take another socket, as the network may have changed: another local port and address, the same session.
@@ -142,7 +143,7 @@ class UdpClient(Sealed):
                 socket.close()
         self._socket = self._old = None
 
-    def _put(self, kind: bytes, payload: bytes) -> SendResult:
+    def _put(self, kind: bytes, payload: bytes, tos: int | None = None) -> SendResult:
         socket = self._socket
         if socket is None:
             self._waiting = True
@@ -151,7 +152,7 @@ class UdpClient(Sealed):
             datagram = self.sealer.seal(kind + payload)
         except RekeyError:
             return SendResult.GONE
-        result = socket.send(datagram, None)
+        result = socket.send(datagram, None, self._tos if tos is None else tos)
         if result is SendResult.FULL:
             self._waiting = True
         return result
@@ -173,7 +174,7 @@ class UdpClient(Sealed):
             if isinstance(address[0], int):
                 continue  # a kernel without IPv6 describes such addresses otherwise
             try:
-                raw = connected_socket(family, address, tos=self._tos)
+                raw = connected_socket(family, address)
             except OSError as error:
                 problem = f"no way to {address[0]}: {(error.strerror or str(error)).lower()}"
             else:

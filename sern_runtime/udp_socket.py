@@ -103,6 +103,12 @@ class DatagramSocket:
         self._fd = socket.fileno()
         self._paused: asyncio.Handle | None = None
         self._blocked = False
+        self._tos = -1  # of the datagram before
+        self._level, self._tos_option = (
+            (socketlib.IPPROTO_IPV6, socketlib.IPV6_TCLASS)
+            if socket.family == socketlib.AF_INET6
+            else (socketlib.IPPROTO_IP, socketlib.IP_TOS)
+        )
         self._filtered = False
         self._closed = False
         self._loop.add_reader(self._fd, self._readable)
@@ -126,10 +132,14 @@ class DatagramSocket:
             return 0
         return int(struct.unpack_from("=I", words, 4 * _MEMINFO_DROPS)[0]) if len(words) > 4 * _MEMINFO_DROPS else 0
 
-    def send(self, datagram: bytes, address: Address | None) -> SendResult:
-        """To `address`, or to the peer of a connected socket. FULL: `on_writable` follows. Whatever else the kernel
-        says is a datagram lost, which UDP allows: OK, counted, and told to `on_error`."""
+    def send(self, datagram: bytes, address: Address | None, tos: int) -> SendResult:
+        """To `address`, or to the peer of a connected socket, with `tos` as its IP byte (DSCP in the upper six bits).
+        FULL: `on_writable` follows. Whatever else the kernel says is a datagram lost, which UDP allows: OK, counted,
+        and told to `on_error`."""
         try:
+            if tos != self._tos:
+                self.socket.setsockopt(self._level, self._tos_option, tos)
+                self._tos = tos
             if address is None:
                 self.socket.send(datagram)
             else:
@@ -260,7 +270,7 @@ def _filter_program(ids: Collection[int]) -> bytes:
     return b"".join(_INSTRUCTION.pack(*instruction) for instruction in program)
 
 
-def bound_socket(endpoint: str, *, tos: int = 0) -> socketlib.socket:
+def bound_socket(endpoint: str) -> socketlib.socket:
     """A socket on `udp://address:port`; `*` is every IPv4 address, or a free port. Raises ConfigError of one line.
 
     On a host with several addresses name the one that clients connect to: from a wildcard the kernel chooses the source
@@ -283,7 +293,7 @@ def bound_socket(endpoint: str, *, tos: int = 0) -> socketlib.socket:
     try:
         if family == socketlib.AF_INET6:
             socket.setsockopt(socketlib.IPPROTO_IPV6, socketlib.IPV6_V6ONLY, 1)  # each family has its own socket
-        prepare(socket, tos=tos)
+        prepare(socket)
         socket.bind(address)
     except OSError as error:
         socket.close()
@@ -291,11 +301,11 @@ def bound_socket(endpoint: str, *, tos: int = 0) -> socketlib.socket:
     return socket
 
 
-def connected_socket(family: int, address: Address, *, tos: int = 0) -> socketlib.socket:
+def connected_socket(family: int, address: Address) -> socketlib.socket:
     """Raises OSError when the kernel knows no way to `address`."""
     socket = socketlib.socket(family, socketlib.SOCK_DGRAM)
     try:
-        prepare(socket, tos=tos)
+        prepare(socket)
         socket.connect(address)
     except OSError:
         socket.close()
@@ -303,8 +313,8 @@ def connected_socket(family: int, address: Address, *, tos: int = 0) -> socketli
     return socket
 
 
-def prepare(socket: socketlib.socket, *, tos: int) -> None:
-    """Options of both sides. `tos`: the IP byte, DSCP in its upper six bits (0xB8: expedited forwarding).
+def prepare(socket: socketlib.socket) -> None:
+    """Options of both sides.
 
     Don't Fragment is set, and what the kernel believes to know of the path's MTU is ignored (PMTUDISC_PROBE): a
     fragmented datagram is lost with any of its pieces, and believing ICMP would let anybody shrink the path. A path
@@ -313,13 +323,10 @@ def prepare(socket: socketlib.socket, *, tos: int) -> None:
     socket.setblocking(False)
     socket.setsockopt(socketlib.SOL_SOCKET, socketlib.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
     socket.setsockopt(socketlib.SOL_SOCKET, socketlib.SO_SNDBUF, SEND_BUFFER_BYTES)
-    dscp = tos & 0xFC  # the lower two are ECN's
     if socket.family == socketlib.AF_INET6:
         socket.setsockopt(socketlib.IPPROTO_IPV6, _IPV6_MTU_DISCOVER, _PMTUDISC_PROBE)
-        socket.setsockopt(socketlib.IPPROTO_IPV6, socketlib.IPV6_TCLASS, dscp)
     else:
         socket.setsockopt(socketlib.IPPROTO_IP, _IP_MTU_DISCOVER, _PMTUDISC_PROBE)
-        socket.setsockopt(socketlib.IPPROTO_IP, socketlib.IP_TOS, dscp)
 
 
 def split_udp(endpoint: str) -> tuple[str, int]:

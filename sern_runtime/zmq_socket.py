@@ -54,8 +54,6 @@ RCVHWM: Final = 256
 MAX_MESSAGE_BYTES: Final = 64 * 1024
 """Frames above it close the connection. Without it eight unauthenticated connections cost 479 MB (measured)."""
 BACKLOG: Final = 512
-TOS_EXPEDITED: Final = 0xB8
-"""DSCP EF, for the connection that carries class 0 alone."""
 
 BATCH: Final = 200
 """Messages taken in one callback, about 0.3 ms: others in the loop get their turn."""

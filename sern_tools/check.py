@@ -1,5 +1,7 @@
-"""`sern check FILE`: is this relay, client or key file right? Offline: nothing is connected to or changed."""
+"""`sern check FILE`: is this relay, client or key file right? Nothing is connected to or changed: of a client's relay
+only the name is looked up."""
 
+import asyncio
 import difflib
 from collections.abc import Iterable
 from pathlib import Path
@@ -10,7 +12,9 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from sern_client.relay_name import name_in, unresolved
 from sern_core.errors import ConfigError
+from sern_core.types import ClientName
 from sern_runtime import keys
 from sern_runtime.config.base import FileModel
 from sern_runtime.config.client import ClientFile
@@ -20,6 +24,8 @@ from sern_runtime.config.yaml import Document, read_document
 
 EXIT_OK: Final = 0
 EXIT_USER_ERROR: Final = 2
+RESOLVE_S: Final = 5.0
+"""How long the resolver is waited for."""
 _KEY_FILES: Final[dict[str, type[FileModel]]] = {"public": keys.PublicKeyFile, "secret": keys.SecretKeyFile}
 
 
@@ -41,9 +47,31 @@ def run_check(path: Path, *, out: Console | None = None, err: Console | None = N
     if isinstance(loaded.model, keys.SecretKeyFile):
         warning = keys.secret_warning(path)
         _lines(err, [f"warning: {warning}"] if warning else [])
+    if isinstance(loaded.model, (keys.PublicKeyFile, keys.SecretKeyFile)):
+        odd = keys.misnamed(path, ClientName(loaded.model.name))
+        _lines(err, [f"warning: {odd}"] if odd else [])
     _lines(err, [f"warning: {text}" for text in loaded.warnings])
+    if isinstance(loaded.model, ClientFile):
+        problem = _unresolved(loaded.model.relay.endpoint)
+        if problem is not None:  # no error: the file may be for another machine, and the name be made later
+            _lines(err, [f"warning: {document.error(('relay', 'endpoint'), problem)}"])
     _summary(out, loaded)
     return EXIT_OK
+
+
+def _unresolved(endpoint: str) -> str | None:
+    named = name_in(endpoint)
+    if named is None:
+        return None
+
+    async def ask() -> str | None:
+        try:
+            return await asyncio.wait_for(unresolved(*named), RESOLVE_S)
+        except TimeoutError:
+            return f"no answer within {RESOLVE_S:g} s"
+
+    why = asyncio.run(ask())
+    return None if why is None else f"{named[0]} does not resolve on this machine now: {why}"
 
 
 def detect(document: Document) -> type[FileModel]:

@@ -11,7 +11,6 @@ Whatever happens, no process and no temporary file is left: children are stopped
 
 import asyncio
 import shlex
-import shutil
 import signal
 import sys
 import tempfile
@@ -32,6 +31,7 @@ from sern_core.errors import ConfigError, SernError
 from sern_runtime.profiles import load_profile
 from sern_tools import demo_report
 from sern_tools.counters import Counters, read_counters
+from sern_tools.demo_behaviour import Behaviour, Look
 from sern_tools.demo_link import LinkProcess, free_ports
 from sern_tools.demo_live import LiveView, Sample, join
 from sern_tools.demo_report import Carried, Report
@@ -49,7 +49,7 @@ from sern_tools.demo_scenario import (
     write_files,
 )
 from sern_tools.message_log import TopicLog, read_logs
-from sern_tools.processes import Child, Children, program
+from sern_tools.processes import Child, Children, program, swept
 from sern_tools.shaping import RateSchedule
 from sern_tools.summary import RunFacts, analyse, judge
 
@@ -91,6 +91,7 @@ class Run:
     origin_ns: int = 0
     carried: Carried = field(default_factory=lambda: Carried(1.0, ()))
     files: Mapping[str, Path] = field(default_factory=dict)
+    behaviour: Behaviour = field(default_factory=Behaviour)
 
 
 class Demo:
@@ -148,7 +149,7 @@ class Demo:
 
     async def _start_baseline(self, children: Children, directory: Path) -> tuple[LinkProcess, Child, Child]:
         publish, subscribe = free_ports(2)
-        files = write_files(directory / "config", self.scenario, Ports(*free_ports(5)))
+        files = write_files(directory / "config", self.scenario, Ports(*free_ports(4)))
         base = [sys.executable, "-m", "sern_tools.baseline"]
         site = await children.start(
             "baseline-site",
@@ -175,10 +176,15 @@ class Demo:
         await robot.read_object()
         return link, robot, site
 
-    async def _start_link(self, children: Children, targets: list[int]) -> LinkProcess:
-        profile = self.scenario.profile.name
+    async def _start_link(self, children: Children, targets: list[int], *, datagrams: bool = False) -> LinkProcess:
         return await LinkProcess.start(
-            children, "proxy", targets, profile=profile, profiles=self.options.profiles, seed=self.scenario.seed
+            children,
+            "proxy",
+            targets,
+            profile=self.scenario.profile.name,
+            profiles=self.options.profiles,
+            seed=self.scenario.seed,
+            datagrams=datagrams,
         )
 
     async def run_baseline(self) -> Run:
@@ -220,9 +226,9 @@ class Demo:
         relay_port, *http_ports = free_ports(4)
         timeout = aiohttp.ClientTimeout(total=2.0)
         async with aiohttp.ClientSession(timeout=timeout) as session, Children(directory) as children:
-            link = await self._start_link(children, [relay_port])
+            link = await self._start_link(children, [relay_port], datagrams=True)
             try:
-                ports = Ports(relay_port, link.ports[0], *http_ports)
+                ports = Ports(relay_port, *http_ports)
                 files = write_files(directory / "config", self.scenario, ports)
                 web = {
                     name: f"http://{HOST}:{port}" for name, port in zip((RELAY, ROBOT, SITE), http_ports, strict=True)
@@ -234,12 +240,18 @@ class Demo:
                     await self._until(children, f"{name} is ready", partial(_ready, session, web[name]))
                 await self._until(children, "the robot's messages arrive", partial(_arriving, session, web[SITE]))
 
+                behaviour = Behaviour()
+
                 async def sample(t_s: float, statistics: Mapping[str, Any]) -> Sample:
                     topics = [await _get(session, f"{web[name]}/api/topics") or {} for name in (ROBOT, SITE)]
                     links = await _get(session, f"{web[ROBOT]}/api/link") or []
+                    mmcf = await _get(session, f"{web[ROBOT]}/api/mmcf") or {}
+                    adapting = next(iter(mmcf.get("links", ())), None)
+                    behaviour.looks.append(Look.of(t_s, next(iter(links), None), adapting))
                     return _with_links(_sample(t_s, statistics, topics), links)
 
                 run = await self._watch(children, link, SERN_NAME, sample)
+                run.behaviour = behaviour
                 # Upstream first: what the robot still has goes to the relay, and from there to the site.
                 await children.stop([daemons[ROBOT]])
                 await self._drained(session, web[RELAY])
@@ -311,7 +323,16 @@ class Demo:
         # First in, first out overtakes nobody: the class order is nothing to compare plain ZMQ by.
         others = judge(results[1], None, overtaken_share_limits={}) if baseline else ()
         comparison = {verdict.name: verdict for verdict in others}
-        return Report(self.options.command, started, self.scenario, results, verdicts, carried, comparison)
+        return Report(
+            self.options.command,
+            started,
+            self.scenario,
+            results,
+            verdicts,
+            carried,
+            comparison,
+            behaviour=sern.behaviour,
+        )
 
     def _facts(self, floor_s: Mapping[str, float], run: Run, logs: Mapping[str, TopicLog]) -> RunFacts:
         poses = {name: log.offered for name, log in logs.items() if log.priority == "control" and log.origin == ROBOT}
@@ -391,11 +412,8 @@ def _working_directory(options: Options) -> Iterator[Path]:
         path.mkdir(parents=True)
         yield path
         return
-    path = Path(tempfile.mkdtemp(prefix="sern-demo-"))
-    try:
+    with swept(Path(tempfile.mkdtemp(prefix="sern-demo-"))) as path:
         yield path
-    finally:
-        shutil.rmtree(path, ignore_errors=True)
 
 
 async def run(options: Options, console: Console) -> int:

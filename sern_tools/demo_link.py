@@ -12,6 +12,7 @@ from typing import Any, Final
 
 from sern_core.errors import SernError
 from sern_tools.demo_report import Carried
+from sern_tools.demo_scenario import FAR_HOST
 from sern_tools.processes import Child, Children
 from sern_tools.proxy import address
 
@@ -47,11 +48,24 @@ class LinkProcess:
 
     @classmethod
     async def start(
-        cls, children: Children, name: str, targets: list[int], *, profile: str, profiles: Path | None, seed: int
+        cls,
+        children: Children,
+        name: str,
+        targets: list[int],
+        *,
+        profile: str,
+        profiles: Path | None,
+        seed: int,
+        datagrams: bool = False,
     ) -> "LinkProcess":
+        """With `datagrams` it listens on `FAR_HOST`, TCP and UDP, on the very ports of its targets: a relay tells its
+        clients the number of its UDP port, and not where a proxy has it."""
         command = [sys.executable, "-m", "sern_tools.proxy", "--profile", profile, "--seed", str(seed)]
         for port in targets:
-            command += ["--listen", f"{HOST}:0", "--target", f"{HOST}:{port}"]
+            listen = f"{FAR_HOST}:{port}" if datagrams else f"{HOST}:0"
+            command += ["--listen", listen, "--target", f"{HOST}:{port}"]
+        if datagrams:
+            command.append("--udp")
         if profiles is not None:
             command += ["--profiles", str(profiles)]
         child = await children.start(name, command, talks=True)

@@ -18,6 +18,7 @@ from sern_core.types import CLASS_LABELS
 from sern_sim.profiles import LinkProfile
 from sern_tools import demo_charts
 from sern_tools.checkout import commit
+from sern_tools.demo_behaviour import Behaviour
 from sern_tools.demo_live import rate
 from sern_tools.demo_scenario import Scenario
 from sern_tools.summary import Result, Statistics, Verdict
@@ -44,6 +45,8 @@ class Report:
     comparison: Mapping[str, Verdict] = field(default_factory=dict)
     """What the baseline, which promises none of it, measured to: by the name of the verdict."""
     remarks: Sequence[str] = ()
+    behaviour: Behaviour = field(default_factory=Behaviour)
+    """What SERN did in its run."""
 
     @property
     def ok(self) -> bool:
@@ -67,6 +70,8 @@ def as_json(report: Report) -> str:
         link |= {f"idle_from_{origin}_s": _number(value) for origin, value in sorted(result.facts.floor_s.items())}
         for number, seconds in enumerate(result.first_fresh_pose_s, start=1):
             link[f"first_fresh_pose_{number}_s"] = _number(seconds)
+        if result is report.results[0]:
+            link |= report.behaviour.as_row()
         rows.append(link)
     reach = [
         {"name": v.name, "value": _number(v.value), "limit": _number(v.limit), "ok": v.ok} for v in report.verdicts
@@ -121,6 +126,10 @@ def print_summary(report: Report, console: Console) -> None:
             reasons = drop_words(result.classes[label])
             if reasons:
                 console.print(f"{result.system}, {label}: {reasons}", highlight=False)
+    behaved = Table.grid(padding=(0, 2, 0, 0))
+    for name, words in _behaviour(report):
+        behaved.add_row(f"{report.results[0].system}, {name}:", words)
+    console.print(behaved)
     console.print()
     promises = Table.grid(padding=(0, 2, 0, 0))
     for verdict in report.verdicts:
@@ -129,6 +138,10 @@ def print_summary(report: Report, console: Console) -> None:
     console.print(promises)
     for remark in report.remarks:
         console.print(remark, highlight=False, style="yellow", markup=False)
+
+
+def _behaviour(report: Report) -> list[tuple[str, str]]:
+    return report.behaviour.rows(report.results[0].classes["bulk"].delivered_share)
 
 
 def measured(verdict: Verdict) -> str:
@@ -224,6 +237,7 @@ def as_html(report: Report) -> str:
         _verdict_table(report),
         "<h2>What became of the messages</h2>",
         _class_table(report.results),
+        *_behaviour_table(report),
         *_figures(report),
         "<h2>By topic</h2>",
         *(_topic_table(result) for result in report.results),
@@ -236,6 +250,11 @@ def as_html(report: Report) -> str:
         "</body></html>",
     ]
     return "\n".join(parts) + "\n"
+
+
+def _behaviour_table(report: Report) -> list[str]:
+    cells = [f"<tr><td>{name}</td><td>{html.escape(words)}</td></tr>" for name, words in _behaviour(report)]
+    return [f"<h2>How {report.results[0].system} behaved</h2>", "<table>", *cells, "</table>"] if cells else []
 
 
 def _verdict_table(report: Report) -> str:
@@ -328,15 +347,16 @@ def _notes(report: Report) -> list[str]:
     profile: LinkProfile = report.scenario.profile
     notes = [
         "Relay, robot and site ran as processes of their own on one machine, so one clock stamped both ends. The robot "
-        "reached the relay through a proxy that shapes TCP: rate, delay, jitter, a queue of "
-        f"{profile.queue_packets} packets, 64 kB of socket buffers, and blackouts that freeze bytes and new "
+        "reached the relay through a proxy that shapes TCP and UDP as one link: rate, delay, jitter, a queue of "
+        f"{profile.queue_packets} packets, 64 kB of socket buffers, and blackouts that freeze bytes, datagrams and new "
         "connections alike. The site was beside the relay; commands went the other way through the same proxy.",
         "<b>The proxy does not represent TCP's own loss recovery.</b> Its bytes are a TCP stream, so packet loss is "
-        "not applied"
+        "applied to datagrams only"
         + (f" (this profile has {100 * profile.up.mean_loss:.2g} %)" if profile.up.mean_loss else "")
-        + ", and after a blackout bytes move again at once instead of after TCP's retransmission timer. Both systems "
-        "are spared this alike; the lab (<code>tc netem</code>) is where it is measured.",
-        "SERN talks over its ZMQ lane here: the proxy carries no UDP.",
+        + ", and after a blackout bytes move again at once instead of after TCP's retransmission timer. Over TCP "
+        "both systems are spared this alike; the lab (<code>tc netem</code>) is where it is measured.",
+        "SERN may use its datagram lane and its adaptation, as it does in the field; datagrams share the link with "
+        "TCP, and the profile's loss is theirs. How much it used them is told above.",
     ]
     if len(report.results) > 1:
         notes += [

@@ -20,6 +20,8 @@ from sern_sim.profiles import LinkProfile
 from sern_tools.shaping import RateSchedule
 
 HOST: Final = "127.0.0.1"
+FAR_HOST: Final = "127.0.0.2"
+"""Where the robot finds the relay: the address of the shaping proxy, another one of loopback's."""
 RELAY, ROBOT, SITE = "relay", "robot", "site"
 COMMAND_TOPIC: Final = "/robot/cmd_vel"
 POSE_TOPIC: Final = "/robot/odometry/filtered"
@@ -37,14 +39,19 @@ ODOMETRY_BYTES: Final = 730
 POSE_BYTES: Final = 110
 CLOUD_LIFESPAN_S: Final = 3.0
 """A cloud of the demo may take a while on a link that has just become four times slower, and is still of use."""
+ADAPTATION: Final = {
+    "deadlines_s": {"bulk": CLOUD_LIFESPAN_S},
+    "limits": {"min_rates": {"control": 1.0, "state": 1.0, "bulk": 0.4}},
+}
+"""The robot's: the defaults, but clouds have their lifespan to arrive, and as many are let in as the link carries of
+twice its load."""
 
 
 @dataclass(frozen=True)
 class Ports:
-    """TCP ports on loopback; `link` is the proxy's, towards the robot."""
+    """Ports on loopback; the relay's is the proxy's too, at another address."""
 
     relay: int
-    link: int
     relay_http: int
     robot_http: int
     site_http: int
@@ -162,7 +169,13 @@ def write_files(directory: Path, scenario: Scenario, ports: Ports) -> dict[str, 
     files = {
         RELAY: _relay(ports),
         ROBOT: _client(
-            ROBOT, ports.link, ports.robot_http, scenario.robot_endpoints, scenario.robot_rules, discovery="dynamic"
+            ROBOT,
+            FAR_HOST,
+            ports,
+            ports.robot_http,
+            scenario.robot_endpoints,
+            scenario.robot_rules,
+            discovery="dynamic",
         ),
         SITE: _site(scenario, ports),
     }
@@ -193,16 +206,15 @@ def _relay(ports: Ports) -> dict[str, Any]:
 
 
 def _client(
-    name: str, relay_port: int, http_port: int, endpoint: Sequence[dict[str, Any]], topics: Sequence[dict[str, Any]],
-    **discovery: str,
+    name: str, relay_host: str, ports: Ports, http_port: int, endpoint: Sequence[dict[str, Any]],
+    topics: Sequence[dict[str, Any]], **discovery: str,
 ) -> dict[str, Any]:  # fmt: skip
     content: dict[str, Any] = {
         "client": {"name": name},
         "relay": {
-            "endpoint": f"tcp://{HOST}:{relay_port}",
+            "endpoint": f"tcp://{relay_host}:{ports.relay}",
             "server_key_file": f"{RELAY}.pub",
             "secret_key_file": f"{name}.key",
-            "udp": False,  # the shaping proxy carries TCP only
         },
         "endpoint": list(endpoint),
         "topics": list(topics),
@@ -212,6 +224,7 @@ def _client(
     }
     if discovery:
         content["discovery"] = {"mode": discovery["discovery"]}
+        content["adaptation"] = ADAPTATION
     return content
 
 
@@ -226,7 +239,7 @@ def _site(scenario: Scenario, ports: Ports) -> dict[str, Any]:
     }
     commands = {"match": COMMAND_TOPIC, "class": "control", "direction": "send", "reliability": "best_effort"}
     rules = [{**commands, "depth": 1, "lifespan_s": scenario.command_lifespan_s}]
-    content = _client(SITE, ports.relay, ports.site_http, [operator], rules)
+    content = _client(SITE, HOST, ports, ports.site_http, [operator], rules)
     content["client"]["namespace"] = "/"  # it commands the robot by the robot's own topic
     content["subscribe"] = [f"/{ROBOT}/.*"]
     return content

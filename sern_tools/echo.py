@@ -1,11 +1,12 @@
 """`sern echo TOPIC`: print the messages of a topic as they pass, as text that is YAML.
 
-It is a client of the relay like any other, with a key and a name of its own: so access rules hold, what it prints is
-what a site would get, and its ages are a site's. It must not borrow the name of a client that runs: one name has one
-connection, and what is delivered to it counts as delivered. When it ends it takes its subscription back, so that the
-relay keeps nothing for it.
+It asks the daemon on this machine (`--api`, as `sern topics` does), which needs no key: it polls a relay's registry for
+the latest value.
 
-With `--api` it is no client: it polls the relay's registry for the latest value, where there is no key at hand.
+With `--relay` or `--config` it is a client of the relay like any other, with a key and a name of its own: so access
+rules hold, what it prints is every message that a site would get, and its ages are a site's. It must not borrow the
+name of a client that runs: one name has one connection, and what is delivered to it counts as delivered. When it ends
+it takes its subscription back, so that the relay keeps nothing for it.
 """
 
 import asyncio
@@ -33,12 +34,13 @@ from sern_core.errors import ConfigError, RefusedError, SernError, UsageError
 from sern_core.message import Message, StreamId, StreamInfo
 from sern_core.params import LinkParams, SchedulerParams
 from sern_core.rules import client_name, name_problem
+from sern_core.session import DISPLACED
 from sern_core.types import ClientName, DropReason, Encoding, TopicName
 from sern_runtime import clock
 from sern_runtime.config.client import RelayConnection, load_client
 from sern_runtime.keys import SecretKey, load_public, load_secret
 from sern_runtime.loop import Shutdown, run
-from sern_tools.api import checked_api, drop_output, get_json, is_stream, say
+from sern_tools.api import DEFAULT_API, NotFoundError, checked_api, drop_output, get_json, is_stream, say
 from sern_tools.echo_text import Decoder
 
 DEFAULT_TIMEOUT_S: Final = 5.0
@@ -50,6 +52,7 @@ RIVAL_TURNS: Final = 3
 """New sessions on one connection, after which somebody else must be using our name."""
 NEW_SESSION: Final = "new session"
 """The reason that `sern_core.link` gives when the relay has it begin anew on a connection that is up."""
+TAKEN: Final = "another process connected as "
 _CHECK_S: Final = 0.05
 
 
@@ -225,7 +228,7 @@ class Listener:
     def link_down(self, reason: str) -> None:
         if reason == NEW_SESSION:
             self.turns += 1
-        elif not self.done:
+        elif not self.done and not reason.startswith(TAKEN):  # `rejected` says it next
             self._warn(f"link down: {reason}; waiting")
 
     def lane_offered(self, parameters: wire.Envelope) -> None:
@@ -235,6 +238,9 @@ class Listener:
         """There is none."""
 
     def rejected(self, code: str, text: str) -> None:
+        if code == DISPLACED:  # the guest gives way
+            self.problem = RefusedError(code, f"{text}: sern keygen client NAME")
+            return
         self.problem = RefusedError(code, f"the relay refuses us: {text}")
 
     def stream_opened(self, stream: StreamInfo) -> None:
@@ -408,16 +414,37 @@ def _refuse_a_running_daemon(identity: Identity) -> None:
 
 
 async def poll(
-    topic: str, api: str, printer: Printer, shutdown: Shutdown, decoder: Decoder, *, timeout_s: float
+    topic: str,
+    api: str,
+    printer: Printer,
+    shutdown: Shutdown,
+    decoder: Decoder,
+    *,
+    timeout_s: float,
+    warn: Callable[[str], None],
 ) -> None:
     """Print the latest value of `topic` whenever the registry at `api` has a newer one. Raises SernError."""
     shown: dict[str, int] = {}
     began_s = clock.now()
+    warned = False
     while not shutdown.requested:
-        answer = await asyncio.to_thread(get_json, api, "/api/objects")
+        try:
+            answer = await asyncio.to_thread(get_json, api, "/api/objects")
+        except NotFoundError:
+            raise SernError(
+                f"{api} is a client's: only a relay keeps values; give its address with --api, or connect as a client: "
+                "--relay, --key and --server-key"
+            ) from None
         found = [item for item in answer["objects"] if is_stream(item) and item["attributes"]["topic"] == topic]
         if not found and not shown and timeout_s and clock.now() - began_s > timeout_s:
             raise SernError(f"{api}: no topic {topic} within {timeout_s:g} s; `sern topics` lists what there is")
+        if found and not shown and not warned and timeout_s and clock.now() - began_s > timeout_s:
+            warned = all(item["value"] is None for item in found)
+            if warned:
+                warn(
+                    f"{topic} of {found[0]['owner']} is announced, and the relay has no message of it: nothing is "
+                    "published, or nobody takes it (`sern topics` marks that); a client has it sent: --relay"
+                )
         for item in found:
             value = item["value"]
             if value is None or shown.get(item["id"]) == item["version"]:
@@ -467,16 +494,19 @@ def run_echo(
     problem = name_problem(topic)
     if problem is not None:
         raise UsageError(f"topic {topic!r} {problem}")
-    if sum(source is not None for source in (config, relay, api)) != 1:
-        raise UsageError("say where to listen: --relay with --key and --server-key, or --config FILE, or --api URL")
+    if sum(source is not None for source in (config, relay, api)) > 1:
+        raise UsageError("give one place to listen at: --api URL, or --relay with its keys, or --config FILE")
     if relay is None and (key, server_key, name) != (None, None, None):
         raise UsageError("--key, --server-key and --name go with --relay")
     decoder = Decoder(raw=raw, full=full)
-    if api is not None:
+    if config is None and relay is None:
         if rate:
-            raise UsageError("--rate needs every message, and --api sees only the latest; connect as a client")
-        printer, address = Printer(decoder, out, count=count), checked_api(api)
-        run(lambda shutdown: poll(topic, address, printer, shutdown, decoder, timeout_s=timeout_s))
+            raise UsageError(
+                "--rate needs every message, and --api sees only the latest; connect as a client: --relay, --key and "
+                "--server-key"
+            )
+        printer, address = Printer(decoder, out, count=count), checked_api(api or DEFAULT_API)
+        run(lambda shutdown: poll(topic, address, printer, shutdown, decoder, timeout_s=timeout_s, warn=_warn))
         return
     if config is not None:
         identity = identity_from_file(config)
@@ -500,7 +530,10 @@ def echo(
         Path | None, typer.Option("--config", "-c", help="A client file to take name, relay and keys from.")
     ] = None,
     api: Annotated[
-        str | None, typer.Option("--api", help="Without a key: latest values from the relay's HTTP address.")
+        str | None,
+        typer.Option(
+            "--api", help=f"Latest values, without a key, from a relay's HTTP address [default: {DEFAULT_API}]."
+        ),
     ] = None,
     count: Annotated[int | None, typer.Option("--count", "-n", min=1, help="End after so many messages.")] = None,
     raw: Annotated[bool, typer.Option("--raw", help="The bytes in hex, not decoded.")] = False,
@@ -512,7 +545,8 @@ def echo(
 ) -> None:
     """Print the messages of a topic as they pass.
 
-    As a client of the relay with a key of its own, so access rules hold. Exit code 0 when ended by Ctrl-C or --count,
+    From the relay on this machine its latest values, looked at twice a second; with --relay or --config every message,
+    as a client of the relay with a key of its own, so access rules hold. Exit code 0 when ended by Ctrl-C or --count,
     1 when relay or topic could not be had or decoded, 2 for wrong usage or configuration.
     """
     try:

@@ -6,18 +6,21 @@ children the way a supervisor does: SIGTERM, time to drain, SIGKILL.
 
 import asyncio
 import contextlib
-import ctypes
+import errno
 import json
 import os
+import shutil
 import signal
+import subprocess
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Any, Final, Self
 
 from sern_core.errors import SernError
+from sern_tools import child as launcher
+from sern_tools import sweeper as sweeping
 
 DRAIN_S: Final = 45.0
 """How long a child may take to end after SIGTERM when all is well: a daemon drains first."""
@@ -25,16 +28,30 @@ ABORT_S: Final = 5.0
 """The same when the whole is being given up."""
 TAIL_LINES: Final = 3
 LINE_BYTES: Final = 2**20
-PR_SET_PDEATHSIG: Final = 1
-"""linux/prctl.h"""
-_libc: Final = ctypes.CDLL(None, use_errno=True)
+_PLAIN_PYTHON: Final = (sys.executable, "-I", "-S")
+"""For helpers that import nothing that is installed."""
 
 
-def _die_with(parent: int) -> None:
-    """In the child, before it becomes its program: SIGKILL when the parent ends, even by kill -9."""
-    _libc.prctl(PR_SET_PDEATHSIG, int(signal.SIGKILL))
-    if os.getppid() != parent:  # it ended meanwhile
-        os._exit(1)
+def bound(command: Sequence[str]) -> list[str]:
+    """`command` as one that gets SIGKILL when this process ends, even by kill -9. FileNotFoundError."""
+    found = shutil.which(command[0])
+    if found is None:
+        raise FileNotFoundError(errno.ENOENT, "no such program", command[0])
+    return [*_PLAIN_PYTHON, launcher.__file__, str(os.getpid()), found, *command[1:]]
+
+
+@contextlib.contextmanager
+def swept(directory: Path) -> Iterator[Path]:
+    """Remove `directory` at the end of the block, or of this process if that comes first, even by kill -9."""
+    sweeper = subprocess.Popen(
+        [*_PLAIN_PYTHON, sweeping.__file__, str(directory)], stdin=subprocess.PIPE, start_new_session=True
+    )
+    try:
+        yield directory
+    finally:
+        assert sweeper.stdin is not None
+        sweeper.stdin.close()
+        sweeper.wait()
 
 
 @dataclass(eq=False)
@@ -121,12 +138,11 @@ class Children:
         try:
             with log.open("wb") as stream:
                 process = await asyncio.create_subprocess_exec(
-                    *command,
+                    *bound(command),
                     stdin=pipe or asyncio.subprocess.DEVNULL,
                     stdout=pipe or stream,
                     stderr=stream,
                     start_new_session=True,
-                    preexec_fn=partial(_die_with, os.getpid()),
                     env={**os.environ, **(environment or {})},
                     limit=LINE_BYTES,
                 )

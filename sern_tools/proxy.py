@@ -1,13 +1,14 @@
-"""A TCP proxy that makes a good link bad, fairly: the same badness for whoever is measured through it.
+"""A proxy that makes a good link bad, fairly: the same badness for whoever is measured through it.
 
-Bytes of all connections in one direction share one bottleneck (`shaping.Shaper`): rate over time, delay, jitter, and
-a queue of 100 packets. When the queue is full the proxy stops reading, and its socket buffers are fixed and small, so
-that a sender feels the link within a few hundred milliseconds instead of hiding seconds of data in the kernel. The
-segment size is clamped to Ethernet's, because on loopback a 64 kB segment lets the *sender's* buffer grow to
-megabytes. A blackout freezes bytes and new connections alike; established connections stay open and go on after it.
+Bytes of all connections in one direction, and datagrams beside them (`--udp`), share one bottleneck (`shaping.Shaper`):
+rate over time, delay, jitter, and a queue of 100 packets. When the queue is full datagrams are dropped, and the proxy
+stops reading from connections; its socket buffers are fixed and small, so that a sender feels the link within a few
+hundred milliseconds instead of hiding seconds of data in the kernel. The segment size is clamped to Ethernet's, because
+on loopback a 64 kB segment lets the *sender's* buffer grow to megabytes. A blackout freezes bytes, datagrams and new
+connections alike; established connections stay open and go on after it.
 
-What it cannot show: packet loss. The bytes are a TCP stream, so the loss of a profile is not applied, and TCP's own
-loss recovery is not represented. Tests with tc netem do that.
+What it cannot show: packet loss under TCP. Those bytes are a stream, so the loss of a profile is applied to datagrams
+only, and TCP's own loss recovery is not represented. Tests with tc netem do that.
 
 Run as a process:  python -m sern_tools.proxy --listen 127.0.0.1:0 --target 127.0.0.1:5555 --profile demo --seed 1
 It prints one JSON line when ready, and answers one JSON line per line on its control port:
@@ -35,6 +36,7 @@ from typing import Final, Self
 from sern_core.errors import SernError
 from sern_sim.models import LinkModel
 from sern_sim.profiles import LinkProfile
+from sern_tools.proxy_datagrams import DatagramRoute, Loss
 from sern_tools.shaping import SLOT_BYTES, Shaper
 
 SOCKET_BUFFER_BYTES: Final = 32 * 1024
@@ -91,10 +93,13 @@ class _Connection:
 class _Direction:
     """Everything that moves one way: the shaper, the packets on their way, the pipes that wait to be read."""
 
-    def __init__(self, proxy: "ShapingProxy", shaper: Shaper) -> None:
+    def __init__(self, proxy: "ShapingProxy", shaper: Shaper, loss_seed: str) -> None:
         self.proxy = proxy
         self.shaper = shaper
-        self.line: deque[tuple[float, _Pipe, bytes | None]] = deque()  # (arrival, pipe, bytes or end)
+        self.line: deque[tuple[float, _Pipe | Callable[[bytes], None], bytes | None]] = deque()
+        """(arrival, pipe, bytes or end); of a datagram: what delivers it."""
+        self.loss = Loss(shaper.model, Random(loss_seed))
+        self.datagrams = self.datagrams_dropped = self.datagrams_lost = 0
         self.waiting: deque[_Pipe] = deque()  # pipes whose reading is paused for want of a slot
         self.delivered_bytes = 0
         self.buckets: dict[int, int] = {}
@@ -167,7 +172,20 @@ class _Direction:
 
     # -- delivering ------------------------------------------------------------------------------------------------
 
-    def _put(self, arrival: float, pipe: _Pipe, chunk: bytes | None) -> None:
+    def carry(self, datagram: bytes, deliver: Callable[[bytes], None]) -> None:
+        """Queue a datagram; dropped where the queue is full, lost behind the bottleneck where the model says so."""
+        now = time.monotonic()
+        self.datagrams += 1
+        if self.shaper.free_slots(now) <= 0:
+            self.datagrams_dropped += 1
+            return
+        arrival = self.shaper.admit(len(datagram), now)
+        if self.loss.strikes():
+            self.datagrams_lost += 1
+        else:
+            self._put(arrival, deliver, datagram)
+
+    def _put(self, arrival: float, pipe: _Pipe | Callable[[bytes], None], chunk: bytes | None) -> None:
         self.line.append((arrival, pipe, chunk))
         if self._timer is None:
             self._arm()
@@ -187,11 +205,15 @@ class _Direction:
         carried = 0
         while line and line[0][0] <= due:
             _, pipe, chunk = line.popleft()
-            if chunk is None:
+            if chunk is not None:
+                carried += len(chunk)
+            if not isinstance(pipe, _Pipe):
+                if chunk is not None:
+                    pipe(chunk)
+            elif chunk is None:
                 ends.append(pipe)
             else:
                 burst.setdefault(pipe, []).append(chunk)
-                carried += len(chunk)
         self.delivered_bytes += carried
         bucket = int((now - self.shaper.origin_s) // STATISTICS_BUCKET_S)
         self.buckets[bucket] = self.buckets.get(bucket, 0) + carried
@@ -216,11 +238,16 @@ class ShapingProxy:
 
     `up` is what a client sends to the target, `down` the way back. `addresses` are the real listening addresses, in
     the order of `routes`. `start(at_s)` puts time 0 of the models' script at that CLOCK_MONOTONIC time. All routes
-    share the one link. Raises OSError when an address cannot be listened on.
+    share the one link; with `datagrams` they carry UDP on the same ports too. Raises OSError when an address cannot be
+    listened on.
     """
 
-    def __init__(self, up: LinkModel, down: LinkModel, routes: Sequence[Route], *, seed: int = 0) -> None:
+    def __init__(
+        self, up: LinkModel, down: LinkModel, routes: Sequence[Route], *, seed: int = 0, datagrams: bool = False
+    ) -> None:
         self.routes = tuple(routes)
+        self._carries_datagrams = datagrams
+        self._datagrams: list[DatagramRoute] = []
         self.addresses: list[tuple[str, int]] = []
         self.connections: set[_Connection] = set()
         self.accepted = 0
@@ -228,7 +255,7 @@ class ShapingProxy:
         self._rtt_s = up.delay_s + down.delay_s
         origin = time.monotonic() + NOT_STARTED_S
         self._directions = {
-            name: _Direction(self, Shaper(model, rng=Random(f"{seed} {name}"), origin_s=origin))
+            name: _Direction(self, Shaper(model, rng=Random(f"{seed} {name}"), origin_s=origin), f"{seed} {name} loss")
             for name, model in (("up", up), ("down", down))
         }
         self._listeners: list[socket.socket] = []
@@ -255,6 +282,9 @@ class ShapingProxy:
             self.loop.remove_reader(listener)
             listener.close()
         self._listeners.clear()
+        for datagrams in self._datagrams:
+            datagrams.close()
+        self._datagrams.clear()
         for timer in self._timers:
             timer.cancel()
         self._timers.clear()
@@ -296,6 +326,9 @@ class ShapingProxy:
                 "rate_bps": shaper.schedule.rate_bps(now - origin),
                 "queue_packets": shaper.slots - shaper.free_slots(now),
                 "delivered_bytes": direction.delivered_bytes,
+                "datagrams": direction.datagrams,
+                "datagrams_dropped": direction.datagrams_dropped,
+                "datagrams_lost": direction.datagrams_lost,
                 "bytes_per_bucket": [direction.buckets.get(i, 0) for i in range(last + 1)] if self._started else [],
             }
         return result
@@ -312,6 +345,9 @@ class ShapingProxy:
         listener.listen(128)
         self.addresses.append(listener.getsockname())
         self.loop.add_reader(listener, self._accept, listener, route)
+        if self._carries_datagrams:
+            up, down = self._directions["up"].carry, self._directions["down"].carry
+            self._datagrams.append(DatagramRoute(listener.getsockname(), route.target, up=up, down=down))
 
     def _accept(self, listener: socket.socket, route: Route) -> None:
         now = time.monotonic()
@@ -481,13 +517,15 @@ def address(text: str) -> tuple[str, int]:
     return host, int(port)
 
 
-async def run(profile: LinkProfile, routes: Sequence[Route], *, seed: int, start_at_s: float | None) -> None:
+async def run(
+    profile: LinkProfile, routes: Sequence[Route], *, seed: int, start_at_s: float | None, datagrams: bool
+) -> None:
     """The process: serve until SIGTERM or SIGINT."""
     stop = asyncio.Event()
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, stop.set)
-    async with ShapingProxy(profile.up, profile.down, routes, seed=seed) as proxy:
+    async with ShapingProxy(profile.up, profile.down, routes, seed=seed, datagrams=datagrams) as proxy:
         writers: set[asyncio.StreamWriter] = set()
         control = await asyncio.start_server(lambda r, w: _control(proxy, writers, r, w), "127.0.0.1", 0)
         if start_at_s is not None:
@@ -505,13 +543,14 @@ async def run(profile: LinkProfile, routes: Sequence[Route], *, seed: int, start
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(prog="python -m sern_tools.proxy", description="A TCP proxy with a bad link in it")
+    parser = argparse.ArgumentParser(prog="python -m sern_tools.proxy", description="A proxy with a bad link in it")
     parser.add_argument("--listen", action="append", required=True, type=address, metavar="HOST:PORT")
     parser.add_argument("--target", action="append", required=True, type=address, metavar="HOST:PORT")
     parser.add_argument("--profile", required=True, help="name of a link profile")
     parser.add_argument("--profiles", metavar="FILE", help="a file of profiles other than the shipped one")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--start-at", type=float, metavar="S", help="CLOCK_MONOTONIC time of the script's 0")
+    parser.add_argument("--udp", action="store_true", help="carry datagrams too, on the same ports")
     options = parser.parse_args(arguments)
     if len(options.listen) != len(options.target):
         parser.error("give as many --target as --listen: they are pairs")
@@ -520,7 +559,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         profile = load_profile(options.profile, options.profiles)
         routes = [Route(*pair) for pair in zip(options.listen, options.target, strict=True)]
-        asyncio.run(run(profile, routes, seed=options.seed, start_at_s=options.start_at))
+        asyncio.run(run(profile, routes, seed=options.seed, start_at_s=options.start_at, datagrams=options.udp))
     except (SernError, OSError) as error:
         print(f"proxy: {error}", file=sys.stderr)
         return 2

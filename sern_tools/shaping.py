@@ -120,7 +120,7 @@ class RateSchedule:
 class Shaper:
     """One direction of the link. `origin_s` is where 0 of the model's script lies on the caller's clock.
 
-    Of the model, loss, reordering and duplication do not apply: the bytes are a TCP stream.
+    Of the model, reordering and duplication do not apply, and loss is the caller's, for datagrams.
     """
 
     def __init__(self, model: LinkModel, *, rng: Random, origin_s: float) -> None:

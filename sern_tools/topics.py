@@ -1,7 +1,8 @@
 """`sern topics`: the topics at a relay or a client: whose, what, how much, how old, and what was dropped.
 
 In and out are the daemon's own: at a relay, in is what its clients sent it and out what its subscribers have; at a
-client, in is what came from the relay and out what the relay has. Rates come from two looks at the counters.
+client, in is what came from the relay and out what the relay has. Rates come from two looks at the counters. A relay
+also lists what is announced and taken by nobody, with a mark.
 """
 
 import json
@@ -32,7 +33,8 @@ NOT_LOSSES: Final = frozenset({"duplicate"})
 
 @dataclass(slots=True)
 class Counts:
-    """Counters of one topic at one time. `takers`: links over which it is wanted now."""
+    """Counters of one topic at one time. `takers`: links over which it is wanted now. `untaken`: it is announced at a
+    relay, and nobody takes it."""
 
     priority: str
     received: int = 0
@@ -41,6 +43,7 @@ class Counts:
     delivered_bytes: int = 0
     queued: int = 0
     takers: int = 0
+    untaken: bool = False
     age_s: float | None = None
     reasons: Counter[str] = field(default_factory=Counter)
 
@@ -67,6 +70,7 @@ class Row:
     out_bytes_per_s: float
     age_s: float | None
     takers: int
+    untaken: bool
     queued: int
     dropped: int
     dropped_by_reason: Mapping[str, int]
@@ -93,6 +97,9 @@ def parse_topics(answer: Mapping[str, Any]) -> dict[str, Counts]:
                 counts.queued += row["in_queue"] + row["in_flight"]
                 counts.takers += bool(row["wanted"])
             counts.reasons.update({reason: n for reason, n in row["dropped"].items() if reason not in NOT_LOSSES})
+    # A topic that nobody takes stays at its origin: no counter at the relay knows it. Older relays do not list them.
+    for name, announced in answer.get("announced", {}).items() if _is_relay(answer) else ():
+        topics.setdefault(name, Counts(announced["class"])).untaken = not announced["taken"]
     return topics
 
 
@@ -133,6 +140,7 @@ def compare(
                 out_bytes_per_s=(counts.delivered_bytes - past.delivered_bytes) / interval_s,
                 age_s=counts.age_s,
                 takers=counts.takers,
+                untaken=counts.untaken,
                 queued=counts.queued,
                 dropped=counts.reasons.total(),
                 dropped_by_reason=dict(counts.reasons.most_common()),
@@ -202,8 +210,11 @@ class Column(NamedTuple):
     number: bool = True
 
 
+UNTAKEN: Final = " *"
+UNTAKEN_NOTE: Final = "* announced here, and nobody takes it: it stays at its origin"
+
 COLUMNS: Final = (
-    Column("topic", lambda row: row.topic, number=False),
+    Column("topic", lambda row: row.topic + UNTAKEN * row.untaken, number=False),
     Column("class", lambda row: row.priority, number=False),
     Column("type", lambda row: row.type_name or "", 150, number=False),
     Column("owner", lambda row: row.owner or "", 110, number=False),
@@ -228,6 +239,9 @@ def table(rows: list[Row], width: int = PLAIN_WIDTH) -> Table:
         result.add_column(column.label, no_wrap=True, justify=justify)
     for row in rows:
         result.add_row(*(Text(column.cell(row)) for column in columns))
+    if any(row.untaken for row in rows):
+        result.caption = Text(UNTAKEN_NOTE)
+        result.caption_justify = "left"
     return result
 
 

@@ -9,24 +9,21 @@ import gc
 import threading
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping
 from pathlib import Path
+from typing import Final
 
 import pytest
 import uvloop
 import zmq
-from hypothesis import HealthCheck, settings
 
 from sern_core.types import ClientName
 from sern_runtime.keys import SecretKey, generate
+from tests.exploring import load_profile
 from tests.support import DEADLINE_S, Patience
 
 Context = zmq.Context[zmq.Socket[bytes]]
+PEERS: Final = Path(__file__).parent / "peers"
 
-# The same cases in every run: a failure is one of the change at hand, and is there again in the next run. Nor is a busy
-# machine, which draws and runs them slowly, a failure.
-settings.register_profile(
-    "sern", derandomize=True, database=None, deadline=None, suppress_health_check=[HealthCheck.too_slow]
-)
-settings.load_profile("sern")
+load_profile()
 
 
 @pytest.hookimpl(optionalhook=True)
@@ -37,11 +34,18 @@ def pytest_asyncio_loop_factories(
     return {"uvloop": uvloop.new_event_loop}
 
 
+@pytest.hookimpl(tryfirst=True)  # before pytest-xdist reads the groups
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Ask for `no_leftover_tasks` ahead of all other fixtures, so that it is torn down after them."""
+    """Ask for `no_leftover_tasks` ahead of all other fixtures, so that it is torn down after them.
+
+    Name the groups whose tests run one after the other where several processes share the tests: those of a file, and
+    all with ROS peers, which share the host's ROS domains and its multicast.
+    """
     for item in items:
         if isinstance(item, pytest.Function) and asyncio.iscoroutinefunction(item.function):
             item.fixturenames.insert(0, "no_leftover_tasks")
+        group = "peers" if PEERS in item.path.parents else str(item.path)
+        item.add_marker(pytest.mark.xdist_group(group))
 
 
 @pytest.fixture

@@ -332,6 +332,23 @@ def valid() -> list[Vector]:
             {"t": "subscribe", "patterns": ["/jackal1/.*", "/tf"], "more": False},
         ),
         _control(
+            "subscribe-peers",
+            "the same, and the client is to be told of its peers",
+            {"t": "subscribe", "patterns": ["/jackal1/.*", "/tf"], "more": False, "peers": True},
+        ),
+        _control(
+            "peers",
+            "jackal1 has been there for a minute, jackal2 is lost for 2.5 s, and nothing of jackal3 is taken any more",
+            {
+                "t": "peers",
+                "peers": [
+                    {"name": "jackal1", "up": True, "for": 60.0, "lane": "udp", "rtt": 0.0625},
+                    {"name": "jackal2", "up": False, "for": 2.5, "lane": "zmq"},
+                    {"name": "jackal3"},
+                ],
+            },
+        ),
+        _control(
             "denied",
             "the client may not have a topic that it named",
             {"t": "denied", "topic": "/jackal2/map", "code": "forbidden", "why": "no access rule grants it"},

@@ -6,7 +6,7 @@ Validators raise `fault(...)` with a finished phrase; `load.py` puts file, line 
 
 import ipaddress
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Final
@@ -16,13 +16,15 @@ from pydantic_core import PydanticCustomError
 
 from sern_core.access import LONGEST_NAME, with_self
 from sern_core.errors import UsageError
-from sern_core.patterns import compile_pattern
+from sern_core.patterns import compile_pattern, matches_a_name
 from sern_core.rules import client_name, normal_namespace, topic_name
 from sern_runtime.config.yaml import Loc
 
 _HOST: Final = re.compile(r"[A-Za-z0-9_](?:[A-Za-z0-9_.-]{0,251}[A-Za-z0-9_])?")
 _TCP: Final = re.compile(r"tcp://(\[[0-9A-Fa-f:.%a-z]+\]|[^:/\[\]]+):([0-9]{1,5})")
 _IPC_MAX_CHARS: Final = 100  # a Unix socket path holds 107 bytes on Linux
+LONG_COMMAND_S: Final = 60.0
+"""A command that is older moves nobody's robot on purpose."""
 _LOOPBACK_NAMES: Final = frozenset({"localhost", "ip6-localhost"})
 
 
@@ -55,6 +57,31 @@ class FileModel(Section):
         """Problems with the files this one names; relative paths start at `base_dir`. By default it names none."""
         del base_dir
         return iter(())
+
+
+def pattern_problems(texts: Iterable[str], loc: Loc) -> Iterator[FileProblem]:
+    """Warnings of patterns that match no name, one after another in the list at `loc`."""
+    for index, text in enumerate(texts):
+        yield from pattern_problem(text, (*loc, index))
+
+
+def pattern_problem(text: str, loc: Loc) -> Iterator[FileProblem]:
+    """A warning of a pattern that matches no name; `{self}` in it is a client's name."""
+    if not matches_a_name(with_self(text, LONGEST_NAME)):
+        hint = f"; /{text}?" if re.match(r"[a-z]", text) else ""
+        yield FileProblem(loc, f"{_shown(text)} matches no topic: names begin with '/'{hint}", warning=True)
+
+
+def lifespan_problem(lifespan_s: object, loc: Loc, *, reliable: bool) -> Iterator[FileProblem]:
+    """A warning of commands that move a robot long after they were given. `lifespan_s` as the file has it."""
+    if isinstance(lifespan_s, (int, float)) and lifespan_s >= LONG_COMMAND_S:
+        how = f"for up to {lifespan_s:g} s"
+    elif lifespan_s is None and not reliable:
+        how = "for ever"
+    else:
+        return
+    problem = f"lets a command wait {how}, and then a robot moves by it; leave it out, or write a second or less"
+    yield FileProblem(loc, problem, warning=True)
 
 
 def fault(problem: str, *at: str | int) -> PydanticCustomError:

@@ -46,8 +46,12 @@ from sern_runtime.config.base import (
     described,
     fault,
     is_local,
+    lifespan_problem,
+    pattern_problem,
+    pattern_problems,
 )
 from sern_runtime.config.endpoints import EndpointSection
+from sern_runtime.config.link_state import LinkStateSection
 from sern_runtime.config.load import Loaded, load
 from sern_runtime.config.shared import (
     ClassWord,
@@ -415,6 +419,8 @@ class ClientFile(FileModel):
     """Choose rates, queue limits, compression and redundancy by their predicted cost; null: leave them as they are."""
     link: LinkSection = LinkSection()
     """The link to the relay."""
+    link_state: LinkStateSection = LinkStateSection()
+    """What this site's nodes are told of the link, and of who is there behind it."""
     http: HttpSection = HttpSection()
     """Metrics and health over HTTP; off by default."""
     log: LogSection = LogSection()
@@ -475,18 +481,35 @@ class ClientFile(FileModel):
 
     def file_problems(self, base_dir: Path) -> Iterator[FileProblem]:
         if self.relay.server_key_file is not None:
-            yield from public_key_problems(base_dir, self.relay.server_key_file, ("relay", "server_key_file"))
+            loc = ("relay", "server_key_file")
+            yield from public_key_problems(base_dir, self.relay.server_key_file, loc, client=self.name)
         if self.relay.secret_key_file is not None:
             loc = ("relay", "secret_key_file")
             yield from secret_key_problems(base_dir, self.relay.secret_key_file, loc, owner=self.name)
         several = isinstance(self.endpoint, tuple)
         for index, endpoint in enumerate(self.endpoints):
             yield from endpoint.file_problems(base_dir, ("endpoint", index) if several else ("endpoint",))
+        yield from self._pattern_problems()
         for index, section in enumerate(self.topics):
+            if section.priority == "control":
+                at, reliable = ("topics", index, "lifespan_s"), section.reliability == "reliable"
+                yield from lifespan_problem(section.lifespan_s, at, reliable=reliable)
             if section.max_rate_hz is not None and (problem := section.rate_problem()) is not None:
                 yield FileProblem(("topics", index, "max_rate_hz"), problem, warning=True)
         yield from output_problems(base_dir, self.message_log, ("message_log",))
         yield from output_problems(base_dir, self.summary, ("summary",))
+
+    def _pattern_problems(self) -> Iterator[FileProblem]:
+        """Warnings of patterns that match no name."""
+        yield from pattern_problems(self.discovery.allow, ("discovery", "allow"))
+        yield from pattern_problems(self.discovery.deny, ("discovery", "deny"))
+        for index, topic in enumerate(self.topics):
+            yield from pattern_problem(topic.match, ("topics", index, "match"))
+        yield from pattern_problems(self.subscribe, ("subscribe",))
+        for key, part in (("services", self.services), ("actions", self.actions)):
+            for word in ("offer", "use"):
+                for index, section in enumerate(getattr(part, word)):
+                    yield from pattern_problem(section.match, (key, word, index, "match"))
 
 
 def load_client(path: Path, *, files: bool = True) -> Loaded[ClientFile]:

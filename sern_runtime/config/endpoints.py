@@ -4,7 +4,9 @@ To add a kind: write a section with `kind: Literal["name"]` and its settings, an
 schema and reference follow from there; `sern_client` makes the endpoint from the section.
 """
 
+import importlib.util
 import re
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -24,12 +26,25 @@ from sern_runtime.config.base import (
     Section,
     TopicText,
     fault,
+    pattern_problems,
     resolve,
     unexpected,
 )
 from sern_runtime.config.yaml import Loc
 
 MAX_SYNTHETIC_TOPICS = 20
+
+
+def installed(package: str) -> bool:
+    """Whether Python could import it here; nothing is imported."""
+    return package in sys.modules or importlib.util.find_spec(package) is not None
+
+
+def missing_package(package: str, remedy: str, loc: Loc) -> Iterator[FileProblem]:
+    """A warning of an endpoint that this machine cannot run: the file may be for another one."""
+    if not installed(package):
+        problem = f"needs the Python package {package}, which is not on this machine: {remedy}"
+        yield FileProblem((*loc, "kind"), problem, warning=True)
 
 
 class EndpointBase(Section):
@@ -71,6 +86,8 @@ class BagEndpoint(EndpointBase):
         path = resolve(base_dir, self.path)
         if not path.exists():
             yield FileProblem((*loc, "path"), f"{path}: no such file or directory")
+        yield from pattern_problems(self.topics or (), (*loc, "topics"))
+        yield from pattern_problems(self.deny, (*loc, "deny"))
 
 
 def _topics_tag(value: Any) -> str | None:
@@ -241,6 +258,7 @@ class ZenohEndpoint(EndpointBase):
     """Directories with .msg and .srv files of types beyond those of a ROS 2 install (searched at any depth)."""
 
     def file_problems(self, base_dir: Path, loc: Loc) -> Iterator[FileProblem]:
+        yield from missing_package("zenoh", "pip install eclipse-zenoh", loc)
         if self.config_file is not None and not resolve(base_dir, self.config_file).is_file():
             yield FileProblem((*loc, "config_file"), f"{resolve(base_dir, self.config_file)}: no such file")
         yield from missing_directories(base_dir, self.type_paths, (*loc, "type_paths"))
@@ -284,6 +302,7 @@ class DdsEndpoint(EndpointBase):
     domain in the middle; with two of them side by side it makes a loop."""
 
     def file_problems(self, base_dir: Path, loc: Loc) -> Iterator[FileProblem]:
+        yield from missing_package("cyclonedds", "pip install cyclonedds==11.0.1", loc)
         yield from missing_directories(base_dir, self.type_paths, (*loc, "type_paths"))
 
 
@@ -302,6 +321,7 @@ class RclpyEndpoint(EndpointBase):
     """Directories with .msg files of types beyond those of a ROS 2 install (searched at any depth)."""
 
     def file_problems(self, base_dir: Path, loc: Loc) -> Iterator[FileProblem]:
+        yield from missing_package("rclpy", "source the setup file of a ROS 2 installation", loc)
         yield from missing_directories(base_dir, self.type_paths, (*loc, "type_paths"))
 
 

@@ -31,6 +31,9 @@ from sern_runtime.config.base import (
     described,
     fault,
     is_local,
+    lifespan_problem,
+    pattern_problem,
+    pattern_problems,
     resolve,
 )
 from sern_runtime.config.load import Loaded, load
@@ -320,6 +323,7 @@ class RelayFile(FileModel):
         return tuple(section.role() for section in self.feed.roles)
 
     def file_problems(self, base_dir: Path) -> Iterator[FileProblem]:
+        yield from self._rule_problems()
         yield from output_problems(base_dir, self.message_log, ("message_log",))
         yield from output_problems(base_dir, self.summary, ("summary",))
         if self.relay.secret_key_file is not None:
@@ -346,6 +350,21 @@ class RelayFile(FileModel):
             if not rules.fullmatch(name):
                 problem = f"no rule matches client {name}: it may connect and do nothing"
                 yield FileProblem(("access",), problem, warning=True)
+
+    def _rule_problems(self) -> Iterator[FileProblem]:
+        """Warnings of patterns that match no name, and of commands that live too long."""
+        for index, rule in enumerate(self.access):
+            for word in ("publish", "subscribe", "replay"):
+                yield from pattern_problems(getattr(rule, word) or (), ("access", index, word))
+        for index, role in enumerate(self.feed.roles):
+            at = ("feed", "roles", index)
+            yield from pattern_problems(role.subscribe, (*at, "subscribe"))
+            yield from pattern_problems(role.publish, (*at, "publish"))
+            for number, entry in enumerate(role.types):
+                yield from pattern_problem(entry.match, (*at, "types", number, "match"))
+                if entry.commands:
+                    place, reliable = (*at, "types", number, "lifespan_s"), entry.reliability == "reliable"
+                    yield from lifespan_problem(entry.lifespan_s, place, reliable=reliable)
 
 
 def load_relay(path: Path, *, files: bool = True) -> Loaded[RelayFile]:

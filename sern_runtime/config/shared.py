@@ -4,18 +4,38 @@ import os
 from collections.abc import Iterator
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, get_args
 
 from pydantic import Field
 
 from sern_core.errors import ConfigError
 from sern_core.params import LinkParams, Redundancy, SchedulerParams, WindowAlgorithm, WindowParams
 from sern_core.types import Ordering
-from sern_runtime.config.base import Bytes, FileProblem, HttpListen, PathText, Seconds, SecondsOrZero, Section, resolve
+from sern_runtime.config.base import (
+    Bytes,
+    FileProblem,
+    HttpListen,
+    PathText,
+    Seconds,
+    SecondsOrZero,
+    Section,
+    described,
+    resolve,
+)
 from sern_runtime.config.yaml import Loc
-from sern_runtime.keys import load_public, load_secret, secret_warning
+from sern_runtime.dscp import DSCP_NAMES, Marks
+from sern_runtime.keys import PUBLIC_SUFFIX, load_public, load_secret, secret_warning
 
 ClassWord = Literal["control", "state", "bulk"]
+DscpName = Literal[
+    "cs0", "le", "cs1", "cs2", "cs3", "cs4", "cs5", "cs6", "cs7",
+    "af11", "af12", "af13", "af21", "af22", "af23", "af31", "af32", "af33", "af41", "af42", "af43",
+    "va", "ef",
+]  # fmt: skip
+DscpValue = Annotated[
+    DscpName | Annotated[int, Field(ge=0, le=63)], described("a DSCP: a name such as ef, af41 or cs1, or 0 to 63")
+]
+_MARKS = Marks()
 _SCHEDULER = SchedulerParams()
 _LINK = LinkParams()
 
@@ -63,6 +83,32 @@ class WindowSection(Section):
         return WindowParams(algorithm=self.algorithm, fixed_bytes=self.fixed_bytes)
 
 
+def _name_of(number: int) -> DscpName:
+    names: dict[int, DscpName] = {DSCP_NAMES[name]: name for name in get_args(DscpName)}
+    return names[number]
+
+
+class DscpSection(Section):
+    """The mark (DSCP) on each IP packet, by which access points and routers on the way know what is urgent. A datagram
+    has that of the most urgent class in it, a connection for class control alone that of `control`, every other
+    connection and what carries no message that of `state`."""
+
+    control: DscpValue = _name_of(_MARKS.control)
+    """Class control. `ef` goes ahead of everything where a network has such a queue (voice in Wi-Fi)."""
+    state: DscpValue = _name_of(_MARKS.state)
+    """Class state. `cs0` is what unmarked traffic gets, on Wi-Fi between the other two; `af41` would share a queue with
+    `ef` there."""
+    bulk: DscpValue = _name_of(_MARKS.bulk)
+    """Class bulk. `cs1` gives way to everything else where a network has such a queue (background in Wi-Fi)."""
+
+    def marks(self) -> Marks:
+        return Marks(_code_point(self.control), _code_point(self.state), _code_point(self.bulk))
+
+
+def _code_point(value: DscpName | int) -> int:
+    return value if isinstance(value, int) else DSCP_NAMES[value]
+
+
 class LinkSection(Section):
     """The link between this daemon and its peer."""
 
@@ -77,6 +123,8 @@ class LinkSection(Section):
     redundancy: Redundancy = _LINK.redundancy
     """Class control sent twice over the datagram lane: `auto` while it loses packets, `always`, or `off`. While
     something waits for the link, what exceeds class control's share of it is not copied."""
+    dscp: DscpSection = DscpSection()
+    """Marks of the classes on IP packets."""
     max_message_bytes: Annotated[int, Field(ge=1024, le=1 << 30)] = _LINK.max_message_bytes
     """Larger messages are dropped and counted as `too_large`."""
     drain_s: Annotated[float, Field(ge=0, le=3600)] = 20.0
@@ -122,15 +170,21 @@ class LogSection(Section):
     """`text`: a line a person reads; `json`: one object a line."""
 
 
-def public_key_problems(base_dir: Path, text: PathText, loc: Loc) -> Iterator[FileProblem]:
+def public_key_problems(base_dir: Path, text: PathText, loc: Loc, *, client: str) -> Iterator[FileProblem]:
+    """Problems of the relay's public key file, as `client` has it."""
+    path = resolve(base_dir, text)
     try:
-        load_public(resolve(base_dir, text))
+        keys = load_public(path)
     except ConfigError as error:
         yield FileProblem(loc, str(error))
+        return
+    if keys.name == client:
+        yield FileProblem(loc, f"{path} is the key of {client}, this client; the relay's is needed", warning=True)
 
 
 def secret_key_problems(base_dir: Path, text: PathText, loc: Loc, *, owner: str) -> Iterator[FileProblem]:
-    """Problems of the secret key file of `owner`, the name that the configuration gives to this daemon."""
+    """Problems of the secret key file of `owner`, the name that the configuration gives to this daemon, and of the
+    public one beside it, which is what people copy."""
     path = resolve(base_dir, text)
     try:
         key = load_secret(path)
@@ -142,6 +196,22 @@ def secret_key_problems(base_dir: Path, text: PathText, loc: Loc, *, owner: str)
     warning = secret_warning(path)
     if warning is not None:
         yield FileProblem(loc, warning, warning=True)
+    public = path.with_suffix(PUBLIC_SUFFIX)
+    if not public.is_file():
+        return
+    try:
+        keys = load_public(public)
+    except ConfigError as error:
+        yield FileProblem(loc, f"beside it is {error}", warning=True)
+        return
+    if key.public_key not in {entry.key for entry in keys.keys}:
+        problem = (
+            f"{public} is not its public half (it holds the key of {keys.name}): whoever copies it has the wrong one"
+        )
+        yield FileProblem(loc, problem, warning=True)
+    elif keys.name != key.name:
+        problem = f"{public} says that this is the key of {keys.name}, and it is that of {key.name}"
+        yield FileProblem(loc, problem, warning=True)
 
 
 def output_problems(base_dir: Path, text: PathText | None, loc: Loc) -> Iterator[FileProblem]:

@@ -7,7 +7,10 @@ from typing import Final
 
 import pytest
 import typer.main
+from ruamel.yaml import YAML
 
+from sern_relay.udp import udp_endpoints
+from sern_runtime.config.base import split_tcp
 from sern_runtime.profiles import load_profiles
 from sern_sim.netem import netem_commands
 from sern_tools.commands import app
@@ -82,3 +85,18 @@ async def test_a_key_file_may_hold_two_keys_as_the_rotation_says(tmp_path: Path)
         client = await lab.connected(config)
         assert client.core.link.established
         await lab.end(client)
+
+
+def test_the_guide_opens_every_port_that_the_example_relay_listens_on() -> None:
+    relay = YAML(typ="safe").load((ROOT / "deploy" / "examples" / "relay.yaml").read_text())["relay"]
+    tcp = {str(parts[1]) for endpoint in relay["listen"] if (parts := split_tcp(endpoint)) is not None}
+    udp = {endpoint.rpartition(":")[2] for endpoint in udp_endpoints(relay["listen"])}
+    opened: dict[str, set[tuple[str, str]]] = {"ufw": set(), "firewall-cmd": set(), "nft": set()}
+    for words in commands("deploy/README.md"):
+        for tool, found in opened.items():
+            if tool in words:
+                found.update(re.findall(r"\b(\d+)/(tcp|udp)\b", " ".join(words)))
+                found.update((port, kind) for kind, port in re.findall(r"\b(tcp|udp) dport (\d+)", " ".join(words)))
+    wanted = {(port, "tcp") for port in tcp} | {(port, "udp") for port in udp}
+    assert wanted == {("5555", "tcp"), ("5555", "udp")}
+    assert opened == dict.fromkeys(opened, wanted)

@@ -30,8 +30,17 @@ class Systemd:
     def count(self, state: str) -> int:
         return sum(state in message.splitlines() for message in self.read())
 
+    @property
+    def _statuses(self) -> list[str]:
+        return [line for text in self.read() for line in text.splitlines() if line.startswith("STATUS=")]
+
     def status(self, words: str) -> bool:
-        return any(line.startswith("STATUS=") and words in line for text in self.read() for line in text.splitlines())
+        return any(words in line for line in self._statuses)
+
+    @property
+    def last_status(self) -> str:
+        """What `systemctl status` shows now."""
+        return self._statuses[-1]
 
 
 @pytest.fixture
@@ -61,10 +70,19 @@ async def test_the_relay(tmp_path: Path, systemd: Systemd) -> None:
         relay.signal(signal.SIGHUP)
         await until(lambda: systemd.count("READY=1") == 2, "reloaded")
         assert systemd.count("RELOADING=1") == 1
-        assert systemd.status("reloaded")
+        await relay.said("reloaded keys")
+        good = relay.config.read_text()
         relay.config.write_text("relay: {name: relay")
         relay.signal(signal.SIGHUP)
-        await until(lambda: systemd.status("reload failed: "), "says that the reload failed")
+        await until(lambda: systemd.status("reload failed, the old configuration stays: "), "says that it failed")
+        # It stays: the next sweeps, which tell how many clients there are, say it too.
+        sweeps = systemd.count("WATCHDOG=1")
+        await until(lambda: systemd.count("WATCHDOG=1") >= sweeps + 3, "goes on")
+        assert "0 clients" in systemd.last_status and "reload failed" in systemd.last_status
+        relay.config.write_text(good)
+        relay.signal(signal.SIGHUP)
+        await until(lambda: systemd.last_status == "STATUS=0 clients, 0 streams", "says that all is well")
+        await relay.said("ERROR", "the reload works again")
         assert systemd.count("STOPPING=1") == 0
         await ends(relay, systemd)
 

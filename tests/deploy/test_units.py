@@ -1,7 +1,9 @@
 """The systemd units: systemd reads them, they hold what the daemons need, and libzmq is not locked out."""
 
 import re
+import shlex
 import shutil
+import signal
 import subprocess
 from pathlib import Path
 from typing import Final
@@ -76,8 +78,14 @@ def test_libzmq_is_not_locked_out(name: str) -> None:
     assert not values(name, "MemoryDenyWriteExecute")
 
 
-def test_reload_is_for_the_relay() -> None:
-    assert values("sern-relay.service", "ExecReload") == ["/bin/kill -HUP $MAINPID"]
+def test_reload_is_for_the_relay_and_needs_no_program_but_the_shell() -> None:
+    command = shlex.split(values("sern-relay.service", "ExecReload")[0])
+    assert command[:2] == ["/bin/sh", "-c"]
+    with subprocess.Popen(["/bin/cat"], stdin=subprocess.PIPE) as daemon:
+        # As systemd runs it, with nothing to be found on the path.
+        environment = {"MAINPID": str(daemon.pid), "PATH": "/nowhere"}
+        assert subprocess.run(command, env=environment, timeout=60, check=False).returncode == 0
+        assert daemon.wait(timeout=60) == -signal.SIGHUP
     assert not values("sern-client.service", "ExecReload")
 
 

@@ -13,9 +13,10 @@ from sern_runtime.config.client import ClientFile
 from sern_runtime.config.load import accepted_keys, check_bytes, models_in
 from sern_runtime.config.relay import RelayFile
 from sern_runtime.config.yaml import parse_document
+from tests.exploring import cases
 
 MODELS: tuple[type[FileModel], ...] = (ClientFile, RelayFile, keys.PublicKeyFile, keys.SecretKeyFile)
-STEADY = settings(deadline=None, derandomize=True, database=None, max_examples=400)
+STEADY = settings(max_examples=cases(400))
 
 # Characters and words that mean something to YAML, so that a good part of the examples gets past the scanner.
 _PARTS = (

@@ -12,10 +12,11 @@ from sern_core.announce import Announcement, decode_announcement, definition_has
 from sern_core.errors import VersionError, WireError
 from sern_core.types import PriorityClass
 from sern_sim.ports import Port
+from tests.exploring import cases
 from tests.make_vectors import Frames, decode, rejected, valid
 from tests.world import World, spec
 
-STEADY = settings(deadline=None, derandomize=True, database=None, max_examples=400)
+STEADY = settings(max_examples=cases(400))
 GOOD: Final = {vector["name"]: (vector["layer"], bytes.fromhex(vector["hex"])) for vector in valid()}
 BAD: Final = {
     vector["name"]: (vector["layer"], bytes.fromhex(vector["hex"])) for vector in rejected() if "hex" in vector
@@ -230,7 +231,7 @@ BEHIND_A_HEADER = st.builds(
     )
     | st.binary(max_size=60),
 )
-FEW = settings(STEADY, max_examples=120)
+FEW = settings(STEADY, max_examples=cases(120))
 
 
 @FEW

@@ -13,10 +13,11 @@ from sern_core.errors import WireError
 from sern_core.hub_port import HubPort
 from sern_core.message import StreamId, StreamInfo, TopicInfo
 from sern_core.types import DROP_CODES, ClientName, Encoding, TopicName
+from tests.exploring import cases
 from tests.fuzz.test_hostile_peer import Hostile
 from tests.world import Got, SimClient, World, spec
 
-STEADY = settings(deadline=None, derandomize=True, database=None, max_examples=60)
+STEADY = settings(max_examples=cases(60))
 PERIOD_S = 0.05
 TEXT = "float64 x\n"
 TOPICS = ("/robot/a", "/robot/b", "/tf", "/robot/" + "x" * 240, "/jackal/odom")

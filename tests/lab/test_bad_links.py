@@ -83,10 +83,10 @@ class Stage:
 
     async def start(self) -> None:
         self.lab.apply(self.profile)
+        # The robot last: what it offers before anybody subscribes is unwanted, not lost.
         for name, node in ((RELAY, self.lab.b), (SITE, self.lab.b), (ROBOT, self.lab.a)):
             program = "relay" if name == RELAY else "client"
-            self.daemons[name] = Placed(node, name, program, self.files[name])
-        for daemon in self.daemons.values():
+            daemon = self.daemons[name] = Placed(node, name, program, self.files[name])
             await daemon.ready()
         await self.site.until(lambda: {POSE_TOPIC, COUNTER} <= received(self.site), "hears from the robot")
         await self.robot.until(lambda: COMMAND_TOPIC in received(self.robot), "hears commands")

@@ -33,7 +33,7 @@ from tests.daemons import Process
 
 pytestmark = pytest.mark.root
 RUN_S = 6.0
-PORTS = Ports(relay=5555, link=5555, relay_http=8081, robot_http=8082, site_http=8083)
+PORTS = Ports(relay=5555, relay_http=8081, robot_http=8082, site_http=8083)
 MEGABIT = 1e6
 COUNTER = f"/{ROBOT}{COUNTER_TOPIC}"
 MAP = f"/{ROBOT}/map"
@@ -60,12 +60,13 @@ class Run:
 
 
 def files_for(scenario: Scenario, directory: Path, relay: Node) -> dict[str, Path]:
-    """The demo's files, with the relay where the lab has it."""
+    """The demo's files, with the relay where the lab has it, over TCP, and nothing thinned."""
     files = write_files(directory / "config", scenario, PORTS)
     endpoint = f"tcp://{relay.address}:{PORTS.relay}"
     for name, path in files.items():
         content: dict[str, Any] = YAML(typ="safe", pure=True).load(path)
-        content["relay"] |= {"listen": [endpoint]} if name == RELAY else {"endpoint": endpoint}
+        content["relay"] |= {"listen": [endpoint]} if name == RELAY else {"endpoint": endpoint, "udp": False}
+        content.pop("adaptation", None)
         path.write_text(json.dumps(content))
     return files
 

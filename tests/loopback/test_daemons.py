@@ -213,10 +213,10 @@ async def test_the_relay_tells_systemd_what_it_does(tmp_path: Path) -> None:
                 del os.environ["NOTIFY_SOCKET"]
             await until(lambda: says("READY=1"))
             relay.signal(signal.SIGHUP)
-            await until(lambda: says("RELOADING=1") and says("STATUS=reloaded"))
+            await until(lambda: says("RELOADING=1") and says("STATUS=0 clients, 0 streams"))
             config.write_text(json.dumps({"relay": 1}))
             relay.signal(signal.SIGHUP)
-            await until(lambda: says("STATUS=reload failed"))
+            await until(lambda: says("; reload failed, the old configuration stays: "))
             await relay.stop()
             assert says("STOPPING=1")
 

@@ -18,6 +18,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 import sern_client.cli
 import sern_relay.cli
 from sern_runtime import logs
+from sern_runtime.transport_watch import CUT, ENDED
 from tests.daemons import HOST, START_NS, Lab, Process, balance, write_bag
 from tests.support import until
 
@@ -180,7 +181,8 @@ async def test_a_relay_that_is_not_there_is_reported_once_and_found_when_it_come
         relay = await lab.process(lab.relay_file()).ready()
         await robot.ready()
         await relay.said("INFO", "robot1 connected")
-        assert sum("WARNING" in line or "ERROR" in line for line in robot.lines) == 1, robot.text
+        told = [line for line in robot.lines if "WARNING" in line or "ERROR" in line]
+        assert ["the link is there again" in line for line in told] == [False, True], robot.text
 
 
 @pytest.mark.parametrize("mistake", ["stranger", "wrong relay key"])
@@ -192,13 +194,10 @@ async def test_keys_that_do_not_fit_are_explained_and_tried_again(tmp_path: Path
             reason = "relay refused our key: it is not in the relay's directory, or has expired"
         else:
             shutil.copy(lab.clients_dir / "other.pub", lab.directory / "relay.pub")
-            reason = (
-                "the relay ended the handshake: its key is not the one in server_key_file, it is full, "
-                "or this is no SERN relay"
-            )
+            reason = ENDED
         robot = lab.process(config)
         await robot.said("WARNING", f"{lab.endpoint}: {reason}; trying again until it works")
-        assert robot.get("/readyz") == (503, f"{reason}\n")
+        assert robot.get("/readyz") == (503, f"{reason}\n") or robot.get("/readyz") == (503, f"{CUT}\n")
         if mistake == "stranger":
             await relay.said("WARNING", "refused a connection from 127.0.0.1: unknown key")
             relay.signal(signal.SIGHUP)  # the administrator has copied the key
@@ -210,7 +209,9 @@ async def test_keys_that_do_not_fit_are_explained_and_tried_again(tmp_path: Path
             relay = await lab.process(relay.config).ready()
             robot = lab.process(config)
         await robot.ready()
-        assert sum("WARNING" in line or "ERROR" in line for line in robot.lines) <= 1, robot.text
+        # CUT: libzmq had closed the connection before it was looked at.
+        told = [line for line in robot.lines if CUT not in line and "the link is there again" not in line]
+        assert sum("WARNING" in line or "ERROR" in line for line in told) <= 1, robot.text
 
 
 async def test_a_key_that_the_relay_knows_by_another_name_is_explained(

@@ -9,7 +9,17 @@ from sern_runtime.profiles import load_profile
 from sern_sim.models import LinkModel
 from sern_tools.counters import read_counters
 from sern_tools.demo_link import free_ports
-from sern_tools.demo_scenario import COMMAND_TOPIC, POSE_TOPIC, RELAY, ROBOT, SITE, Ports, Scenario, write_files
+from sern_tools.demo_scenario import (
+    COMMAND_TOPIC,
+    FAR_HOST,
+    POSE_TOPIC,
+    RELAY,
+    ROBOT,
+    SITE,
+    Ports,
+    Scenario,
+    write_files,
+)
 from sern_tools.message_log import read_logs
 from sern_tools.proxy import Route, ShapingProxy
 from sern_tools.summary import Result, RunFacts, analyse, judge
@@ -35,10 +45,11 @@ async def test_every_message_has_one_fate_whatever_is_cut(tmp_path: Path) -> Non
     scenario = Scenario(load_profile("demo"), 10.0)
     relay_port, *more = free_ports(4)
     thin = LinkModel(rate_bps=scenario.usual_bps, delay_s=0.01)
-    async with ShapingProxy(thin, thin, [Route((HOST, 0), (HOST, relay_port))], seed=1) as proxy, Lab(tmp_path) as lab:
+    routes = [Route((FAR_HOST, relay_port), (HOST, relay_port))]
+    async with ShapingProxy(thin, thin, routes, seed=1, datagrams=True) as proxy, Lab(tmp_path) as lab:
         proxy.start()
         directory = tmp_path / "config"
-        files = write_files(directory, scenario, Ports(relay_port, proxy.addresses[0][1], *more))
+        files = write_files(directory, scenario, Ports(relay_port, *more))
         relay = await lab.relay(files[RELAY])
         site = await lab.connected(files[SITE])
         robot = await lab.connected(files[ROBOT])

@@ -1,5 +1,6 @@
 """What happens to connections: the watch of a client, the table of a server, and the TCP socket underneath."""
 
+import asyncio
 import os
 import socket as socketlib
 
@@ -7,7 +8,8 @@ import pytest
 import zmq
 
 from sern_runtime.keys import SecretKey
-from sern_runtime.monitor import ConnectionTable, TcpHandle, TransportWatch, port_of
+from sern_runtime.monitor import ConnectionTable, TcpHandle, port_of
+from sern_runtime.transport_watch import CUT, ENDED, HALF_WAY, OTHER, SHUT, SILENT, TransportWatch
 from sern_runtime.zap import ZapHandler
 from sern_runtime.zmq_socket import DealerSocket, RouterSocket, make_client, make_server
 from tests.support import until
@@ -55,16 +57,20 @@ class Server:
 
 
 class Client:
-    def __init__(self, context: Context, endpoint: str) -> None:
+    def __init__(self, context: Context, endpoint: str, keys: tuple[SecretKey, str] | None = None) -> None:
         self.handles: list[TcpHandle | None] = []
         self.reasons: list[str] = []
         self.rebuilds: list[str] = []
         self.dealer = DealerSocket(
-            make_client(context, endpoint, None, None, before_connect=self._watch), lambda _body: None
+            make_client(context, endpoint, *(keys or (None, None)), before_connect=self._watch), lambda _body: None
         )
 
     def _watch(self, socket: "zmq.Socket[bytes]") -> None:
-        self.watch = TransportWatch(socket, self.handles.append, self.reasons.append, self.rebuilds.append)
+        socket.setsockopt(zmq.HANDSHAKE_IVL, 500)  # in place of 10 s
+        self.dead: list[str] = []
+        self.watch = TransportWatch(
+            socket, self.handles.append, self.reasons.append, self.rebuilds.append, self.dead.append
+        )
 
     def close(self) -> None:
         self.watch.close()
@@ -100,6 +106,51 @@ async def test_nobody_listening_is_said_once(zmq_context: Context) -> None:
     assert client.reasons == ["the relay does not answer: connecting failed"]
     client.close()
     server_socket.close()
+
+
+GREETING = b"\xff" + bytes(8) + b"\x7f\x03\x00CURVE" + bytes(47)
+"""What a CURVE peer of ZMTP 3.0 says first (RFC 23)."""
+
+
+async def keep(reader: asyncio.StreamReader, writer: asyncio.StreamWriter, says: bytes, *, ends: bool) -> None:
+    writer.write(says)
+    await reader.readexactly(10)  # the client's signature
+    if ends:
+        if len(says) >= len(GREETING):  # as a relay whose key is another one: at the client's HELLO
+            await reader.readexactly(54 + 200)
+        writer.close()
+    else:
+        await reader.read()
+        writer.close()
+
+
+@pytest.mark.parametrize(
+    ("says", "ends", "reasons", "dead"),
+    [
+        (b"", False, {SILENT}, False),
+        (b"", True, {SHUT}, False),
+        (GREETING, False, {HALF_WAY}, False),
+        (GREETING, True, {ENDED}, False),
+        (b"HTTP/1.1 400 Bad Request\r\nConnection: close\r\n\r\n", True, {OTHER}, True),
+        (b"SSH-2.0-OpenSSH_9.2\r\n", False, {OTHER}, True),
+    ],
+    ids=["silent", "shut", "hangs half way", "another key", "http", "ssh"],
+)
+async def test_what_listens_in_place_of_a_relay_is_told_apart(
+    zmq_context: Context, robot_keys: SecretKey, says: bytes, ends: bool, reasons: set[str], dead: bool
+) -> None:
+    server = await asyncio.start_server(lambda r, w: keep(r, w, says, ends=ends), "127.0.0.1", 0)
+    endpoint = f"tcp://127.0.0.1:{server.sockets[0].getsockname()[1]}"
+    client = Client(zmq_context, endpoint, (robot_keys, robot_keys.public_key))
+    try:
+        await until(lambda: client.reasons)
+        # How many bytes came is not known of a connection that libzmq has closed before we look: then it says less.
+        assert client.reasons[0] in reasons | ({CUT} if ends and not dead else set())
+        await until(lambda: reasons & set(client.reasons) and bool(client.dead) == dead)
+        assert client.rebuilds == []
+    finally:
+        client.close()
+        server.close()
 
 
 async def test_connections_are_counted_until_they_end(zmq_context: Context) -> None:
@@ -251,7 +302,7 @@ async def test_a_revoked_user_loses_the_connection_and_is_refused(
             robot_keys,
             relay_keys.public_key,
             before_connect=lambda s: watches.append(
-                TransportWatch(s, lambda _handle: None, reasons.append, rebuilds.append)
+                TransportWatch(s, lambda _handle: None, reasons.append, rebuilds.append, rebuilds.append)
             ),
         ),
         lambda _body: None,

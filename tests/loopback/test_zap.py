@@ -8,7 +8,8 @@ import zmq
 
 from sern_core.errors import SernError, UsageError
 from sern_runtime.keys import SecretKey
-from sern_runtime.monitor import EventKind, MonitorEvent, SocketMonitor, TransportWatch
+from sern_runtime.monitor import EventKind, MonitorEvent, SocketMonitor
+from sern_runtime.transport_watch import TransportWatch
 from sern_runtime.zap import TemporaryRefusal, ZapHandler, reachable, self_test
 from sern_runtime.zmq_socket import DealerSocket, RouterSocket, make_client, make_server
 from tests.support import until
@@ -42,6 +43,7 @@ class Site:
                     lambda handle: events.append(f"up {handle is not None}"),
                     lambda reason: events.append(f"down {reason}"),
                     lambda reason: events.append("rebuild"),
+                    lambda reason: events.append("dead"),
                 )
             )
 

@@ -396,9 +396,7 @@ def test_an_empty_zap_domain_is_refused(zmq_context: Context, relay_keys: Secret
 
 def test_options_follow_their_constants(zmq_context: Context, relay_keys: SecretKey, robot_keys: SecretKey) -> None:
     server = make_server(zmq_context, ["tcp://127.0.0.1:*"], relay_keys, heartbeat_timeout_ms=7000)
-    client = make_client(
-        zmq_context, endpoint_of(server), robot_keys, relay_keys.public_key, tos=zmq_socket.TOS_EXPEDITED
-    )
+    client = make_client(zmq_context, endpoint_of(server), robot_keys, relay_keys.public_key, tos=0xB8)
     for socket in (server, client):
         assert socket.getsockopt(zmq.LINGER) == 0
         assert socket.getsockopt(zmq.IMMEDIATE) == 1

@@ -9,11 +9,12 @@ from sern_client.endpoints.zenoh.endpoint import ZenohEndpoint, ZenohOptions
 from sern_client.endpoints.zenoh.session import SessionOptions
 from sern_core.types import Encoding
 from sern_tools.demo_link import free_ports
+from tests.exploring import seeds
 from tests.peers.dds.peer import free_domain
 from tests.sern_client.sessions import Changes
 from tests.support import Events, until
 
-SEEDS = range(3)
+SEEDS = seeds(3)
 
 
 def seen(changes: Changes, others: Events) -> bool:

@@ -21,6 +21,7 @@ from sern_core.types import Encoding, TopicName
 from sern_runtime import ros_types
 from sern_runtime.ros_types import topic_info
 from tests.daemons import recording
+from tests.exploring import cases, seeds
 from tests.sern_client import messages
 from tests.sern_client.messages import made_up
 
@@ -77,7 +78,7 @@ def written(message: Any, info: TopicInfo) -> bytes:
 
 
 @pytest.mark.parametrize("source", [ROS1, CDR])
-@settings(max_examples=8, deadline=None, derandomize=True, database=None)
+@settings(max_examples=cases(8))
 @given(seed=st.integers(0, 2**32))
 def test_every_type_keeps_its_values_there_and_back(source: Encoding, seed: int) -> None:
     """Over all types that both sides know; what is written is what the other side would write itself."""
@@ -101,7 +102,7 @@ def test_every_type_keeps_its_values_there_and_back(source: Encoding, seed: int)
 
 
 @pytest.mark.parametrize("name", EXTENDED + RENAMED)
-@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("seed", seeds(20))
 def test_types_that_ros2_laid_out_otherwise(name: str, seed: int) -> None:
     info = topic_info("/x", name, ROS1)
     message = made_up(ros_types.typestore(ROS1), name, Random(seed))

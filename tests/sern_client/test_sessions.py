@@ -17,12 +17,13 @@ from sern_client.endpoints.ros1.xmlrpc import XmlRpcClient
 from sern_client.endpoints.synthetic import SyntheticEndpoint, SyntheticOptions
 from sern_core.types import Encoding
 from sern_runtime import ros_types
+from tests.exploring import seeds
 from tests.sern_client.endpoints.ros1.fakes import HOST, FakeMaster
 from tests.sern_client.endpoints.test_rclpy import Graph, graph
 from tests.sern_client.sessions import Changes
 from tests.support import Events, until
 
-SEEDS = range(6)
+SEEDS = seeds(6)
 
 __all__ = ["graph"]
 

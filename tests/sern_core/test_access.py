@@ -15,8 +15,9 @@ from sern_core.access import (
 )
 from sern_core.errors import ConfigError, UsageError
 from sern_core.types import ClientName, TopicName
+from tests.exploring import cases
 
-PURE = settings(deadline=None, derandomize=True, database=None)
+PURE = settings(max_examples=cases(100))
 
 RULES = (
     AccessRule("operator", publish=("/.*/cmd_vel",), subscribe=(".*",), replay=("/map",)),

@@ -27,8 +27,9 @@ from sern_core.errors import UsageError, WireError
 from sern_core.message import StreamId, StreamInfo, TopicInfo, TopicSpec
 from sern_core.rules import NAME_MAX_CHARS
 from sern_core.types import ClientName, Durability, Encoding, PriorityClass, Reliability, TopicName
+from tests.exploring import cases
 
-STEADY = settings(deadline=None, derandomize=True, database=None, max_examples=200)
+STEADY = settings(max_examples=cases(200))
 NAMES = st.from_regex(r"\A[a-z][a-z0-9_]{0,62}\Z")
 TOPICS = st.from_regex(r"\A/[A-Za-z_][A-Za-z0-9_]{0,40}(/[a-z0-9_]{1,40}){0,4}\Z")
 PRINTABLE = st.text(max_size=60).filter(str.isprintable)

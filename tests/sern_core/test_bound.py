@@ -12,6 +12,7 @@ from sern_core.link import Link
 from sern_core.queues import MESSAGE_OVERHEAD_BYTES, OutChannel
 from sern_core.types import ClientName, DropReason, PriorityClass
 from sern_sim.models import LinkModel
+from tests.exploring import seeds
 from tests.fuzz.test_hostile_peer import Hostile, _whole
 from tests.world import World, spec
 
@@ -156,7 +157,7 @@ def test_new_access_rules_lift_the_bound() -> None:
     assert site.seqs("/log") == list(range(1, 13))
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", seeds(8))
 def test_whatever_comes_the_bound_holds_and_nothing_is_lost_silently(seed: int) -> None:
     world = bounded_world().watch(0.5)
     robot, site = world.clients["robot"], world.clients["site"]

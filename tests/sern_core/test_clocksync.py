@@ -10,8 +10,9 @@ from hypothesis import strategies as st
 
 from sern_core.clocksync import MAX_SKEW_PPM, MIN_RTO_S, ClockSync, RttEstimator
 from sern_core.errors import UsageError
+from tests.exploring import cases
 
-PURE = settings(deadline=None, derandomize=True, database=None, max_examples=60)
+PURE = settings(max_examples=cases(60))
 
 
 @dataclass

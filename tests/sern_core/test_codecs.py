@@ -12,13 +12,14 @@ from hypothesis import strategies as st
 from sern_core import codecs
 from sern_core.codecs import SIZE, Codec, CodecProfile, Coder, Compression, decode, encode, quickest
 from sern_core.errors import CodecError
+from tests.exploring import cases
 
 if sys.version_info >= (3, 14):
     from compression import zstd as zstandard
 else:
     from backports import zstd as zstandard
 
-STEADY = settings(deadline=None, derandomize=True, database=None, max_examples=200)
+STEADY = settings(max_examples=cases(200))
 PACKING = [mode for mode in codecs.LOSSLESS if mode is not Compression.NONE]
 CAP = 1 << 20
 TEXT = b"a robot drives along the hall and reports where it is; " * 200
@@ -153,7 +154,7 @@ def mutated() -> st.SearchStrategy[tuple[int, bytes]]:
 
 
 @given(case=mutated() | st.tuples(st.integers(0, 255), st.binary(max_size=200)))
-@settings(STEADY, max_examples=1500)
+@settings(STEADY, max_examples=cases(1500))
 def test_any_bytes_decode_to_what_they_claim_or_raise_codec_error(case: tuple[int, bytes]) -> None:
     codec, body = case
     try:

@@ -9,6 +9,7 @@ from sern_core.announce import definition_hash
 from sern_core.definitions import LINGERING_TEXTS, DefinitionStore, PeerDefinitions
 from sern_core.errors import WireError
 from sern_core.types import ClientName
+from tests.exploring import seeds
 from tests.fuzz.test_hostile_peer import Hostile
 from tests.world import World, spec
 
@@ -116,7 +117,7 @@ def test_a_text_that_comes_too_late_is_not_kept() -> None:
     assert len(peer.hub.definitions) == 0
 
 
-@pytest.mark.parametrize("seed", range(10))
+@pytest.mark.parametrize("seed", seeds(10))
 def test_uses_add_up_whatever_happens(seed: int) -> None:
     random = Random(seed)
     store = DefinitionStore()

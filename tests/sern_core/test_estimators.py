@@ -15,6 +15,7 @@ from sern_core.control.fixed import FixedWindow
 from sern_core.control.hybrid import HybridWindow
 from sern_core.errors import WireError
 from sern_core.types import PriorityClass
+from tests.exploring import cases
 from tests.world import World, spec
 
 ESTIMATORS: dict[str, Callable[[], CapacityEstimator]] = {
@@ -24,11 +25,8 @@ ESTIMATORS: dict[str, Callable[[], CapacityEstimator]] = {
 }
 U64 = 2**64 - 1
 SETTINGS = settings(
-    derandomize=True,
-    database=None,
-    deadline=None,
     phases=[Phase.explicit, Phase.generate],
-    max_examples=60,
+    max_examples=cases(60),
     suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large, HealthCheck.large_base_example],
 )
 
@@ -126,7 +124,7 @@ def test_a_clock_estimate_takes_any_stamps(pings: list[tuple[float, float, float
             assert math.isfinite(value)
 
 
-@settings(SETTINGS, max_examples=15)
+@settings(SETTINGS, max_examples=cases(15))
 @given(
     acks=st.lists(
         st.tuples(

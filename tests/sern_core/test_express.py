@@ -234,3 +234,17 @@ def test_only_its_own_client_joins_a_session() -> None:
     with pytest.raises(WireError):
         hub.join(ROBOT, wire.encode_handshake(wire.Kind.JOIN, header.tag, 0, {"name": "robot"}), now=now)
     assert hub.join(ROBOT, said, now=now)
+
+
+def test_thirteen_times_as_much_class_control_as_the_path_carries_leaves_a_way_for_what_must_be_said() -> None:
+    express = Express(second=stream())
+    flood = express.robot.publish("/robot/flood", spec(PriorityClass.CONTROL, depth=10))
+    express.robot.every(1000 * 8 / (13 * RATE_BPS), flood, b"f" * 1000, first_s=2.0)
+    express.world.until(express.used)
+    express.run(10.0)
+    assert express.used()
+    opened = len(express.site.opened)
+    express.robot.publish("/robot/chat", spec(reliable=True), definition="string data")
+    express.world.until(lambda: len(express.site.opened) > opened, within_s=2.0, what="the site hears of a new stream")
+    assert express.used()
+    express.world.validate()

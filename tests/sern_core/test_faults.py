@@ -6,7 +6,7 @@ from functools import cache, partial
 from itertools import pairwise
 
 import pytest
-from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
 from sern_core import wire
@@ -19,6 +19,7 @@ from sern_core.link import Link
 from sern_core.message import Message, StreamInfo
 from sern_core.queues import OutChannel
 from sern_core.types import ClientName, DropReason, PriorityClass
+from tests.exploring import cases
 from tests.faults import HANDLERS, INSIDE, RECORDS, Faults, Injected, Place
 from tests.fuzz.test_hostile_peer import Hostile
 from tests.sern_core.test_lanes import TwoLanes, models
@@ -126,14 +127,7 @@ def _calls(seed: int, lossless: bool) -> dict[Place, int]:
     return {place: count for place, count in faults.calls.items() if count}
 
 
-@settings(
-    derandomize=True,
-    database=None,
-    deadline=None,
-    max_examples=25,
-    phases=[Phase.explicit, Phase.generate],
-    suppress_health_check=[HealthCheck.too_slow],
-)
+@settings(max_examples=cases(25), phases=[Phase.explicit, Phase.generate])
 @given(data=st.data(), lossless=st.booleans(), after=st.booleans())
 def test_an_error_at_any_call_costs_at_most_what_it_was_about(data: st.DataObject, lossless: bool, after: bool) -> None:
     calls = _calls(1, lossless)

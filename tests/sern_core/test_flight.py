@@ -5,6 +5,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sern_core.flight import ACK_DELAY_S, ACK_SPACING_S, FIRST_LOSS_TIMEOUT_S, SACK_BITS, SPACED_BYTES, Arrivals, Flight
+from sern_core.types import PriorityClass
+from tests.exploring import cases
+
+CONTROL, STATE, BULK = PriorityClass
 
 
 def flight(count: int, *, lossless: bool = False, rtt_s: float | None = 0.1) -> Flight:
@@ -43,6 +47,26 @@ def test_lost_when_three_later_ones_have_arrived() -> None:
     subject.acked(4, 0b11, now=0.05)  # 4, 3, 2
     assert [p.number for p in subject.lost(now=0.05)] == [1]
     assert list(subject.packets) == [5, 6]
+
+
+def test_a_more_urgent_packet_that_overtakes_shows_no_loss() -> None:
+    """A network that heeds the marks of the classes lets class control pass; what waits there is not lost."""
+    subject = flight(0)
+    for number, priority in enumerate((BULK, BULK, CONTROL, CONTROL, CONTROL, STATE, BULK, BULK)):
+        subject.sent(now=0.001 * number, nbytes=100, items=[], app_limited=False, priority=priority)
+    subject.acked(6, 0b111, now=0.05)  # 6, 5, 4, 3: two of class bulk wait
+    assert subject.lost(now=0.05) == []
+    subject.acked(8, 0b11110, now=0.06)  # a later one of their own class
+    assert [p.number for p in subject.lost(now=0.06)] == [1, 2]
+    assert list(subject.packets) == [7]
+
+
+def test_a_less_urgent_packet_that_arrives_first_shows_a_loss() -> None:
+    subject = flight(0)
+    for priority in (CONTROL, BULK, BULK, BULK):
+        subject.sent(now=0.0, nbytes=100, items=[], app_limited=False, priority=priority)
+    subject.acked(4, 0b11, now=0.05)
+    assert [p.number for p in subject.lost(now=0.05)] == [1]
 
 
 def test_lost_when_older_than_the_timeout_and_not_before() -> None:
@@ -132,7 +156,7 @@ def test_a_far_jump_of_numbers_costs_nothing() -> None:
     assert arrivals.mask == 0 and arrivals.highest == 0xFFFFFFFF
 
 
-@settings(derandomize=True, database=None, deadline=None, max_examples=200)
+@settings(max_examples=cases(200))
 @given(
     st.lists(st.integers(1, 40), max_size=60),
     st.integers(0, 2**16),

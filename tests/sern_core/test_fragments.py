@@ -22,6 +22,7 @@ from sern_core.fragments import (
 from sern_core.message import Message, StreamId, StreamInfo, TopicInfo
 from sern_core.types import DROP_CODES, ClientName, DropReason, Encoding, TopicName
 from sern_core.wire import FLAG_TOMBSTONE
+from tests.exploring import cases
 from tests.world import spec
 
 
@@ -75,7 +76,7 @@ def _body(seq: int, total: int) -> bytes:
     return (b"%08d" % seq * (total // 8 + 1))[:total]
 
 
-@settings(derandomize=True, database=None, deadline=None, max_examples=200)
+@settings(max_examples=cases(200))
 @given(st.data())
 def test_pieces_in_any_order_repeated_and_overlapping(data: st.DataObject) -> None:
     total = data.draw(st.integers(2, 300))
@@ -91,7 +92,7 @@ def test_pieces_in_any_order_repeated_and_overlapping(data: st.DataObject) -> No
     assert receiver.room.held_bytes == 0
 
 
-@settings(derandomize=True, database=None, deadline=None, max_examples=200)
+@settings(max_examples=cases(200))
 @given(st.lists(st.tuples(st.integers(1, 20), st.booleans()), max_size=60))
 def test_reliable_is_once_and_in_order_best_effort_rises(arrivals: list[tuple[int, bool]]) -> None:
     reliable, best = Receiver(reliable=True), Receiver()

@@ -13,6 +13,7 @@ from sern_core.fragments import InStream, Reassembly
 from sern_core.interest import PAUSE_MAX_S, Interest
 from sern_core.message import StreamId, StreamInfo, TopicInfo
 from sern_core.types import ClientName, Encoding, TopicName
+from tests.exploring import seeds
 from tests.fuzz.test_hostile_peer import Hostile
 from tests.make_vectors import Frames
 from tests.world import SimClient, World, spec
@@ -205,7 +206,7 @@ def in_stream(index: int) -> InStream:
 
 
 @pytest.mark.parametrize("batches", [True, False])
-@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("seed", seeds(20))
 def test_whatever_changes_the_peer_ends_up_with_what_is(seed: int, batches: bool) -> None:
     random = Random(seed)
     interest = Interest()
@@ -221,8 +222,7 @@ def test_whatever_changes_the_peer_ends_up_with_what_is(seed: int, batches: bool
     def send(envelope: wire.Envelope) -> int:
         nonlocal seq
         seq += 1
-        assert len(wire.encode_envelope(envelope)) <= wire.MAX_ENVELOPE_BYTES
-        want = decode_want(wire.decode_envelope(wire.encode_envelope(envelope)))
+        want = decode_want(wire.decode_envelope(wire.encode_envelope(envelope)))  # which refuses what is too long
         assert batches or (want.owed is not None and len(want.runs) == 1)
         first = want.runs[0][0]
         if want.more:
@@ -235,7 +235,7 @@ def test_whatever_changes_the_peer_ends_up_with_what_is(seed: int, batches: bool
                 peer[slot] = (want.on, (had | set(want.add)) - set(want.drop) if owed is None else owed)
         return seq
 
-    for _ in range(400):
+    for _ in range(100):
         now += random.choice([0.0, 0.01, 0.3])
         for slot in random.sample(sorted(streams), random.choice([1, 5, 60])):
             owed = tuple(random.sample(names, random.choice([0, 1, 3, 100])))

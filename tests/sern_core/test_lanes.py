@@ -229,3 +229,51 @@ def test_copies_go_on_through_lucky_moments_and_end_on_a_path_that_loses_nothing
         seen.append(lane.redundant)
     assert seen == [False, True, True, False]
     assert lane.loss < 1e-6
+
+
+class _Carried:
+    """The channels with data in one datagram."""
+
+    def __init__(self, datagram: bytes) -> None:
+        self.channels: set[int] = set()
+        wire.decode_frames(datagram, self)
+
+    def on_data(self, _flags: int, channel: int, *_: object) -> None:
+        self.channels.add(channel)
+
+    def on_ack(self, *_: object) -> None: ...
+
+    def on_watermark(self, *_: object) -> None: ...
+
+    def on_ping(self) -> None: ...
+
+
+def test_a_datagram_has_the_class_of_the_most_urgent_message_in_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Second copies too; what carries no message, or only control messages, is state."""
+    seen: dict[frozenset[str], set[PriorityClass]] = {}
+    slots: dict[int, str] = {0: "control messages"}
+
+    def noted(port: LanePort, *, now: float) -> bytes | None:
+        datagram = port.link.next_datagram(now=now, lane=port.lane)
+        if datagram is not None and port.link.name == "robot":
+            slots.update((c.slot, c.spec.priority.name) for c in port.link.channels.values())
+            carried = frozenset(slots[slot] for slot in _Carried(datagram).channels)
+            seen.setdefault(carried, set()).add(port.priority)
+        return datagram
+
+    monkeypatch.setattr(LanePort, "next_datagram", noted)
+    lanes = TwoLanes(stream=models()[0], datagrams=models(loss=0.02)[1])
+    lanes.run(5.0)
+    for number in range(20):
+        lanes.core.subscribe((f"/site/{number}",), now=lanes.world.now)
+        lanes.run(0.1)
+    assert lanes.core.link.lanes[LANE_UDP].redundant, "second copies were sent"
+    for carried, priorities in seen.items():
+        if "CONTROL" in carried:
+            assert priorities == {PriorityClass.CONTROL}, carried
+        elif carried == {"BULK"}:
+            assert priorities == {PriorityClass.BULK}
+        else:
+            assert priorities == {PriorityClass.STATE}, carried
+    assert seen.keys() >= {frozenset(), frozenset({"CONTROL"}), frozenset({"BULK"}), frozenset({"STATE"})}
+    assert any("control messages" in carried for carried in seen)

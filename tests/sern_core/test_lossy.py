@@ -23,12 +23,13 @@ from sern_core.types import Encoding, PriorityClass
 from sern_runtime import ros_types
 from sern_sim.models import LinkModel
 from tests.daemons import recording
+from tests.exploring import cases
 from tests.world import World, spec
 
 pytest.importorskip("DracoPy", reason="the Python package DracoPy (extra lossy) is not installed")
 pytest.importorskip("PIL", reason="the Python package Pillow (extra lossy) is not installed")
 
-STEADY = settings(deadline=None, derandomize=True, database=None, max_examples=200)
+STEADY = settings(max_examples=cases(200))
 CAP = 16 << 20
 STAMP_NS = 1_700_000_000_123_456_789
 ENCODINGS = (Encoding.ROS1, Encoding.CDR)
@@ -230,7 +231,7 @@ def mutated(draw: st.DrawFn) -> tuple[Codec, bytes]:
 
 
 @given(case=mutated() | st.tuples(st.sampled_from([Codec.DRACO, Codec.JPEG]), st.binary(max_size=300)))
-@settings(STEADY, max_examples=1500)
+@settings(STEADY, max_examples=cases(500))
 def test_any_bytes_decode_to_what_they_claim_or_raise_codec_error(case: tuple[Codec, bytes]) -> None:
     codec, body = case
     try:

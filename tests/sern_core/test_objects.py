@@ -15,6 +15,7 @@ from sern_core.errors import RefusedError
 from sern_core.message import StreamId, StreamInfo, TopicInfo, TopicSpec
 from sern_core.objects import ObjectLimits, ObjectRegistry, kind_of, topic_object_id
 from sern_core.types import ClientName, Encoding, ObjectKind, PriorityClass, TopicName
+from tests.exploring import cases
 
 A, B = ClientName("a"), ClientName("b")
 
@@ -451,5 +452,5 @@ class RegistryMachine(RuleBasedStateMachine):
 def test_against_a_model() -> None:
     run_state_machine_as_test(
         RegistryMachine,
-        settings=settings(deadline=None, derandomize=True, database=None, max_examples=100, stateful_step_count=30),
+        settings=settings(max_examples=cases(100), stateful_step_count=30),
     )

@@ -1,5 +1,6 @@
 """Two processes with one name: each takes the session from the other, more and more seldom."""
 
+import re
 from typing import Any, Final
 
 from sern_core.client import ClientCore
@@ -17,17 +18,20 @@ class Told:
 
     def __init__(self) -> None:
         self.calls: dict[str, int] = {}
+        self.last: dict[str, tuple[Any, ...]] = {}
 
     def __getattr__(self, name: str) -> Any:
-        def told(*_args: object, **_kwargs: object) -> None:
+        def told(*args: Any, **kwargs: Any) -> None:
+            self.last[name] = (*args, *kwargs.values())
             self.calls[name] = self.calls.get(name, 0) + 1
 
         return told
 
 
 def test_of_two_with_one_name_neither_flaps_for_ever() -> None:
+    hub_told = Told()
     hub = Hub(
-        name=ClientName("relay"), boot=1, access=OPEN_ACCESS, known=lambda _name: True, events=Told(),
+        name=ClientName("relay"), boot=1, access=OPEN_ACCESS, known=lambda _name: True, events=hub_told,
         link=LinkParams(), scheduler=SchedulerParams(), wall_ns=lambda now: int(now * 1e9), now=0.0,
     )  # fmt: skip
     events = [Told(), Told()]
@@ -38,7 +42,7 @@ def test_of_two_with_one_name_neither_flaps_for_ever() -> None:
         )
         for boot in range(2)
     ]  # fmt: skip
-    ports = [HubPort(hub, core.name) for core in cores]
+    ports = [HubPort(hub, core.name, f"10.0.0.{boot}:4000") for boot, core in enumerate(cores)]
     for core in cores:
         core.link.connected(now=0.0)
 
@@ -56,7 +60,15 @@ def test_of_two_with_one_name_neither_flaps_for_ever() -> None:
                 for core in cores:
                     core.subscribe(("/a", f"/{step}"), now=now)  # something to say, as every client has
 
-    run(0.0, 40.0)
+    run(0.0, 2.0)
+    text = "another process connected as site from 10.0.0.{}:4000; one name has one connection: end one of the two, "
+    for boot, told in enumerate(events):
+        code, why = told.last["rejected"]
+        assert code == "displaced" and why.startswith(text.format(1 - boot))
+        assert told.last["link_down"] == (why,)
+    assert hub_told.last["refused"][:2] == ("site", "displaced")
+    assert set(re.findall(r"10\.0\.0\.\d", hub_told.last["refused"][2])) == {"10.0.0.0", "10.0.0.1"}
+    run(2.0, 40.0)
     first = sum(told.calls["link_up"] for told in events)
     run(40.0, 100.0)
     later = sum(told.calls["link_up"] for told in events) - first

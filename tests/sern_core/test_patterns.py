@@ -10,8 +10,9 @@ from hypothesis import strategies as st
 from sern_core import patterns
 from sern_core.errors import UsageError
 from sern_core.patterns import MAX_CLIENT_PROGRAM, MAX_PROGRAM, PatternError, PatternSet, compile_pattern
+from tests.exploring import cases
 
-PURE = settings(deadline=None, derandomize=True, database=None, max_examples=150)
+PURE = settings(max_examples=cases(150))
 
 
 @pytest.mark.parametrize(
@@ -178,11 +179,11 @@ HOSTILE = [
 def test_no_pattern_takes_long(text: str) -> None:
     """A backtracking matcher needs seconds to hours for most of these."""
     names = ["/" + "a" * 254, "/" + "ab" * 127, "/" + "anz" * 84, "/" + "a" * 40]
-    begun_s = time.process_time()
+    begun_s = time.thread_time()
     pattern = compile_pattern(text)
     for name in names:
         pattern.fullmatch(name)
-    assert time.process_time() - begun_s < 1.0  # some milliseconds
+    assert time.thread_time() - begun_s < 1.0  # some milliseconds
 
 
 def test_what_cannot_match_costs_no_steps() -> None:

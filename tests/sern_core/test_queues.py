@@ -13,6 +13,7 @@ from sern_core.message import Message, StreamId, StreamInfo, TopicInfo, TopicSpe
 from sern_core.out_message import OutMessage
 from sern_core.queues import OutChannel
 from sern_core.types import ClientName, DropReason, Encoding, TopicName
+from tests.exploring import cases
 from tests.world import spec
 
 
@@ -26,7 +27,7 @@ class Sender:
         self.drops: list[tuple[int, DropReason]] = []
         counters = self.ledger.topic(info.name, topic_spec.priority)
         self.channel = OutChannel(
-            1, self.stream, counters, lambda out, reason: self.drops.append((out.seq, reason)), first=first
+            1, self.stream, counters, lambda _channel, out, reason: self.drops.append((out.seq, reason)), first=first
         )
         self.channel.wanted = self.channel.ready = True
 
@@ -405,9 +406,7 @@ class Channel(RuleBasedStateMachine):
 
 
 TestChannel = Channel.TestCase
-TestChannel.settings = settings(
-    derandomize=True, database=None, deadline=None, max_examples=150, stateful_step_count=40
-)
+TestChannel.settings = settings(max_examples=cases(75), stateful_step_count=40)
 
 
 @pytest.mark.parametrize("reliable", [False, True])

@@ -14,6 +14,7 @@ from sern_core.errors import RefusedError
 from sern_core.message import StreamId, StreamInfo, TopicInfo, TopicSpec
 from sern_core.routing import NO_CHANGE, Denied, Match, RouteChange, RoutingLimits, RoutingTable
 from sern_core.types import ClientName, Encoding, PriorityClass, TopicName
+from tests.exploring import cases
 
 OPEN = AccessTable([AccessRule(".*", publish=(".*",), subscribe=(".*",))])
 A, B, C = ClientName("a"), ClientName("b"), ClientName("c")
@@ -485,5 +486,5 @@ def test_against_brute_force(machine: type[RoutingMachine], monkeypatch: pytest.
         monkeypatch.setattr(routing, "SLICE_UNITS", 1)
     run_state_machine_as_test(
         machine,
-        settings=settings(deadline=None, derandomize=True, database=None, max_examples=60, stateful_step_count=30),
+        settings=settings(max_examples=cases(60), stateful_step_count=30),
     )

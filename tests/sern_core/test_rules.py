@@ -31,8 +31,9 @@ from sern_core.rules import (
     topic_name,
 )
 from sern_core.types import Durability, Encoding, PriorityClass, Reliability, TopicName
+from tests.exploring import cases
 
-STEADY = settings(deadline=None, derandomize=True, database=None)
+STEADY = settings(max_examples=cases(100))
 PARTS = st.from_regex(r"[A-Za-z_][A-Za-z0-9_]{0,5}", fullmatch=True)
 NAMES = st.lists(PARTS, min_size=1, max_size=4).map(lambda parts: TopicName("/" + "/".join(parts)))
 FEW_NAMES = st.sampled_from([TopicName(name) for name in ("/a", "/b", "/a/b", "/odom", "/tf")])

@@ -8,6 +8,7 @@ from sern_core.params import SchedulerParams
 from sern_core.pending import FEW
 from sern_core.scheduler import CREDIT_QUANTA, DEFAULT_QUANTUM_BYTES, Scheduler
 from sern_core.types import CLASSES, PriorityClass
+from tests.exploring import cases
 
 CONTROL, STATE, BULK = CLASSES
 SLOTS = 3 * FEW
@@ -210,6 +211,4 @@ class SchedulerMachine(RuleBasedStateMachine):
 
 
 TestSchedulerMachine = SchedulerMachine.TestCase
-TestSchedulerMachine.settings = settings(
-    deadline=None, derandomize=True, database=None, max_examples=150, stateful_step_count=40
-)
+TestSchedulerMachine.settings = settings(max_examples=cases(75), stateful_step_count=40)

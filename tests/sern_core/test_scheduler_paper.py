@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from sern_core.params import SchedulerParams
 from sern_core.scheduler import Scheduler, WaitReason
 from sern_core.types import CLASSES, Ordering, PriorityClass
+from tests.exploring import cases
 
 CONTROL, STATE, BULK = CLASSES
 T0 = 1000.0
@@ -88,7 +89,7 @@ messages = st.builds(
 )
 
 
-@settings(deadline=None, derandomize=True, database=None)
+@settings(max_examples=cases(100))
 @given(rounds=st.lists(st.lists(messages, max_size=12), min_size=1, max_size=5))
 def test_each_interval_does_what_the_algorithm_says(rounds: list[list[Pending]]) -> None:
     scheduler = paper_scheduler()

@@ -253,6 +253,23 @@ def test_every_late_joiner_gets_the_last_of_each_publisher(reliable: bool) -> No
             assert [g.seq for g in got] == [8, 9, 10] and all(g.replay and g.body == robot.name.encode() for g in got)
 
 
+def test_a_message_on_its_way_to_a_subscriber_that_leaves_is_no_loss_either() -> None:
+    """It was sent whole, and its acknowledgement is still to come when nobody wants it any more."""
+    world = World().watch()
+    robot = world.client("robot")
+    guest = world.client("guest", LinkModel(delay_s=1.0).as_stream(), patterns=["/robot/.*"])
+    log = robot.publish("/robot/log", spec(reliable=True))
+    world.run(10.0)
+    guest.subscribe()
+    world.run(0.8)
+    send(robot, log, 1)
+    link = world.relay.hub.links[guest.name]
+    world.until(lambda: any(channel.flying for channel in link.channels.values()), within_s=0.5)
+    world.until(lambda: not link.channels, within_s=1.0)
+    world.until(lambda: not log.retained)
+    assert robot.dropped_out == [] and log.counters.delivered == 1
+
+
 @pytest.mark.parametrize("reliable", [True, False])
 @pytest.mark.parametrize("restarted", ["relay", "site", "both"])
 def test_latched_state_outlives_restarts(reliable: bool, restarted: str) -> None:

@@ -9,8 +9,9 @@ from hypothesis import strategies as st
 from sern_core.errors import UsageError
 from sern_core.trace import LINK, OTHER, DecisionTrace, TraceEvent
 from sern_core.types import DropReason, TopicName
+from tests.exploring import cases
 
-PURE = settings(deadline=None, derandomize=True, database=None)
+PURE = settings(max_examples=cases(100))
 ODOM, MAP = TopicName("/odom"), TopicName("/map")
 
 

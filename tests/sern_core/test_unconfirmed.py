@@ -12,12 +12,13 @@ from hypothesis import strategies as st
 from sern_core.message import Message, StreamInfo
 from sern_core.types import DropReason, PriorityClass
 from sern_sim.models import LinkModel
+from tests.exploring import cases
 from tests.world import World, spec
 
 TOPIC = "/robot/points"
 
 
-@settings(max_examples=12, deadline=None, phases=(Phase.explicit, Phase.generate))
+@settings(max_examples=cases(12), phases=(Phase.explicit, Phase.generate))
 @given(
     loss=st.sampled_from([0.0, 0.05, 0.3]),
     jitter_s=st.sampled_from([0.0, 0.02]),

@@ -15,9 +15,10 @@ from hypothesis import strategies as st
 
 from sern_core import wire
 from sern_core.errors import VersionError, WireError
+from tests.exploring import cases
 from tests.make_vectors import Frames
 
-STEADY = settings(deadline=None, derandomize=True, database=None, max_examples=200)
+STEADY = settings(max_examples=cases(200))
 U8, U16, U32, U64 = (st.integers(0, 2**bits - 1) for bits in (8, 16, 32, 64))
 HEADER = wire.encode_header(wire.Kind.DATA, 7, 1, 0)
 

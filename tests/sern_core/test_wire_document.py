@@ -21,8 +21,18 @@ ROOT = Path(__file__).resolve().parents[2]
 DOCUMENT = (ROOT / "schemas" / "wire.md").read_text()
 CORE = [
     ROOT / "sern_core" / name
-    for name in ("announce.py", "answering.py", "client.py", "hop.py", "hub.py", "hub_port.py", "link.py", "session.py")
-]
+    for name in (
+        "announce.py",
+        "answering.py",
+        "client.py",
+        "hop.py",
+        "hub.py",
+        "hub_port.py",
+        "link.py",
+        "presence.py",
+        "session.py",
+    )
+]  # fmt: skip
 
 
 def section(title: str) -> str:

@@ -7,7 +7,8 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from typing import Any
 
 import pytest
 import uvloop
@@ -167,7 +168,21 @@ async def test_an_idle_loop_is_not_reported() -> None:
     assert detector.reports == []
 
 
-def test_run_gives_the_exit_code_and_leaves_no_handlers() -> None:
+@pytest.fixture
+def default_signals() -> Iterator[None]:
+    """As in a terminal: whoever started the tests may have some ignored (nohup, a shell's background job)."""
+    usual: dict[signal.Signals, Any] = {
+        signal.SIGTERM: signal.SIG_DFL,
+        signal.SIGINT: signal.default_int_handler,
+        signal.SIGHUP: signal.SIG_DFL,
+    }
+    before = {number: signal.signal(number, handler) for number, handler in usual.items()}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+def test_run_gives_the_exit_code_and_leaves_no_handlers(default_signals: None) -> None:
     before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)}
     seen: list[str] = []
 

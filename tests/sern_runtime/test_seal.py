@@ -29,6 +29,7 @@ from sern_runtime.seal import (
     make_seals,
     offered_ciphers,
 )
+from tests.exploring import cases
 
 SECRET = bytes(range(32))
 AES, CHACHA = Cipher.AES_256_GCM, Cipher.CHACHA20_POLY1305
@@ -155,7 +156,7 @@ def test_counter_zero_is_no_counter() -> None:
 )
 @example(arrivals=[1, REPLAY_WINDOW, 1, REPLAY_WINDOW + 1, 1, 2])
 @example(arrivals=[5, 5 + REPLAY_WINDOW, 6, 5])
-@settings(deadline=None, derandomize=True, database=None, max_examples=200)
+@settings(max_examples=cases(200))
 def test_the_window_is_a_set_of_what_arrived(arrivals: list[int]) -> None:
     """Against the model: a number opens when it is above the newest less the window, and was not seen."""
     opener = Opener(parameters(), Side.CLIENT)

@@ -9,11 +9,12 @@ from hypothesis import strategies as st
 from sern_sim.links import LOST, NS, Link
 from sern_sim.models import LinkMode, LinkModel, RateStep, Window
 from sern_sim.network import Direction, Network
+from tests.exploring import cases
 from tests.sern_sim.strategies import link_models, rate_steps, windows
 from tests.sern_sim.toys import ArqReceiver, ArqSender
 
 RUN_S = 10.0
-PURE = settings(deadline=None, derandomize=True, database=None, max_examples=150)
+PURE = settings(max_examples=cases(150))
 
 sendings = st.lists(
     st.tuples(st.integers(0, 300), st.integers(0, 3000)),  # milliseconds since the last packet, bytes
@@ -96,7 +97,7 @@ def test_serialisation_is_the_integral_of_the_rate(
         busy_ns = arrival_ns
 
 
-@settings(PURE, max_examples=60)
+@settings(PURE, max_examples=cases(60))
 @given(st.sampled_from(LinkMode).flatmap(lambda mode: st.tuples(*[link_models(mode=mode, run_s=3.0)] * 2)), st.data())
 def test_an_arq_gets_through_any_link_and_every_packet_is_accounted_for(
     links: tuple[LinkModel, LinkModel], data: st.DataObject

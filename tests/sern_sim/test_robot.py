@@ -16,6 +16,7 @@ from sern_sim.robot import (
     SimulatedJackal,
 )
 from sern_sim.world import World
+from tests.exploring import seeds
 
 
 def run(robot: SimulatedJackal, seconds: float) -> RobotState:
@@ -63,7 +64,7 @@ def test_odometry_drifts_but_not_far() -> None:
     assert 0.001 < error < 0.25 * state.travelled_m
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", seeds(8))
 def test_patrol_stays_clear_of_obstacles(seed: int) -> None:
     robot = SimulatedJackal(Random(seed), patrol=True)
     for _ in range(3000):

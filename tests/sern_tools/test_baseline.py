@@ -72,7 +72,7 @@ class _Closing:
 
 @pytest.fixture
 def files(tmp_path: Path) -> dict[str, Path]:
-    return write_files(tmp_path / "run", Scenario(load_profile("demo"), 10), Ports(*free_ports(5)))
+    return write_files(tmp_path / "run", Scenario(load_profile("demo"), 10), Ports(*free_ports(4)))
 
 
 async def test_both_directions_are_carried_and_logged(files: dict[str, Path], tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ import typer
 from rich.console import Console
 from typer.testing import CliRunner
 
+from sern_runtime.config import endpoints
 from sern_tools import check
 from sern_tools.keygen import run_keygen
 
@@ -34,10 +35,21 @@ def deployed(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.yaml")), ids=lambda path: path.name)
-def test_examples_are_right(deployed: Path, path: Path) -> None:
+def test_examples_are_right(deployed: Path, path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(endpoints, "installed", lambda _package: True)
+    text = (deployed / path.name).read_text()
+    (deployed / path.name).write_text(text.replace("tcp://relay.example:", "tcp://127.0.0.1:"))
     code, out, err = ran(deployed / path.name)
     assert (code, err) == (0, "")
     assert out.endswith(f"{path.name}: right\n")
+
+
+def test_a_relay_that_does_not_resolve_is_a_warning(deployed: Path) -> None:
+    code, out, err = ran(deployed / "site.yaml")  # its relay is in .example, which nobody has (RFC 2606)
+    assert (code, err.count("\n")) == (0, 1)
+    assert err.startswith(f"warning: {deployed}/site.yaml:")
+    assert "relay.endpoint: relay.example does not resolve on this machine now: " in err
+    assert out.endswith("site.yaml: right\n")
 
 
 def test_there_are_examples() -> None:
@@ -112,6 +124,97 @@ def test_warnings_go_to_standard_error(deployed: Path) -> None:
         code, _, err = ran(deployed / name)
         assert code == 0
         assert err.startswith("warning: ") and "chmod 600" in err
+
+
+HERE = "client: {name: jackal1}\nrelay: {endpoint: 'tcp://127.0.0.1:5555', insecure: true}\n"
+ENDPOINT = "endpoint: {kind: synthetic, role: robot}\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (
+            ENDPOINT + "topics:\n  - {match: /cmd_vel, class: control, lifespan_s: 120}\n",
+            "5: topics.0.lifespan_s: lets a command wait for up to 120 s, and then a robot moves by it; leave it out, "
+            "or write a second or less",
+        ),
+        (
+            ENDPOINT + "topics:\n  - {match: /cmd_vel, class: control, lifespan_s: null}\n",
+            "5: topics.0.lifespan_s: lets a command wait for ever, and then a robot moves by it; leave it out, or "
+            "write a second or less",
+        ),
+        (ENDPOINT + "topics:\n  - {match: /stop, class: control, reliability: reliable, lifespan_s: null}\n", ""),
+        (ENDPOINT + "topics:\n  - {match: /map, class: state, lifespan_s: 600}\n", ""),
+        (
+            ENDPOINT + "topics:\n  - {match: cmd_vel}\n",
+            "5: topics.0.match: 'cmd_vel' matches no topic: names begin with '/'; /cmd_vel?",
+        ),
+        (
+            ENDPOINT + "subscribe: ['[a-z]+/odom']\n",
+            "4: subscribe.0: '[a-z]+/odom' matches no topic: names begin with '/'",
+        ),
+        (ENDPOINT + "subscribe: ['.*odom', '(/a|b)/c', '[^a]b', '/?odom']\n", ""),
+        (
+            ENDPOINT + "discovery: {deny: [rosout]}\n",
+            "4: discovery.deny.0: 'rosout' matches no topic: names begin with '/'; /rosout?",
+        ),
+        (
+            "endpoint: {kind: zenoh}\n",
+            "3: endpoint.kind: needs the Python package zenoh, which is not on this machine: pip install eclipse-zenoh",
+        ),
+        (
+            "endpoint: {kind: dds}\n",
+            "3: endpoint.kind: needs the Python package cyclonedds, which is not on this machine: "
+            "pip install cyclonedds==11.0.1",
+        ),
+    ],
+)
+def test_what_is_accepted_and_does_not_do_what_it_seems(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str, said: str
+) -> None:
+    monkeypatch.setattr(endpoints, "installed", lambda _package: False)
+    path = tmp_path / "f.yaml"
+    path.write_text(HERE + text, encoding="utf-8")
+    code, _, err = ran(path)
+    assert (code, err) == (0, said and f"warning: {path}:{said}\n")
+
+
+def test_a_package_that_is_there_is_found() -> None:
+    assert endpoints.installed("zmq") and not endpoints.installed("no_such_package")
+
+
+def test_patterns_and_commands_of_a_relay(deployed: Path) -> None:
+    path = deployed / "relay.yaml"
+    path.write_text(path.read_text().replace("publish: ['/{self}/.*']", "publish: ['{self}/.*']"))
+    code, _, err = ran(path)
+    assert code == 0
+    assert "publish.0: '{self}/.*' matches no topic: names begin with '/'" in err
+    assert err.count("warning") == 1
+
+
+def test_key_files_with_the_name_of_somebody_else(deployed: Path) -> None:
+    clients = deployed / "clients"
+    shutil.move(clients / "husky1.pub", clients / "jackal2.pub")
+    shutil.move(clients / "site1.pub", clients / "site1-2030.pub")  # several files may be of one client
+    odd = (
+        f"{clients}/jackal2.pub holds the key of husky1, and by its name that of jackal2: who has it connects as husky1"
+    )
+    code, _, err = ran(deployed / "relay.yaml")
+    assert (code, err.count("\n")) == (0, 1)
+    assert err.endswith(f"relay.clients_dir: {odd}\n")
+    code, out, err = ran(clients / "jackal2.pub")
+    assert (code, err) == (0, f"warning: {odd}\n")
+    assert out == f"public key file of husky1, 1 key(s)\n{clients}/jackal2.pub: right\n"
+    site = deployed / "site.yaml"
+    site.write_text(site.read_text().replace("relay.example", "127.0.0.1").replace("relay.pub", "site1.pub"))
+    shutil.copy(deployed / "jackal1.pub", deployed / "site1.pub")
+    code, _, err = ran(site)
+    assert code == 0
+    assert f"relay.secret_key_file: {deployed}/site1.pub is not its public half (it holds the key of jackal1)" in err
+    run_keygen("client", "site1", out=deployed, force=True)
+    code, _, err = ran(site)
+    assert f"relay.server_key_file: {deployed}/site1.pub is the key of site1, this client; the relay's is needed" in err
+    assert err.count("warning") == 1
 
 
 def test_command_line_alone_and_inside_another(deployed: Path) -> None:

@@ -56,7 +56,7 @@ def test_the_json_has_the_benchmarks_shape() -> None:
     assert control["latency_p99_s"] == pytest.approx(0.030)
     for row in document["rows"]:
         units = {name.rpartition("_")[2] for name in row if name not in ("case", "system")}
-        assert units <= {"messages", "bytes", "s"}
+        assert units <= {"messages", "bytes", "s", "share", "changes", "switches"}
     assert all(reach.keys() == {"name", "value", "limit", "ok"} for reach in document["reach"])
     assert all(reach["ok"] for reach in document["reach"])
 

@@ -144,3 +144,19 @@ async def test_what_is_wrong_is_one_line(tmp_path: Path, arguments: list[str], w
     assert words in demo.output
     assert len(demo.output.splitlines()) == 1
     demo.assert_nothing_left()
+
+
+@pytest.mark.parametrize("stage", ["1/3", "  0.0 s", "3/3"])
+async def test_kill_9_leaves_nothing_behind(tmp_path: Path, stage: str) -> None:
+    """No process, and no directory with keys."""
+    demo = Started(tmp_path)
+    try:
+        await demo.start("--profile", "quick")
+        await until(lambda: stage in demo.output and len(demo.processes()) > 3, stage, deadline_s=RUN_S)
+        assert demo.process is not None
+        demo.process.kill()
+        assert await demo.ended() == -signal.SIGKILL
+        await until(lambda: demo.processes() == [], "every process has ended", deadline_s=RUN_S)
+        demo.assert_nothing_left()
+    finally:
+        await demo.clean_up()

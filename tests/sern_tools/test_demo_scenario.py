@@ -14,7 +14,7 @@ from sern_sim.models import LinkModel
 from sern_sim.profiles import LinkProfile
 from sern_tools.demo_scenario import COMMAND_TOPIC, POSE_TOPIC, RELAY, ROBOT, SITE, Ports, Scenario, write_files
 
-PORTS = Ports(relay=5001, link=5002, relay_http=5003, robot_http=5004, site_http=5005)
+PORTS = Ports(relay=5001, relay_http=5003, robot_http=5004, site_http=5005)
 DEMO = load_profile("demo")
 
 
@@ -41,8 +41,9 @@ def test_the_files_are_valid(tmp_path: Path) -> None:
     assert load_relay(files[RELAY]).warnings == ()
     robot, site = load_client(files[ROBOT]), load_client(files[SITE])
     assert (robot.warnings, site.warnings) == ((), ())
-    assert robot.model.relay.endpoint == "tcp://127.0.0.1:5002"
+    assert robot.model.relay.endpoint == "tcp://127.0.0.2:5001", "where the proxy is"
     assert site.model.relay.endpoint == "tcp://127.0.0.1:5001"
+    assert robot.model.relay.udp and site.model.relay.udp and robot.model.adaptation is not None
     assert robot.model.subscribe_patterns() == ("/robot(?:/cmd_vel)",)
     assert site.model.subscribe_patterns() == ("/robot/.*",)
 

@@ -1,11 +1,14 @@
 """`sern echo`: messages as text, who it is to the relay, and what it prints, refuses and leaves at a real one."""
 
+import base64
 import json
 import os
 import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Callable
+from http.server import BaseHTTPRequestHandler, HTTPServer
 from io import StringIO
 from pathlib import Path
 from typing import Any
@@ -22,6 +25,7 @@ from sern_core.message import Message, StreamId, StreamInfo, TopicInfo, TopicSpe
 from sern_core.types import ClientName, DropReason, Encoding, TopicName
 from sern_runtime import ros_types
 from sern_runtime.loop import Shutdown
+from sern_runtime.transport_watch import CUT, ENDED
 from sern_tools.commands import app
 from sern_tools.echo import (
     Listener,
@@ -235,7 +239,9 @@ def test_a_client_file_is_enough(tmp_path: Path) -> None:
 def test_exit_codes(tmp_path: Path) -> None:
     runner = CliRunner()
     for arguments, code, words in (
-        (["/a"], 2, "say where to listen"),
+        (["/a", "--api", "http://127.0.0.1:1", "--relay", "tcp://127.0.0.1:1"], 2, "give one place to listen at"),
+        (["/a", "--rate"], 2, "--rate needs every message"),
+        (["/a", "--key", "x.key"], 2, "go with --relay"),
         (["a", "--api", "http://127.0.0.1:1"], 2, "topic 'a' must start with '/'"),
         (["/a", "--api", "http://127.0.0.1:1", "--rate"], 2, "--rate needs every message"),
         (["/a", "--api", "http://127.0.0.1:1", "--name", "x"], 2, "go with --relay"),
@@ -313,7 +319,7 @@ async def test_who_is_not_let_in(tmp_path: Path) -> None:
         (tmp_path / "stranger").mkdir()
         other = Lab(tmp_path / "stranger", "viewer", relay_port=lab.port)
         show = Show(other)
-        with pytest.raises(SernError, match="the relay ended the handshake"):
+        with pytest.raises(SernError, match=f"{ENDED}|{CUT}"):
             await show.run(timeout_s=1.0)
         (other.directory / "relay.pub").write_text((tmp_path / "relay.pub").read_text())
         with pytest.raises(SernError, match="relay refused our key"):
@@ -338,7 +344,7 @@ async def test_a_running_client_is_not_pushed_aside(tmp_path: Path) -> None:
         with pytest.raises(UsageError, match="viewer is connected already"):
             await show.run()
         # Without that hint: the two take the session from each other, and the guest gives way.
-        with pytest.raises(SernError, match=r"another program is connected to .* as viewer"):
+        with pytest.raises(SernError, match=r"process connected as viewer from 127\.0\.0\.1:\d+; .*sern keygen"):
             await Show(lab).run()
 
 
@@ -352,11 +358,71 @@ async def test_the_latest_value_without_a_key(tmp_path: Path) -> None:
         out = StringIO()
         decoder = SAY["plain"]
         url = f"http://127.0.0.1:{relay.port}"
-        await poll("/robot1/text", url, Printer(decoder, out, count=1), Shutdown(), decoder, timeout_s=20.0)
+        await poll(
+            "/robot1/text", url, Printer(decoder, out, count=1), Shutdown(), decoder, timeout_s=20.0, warn=pytest.fail
+        )
         assert out.getvalue().startswith("# robot1 seq ")
         assert read_yaml(out.getvalue().split("---\n")[0])["data"].startswith("/text ")
         with pytest.raises(SernError, match="no topic /robot1/none within"):
-            await poll("/robot1/none", url, Printer(decoder, out, count=1), Shutdown(), decoder, timeout_s=0.1)
+            await poll(
+                "/robot1/none",
+                url,
+                Printer(decoder, out, count=1),
+                Shutdown(),
+                decoder,
+                timeout_s=0.1,
+                warn=pytest.fail,
+            )
+        client = f"http://127.0.0.1:{robot.port}"
+        options: dict[str, Any] = {"timeout_s": 0.1, "warn": pytest.fail}
+        with pytest.raises(SernError, match=r"is a client's: only a relay keeps values; .*--relay"):
+            await poll("/robot1/text", client, Printer(decoder, out, count=1), Shutdown(), decoder, **options)
+
+
+async def test_a_topic_that_nobody_takes_is_said_to_be_so(tmp_path: Path) -> None:
+    async with Lab(tmp_path, "robot1") as lab:
+        relay = lab.process(lab.relay_file())
+        bag = write_bag(tmp_path / "a.bag", {"/text": 3})
+        robot = lab.process(lab.player_file("robot1", bag, play={"wait_for": []}))
+        for process in (relay, robot):
+            await process.ready()
+        await relay.until(lambda: relay.json("/api/topics")["announced"], "has the topic")
+        shutdown, said = Shutdown(), list[str]()
+
+        def warn(text: str) -> None:
+            said.append(text)
+            shutdown.request()
+
+        decoder, url = SAY["plain"], f"http://127.0.0.1:{relay.port}"
+        printer = Printer(decoder, StringIO(), count=1)
+        await poll("/robot1/text", url, printer, shutdown, decoder, timeout_s=0.01, warn=warn)
+        assert said[0].startswith("/robot1/text of robot1 is announced, and the relay has no message of it: ")
+
+
+class Registry(BaseHTTPRequestHandler):
+    """The daemon of this machine."""
+
+    def do_GET(self) -> None:
+        value = {"base64": base64.b64encode(ros_types.serialise(message_of(TEXT, data="here"), TEXT, ROS1)).decode()}
+        attributes = {"topic": "/r/text", "encoding": "ros1"}
+        item = {"id": "1", "version": 1, "owner": "r", "type": TEXT, "definition": "", "seq": 7, "value": value}
+        self.send_response(200)
+        self.end_headers()
+        self.wfile.write(json.dumps({"objects": [item | {"attributes": attributes}]}).encode())
+
+    def log_message(self, *_: object) -> None:
+        """Say nothing."""
+
+
+def test_without_options_it_asks_the_daemon_of_this_machine(monkeypatch: pytest.MonkeyPatch) -> None:
+    with HTTPServer(("127.0.0.1", 0), Registry) as server:
+        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
+        thread.start()
+        monkeypatch.setattr("sern_tools.echo.DEFAULT_API", f"http://127.0.0.1:{server.server_port}")
+        result = CliRunner().invoke(app, ["echo", "/r/text", "--count", "1"])
+        server.shutdown()
+        thread.join()
+    assert (result.exit_code, result.stdout) == (0, '# r seq 7 latest value\ndata: "here"\n---\n'), result.output
 
 
 async def test_ctrl_c_and_a_closed_pipe_are_quiet(tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ from sern_core.types import ClientName, DropReason, PriorityClass
 from sern_sim.models import LinkModel
 from sern_tools.fates import Fate, Fates, Route, fates
 from sern_tools.message_log import Delivery, Offer, TopicLog
+from tests.exploring import cases
 from tests.world import SimClient, World, spec
 
 TOPIC = "/robot/points"
@@ -108,7 +109,7 @@ class Stage:
         return fates(log, ROUTE, reliable=self.reliable)
 
 
-@settings(max_examples=15, deadline=None, phases=(Phase.explicit, Phase.generate))
+@settings(max_examples=cases(15), phases=(Phase.explicit, Phase.generate))
 @given(
     seed=st.integers(0, 1000),
     loss=st.sampled_from([0.0, 0.05, 0.3]),

@@ -3,12 +3,14 @@
 import asyncio
 import os
 import signal
+import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
 from sern_core.errors import SernError
+from sern_tools import child as launcher
 from sern_tools import processes
 from sern_tools.processes import Child, Children, program
 from tests.support import until
@@ -152,3 +154,18 @@ def ended(pid: int) -> bool:
         return (Path("/proc") / str(pid) / "stat").read_text().rpartition(")")[2].split()[0] == "Z"
     except FileNotFoundError:
         return True
+
+
+def launched(parent: int, *command: str) -> subprocess.CompletedProcess[str]:
+    """What becomes of a command that is bound to the process `parent`."""
+    line = [sys.executable, "-I", "-S", launcher.__file__, str(parent), *command]
+    return subprocess.run(line, capture_output=True, text=True, timeout=60, check=False)
+
+
+def test_a_child_whose_parent_ended_before_it_asked_does_not_start() -> None:
+    """Then no signal would come any more: whoever is its parent now is not the one that it was started for."""
+    assert launched(os.getpid(), "echo", "here").stdout == "here\n"
+    orphan = launched(os.getppid(), "echo", "here")
+    assert (orphan.returncode, orphan.stdout) == (1, "")
+    missing = launched(os.getpid(), "/nowhere/relay")
+    assert (missing.returncode, missing.stderr) == (127, "/nowhere/relay: No such file or directory\n")

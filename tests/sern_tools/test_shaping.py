@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from sern_sim.models import Flap, Jitter, LinkModel, RateStep, Window
 from sern_tools.shaping import SLOT_BYTES, UNLIMITED_BPS, RateSchedule, Shaper
+from tests.exploring import cases
 
 
 def shaper(model: LinkModel, *, origin_s: float = 0.0) -> Shaper:
@@ -91,7 +92,7 @@ def test_jitter_keeps_the_order_and_is_seeded(jitter: Jitter) -> None:
     assert max(delays) - min(delays) > 0.015
 
 
-@settings(deadline=None, derandomize=True, database=None)
+@settings(max_examples=cases(100))
 @given(
     gaps=st.lists(st.tuples(st.floats(0.001, 3.0), st.floats(0.0, 1e6)), min_size=1, max_size=6),
     sizes=st.lists(st.integers(1, 1500), min_size=1, max_size=50),

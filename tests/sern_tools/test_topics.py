@@ -18,6 +18,7 @@ from sern_tools import api
 from sern_tools.commands import app
 from sern_tools.demo_link import free_ports
 from sern_tools.topics import (
+    UNTAKEN_NOTE,
     Counts,
     Identity,
     Row,
@@ -69,6 +70,17 @@ def test_a_relay_has_the_sum_of_its_links() -> None:
     odom = parse_topics(relay_view(1))["/r/odom"]
     assert (odom.received, odom.delivered, odom.queued, odom.takers, odom.age_s) == (10, 10, 4, 1, 0.25)
     assert odom.reasons == {"superseded": 2, "lifespan": 1}  # a duplicate is no loss
+
+
+def test_what_nobody_takes_is_listed_with_a_mark() -> None:
+    announced = {"/r/odom": {"class": "state", "taken": True}, "/r/log": {"class": "bulk", "taken": False}}
+    rows = compare({}, parse_topics(relay_view(1) | {"announced": announced}), 1.0, parse_identities(OBJECTS))
+    assert [(row.topic, row.untaken) for row in rows] == [("/r/cmd_vel", False), ("/r/odom", False), ("/r/log", True)]
+    for width in (60, 120):
+        lines = text_of(rows, width).splitlines()
+        assert [line.split()[1] == "*" for line in lines[1:4]] == [False, False, True]
+        assert " ".join(lines[4:]).split() == UNTAKEN_NOTE.split()
+    assert "*" not in text_of(rows[:2], 120)
 
 
 def test_a_client_has_one_flat_table() -> None:
@@ -221,9 +233,10 @@ def test_exit_codes() -> None:
 async def test_a_real_relay_and_its_client(tmp_path: Path) -> None:
     async with Lab(tmp_path, "robot1", "site") as lab:
         relay = lab.process(lab.relay_file())
-        site = lab.process(lab.recorder_file("site", "/robot1/.*"))
-        bag = write_bag(tmp_path / "a.bag", {"/text": 20})
-        robot = lab.process(lab.player_file("robot1", bag, play={"rate": 1.0, "loop": True}))
+        site = lab.process(lab.recorder_file("site", "/robot1/text"))
+        bag = write_bag(tmp_path / "a.bag", {"/text": 20, "/spare": 20})
+        play = {"rate": 1.0, "loop": True, "wait_for": ["/text"]}
+        robot = lab.process(lab.player_file("robot1", bag, play=play))
         for process in (relay, robot, site):
             await process.ready()
         await relay.until(lambda: relay.json("/api/topics")["received"].get("/robot1/text"), "has the topic")
@@ -236,11 +249,14 @@ async def test_a_real_relay_and_its_client(tmp_path: Path) -> None:
             return json.loads(out.getvalue())
 
         rows = listed(relay.port)
-        assert [(row["topic"], row["owner"], row["priority"]) for row in rows] == [("/robot1/text", "robot1", "state")]
-        assert rows[0]["type_name"] == "std_msgs/msg/String"
-        assert rows[0]["takers"] == 1
+        assert [(row["topic"], row["owner"], row["priority"], row["untaken"]) for row in rows] == [
+            ("/robot1/spare", "robot1", "state", True),  # the recording has it, and the site does not want it
+            ("/robot1/text", "robot1", "state", False),
+        ]
+        assert {row["type_name"] for row in rows} == {"std_msgs/msg/String"}
+        assert rows[1]["takers"] == 1
         for client in (site, robot):
-            (row,) = listed(client.port)
+            (row,) = listed(client.port, pattern=".*/text")
             assert (row["topic"], row["owner"], row["type_name"]) == ("/robot1/text", "robot1", "std_msgs/msg/String")
         assert listed(robot.port, pattern="/none") == []
 

@@ -106,6 +106,7 @@ static std::map<std::string, Kind> kinds() {
     std::map<std::string, Kind> all;
     auto add = [&all](Kind kind) { all[kind.support.get_type_name()] = kind; };
     add(Kind{TypeSupport(new std_msgs::msg::dds_::String_PubSubType()), nullptr, nullptr});
+    add(Kind{TypeSupport(new diagnostic_msgs::msg::dds_::DiagnosticStatus_PubSubType()), nullptr, nullptr});
     add(Kind{TypeSupport(new std_srvs::srv::dds_::SetBool_Request_PubSubType()), nullptr, nullptr});
     add(Kind{TypeSupport(new std_srvs::srv::dds_::SetBool_Response_PubSubType()), nullptr, nullptr});
     using namespace example_interfaces::action::dds_;

@@ -34,8 +34,9 @@ from sern_core.errors import ConfigError
 from sern_core.message import TopicInfo
 from sern_core.types import Encoding, TopicName
 from sern_runtime.ros_types import topic_info
+from tests.exploring import cases
 
-STEADY = settings(max_examples=100, deadline=None, derandomize=True, database=None)
+STEADY = settings(max_examples=cases(100))
 QOS = st.builds(
     EndpointQos,
     reliable=st.booleans(),

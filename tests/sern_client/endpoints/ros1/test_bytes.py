@@ -12,6 +12,7 @@ from sern_client.endpoints.ros1.header import MAX_HEADER_BYTES, decode_header, e
 from sern_client.endpoints.ros1.http import HttpMessage, HttpReader
 from sern_client.endpoints.ros1.xmlrpc import CallError, decode_call, split_uri, value_of
 from sern_core.errors import WireError
+from tests.exploring import cases
 
 NAMES = st.text(st.characters(codec="utf-8", exclude_characters="="), min_size=1, max_size=20)
 FIELDS = st.dictionaries(NAMES, st.text(st.characters(codec="utf-8"), max_size=100), max_size=20)
@@ -183,7 +184,7 @@ def framed(*bodies: bytes) -> bytes:
     return b"".join(struct.pack("<I", len(body)) + body for body in bodies)
 
 
-@settings(max_examples=200)
+@settings(max_examples=cases(200))
 @given(st.lists(st.binary(max_size=40), max_size=12), st.lists(st.integers(1, 30), min_size=1, max_size=6))
 def test_frames_in_any_pieces(bodies: list[bytes], pieces: list[int]) -> None:
     taken = Taken(limit=32)

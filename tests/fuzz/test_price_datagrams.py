@@ -1,127 +1,30 @@
-"""Whatever a peer sends has a bounded price: in processor time of the event loop, and in memory beside its own size.
+"""Whatever datagram a client sends has a bounded price for its relay: `price.py` says which, and how it is measured."""
 
-Times are processor time of this thread, the best of a few tries, against a budget of 20 ms on the machine the limits
-were measured on; a slower machine has the time that it needs more for a reference loop, and noise has MARGIN.
-"""
-
-import gc
 import random
 import struct
-import time
-import tracemalloc
 import zlib
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
 from functools import partial
 from typing import Final
 
 import pytest
 
-from sern_client import conversion
-from sern_client.frames import FramePrefixer
-from sern_client.tf_latch import TfLatch
 from sern_core import wire
 from sern_core.announce import Announcement, definition_hash, encode_announcement
 from sern_core.codecs import Compression, encode
-from sern_core.errors import BodyError, ConfigError, WireError
+from sern_core.errors import WireError
 from sern_core.message import StreamId, StreamInfo, TopicInfo
-from sern_core.summaries import transforms
 from sern_core.types import Encoding, TopicName
-from sern_runtime import ros_services, ros_text, ros_types
+from tests.exploring import seeds
+from tests.fuzz.price import Input, Make, within_budget, within_memory
 from tests.fuzz.test_hostile_peer import Hostile, _piece, _whole
 from tests.world import World, spec
 
-BUDGET_S: Final = 0.020
-REFERENCE_S: Final = 0.0020
-"""What `_reference` takes where the limits were measured."""
-TRIES: Final = 2
-MARGIN: Final = 3.0
-MULTIPLE: Final = 24
-"""Bytes of memory that an input may hold for each of its own, and..."""
-MULTIPLE_EACH: Final = 40
-"""... and for each client that gets what is announced in it: a channel with its queue and counters takes 7 kB."""
-BASE_BYTES: Final = 2 * 2**20
-"""... what it may hold whatever its size: caches that fill, what one attachment unpacks to."""
-
-
-def _reference() -> float:
-    start_s = time.thread_time()
-    table: dict[int, bytes] = {}
-    for number in range(20_000):
-        table[number & 1023] = b"%d" % number
-    return time.thread_time() - start_s
-
-
-def _slowness() -> float:
-    return max(1.0, min(_reference() for _ in range(5)) / REFERENCE_S)
-
-
-@dataclass
-class Input:
-    """What is sent, and its size. Made anew for every try: what is known already costs nothing."""
-
-    nbytes: int
-    take: Callable[[], object]
-    clients: int = 0
-    rest: Callable[[], bool] = lambda: False
-    """Does one more slice of it, in another turn of the loop; False: there was none."""
-
-
-Make = Callable[[], Input]
-INPUTS: dict[str, Make] = {}
+INPUTS: Final[dict[str, Make]] = {}
 FEWER: Final[dict[str, Make]] = {}
 """Those with fewer clients, for what grows with their number: counting memory is slow."""
 FEW: Final = 8
-
-
-def price_s(make: Make) -> float:
-    """The processor time of the longest slice of one input, the best of some tries."""
-    best_s = float("inf")
-    for _ in range(TRIES):
-        given = make()
-        longest_s = 0.0
-        gc.collect()
-        gc.disable()  # a collection costs what there is in the process, and not what came
-        try:
-            start_s = time.thread_time()
-            given.take()
-            longest_s = time.thread_time() - start_s
-            more = True
-            while more:
-                start_s = time.thread_time()
-                more = given.rest()
-                longest_s = max(longest_s, time.thread_time() - start_s)
-        finally:
-            gc.enable()
-        best_s = min(best_s, longest_s)
-        if best_s <= BUDGET_S:
-            break
-    return best_s
-
-
-def within_budget(make: Make) -> bool:
-    spent_s = price_s(make)
-    return spent_s <= BUDGET_S or spent_s <= MARGIN * BUDGET_S * _slowness()
-
-
-def held_bytes(make: Make) -> tuple[int, int]:
-    """What an input adds to memory at most, and what its size allows."""
-    given = make()
-    tracemalloc.start()
-    try:
-        before = tracemalloc.get_traced_memory()[0]
-        kept = given.take()
-        while given.rest():
-            pass
-        peak = tracemalloc.get_traced_memory()[1] - before
-        del kept
-    finally:
-        tracemalloc.stop()
-    return peak, given.nbytes * (MULTIPLE + MULTIPLE_EACH * given.clients)
-
-
-# --- datagrams -------------------------------------------------------------------------------------------------------
 
 
 def one_more_slice(peer: Hostile) -> bool:
@@ -371,7 +274,7 @@ def with_channels(peer: Hostile, count: int) -> None:
 
 @for_fifty
 def answers_about_many_channels(peer: Hostile) -> list[bytes]:
-    with_channels(peer, 400)
+    with_channels(peer, 8 * len(peer.hub.links))
     return filled(lambda index: control(peer, wire.encode_control(
         {"t": "want", "ch": 1, "on": bool(index % 2), "chs": [2, 0xFFFF]})))  # fmt: skip
 
@@ -454,148 +357,6 @@ def encoded(mode: Compression, raw: bytes) -> Prepare:
 encoded(Compression.LZ4, bytes(8192))
 encoded(Compression.ZSTD, bytes(8192))
 
-# --- definitions -----------------------------------------------------------------------------------------------------
-
-SEP: Final = ros_text.SEPARATOR
-_serial = iter(range(10**9))
-
-
-def definition(label: str, text: str) -> None:
-    """A definition, read for everything that is done with one. A name of its own each time: no cache knows it."""
-    for encoding in (Encoding.ROS1, Encoding.CDR):
-        other = Encoding.CDR if encoding is Encoding.ROS1 else Encoding.ROS1
-
-        def make(encoding: Encoding = encoding, other: Encoding = other) -> Input:
-            name = f"evil/msg/T{next(_serial)}"
-            info = TopicInfo(TopicName("/evil"), name, encoding, "", text.replace("evil/msg/A", name))
-
-            def take() -> object:
-                for use in (
-                    lambda: conversion.converted(info, other),
-                    lambda: FramePrefixer("robot/").incoming(info),
-                    lambda: ros_services.resolve(name.replace("/msg/", "/srv/"), info.definition, encoding),
-                ):
-                    try:
-                        use()
-                    except ConfigError:
-                        continue
-                return None
-
-            return Input(len(text), take)
-
-        INPUTS[f"definition: {label}, {encoding}"] = make
-
-
-definition("blank lines", "\n" * 2**18)
-definition("few blank lines", "\n" * 7_900 + "int32 x\n")
-definition("spaces", " " * 2**18)
-definition("comments", ("#" * 30 + "\n") * 7_900)
-definition("fields", "".join(f"float64[] x{n}\n" for n in range(ros_text.MAX_MEMBERS)))
-definition("too many fields", "".join(f"float64[] x{n}\n" for n in range(7_000)))
-definition("constants", "".join(f"string X{n}='{n}'\n" for n in range(ros_text.MAX_MEMBERS)))
-definition(
-    "types",
-    "".join(f"B{n} x{n}\n" for n in range(255))
-    + "".join(f"{SEP}\nMSG: evil/B{n}\nint32 x\nHeader y\n" for n in range(254)),
-)
-definition("arrays of texts", "string[4900] x\n")
-definition("arrays of numbers", "float64[1048576] x\n" * 1)
-definition("huge arrays", "uint8[4294967295] x\n")
-definition("in each other", "B0 x\n" + "".join(f"{SEP}\nMSG: evil/B{n}\nB{n + 1} x\nB{n + 1} y\n" for n in range(30)))
-definition("a long number", "int32 X=" + "9" * 100_000 + "\n")
-definition("quotes", ("string X='" + "\\\\" * 1_900 + "\n") * 60)
-definition("underscores", ("a_" * 2_000 + "\n") * 60)
-definition("headings", f"{SEP}\nMSG: a/B\n" * 2_700)
-IDL: Final = f"{SEP}\nIDL: evil/msg/A\nmodule evil {{ module msg {{ struct A {{ "
-definition("IDL members", IDL + "".join(f"long x{n}; " for n in range(200)) + "}; }; };\n")
-definition("IDL annotations", IDL + '@verbatim (language="comment", text="abc") ' * 60 + "long x; }; }; };\n")
-definition("IDL open quotes", IDL + '@a("' * 60_000)
-definition("IDL shifts", IDL + "long x[1<<1<<29]; }; }; };\n")
-definition("IDL dimensions", IDL + "long x" + "[2]" * 300 + "; }; }; };\n")
-definition("IDL parentheses", IDL + "long x[" + "(" * 400 + "; }; }; };\n")
-definition("IDL names", IDL + "a::" * 900 + "b x; }; }; };\n")
-definition("IDL comments", IDL + "/*" * 100_000)
-
-# --- bodies ----------------------------------------------------------------------------------------------------------
-
-HEAD: Final = struct.pack("<IIII", 0, 0, 0, 0)
-HEADER_TEXT: Final = f"{SEP}\nMSG: std_msgs/Header\nuint32 seq\ntime stamp\nstring frame_id\n"
-
-
-def body(label: str, type_name: str, text: str, data: bytes) -> None:
-    """A body of ROS 1 that is converted, and whose frame ids change."""
-
-    def make() -> Input:
-        info = TopicInfo(TopicName("/evil"), type_name, Encoding.ROS1, "", text)
-        _, convert = conversion.converted(info, Encoding.CDR)
-        rewrite = FramePrefixer("robot/").incoming(info)
-        assert rewrite is not None
-
-        def take() -> object:
-            try:
-                return convert(data), rewrite(data)
-            except ConfigError:
-                return rewrite(data)
-
-        return Input(len(data), take)
-
-    INPUTS[f"body: {label}"] = make
-
-
-EMPTY: Final = f"Header header\nEmpty[] x\n{SEP}\nMSG: evil/Empty\n{HEADER_TEXT}"
-body("messages without fields", "evil/msg/A", EMPTY, HEAD + struct.pack("<I", 2**32 - 1))
-body("many of them", "evil/msg/A", EMPTY, HEAD + struct.pack("<I", 20_000))
-body(
-    "texts",
-    "evil/msg/A",
-    "Header header\nstring[] x\n" + HEADER_TEXT,
-    HEAD + struct.pack("<I", 40_000) + bytes(160_000),
-)
-body("numbers", "evil/msg/A", "Header header\nfloat64[] x\n" + HEADER_TEXT, HEAD + b"\xff\xff\xff\xff")
-body("array", "evil/msg/A", "Header header\nfloat64[1048576] x\n" + HEADER_TEXT, HEAD)
-body(
-    "transforms",
-    "tf2_msgs/msg/TFMessage",
-    "",
-    struct.pack("<I", 60_000) + (bytes(12) + struct.pack("<I", 0) * 2 + bytes(56)) * 60_000,
-)
-body(
-    "poses",
-    "nav_msgs/msg/Path",
-    "",
-    HEAD + struct.pack("<I", 4_700) + (HEAD + bytes(56)) * 4_700,
-)
-
-
-def transforms_of(count: int) -> None:
-    def make() -> Input:
-        data = struct.pack("<I", count) + (bytes(12) + struct.pack("<I", 0) * 2 + bytes(56)) * count
-
-        def take() -> object:
-            latch, merger = TfLatch(Encoding.ROS1), transforms.TransformMerger(Encoding.ROS1)
-            for use in (lambda: latch.add("a", data), lambda: merger.add(data, now=0.0)):
-                try:
-                    use()
-                except (BodyError, ConfigError):
-                    continue
-            return latch, merger
-
-        return Input(len(data), take)
-
-    INPUTS[f"body: {count} transforms to merge"] = make
-
-
-transforms_of(1_900)
-transforms_of(10**5)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def warm() -> None:
-    """What is loaded once in a process is no input's price."""
-    for encoding in (Encoding.ROS1, Encoding.CDR):
-        ros_types.typestore(encoding)
-    INPUTS["definition: fields, ros1"]().take()
-
 
 @pytest.mark.parametrize("name", list(INPUTS))
 def test_an_input_holds_the_loop_for_a_bounded_time(name: str) -> None:
@@ -604,37 +365,7 @@ def test_an_input_holds_the_loop_for_a_bounded_time(name: str) -> None:
 
 @pytest.mark.parametrize("name", list(INPUTS))
 def test_an_input_adds_a_bounded_multiple_of_its_size_to_memory(name: str) -> None:
-    peak, allowed_bytes = held_bytes(FEWER.get(name, INPUTS[name]))
-    assert peak <= BASE_BYTES + allowed_bytes
-
-
-# --- anything --------------------------------------------------------------------------------------------------------
-
-WORDS: Final = (
-    "int32 x\n", "string[] y\n", "B[3] z\n", "Header h\n", "float64 X=1e9\n", "\n", " ", "=" * 80 + "\n",
-    "MSG: evil/B\n", "IDL: evil/msg/A\n", "module evil { module msg { struct A { long x; }; }; };", "[", "]", "<=", "#",
-    "'", '"', "\\", "a/", "time t\n", "string<=9[<=9] s\n", "uint8[1000000] b\n", "@", "\t", "\r\n", "\0", "9" * 50,
-    "B b\n",
-)  # fmt: skip
-
-
-def fuzzed_definition(rng: random.Random) -> Make:
-    text = "".join(rng.choice(WORDS) * rng.choice((1, 1, 1, 2, 50, 900)) for _ in range(rng.randrange(40)))
-    encoding = rng.choice((Encoding.ROS1, Encoding.CDR))
-    data = rng.randbytes(rng.randrange(64)) + bytes(rng.randrange(2000))
-
-    def take() -> object:
-        """All that is done with a definition and a body of its type; nothing but the documented error comes of it."""
-        info = TopicInfo(TopicName("/evil"), "evil/msg/A", encoding, "", text)
-        rewrite = FramePrefixer("robot/").incoming(info)
-        if rewrite is not None:
-            rewrite(data)
-        with suppress(ConfigError):
-            _, convert = conversion.converted(info, Encoding.CDR if encoding is Encoding.ROS1 else Encoding.ROS1)
-            convert(data)
-        return None
-
-    return lambda: Input(len(text), take)
+    assert within_memory(FEWER[name])
 
 
 def fuzzed_datagram(rng: random.Random) -> Make:
@@ -685,11 +416,9 @@ def fuzzed_frame(rng: random.Random, peer: Hostile) -> bytes:
     return bytes([rng.randrange(6)]) + rng.randbytes(rng.randrange(40))
 
 
-@pytest.mark.parametrize("seed", range(120))
-@pytest.mark.parametrize("kind", [fuzzed_definition, fuzzed_datagram])
-def test_anything_has_a_bounded_price(kind: Callable[[random.Random], Make], seed: int) -> None:
-    make = kind(random.Random(seed))
+@pytest.mark.parametrize("seed", seeds(120))
+def test_any_datagram_has_a_bounded_price(seed: int) -> None:
+    make = fuzzed_datagram(random.Random(seed))
     assert within_budget(make)
     if seed % 8 == 0:  # counting memory is slow
-        peak, allowed_bytes = held_bytes(make)
-        assert peak <= BASE_BYTES + allowed_bytes
+        assert within_memory(make)

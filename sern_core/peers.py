@@ -1,0 +1,171 @@
+"""What a client knows of its peers, the clients whose streams it takes: are they there? Pure.
+
+The relay tells of each peer whether it can be reached (`sern_core/presence.py`), the streams tell when something of it
+came last, and the client's own link says whether any of that is still to be believed: while it is down nobody knows,
+and ages grow.
+"""
+
+from collections import Counter
+from collections.abc import Callable
+from enum import StrEnum
+from typing import Any, Final, NamedTuple
+
+from sern_core import wire
+from sern_core.errors import WireError
+from sern_core.types import ClientName
+
+LET_GO_S: Final = 60.0
+"""A peer of which the relay of a new session says nothing for so long, and that has no stream here, is forgotten."""
+MAX_PEERS: Final = 4096
+"""Peers that a relay may tell of; no honest one has as many."""
+MAX_FOR_S: Final = 1e9
+MAX_RTT_S: Final = 1e6
+
+
+class PeerStatus(StrEnum):
+    """`connected`: the relay reaches it; `gone`: the relay has lost it; `unknown`: our own link is down, or the relay
+    does not say."""
+
+    CONNECTED = "connected"
+    GONE = "gone"
+    UNKNOWN = "unknown"
+
+
+class PeerView(NamedTuple):
+    """A peer at one time. `age_s`: since the last message of it came here; None: none has. `since_s`: for how long its
+    status has been so. `rtt_s`: round trip between it and the relay, and `lane` its lane there, as far as known."""
+
+    name: ClientName
+    status: PeerStatus
+    since_s: float
+    age_s: float | None
+    rtt_s: float | None
+    lane: str
+
+
+class PeerChange(NamedTuple):
+    """A peer's status is another one, after `lasted_s` of the one before. `old` None: it is a new peer."""
+
+    name: ClientName
+    old: PeerStatus | None
+    new: PeerStatus
+    lasted_s: float
+
+
+class _Peer:
+    __slots__ = ("lane", "rtt_s", "since_s", "status", "up", "up_since_s")
+
+    def __init__(self, since_s: float) -> None:
+        self.status = PeerStatus.UNKNOWN
+        self.since_s = since_s
+        self.up: bool | None = None  # as the relay says in this session; None: it has said nothing
+        self.up_since_s = since_s
+        self.lane = ""
+        self.rtt_s: float | None = None
+
+
+class Peers:
+    """`on_change` is told of every peer whose status changes, and that comes."""
+
+    def __init__(self) -> None:
+        self.on_change: Callable[[PeerChange], None] = lambda _change: None
+        self._peers: dict[ClientName, _Peer] = {}
+        self._streams: Counter[ClientName] = Counter()  # open here, by origin
+        self._heard_s: dict[ClientName, float] = {}
+        self._session_s = 0.0
+        self._session = False
+        self._believed = False  # the relay answers, so what it said last holds
+
+    def session_began(self, *, now: float) -> None:
+        """The relay will tell of each peer anew."""
+        self._session = self._believed = True
+        self._session_s = now
+
+    def session_ended(self, *, now: float) -> None:
+        """Nobody knows of any peer any more."""
+        self._session = False
+        for peer in self._peers.values():
+            peer.up = None
+        self.reached(False, now=now)
+
+    def reached(self, answers: bool, *, now: float) -> None:
+        """Whether the relay answers. While it does not, what it said last may not hold any more."""
+        self._believed = answers
+        for name, peer in self._peers.items():
+            self._settle(name, peer, now)
+
+    def opened(self, origin: ClientName, *, now: float) -> None:
+        """A stream of `origin` is open here."""
+        self._streams[origin] += 1
+        self._known(origin, now)
+
+    def closed(self, origin: ClientName) -> None:
+        self._streams[origin] -= 1
+        if not self._streams[origin]:
+            del self._streams[origin]
+
+    def arrived(self, origin: ClientName, *, now: float) -> None:
+        """A message of `origin` came."""
+        self._heard_s[origin] = now
+
+    def told(self, envelope: wire.Envelope, *, now: float) -> None:
+        """The relay's `peers` message. Raises WireError for one that no honest relay sends."""
+        items = envelope.get("peers", [])
+        if not isinstance(items, list) or not all(isinstance(item, dict) for item in items):
+            raise WireError("envelope key 'peers' must be a list of maps")
+        for item in items:
+            self._told(item, now)
+
+    def _told(self, item: dict[str, Any], now: float) -> None:
+        name = ClientName(wire.take_str(item, "name", max_length=64))
+        if "up" not in item:  # we take nothing of it any more
+            if name in self._peers:
+                self._peers[name].up = None
+                self._let_go(name)
+            return
+        up = wire.take_bool(item, "up")
+        for_s = wire.take_float(item, "for", low=0.0, high=MAX_FOR_S) or 0.0
+        rtt_s = wire.take_float(item, "rtt", low=0.0, high=MAX_RTT_S)
+        lane = wire.take_str(item, "lane", max_length=16, default="")
+        if name not in self._peers and len(self._peers) >= MAX_PEERS:
+            raise WireError(f"the relay tells of more than {MAX_PEERS} peers")
+        peer = self._known(name, now)
+        if peer.up is not up:
+            peer.up, peer.up_since_s = up, now - for_s
+        peer.rtt_s, peer.lane = rtt_s, lane
+        self._settle(name, peer, now)
+
+    def _known(self, name: ClientName, now: float) -> _Peer:
+        peer = self._peers.get(name)
+        if peer is None:
+            peer = self._peers[name] = _Peer(now)
+            self.on_change(PeerChange(name, None, PeerStatus.UNKNOWN, 0.0))
+        return peer
+
+    def _settle(self, name: ClientName, peer: _Peer, now: float) -> None:
+        """Give a peer the status that follows from what is known."""
+        if peer.up is None or not self._believed:
+            status, since_s = PeerStatus.UNKNOWN, now
+        else:
+            status, since_s = PeerStatus.CONNECTED if peer.up else PeerStatus.GONE, peer.up_since_s
+        if status is not peer.status:
+            old, lasted_s = peer.status, now - peer.since_s
+            peer.status, peer.since_s = status, since_s
+            self.on_change(PeerChange(name, old, status, lasted_s))
+
+    def _let_go(self, name: ClientName) -> None:
+        if name not in self._streams:
+            del self._peers[name]
+            self._heard_s.pop(name, None)
+
+    def look(self, *, now: float) -> list[PeerView]:
+        """All peers by name. Lets go of those that nothing speaks of any more."""
+        if self._session and now - self._session_s > LET_GO_S:
+            for name in [name for name, peer in self._peers.items() if peer.up is None]:
+                self._let_go(name)
+        return [self._view(name, peer, now) for name, peer in sorted(self._peers.items())]
+
+    def _view(self, name: ClientName, peer: _Peer, now: float) -> PeerView:
+        heard_s = self._heard_s.get(name)
+        age_s = None if heard_s is None else max(0.0, now - heard_s)
+        return PeerView(name, peer.status, max(0.0, now - peer.since_s), age_s, peer.rtt_s, peer.lane)

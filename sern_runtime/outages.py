@@ -1,0 +1,43 @@
+"""Losses and recoveries in pairs: whoever was told of the one is told of the other, at the same level."""
+
+import logging
+from dataclasses import dataclass
+from typing import Final
+
+SAY_AFTER_S: Final = 3.0
+"""A path that is silent for less is no news: bad links do so all the time."""
+
+
+@dataclass(slots=True)
+class _Outage:
+    since_s: float
+    said: bool = False
+
+
+class Outages:
+    """What is silent now, by key. Call `look` about once a second for each."""
+
+    def __init__(self, log: logging.Logger, level: int, *, after_s: float = SAY_AFTER_S) -> None:
+        self._log = log
+        self._level = level
+        self._after_s = after_s
+        self._outages: dict[tuple[str, ...], _Outage] = {}
+
+    def look(self, key: tuple[str, ...], *, lost: bool, gone: str, back: str, now: float) -> None:
+        """`gone` and `back` are what is said; how long it was is put behind `back`."""
+        outage = self._outages.get(key)
+        if not lost:
+            if outage is not None:
+                del self._outages[key]
+                if outage.said:
+                    self._log.log(self._level, "%s, after %.0f s", back, now - outage.since_s)
+        elif outage is None:
+            self._outages[key] = _Outage(now)
+        elif not outage.said and now - outage.since_s >= self._after_s:
+            outage.said = True
+            self._log.log(self._level, "%s", gone)
+
+    def forget(self, *key: str) -> None:
+        """It ended with something else, of which was told: all keys that begin so."""
+        for known in [known for known in self._outages if known[: len(key)] == key]:
+            del self._outages[known]

@@ -1,0 +1,72 @@
+"""The shipped files of a Husky, its relay and its sites, with what a real Husky publishes: a recording of one drives
+them."""
+
+from pathlib import Path
+from typing import Any, Final
+
+import pytest
+from rosbags.rosbag1 import Reader
+from ruamel.yaml import YAML
+
+from sern_core.types import Encoding, TopicName
+from sern_runtime import ros_types
+from tests.daemons import Lab, bodies, recording
+from tests.support import until
+
+EXAMPLES: Final = Path(__file__).resolve().parents[2] / "deploy" / "examples"
+NEEDED: Final = {
+    "/fix": "sensor_msgs/msg/NavSatFix",
+    "/husky_velocity_controller/odom": "nav_msgs/msg/Odometry",
+}
+"""What an operator drives by: where it is on the map, and how it moves."""
+LEFT_OUT: Final = {"/imu/data": "raw measurements; they are in the fused pose, and offered to a site that asks"}
+"""What does not cross the link, and why."""
+
+
+def shipped(name: str) -> dict[str, Any]:
+    content: dict[str, Any] = YAML(typ="safe").load((EXAMPLES / f"{name}.yaml").read_text())
+    return content
+
+
+def here(lab: Lab, name: str, endpoint: dict[str, object]) -> Path:
+    """A shipped client file with nothing changed but where its relay, its topics and its HTTP server are."""
+    content = shipped(name)
+    client = content.pop("client")
+    content.pop("relay")
+    content.pop("http")
+    own = content.pop("endpoint")
+    assert own["kind"] in {"ros1", "dds"}
+    # `client_file` adds keys, the address of the relay and a free port for HTTP.
+    return lab.client_file(client["name"], endpoint, **{"discovery": {"mode": "manual"}, **content}, client=client)
+
+
+@pytest.mark.parametrize("site", ["site-noetic", "site-jazzy"])
+async def test_what_an_operator_needs_of_a_real_husky_arrives(tmp_path: Path, site: str) -> None:
+    bag = recording("husky_gps_imu_odom.bag")
+    with Reader(bag) as reader:
+        assert {connection.topic for connection in reader.connections} == NEEDED.keys() | LEFT_OUT.keys()
+    async with Lab(tmp_path, "husky1", "site1") as lab:
+        relay = await lab.relay(lab.relay_file(access=shipped("relay")["access"]))
+        # A recorder takes both encodings, so the site of ROS 2 is tested without a conversion.
+        target = await lab.connected(here(lab, site, {"kind": "record", "path": "site1", "overwrite": True}))
+        play = {"kind": "bag", "path": str(bag), "rate": 0, "wait_for": sorted(NEEDED)}
+        robot = await lab.connected(here(lab, "husky-noetic", play))
+        await until(lambda: {s.topic for s in relay.hub.relayed} >= {f"/husky1{name}" for name in (*NEEDED, *LEFT_OUT)})
+        received = target.core.received.topics
+        wanted = {TopicName(f"/husky1{name}") for name in NEEDED}
+        await until(
+            lambda: {name for name, counters in received.items() if counters.delivered} == wanted,
+            "every topic that an operator needs arrives",
+        )
+        await lab.end(robot)
+        await lab.end(target)
+    arrived = bodies(tmp_path / "site1.bag")
+    assert arrived.keys() == {f"/husky1{name}" for name in NEEDED}
+    sent = bodies(bag)
+    for name, type_name in NEEDED.items():
+        original = [ros_types.deserialise(body, type_name, Encoding.ROS1) for body in sent[name]]
+        stamps = {(m.header.stamp.sec, m.header.stamp.nanosec): m for m in original}
+        for body in arrived[f"/husky1{name}"]:
+            message = ros_types.deserialise(body, type_name, Encoding.ROS1)
+            source = stamps[message.header.stamp.sec, message.header.stamp.nanosec]
+            assert message.header.frame_id == f"husky1/{source.header.frame_id.removeprefix('/')}"

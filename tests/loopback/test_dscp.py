@@ -1,0 +1,235 @@
+"""What is marked how on the wire (DSCP): each datagram by its class, and each connection."""
+
+import asyncio
+import socket as socketlib
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import pytest
+from pydantic import ValidationError
+
+from sern_core.lanes import LANE_UDP
+from sern_core.message import TopicInfo, TopicSpec
+from sern_core.types import ClientName, Encoding, PriorityClass, TopicName
+from sern_runtime import clock
+from sern_runtime.config.shared import DscpSection
+from sern_runtime.dscp import Marks
+from sern_runtime.express import CONNECTIONS
+from sern_runtime.udp import UdpServer
+from sern_runtime.udp_client import UdpClient
+from sern_runtime.zmq_socket import SendResult
+from sern_tools.demo_link import free_ports
+from tests.daemons import HOST, Lab
+from tests.loopback.test_udp_client import has_ipv6
+from tests.loopback.udp_support import OFFERED, ROBOT
+from tests.support import until
+
+INSIDE = "127.0.0.2"
+EF, CS0, CS1 = 46 << 2, 0, 8 << 2
+
+
+def listening(host: str, port: int = 0) -> socketlib.socket:
+    """A bound socket that is told the IP byte of each datagram."""
+    family = socketlib.AF_INET6 if ":" in host else socketlib.AF_INET
+    socket = socketlib.socket(family, socketlib.SOCK_DGRAM)
+    if family == socketlib.AF_INET6:
+        socket.setsockopt(socketlib.IPPROTO_IPV6, socketlib.IPV6_RECVTCLASS, 1)
+    else:
+        socket.setsockopt(socketlib.IPPROTO_IP, socketlib.IP_RECVTOS, 1)
+    socket.setblocking(False)
+    socket.bind((host, port))
+    return socket
+
+
+def take(socket: socketlib.socket) -> tuple[int, bytes, Any] | None:
+    """The IP byte of the next datagram, the datagram, and whence it came; None: there is none."""
+    try:
+        data, ancillary, _, address = socket.recvmsg(2048, 64)
+    except BlockingIOError:
+        return None
+    ((_, _, value),) = ancillary
+    return int.from_bytes(value, "little"), data, address
+
+
+class Tap:
+    """Forwards datagrams between a client that sends to `INSIDE`:port and `HOST`:port, TCP connections too, and notes
+    the IP byte and the size of each datagram."""
+
+    def __init__(self, port: int) -> None:
+        self.port = port
+        self.inner = listening(INSIDE, port)
+        self.outer = listening("127.0.0.3")
+        self.up: list[tuple[int, int]] = []
+        self.down: list[tuple[int, int]] = []
+        self._client: Any = None
+        loop = asyncio.get_running_loop()
+        loop.add_reader(self.inner, self._from_client)
+        loop.add_reader(self.outer, self._from_relay)
+
+    def _from_client(self) -> None:
+        while (got := take(self.inner)) is not None:
+            tos, data, self._client = got
+            self.up.append((tos, len(data)))
+            self.outer.sendto(data, (HOST, self.port))
+
+    def _from_relay(self) -> None:
+        while (got := take(self.outer)) is not None:
+            tos, data, _ = got
+            self.down.append((tos, len(data)))
+            self.inner.sendto(data, self._client)
+
+    def close(self) -> None:
+        for socket in (self.inner, self.outer):
+            asyncio.get_running_loop().remove_reader(socket)
+            socket.close()
+
+
+@pytest.mark.parametrize(
+    "host", ["127.0.0.1", pytest.param("::1", marks=pytest.mark.skipif(not has_ipv6(), reason=""))]
+)
+async def test_each_datagram_has_the_mark_it_was_sent_with(host: str) -> None:
+    url = f"udp://[{host}]:*" if ":" in host else f"udp://{host}:*"
+    marks = [EF, EF, CS1, CS0, EF, CS1, CS1, None]
+    server = UdpServer([url], lambda _session, _data, _now: None, tos=0xBB)
+    session = server.open_session(ROBOT, OFFERED)
+    far = listening(host)
+    client = UdpClient(host, far.getsockname()[1], session.parameters, lambda _data, _now: None, tos=CS1 | 3)
+    try:
+        await until(lambda: client.socket is not None, "the client has a socket")
+        for tos in marks:
+            assert client.send(b"x" * 100, tos) is SendResult.OK
+        got = [take(far) for _ in range(1 + len(marks))]
+        challenge, *rest = [one[0] for one in got if one is not None]
+        assert challenge == CS1, "ECN's two bits are not ours"
+        assert rest == [CS1 if tos is None else tos for tos in marks]
+        first = got[0]
+        assert first is not None
+        server.listeners[0].send(b"from the relay", far.getsockname()[:2], server.tos)
+        await until(lambda: (seen := take(far)) is not None and seen[0] == 0xB8, "the server's own")
+    finally:
+        client.close()
+        server.close()
+        far.close()
+
+
+async def test_the_classes_of_a_session_are_marked_both_ways(tmp_path: Path) -> None:
+    """Bulk fills datagrams of 1200 bytes, class control sends messages of 300 bytes: the sizes tell them apart."""
+    (port,) = free_ports(1)
+    async with Lab(tmp_path, "robot1", relay_port=port) as lab:
+        relay = await lab.relay()
+        tap = Tap(port)
+        forward = await asyncio.start_server(_pipe_to(port), INSIDE, port)
+        try:
+            there = {"endpoint": f"tcp://{INSIDE}:{port}"}
+            robot = await lab.connected(
+                lab.client_file("robot1", {"kind": "synthetic", "role": "operator"}, relay=there)
+            )
+            await until(lambda: robot.core.link.lane.id == LANE_UDP, "datagrams are used")
+            hub = relay.hub
+            hub.tap = lambda _stream: True
+            now = clock.now()
+            channels = {}
+            for priority in PriorityClass:
+                info = TopicInfo(TopicName(f"/robot1/{priority.name.lower()}"), "std_msgs/msg/String", Encoding.CDR)
+                channels[priority] = robot.core.publish(info, TopicSpec(priority, depth=1000), now=now)
+            hub.refresh_interest(now=now)
+            robot.core.subscribe(("/feed/.*",), now=now)
+            down = {
+                priority: hub.open_local(
+                    TopicInfo(TopicName(f"/feed/{priority.name.lower()}"), "std_msgs/msg/String", Encoding.CDR),
+                    TopicSpec(priority, depth=1000),
+                    ClientName("feed_x"),
+                    now=now,
+                )
+                for priority in PriorityClass
+            }
+            await until(lambda: all(channel.wanted for channel in channels.values()), "all are wanted")
+            tap.up.clear()
+            tap.down.clear()
+            sizes = {PriorityClass.CONTROL: 300, PriorityClass.STATE: 500, PriorityClass.BULK: 20_000}
+
+            def enough() -> bool:
+                """Sends one message each way; whether 40 datagrams that must hold such came through, each way."""
+                body = b"x" * sizes[priority]
+                robot.core.send(channels[priority], body, 0, now=clock.now())
+                hub.inject(down[priority], body, 0, now=clock.now())
+                robot._kick()
+                relay._after()
+                return all(sum(size > least for _, size in way) >= 40 for way in (tap.up, tap.down))
+
+            seen: dict[PriorityClass, tuple[Counter[int], Counter[int]]] = {}
+            for priority, nbytes in sizes.items():
+                least = min(nbytes, 1000)
+                await until(enough, f"datagrams of class {priority.name}")
+                seen[priority] = (
+                    Counter(tos for tos, size in tap.up if size > least),
+                    Counter(tos for tos, size in tap.down if size > least),
+                )
+                tap.up.clear()
+                tap.down.clear()
+            for priority, mark in zip(PriorityClass, (EF, CS0, CS1), strict=True):
+                for counts in seen[priority]:
+                    assert set(counts) == {mark}, f"{priority.name}: {counts}"
+            await lab.end(robot)
+            await lab.end(relay)
+        finally:
+            forward.close()
+            tap.close()
+
+
+def _pipe_to(port: int) -> Any:
+    async def pipe(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        try:
+            while data := await reader.read(65536):
+                writer.write(data)
+                await writer.drain()
+        finally:
+            writer.close()
+
+    async def connected(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        far_reader, far_writer = await asyncio.open_connection(HOST, port)
+        await asyncio.gather(pipe(reader, far_writer), pipe(far_reader, writer), return_exceptions=True)
+
+    return connected
+
+
+async def test_connections_have_the_marks_of_the_file(tmp_path: Path) -> None:
+    """Both ends of the stream, and of the connections for class control alone."""
+    dscp = {"control": "cs5", "state": 18}
+    express, stream = 40 << 2, 18 << 2
+    async with Lab(tmp_path, "robot1") as lab:
+        relay = await lab.relay(lab.relay_file(link={"dscp": dscp}))
+        file = lab.client_file(
+            "robot1", {"kind": "synthetic", "role": "robot"}, relay={"udp": False}, link={"dscp": dscp}
+        )
+        robot = await lab.connected(file)
+        await until(lambda: robot._express is not None and len(robot._express.paths) == CONNECTIONS, "all are joined")
+        server = relay.server
+        assert server is not None
+        await until(lambda: len(server.express.joined) == CONNECTIONS, "the relay knows that they are")
+        marked = []
+        for handle in server.connections.handles():
+            with handle._connection() as socket:
+                assert socket is not None
+                marked.append(socket.getsockopt(socketlib.IPPROTO_IP, socketlib.IP_TOS))
+        assert sorted(marked) == [stream, express, express]
+        assert robot._transport is not None and robot._express is not None
+        ours = [robot._transport._dialer, *(each.dialer for each in robot._express._connections)]
+        marked = []
+        for dialer in ours:
+            assert dialer._handle is not None
+            with dialer._handle._connection() as socket:
+                assert socket is not None
+                marked.append(socket.getsockopt(socketlib.IPPROTO_IP, socketlib.IP_TOS))
+        assert marked == [stream, express, express]
+
+
+def test_the_marks_of_a_file() -> None:
+    assert DscpSection().marks() == Marks() == Marks(control=46, state=0, bulk=8)
+    assert Marks().tos == (EF, CS0, CS1)
+    section = DscpSection.model_validate({"control": "cs5", "state": "af41", "bulk": 63})
+    assert section.marks() == Marks(40, 34, 63)
+    for wrong in ("EF", "af44", 64, -1, True, 1.0, None):
+        with pytest.raises(ValidationError, match="a DSCP: a name such as ef, af41 or cs1, or 0 to 63"):
+            DscpSection.model_validate({"bulk": wrong})

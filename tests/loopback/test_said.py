@@ -1,0 +1,144 @@
+"""What the daemons say to their operator: in the log, in /readyz and in the status, and that it is so."""
+
+import signal
+import socket
+from pathlib import Path
+
+import pytest
+
+from sern_client import relay_name
+from sern_client.daemon import SILENT
+from sern_core.lanes import LANE_UDP
+from sern_core.message import TopicInfo
+from sern_core.types import Encoding, TopicName
+from sern_runtime.transport_watch import WAITING
+from tests.daemons import Lab, write_bag
+from tests.support import until
+
+ROBOT = {"kind": "synthetic", "role": "robot", "topics": 1}
+CHAT = ({"match": "/chat", "class": "state", "reliability": "reliable"},)
+
+
+async def test_a_topic_that_no_rule_names_is_said_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("INFO")
+    bag = write_bag(tmp_path / "a.bag", {"/chat": 3, "/chta": 3, "/denied": 3})
+    discovery = {"mode": "manual", "deny": ["/denied"]}
+    async with Lab(tmp_path, "robot1") as lab:
+        await lab.relay()
+        play = {"loop": True, "wait_for": []}
+        robot = await lab.connected(lab.player_file("robot1", bag, play=play, topics=list(CHAT), discovery=discovery))
+        again = TopicInfo(TopicName("/chta"), "std_msgs/msg/String", Encoding.ROS1)
+        robot.bridge.topic_removed(again.name)  # a node that comes and goes is no news
+        robot.bridge.topic_added(again)
+        said = [message for message in caplog.messages if "stays here" in message]
+        assert said == ["/chta (std_msgs/msg/String) stays here: no rule in `topics` names it (discovery.mode: manual)"]
+
+
+async def test_a_relay_that_does_not_resolve_is_said_at_once_and_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(relay_name, "ASK_AGAIN_S", 0.0)
+    monkeypatch.setattr(relay_name, "SAY_AGAIN_S", (0.0, 0.0))
+    async with Lab(tmp_path, "robot1") as lab:
+        config = lab.client_file("robot1", ROBOT, relay={"endpoint": f"tcp://relay.example:{lab.port}"})
+        robot = await lab.client(config)
+        await until(lambda: sum("does not resolve" in message for message in caplog.messages) >= 3, "says it again")
+        first, second = [message for message in caplog.messages if "does not resolve" in message][:2]
+        text = "the relay's name relay.example does not resolve: "
+        assert first.startswith(f"tcp://relay.example:{lab.port}: {text}")
+        assert first.endswith("; trying again until it does")
+        assert " s now" in second
+        assert robot._ready().reason.startswith(text)
+        assert robot._name is not None
+
+        async def resolves(_host: str, _port: int) -> None:
+            return None
+
+        monkeypatch.setattr(relay_name, "unresolved", resolves)
+        await until(lambda: any("relay.example resolves again, after" in message for message in caplog.messages))
+        assert "does not resolve" not in robot._ready().reason
+
+
+def test_only_names_are_looked_up() -> None:
+    assert relay_name.name_in("tcp://relay.example:5555") == ("relay.example", 5555)
+    for endpoint in ("tcp://127.0.0.1:5555", "tcp://[::1]:5555", "ipc:///run/sern"):
+        assert relay_name.name_in(endpoint) is None
+
+
+async def test_two_processes_with_one_name_are_told_of_each_other(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    async with Lab(tmp_path, "robot1") as lab:
+        relay = await lab.relay()
+        first = await lab.connected(lab.client_file("robot1", ROBOT))
+        second = await lab.connected(lab.client_file("robot1", ROBOT))
+        said = "another process connected as robot1 from 127.0.0.1:"
+        for daemon in (first, second):
+            await until(lambda daemon=daemon: daemon._ready().reason.startswith(said), "is displaced, and says so")  # type: ignore[misc]
+            assert daemon._why() == daemon._ready().reason
+        # One line for each time that it is displaced, and one at the relay.
+        await lab.end(second)
+        await until(lambda: first._ready().ok, "goes on alone")
+        await until(lambda: len(relay.hub.relayed) == len(first.core.link.channels) > 0, "has its topics again")
+        assert first.bridge.refusals == 0
+        own = [record for record in caplog.records if said in record.getMessage()]
+        assert {record.name for record in own} == {"sern_client.daemon", "sern_relay.daemon"}
+        at_relay = [record for record in own if record.name == "sern_relay.daemon"]
+        assert relay.refusals["displaced"] == len(at_relay) >= 2
+        assert at_relay[0].getMessage().endswith(" has no session any more")
+        assert not any(record.levelname == "ERROR" for record in caplog.records)
+
+
+async def test_a_recovery_is_said_like_the_loss(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("INFO")
+    async with Lab(tmp_path, "robot1") as lab:
+        relay = await lab.relay()
+        robot = await lab.connected(lab.client_file("robot1", ROBOT, relay={"udp": False}))
+        assert not [record for record in caplog.records if "again" in record.getMessage()]
+        assert relay.server is not None
+        relay.server.cut_client("robot1")
+        await until(lambda: any("the link is there again, after " in message for message in caplog.messages))
+        await until(lambda: any("robot1 connected again, after " in message for message in caplog.messages))
+        lines = {record.getMessage().partition(", after")[0]: record.levelname for record in caplog.records}
+        assert lines[f"{lab.endpoint}: the connection to the relay was lost; trying again until it works"] == "WARNING"
+        assert lines[f"{lab.endpoint}: the link is there again"] == "WARNING"
+        await lab.end(robot)
+
+
+async def test_a_relay_that_hangs_is_not_said_to_be_there(tmp_path: Path) -> None:
+    async with Lab(tmp_path, "robot1") as lab:
+        relay = await lab.process(lab.relay_file()).ready()
+        robot = await lab.process(lab.client_file("robot1", ROBOT)).ready()
+        relay.signal(signal.SIGSTOP)
+        await robot.until(lambda: robot.get("/readyz") == (503, f"{SILENT}\n"), "says that it does not answer")
+        await robot.said("WARNING", f"{lab.endpoint}: {SILENT}")
+        relay.signal(signal.SIGCONT)
+        await robot.until(lambda: robot.get("/readyz")[0] == 200, "has it again")
+        ends = ("the relay answers again, after ", "the link is there again, after ")  # if the session did not last
+        await robot.until(lambda: any(end in line for line in robot.lines for end in ends), "says that it is back")
+        assert not any("no datagram gets through" in line for line in robot.lines), robot.text  # nothing got through
+
+
+async def test_a_session_that_outlives_its_connection_says_that_there_is_another(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    async with Lab(tmp_path, "robot1") as lab:
+        relay = await lab.relay()
+        robot = await lab.connected(lab.client_file("robot1", ROBOT))
+        await until(lambda: robot.core.link.lane.id == LANE_UDP, "data goes over UDP")
+        assert relay.server is not None
+        assert relay.server.connections.cut_user("robot1") >= 1
+        await until(lambda: any("the connection is there again, after " in message for message in caplog.messages))
+        assert not any("the link is there again" in message for message in caplog.messages)  # it was never gone
+        assert robot._said == set()
+
+
+async def test_before_anything_has_come_back_nothing_else_is_said(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    async with Lab(tmp_path, "robot1") as lab:
+        with socket.create_server(("127.0.0.1", lab.port)):  # as a relay that was stopped: the kernel takes connections
+            robot = await lab.client(lab.client_file("robot1", ROBOT))
+            await until(lambda: robot._ready().reason == WAITING, "has a connection")
+            assert not [record for record in caplog.records if record.levelname == "WARNING"]
+            await lab.drop(robot)

@@ -1,0 +1,321 @@
+"""A client knows whether those are there whose streams it takes, however loaded its link is."""
+
+from collections import Counter
+
+import pytest
+
+from sern_core import wire
+from sern_core.access import AccessRule, AccessTable
+from sern_core.errors import WireError
+from sern_core.hub import HubParams
+from sern_core.message import TopicInfo
+from sern_core.peers import LET_GO_S, MAX_PEERS, PeerChange, Peers, PeerStatus, PeerView
+from sern_core.presence import MAX_TOLD
+from sern_core.types import ClientName, Encoding, PriorityClass, TopicName
+from sern_sim.models import LinkModel, Window
+from tests.world import SimClient, World, spec
+
+CONNECTED, GONE, UNKNOWN = PeerStatus.CONNECTED, PeerStatus.GONE, PeerStatus.UNKNOWN
+THIN_BPS = 1e6
+OVERLOAD = 13.0
+
+
+def thin(rate_bps: float = THIN_BPS, delay_s: float = 0.025) -> LinkModel:
+    return LinkModel(rate_bps=rate_bps, delay_s=delay_s).as_stream()
+
+
+def peers(client: SimClient) -> dict[str, PeerView]:
+    return {view.name: view for view in client.core.look_at_peers(now=client.now)}
+
+
+def statuses(client: SimClient) -> dict[str, PeerStatus]:
+    return {name: view.status for name, view in peers(client).items()}
+
+
+# --- who is told of whom ----------------------------------------------------------------------------------------------
+
+
+def test_a_site_knows_of_its_robots_and_a_robot_of_who_drives_it() -> None:
+    world = World().watch()
+    robots = [world.client(name, thin(), patterns=[f"/{name}/cmd_vel"]) for name in ("robot1", "robot2")]
+    stranger = world.client("stranger")
+    site = world.client("site", thin(delay_s=0.1), patterns=["/robot.*"])
+    for robot in robots:
+        robot.publish(f"/{robot.name}/odom", spec())
+    stranger.publish("/stranger/odom", spec())
+    site.publish("/robot1/cmd_vel", spec(PriorityClass.CONTROL))
+    world.until(lambda: statuses(site) == {"robot1": CONNECTED, "robot2": CONNECTED})
+    world.until(lambda: statuses(robots[0]) == {"site": CONNECTED})
+    world.run(5.0)
+    assert statuses(robots[1]) == statuses(stranger) == {}
+    assert peers(site)["robot1"].lane == "zmq"
+    assert peers(site)["robot1"].rtt_s == pytest.approx(0.05, abs=0.03)
+    assert peers(robots[0])["site"].rtt_s == pytest.approx(0.2, abs=0.05)
+
+
+def test_the_age_is_that_of_the_last_message_of_any_of_its_topics_and_a_replay_is_none() -> None:
+    world = World()
+    robot = world.client("robot")
+    map_ = robot.publish("/robot/map", spec(reliable=True, latched=True))
+    world.run(1.0)
+    robot.send(map_, b"map")
+    world.run(1.0)
+    site = world.client("site", patterns=["/robot/.*"])
+    world.until(lambda: site.seqs("/robot/map") == [1])
+    assert site.got[0].replay
+    world.run(2.0)
+    assert peers(site)["robot"].age_s is None
+    odom = robot.publish("/robot/odom", spec())
+    world.run(1.0)
+    robot.send(odom, b"odom")
+    world.run(3.0)
+    assert peers(site)["robot"].age_s == pytest.approx(3.0, abs=0.3)
+
+
+def test_a_stream_that_ends_leaves_a_peer_only_while_there_is_another() -> None:
+    world = World().watch()
+    robot = world.client("robot")
+    site = world.client("site", patterns=["/robot/.*"])
+    channels = [robot.publish(f"/robot/{name}", spec()) for name in ("odom", "map")]
+    world.until(lambda: statuses(site) == {"robot": CONNECTED})
+    robot.core.unpublish(channels[0], now=robot.now)
+    world.run(3.0)
+    assert statuses(site) == {"robot": CONNECTED}
+    robot.core.unpublish(channels[1], now=robot.now)
+    world.until(lambda: statuses(site) == {})
+
+
+def test_what_the_relay_itself_publishes_is_nobodys() -> None:
+    world = World(access=AccessTable([AccessRule(client=".*", publish=(".*",), subscribe=(".*",))])).watch()
+    site = world.client("site", patterns=["/scene/.*"])
+    world.run(1.0)
+    info = TopicInfo(TopicName("/scene/pose"), "std_msgs/msg/String", Encoding.CDR)
+    handle = world.relay.hub.open_local(info, spec(), ClientName("feed_scene"), now=world.relay.now)
+    world.run(1.0)
+    world.relay.hub.inject(handle, b"1", 0, now=world.relay.now)
+    world.until(lambda: site.seqs("/scene/pose") == [1])
+    world.run(2.0)
+    told = [name for name in statuses(site) if name != "feed_scene"]
+    assert told == [] and GONE not in statuses(site).values()
+
+
+def test_a_client_that_does_not_ask_is_told_nothing() -> None:
+    """Of an earlier version: a control message that it does not know would end its session."""
+    world = World().watch()
+    robot = world.client("robot")
+    site = world.client("site")
+    robot.publish("/robot/odom", spec())
+    world.run(0.5)
+    site.core.link.send_control({"t": "subscribe", "patterns": ["/robot/.*"], "more": False}, now=site.now)
+    told: list[str] = []
+    link = world.relay.hub.links[site.name]
+    send = link.send_control
+
+    def watched(envelope: wire.Envelope, attachment: bytes = b"", *, now: float) -> int:
+        told.append(envelope["t"])
+        return send(envelope, attachment, now=now)
+
+    world.relay.hub.presence._watchers.clear()
+    link.send_control = watched  # type: ignore[method-assign]
+    world.until(lambda: site.opened)
+    world.run(5.0)
+    assert "announce" in told and "peers" not in told
+
+
+# --- who is gone ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("lossless", [True, False])
+def test_a_robot_that_falls_silent_is_gone_and_comes_back(lossless: bool) -> None:
+    world = World(lossless=lossless)
+    model = LinkModel(rate_bps=THIN_BPS, delay_s=0.025, blackouts=(Window(10.0, 20.0),))
+    robot = world.client("robot", model.as_stream() if lossless else model)
+    site = world.client("site", patterns=["/robot/.*"])
+    odom = robot.publish("/robot/odom", spec())
+    robot.every(0.1, odom, b"o")
+    world.run(9.9)
+    assert statuses(site) == {"robot": CONNECTED}
+    start_s = world.network.now
+    assert world.until(lambda: statuses(site) == {"robot": GONE}) <= 2.5
+    world.run(5.0)
+    view = peers(site)["robot"]
+    assert view.age_s == pytest.approx(world.network.now - start_s - 0.1, abs=0.2)
+    assert view.since_s == pytest.approx(5.0, abs=0.5)
+    world.until(lambda: site.got[-1].at_s > start_s + 5.0)
+    assert world.until(lambda: statuses(site) == {"robot": CONNECTED}) <= 1.5
+
+
+def test_a_robot_whose_connection_ends_is_gone_at_once_and_is_let_go_with_its_streams() -> None:
+    world = World(hub_params=HubParams(resume_s=20.0)).watch()
+    model = LinkModel(blackouts=(Window(5.0, 100.0),), disconnect_after_s=0.2).as_stream()
+    robot = world.client("robot", model)
+    site = world.client("site", patterns=["/robot/.*"])
+    robot.publish("/robot/odom", spec())
+    world.run(4.9)
+    assert statuses(site) == {"robot": CONNECTED}
+    assert world.until(lambda: statuses(site) == {"robot": GONE}) <= 2.0
+    world.run(10.0)
+    assert statuses(site) == {"robot": GONE}
+    world.until(lambda: site.closed, what="the relay lets go of the robot's streams")
+    world.until(lambda: statuses(site) == {}, within_s=2.0)
+
+
+@pytest.mark.parametrize("disconnect_after_s", [0.2, 30.0])
+def test_while_a_sites_own_link_is_down_nobody_knows_and_ages_grow(disconnect_after_s: float) -> None:
+    """Also while its session goes on: it is the silence that counts."""
+    world = World().watch()
+    robot = world.client("robot")
+    model = LinkModel(blackouts=(Window(5.0, 15.0),), disconnect_after_s=disconnect_after_s).as_stream()
+    site = world.client("site", model, patterns=["/robot/.*"])
+    odom = robot.publish("/robot/odom", spec())
+    robot.every(0.1, odom, b"o")
+    world.run(4.9)
+    world.until(lambda: statuses(site) == {"robot": UNKNOWN}, within_s=2.5)
+    began_s = world.network.now
+    world.run(3.0)
+    assert peers(site)["robot"].since_s == pytest.approx(3.0, abs=0.01)
+    assert peers(site)["robot"].age_s == pytest.approx(world.network.now - 5.0 - world.network.start_s, abs=0.3)
+    assert world.network.now > began_s
+    world.until(lambda: statuses(site) == {"robot": CONNECTED})
+
+
+def test_a_relay_that_begins_anew_tells_of_who_is_there() -> None:
+    world = World().watch()
+    changes: list[PeerChange] = []
+    robot = world.client("robot")
+    site = world.client("site", patterns=["/robot/.*"])
+    robot.publish("/robot/odom", spec())
+    world.until(lambda: statuses(site) == {"robot": CONNECTED})
+    site.core.peers.on_change = changes.append
+    world.restart_relay()
+    world.until(lambda: [change.new for change in changes] == [UNKNOWN, CONNECTED])
+    assert {change.name for change in changes} == {"robot"}
+
+
+def test_a_robot_that_a_new_relay_never_hears_of_is_let_go_once_its_streams_are() -> None:
+    world = World().watch()
+    robot = world.client("robot", LinkModel(blackouts=(Window(5.0, 1e6),), disconnect_after_s=0.2).as_stream())
+    site = world.client("site", patterns=["/robot/.*"])
+    robot.publish("/robot/odom", spec())
+    world.run(6.0)
+    world.restart_relay()
+    world.run(2 * LET_GO_S)
+    assert statuses(site) == {"robot": UNKNOWN}
+    world.until(lambda: site.closed, within_s=1000.0, what="the site's retention is over")
+    assert statuses(site) == {}
+
+
+# --- under load -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("lossless", [True, False])
+@pytest.mark.parametrize("loaded", [*PriorityClass, None])
+def test_at_thirteen_times_what_the_link_carries_a_lost_robot_is_known_at_once(
+    loaded: PriorityClass | None, lossless: bool
+) -> None:
+    """`loaded` None: all classes together. Another robot overloads the site's link; nobody who is there is taken for
+    gone meanwhile, and who goes is known within two seconds of the relay's knowing."""
+    world = World(lossless=lossless)
+    down = LinkModel(rate_bps=THIN_BPS, delay_s=0.025)
+    lost = LinkModel(delay_s=0.025, blackouts=(Window(20.0, 30.0),))
+    away = world.client("away", lost.as_stream() if lossless else lost)
+    loud = world.client("loud")
+    site = world.client("site", down.as_stream() if lossless else down, patterns=["/.*/t.*"])
+    away.every(0.1, away.publish("/away/t", spec(PriorityClass.STATE)), b"x" * 100)
+    classes = list(PriorityClass) if loaded is None else [loaded]
+    size = 2000
+    period_s = size * 8 * len(classes) / (OVERLOAD * THIN_BPS)
+    for number, priority in enumerate(classes):
+        loud.every(period_s, loud.publish(f"/loud/t{number}", spec(priority, depth=10)), b"x" * size)
+    world.until(lambda: statuses(site) == {"away": CONNECTED, "loud": CONNECTED}, within_s=5.0)
+    changes: list[PeerChange] = []
+    site.core.peers.on_change = changes.append
+    world.run(19.0 - (world.network.now - world.network.start_s))
+    assert changes == []
+    relay = world.relay.hub.links[away.name]
+    world.until(lambda: relay.lane.stalled or not relay.established, within_s=5.0)
+    assert world.until(lambda: statuses(site)["away"] is GONE) <= 2.0
+    assert statuses(site)["loud"] is CONNECTED
+    world.until(lambda: relay.established and not relay.lane.stalled, within_s=30.0)
+    assert world.until(lambda: statuses(site)["away"] is CONNECTED) <= 2.0
+    assert {change.name for change in changes} == {"away"}
+    world.validate()
+
+
+def test_a_robot_that_overloads_its_own_link_thirteen_times_is_there() -> None:
+    world = World()
+    robot = world.client("robot", thin())
+    site = world.client("site", patterns=["/robot/.*"])
+    robot.every(2000 * 8 / (OVERLOAD * THIN_BPS), robot.publish("/robot/t", spec(PriorityClass.BULK)), b"x" * 2000)
+    world.until(lambda: statuses(site) == {"robot": CONNECTED}, within_s=5.0)
+    changes: list[PeerChange] = []
+    site.core.peers.on_change = changes.append
+    world.run(60.0)
+    assert changes == []
+
+
+def test_what_flaps_is_told_as_it_is_when_the_site_has_heard_of_what_was_said_before() -> None:
+    """Control messages do not pile up: one waits at most, whatever happens meanwhile."""
+    world = World()
+    robot = world.client("robot")
+    site = world.client("site", LinkModel(delay_s=2.0).as_stream(), patterns=["/robot/.*"])
+    robot.publish("/robot/odom", spec())
+    world.until(lambda: statuses(site) == {"robot": CONNECTED})
+    link = world.relay.hub.links[site.name]
+    most = 0
+    told_before = link._control.next_seq
+    for _ in range(40):
+        world.hops["robot"].break_connection()
+        world.run(0.3)
+        waiting = len(link._control.retained)
+        most = max(most, waiting)
+    assert most <= 3
+    assert link._control.next_seq - told_before < 40
+    world.run(10.0)
+    assert statuses(site) == {"robot": CONNECTED}
+
+
+def test_many_peers_are_told_in_few_messages() -> None:
+    world = World()
+    robots = [world.client(f"robot{number}") for number in range(2 * MAX_TOLD + 2)]
+    for robot in robots:
+        robot.publish(f"/{robot.name}/odom", spec())
+    world.run(2.0)
+    site = world.client("site", patterns=["/robot.*"])
+    world.until(lambda: statuses(site) == {robot.name: CONNECTED for robot in robots})
+    world.validate()
+
+
+# --- what a relay may say ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "item",
+    [
+        {"up": True, "for": 1.0},
+        {"name": 7},
+        {"name": "a", "up": 1, "for": 1.0},
+        {"name": "a", "up": True, "for": -1.0},
+        {"name": "a", "up": True, "for": 1.0, "rtt": "x"},
+        {"name": "a", "up": True, "for": 1.0, "lane": "x" * 17},
+    ],
+)
+def test_what_no_relay_says_is_refused(item: wire.Envelope) -> None:
+    with pytest.raises(WireError):
+        Peers().told({"t": "peers", "peers": [item]}, now=0.0)
+
+
+@pytest.mark.parametrize("items", [7, {"name": "a"}, ["a"]])
+def test_peers_are_a_list_of_maps(items: object) -> None:
+    with pytest.raises(WireError, match="list of maps"):
+        Peers().told({"t": "peers", "peers": items}, now=0.0)
+
+
+def test_there_is_an_end_to_the_peers_that_a_relay_may_tell_of() -> None:
+    known = Peers()
+    known.session_began(now=0.0)
+    for number in range(MAX_PEERS):
+        known.told({"t": "peers", "peers": [{"name": f"c{number}", "up": True, "for": 0.0}]}, now=0.0)
+    with pytest.raises(WireError, match="more than"):
+        known.told({"t": "peers", "peers": [{"name": "one_more", "up": True, "for": 0.0}]}, now=0.0)
+    assert Counter(view.status for view in known.look(now=1.0)) == {CONNECTED: MAX_PEERS}
