@@ -152,38 +152,53 @@ class Eased:
     with packets that left when there was nothing else to send.
     """
 
-    __slots__ = ("_count", "_least", "_rate", "at_s")
+    __slots__ = ("_count", "_known_s", "_least", "_rate", "_until_s", "at_s")
 
     def __init__(self) -> None:
         self.at_s = -inf
         self._rate = 0.0
         self._count = 0
         self._least: deque[tuple[float, float]] = deque()  # (since, least) of spans of EASED_SPAN_S
+        self._known_s = -inf  # the least of the spans that are over; -inf: too few
+        self._until_s = -inf  # when that is another
 
     def note(self, now: float, delay_s: float, nbytes: float, rate: float, *, queued: bool) -> None:
         """A packet of `nbytes` came after `delay_s` over a link of `rate` bytes/s; `queued`: maybe behind others."""
         if abs(rate - self._rate) > EASED_STEADY * self._rate:
             self._rate = rate
-            self._least.clear()
-        least, took_s = self._least, nbytes / rate
+            self._forget()
+        if now >= self._until_s:
+            self._span_over(now)
+        took_s = nbytes / rate
         left_s = delay_s - took_s
-        while least and least[0][0] < now - EASED_MEMORY_S:
-            least.popleft()
-        known = [value for since_s, value in least if since_s <= now - EASED_SPAN_S]
-        if len(known) >= EASED_SPANS and left_s < min(known) - max(EASED_S, EASED_SHARE * took_s):
+        if left_s < self._known_s - max(EASED_S, EASED_SHARE * took_s):
             self._count += 1
             if self._count >= EASED_PACKETS:
                 self.at_s = now
                 self._count = 0
-                least.clear()
+                self._forget()
             return
         self._count = 0
         if queued:
             return
+        least = self._least
         if not least or now >= least[-1][0] + EASED_SPAN_S:
             least.append((now, left_s))
+            self._until_s = now + EASED_SPAN_S
         elif left_s < least[-1][1]:
             least[-1] = (least[-1][0], left_s)
+
+    def _forget(self) -> None:
+        self._least.clear()
+        self._known_s = self._until_s = -inf
+
+    def _span_over(self, now: float) -> None:
+        least = self._least
+        while least and least[0][0] < now - EASED_MEMORY_S:
+            least.popleft()
+        known = [value for since_s, value in least if since_s <= now - EASED_SPAN_S]
+        self._known_s = min(known) if len(known) >= EASED_SPANS else -inf
+        self._until_s = now + EASED_SPAN_S
 
 
 class Swing:
