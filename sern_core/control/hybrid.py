@@ -57,7 +57,11 @@ MAX_GROWTH: Final = 0.25
 CUT: Final = 0.95
 EMERGENCY_CUT: Final = 0.9
 WENT: Final = 0.25
-"""Of the longest queue since the link got slower; one that came down to so much as we made way was ours."""
+"""Of the longest queue since the link got slower; one that came down to so much as we made way was ours..."""
+WENT_RTTS: Final = 10
+WENT_SLOWER: Final = 0.1
+"""... if it was so many round trips long, and the rate is so little of what it was: a rival leaves more, and its queue is
+short for a moment whenever it looks at the empty path."""
 SLOWER: Final = 0.8
 """Less than this share of the known rate through a queue that stays: the link got slower."""
 EMERGENCY_S: Final = 0.050
@@ -346,7 +350,8 @@ class HybridWindow(CapacityEstimator):
         self._most_queue_s = max(most_s, queue_s)
         room = 2 * self._fragment
         least = self._window <= room and queue_s * self._rate < self._window + room
-        return least and queue_s < WENT * most_s
+        far = most_s > WENT_RTTS * (self._rtt_s or inf) and self._rate < WENT_SLOWER * self._peak
+        return least and far and queue_s < WENT * most_s
 
     def _emptied_slower(self, now: float) -> None:
         """The queue went as we made way, so it was ours, and the link is slower: what a packet takes on it is none."""
@@ -622,8 +627,13 @@ class HybridWindow(CapacityEstimator):
                 delay_s = base.least[0][1] + queue_s
                 base.least.clear()
                 base.least.append((now, delay_s))
+        far = self._rtt_s is not None and queue_s > WENT_RTTS * self._rtt_s
         if self._rtt_s is not None:
             self._rtt_s += queue_s
+        if far and self._rate is not None and self._rate < WENT_SLOWER * self._peak:
+            self._peak = self._rate  # what packets take on a link so much slower is what made it longer
+            self._fragment = min(self._fragment, max(self._longest, self._first_fragment_bytes))
+            self._most_queue_s = None
         self._queue_s = 0.0
         self._above_epochs = 0
         self._adopted_until_s = now + RIVAL_MEMORY_S
