@@ -158,6 +158,12 @@ async def test_the_classes_of_a_session_are_marked_both_ways(tmp_path: Path) -> 
                 relay._after()
                 return all(sum(size > least for _, size in way) >= 40 for way in (tap.up, tap.down))
 
+            def quiet() -> bool:
+                """Whether nothing of the class before is still to come."""
+                links = (robot.core.link, hub.links[ClientName("robot1")])
+                mine = [channel for link in links for channel in link.channels.values()]
+                return not any(channel.queue or channel.flying for channel in mine)
+
             seen: dict[PriorityClass, tuple[Counter[int], Counter[int]]] = {}
             for priority, nbytes in sizes.items():
                 least = min(nbytes, 1000)
@@ -166,6 +172,7 @@ async def test_the_classes_of_a_session_are_marked_both_ways(tmp_path: Path) -> 
                     Counter(tos for tos, size in tap.up if size > least),
                     Counter(tos for tos, size in tap.down if size > least),
                 )
+                await until(quiet, f"all of class {priority.name} has come")
                 tap.up.clear()
                 tap.down.clear()
             for priority, mark in zip(PriorityClass, (EF, CS0, CS1), strict=True):

@@ -11,6 +11,7 @@ from random import Random
 from sern_core.access import AccessRule, AccessTable
 from sern_core.hub import HubParams
 from sern_core.message import TopicInfo
+from sern_core.peers import LET_GO_S
 from sern_core.types import CLASSES, ClientName, Encoding, ObjectKind, TopicName
 from tests.sizes import sizes
 from tests.world import Clock, SimClient, World, spec
@@ -49,6 +50,9 @@ def tidy(world: World) -> None:
     for _ in range(3):
         skip(world, 3700.0)
         world.run(1.0)
+    world.run(LET_GO_S + 3.0)
+    for client in world.clients.values():
+        client.core.look_at_peers(now=client.now)  # as its daemon does twice a second
     gc.collect()
 
 
