@@ -60,8 +60,8 @@ WENT: Final = 0.25
 """Of the longest queue since the link got slower; one that came down to so much as we made way was ours..."""
 WENT_RTTS: Final = 10
 WENT_SLOWER: Final = 0.1
-"""... if it was so many round trips long, and the rate is so little of what it was: a rival leaves more, and its queue is
-short for a moment whenever it looks at the empty path."""
+"""... if it was so many round trips long, and the rate is so little of what it was: a rival leaves more, and its queue
+is short for a moment whenever it looks at the empty path."""
 SLOWER: Final = 0.8
 """Less than this share of the known rate through a queue that stays: the link got slower."""
 EMERGENCY_S: Final = 0.050
