@@ -24,6 +24,7 @@ from sern_client.endpoints.composite import CompositeEndpoint
 from sern_client.frames import FramePrefixer, Rewrite
 from sern_client.guard import Guard
 from sern_client.keeping import Keeping
+from sern_client.leaving import Leaving
 from sern_client.link_state import LinkState
 from sern_client.rebuild import Rebuilds
 from sern_client.services import ServiceBridge
@@ -152,6 +153,7 @@ class Bridge:
         self._closed = False
         self._core: ClientCore | None = None
         self._outgoing: dict[TopicName, Outgoing] = {}
+        self.leaving = Leaving(lambda channel: self.core.unpublish(channel, now=clock.now()))
         self._incoming: dict[StreamId, Incoming] = {}
         self.withdrawal = Withdrawal(self._incoming, self._advertise, self._close_publisher)
         """Ends the topics of who is not there."""
@@ -196,6 +198,7 @@ class Bridge:
                 outgoing.source.close()
         self.summaries.close()
         self._outgoing.clear()
+        self.leaving.close()
         self._timer.close()
         self._keep_timer.cancel()
         self._again.cancel()
@@ -238,6 +241,7 @@ class Bridge:
     def topic_added(self, info: TopicInfo) -> None:
         if info.name in self._outgoing or self._sources_stopped:
             return
+        self.leaving.come_back(info.name)
         listed = self.rules.find(info.type_name, info.name) is not None
         if not self.discovery.wants(info.name, info.type_name, listed=listed):
             if self.discovery.wants(info.name, info.type_name, listed=True):  # only a rule is missing
@@ -277,10 +281,13 @@ class Bridge:
 
     def _withdraw(self, channel: OutChannel, source: Source | None) -> None:
         """Offer a topic no more."""
+        self._forget_source(source)
+        self.core.unpublish(channel, now=clock.now())
+
+    def _forget_source(self, source: Source | None) -> None:
         if source is not None:
             source.close()
             self.summaries.forget(source)
-        self.core.unpublish(channel, now=clock.now())
 
     def _offer(self, info: TopicInfo, resolved: ResolvedTopic, name: TopicName) -> tuple[OutChannel, Source | None]:
         """Offer a topic to the link, with what its rule makes of it. UsageError when it cannot be."""
@@ -309,7 +316,8 @@ class Bridge:
             if self.goals is not None:
                 self.goals.withdrawn(name)
             outgoing.subscription.close()
-            self._withdraw(outgoing.channel, outgoing.source)
+            self._forget_source(outgoing.source)
+            self.leaving.leave(name, outgoing.channel, now=clock.now())
             self._kick()
 
     def _sink(self, channel: OutChannel, rewrite: Rewrite | None) -> Callable[[bytes, int], bool]:

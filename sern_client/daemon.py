@@ -310,6 +310,7 @@ class ClientDaemon:
                 self._express.tick()
             self.check.tick(now=clock.now())
             self.link_state.look()
+            self.bridge.leaving.look(now=clock.now())
             if watchdog.interval_s is not None:
                 watchdog.check()
             if self._name is not None:

@@ -1,0 +1,50 @@
+"""Topics whose last publisher has gone while reliable messages of it were on their way to the relay.
+
+A node that publishes a few messages and ends is usual (`rostopic pub -1`, `rosbag play`). The stream goes on until the
+relay has got them all, or for `LEAVE_S`: what has not arrived then is reported as ever. What subscribers behind the
+relay are still owed is the relay's to keep.
+"""
+
+from collections.abc import Callable
+from typing import Final
+
+from sern_core.queues import OutChannel
+from sern_core.types import TopicName
+
+LEAVE_S: Final = 10.0
+"""As long as nothing gets through, say. A topic that comes back meanwhile ends the wait."""
+
+
+class Leaving:
+    """`withdraw` ends a stream. Call `look` about once a second."""
+
+    def __init__(self, withdraw: Callable[[OutChannel], None]) -> None:
+        self._withdraw = withdraw
+        self._until_s: dict[TopicName, tuple[OutChannel, float]] = {}
+
+    def leave(self, name: TopicName, channel: OutChannel, *, now: float) -> None:
+        """The local topic has no publisher any more."""
+        if _owes(channel):
+            self._until_s[name] = (channel, now + LEAVE_S)
+        else:
+            self._withdraw(channel)
+
+    def come_back(self, name: TopicName) -> None:
+        """The topic has a publisher again, whose messages are another stream."""
+        channel, _ = self._until_s.pop(name, (None, 0.0))
+        if channel is not None:
+            self._withdraw(channel)
+
+    def look(self, *, now: float) -> None:
+        """End what has been sent, or has taken too long."""
+        for name, (channel, until_s) in list(self._until_s.items()):
+            if now >= until_s or not _owes(channel):
+                self.come_back(name)
+
+    def close(self) -> None:
+        self._until_s.clear()
+
+
+def _owes(channel: OutChannel) -> bool:
+    """Whether something of it must still get to the relay."""
+    return channel.reliable and channel.wanted is not False and bool(channel.queue or channel.flying)
