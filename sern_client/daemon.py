@@ -28,7 +28,6 @@ from sern_client.transport import RelayTransport
 from sern_client.udp import ClientLane
 from sern_core.client import ClientCore
 from sern_core.errors import ConfigError
-from sern_core.lanes import LANE_UDP
 from sern_core.lossy import missing
 from sern_core.patterns import compile_pattern
 from sern_core.trace import DecisionTrace
@@ -274,7 +273,7 @@ class ClientDaemon:
         self.reason = reason
         self.link_state.soon()
         if not self.core.link.established:  # else the session goes on over the other lane
-            self._outages.forget()
+            self._outages.forget(self.core.link.peer)
         if self._stopping:
             return
         if not self._said:
@@ -315,12 +314,12 @@ class ClientDaemon:
                 watchdog.check()
             if self._name is not None:
                 self._name.tick(connected=link.established)
-            self._look_at_lanes()
+            self._look_at_link()
             state = "up" if link.established and not link.lane.stalled else f"down: {self._why()}"
             self.notifier.status(f"link {state}")
 
-    def _look_at_lanes(self) -> None:
-        """Say what has been silent for a while in a session that goes on, and when it is not any more."""
+    def _look_at_link(self) -> None:
+        """Say that the relay has been silent for a while in a session that goes on, and when it is not any more."""
         link = self.core.link
         if not link.established:
             return
@@ -329,13 +328,8 @@ class ClientDaemon:
             self._said.clear()
             _log.warning("%s: the connection is there again, after %.0f s", relay, now - self._down_since_s)
         self._outages.look(
-            ("link",), lost=link.lane.stalled, now=now,
+            link.peer, lost=link.lane.stalled, now=now,
             gone=f"{relay}: {SILENT}", back=f"{relay}: the relay answers again",
-        )  # fmt: skip
-        udp = link.lanes.get(LANE_UDP)
-        self._outages.look(
-            ("udp",), lost=udp is not None and udp.stalled and not link.lane.stalled, now=now,
-            gone=f"{relay}: no datagram gets through; data goes over TCP", back=f"{relay}: datagrams get through again",
         )  # fmt: skip
 
     def _why(self) -> str:

@@ -58,7 +58,7 @@ class _Peer:
     def __init__(self, since_s: float) -> None:
         self.status = PeerStatus.UNKNOWN
         self.since_s = since_s
-        self.up: bool | None = None  # as the relay says in this session; None: it has said nothing
+        self.up: bool | None = None  # what the relay said last; None: nothing since the session began
         self.up_since_s = since_s
         self.lane = ""
         self.rtt_s: float | None = None

@@ -16,7 +16,6 @@ from sern_core.access import AccessTable
 from sern_core.decoding import Decoder
 from sern_core.errors import ConfigError
 from sern_core.hub import Hub, HubParams
-from sern_core.lanes import LANE_UDP
 from sern_core.ledger import MAX_TOPICS
 from sern_core.link import Link
 from sern_core.message import Message, StreamInfo
@@ -279,23 +278,17 @@ class RelayDaemon:
                 self.zap.ping()
             if watchdog.interval_s is not None:
                 watchdog.check()
-            self._look_at_lanes(now)
+            self._look_at_clients(now)
             self.notifier.status(self._status())
 
-    def _look_at_lanes(self, now: float) -> None:
+    def _look_at_clients(self, now: float) -> None:
         """Say which client has been silent for a while in a session that goes on, and when it is not any more."""
         for client, link in self.hub.links.items():
             if not link.established:
                 continue
             self._outages.look(
-                (client, "link"), lost=link.lane.stalled, now=now,
+                client, lost=link.lane.stalled, now=now,
                 gone=f"{client} does not answer; its session waits for it", back=f"{client} answers again",
-            )  # fmt: skip
-            udp = link.lanes.get(LANE_UDP)
-            self._outages.look(
-                (client, "udp"), lost=udp is not None and udp.stalled and not link.lane.stalled, now=now,
-                gone=f"no datagram gets through to {client}; data goes over TCP",
-                back=f"datagrams get through to {client} again",
             )  # fmt: skip
         for client in self._away_since_s.keys() - self.hub.links.keys():  # nobody waits for it any more
             del self._away_since_s[client]

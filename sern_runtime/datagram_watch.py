@@ -1,4 +1,5 @@
-"""Says, once and by name, that the datagram lane was wanted and does not come up, and once that it did after all."""
+"""Says, once and by name, that the datagram lane was wanted and does not come up, or that it fell silent in a session
+that goes on; and once that datagrams pass after all."""
 
 import logging
 from collections.abc import Callable, Collection
@@ -12,6 +13,7 @@ from sern_runtime.metrics import Metrics
 PATIENCE_S: Final = 5.0
 """How long the stream lane may work without the datagram lane before that is said: several round trips of a satellite
 link, and some lost challenges."""
+STOPPED: Final = "no datagram gets through any more; data goes over TCP"
 
 _log = logging.getLogger(__name__)
 
@@ -41,27 +43,32 @@ class DatagramWatch:
         self._name = name
         self._without_since_s: dict[str, float] = {}
         self._said: set[str] = set()
+        self._passed: set[str] = set()  # peers whose datagrams have passed in this session
 
     def tick(self) -> None:
         now = clock.now()
         links = self._links()
         for link in links:
             self._look(link, now)
-        gone = self._without_since_s.keys() - {link.peer for link in links}
-        for peer in gone:
-            del self._without_since_s[peer]
+        for peer in (self._without_since_s.keys() | self._said | self._passed) - {link.peer for link in links}:
+            self._without_since_s.pop(peer, None)
             self._said.discard(peer)
+            self._passed.discard(peer)
 
     def _look(self, link: Link, now: float) -> None:
         peer = link.peer
         if datagrams_pass(link):
-            self._without_since_s.pop(peer, None)
+            since_s = self._without_since_s.pop(peer, now)
+            self._passed.add(peer)
             if peer in self._said:
                 self._said.discard(peer)
-                _log.info("%s: datagrams pass now; the datagram lane is up", self._name(link))
+                _log.warning("%s: datagrams pass now, after %.0f s without", self._name(link), now - since_s)
             return
-        if not (link.established and link.lanes[LANE_ZMQ].usable):  # nothing passes: that is not the datagrams' fault
-            self._without_since_s.pop(peer, None)
+        if not link.established:
+            self._passed.discard(peer)
+        if not link.established or link.lane.stalled or not link.lanes[LANE_ZMQ].usable:
+            if peer not in self._said:  # nothing passes: that is not the datagrams' fault
+                self._without_since_s.pop(peer, None)
             return
         since_s = self._without_since_s.setdefault(peer, now)
         if peer in self._said or now - since_s < PATIENCE_S:
@@ -69,7 +76,7 @@ class DatagramWatch:
         problem = self._problem(link, PATIENCE_S)
         if problem is not None:
             self._said.add(peer)
-            _log.warning("%s: %s", self._name(link), problem)
+            _log.warning("%s: %s", self._name(link), STOPPED if peer in self._passed else problem)
 
     def register(self, metrics: Metrics) -> None:
         def up() -> list[tuple[tuple[str], float]]:

@@ -15,29 +15,28 @@ class _Outage:
 
 
 class Outages:
-    """What is silent now, by key. Call `look` about once a second for each."""
+    """Who is silent now, by name. Call `look` about once a second for each."""
 
     def __init__(self, log: logging.Logger, level: int, *, after_s: float = SAY_AFTER_S) -> None:
         self._log = log
         self._level = level
         self._after_s = after_s
-        self._outages: dict[tuple[str, ...], _Outage] = {}
+        self._outages: dict[str, _Outage] = {}
 
-    def look(self, key: tuple[str, ...], *, lost: bool, gone: str, back: str, now: float) -> None:
+    def look(self, peer: str, *, lost: bool, gone: str, back: str, now: float) -> None:
         """`gone` and `back` are what is said; how long it was is put behind `back`."""
-        outage = self._outages.get(key)
+        outage = self._outages.get(peer)
         if not lost:
             if outage is not None:
-                del self._outages[key]
+                del self._outages[peer]
                 if outage.said:
                     self._log.log(self._level, "%s, after %.0f s", back, now - outage.since_s)
         elif outage is None:
-            self._outages[key] = _Outage(now)
+            self._outages[peer] = _Outage(now)
         elif not outage.said and now - outage.since_s >= self._after_s:
             outage.said = True
             self._log.log(self._level, "%s", gone)
 
-    def forget(self, *key: str) -> None:
-        """It ended with something else, of which was told: all keys that begin so."""
-        for known in [known for known in self._outages if known[: len(key)] == key]:
-            del self._outages[known]
+    def forget(self, peer: str) -> None:
+        """Its silence ended with something else, of which was told."""
+        self._outages.pop(peer, None)

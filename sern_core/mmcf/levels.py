@@ -16,8 +16,6 @@ from sern_core.types import CLASSES
 PROBE_INTERVALS: Final = 5
 PROBE_INTERVALS_MAX: Final = 30
 PROBE_SHARE: Final = 0.1
-PROBE_GREW: Final = 1.1
-"""A capacity that rose by this factor since a probe began: the link may carry more still."""
 
 
 class Summarised(Protocol):
@@ -129,49 +127,35 @@ def apply_levels(items: Iterable[Summarised], configuration: Configuration) -> N
 
 
 class RawProbe:
-    """Sends a raw message now and then while its summaries go.
+    """Sends one raw message now and then while its summaries go.
 
-    They fill no link, so nobody would see that it has become a better one. A probe is one message. It takes
-    PROBE_SHARE of what the link is believed to carry, in the mean, but probes are PROBE_INTERVALS apart at least and
-    PROBE_INTERVALS_MAX at most. One message is too short to show what a fast link carries. So where the capacity has
-    grown since the probe began, raw messages go for whole intervals, as long as each finds a capacity that is
-    PROBE_GREW times the one before.
+    They fill no link, so nobody would see that it has become a better one. A probe takes PROBE_SHARE of what the link
+    is believed to carry, in the mean, but they are PROBE_INTERVALS apart at least and PROBE_INTERVALS_MAX at
+    most.
     """
 
     def __init__(self, interval_s: float) -> None:
         self._least_s, self._most_s = PROBE_INTERVALS * interval_s, PROBE_INTERVALS_MAX * interval_s
         self._due_s: dict[OutChannel, float] = {}
-        self._found_bps: dict[OutChannel, float] = {}  # the capacity when the latest probe began
         self._under_way: list[tuple[Summarised, int]] = []
-        self._whole: list[Summarised] = []  # probed until the next interval
 
     def start(self, items: Sequence[Summarised], capacity_bps: float | None, *, now: float) -> None:
         """After the levels have been set; `items` are those that may be chosen."""
         summarised = [item for item in items if item.level is SummaryLevel.SUMMARY]
-        sources = {item.source for item in summarised}
-        for gone in self._due_s.keys() - sources:
+        for gone in self._due_s.keys() - {item.source for item in summarised}:
             del self._due_s[gone]
-        for gone in self._found_bps.keys() - sources:
-            del self._found_bps[gone]
-        probed = []
         for item in summarised:
-            source = item.source
             raw_s = 8.0 * item.profile.raw_bytes / max(capacity_bps or 0.0, 1.0)
-            due_s = self._due_s.setdefault(source, now + min(max(self._least_s, raw_s / PROBE_SHARE), self._most_s))
-            if not capacity_bps:
-                continue
-            grew = capacity_bps > PROBE_GREW * self._found_bps.get(source, capacity_bps)
-            if now >= due_s or grew:
+            due_s = self._due_s.setdefault(
+                item.source, now + min(max(self._least_s, raw_s / PROBE_SHARE), self._most_s)
+            )
+            if now >= due_s and capacity_bps:
+                source = item.source
+                self._under_way.append((item, source.counters.offered))
                 source.adapt(share=1.0, depth_max=source.depth)  # until the next interval
-                if grew:
-                    self._whole.append(item)
-                else:
-                    self._under_way.append((item, source.counters.offered))
                 item.set_level(SummaryLevel.RAW)
-                probed.append(source)
-        for source in probed:
-            self._due_s.pop(source, None)
-            self._found_bps[source] = capacity_bps or 0.0
+        for item, _ in self._under_way:
+            self._due_s.pop(item.source, None)
 
     def finish(self) -> None:
         """Back to summaries where a message has gone; to be called often."""
@@ -185,7 +169,6 @@ class RawProbe:
 
     def abort(self) -> None:
         """What was begun is over, before levels are read or set."""
-        for item in (*(item for item, _ in self._under_way), *self._whole):
+        for item, _ in self._under_way:
             item.set_level(SummaryLevel.SUMMARY)
         self._under_way.clear()
-        self._whole.clear()

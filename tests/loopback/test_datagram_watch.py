@@ -73,6 +73,39 @@ async def test_blocked_datagrams_are_named_on_both_sides_and_so_is_their_return(
             await nat.close()
 
 
+async def test_datagrams_that_stop_in_a_session_are_named_on_both_sides_and_so_is_their_return(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("INFO")
+    (port,) = free_ports(1)
+    nat = Nat(port)
+    async with Lab(tmp_path, "robot1", relay_port=port) as lab:
+        try:
+            relay = await lab.relay()
+            await nat.start()
+            there = {"endpoint": f"tcp://{INSIDE}:{port}"}
+            robot = await lab.connected(lab.client_file("robot1", {"kind": "synthetic", "role": "robot"}, relay=there))
+            await until(
+                lambda: scraped(robot) == {"relay": 1.0} and scraped(relay) == {"robot1": 1.0}, "datagrams pass"
+            )
+            for daemon in (relay, robot):
+                daemon.datagrams.tick()  # it has seen that they pass
+            assert nat.outer is not None
+            nat.outer.close()
+            nat.outer = None
+            stopped = f"robot1: {datagram_watch.STOPPED}"
+            await until(lambda: len(said(caplog, stopped)) == 2, "both sides say that none passes any more")
+            await nat.rebind("127.0.0.3")
+            back = "robot1: datagrams pass now"
+            await until(lambda: len(said(caplog, back)) == 2, "both sides say that they pass", deadline_s=60.0)
+            assert [line for line in caplog.messages if "datagram" in line] == [
+                *said(caplog, stopped),
+                *said(caplog, back),
+            ]
+        finally:
+            await nat.close()
+
+
 async def test_answers_that_are_lost_are_told_from_datagrams_that_do_not_come(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:

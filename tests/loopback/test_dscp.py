@@ -21,7 +21,7 @@ from sern_runtime.udp_client import UdpClient
 from sern_runtime.zmq_socket import SendResult
 from sern_tools.demo_link import free_ports
 from tests.daemons import HOST, Lab
-from tests.loopback.test_udp_client import has_ipv6
+from tests.loopback.test_udp_client import NO_IPV6, has_ipv6
 from tests.loopback.udp_support import OFFERED, ROBOT
 from tests.support import until
 
@@ -86,7 +86,7 @@ class Tap:
 
 
 @pytest.mark.parametrize(
-    "host", ["127.0.0.1", pytest.param("::1", marks=pytest.mark.skipif(not has_ipv6(), reason=""))]
+    "host", ["127.0.0.1", pytest.param("::1", marks=pytest.mark.skipif(not has_ipv6(), reason=NO_IPV6))]
 )
 async def test_each_datagram_has_the_mark_it_was_sent_with(host: str) -> None:
     url = f"udp://[{host}]:*" if ":" in host else f"udp://{host}:*"

@@ -18,6 +18,8 @@ from sern_runtime.zmq_socket import SendResult
 from tests.loopback.udp_support import ROBOT, Client, Relay
 from tests.support import until
 
+NO_IPV6 = "the loopback has no IPv6 here: sysctl net.ipv6.conf.lo.disable_ipv6=0"
+
 
 def has_ipv6() -> bool:
     try:
@@ -61,7 +63,7 @@ async def test_round_trip(relay: Relay) -> None:
     client.close()
 
 
-@pytest.mark.skipif(not has_ipv6(), reason="no IPv6 loopback")
+@pytest.mark.skipif(not has_ipv6(), reason=NO_IPV6)
 async def test_ipv6() -> None:
     relay = Relay(["udp://127.0.0.1:*", "udp://[::1]:*"], echo=True)
     ports = relay.server.ports

@@ -9,7 +9,7 @@ from sern_runtime.outages import Outages
 
 def look(outages: Outages, times_s: dict[float, bool]) -> None:
     for now, lost in times_s.items():
-        outages.look(("a", "udp"), lost=lost, gone="a is silent", back="a is back", now=now)
+        outages.look("a", lost=lost, gone="a is silent", back="a is back", now=now)
 
 
 @pytest.mark.parametrize(

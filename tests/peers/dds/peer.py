@@ -43,7 +43,8 @@ def build_peer() -> Path:
         folder = Path(name)
         for path in sources:
             shutil.copy(path, folder)
-        _run(["fastddsgen", "-replace", "-cs", "Peer.idl"], folder)
+        # Without -t it writes /tmp/Peer.idl.cc, which may be another user's, or of a build at the same time.
+        _run(["fastddsgen", "-replace", "-cs", "-t", str(folder), "Peer.idl"], folder)
         units = ["peer.cpp", "Peer.cxx", "PeerPubSubTypes.cxx"]
         _run(["g++", "-O1", "-std=c++17", "-o", "peer", *units, "-lfastrtps", "-lfastcdr", "-lpthread"], folder)
         cache.mkdir(parents=True, exist_ok=True)
@@ -55,7 +56,7 @@ def build_peer() -> Path:
 
 def _run(command: list[str], folder: Path) -> None:
     done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=BUILD_TIMEOUT_S, check=False)
-    assert done.returncode == 0, f"{command[0]}: {done.stderr[-2000:]}"
+    assert done.returncode == 0, f"{' '.join(command)}: {done.stdout[-2000:]}{done.stderr[-2000:]}"
 
 
 _domains: Final = itertools.cycle([(os.getpid() + number) % 80 + 20 for number in range(80)])
