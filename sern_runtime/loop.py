@@ -4,6 +4,7 @@ import asyncio
 import logging
 import math
 import os
+import resource
 import signal
 import sys
 import threading
@@ -19,6 +20,8 @@ from sern_runtime.clock import now
 
 KEPT_BYTES: Final = 16 * 2**20
 """Freed memory that a process keeps at the top of a heap."""
+OPEN_FILES: Final = 16_384
+"""How many files a daemon wants to be able to open, one for each connection; as in the systemd units."""
 
 _log = logging.getLogger(__name__)
 _STOP_SIGNALS: Final = (signal.SIGTERM, signal.SIGINT)
@@ -73,6 +76,19 @@ def keep_freed_memory() -> None:
     del block
 
 
+def raise_open_files() -> int:
+    """Let this process open as many files as it may, up to what its systemd units allow; the limit that holds now.
+
+    A shell gives 1,024, of which half-open connections of strangers could take most.
+    """
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    wanted = OPEN_FILES if hard == resource.RLIM_INFINITY else min(OPEN_FILES, hard)
+    if soft != resource.RLIM_INFINITY and soft < wanted:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
+        return wanted
+    return soft
+
+
 def run(main: Callable[[Shutdown], Coroutine[Any, Any, int | None]]) -> int:
     """Run `main(shutdown)` in a new uvloop until it returns; its answer (None: 0) is the exit code.
 
@@ -80,6 +96,7 @@ def run(main: Callable[[Shutdown], Coroutine[Any, Any, int | None]]) -> int:
     """
 
     keep_freed_memory()
+    raise_open_files()
 
     async def with_signals() -> int:
         loop = asyncio.get_running_loop()

@@ -17,13 +17,16 @@ import zmq
 
 from sern_core.types import ClientName
 from sern_runtime.keys import SecretKey, generate
+from sern_runtime.loop import raise_open_files
 from tests.exploring import load_profile
+from tests.peers.dds.peer import release_domains
 from tests.support import DEADLINE_S, Patience
 
 Context = zmq.Context[zmq.Socket[bytes]]
 PEERS: Final = Path(__file__).parent / "peers"
 
 load_profile()
+raise_open_files()  # as the daemons do, many of which run inside the tests
 
 
 @pytest.hookimpl(optionalhook=True)
@@ -132,6 +135,7 @@ def nothing_left_behind() -> Iterator[None]:
     probes = (_threads, _children, _sockets)
     before = [probe() for probe in probes]
     yield
+    release_domains()
     patience = Patience()
     while True:
         gc.collect()

@@ -135,7 +135,6 @@ class HybridWindow(CapacityEstimator):
         self._rtt_s: float | None = None  # with our own queue on the way out empty
         self._startup = True
         self._cubic: Cubic | None = None  # while somebody else keeps the queue
-        self._loss_floor = 0.0
         self._eased = Eased()
         self._lost_s = -inf
         self._restart()

@@ -97,30 +97,45 @@ static int64_t get_stamp(void* data) {
     return int64_t(stamp.sec()) * 1000000000 + stamp.nanosec();
 }
 
-template <class T>
-static Kind stamped_kind(TopicDataType* type) {
-    return Kind{TypeSupport(type), set_stamp<T>, get_stamp<T>};
+// Fast CDR leaves padding as it finds it: in a buffer that is used again, bytes of an earlier message.
+template <class Base>
+struct Clean : Base {
+    using Base::serialize;
+    bool serialize(void* data, SerializedPayload_t* payload) override {
+        std::fill_n(payload->data, payload->max_size, 0);
+        return Base::serialize(data, payload);
+    }
+};
+
+template <class Type>
+static Kind plain_kind() {
+    return Kind{TypeSupport(new Clean<Type>()), nullptr, nullptr};
+}
+
+template <class T, class Type>
+static Kind stamped_kind() {
+    return Kind{TypeSupport(new Clean<Type>()), set_stamp<T>, get_stamp<T>};
 }
 
 static std::map<std::string, Kind> kinds() {
     std::map<std::string, Kind> all;
     auto add = [&all](Kind kind) { all[kind.support.get_type_name()] = kind; };
-    add(Kind{TypeSupport(new std_msgs::msg::dds_::String_PubSubType()), nullptr, nullptr});
-    add(Kind{TypeSupport(new diagnostic_msgs::msg::dds_::DiagnosticStatus_PubSubType()), nullptr, nullptr});
-    add(Kind{TypeSupport(new std_srvs::srv::dds_::SetBool_Request_PubSubType()), nullptr, nullptr});
-    add(Kind{TypeSupport(new std_srvs::srv::dds_::SetBool_Response_PubSubType()), nullptr, nullptr});
+    add(plain_kind<std_msgs::msg::dds_::String_PubSubType>());
+    add(plain_kind<diagnostic_msgs::msg::dds_::DiagnosticStatus_PubSubType>());
+    add(plain_kind<std_srvs::srv::dds_::SetBool_Request_PubSubType>());
+    add(plain_kind<std_srvs::srv::dds_::SetBool_Response_PubSubType>());
     using namespace example_interfaces::action::dds_;
-    add(Kind{TypeSupport(new Fibonacci_SendGoal_Request_PubSubType()), nullptr, nullptr});
-    add(Kind{TypeSupport(new Fibonacci_SendGoal_Response_PubSubType()), nullptr, nullptr});
-    add(Kind{TypeSupport(new Fibonacci_GetResult_Request_PubSubType()), nullptr, nullptr});
-    add(Kind{TypeSupport(new Fibonacci_GetResult_Response_PubSubType()), nullptr, nullptr});
-    add(Kind{TypeSupport(new Fibonacci_FeedbackMessage_PubSubType()), nullptr, nullptr});
-    add(Kind{TypeSupport(new action_msgs::srv::dds_::CancelGoal_Request_PubSubType()), nullptr, nullptr});
-    add(Kind{TypeSupport(new action_msgs::srv::dds_::CancelGoal_Response_PubSubType()), nullptr, nullptr});
-    add(Kind{TypeSupport(new action_msgs::msg::dds_::GoalStatusArray_PubSubType()), nullptr, nullptr});
-    add(Kind{TypeSupport(new rmw_dds_common::msg::dds_::ParticipantEntitiesInfo_PubSubType()), nullptr, nullptr});
-    add(stamped_kind<nav_msgs::msg::dds_::Odometry_>(new nav_msgs::msg::dds_::Odometry_PubSubType()));
-    add(stamped_kind<sensor_msgs::msg::dds_::PointCloud2_>(new sensor_msgs::msg::dds_::PointCloud2_PubSubType()));
+    add(plain_kind<Fibonacci_SendGoal_Request_PubSubType>());
+    add(plain_kind<Fibonacci_SendGoal_Response_PubSubType>());
+    add(plain_kind<Fibonacci_GetResult_Request_PubSubType>());
+    add(plain_kind<Fibonacci_GetResult_Response_PubSubType>());
+    add(plain_kind<Fibonacci_FeedbackMessage_PubSubType>());
+    add(plain_kind<action_msgs::srv::dds_::CancelGoal_Request_PubSubType>());
+    add(plain_kind<action_msgs::srv::dds_::CancelGoal_Response_PubSubType>());
+    add(plain_kind<action_msgs::msg::dds_::GoalStatusArray_PubSubType>());
+    add(plain_kind<rmw_dds_common::msg::dds_::ParticipantEntitiesInfo_PubSubType>());
+    add(stamped_kind<nav_msgs::msg::dds_::Odometry_, nav_msgs::msg::dds_::Odometry_PubSubType>());
+    add(stamped_kind<sensor_msgs::msg::dds_::PointCloud2_, sensor_msgs::msg::dds_::PointCloud2_PubSubType>());
     return all;
 }
 

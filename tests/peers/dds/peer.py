@@ -8,6 +8,7 @@ import shutil
 import socket
 import subprocess
 import tempfile
+from collections import deque
 from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
@@ -61,18 +62,33 @@ def _run(command: list[str], folder: Path) -> None:
 
 _domains: Final = itertools.cycle([(os.getpid() + number) % 80 + 20 for number in range(80)])
 """Those whose ports are below the ones that the system gives to anybody."""
+_held: Final[deque[socket.socket]] = deque()
+HELD: Final = 8
+"""More domains than one test asks for."""
 
 
 def free_domain() -> int:
-    """A DDS domain that nobody on this host is in: its first unicast port is free."""
+    """A DDS domain that nobody on this host is in: its first unicast port is free, and no other process of tests holds
+    it by an abstract socket of its name, as this one does until it has asked for some more."""
     for domain in itertools.islice(_domains, 80):
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-            try:
+        claim = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        try:
+            claim.bind(f"\0sern-tests-dds-domain-{domain}")
+            with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
                 probe.bind(("127.0.0.1", 7400 + 250 * domain + 10))
-            except OSError:
-                continue
+        except OSError:
+            claim.close()
+            continue
+        _held.append(claim)
+        release_domains(but=HELD)
         return domain
     raise AssertionError("every DDS domain of this host is in use")
+
+
+def release_domains(*, but: int = 0) -> None:
+    """Let other processes have the domains that this one asked for, but for the last ones."""
+    while len(_held) > but:
+        _held.popleft().close()
 
 
 class Peer:
