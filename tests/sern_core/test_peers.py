@@ -16,7 +16,7 @@ from sern_sim.models import LinkModel, Window
 from tests.world import SimClient, World, spec
 
 CONNECTED, GONE, UNKNOWN = PeerStatus.CONNECTED, PeerStatus.GONE, PeerStatus.UNKNOWN
-THIN_BPS = 1e6
+THIN_BPS = 0.5e6
 OVERLOAD = 13.0
 
 
@@ -217,7 +217,7 @@ def test_at_thirteen_times_what_the_link_carries_a_lost_robot_is_known_at_once(
     gone meanwhile, and who goes is known within two seconds of the relay's knowing."""
     world = World(lossless=lossless)
     down = LinkModel(rate_bps=THIN_BPS, delay_s=0.025)
-    lost = LinkModel(delay_s=0.025, blackouts=(Window(20.0, 30.0),))
+    lost = LinkModel(delay_s=0.025, blackouts=(Window(10.0, 20.0),))
     away = world.client("away", lost.as_stream() if lossless else lost)
     loud = world.client("loud")
     site = world.client("site", down.as_stream() if lossless else down, patterns=["/.*/t.*"])
@@ -230,7 +230,7 @@ def test_at_thirteen_times_what_the_link_carries_a_lost_robot_is_known_at_once(
     world.until(lambda: statuses(site) == {"away": CONNECTED, "loud": CONNECTED}, within_s=5.0)
     changes: list[PeerChange] = []
     site.core.peers.on_change = changes.append
-    world.run(19.0 - (world.network.now - world.network.start_s))
+    world.run(9.0 - (world.network.now - world.network.start_s))
     assert changes == []
     relay = world.relay.hub.links[away.name]
     world.until(lambda: relay.lane.stalled or not relay.established, within_s=5.0)
