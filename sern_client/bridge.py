@@ -24,6 +24,7 @@ from sern_client.endpoints.composite import CompositeEndpoint
 from sern_client.frames import FramePrefixer, Rewrite
 from sern_client.guard import Guard
 from sern_client.keeping import Keeping
+from sern_client.latest import LatestValues
 from sern_client.leaving import Leaving
 from sern_client.link_state import LinkState
 from sern_client.rebuild import Rebuilds
@@ -153,7 +154,8 @@ class Bridge:
         self._closed = False
         self._core: ClientCore | None = None
         self._outgoing: dict[TopicName, Outgoing] = {}
-        self.leaving = Leaving(lambda channel: self.core.unpublish(channel, now=clock.now()))
+        self.leaving = Leaving(self._unpublish)
+        self.values = LatestValues()
         self._incoming: dict[StreamId, Incoming] = {}
         self.withdrawal = Withdrawal(self._incoming, self._advertise, self._close_publisher)
         """Ends the topics of who is not there."""
@@ -282,6 +284,10 @@ class Bridge:
     def _withdraw(self, channel: OutChannel, source: Source | None) -> None:
         """Offer a topic no more."""
         self._forget_source(source)
+        self._unpublish(channel)
+
+    def _unpublish(self, channel: OutChannel) -> None:
+        self.values.forget(channel.stream.id)
         self.core.unpublish(channel, now=clock.now())
 
     def _forget_source(self, source: Source | None) -> None:
@@ -330,12 +336,14 @@ class Bridge:
 
     def _send(self, channel: OutChannel, rewrite: Rewrite | None) -> Callable[[bytes, int, float | None], bool]:
         core, kick, log, stream, parts = self.core, self._kick, self._log, channel.stream, self.parts
+        passed = self.values.passed
 
         def send(body: bytes, stamp_ns: int, born_s: float | None) -> bool:
             seq = channel.next_seq
             if rewrite is not None:
                 body = rewrite(body)
             accepted = core.send(channel, body, stamp_ns, born_s=born_s, now=clock.now())
+            passed(stream, seq, body)
             if log is not None:
                 try:
                     log.offered(stream, seq, body, stamp_ns, accepted=accepted)
@@ -468,6 +476,7 @@ class Bridge:
         if self.services is not None:
             self.services.stream_closed(stream)
         incoming = self._incoming.pop(stream.id, None)
+        self.values.forget(stream.id)
         self._last_arrival_s.pop(stream.id, None)
         if incoming is not None:
             if self.goals is not None:
@@ -481,6 +490,7 @@ class Bridge:
             if self.services is not None:
                 self.services.message(stream, message)
             return
+        self.values.passed(stream, message.seq, message.body)
         age_s = now - message.born_s
         if incoming.lease is not None:
             incoming.lease.renew(born_s=message.born_s)

@@ -467,6 +467,7 @@ class ClientDaemon:
                 "/api/peers": self.link_state.to_json,
                 "/api/topics": self.topics,
                 "/api/trace": self.core.trace.to_json,
+                "/api/values": self.bridge.values.view(),
                 **({} if adaptation is None else {"/api/mmcf": adaptation.to_json}),
             },
             parts=self.parts,

@@ -17,8 +17,9 @@ from urllib.parse import urlsplit
 from sern_core.errors import ConfigError, SernError, UsageError
 from sern_runtime.entry import EXIT_CONFIG, EXIT_FAILED
 
-DEFAULT_API: Final = "http://127.0.0.1:5580"
-"""Where the relay of the examples answers; the robot is at 5581, the site at 5582."""
+LOCAL_APIS: Final = tuple(f"http://127.0.0.1:{port}" for port in (5580, 5581, 5582))
+"""Where the daemons of the examples answer: relay, robot, site."""
+PROBE_S: Final = 1.0
 TIMEOUT_S: Final = 5.0
 
 # A daemon's HTTP server is on loopback or on a private network: a proxy for the outside must not come in between.
@@ -37,8 +38,23 @@ def checked_api(api: str) -> str:
     except ValueError:
         good = False
     if not good:
-        raise UsageError(f"--api {api!r} is not an address; write it like {DEFAULT_API}")
+        raise UsageError(f"--api {api!r} is not an address; write it like {LOCAL_APIS[0]}")
     return api.rstrip("/")
+
+
+def local_api() -> str:
+    """The daemon of this machine, at the first of `LOCAL_APIS` that answers. Raises SernError where none does."""
+    for api in LOCAL_APIS:
+        try:
+            get_json(api, "/api/link", timeout_s=PROBE_S)
+        except SernError:
+            continue
+        return api
+    ports = ", ".join(api.rpartition(":")[2] for api in LOCAL_APIS)
+    raise SernError(
+        f"no daemon answers on this machine (127.0.0.1, ports {ports}); is one running, and is http.listen set in its "
+        "file? --api gives another address"
+    )
 
 
 def get_json(api: str, path: str, *, timeout_s: float = TIMEOUT_S) -> Any:

@@ -1,7 +1,7 @@
 """`sern echo TOPIC`: print the messages of a topic as they pass, as text that is YAML.
 
-It asks the daemon on this machine (`--api`, as `sern topics` does), which needs no key: it polls a relay's registry for
-the latest value.
+It asks the daemon on this machine (`--api`, as `sern topics` does), which needs no key: it polls it for the latest
+value, which a relay has of every topic that somebody takes, and a client of those that pass it.
 
 With `--relay` or `--config` it is a client of the relay like any other, with a key and a name of its own: so access
 rules hold, what it prints is every message that a site would get, and its ages are a site's. It must not borrow the
@@ -21,7 +21,8 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from random import Random
-from typing import Annotated, Final, TextIO
+from typing import Annotated, Any, Final, TextIO
+from urllib.parse import quote
 
 import typer
 import zmq
@@ -40,7 +41,7 @@ from sern_runtime import clock
 from sern_runtime.config.client import RelayConnection, load_client
 from sern_runtime.keys import SecretKey, load_public, load_secret
 from sern_runtime.loop import Shutdown, run
-from sern_tools.api import DEFAULT_API, NotFoundError, checked_api, drop_output, get_json, is_stream, say
+from sern_tools.api import NotFoundError, checked_api, drop_output, get_json, is_stream, local_api, say
 from sern_tools.echo_text import Decoder
 
 DEFAULT_TIMEOUT_S: Final = 5.0
@@ -410,7 +411,18 @@ def _refuse_a_running_daemon(identity: Identity) -> None:
     )
 
 
-# --- without a key: the relay's registry -----------------------------------------------------------------------
+# --- without a key: the values that a daemon has ----------------------------------------------------------------
+
+
+def _values(api: str, topic: str) -> tuple[list[dict[str, Any]], str]:
+    """What the daemon has of `topic`, and what it means that there is nothing."""
+    try:
+        objects, nothing = get_json(api, "/api/objects")["objects"], "no topic {topic}"
+    except NotFoundError:  # a client
+        objects = get_json(api, f"/api/values?topic={quote(topic, safe='')}")["objects"]
+        nothing = "no message of {topic} has passed this client"
+    found = [item for item in objects if is_stream(item) and item["attributes"]["topic"] == topic]
+    return found, nothing.format(topic=topic)
 
 
 async def poll(
@@ -423,21 +435,14 @@ async def poll(
     timeout_s: float,
     warn: Callable[[str], None],
 ) -> None:
-    """Print the latest value of `topic` whenever the registry at `api` has a newer one. Raises SernError."""
+    """Print the latest value of `topic` whenever the daemon at `api` has a newer one. Raises SernError."""
     shown: dict[str, int] = {}
     began_s = clock.now()
     warned = False
     while not shutdown.requested:
-        try:
-            answer = await asyncio.to_thread(get_json, api, "/api/objects")
-        except NotFoundError:
-            raise SernError(
-                f"{api} is a client's: only a relay keeps values; give its address with --api, or connect as a client: "
-                "--relay, --key and --server-key"
-            ) from None
-        found = [item for item in answer["objects"] if is_stream(item) and item["attributes"]["topic"] == topic]
+        found, nothing = await asyncio.to_thread(_values, api, topic)
         if not found and not shown and timeout_s and clock.now() - began_s > timeout_s:
-            raise SernError(f"{api}: no topic {topic} within {timeout_s:g} s; `sern topics` lists what there is")
+            raise SernError(f"{api}: {nothing} within {timeout_s:g} s; `sern topics` lists what there is")
         if found and not shown and not warned and timeout_s and clock.now() - began_s > timeout_s:
             warned = all(item["value"] is None for item in found)
             if warned:
@@ -451,7 +456,7 @@ async def poll(
                 continue
             if "base64" not in value:
                 raise SernError(
-                    f"{topic}: a message has {value['bytes']} bytes, and the registry keeps only small ones; "
+                    f"{topic}: a message has {value['bytes']} bytes, and {api} keeps only small ones; "
                     "connect as a client: --relay, --key and --server-key"
                 )
             encoding = Encoding(item["attributes"]["encoding"])
@@ -505,7 +510,7 @@ def run_echo(
                 "--rate needs every message, and --api sees only the latest; connect as a client: --relay, --key and "
                 "--server-key"
             )
-        printer, address = Printer(decoder, out, count=count), checked_api(api or DEFAULT_API)
+        printer, address = Printer(decoder, out, count=count), checked_api(api or local_api())
         run(lambda shutdown: poll(topic, address, printer, shutdown, decoder, timeout_s=timeout_s, warn=_warn))
         return
     if config is not None:
@@ -532,7 +537,7 @@ def echo(
     api: Annotated[
         str | None,
         typer.Option(
-            "--api", help=f"Latest values, without a key, from a relay's HTTP address [default: {DEFAULT_API}]."
+            "--api", help="Latest values, without a key, from a daemon's HTTP address [default: this machine's]."
         ),
     ] = None,
     count: Annotated[int | None, typer.Option("--count", "-n", min=1, help="End after so many messages.")] = None,
@@ -545,7 +550,7 @@ def echo(
 ) -> None:
     """Print the messages of a topic as they pass.
 
-    From the relay on this machine its latest values, looked at twice a second; with --relay or --config every message,
+    From the daemon on this machine its latest values, looked at twice a second; with --relay or --config every message,
     as a client of the relay with a key of its own, so access rules hold. Exit code 0 when ended by Ctrl-C or --count,
     1 when relay or topic could not be had or decoded, 2 for wrong usage or configuration.
     """

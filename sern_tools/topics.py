@@ -22,7 +22,7 @@ from sern_core.errors import SernError, UsageError
 from sern_core.patterns import Pattern, compile_pattern
 from sern_core.services import parse as parse_service
 from sern_core.types import CLASS_LABELS, TopicName
-from sern_tools.api import DEFAULT_API, NotFoundError, checked_api, drop_output, get_json, is_stream, say
+from sern_tools.api import NotFoundError, checked_api, drop_output, get_json, is_stream, local_api, say
 
 MIN_INTERVAL_S: Final = 0.1
 PLAIN_WIDTH: Final = 200
@@ -306,8 +306,11 @@ def topics(
         str | None, typer.Argument(help="Only topics whose whole name this regular expression matches.")
     ] = None,
     api: Annotated[
-        str, typer.Option("--api", help="HTTP address of a relay or a client (http.listen in its file).")
-    ] = DEFAULT_API,
+        str | None,
+        typer.Option(
+            "--api", help="HTTP address of a relay or a client (http.listen in its file) [default: this machine's]."
+        ),
+    ] = None,
     watch: Annotated[bool, typer.Option("--watch", "-w", help="Again and again, until Ctrl-C.")] = False,
     services: Annotated[
         bool, typer.Option("--services", help="Also the streams of services: offers, calls, replies.")
@@ -322,7 +325,7 @@ def topics(
     Exit code 0 when listed (or ended by Ctrl-C), 1 when there is no daemon or no topic, 2 for wrong usage.
     """
     try:
-        run_topics(api, pattern, watch=watch, as_json=as_json, interval_s=interval_s, services=services)
+        run_topics(api or local_api(), pattern, watch=watch, as_json=as_json, interval_s=interval_s, services=services)
     except KeyboardInterrupt:
         raise typer.Exit(0) from None
     except BrokenPipeError:

@@ -27,6 +27,7 @@ from sern_runtime import ros_types
 from sern_runtime.loop import Shutdown
 from sern_runtime.transport_watch import CUT, ENDED
 from sern_tools.commands import app
+from sern_tools.demo_link import free_ports
 from sern_tools.echo import (
     Listener,
     Printer,
@@ -349,34 +350,25 @@ async def test_a_running_client_is_not_pushed_aside(tmp_path: Path) -> None:
 
 
 async def test_the_latest_value_without_a_key(tmp_path: Path) -> None:
+    """From the relay, the robot's client and the site's."""
     async with Lab(tmp_path, "robot1", "site") as lab:
         relay = lab.process(lab.relay_file())
         site = lab.process(lab.recorder_file("site", "/robot1/.*"))
-        robot = lab.process(lab.player_file("robot1", write_bag(tmp_path / "a.bag", {"/text": 3})))
-        for process in (relay, robot, site):
+        bag = write_bag(tmp_path / "a.bag", {"/text": 50})
+        robot = lab.process(lab.player_file("robot1", bag, play={"rate": 1.0, "loop": True}))
+        daemons = {relay: "no topic", robot: "no message of", site: "no message of"}
+        for process in daemons:
             await process.ready()
-        out = StringIO()
         decoder = SAY["plain"]
-        url = f"http://127.0.0.1:{relay.port}"
-        await poll(
-            "/robot1/text", url, Printer(decoder, out, count=1), Shutdown(), decoder, timeout_s=20.0, warn=pytest.fail
-        )
-        assert out.getvalue().startswith("# robot1 seq ")
-        assert read_yaml(out.getvalue().split("---\n")[0])["data"].startswith("/text ")
-        with pytest.raises(SernError, match="no topic /robot1/none within"):
-            await poll(
-                "/robot1/none",
-                url,
-                Printer(decoder, out, count=1),
-                Shutdown(),
-                decoder,
-                timeout_s=0.1,
-                warn=pytest.fail,
-            )
-        client = f"http://127.0.0.1:{robot.port}"
-        options: dict[str, Any] = {"timeout_s": 0.1, "warn": pytest.fail}
-        with pytest.raises(SernError, match=r"is a client's: only a relay keeps values; .*--relay"):
-            await poll("/robot1/text", client, Printer(decoder, out, count=1), Shutdown(), decoder, **options)
+        for process, nothing in daemons.items():
+            out = StringIO()
+            printer, url = Printer(decoder, out, count=1), f"http://127.0.0.1:{process.port}"
+            options: dict[str, Any] = {"warn": lambda text: None}
+            await poll("/robot1/text", url, printer, Shutdown(), decoder, timeout_s=20.0, **options)
+            assert out.getvalue().startswith("# robot1 seq ")
+            assert read_yaml(out.getvalue().split("---\n")[0])["data"].startswith("/text ")
+            with pytest.raises(SernError, match=f"{nothing} /robot1/none"):
+                await poll("/robot1/none", url, printer, Shutdown(), decoder, timeout_s=0.1, **options)
 
 
 async def test_a_topic_that_nobody_takes_is_said_to_be_so(tmp_path: Path) -> None:
@@ -418,11 +410,23 @@ def test_without_options_it_asks_the_daemon_of_this_machine(monkeypatch: pytest.
     with HTTPServer(("127.0.0.1", 0), Registry) as server:
         thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
         thread.start()
-        monkeypatch.setattr("sern_tools.echo.DEFAULT_API", f"http://127.0.0.1:{server.server_port}")
+        (closed,) = free_ports(1)
+        ports = (closed, server.server_port)
+        monkeypatch.setattr("sern_tools.api.LOCAL_APIS", tuple(f"http://127.0.0.1:{port}" for port in ports))
         result = CliRunner().invoke(app, ["echo", "/r/text", "--count", "1"])
         server.shutdown()
         thread.join()
     assert (result.exit_code, result.stdout) == (0, '# r seq 7 latest value\ndata: "here"\n---\n'), result.output
+
+
+@pytest.mark.parametrize("command", [["echo", "/r/text"], ["topics"]])
+def test_no_daemon_on_this_machine(command: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    ports = free_ports(2)
+    monkeypatch.setattr("sern_tools.api.LOCAL_APIS", tuple(f"http://127.0.0.1:{port}" for port in ports))
+    result = CliRunner().invoke(app, command)
+    assert result.exit_code == 1
+    problem = f"no daemon answers on this machine (127.0.0.1, ports {ports[0]}, {ports[1]}); is one running, and is"
+    assert f"sern {command[0]}: {problem}" in result.output
 
 
 async def test_ctrl_c_and_a_closed_pipe_are_quiet(tmp_path: Path) -> None:
