@@ -10,7 +10,9 @@ from typing import Any, Self
 import pytest
 
 from sern_client.endpoints.base import Endpoint, Held, ServiceEndpoint, ServiceInfo
+from sern_client.endpoints.zenoh import names
 from sern_client.endpoints.zenoh.endpoint import ZenohEndpoint, ZenohOptions
+from sern_client.endpoints.zenoh.services import _Server
 from sern_client.endpoints.zenoh.session import SessionOptions
 from sern_core.errors import ConfigError, ServiceError, UsageError
 from sern_core.message import TopicInfo
@@ -284,6 +286,32 @@ async def test_services_both_ways(endpoint: tuple[ZenohEndpoint, Events], peer: 
     await peer.do("close", thing="server" + MODE)
     await until(lambda: MODE not in events.services, "the service has ended")
     assert "/ours" not in events.services
+
+
+async def test_a_server_that_is_known_before_it_can_be_reached_is_waited_for(
+    router: Router, endpoint: tuple[ZenohEndpoint, Events]
+) -> None:
+    ours, events = endpoint
+    theirs = ZenohEndpoint(ZenohOptions(router.options, DOMAIN))
+    await theirs.start(Events())
+    try:
+        dds_name, type_hash = names.dds_type("std_srvs/srv/SetBool"), "RIHS01_" + 64 * "0"
+        token = theirs._declare_token(names.Kind.SERVER, MODE, dds_name, type_hash, names.Qos())
+        await until(lambda: MODE in events.services, "the service is announced")
+        with pytest.raises(ServiceError, match=f"{MODE} did not answer within 0.1 s"):
+            await ours.call(MODE, b"", timeout_s=0.1)
+        call = asyncio.create_task(ours.call(MODE, b"hello", timeout_s=60))
+        await asyncio.sleep(0)  # it has begun
+
+        async def handler(asked: bytes) -> bytes:
+            return asked[::-1]
+
+        server = _Server(theirs, names.data_key(DOMAIN, MODE, dds_name, type_hash), handler)
+        server.declare(token)
+        assert await call == b"olleh"
+        server.close()
+    finally:
+        await theirs.stop()
 
 
 async def test_a_node_that_dies_takes_its_topics_with_it(endpoint: tuple[ZenohEndpoint, Events], peer: Peer) -> None:

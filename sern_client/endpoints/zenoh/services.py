@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 from sern_client.endpoints.base import ServiceEvents, ServiceHandler, ServiceInfo, ServiceServer
 from sern_client.endpoints.zenoh import names
 from sern_client.endpoints.zenoh.names import Entity, Kind, Qos
+from sern_client.endpoints.zenoh.presence import Presence
 from sern_core.errors import ConfigError, ServiceError, WireError
 from sern_core.types import Encoding, TopicName
 
@@ -37,6 +38,7 @@ class Services(ABC):
     def __init__(self) -> None:
         self._service_events: ServiceEvents | None = None
         self._servers: dict[TopicName, dict[str, ServiceInfo]] = {}  # of others, by their key in the graph
+        self._present: dict[TopicName, Presence] = {}  # of those that were called
         self._calls = itertools.count(1)
         self._gid = secrets.token_bytes(names.GID_BYTES)
         self._serving: list[_Server] = []
@@ -63,6 +65,8 @@ class Services(ABC):
         gone = servers.pop(entity.key, None)
         if not servers:
             del self._servers[entity.name]
+            if entity.name in self._present:
+                self._present.pop(entity.name).close()
             if gone is not None and self._service_events is not None:
                 self._service_events.service_removed(entity.name)
 
@@ -98,18 +102,21 @@ class Services(ABC):
         def ended() -> None:
             handover.put(lambda: settle(None, f"{name} did not answer"))
 
-        self.session.opened.get(
-            key,
-            zenoh.handlers.Callback(replied, ended),
-            target=zenoh.QueryTarget.BEST_MATCHING,
-            consolidation=zenoh.ConsolidationMode.NONE,
-            timeout=timeout_s,
-            payload=request,
-            encoding=CDR,
-            attachment=names.pack_attachment(next(self._calls), time.time_ns(), self._gid),
-        )
+        if name not in self._present:
+            self._present[name] = Presence(self.session, key)
         try:
             async with asyncio.timeout(timeout_s):
+                await self._present[name].wait()
+                self.session.opened.get(
+                    key,
+                    zenoh.handlers.Callback(replied, ended),
+                    target=zenoh.QueryTarget.BEST_MATCHING,
+                    consolidation=zenoh.ConsolidationMode.NONE,
+                    timeout=timeout_s,
+                    payload=request,
+                    encoding=CDR,
+                    attachment=names.pack_attachment(next(self._calls), time.time_ns(), self._gid),
+                )
                 return await answer
         except TimeoutError:
             raise ServiceError(f"{name} did not answer within {timeout_s:g} s") from None
@@ -128,6 +135,9 @@ class Services(ABC):
         return server
 
     async def end_services(self) -> None:
+        for present in self._present.values():
+            present.close()
+        self._present.clear()
         for server in list(self._serving):
             server.close()
             await server.ended()
