@@ -53,7 +53,7 @@ from sern_runtime.config.relay import load_relay
 from sern_runtime.feed import Feed, FeedHeader, topic_frame
 from sern_runtime.loop import Shutdown, keep_freed_memory, run
 from sern_runtime.pump import Pump
-from sern_tools.demo_link import free_ports
+from sern_tools.ports import free_ports
 
 SIZES: Final = {"100 B": 100, "1 kB": 1000, "64 kB": 64_000, "1 MB": 1_000_000}
 IN_FLIGHT_MESSAGES: Final = 500

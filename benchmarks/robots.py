@@ -46,7 +46,7 @@ from sern_runtime import clock, logs
 from sern_runtime.config.relay import load_relay
 from sern_runtime.keys import PublicKey, PublicKeys, generate, load_public, load_secret, write_public, write_secret
 from sern_runtime.loop import Shutdown, run
-from sern_tools.demo_link import free_ports
+from sern_tools.ports import free_ports
 
 FLEETS: Final = (1, 5, 10, 20, 50)
 HOSTS: Final = 2

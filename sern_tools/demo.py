@@ -32,7 +32,7 @@ from sern_runtime.profiles import load_profile
 from sern_tools import demo_report
 from sern_tools.counters import Counters, read_counters
 from sern_tools.demo_behaviour import Behaviour, Look
-from sern_tools.demo_link import LinkProcess, free_ports
+from sern_tools.demo_link import LinkProcess
 from sern_tools.demo_live import LiveView, Sample, join
 from sern_tools.demo_report import Carried, Report
 from sern_tools.demo_scenario import (
@@ -49,6 +49,7 @@ from sern_tools.demo_scenario import (
     write_files,
 )
 from sern_tools.message_log import TopicLog, read_logs
+from sern_tools.ports import free_ports
 from sern_tools.processes import Child, Children, program, swept
 from sern_tools.shaping import RateSchedule
 from sern_tools.summary import RunFacts, analyse, judge

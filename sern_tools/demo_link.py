@@ -2,10 +2,7 @@
 
 import asyncio
 import json
-import random
-import socket
 import sys
-from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -17,24 +14,6 @@ from sern_tools.processes import Child, Children
 from sern_tools.proxy import address
 
 HOST: Final = "127.0.0.1"
-
-
-PORTS: Final = range(15_000, 32_000)
-"""Below those that the kernel gives to outgoing connections, which could take one before its owner listens."""
-
-
-def free_ports(count: int) -> list[int]:
-    """Ports on loopback that nobody listens on now. Raises SernError when there are none."""
-    with ExitStack() as held:
-        found: list[int] = []
-        for port in random.SystemRandom().sample(PORTS, len(PORTS)):
-            if len(found) == count:
-                return found
-            sock = held.enter_context(socket.socket())
-            with suppress(OSError):
-                sock.bind((HOST, port))
-                found.append(port)
-    raise SernError(f"no {count} free ports on {HOST} between {PORTS.start} and {PORTS.stop}")
 
 
 @dataclass

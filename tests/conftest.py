@@ -18,8 +18,8 @@ import zmq
 from sern_core.types import ClientName
 from sern_runtime.keys import SecretKey, generate
 from sern_runtime.loop import raise_open_files
+from sern_tools.ports import release_claims
 from tests.exploring import load_profile
-from tests.peers.dds.peer import release_domains
 from tests.support import DEADLINE_S, Patience
 
 Context = zmq.Context[zmq.Socket[bytes]]
@@ -135,7 +135,7 @@ def nothing_left_behind() -> Iterator[None]:
     probes = (_threads, _children, _sockets)
     before = [probe() for probe in probes]
     yield
-    release_domains()
+    release_claims()
     patience = Patience()
     while True:
         gc.collect()

@@ -29,7 +29,7 @@ from sern_relay.daemon import RelayDaemon
 from sern_runtime.config.client import load_client
 from sern_runtime.config.relay import load_relay
 from sern_runtime.keys import PublicKey, PublicKeys, SecretKey, generate, write_public, write_secret
-from sern_tools.demo_link import free_ports
+from sern_tools.ports import free_ports
 from tests.support import until
 
 HOST: Final = "127.0.0.1"

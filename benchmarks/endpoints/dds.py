@@ -33,7 +33,7 @@ from sern_core.message import TopicInfo
 from sern_core.types import ClientName, Encoding, TopicName
 from sern_runtime import ros_types
 from sern_runtime.keys import PublicKey, PublicKeys, generate, write_public, write_secret
-from sern_tools.demo_link import free_ports
+from sern_tools.ports import free_ports
 from tests.peers.dds.peer import Peer, build_peer, free_domain, missing_packages
 
 MEASURE_S: Final = 8.0

@@ -19,7 +19,7 @@ from sern_core.types import Encoding, TopicName
 from sern_runtime import ros_types
 from sern_runtime.codec_pool import CodecPool, make_coder
 from sern_runtime.config.client import load_client
-from sern_tools.demo_link import free_ports
+from sern_tools.ports import free_ports
 from tests.daemons import HOST, Lab, bodies, recording, under
 from tests.loopback.test_summaries import bag_of
 from tests.sern_core.test_lossy import IMAGE, image_body, scene

@@ -9,7 +9,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from sern_client.daemon import ClientDaemon
 from sern_relay.daemon import RelayDaemon
 from sern_runtime import datagram_watch
-from sern_tools.demo_link import free_ports
+from sern_tools.ports import free_ports
 from tests.daemons import HOST, Lab
 from tests.loopback.test_nat import INSIDE, Nat
 from tests.support import until

@@ -19,7 +19,7 @@ from sern_runtime.express import CONNECTIONS
 from sern_runtime.udp import UdpServer
 from sern_runtime.udp_client import UdpClient
 from sern_runtime.zmq_socket import SendResult
-from sern_tools.demo_link import free_ports
+from sern_tools.ports import free_ports
 from tests.daemons import HOST, Lab
 from tests.loopback.test_udp_client import NO_IPV6, has_ipv6
 from tests.loopback.udp_support import OFFERED, ROBOT

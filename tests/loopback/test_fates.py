@@ -8,7 +8,6 @@ from sern_core.types import ClientName
 from sern_runtime.profiles import load_profile
 from sern_sim.models import LinkModel
 from sern_tools.counters import read_counters
-from sern_tools.demo_link import free_ports
 from sern_tools.demo_scenario import (
     COMMAND_TOPIC,
     FAR_HOST,
@@ -21,6 +20,7 @@ from sern_tools.demo_scenario import (
     write_files,
 )
 from sern_tools.message_log import read_logs
+from sern_tools.ports import free_ports
 from sern_tools.proxy import Route, ShapingProxy
 from sern_tools.summary import Result, RunFacts, analyse, judge
 from tests.daemons import HOST, Lab

@@ -16,7 +16,7 @@ from sern_relay.daemon import RelayDaemon
 from sern_relay.feed import InjectCounters, RelayFeed
 from sern_runtime import clock, ros_types
 from sern_runtime.feed import HEADER, FeedHeader
-from sern_tools.demo_link import free_ports
+from sern_tools.ports import free_ports
 from tests.daemons import Lab, endpoint_of
 from tests.support import until
 

@@ -11,7 +11,7 @@ from typing import Final
 import pytest
 
 from sern_client.daemon import ClientDaemon
-from sern_tools.demo_link import free_ports
+from sern_tools.ports import free_ports
 from tests.daemons import HOST, Lab, bodies, under, write_bag
 from tests.support import until
 

@@ -157,6 +157,7 @@ async def test_patches_arrive_as_whole_grids(tmp_path: Path, late: bool) -> None
         rebuilds = site.bridge.rebuilds
         updates_topic = TopicName("/robot1/map_updates")
         if late:  # what came after the last whole grid, which is the one at which the map grew
+            await delivered(site, topic, 1)
             await delivered(site, updates_topic, 10)
         else:
             await delivered(site, updates_topic, updates.offered)

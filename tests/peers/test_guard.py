@@ -14,7 +14,7 @@ from sern_core.types import Encoding, TopicName
 from sern_runtime import clock, ros_types
 from sern_runtime.config import endpoints as sections
 from sern_runtime.config.shared import LogSection
-from sern_tools.demo_link import free_ports
+from sern_tools.ports import free_ports
 from tests.support import Events, until
 
 TWIST = "geometry_msgs/msg/Twist"

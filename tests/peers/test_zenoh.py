@@ -18,7 +18,7 @@ from sern_core.errors import ConfigError, ServiceError, UsageError
 from sern_core.message import TopicInfo
 from sern_core.types import Encoding, TopicName
 from sern_runtime import ros_services, ros_types
-from sern_tools.demo_link import free_ports
+from sern_tools.ports import free_ports
 from tests.daemons import Lab, bodies, under, write_bag
 from tests.support import Events, until
 

@@ -14,9 +14,9 @@ from sern_core.types import Encoding, TopicName
 from sern_runtime.config.client import load_client
 from sern_runtime.profiles import load_profile
 from sern_tools.baseline import Baseline
-from sern_tools.demo_link import free_ports
 from sern_tools.demo_scenario import COMMAND_TOPIC, POSE_TOPIC, ROBOT, SITE, Ports, Scenario, write_files
 from sern_tools.message_log import MessageLog, read_logs
+from sern_tools.ports import free_ports
 from tests.support import DEADLINE_S, until
 
 HOST = "127.0.0.1"

@@ -67,6 +67,18 @@ class Started:
             await self._reading
             return await self.process.wait()
 
+    async def reaches(self, stage: str, *, processes: int = 0) -> asyncio.subprocess.Process:
+        """Wait until it has printed `stage` and has more than so many processes; it must not end before."""
+        process = self.process
+        assert process is not None
+
+        def met() -> bool:
+            assert process.returncode is None, f"it ended with {process.returncode}: {self.output}"
+            return stage in self.output and len(self.processes()) > processes
+
+        await until(met, f"{stage!r} of the demo", deadline_s=RUN_S)
+        return process
+
     def processes(self) -> list[str]:
         """The command lines of everything that carries this demo's mark."""
         found = []
@@ -119,9 +131,8 @@ async def test_ctrl_c_stops_everything_at_any_stage(tmp_path: Path, stage: str, 
     demo = Started(tmp_path)
     try:
         await demo.start("--profile", "quick", "--duration", "2")
-        await until(lambda: stage in demo.output or demo.process is None, stage, deadline_s=RUN_S)
-        assert demo.process is not None
-        demo.process.send_signal(number)
+        process = await demo.reaches(stage)
+        process.send_signal(number)
         assert await demo.ended() == EXIT_INTERRUPTED, demo.output
         demo.assert_nothing_left()
     finally:
@@ -152,9 +163,8 @@ async def test_kill_9_leaves_nothing_behind(tmp_path: Path, stage: str) -> None:
     demo = Started(tmp_path)
     try:
         await demo.start("--profile", "quick")
-        await until(lambda: stage in demo.output and len(demo.processes()) > 3, stage, deadline_s=RUN_S)
-        assert demo.process is not None
-        demo.process.kill()
+        process = await demo.reaches(stage, processes=3)
+        process.kill()
         assert await demo.ended() == -signal.SIGKILL
         await until(lambda: demo.processes() == [], "every process has ended", deadline_s=RUN_S)
         demo.assert_nothing_left()

@@ -27,7 +27,6 @@ from sern_runtime import ros_types
 from sern_runtime.loop import Shutdown
 from sern_runtime.transport_watch import CUT, ENDED
 from sern_tools.commands import app
-from sern_tools.demo_link import free_ports
 from sern_tools.echo import (
     Listener,
     Printer,
@@ -38,6 +37,7 @@ from sern_tools.echo import (
     poll,
 )
 from sern_tools.echo_text import Decoder, hex_text, scalar, text_of
+from sern_tools.ports import free_ports
 from tests.daemons import Lab, write_bag
 from tests.support import until
 

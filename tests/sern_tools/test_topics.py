@@ -16,7 +16,7 @@ from sern_core.errors import SernError, UsageError
 from sern_core.patterns import compile_pattern
 from sern_tools import api
 from sern_tools.commands import app
-from sern_tools.demo_link import free_ports
+from sern_tools.ports import free_ports
 from sern_tools.topics import (
     UNTAKEN_NOTE,
     Counts,

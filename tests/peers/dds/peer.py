@@ -8,7 +8,6 @@ import shutil
 import socket
 import subprocess
 import tempfile
-from collections import deque
 from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
@@ -16,6 +15,7 @@ from typing import Final, Self
 
 import pytest
 
+from sern_tools.ports import claim
 from tests.support import DEADLINE_S
 
 SOURCES: Final = Path(__file__).resolve().parent
@@ -62,33 +62,20 @@ def _run(command: list[str], folder: Path) -> None:
 
 _domains: Final = itertools.cycle([(os.getpid() + number) % 80 + 20 for number in range(80)])
 """Those whose ports are below the ones that the system gives to anybody."""
-_held: Final[deque[socket.socket]] = deque()
-HELD: Final = 8
-"""More domains than one test asks for."""
 
 
 def free_domain() -> int:
-    """A DDS domain that nobody on this host is in: its first unicast port is free, and no other process of tests holds
-    it by an abstract socket of its name, as this one does until it has asked for some more."""
+    """A DDS domain that nobody on this host is in: its first unicast port is free, and no other process of tests is
+    given it meanwhile."""
     for domain in itertools.islice(_domains, 80):
-        claim = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
-        try:
-            claim.bind(f"\0sern-tests-dds-domain-{domain}")
-            with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            try:
                 probe.bind(("127.0.0.1", 7400 + 250 * domain + 10))
-        except OSError:
-            claim.close()
-            continue
-        _held.append(claim)
-        release_domains(but=HELD)
-        return domain
+            except OSError:
+                continue
+        if claim(f"dds-domain-{domain}"):
+            return domain
     raise AssertionError("every DDS domain of this host is in use")
-
-
-def release_domains(*, but: int = 0) -> None:
-    """Let other processes have the domains that this one asked for, but for the last ones."""
-    while len(_held) > but:
-        _held.popleft().close()
 
 
 class Peer:

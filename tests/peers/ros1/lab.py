@@ -15,7 +15,7 @@ from xmlrpc.client import ServerProxy
 import pytest
 
 from sern_client.endpoints.ros1 import Ros1Endpoint, Ros1Options
-from sern_tools.demo_link import free_ports
+from sern_tools.ports import free_ports
 from tests.daemons import HOST
 from tests.support import Events, until
 

@@ -8,7 +8,7 @@ from ruamel.yaml import YAML
 
 from sern_core.types import Encoding
 from sern_runtime import ros_types
-from sern_tools.demo_link import free_ports
+from sern_tools.ports import free_ports
 from tests.daemons import HOST, Lab
 from tests.peers.ros1.lab import SUBSCRIBER, RosLab, publisher
 from tests.support import until

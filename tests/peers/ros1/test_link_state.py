@@ -14,12 +14,12 @@ STATUS: Final = "diagnostic_msgs/msg/DiagnosticStatus"
 ARRAY: Final = "diagnostic_msgs/msg/DiagnosticArray"
 ROBOT: Final = {"kind": "synthetic", "role": "robot", "topics": ["/pose", "/map"]}
 LISTENER: Final = """
-import sys, json, rospy
+import os, sys, json, rospy
 rospy.init_node(sys.argv[1], disable_rosout=True)
 def got(message, topic):
     header = message._connection_header
     line = {"topic": topic, "hex": message._buff.hex(), "type": header["type"], "latching": header["latching"]}
-    print(json.dumps(line))
+    os.write(1, json.dumps(line).encode() + b"\\n")  # at once: each topic has a thread
 for topic in sys.argv[2:]:
     rospy.Subscriber(topic, rospy.AnyMsg, got, topic)
 rospy.spin()

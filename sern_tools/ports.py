@@ -1,0 +1,61 @@
+"""Numbers that one of several processes may use for itself: ports on loopback, until their owners listen.
+
+A port that is free now may be taken by the time that its owner listens. Who looks for one here claims it first, by an
+abstract socket of its name, which every process of this network namespace sees and which ends with its process.
+"""
+
+import random
+import socket
+from collections import deque
+from contextlib import ExitStack
+from typing import Final
+
+from sern_core.errors import SernError
+
+HOST: Final = "127.0.0.1"
+PORTS: Final = range(15_000, 32_000)
+"""Below those that the kernel gives to outgoing connections, which could take one before its owner listens."""
+CLAIMS: Final = 128
+"""So many of the last claims of a process hold; by then the owners of those before listen, or have ended."""
+
+_claims: Final[deque[socket.socket]] = deque()
+
+
+def claim(name: str) -> bool:
+    """Whether `name` is this process's now: no other process, and no earlier call here, holds a claim to it."""
+    held = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+    try:
+        held.bind(f"\0sern-claim-{name}")
+    except OSError:
+        held.close()
+        return False
+    _claims.append(held)
+    if len(_claims) > CLAIMS:
+        _claims.popleft().close()
+    return True
+
+
+def release_claims() -> None:
+    """Let others have everything that this process claimed."""
+    while _claims:
+        _claims.popleft().close()
+
+
+def free_ports(count: int) -> list[int]:
+    """Ports on loopback that nobody listens on now, and that no other process of this kind is given meanwhile.
+
+    Raises SernError when there are none.
+    """
+    with ExitStack() as held:
+        found: list[int] = []
+        for port in random.SystemRandom().sample(PORTS, len(PORTS)):
+            sock = held.enter_context(socket.socket())
+            try:
+                sock.bind((HOST, port))
+            except OSError:
+                continue
+            if claim(f"port-{port}"):
+                found.append(port)
+            if len(found) == count:
+                return found
+    raise SernError(f"no {count} free ports on {HOST} between {PORTS.start} and {PORTS.stop}")
