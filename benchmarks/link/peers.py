@@ -41,15 +41,17 @@ def _listen(orders: Orders, log: Log, wait: Any) -> None:
 # --- one datagram ---------------------------------------------------------------------------------------------------
 
 
+def send_datagram(sock: socket.socket, datagram: bytes) -> None:
+    """On a connected socket. The other end may not listen yet, or no more: the kernel reports that of the datagram
+    before, and does not send this one."""
+    with suppress(ConnectionRefusedError):
+        sock.send(datagram)
+
+
 def udp_sender(spec: Spec, load: Load, orders: Orders, log: Log) -> dict[str, Any]:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
         sock.connect((spec.address, PORT))
-
-        def send(_kind: Kind, body: bytes) -> None:
-            with suppress(ConnectionRefusedError):  # the other end stops first
-                sock.send(body)
-
-        _drive(spec, load, orders, log, send)
+        _drive(spec, load, orders, log, lambda _kind, body: send_datagram(sock, body))
     return NOTHING
 
 
