@@ -8,7 +8,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -17,6 +17,7 @@ import psutil
 
 from benchmarks.link import peers
 from benchmarks.link.children import Running, environment
+from benchmarks.link.forwarder import FORWARDER, Hops
 from benchmarks.link.load import Load, Records, Spec, read_log
 from benchmarks.link.sern import RELAY_PORT
 from sern_core.errors import SernError
@@ -62,6 +63,8 @@ class Outcome:
     site: dict[str, Any]
     relay: dict[str, Any]
     events: dict[str, tuple[int, int]]
+    wire_packets: int
+    """What left the link from the robot to the relay while load was offered; `wire_bytes` with Ethernet headers."""
     wire_bytes: int
     wire_dropped: int
     cpu_percent: dict[str, float]
@@ -90,6 +93,8 @@ def run(
         if system.startswith("sern"):
             make_keys(directory)
             running.ends["relay"] = start_relay(lab, directory, udp=system == "sern-udp")
+        if system == FORWARDER:
+            running.ends["relay"] = _start_forwarder(lab, directory)
         if system == "tcpros":
             _start_master(lab, running)
         for sends, node in ((False, lab.b), (True, lab.a)):
@@ -124,6 +129,7 @@ def run(
         read["site"],
         json.loads(summary.read_text()) if summary.exists() else {},
         events,
+        wire_after.packets - wire_before.packets,
         wire_after.bytes - wire_before.bytes,
         wire_after.dropped - wire_before.dropped,
         {role: 100 * (cpu_after[role] - cpu_before[role]) / duration_s for role in cpu_after},
@@ -160,26 +166,38 @@ def start_relay(lab: Lab, directory: Path, *, udp: bool) -> "subprocess.Popen[by
     config = directory / "relay.yaml"
     config.write_text(json.dumps(content))
     command = [sys.executable, "-P", "-m", "sern_relay.cli", "--config", str(config)]
-    with (directory / "relay.log").open("wb") as log:
+    return _start_daemon(lab, directory, "relay", command, os.environ)
+
+
+def _start_daemon(
+    lab: Lab, directory: Path, role: str, command: Sequence[str], environ: Mapping[str, str]
+) -> "subprocess.Popen[bytes]":
+    """On the site's side; it is told to end by a signal."""
+    with (directory / f"{role}.log").open("wb") as log:
         return lab.popen(
-            lab.b, command, stdin=subprocess.DEVNULL, stdout=log, stderr=log, cwd=directory, start_new_session=True
+            lab.b,
+            command,
+            env=environ,
+            stdin=subprocess.DEVNULL,
+            stdout=log,
+            stderr=log,
+            cwd=directory,
+            start_new_session=True,
         )
+
+
+def _start_forwarder(lab: Lab, directory: Path) -> "subprocess.Popen[bytes]":
+    """In the relay's place."""
+    Hops.draw().write(directory)
+    command = [sys.executable, "-m", "benchmarks.link.forwarder", str(directory), lab.b.address]
+    return _start_daemon(lab, directory, "relay", command, environment())
 
 
 def _start_master(lab: Lab, running: Running) -> None:
     """Returns when it listens."""
     command = [sys.executable, "-c", peers.ROS_MASTER, "--core", "-p", str(peers.ROS_PORT)]
     names = {"ROS_MASTER_URI": f"http://{lab.b.address}:{peers.ROS_PORT}", "ROS_IP": lab.b.address}
-    with (running.directory / "master.log").open("wb") as log:
-        running.ends["master"] = lab.popen(
-            lab.b,
-            command,
-            env={**os.environ, **names},
-            stdin=subprocess.DEVNULL,
-            stdout=log,
-            stderr=log,
-            start_new_session=True,
-        )
+    running.ends["master"] = _start_daemon(lab, running.directory, "master", command, {**os.environ, **names})
     give_up_s = time.monotonic() + START_S
     with lab.b.socket(socket.SOCK_STREAM) as probe:
         while probe.connect_ex((lab.b.address, peers.ROS_PORT)):
