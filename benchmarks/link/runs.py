@@ -28,8 +28,9 @@ from sern_tools.lab.backends import DEVICE, NETWORK, PREFIX
 from sern_tools.lab.host import run as run_command
 from sern_tools.lab.lab import Lab, Node
 
-START_S: Final = 40.0
-"""How long ends may take to start and to find each other; the machine may be busy, the link lossy."""
+START_S: Final = 60.0
+"""How long ends may take to start and to find each other; the machine may be busy, the link lossy. One that ends is
+noticed at once."""
 LEAD_S: Final = 0.3
 """From the order to go until the first message."""
 DRAIN_S: Final = 1.5
@@ -231,7 +232,10 @@ def _await_ready(running: Running, role: str) -> None:
         running.check()
         left_s = give_up_s - time.monotonic()
         if left_s <= 0:
-            raise SernError(f"{running.name(role)}: nothing got through within {START_S:g} s{running.said()}")
+            raise SernError(
+                f"{running.name(role)}: nothing got through within {START_S:g} s; is the machine "
+                f"overloaded?{running.said()}"
+            )
         if select.select([process.stdout], [], [], min(left_s, POLL_S))[0]:
             data = os.read(process.stdout.fileno(), 4096)
             if not data:
