@@ -40,13 +40,17 @@ FLOODS: Final = (1.3, 2.0, 4.0, 13.0)
 """Class control, times what the link carries."""
 FLOOD_AGE_S: Final = 0.2
 """Four round trips."""
-CPU_LIMIT: Final = 4.0
-"""CPU of the busier side at 4 Mbit/s, times that of a bare forwarder of as many datagrams: 5 % of a core of the machine
-of docs/performance.md, where the forwarder takes 1.25 %."""
-CPU_LIMIT_FAST: Final = 3.1
-"""The same at 20 Mbit/s: 12 % of that core, where the forwarder takes 3.9 %; a datagram wakes it more cheaply there."""
-JUNK_LIMIT: Final = 0.15
-"""CPU of refusing a datagram, by that of forwarding one at 4 Mbit/s: 20,000 a second are 10 % of that core then."""
+BARE_PERCENT: Final = 1.25
+"""CPU of the bare forwarder at 4 Mbit/s on the machine of docs/performance.md. What was set out in shares of a core of
+that machine is held as multiples of this."""
+BARE_FAST_PERCENT: Final = 3.9
+"""The same at 20 Mbit/s, where a datagram wakes it more cheaply."""
+BARE_US: Final = 33.0
+"""What a datagram of the full size costs it at 4 Mbit/s."""
+CPU_LIMIT: Final = 5.0 / BARE_PERCENT
+CPU_LIMIT_FAST: Final = 12.0 / BARE_FAST_PERCENT
+JUNK_LIMIT: Final = 5.0 / BARE_US
+"""5 µs each are a tenth of a core at JUNK_HZ."""
 FULL: Final = Load(even_hz=360.0, even_bytes=ROOM_BYTES)
 """Datagrams of the full size, nine tenths of what 4 Mbit/s carry."""
 

@@ -10,12 +10,16 @@ import pytest
 
 pytest.importorskip("psutil")
 
+from benchmarks.common import Report
 from benchmarks.link import figures
+from benchmarks.link.cases import Bench
 from benchmarks.link.forwarder import Forwarder, Hops
-from benchmarks.link.load import Kind
+from benchmarks.link.load import Kind, Load
+from benchmarks.link.runs import Outcome
 from sern_core.errors import SernError
 from sern_runtime.seal import ROOM_BYTES, SEAL_BYTES, Opener, Sealer, Side
 from sern_sim.models import LinkModel
+from sern_tools.lab.lab import Lab
 from tests.benchmarks.test_link import outcome
 
 
@@ -128,3 +132,20 @@ def test_the_forwarder_gets_datagrams_of_the_size_and_rate_of_the_run() -> None:
 
 def test_refusing_is_told_by_what_forwarding_one_costs() -> None:
     assert figures.refusing_to_forwarding(10.0, 20_000, BARE) == pytest.approx(5.0 / 31.25)
+
+
+def test_a_case_holds_its_cpu_against_a_forwarder_of_the_same_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[tuple[str, str, LinkModel, Load]] = []
+
+    def run(_bench: Bench, case: str, system: str, model: LinkModel, load: Load, *_: object, **__: object) -> Outcome:
+        asked.append((case, system, model, load))
+        return BARE
+
+    monkeypatch.setattr(Bench, "run", run)
+    report = Report("link")
+    bench = Bench(Lab(), report, ("sern-udp",), quick=True, directory=Path(), plots=None)
+    for limit in (5.0, 3.9):
+        bench.cpu("4 Mbit/s", OURS, limit)
+    assert asked == 2 * [("4 Mbit/s", "forwarder", OURS.model, figures.bare_load(OURS))]
+    assert [reach.value for reach in report.reaches] == pytest.approx([4.0, 4.0])
+    assert [(reach.limit, reach.ok) for reach in report.reaches] == [(5.0, True), (3.9, False)]
