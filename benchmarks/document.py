@@ -24,6 +24,8 @@ TITLES: Final = {
     "fresh_s": "first fresh pose, s",
     "messages_hz": "messages/s",
     "relay_cpu_us": "relay CPU a message, µs",
+    "datagrams_hz": "datagrams/s",
+    "datagram_us": "CPU a datagram, µs",
     "cost_1": "cost J",
     "plusminus_1": "± (95 %)",
     "forward_1": "J, first to last",

@@ -23,7 +23,8 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from benchmarks.common import Report, main, positive, try_realtime
-from benchmarks.link.runs import DRAIN_S, START_S, STOP_S, Running, make_keys, sleep_until, start_relay
+from benchmarks.link.children import Running
+from benchmarks.link.runs import DRAIN_S, START_S, make_keys, sleep_until, start_relay
 from benchmarks.link.sern import RELAY_PORT
 from benchmarks.mmcf_replay import CLOUD_HZ, EVERY_NTH_POINT, REAL, recorded, tabulate
 from sern_client.endpoints.clouds import read_ply
@@ -247,15 +248,12 @@ def _connected(robot: Node, topics: int) -> bool:
     return lanes == ["udp"] and sum(entry["delivered"] > 0 for entry in sent) == topics
 
 
-def _await_connected(running: Running, robot: Node, topics: int, directory: Path) -> None:
+def _await_connected(running: Running, robot: Node, topics: int) -> None:
     give_up_s = time.monotonic() + START_S
     while not _connected(robot, topics):
-        for role, process in running.ends.items():
-            if process.poll() is not None:
-                lines = (directory / f"{role}.log").read_text(errors="replace").strip().splitlines()
-                raise SernError(f"{role} ended: {lines[-1] if lines else 'it said nothing'}")
+        running.check()
         if time.monotonic() > give_up_s:
-            raise SernError(f"not every topic of the robot got through within {START_S:g} s")
+            raise SernError(f"not every topic of the robot got through within {START_S:g} s{running.said()}")
         time.sleep(POLL_S)
 
 
@@ -272,14 +270,8 @@ def _edge(lab: Lab, running: Running) -> Edge:
 def _stop(running: Running) -> None:
     """The robot first, so that nothing is offered any more; then who listens, then the relay."""
     for role in (ROBOT, SITE, "relay"):
-        process = running.ends[role]
-        process.send_signal(signal.SIGTERM)
-        try:
-            code = process.wait(STOP_S)
-        except subprocess.TimeoutExpired as error:
-            raise SernError(f"{role} does not end") from error
-        if code:
-            raise SernError(f"{role} ended with {code}")
+        running.ends[role].send_signal(signal.SIGTERM)
+        running.await_end(role)
 
 
 def rates_bps(duration_s: int) -> list[float]:
@@ -298,12 +290,12 @@ def run(lab: Lab, directory: Path, section: AdaptationSection, scans: Sequence[P
     site = site_file(directory, lab.b.address)
     lab.reset()
     lab.link(LINK, LINK)
-    running = Running()
+    running = Running(directory)
     try:
         running.ends["relay"] = start_relay(lab, directory, udp=True)
         running.ends[SITE] = _start(lab, lab.b, site)
         running.ends[ROBOT] = _start(lab, lab.a, robot)
-        _await_connected(running, lab.a, len(specs), directory)
+        _await_connected(running, lab.a, len(specs))
         start_ns = time.monotonic_ns() + int(WARM_S * 1e9)
         capacities_bps = rates_bps(duration_s)
         edges = []

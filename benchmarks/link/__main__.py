@@ -5,7 +5,8 @@ Offered: a pose at 50 Hz (100 bytes, class control), clouds at 10 Hz (100 kB in 
 
 systems: sern-udp, sern-zmq (robot, relay and site, both hops on that lane; CURVE), zmq (PUB/SUB as it comes), zenoh,
 zenoh-multilink, zenoh-multilink-bbr (peers, REAL_TIME against DATA_LOW, one TCP connection or two by priority),
-tcpros (rospy, where it is installed)
+tcpros (rospy, where it is installed). Beside sern-udp: floor (one bare datagram on the idle link) and forwarder (opens,
+seals and sends each datagram in the relay's place), whose latency and CPU the limits are multiples of
 """
 
 import argparse

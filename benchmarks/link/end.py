@@ -8,12 +8,13 @@ import sys
 from collections.abc import Callable
 from typing import Any, Final
 
-from benchmarks.link import peers, sern
+from benchmarks.link import forwarder, peers, sern
 from benchmarks.link.load import Load, Log, Orders, Spec
 
 End = Callable[[Spec, Load, Orders, Log], dict[str, Any]]
 ENDS: Final[dict[str, tuple[End, End]]] = {
     "floor": (peers.udp_sender, peers.udp_receiver),
+    forwarder.FORWARDER: (forwarder.sender, forwarder.receiver),
     "zmq": (peers.zmq_sender, peers.zmq_receiver),
     "zenoh": (peers.zenoh_sender, peers.zenoh_receiver),
     "zenoh-multilink": (peers.zenoh_sender, peers.zenoh_receiver),

@@ -5,13 +5,13 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.link.load import FLOOD_BYTES, Kind, Records
+from benchmarks.link.load import FLOOD_BYTES, Kind, Load, Records
 from benchmarks.link.runs import Outcome
 from benchmarks.link.sern import SAMPLE_COLUMNS, TOPICS
 from sern_core import wire
 from sern_core.errors import SernError
 from sern_core.lanes import DATAGRAM_BYTES
-from sern_runtime.seal import UDP_PAYLOAD_BYTES
+from sern_runtime.seal import ROOM_BYTES, SEAL_BYTES, UDP_PAYLOAD_BYTES
 from sern_runtime.udp import OVERHEAD_BYTES
 
 ETHERNET_BYTES: Final = 42
@@ -23,6 +23,8 @@ NEAR: Final = 0.25
 HELD_S: Final = 0.3
 """... and when it has been so for so long."""
 NEVER_S: Final = 999.0
+ALIKE: Final = 0.1
+"""Two runs are compared by CPU when they carried as many datagrams, within this share."""
 KIND, NUMBER, STAMP, AT, SIZE = range(5)
 
 
@@ -106,6 +108,49 @@ def link_use(outcome: Outcome) -> float:
     """Bytes that left the link, of those it could have carried."""
     assert outcome.model.rate_bps is not None
     return 8 * outcome.wire_bytes / (outcome.model.rate_bps * outcome.duration_s)
+
+
+def datagrams_hz(outcome: Outcome) -> float:
+    """What left the link from the robot to the relay, a second."""
+    return outcome.wire_packets / outcome.duration_s
+
+
+def bare_load(outcome: Outcome) -> Load:
+    """For the bare forwarder: as many datagrams a second as a run had on its link, each of their mean size."""
+    if not outcome.wire_packets:
+        raise SernError(f"{outcome.system}: nothing left the link")
+    size_bytes = round(outcome.wire_bytes / outcome.wire_packets) - ETHERNET_BYTES - SEAL_BYTES
+    return Load(even_hz=datagrams_hz(outcome) / (1 - outcome.model.mean_loss), even_bytes=min(size_bytes, ROOM_BYTES))
+
+
+def busier_percent(outcome: Outcome) -> float:
+    """CPU of the robot or of the relay, whichever takes more, of one core."""
+    return max(outcome.cpu_percent["robot"], outcome.cpu_percent["relay"])
+
+
+def forwarding_us(bare: Outcome) -> float:
+    """What a datagram cost the bare forwarder. SernError when nothing was measured."""
+    if bare.cpu_percent["relay"] <= 0 or not bare.wire_packets:
+        raise SernError("the bare forwarder carried nothing")
+    return 1e4 * bare.cpu_percent["relay"] / datagrams_hz(bare)
+
+
+def times_forwarding(outcome: Outcome, bare: Outcome) -> float:
+    """CPU of the busier side, times that of a bare forwarder for as many datagrams a second.
+
+    Raises SernError when the forwarder did not carry as many: then the two cannot be compared.
+    """
+    ours_hz, bare_hz = datagrams_hz(outcome), datagrams_hz(bare)
+    if abs(bare_hz - ours_hz) > ALIKE * ours_hz:
+        raise SernError(f"the bare forwarder carried {bare_hz:,.0f} datagrams/s, {outcome.system} {ours_hz:,.0f}")
+    bare_percent = 1e-4 * forwarding_us(bare) * ours_hz
+    return busier_percent(outcome) / bare_percent
+
+
+def refusing_to_forwarding(spent_percent: float, junk_hz: float, bare: Outcome) -> float:
+    """What a datagram of junk costs, by what a good one costs the bare forwarder. All of them took `spent_percent` of a
+    core."""
+    return 1e4 * spent_percent / junk_hz / forwarding_us(bare)
 
 
 def first_fresh_s(outcome: Outcome, step: str, floor_s: float) -> float:

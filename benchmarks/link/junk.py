@@ -7,9 +7,10 @@ from contextlib import suppress
 from multiprocessing import Pipe, get_context
 from multiprocessing.connection import Connection
 from struct import Struct
-from typing import Final, Self
+from typing import Any, Final, Self
 
 from benchmarks.link.sern import RELAY_PORT
+from sern_core.errors import SernError
 from sern_runtime.seal import UDP_PAYLOAD_BYTES
 from sern_tools.lab.host import inside
 from sern_tools.lab.lab import Node
@@ -22,12 +23,15 @@ class Junk:
     """A process that waits for `begin` and then sends; ended on exit."""
 
     def __init__(self, node: Node, seconds: float) -> None:
-        self._ours, far = Pipe()
-        self._process = get_context("spawn").Process(target=_flood, args=(node.namespace, seconds, far), daemon=True)
+        self._ours, self._far = Pipe()
+        self._process = get_context("spawn").Process(
+            target=_flood, args=(node.namespace, seconds, self._far), daemon=True
+        )
 
     def __enter__(self) -> Self:
         self._process.start()
-        self._ours.recv()  # it is ready
+        self._far.close()  # so that its end is the end of the pipe
+        self._hear()  # it is ready
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -39,8 +43,15 @@ class Junk:
         self._ours.send(session_id)
 
     def rate_hz(self) -> float:
-        """What it came to; waits for its end."""
-        return float(self._ours.recv())
+        """What it came to; waits for its end. Raises SernError when it has failed."""
+        return float(self._hear())
+
+    def _hear(self) -> Any:
+        try:
+            return self._ours.recv()
+        except EOFError as error:
+            self._process.join()
+            raise SernError(f"the sender of junk ended with exit status {self._process.exitcode}") from error
 
 
 def _flood(namespace: str, seconds: float, told: Connection) -> None:

@@ -55,14 +55,19 @@ FLOOD_PAUSE_S: Final = 0.002
 @dataclass(frozen=True)
 class Load:
     """Poses at 50 Hz; beside them maps and clouds, unless `cloud_bytes` is 0. With `flood_bps` heartbeats in place of
-    the poses, and messages of the same class beside them."""
+    the poses, and messages of the same class beside them. With `even_hz` messages of `even_bytes` alone, as evenly as
+    they can be sent."""
 
     cloud_bytes: int = 0
     seed: int = 1
     flood_bps: float = 0.0
+    even_hz: float = 0.0
+    even_bytes: int = 0
 
     @property
     def flows(self) -> tuple[Flow, ...]:
+        if self.even_hz:
+            return (Flow(Kind.POSE, self.even_hz, self.even_bytes),)
         if self.flood_bps:
             flood = Flow(Kind.FLOOD, self.flood_bps / (8 * FLOOD_BYTES), FLOOD_BYTES)
             clouds = (Flow(Kind.BULK, 10.0, self.cloud_bytes),) if self.cloud_bytes else ()

@@ -21,13 +21,13 @@ ROS_MASTER: Final = f"import sys; sys.path.append({str(ROS_PACKAGES)!r}); import
 ROS_PORT: Final = 11311
 
 
-def _drive(spec: Spec, load: Load, orders: Orders, log: Log, send: Any) -> None:
+def drive(spec: Spec, load: Load, orders: Orders, log: Log, send: Any) -> None:
     ready()
     for pause_s in offer(load, spec.duration_s, orders, log, send):
         time.sleep(pause_s)
 
 
-def _listen(orders: Orders, log: Log, wait: Any) -> None:
+def listen(orders: Orders, log: Log, wait: Any) -> None:
     """`wait` takes what arrives for about POLL_S."""
     said = False
     while not orders.stopped:
@@ -41,15 +41,17 @@ def _listen(orders: Orders, log: Log, wait: Any) -> None:
 # --- one datagram ---------------------------------------------------------------------------------------------------
 
 
+def send_datagram(sock: socket.socket, datagram: bytes) -> None:
+    """On a connected socket. The other end may not listen yet, or no more: the kernel reports that of the datagram
+    before, and does not send this one."""
+    with suppress(ConnectionRefusedError):
+        sock.send(datagram)
+
+
 def udp_sender(spec: Spec, load: Load, orders: Orders, log: Log) -> dict[str, Any]:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
         sock.connect((spec.address, PORT))
-
-        def send(_kind: Kind, body: bytes) -> None:
-            with suppress(ConnectionRefusedError):  # the other end stops first
-                sock.send(body)
-
-        _drive(spec, load, orders, log, send)
+        drive(spec, load, orders, log, lambda _kind, body: send_datagram(sock, body))
     return NOTHING
 
 
@@ -64,7 +66,7 @@ def udp_receiver(spec: Spec, load: Load, orders: Orders, log: Log) -> dict[str, 
             except TimeoutError:
                 return
 
-        _listen(orders, log, wait)
+        listen(orders, log, wait)
     return NOTHING
 
 
@@ -77,7 +79,7 @@ def zmq_sender(spec: Spec, load: Load, orders: Orders, log: Log) -> dict[str, An
     with zmq.Context() as context, context.socket(zmq.PUB) as out:
         out.setsockopt(zmq.LINGER, 0)
         out.connect(f"tcp://{spec.address}:{PORT}")
-        _drive(spec, load, orders, log, lambda kind, body: out.send_multipart((topics[kind], body)))
+        drive(spec, load, orders, log, lambda kind, body: out.send_multipart((topics[kind], body)))
     return NOTHING
 
 
@@ -91,7 +93,7 @@ def zmq_receiver(spec: Spec, load: Load, orders: Orders, log: Log) -> dict[str, 
             if inlet.poll(int(1000 * POLL_S)):
                 log.arrived(inlet.recv_multipart()[1])
 
-        _listen(orders, log, wait)
+        listen(orders, log, wait)
     return NOTHING
 
 
@@ -139,14 +141,14 @@ def zenoh_sender(spec: Spec, load: Load, orders: Orders, log: Log) -> dict[str, 
             )
             for kind, priority in priorities.items()
         }
-        _drive(spec, load, orders, log, lambda kind, body: publishers[kind].put(body))
+        drive(spec, load, orders, log, lambda kind, body: publishers[kind].put(body))
     return NOTHING
 
 
 def zenoh_receiver(spec: Spec, load: Load, orders: Orders, log: Log) -> dict[str, Any]:
     with _zenoh_session(spec, listens=True) as session:
         session.declare_subscriber("bench/**", lambda sample: log.arrived(sample.payload.to_bytes()))
-        _listen(orders, log, lambda: time.sleep(POLL_S))
+        listen(orders, log, lambda: time.sleep(POLL_S))
     return NOTHING
 
 
@@ -182,7 +184,7 @@ def ros_sender(spec: Spec, load: Load, orders: Orders, log: Log) -> dict[str, An
         kind: rospy.Publisher(f"/bench/{kind.name.lower()}", kind_of_message, queue_size=1, tcp_nodelay=True)
         for kind in Kind
     }
-    _drive(spec, load, orders, log, lambda kind, body: publishers[kind].publish(data=body))
+    drive(spec, load, orders, log, lambda kind, body: publishers[kind].publish(data=body))
     return NOTHING
 
 
@@ -191,5 +193,5 @@ def ros_receiver(spec: Spec, load: Load, orders: Orders, log: Log) -> dict[str, 
     for kind in Kind:
         topic = f"/bench/{kind.name.lower()}"
         rospy.Subscriber(topic, kind_of_message, lambda message: log.arrived(message.data), tcp_nodelay=True)
-    _listen(orders, log, lambda: time.sleep(POLL_S))
+    listen(orders, log, lambda: time.sleep(POLL_S))
     return NOTHING

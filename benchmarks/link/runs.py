@@ -8,15 +8,16 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
-from contextlib import suppress
-from dataclasses import asdict, dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import psutil
 
 from benchmarks.link import peers
+from benchmarks.link.children import Running, environment
+from benchmarks.link.forwarder import FORWARDER, Hops
 from benchmarks.link.load import Load, Records, Spec, read_log
 from benchmarks.link.sern import RELAY_PORT
 from sern_core.errors import SernError
@@ -24,15 +25,18 @@ from sern_core.types import ClientName
 from sern_runtime.keys import PublicKey, PublicKeys, generate, write_public, write_secret
 from sern_sim.models import LinkModel
 from sern_tools.lab.backends import DEVICE, NETWORK, PREFIX
+from sern_tools.lab.host import run as run_command
 from sern_tools.lab.lab import Lab, Node
 
-START_S: Final = 40.0
-"""How long ends may take to start and to find each other; the machine may be busy, the link lossy."""
+START_S: Final = 60.0
+"""How long ends may take to start and to find each other; the machine may be busy, the link lossy. One that ends is
+noticed at once."""
 LEAD_S: Final = 0.3
 """From the order to go until the first message."""
 DRAIN_S: Final = 1.5
 """What is under way at the end of the load may still arrive for so long."""
-STOP_S: Final = 20.0
+POLL_S: Final = 0.1
+"""How soon it is noticed that a process of the run has ended."""
 
 Action = Callable[[Lab], None]
 
@@ -60,37 +64,14 @@ class Outcome:
     site: dict[str, Any]
     relay: dict[str, Any]
     events: dict[str, tuple[int, int]]
+    wire_packets: int
+    """What left the link from the robot to the relay while load was offered; `wire_bytes` with Ethernet headers."""
     wire_bytes: int
     wire_dropped: int
     cpu_percent: dict[str, float]
     busy: float
     """Share of the machine's processors in use during the run, by everybody, 0 to 1."""
     warm_s: float = 0.0
-
-
-@dataclass
-class Running:
-    """Processes of one run by role."""
-
-    ends: dict[str, "subprocess.Popen[bytes]"] = field(default_factory=dict)
-
-    def cpu_s(self) -> dict[str, float]:
-        found = {}
-        for role, process in self.ends.items():
-            times = psutil.Process(process.pid).cpu_times()
-            found[role] = times.user + times.system
-        return found
-
-    def stop(self) -> None:
-        """End what still runs, whatever state it is in."""
-        for process in self.ends.values():
-            if process.poll() is None:
-                process.kill()
-            process.wait()
-            for pipe in (process.stdin, process.stdout):
-                if pipe is not None:
-                    with suppress(BrokenPipeError):
-                        pipe.close()
 
 
 def run(
@@ -108,25 +89,28 @@ def run(
     lab.reset()
     lab.link(model, model)
     _congestion(lab, "bbr" if system.endswith("-bbr") else "cubic")
-    running = Running()
+    running = Running(directory, system)
     try:
         if system.startswith("sern"):
             make_keys(directory)
             running.ends["relay"] = start_relay(lab, directory, udp=system == "sern-udp")
+        if system == FORWARDER:
+            running.ends["relay"] = _start_forwarder(lab, directory)
         if system == "tcpros":
-            running.ends["master"] = _start_master(lab)
+            _start_master(lab, running)
         for sends, node in ((False, lab.b), (True, lab.a)):
             spec = Spec(system, sends, lab.b.address, node.address, str(directory), duration_s, asdict(load))
             running.ends[spec.role] = _start(lab, node, spec)
         for role in ("robot", "site"):
-            _await_ready(running.ends[role], directory / f"{role}.log", f"{system}, {role}")
+            _await_ready(running, role)
         start_ns = time.monotonic_ns() + int(LEAD_S * 1e9)
-        _say(running.ends["robot"], f"go {start_ns}\n")
+        _say(running, "robot", f"go {start_ns}\n")
         sleep_until(start_ns)
         wire_before, cpu_before = lab.traffic()[0], running.cpu_s()
         psutil.cpu_percent()
         events = _play(lab, start_ns, script)
         sleep_until(start_ns + int(duration_s * 1e9))
+        running.check()
         cpu_after, wire_after, busy = running.cpu_s(), lab.traffic()[0], psutil.cpu_percent()
         sleep_until(time.monotonic_ns() + int(DRAIN_S * 1e9))
         _finish(running)
@@ -146,6 +130,7 @@ def run(
         read["site"],
         json.loads(summary.read_text()) if summary.exists() else {},
         events,
+        wire_after.packets - wire_before.packets,
         wire_after.bytes - wire_before.bytes,
         wire_after.dropped - wire_before.dropped,
         {role: 100 * (cpu_after[role] - cpu_before[role]) / duration_s for role in cpu_after},
@@ -182,25 +167,45 @@ def start_relay(lab: Lab, directory: Path, *, udp: bool) -> "subprocess.Popen[by
     config = directory / "relay.yaml"
     config.write_text(json.dumps(content))
     command = [sys.executable, "-P", "-m", "sern_relay.cli", "--config", str(config)]
-    with (directory / "relay.log").open("wb") as log:
+    return _start_daemon(lab, directory, "relay", command, os.environ)
+
+
+def _start_daemon(
+    lab: Lab, directory: Path, role: str, command: Sequence[str], environ: Mapping[str, str]
+) -> "subprocess.Popen[bytes]":
+    """On the site's side; it is told to end by a signal."""
+    with (directory / f"{role}.log").open("wb") as log:
         return lab.popen(
-            lab.b, command, stdin=subprocess.DEVNULL, stdout=log, stderr=log, cwd=directory, start_new_session=True
+            lab.b,
+            command,
+            env=environ,
+            stdin=subprocess.DEVNULL,
+            stdout=log,
+            stderr=log,
+            cwd=directory,
+            start_new_session=True,
         )
 
 
-def _start_master(lab: Lab) -> "subprocess.Popen[bytes]":
+def _start_forwarder(lab: Lab, directory: Path) -> "subprocess.Popen[bytes]":
+    """In the relay's place."""
+    Hops.draw().write(directory)
+    command = [sys.executable, "-m", "benchmarks.link.forwarder", str(directory), lab.b.address]
+    return _start_daemon(lab, directory, "relay", command, environment())
+
+
+def _start_master(lab: Lab, running: Running) -> None:
     """Returns when it listens."""
     command = [sys.executable, "-c", peers.ROS_MASTER, "--core", "-p", str(peers.ROS_PORT)]
-    environment = {**os.environ, "ROS_MASTER_URI": f"http://{lab.b.address}:{peers.ROS_PORT}", "ROS_IP": lab.b.address}
-    quiet = subprocess.DEVNULL
-    master = lab.popen(lab.b, command, env=environment, stdin=quiet, stdout=quiet, stderr=quiet, start_new_session=True)
+    names = {"ROS_MASTER_URI": f"http://{lab.b.address}:{peers.ROS_PORT}", "ROS_IP": lab.b.address}
+    running.ends["master"] = _start_daemon(lab, running.directory, "master", command, {**os.environ, **names})
     give_up_s = time.monotonic() + START_S
     with lab.b.socket(socket.SOCK_STREAM) as probe:
         while probe.connect_ex((lab.b.address, peers.ROS_PORT)):
-            if master.poll() is not None or time.monotonic() > give_up_s:
-                raise SernError("rosmaster does not start")
-            time.sleep(0.1)
-    return master
+            running.check()
+            if time.monotonic() > give_up_s:
+                raise SernError(f"the ROS master does not listen within {START_S:g} s{running.said()}")
+            time.sleep(POLL_S)
 
 
 def _start(lab: Lab, node: Node, spec: Spec) -> "subprocess.Popen[bytes]":
@@ -209,33 +214,43 @@ def _start(lab: Lab, node: Node, spec: Spec) -> "subprocess.Popen[bytes]":
         return lab.popen(
             node,
             command,
+            env=environment(),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=log,
-            cwd=Path(__file__).resolve().parents[2],
             start_new_session=True,
         )
 
 
-def _await_ready(process: "subprocess.Popen[bytes]", log: Path, what: str) -> None:
+def _await_ready(running: Running, role: str) -> None:
+    """Until it says so; SernError as soon as any process of the run has ended."""
+    process = running.ends[role]
     assert process.stdout is not None
     text = b""
     give_up_s = time.monotonic() + START_S
     while b"ready" not in text:
+        running.check()
         left_s = give_up_s - time.monotonic()
-        if left_s <= 0 or not select.select([process.stdout], [], [], left_s)[0]:
-            raise SernError(f"{what}: nothing got through within {START_S:g} s")
-        data = os.read(process.stdout.fileno(), 4096)
-        if not data:
-            lines = log.read_text(errors="replace").strip().splitlines() or ["it said nothing"]
-            raise SernError(f"{what}: ended: {lines[-1]}")
-        text += data
+        if left_s <= 0:
+            raise SernError(
+                f"{running.name(role)}: nothing got through within {START_S:g} s; is the machine "
+                f"overloaded?{running.said()}"
+            )
+        if select.select([process.stdout], [], [], min(left_s, POLL_S))[0]:
+            data = os.read(process.stdout.fileno(), 4096)
+            if not data:
+                raise SernError(running.ending(role))
+            text += data
 
 
-def _say(process: "subprocess.Popen[bytes]", text: str) -> None:
+def _say(running: Running, role: str, text: str) -> None:
+    process = running.ends[role]
     assert process.stdin is not None
-    process.stdin.write(text.encode())
-    process.stdin.flush()
+    try:
+        process.stdin.write(text.encode())
+        process.stdin.flush()
+    except BrokenPipeError as error:
+        raise SernError(running.ending(role)) from error
 
 
 def _finish(running: Running) -> None:
@@ -247,12 +262,7 @@ def _finish(running: Running) -> None:
     for role, process in reversed(running.ends.items()):
         if role in ("relay", "master"):
             process.send_signal(signal.SIGTERM)
-        try:
-            code = process.wait(STOP_S)
-        except subprocess.TimeoutExpired as error:
-            raise SernError(f"{role} does not end") from error
-        if code and role != "master":
-            raise SernError(f"{role} ended with {code}")
+        running.await_end(role, any_status=role == "master")
 
 
 def _play(lab: Lab, start_ns: int, script: Sequence[Step]) -> dict[str, tuple[int, int]]:
@@ -275,6 +285,4 @@ def _congestion(lab: Lab, name: str) -> None:
     """What TCP in both namespaces uses from now on."""
     for node in lab.nodes:
         words = f"ip route replace {NETWORK}.0.0/{PREFIX} dev {DEVICE} proto kernel scope link src {node.address}"
-        done = lab.exec(node, [*words.split(), "congctl", name])
-        if done.returncode:
-            raise SernError(f"TCP {name}: {done.stderr.strip()}")
+        run_command([*node.prefix, *words.split(), "congctl", name])

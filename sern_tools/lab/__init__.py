@@ -8,6 +8,6 @@
 
 Modules, each importing only those before it: `host` (namespaces of this machine), `removal` and `keeper` (what removes
 them again, whatever happened to their owner), `image` and `appliance` (the guest that runs netem where this kernel
-cannot), `backends`, `lab`, and `control` and `cli` for `sern lab`. Nothing is imported here, so that the keeper is a
-small process.
+cannot), `backends`, `passing` (whether datagrams get through), `lab`, and `control` and `cli` for `sern lab`. Nothing
+is imported here, so that the keeper is a small process.
 """

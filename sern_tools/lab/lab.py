@@ -20,6 +20,7 @@ import subprocess
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -33,6 +34,7 @@ from sern_sim.profiles import LinkProfile
 from sern_tools.lab.backends import MIDDLE, Backend, Endpoint, Traffic, build, choose, endpoints_of
 from sern_tools.lab.host import LabError, inside
 from sern_tools.lab.keeper import Keeper
+from sern_tools.lab.passing import Way, await_passing
 from sern_tools.lab.removal import kill_within, lock, namespace_name, sweep
 
 Direction = Literal["both", "up", "down"]
@@ -133,7 +135,10 @@ class Lab:
     # --- life -------------------------------------------------------------------------------------------------------
 
     def start(self) -> Self:
-        """Make it, after removing what dead processes have left. A lab that could not be made is removed again."""
+        """Make it, after removing what dead processes have left. Returns when datagrams get through both ways.
+
+        A lab that could not be made is removed again.
+        """
         try:
             sweep()
             self._lock = lock(self.id)
@@ -144,10 +149,28 @@ class Lab:
             self._backend = chosen(middle)
             self._backend.start()
             self.reset()
+            self._await_passing()
+            self.reset()  # nothing has been carried yet
         except BaseException:
             self.close()
             raise
         return self
+
+    def _await_passing(self) -> None:
+        """Between each node and the first of the other side."""
+        left, right = ([self[end.name] for end in self._endpoints if end.side == side] for side in (0, 1))
+        across = [(one, other) for one in left for other in right if one is left[0] or other is right[0]]
+        with ExitStack() as stack:
+            sockets = {node: stack.enter_context(node.socket()) for node in self.nodes}
+            for node, sock in sockets.items():
+                sock.bind((node.address, 0))
+            await_passing(
+                [
+                    Way(f"{source.name} to {target.name}", sockets[source], sockets[target])
+                    for one, other in across
+                    for source, target in ((one, other), (other, one))
+                ]
+            )
 
     def close(self) -> None:
         """End its processes and remove it. Does nothing the second time. LabError when something stays behind."""

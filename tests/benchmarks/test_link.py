@@ -43,6 +43,7 @@ def outcome(
         "site": {},
         "relay": {},
         "events": {},
+        "wire_packets": 4_000,
         "wire_bytes": 5_000_000,
         "wire_dropped": 0,
         "cpu_percent": {},

@@ -1,0 +1,105 @@
+"""The processes of a run: they find this checkout whatever the environment, and what ended says why in one line."""
+
+import os
+import signal
+import subprocess
+import time
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+
+from sern_core.errors import SernError
+
+ROOT: Final = Path(__file__).resolve().parents[2]
+"""The checkout: `benchmarks` is not installed."""
+STOP_S: Final = 20.0
+"""Time for a process to end when it is told to."""
+LAST_LINES: Final = 4
+_CPU_CLOCK: Final = 2
+"""CPUCLOCK_SCHED of linux/posix-timers_types.h: what the scheduler has counted, in ns, all threads."""
+
+
+def environment() -> dict[str, str]:
+    """For a child that imports `benchmarks`, also where PYTHONSAFEPATH keeps the working directory out of the path."""
+    paths = [str(ROOT), os.environ.get("PYTHONPATH", "")]
+    return {**os.environ, "PYTHONPATH": os.pathsep.join(path for path in paths if path)}
+
+
+def last_words(log: Path) -> str:
+    """The last lines of a log as one, of a traceback the exception alone. Empty with no log, or with nothing in it."""
+    try:
+        lines = log.read_text(errors="replace").splitlines()
+    except FileNotFoundError:
+        return ""
+    kept: list[str] = []
+    inside_traceback = False
+    for line in lines:
+        inside_traceback = line.startswith("Traceback (") or (inside_traceback and line[:1].isspace())
+        if line.strip() and not inside_traceback:
+            kept.append(line.strip())
+    return " | ".join(kept[-LAST_LINES:])
+
+
+def cpu_s(pid: int) -> float:
+    """Processor time of a process and its threads so far, user and system, also of one that was not waited for yet."""
+    return time.clock_gettime_ns(~pid << 3 | _CPU_CLOCK) / 1e9
+
+
+@dataclass
+class Running:
+    """Processes of one run by role. What each says on standard error is in `directory`, in ROLE.log."""
+
+    directory: Path
+    what: str = ""
+    """Whose they are, for errors: a system's name."""
+    ends: dict[str, "subprocess.Popen[bytes]"] = field(default_factory=dict)
+
+    def cpu_s(self) -> dict[str, float]:
+        return {role: cpu_s(process.pid) for role, process in self.ends.items()}
+
+    def words(self, role: str) -> str:
+        return last_words(self.directory / f"{role}.log")
+
+    def said(self) -> str:
+        """What all of them have said, as an addition to an error."""
+        told = [f"{role} said: {words}" for role in self.ends if (words := self.words(role))]
+        return f" ({'; '.join(told)})" if told else ""
+
+    def name(self, role: str) -> str:
+        return f"{self.what}, {role}" if self.what else role
+
+    def check(self) -> None:
+        """Raises SernError when one has ended, whatever its status: none does before it is told to."""
+        for role, process in self.ends.items():
+            if process.poll() is not None:
+                raise SernError(self.ending(role))
+
+    def ending(self, role: str) -> str:
+        """One line about a process that has ended: which, how, and its last words."""
+        code = self.ends[role].wait(STOP_S)
+        how = f"was killed by {signal.Signals(-code).name}" if code < 0 else f"ended with exit status {code}"
+        return f"{self.name(role)} {how}: {self.words(role) or 'it said nothing'}"
+
+    def await_end(self, role: str, *, any_status: bool = False) -> None:
+        """Raises SernError when it does not end, or with a status other than 0 unless `any_status`."""
+        try:
+            code = self.ends[role].wait(STOP_S)
+        except subprocess.TimeoutExpired as error:
+            words = self.words(role)
+            raise SernError(
+                f"{self.name(role)} does not end within {STOP_S:g} s{': ' if words else ''}{words}"
+            ) from error
+        if code and not any_status:
+            raise SernError(self.ending(role))
+
+    def stop(self) -> None:
+        """End what still runs, whatever state it is in."""
+        for process in self.ends.values():
+            if process.poll() is None:
+                process.kill()
+            process.wait()
+            for pipe in (process.stdin, process.stdout):
+                if pipe is not None:
+                    with suppress(BrokenPipeError):
+                        pipe.close()
