@@ -442,7 +442,7 @@ class Cubic(CapacityEstimator):
 
 
 class BbrLike(CapacityEstimator):
-    """In the manner of BBR v1: the greatest rate of ten rounds, and twice its product with the least RTT in flight."""
+    """BBR v1 in short: the greatest rate of ten rounds, and twice its product with the least RTT in flight."""
 
     CYCLE: Final = (1.25, 0.75, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0)
 

@@ -59,9 +59,9 @@ class Result:
     runs: dict[str, Run]
     fixed: dict[Configuration, Run]
     settled: dict[str, dict[bool, float]]
-    """By policy and whether the link rises: seconds until delivered traffic settled."""
+    """Seconds until delivered traffic settled, by policy and whether the link rises."""
     keepable: list[bool]
-    """By interval, whether some candidate keeps the floors."""
+    """Whether some candidate keeps the floors, by interval."""
 
     def below_floor(self, one: Run) -> float:
         """Share of the intervals in which a class is below its floor though some candidate keeps all."""
@@ -114,7 +114,7 @@ def job(arguments: tuple[str, int]) -> list[Result]:
 
 
 def _cheapest(results: Sequence[Result]) -> Configuration:
-    """Of those that are below a floor in no more intervals than MMCF; of the least where none is so good."""
+    """The cheapest of those below a floor in no more intervals than MMCF; of the least where none is so good."""
     misses = {c: fmean(r.below_floor(r.fixed[c]) for r in results) for c in results[0].fixed}
     limit = max(fmean(r.below_floor(r.runs["mmcf"]) for r in results), min(misses.values())) + 1e-9
     allowed = [configuration for configuration, missed in misses.items() if missed <= limit]

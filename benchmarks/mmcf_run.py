@@ -112,7 +112,7 @@ class Observer:
             )
 
     def _profile(self, mode: str, seen: Sequence[tuple[float, int, float]], slowdown: float) -> CodecProfile:
-        """By bytes over the topics of the class, as test compressions give it."""
+        """The mean over the topics of the class, weighed by bytes, as test compressions give it."""
         topics = self.trace.topics
         body = encoded = seconds = 0.0
         for _, index, size in seen:

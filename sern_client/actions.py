@@ -83,7 +83,7 @@ class GoalId(NamedTuple):
 
 
 def goal_id(body: bytes) -> GoalId:
-    """Of an action goal, which begins with a header and this. ConfigError for bytes that do not."""
+    """The id of an action goal, which follows its header. ConfigError for bytes that have none."""
     try:
         (length,) = _LENGTH.unpack_from(body, _HEADER_BYTES)
         at = _HEADER_BYTES + _LENGTH.size + length
@@ -138,7 +138,7 @@ class _Action:
 
 
 class GoalWatch:
-    """Of all actions that match one of `rules`: (local name, how long nothing may be heard of an accepted goal)."""
+    """Watches actions that match one of `rules`: (local name, how long nothing may be heard of an accepted goal)."""
 
     def __init__(self, rules: tuple[tuple[Pattern, float], ...], advertise: Callable[[TopicInfo], Publisher]) -> None:
         self.reported = 0

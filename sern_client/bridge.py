@@ -443,7 +443,8 @@ class Bridge:
         self._kick()
 
     def _published_here(self, stream: StreamInfo) -> bool:
-        """Of patches, the updates are only taken to make whole grids of, unless somebody here has asked for them."""
+        """Whether a stream is published: updates of patches are taken to make whole grids of them, unless somebody here
+        has asked for them."""
         if not self.rebuilds.is_updates(stream) or self._asked is None:
             return True
         return PatternSet(self._asked).fullmatch(stream.id.topic)

@@ -63,7 +63,7 @@ class Flight:
         self.next_number = 1
         self.highest_acked = 0
         self._heard = [0] * len(CLASSES)
-        """By class: the highest number that was acknowledged of a packet of it, or of a less urgent class."""
+        """The highest number that was acknowledged of a packet of a class, or of a less urgent one, by class."""
         self.rtt = RttEstimator()
         self.waiting_since_s: float | None = None  # last acknowledgement, or the first packet since nothing is owed
 

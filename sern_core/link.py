@@ -402,7 +402,7 @@ class Link(Answering):
             self.confirm(stream, min(stream.delivered, stream.unhandled - 1) if stream.unhandled else stream.delivered)
 
     def handled(self, stream: InStream, oldest: int) -> None:
-        """Of what had its turn, everything below seq `oldest` has been dealt with by now; 0: everything."""
+        """Everything that had its turn below seq `oldest` has been dealt with by now; 0: everything."""
         stream.unhandled = oldest
         self._confirm_own(stream)
 

@@ -64,9 +64,9 @@ class RoutingLimits:
     max_patterns: int = 256
     max_exact: int = 4_096
     max_program: int = MAX_CLIENT_PROGRAM
-    """Of all patterns together, in instructions of RE2."""
+    """What all patterns of a client may need together, in instructions of RE2."""
     max_all_streams: int = 60_000
-    """Of all clients: what fits into the channel numbers of one that takes everything."""
+    """What all clients may have together: what fits into the channel numbers of one that takes everything."""
 
 
 class Match(NamedTuple):

@@ -141,7 +141,7 @@ class Sender(ABC):
         self._watermarks: dict[int, int] = {}  # channel -> delivered, not yet on the wire
         self._rx_stamp_us = 0
         self._rx_delay: tuple[float, float, float] | None = None
-        """Of the datagram at hand: its delay, that one's uncertainty, and for how long the clocks had not shifted."""
+        """Delay of the datagram at hand, its uncertainty, and for how long the clocks had not shifted."""
         self._now = now
         self._control, self._control_in = self._control_streams()
 

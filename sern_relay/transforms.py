@@ -81,7 +81,7 @@ class TransformObjects:
     ) -> None:
         self._parts = parts or OptionalParts("objects")
         self.refused: dict[tuple[ClientName, str], int] = {}
-        """By client and reason: undecodable, too_large, not_finite, too_many_transforms, or what the registry says."""
+        """Counts by client and reason: undecodable, too_large, not_finite, too_many_transforms, or the registry's."""
         self._registry = registry
         self._clock = clock
         self._streams: dict[StreamId, _Stream] = {}

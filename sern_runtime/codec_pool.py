@@ -80,7 +80,7 @@ class CodecPool:
                 self._loop.call_soon(self._run, work)  # here, this once
 
     def _run(self, work: Work) -> None:
-        """In a thread. Whatever goes wrong there, the message must not wait for ever."""
+        """Runs in a thread. Whatever goes wrong there, the message must not wait for ever."""
         problem: Exception | None = None
         try:
             work.run()

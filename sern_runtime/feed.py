@@ -213,11 +213,11 @@ class Feed:
         return {name: tuple(sorted(outlet.prefixes)) for name, outlet in self._outlets.items()}
 
     def counters(self) -> dict[str, FeedCounters]:
-        """By role name."""
+        """Counters by role name."""
         return {name: outlet.counters for name, outlet in self._outlets.items()}
 
     def endpoints(self) -> dict[str, tuple[str, str | None]]:
-        """By role name: where subscribers and publishers connect, as bound."""
+        """Where subscribers and publishers connect, as bound, by role name."""
         return {
             name: (outlet.endpoint, self._inlets[name].endpoint if name in self._inlets else None)
             for name, outlet in self._outlets.items()

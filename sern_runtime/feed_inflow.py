@@ -33,7 +33,7 @@ _log = logging.getLogger(__name__)
 
 
 class _Seen(NamedTuple):
-    """Of one connection: the messages seen, and what it had brought, and the process's memory, at the last of them."""
+    """What was seen of one connection: messages, and at the last of them its bytes and the process's memory."""
 
     taken: int
     read_bytes: int

@@ -294,7 +294,7 @@ class UdpServer:
 
     @property
     def ports(self) -> tuple[int, ...]:
-        """Of the listeners, in their order."""
+        """The ports of the listeners, in their order."""
         return tuple(listener.port for listener in self.listeners)
 
     def open_session(self, client: ClientName, offered: Sequence[str], *, port: int | None = None) -> UdpSession:

@@ -108,7 +108,7 @@ def _named(terms: Mapping[str, float]) -> str:
 
 
 def topic_lines(trace: DecisionTrace, topics: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """Of each topic: what became of its last message, and of all of them."""
+    """What became of each topic's last message, and of all of them."""
     lines = []
     for topic in trace.topics:
         if topic.startswith(OWN):

@@ -39,7 +39,7 @@ class Route:
 
 @dataclass(slots=True)
 class Fates:
-    """Of one topic. `faults`: seq and what is wrong."""
+    """The fates of one topic's messages. `faults`: seq and what is wrong."""
 
     by_seq: dict[int, Fate] = field(default_factory=dict)
     faults: dict[int, str] = field(default_factory=dict)

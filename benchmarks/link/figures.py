@@ -29,7 +29,7 @@ KIND, NUMBER, STAMP, AT, SIZE = range(5)
 
 
 def latencies_ms(outcome: Outcome, kind: Kind = Kind.POSE) -> NDArray[np.float64]:
-    """Of messages that were due after the warm-up and arrived."""
+    """Latencies of messages that were due after the warm-up and arrived."""
     rows = _after_warm_up(outcome, outcome.arrived)
     rows = rows[rows[:, KIND] == kind]
     result: NDArray[np.float64] = (rows[:, AT] - rows[:, STAMP]) / 1e6

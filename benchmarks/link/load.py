@@ -176,7 +176,7 @@ class Spec:
     system: str
     sends: bool
     address: str
-    """Of the site's namespace."""
+    """The address of the site."""
     own_address: str
     directory: str
     duration_s: float

@@ -188,7 +188,7 @@ def _start_daemon(
 
 
 def _start_forwarder(lab: Lab, directory: Path) -> "subprocess.Popen[bytes]":
-    """In the relay's place."""
+    """Start it in the relay's place."""
     Hops.draw().write(directory)
     command = [sys.executable, "-m", "benchmarks.link.forwarder", str(directory), lab.b.address]
     return _start_daemon(lab, directory, "relay", command, environment())
@@ -276,7 +276,7 @@ def _play(lab: Lab, start_ns: int, script: Sequence[Step]) -> dict[str, tuple[in
 
 
 def sleep_until(at_ns: int) -> None:
-    """By the monotonic clock."""
+    """Sleep until then by the monotonic clock."""
     while (left_ns := at_ns - time.monotonic_ns()) > 0:
         time.sleep(left_ns / 1e9)
 

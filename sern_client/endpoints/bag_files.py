@@ -384,7 +384,7 @@ def _cut(old: BinaryIO | None, path: Path, position: int) -> BufferedWriter:
 
 
 def _nothing() -> None:
-    """In place of what a writer does by itself."""
+    """Replaces what a writer does by itself."""
 
 
 def _shorten(content: BytesIO, size: int) -> None:

@@ -40,7 +40,7 @@ class _Kept(NamedTuple):
 
 
 class FirstMessages:
-    """Of one publisher, from its beginning until `over`, when everything kept has been given to `write`.
+    """Keeps what one publisher writes first, until `over`, when everything kept has been given to `write`.
 
     At most `max_messages` and `max_bytes` are kept, the newest; what is above is told to `dropped` as `overflow`, what
     is too old meanwhile as LIFESPAN. `learning_s`: how much longer the graph may be incomplete.

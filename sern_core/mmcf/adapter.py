@@ -84,7 +84,7 @@ class Step:
 
 
 class _Totals(NamedTuple):
-    """Of one topic: messages, bytes, messages thinned, bytes before and after encoding."""
+    """What one topic had so far: messages, bytes, messages thinned, bytes before and after encoding."""
 
     offered: int
     nbytes: int
@@ -414,7 +414,7 @@ def _depth(channel: OutChannel) -> int:
 
 
 def _class_profile(mode: str, weighed: list[Offer]) -> CodecProfile:
-    """By bytes over the topics of a class: what `mode` would make of them."""
+    """What `mode` would make of a class: the mean of its topics, weighed by their bytes."""
     body = encoded = seconds = 0.0
     for channel, per_interval, size, _ in weighed:
         profile = RAW_PROFILE

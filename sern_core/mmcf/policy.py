@@ -356,8 +356,8 @@ class Mmcf(Policy):
                 predictions.excess[below] = np.inf
 
     def _shortest(self, predictions: Predictions, best: int) -> int:
-        """Of what differs from the best one in its queues alone and costs the same, as far as anybody can tell, the one
-        with the shortest: when the link gets worse before the next decision, less waits there."""
+        """The one with the shortest queues among those that differ from the best one in them alone and cost the same,
+        as far as anybody can tell: when the link gets worse before the next decision, less waits there."""
         grid = self.predictor.grid
         same = (grid.rates == grid.rates[best]).all(axis=1) & (grid.codec == grid.codec[best])
         same &= (grid.redundancy == grid.redundancy[best]) & predictions.allowed

@@ -220,7 +220,7 @@ class AdaptationSection(Section):
         return profile(self.profile) if self.weights is None else self.weights.weights()
 
     def floor_shares(self) -> tuple[float, float, float]:
-        """By class: control, state, bulk."""
+        """The floors of control, state and bulk."""
         return profile_floors(self.profile) if self.floors is None else self.floors.values()
 
     def params(self, *, encodes: bool) -> AdapterParams:

@@ -201,9 +201,9 @@ class TopicSection(Section):
     """Modes that may lose something: `voxel_draco` thins point clouds (x, y and z survive), `jpeg` is for images of
     8-bit colour or grey. Both ends need the extra `lossy`."""
     voxel_m: Annotated[float, Field(gt=0, le=1000)] = DEFAULT_LOSSY.voxel_m
-    """Of `voxel_draco`: edge of a voxel; each becomes one point, exact to a twentieth of it."""
+    """Edge of a voxel of `voxel_draco`; each becomes one point, exact to a twentieth of it."""
     jpeg_quality: Annotated[int, Field(ge=1, le=95)] = DEFAULT_LOSSY.jpeg_quality
-    """Of `jpeg`."""
+    """Quality of `jpeg`."""
     many_writers: bool | None = None
     """Several clients may publish this global name; null: only /tf and /tf_static."""
     remap: TopicText | None = None

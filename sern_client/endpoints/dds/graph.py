@@ -147,7 +147,7 @@ class Graph:
         return self.heed_sern and participant.sern != self.own_guard
 
     def writers(self, topic: str) -> list[Remote]:
-        """Of this site, on a DDS topic, in the order of their GUIDs."""
+        """The writers of this site on a DDS topic, in the order of their GUIDs."""
         return self._of(topic, writers=True)
 
     def readers(self, topic: str) -> list[Remote]:

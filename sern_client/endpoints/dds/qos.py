@@ -42,7 +42,7 @@ class EndpointQos:
 
 
 def read_qos(qos: Qos) -> EndpointQos:
-    """Of a discovered endpoint."""
+    """The policies of a discovered endpoint, as far as they matter here."""
     liveliness = qos[Policy.Liveliness]
     user = qos[Policy.Userdata]
     said = read_user_data(bytes(user.data)) if user is not None else {}

@@ -22,7 +22,7 @@ _log = logging.getLogger(__name__)
 
 
 class Hold:
-    """Of one publication, from its beginning until `over`.
+    """Holds what one publication has from its beginning until `over`.
 
     At most `max_messages` and `max_bytes` are kept, each for `HOLD_S` and no longer than it has left. What a subscriber
     has missed for good is told to `dropped(reason)`, for what is above the limits `overflow`; `done` is called once,

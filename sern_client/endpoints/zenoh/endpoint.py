@@ -240,7 +240,7 @@ class ZenohEndpoint(Services):
     # --- the graph --------------------------------------------------------------------------------------------------
 
     def _token(self, sample: Any) -> None:
-        """In a thread of zenoh's."""
+        """Runs in a thread of zenoh's."""
         key, alive = str(sample.key_expr), sample.kind == self.session.zenoh.SampleKind.PUT
         self.session.handover.put(lambda: self._token_changed(key, alive))
 

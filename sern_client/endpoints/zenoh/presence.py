@@ -11,7 +11,7 @@ from sern_client.endpoints.zenoh.session import ZenohSession
 
 
 class Presence:
-    """Of the queryables that match `key`, from now until `close`."""
+    """Watches the queryables that match `key`, from now until `close`."""
 
     def __init__(self, session: ZenohSession, key: str) -> None:
         zenoh, handover = session.zenoh, session.handover

@@ -183,7 +183,7 @@ class _Server:
         await asyncio.gather(*self._tasks, return_exceptions=True)
 
     def _asked(self, query: Any) -> None:
-        """In a thread of zenoh's."""
+        """Runs in a thread of zenoh's."""
         payload = b"" if query.payload is None else query.payload.to_bytes()
         attachment = b"" if query.attachment is None else query.attachment.to_bytes()
         self._owner.session.handover.put(lambda: self._begin(query, payload, attachment))
