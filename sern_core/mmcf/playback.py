@@ -18,7 +18,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from itertools import pairwise
 from statistics import fmean
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -72,7 +72,7 @@ def played(parts: Sequence[Service], link: LinkState, path: CapacityPath, latenc
     return outcomes
 
 
-def _distinct(keys: Floats) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _distinct(keys: NDArray[Any]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """(the first row of each kind, the kind of each row) of a matrix; a third of what `np.unique` takes for rows."""
     text, width = keys.tobytes(), keys.itemsize * keys.shape[1]
     kinds: dict[bytes, int] = {}
