@@ -23,7 +23,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from benchmarks.common import Report, main, positive, try_realtime
-from benchmarks.link.runs import DRAIN_S, START_S, STOP_S, Running, make_keys, sleep_until, start_relay
+from benchmarks.link.runs import DRAIN_S, START_S, STOP_S, Running, sleep_until, start_daemon, start_relay
 from benchmarks.link.sern import RELAY_PORT
 from benchmarks.mmcf_replay import CLOUD_HZ, EVERY_NTH_POINT, REAL, recorded, tabulate
 from sern_client.endpoints.clouds import read_ply
@@ -36,8 +36,10 @@ from sern_core.types import CLASS_LABELS, CLASSES, DropReason
 from sern_runtime.config.adaptation import AdaptationSection
 from sern_sim.models import LinkModel
 from sern_tools.api import get_json
+from sern_tools.keygen import make_keys
 from sern_tools.lab.lab import Lab, Node
 from sern_tools.message_log import TopicLog, read_logs
+from sern_tools.processes import failure
 
 ROBOT, SITE = "robot", "site"
 HTTP_PORT: Final = 8080
@@ -221,20 +223,6 @@ def _ask(node: Node, path: str) -> Any:
     return node.inside(lambda: get_json(API, path))
 
 
-def _start(lab: Lab, node: Node, config: Path) -> "subprocess.Popen[bytes]":
-    command = [sys.executable, "-P", "-m", "sern_client.cli", "--config", str(config)]
-    with config.with_suffix(".log").open("wb") as log:
-        return lab.popen(
-            node,
-            command,
-            stdin=subprocess.DEVNULL,
-            stdout=log,
-            stderr=log,
-            cwd=config.parent,
-            start_new_session=True,
-        )
-
-
 def _connected(robot: Node, topics: int) -> bool:
     """Over the datagram lane, and all of the topics have reached somebody."""
     try:
@@ -252,8 +240,7 @@ def _await_connected(running: Running, robot: Node, topics: int, directory: Path
     while not _connected(robot, topics):
         for role, process in running.ends.items():
             if process.poll() is not None:
-                lines = (directory / f"{role}.log").read_text(errors="replace").strip().splitlines()
-                raise SernError(f"{role} ended: {lines[-1] if lines else 'it said nothing'}")
+                raise failure(role, process.returncode, directory / f"{role}.log")
         if time.monotonic() > give_up_s:
             raise SernError(f"not every topic of the robot got through within {START_S:g} s")
         time.sleep(POLL_S)
@@ -269,7 +256,7 @@ def _edge(lab: Lab, running: Running) -> Edge:
     return Edge(time.time_ns(), lab.traffic()[0].bytes, running.cpu_s()[ROBOT], left_out)
 
 
-def _stop(running: Running) -> None:
+def _stop(running: Running, directory: Path) -> None:
     """The robot first, so that nothing is offered any more; then who listens, then the relay."""
     for role in (ROBOT, SITE, "relay"):
         process = running.ends[role]
@@ -279,7 +266,7 @@ def _stop(running: Running) -> None:
         except subprocess.TimeoutExpired as error:
             raise SernError(f"{role} does not end") from error
         if code:
-            raise SernError(f"{role} ended with {code}")
+            raise failure(role, code, directory / f"{role}.log")
 
 
 def rates_bps(duration_s: int) -> list[float]:
@@ -291,7 +278,7 @@ def rates_bps(duration_s: int) -> list[float]:
 
 def run(lab: Lab, directory: Path, section: AdaptationSection, scans: Sequence[Path], duration_s: int) -> list[Terms]:
     """One run over a link that is thin in its second third; intervals of 1 s. `directory` must be empty."""
-    make_keys(directory)
+    make_keys(directory, "relay", ROBOT, SITE)
     load = recorded(1.0)
     specs = {name: spec for name, (_, spec) in load.specs.items()}
     robot = robot_file(directory, lab.b.address, specs, section, scans)
@@ -301,8 +288,8 @@ def run(lab: Lab, directory: Path, section: AdaptationSection, scans: Sequence[P
     running = Running()
     try:
         running.ends["relay"] = start_relay(lab, directory, udp=True)
-        running.ends[SITE] = _start(lab, lab.b, site)
-        running.ends[ROBOT] = _start(lab, lab.a, robot)
+        running.ends[SITE] = start_daemon(lab, lab.b, "client", site)
+        running.ends[ROBOT] = start_daemon(lab, lab.a, "client", robot)
         _await_connected(running, lab.a, len(specs), directory)
         start_ns = time.monotonic_ns() + int(WARM_S * 1e9)
         capacities_bps = rates_bps(duration_s)
@@ -314,7 +301,7 @@ def run(lab: Lab, directory: Path, section: AdaptationSection, scans: Sequence[P
                 lab.change(rate_bps=capacities_bps[second])
         (directory / "mmcf.json").write_text(json.dumps(_ask(lab.a, "/api/mmcf")))
         sleep_until(time.monotonic_ns() + int(DRAIN_S * 1e9))
-        _stop(running)
+        _stop(running, directory)
     finally:
         running.stop()
     params = section.params(encodes=True)

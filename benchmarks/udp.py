@@ -20,12 +20,13 @@ import struct
 import sys
 import time
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from multiprocessing.connection import Connection
 from typing import Final
 
 import uvloop
 
+from benchmarks.child import Worker
 from benchmarks.common import Report, interleaved, main, try_realtime
 from sern_core.types import ClientName
 from sern_runtime import udp_socket
@@ -122,27 +123,27 @@ class ServerProcess:
 
     def __init__(self, *, plain: bool = False, echo: bool = True) -> None:
         self._control, self._far = multiprocessing.Pipe()
-        self._process = multiprocessing.get_context("spawn").Process(
-            target=serve, args=(self._far, plain, echo), daemon=True
-        )
+        self._worker = Worker("the UDP server", serve, self._far, plain, echo)
 
     def __enter__(self) -> "ServerProcess":
-        self._process.start()
-        self.parameters: SessionParameters = self._control.recv()
+        try:
+            self._worker.start()
+            self._far.close()  # the server's copy alone keeps it open
+            self.parameters: SessionParameters = self._worker.hear(self._control)
+        except BaseException:
+            self.__exit__()
+            raise
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._control.send(False)
-        self._process.join(10)
-        if self._process.is_alive():
-            self._process.kill()
-            self._process.join()
+        with suppress(ConnectionError):  # it has ended
+            self._control.send(False)
+        self._worker.end(patient=True)
         self._control.close()
-        self._far.close()
 
     def usage(self) -> tuple[float, float, int]:
-        self._control.send(True)
-        cpu_s, wall_s, received = self._control.recv()
+        """CPU and wall clock in seconds, and datagrams received, so far. SernError when the server has ended."""
+        cpu_s, wall_s, received = self._worker.ask(self._control, True)
         return float(cpu_s), float(wall_s), int(received)
 
 
@@ -212,17 +213,20 @@ def flood(port: int, session_id: int, until_s: float, sent: Connection) -> None:
 
 
 def under_junk(known_id: bool, plain: bool, duration_s: float) -> dict[str, float]:
-    context = multiprocessing.get_context("spawn")
     with ServerProcess(plain=plain) as server:
         parameters = server.parameters
         peer = Peer(parameters)
         ours, far = multiprocessing.Pipe(duplex=False)
         session_id = parameters.id if known_id else parameters.id ^ 1
         until_s = time.monotonic() + 1.0 + WARM_UP_S + duration_s + 0.3
-        generator = context.Process(target=flood, args=(parameters.port, session_id, until_s, far), daemon=True)
-        generator.start()
+        generator = Worker("the source of junk", flood, parameters.port, session_id, until_s, far)
         round_trips = []
-        with peer.socket, ours, far:
+        with ExitStack() as stack:
+            stack.callback(generator.end, patient=True)
+            stack.enter_context(peer.socket)
+            stack.enter_context(ours)
+            generator.start()
+            far.close()  # the generator's copy alone keeps it open
             time.sleep(1.0 + WARM_UP_S)  # the generator's interpreter starts
             cpu_s, begun_s, _ = server.usage()
             lost = 0
@@ -242,8 +246,7 @@ def under_junk(known_id: bool, plain: bool, duration_s: float) -> dict[str, floa
                     round_trips.append(time.monotonic() - sent_s)
                 time.sleep(1 / ECHO_HZ)
             cpu_end_s, end_s, _ = server.usage()
-            rate_hz = ours.recv() if ours.poll(5.0) else 0.0
-            generator.join()
+            rate_hz = generator.hear(ours)
     round_trips.sort()
     return {
         "cpu_percent": 100 * (cpu_end_s - cpu_s) / (end_s - begun_s),

@@ -16,15 +16,16 @@ from typing import Any, Final, NamedTuple
 
 import psutil
 
+from benchmarks import child
 from benchmarks.link import peers
 from benchmarks.link.load import Load, Records, Spec, read_log
 from benchmarks.link.sern import RELAY_PORT
 from sern_core.errors import SernError
-from sern_core.types import ClientName
-from sern_runtime.keys import PublicKey, PublicKeys, generate, write_public, write_secret
 from sern_sim.models import LinkModel
+from sern_tools.keygen import make_keys
 from sern_tools.lab.backends import DEVICE, NETWORK, PREFIX
 from sern_tools.lab.lab import Lab, Node
+from sern_tools.processes import failure
 
 START_S: Final = 40.0
 """How long ends may take to start and to find each other; the machine may be busy, the link lossy."""
@@ -111,7 +112,7 @@ def run(
     running = Running()
     try:
         if system.startswith("sern"):
-            make_keys(directory)
+            make_keys(directory, "relay", "robot", "site")
             running.ends["relay"] = start_relay(lab, directory, udp=system == "sern-udp")
         if system == "tcpros":
             running.ends["master"] = _start_master(lab)
@@ -129,7 +130,7 @@ def run(
         sleep_until(start_ns + int(duration_s * 1e9))
         cpu_after, wire_after, busy = running.cpu_s(), lab.traffic()[0], psutil.cpu_percent()
         sleep_until(time.monotonic_ns() + int(DRAIN_S * 1e9))
-        _finish(running)
+        _finish(running, directory)
     finally:
         running.stop()
     read = {role: json.loads((directory / f"{role}.json").read_text()) for role in ("robot", "site")}
@@ -154,16 +155,6 @@ def run(
     )
 
 
-def make_keys(directory: Path) -> None:
-    clients = directory / "clients"
-    clients.mkdir()
-    for name in ("relay", "robot", "site"):
-        pair = generate(ClientName(name))
-        public = PublicKeys(pair.name, (PublicKey(pair.public_key),))
-        write_secret(directory / f"{name}.key", pair)
-        write_public((directory if name == "relay" else clients) / f"{name}.pub", public)
-
-
 def start_relay(lab: Lab, directory: Path, *, udp: bool) -> "subprocess.Popen[bytes]":
     """The daemon, as its user runs it."""
     content = {
@@ -181,10 +172,21 @@ def start_relay(lab: Lab, directory: Path, *, udp: bool) -> "subprocess.Popen[by
     }
     config = directory / "relay.yaml"
     config.write_text(json.dumps(content))
-    command = [sys.executable, "-P", "-m", "sern_relay.cli", "--config", str(config)]
-    with (directory / "relay.log").open("wb") as log:
+    return start_daemon(lab, lab.b, "relay", config)
+
+
+def start_daemon(lab: Lab, node: Node, program: str, config: Path) -> "subprocess.Popen[bytes]":
+    """`program`: relay or client. Its log is beside its configuration, with the suffix .log."""
+    with config.with_suffix(".log").open("wb") as log:
         return lab.popen(
-            lab.b, command, stdin=subprocess.DEVNULL, stdout=log, stderr=log, cwd=directory, start_new_session=True
+            node,
+            child.python("-m", f"sern_{program}.cli", "--config", str(config)),
+            env={**os.environ, **child.environment()},
+            stdin=subprocess.DEVNULL,
+            stdout=log,
+            stderr=log,
+            cwd=config.parent,
+            start_new_session=True,
         )
 
 
@@ -204,7 +206,7 @@ def _start_master(lab: Lab) -> "subprocess.Popen[bytes]":
 
 
 def _start(lab: Lab, node: Node, spec: Spec) -> "subprocess.Popen[bytes]":
-    command = [sys.executable, "-m", "benchmarks.link.end", json.dumps(asdict(spec))]
+    command = child.python("-m", "benchmarks.link.end", json.dumps(asdict(spec)))
     with (spec.path / f"{spec.role}.log").open("wb") as log:
         return lab.popen(
             node,
@@ -212,7 +214,8 @@ def _start(lab: Lab, node: Node, spec: Spec) -> "subprocess.Popen[bytes]":
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=log,
-            cwd=Path(__file__).resolve().parents[2],
+            env={**os.environ, **child.environment()},
+            cwd=spec.path,
             start_new_session=True,
         )
 
@@ -227,8 +230,7 @@ def _await_ready(process: "subprocess.Popen[bytes]", log: Path, what: str) -> No
             raise SernError(f"{what}: nothing got through within {START_S:g} s")
         data = os.read(process.stdout.fileno(), 4096)
         if not data:
-            lines = log.read_text(errors="replace").strip().splitlines() or ["it said nothing"]
-            raise SernError(f"{what}: ended: {lines[-1]}")
+            raise failure(what, process.wait(), log)
         text += data
 
 
@@ -238,7 +240,7 @@ def _say(process: "subprocess.Popen[bytes]", text: str) -> None:
     process.stdin.flush()
 
 
-def _finish(running: Running) -> None:
+def _finish(running: Running, directory: Path) -> None:
     """The site first, so that nothing which arrives after the end counts."""
     for role in ("site", "robot"):
         process = running.ends[role]
@@ -252,7 +254,7 @@ def _finish(running: Running) -> None:
         except subprocess.TimeoutExpired as error:
             raise SernError(f"{role} does not end") from error
         if code and role != "master":
-            raise SernError(f"{role} ended with {code}")
+            raise failure(role, code, directory / f"{role}.log")
 
 
 def _play(lab: Lab, start_ns: int, script: Sequence[Step]) -> dict[str, tuple[int, int]]:
