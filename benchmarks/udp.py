@@ -27,7 +27,7 @@ from typing import Final
 import uvloop
 
 from benchmarks.child import Worker
-from benchmarks.common import Report, interleaved, main, try_realtime
+from benchmarks.common import Report, interleaved, main, medians, try_realtime
 from sern_core.types import ClientName
 from sern_runtime import udp_socket
 from sern_runtime.seal import (
@@ -260,21 +260,17 @@ def under_junk(known_id: bool, plain: bool, duration_s: float) -> dict[str, floa
 # --- the report -------------------------------------------------------------------------------------------------------
 
 
-def median(runs: list[dict[str, float]]) -> dict[str, float]:
-    return {name: statistics.median(run[name] for run in runs) for name in runs[0]}
-
-
 def bench(options: argparse.Namespace, report: Report) -> None:
     rounds, duration_s, count = (1, 1.0, 5_000) if options.quick else (3, 3.0, 30_000)
     sealed = interleaved({cipher.value: _sealing(cipher, count) for cipher in Cipher}, max(rounds, 3))
     for cipher in Cipher:
-        report.row("seal", cipher.value, **median(sealed[cipher.value]))
-    report.row("socket", "echo", **median([throughput(duration_s) for _ in range(rounds)]))
+        report.row("seal", cipher.value, **medians(sealed[cipher.value]))
+    report.row("socket", "echo", **medians([throughput(duration_s) for _ in range(rounds)]))
     for known_id in (False, True):
         case = "junk, bad tag" if known_id else "junk, unknown"
         systems = {"sern": _junk(known_id, False, duration_s), "plain": _junk(known_id, True, duration_s)}
         for name, runs in interleaved(systems, rounds).items():
-            report.row(case, name, **median(runs))
+            report.row(case, name, **medians(runs))
     for case in ("junk, unknown", "junk, bad tag"):
         report.reach(
             f"server CPU at {JUNK_HZ:,} datagrams/s, {case} [% of a core]",

@@ -16,6 +16,7 @@ import numpy as np
 import uvloop
 
 from benchmarks import common
+from benchmarks.endpoints.shared import HOST
 from sern_client.endpoints.ros1 import Ros1Endpoint, Ros1Options
 from sern_client.endpoints.ros1.frames import Frames
 from sern_client.endpoints.ros1.header import BRIDGE_FIELD, encode_header
@@ -26,7 +27,6 @@ from sern_core.message import TopicInfo
 from sern_core.types import Encoding, TopicName
 from sern_runtime import ros_types
 
-HOST: Final = "127.0.0.1"
 ODOM, CLOUD = "/bench/odom", "/bench/cloud"
 TYPES: Final = {ODOM: "nav_msgs/msg/Odometry", CLOUD: "sensor_msgs/msg/PointCloud2"}
 
@@ -132,7 +132,8 @@ async def _connect(master: XmlRpcClient, topic: str) -> _Sink:
 
 
 async def sink(master_uri: str, odom: str, cloud: str, warm_s: float, measure_s: float) -> None:
-    """Measures for a while, and says when that begins and what was found. `cloud` may be empty."""
+    """Measures for a while, and says when that begins and what was found; then it waits to be ended. `cloud` may be
+    empty."""
     master = XmlRpcClient(master_uri)
     # Topics may appear with their first message, which the source sends when both have a subscriber.
     topics = [topic for topic in (odom, cloud) if topic]
@@ -156,8 +157,7 @@ async def sink(master_uri: str, odom: str, cloud: str, warm_s: float, measure_s:
         found[f"{name}_received"] = len(noted)
         found[f"{name}_lost"] = max(numbers) - min(numbers) + 1 - len(set(numbers))
     say(found=found)
-    for each in sinks.values():
-        each.close()
+    await asyncio.Event().wait()
 
 
 class _Forward(_Nothing):

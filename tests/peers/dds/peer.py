@@ -75,6 +75,10 @@ def free_domain() -> int:
     raise AssertionError("every DDS domain of this host is in use")
 
 
+class PeerError(AssertionError):
+    """The peer could not do what it was told, or has ended."""
+
+
 class Peer:
     """A running peer. `said` keeps every line but the answers to commands."""
 
@@ -122,6 +126,7 @@ class Peer:
             else:
                 self.said.append(text)
             self._news.set()
+        self._news.set()  # it has ended
 
     async def do(self, command: str) -> None:
         """Give a command and wait until it is done."""
@@ -142,7 +147,10 @@ class Peer:
     async def until(self, condition: Callable[[], bool]) -> None:
         async with asyncio.timeout(DEADLINE_S):
             while not condition():
-                assert not any(line.startswith("failed ") for line in self.said), self.said[-1]
+                if failed := self.lines("failed "):
+                    raise PeerError(f"the peer: {' '.join(failed[-1])}")
+                if self._reading is None or self._reading.done():
+                    raise PeerError("the peer has ended")
                 self._news.clear()
                 await self._news.wait()
 
