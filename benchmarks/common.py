@@ -16,6 +16,7 @@ import json
 import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import BrokenExecutor
 from dataclasses import dataclass, field
 from itertools import groupby
 from math import inf, sqrt
@@ -248,7 +249,7 @@ def main(
         report.print(Console(width=None if sys.stdout.isatty() else 140))
         if options.json is not None:
             options.json.write_text(json.dumps(report.as_json(), indent=2, allow_nan=False) + "\n")
-    except (SernError, OSError) as error:
+    except (SernError, OSError, BrokenExecutor) as error:
         print(f"benchmarks.{benchmark}: {error}", file=sys.stderr)
         return 1
     return 0

@@ -11,7 +11,7 @@ import time
 from typing import Final
 
 from benchmarks import child, common
-from benchmarks.endpoints.ros1 import Ros, need, running
+from benchmarks.endpoints.ros1 import ROSMASTER, Ros, need, running
 from benchmarks.endpoints.ros1_roles import ODOM, TYPES, advertise, body
 from benchmarks.endpoints.shared import CHAIN, HOST, within
 from sern_client.endpoints.ros1 import Ros1Endpoint, Ros1Options
@@ -96,7 +96,7 @@ async def _measure(count: int) -> list[tuple[float, float]]:
 
 def bench(options: argparse.Namespace, report: common.Report) -> None:
     """MissingError where ROS 1 is not installed."""
-    need("/usr/bin/rosmaster")
+    need(ROSMASTER)
     found = [times for _ in range(options.rounds) for times in asyncio.run(_measure(TOPICS))]
     first_s, gone_s = zip(*found, strict=True)
     report.row(

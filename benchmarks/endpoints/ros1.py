@@ -51,13 +51,17 @@ FOLLOW_LIMIT_PERCENT: Final = 2.0
 
 DEBIAN_PYTHON: Final = "/usr/bin/python3"
 """What Debian's rospy is for."""
+ROSMASTER: Final = "/usr/bin/rosmaster"
+RELAY: Final = "/usr/lib/topic_tools/relay"
+_DEBIAN: Final = "/usr/lib/python3/dist-packages"
+_ROSPY: Final = (f"{_DEBIAN}/rospy", f"{_DEBIAN}/nav_msgs", f"{_DEBIAN}/sensor_msgs")
 PACKAGES: Final = {
-    "/usr/bin/rosmaster": "python3-rosmaster",
-    "/usr/lib/topic_tools/relay": "topic-tools",
-    "/usr/lib/python3/dist-packages/rospy": "python3-rospy",
-    "/usr/lib/python3/dist-packages/nav_msgs": "python3-nav-msgs",
-    "/usr/lib/python3/dist-packages/sensor_msgs": "python3-sensor-msgs",
+    ROSMASTER: "python3-rosmaster",
+    RELAY: "topic-tools",
+    **dict(zip(_ROSPY, ("python3-rospy", "python3-nav-msgs", "python3-sensor-msgs"), strict=True)),
 }
+NEEDS: Final = {TOPIC_TOOLS: (RELAY,), ROSPY: _ROSPY, ZENOH: _ROSPY}
+"""What a system cannot be measured without."""
 _TOPICS: Final = [f"{topic}={type_name}" for topic, type_name in TYPES.items()]
 
 
@@ -104,7 +108,7 @@ class Ros:
         port = free_ports(1)[0]
         uri = f"http://{HOST}:{port}"
         name = f"master{len(self.masters)}"
-        process = await self.start(name, "/usr/bin/rosmaster", "--core", "-p", str(port), master=uri)
+        process = await self.start(name, ROSMASTER, "--core", "-p", str(port), master=uri)
         self.masters.append(process.process.pid)
         client = XmlRpcClient(uri)
 
@@ -160,7 +164,7 @@ async def _through(ros: Ros, system: str, load: tuple[float, int, float], measur
             between = [await ros.rospy("copy", master, suffix)]
         else:
             between = [
-                await ros.start(f"relay{number}", "/usr/lib/topic_tools/relay", topic, topic + suffix,
+                await ros.start(f"relay{number}", RELAY, topic, topic + suffix,
                                 f"__name:=relay{number}", master=master)
                 for number, topic in enumerate(TYPES)
             ]  # fmt: skip
@@ -217,20 +221,16 @@ async def _try_zenoh() -> None:
 
 def bench(options: argparse.Namespace, report: common.Report) -> None:
     """MissingError where ROS 1 is not installed."""
-    need("/usr/bin/rosmaster", "/usr/lib/python3/dist-packages/nav_msgs", "/usr/lib/python3/dist-packages/sensor_msgs")
+    need(ROSMASTER)
     systems = list(SYSTEMS)
-    for system, path in ((TOPIC_TOOLS, "/usr/lib/topic_tools/relay"), (ROSPY, "/usr/lib/python3/dist-packages/rospy")):
+    for system, paths in NEEDS.items():
         try:
-            need(path)
+            need(*paths)
+            if system == ZENOH:
+                asyncio.run(_try_zenoh())
         except MissingError as error:
             systems.remove(system)
             report.note(f"ros1 without {system}: {error}")
-    try:
-        need("/usr/lib/python3/dist-packages/rospy")
-        asyncio.run(_try_zenoh())
-    except MissingError as error:
-        systems.remove(ZENOH)
-        report.note(f"ros1 without {ZENOH}: {error}")
     measure_s = QUICK_S if options.quick else MEASURE_S
     mixed, fast = (
         shared.bench_rounds(report, case, {name: partial(measure, name, load, measure_s) for name in systems},

@@ -115,7 +115,7 @@ def run(
             make_keys(directory, "relay", "robot", "site")
             running.ends["relay"] = start_relay(lab, directory, udp=system == "sern-udp")
         if system == "tcpros":
-            running.ends["master"] = _start_master(lab)
+            running.ends["master"] = _start_master(lab, directory)
         for sends, node in ((False, lab.b), (True, lab.a)):
             spec = Spec(system, sends, lab.b.address, node.address, str(directory), duration_s, asdict(load))
             running.ends[spec.role] = _start(lab, node, spec)
@@ -190,17 +190,28 @@ def start_daemon(lab: Lab, node: Node, program: str, config: Path) -> "subproces
         )
 
 
-def _start_master(lab: Lab) -> "subprocess.Popen[bytes]":
+def _start_master(lab: Lab, directory: Path) -> "subprocess.Popen[bytes]":
     """Returns when it listens."""
     command = [sys.executable, "-c", peers.ROS_MASTER, "--core", "-p", str(peers.ROS_PORT)]
     environment = {**os.environ, "ROS_MASTER_URI": f"http://{lab.b.address}:{peers.ROS_PORT}", "ROS_IP": lab.b.address}
-    quiet = subprocess.DEVNULL
-    master = lab.popen(lab.b, command, env=environment, stdin=quiet, stdout=quiet, stderr=quiet, start_new_session=True)
+    log = directory / "master.log"
+    with log.open("wb") as stream:
+        master = lab.popen(
+            lab.b,
+            command,
+            env=environment,
+            stdin=subprocess.DEVNULL,
+            stdout=stream,
+            stderr=stream,
+            start_new_session=True,
+        )
     give_up_s = time.monotonic() + START_S
     with lab.b.socket(socket.SOCK_STREAM) as probe:
         while probe.connect_ex((lab.b.address, peers.ROS_PORT)):
-            if master.poll() is not None or time.monotonic() > give_up_s:
-                raise SernError("rosmaster does not start")
+            if master.poll() is not None:
+                raise failure("rosmaster", master.returncode, log)
+            if time.monotonic() > give_up_s:
+                raise SernError(f"rosmaster does not listen within {START_S:g} s")
             time.sleep(0.1)
     return master
 
