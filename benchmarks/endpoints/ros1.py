@@ -80,7 +80,7 @@ class Ros:
         """Their process ids."""
 
     def environment(self, master: str) -> dict[str, str | None]:
-        """Of a program at `master`; what this shell has set for ROS, or for our Python, does not count."""
+        """What a program at `master` gets; what this shell has set for ROS, or for our Python, does not count."""
         ours = (name for name in os.environ if name.startswith("ROS_") or name == "PYTHONPATH")
         home = str(self.children.directory)
         return {**dict.fromkeys(ours), "ROS_MASTER_URI": master, "ROS_IP": HOST, "ROS_HOME": home}

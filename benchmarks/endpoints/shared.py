@@ -5,6 +5,7 @@ import importlib.util
 import json
 import statistics
 import tempfile
+import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Mapping, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
@@ -95,9 +96,11 @@ def zenoh_folder() -> Path:
 
 
 def cpu_s(processes: Iterable[int]) -> float:
-    """CPU time of all threads of these process ids, in the kernel's nanoseconds rather than in ticks of 10 ms."""
-    files = (path for pid in processes for path in Path(f"/proc/{pid}/task").glob("*/schedstat"))
-    return sum(int(path.read_text().split()[0]) for path in files) / 1e9
+    """CPU time of these process ids so far, all threads, those that have ended as well. OSError when one is no more.
+
+    The clock is that of clock_getcpuclockid(3): nanoseconds, where /proc/PID/stat has ticks of 10 ms.
+    """
+    return sum(time.clock_gettime((~pid << 3) | 2) for pid in processes)
 
 
 @dataclass(frozen=True)

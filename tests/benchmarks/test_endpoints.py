@@ -204,6 +204,26 @@ def test_rospy_nodes_need_nothing_but_what_their_python_has() -> None:
     assert (done.stdout, done.stderr) == ("1000 False\n", "")
 
 
+async def test_the_cpu_time_of_a_thread_that_has_ended_counts(tmp_path: Path) -> None:
+    program = """
+import json, threading, time
+def work():
+    while time.thread_time() < 0.05:
+        pass
+thread = threading.Thread(target=work)
+thread.start()
+thread.join()
+print(json.dumps({"used_s": time.process_time()}), flush=True)
+input()
+"""
+    async with Children(tmp_path) as children:
+        first, second = [await children.start(name, child.python("-c", program), talks=True) for name in ("a", "b")]
+        used_s = [(await process.read_object())["used_s"] for process in (first, second)]
+        found_s = shared.cpu_s([first.process.pid, second.process.pid])
+    assert min(used_s) >= 0.05
+    assert found_s >= sum(used_s)
+
+
 def test_cases_of_other_metrics_have_a_table_of_their_own() -> None:
     report = Report("endpoints")
     report.row("fast", "direct", odom_p50_ms=1.0)
