@@ -112,7 +112,7 @@ async def _through(children: Children, stack: AsyncExitStack, system: str, progr
             await source.line(f"matched {name} 1")
             await sink.line(f"matched {name} 1")
 
-    await within(matched(), START_S, f"dds: the peers did not find each other through {system}")
+    await within(matched(), START_S, "the Fast DDS peers did not find each other")
     # A daemon says that somebody wants a topic some time after it is there.
     await asyncio.sleep(1.0)
     before_s, began_s = shared.cpu_s(pids), time.monotonic()
@@ -123,7 +123,7 @@ async def _through(children: Children, stack: AsyncExitStack, system: str, progr
         for name in bodies:
             await source.line(f"flooded {name}")
 
-    await within(flooded(), measure_s + START_S, f"dds: not everything could be published beside {system}")
+    await within(flooded(), measure_s + START_S, "not everything could be published")
     took_s = time.monotonic() - began_s
     found: Figures = {}
     for name, rate_hz in RATES_HZ.items():
@@ -131,7 +131,7 @@ async def _through(children: Children, stack: AsyncExitStack, system: str, progr
         delays_ms = await _delays_ms(sink, name, expected)
         settled = sorted(delays_ms[round(len(delays_ms) * WARM_SHARE) :])
         if not settled:
-            raise SernError(f"dds: nothing of {name} arrived through {system}")
+            raise SernError(f"nothing of {name} arrived")
         found[f"{name}_p50_ms"] = statistics.median(settled)
         found[f"{name}_p99_ms"] = settled[int(0.99 * (len(settled) - 1))]
         found[f"{name}_lost"] = expected - len(delays_ms)
@@ -143,7 +143,7 @@ async def _measured(system: str, program: Path, measure_s: float) -> Figures:
     try:
         async with shared.started() as children, AsyncExitStack() as stack:
             return await child.beside(children, _through(children, stack, system, program, measure_s))
-    except PeerError as error:
+    except (PeerError, SernError) as error:
         raise SernError(f"dds, {system}: {error}") from error
     except TimeoutError as error:
         raise SernError(f"dds, {system}: a Fast DDS peer does not answer") from error

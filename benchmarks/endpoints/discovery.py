@@ -15,6 +15,7 @@ from benchmarks.endpoints.ros1 import ROSMASTER, Ros, need, running
 from benchmarks.endpoints.ros1_roles import ODOM, TYPES, advertise, body
 from benchmarks.endpoints.shared import CHAIN, HOST, within
 from sern_client.endpoints.ros1 import Ros1Endpoint, Ros1Options
+from sern_core.errors import SernError
 from sern_core.message import TopicInfo
 from sern_core.types import TopicName
 
@@ -68,10 +69,10 @@ async def _once(source: Ros1Endpoint, observer: _Observer, topic: str) -> tuple[
         while topic not in observer.gone_s:  # noqa: ASYNC110  the observer's events have no loop of their own
             await asyncio.sleep(PERIOD_S / 10)
 
-    await within(first(), TIMEOUT_S, f"discovery: no message of {topic} got to the other master")
+    await within(first(), TIMEOUT_S, f"no message of {topic} got to the other master")
     handle.close()
     ended_s = time.monotonic()
-    await within(gone(), TIMEOUT_S, f"discovery: {topic} was not gone from the other master")
+    await within(gone(), TIMEOUT_S, f"{topic} was not gone from the other master")
     return observer.first_s[topic] - began_s, observer.gone_s[topic] - ended_s
 
 
@@ -90,8 +91,11 @@ async def _topics(ros: Ros, count: int) -> list[tuple[float, float]]:
 
 
 async def _measure(count: int) -> list[tuple[float, float]]:
-    async with running() as ros:
-        return await child.beside(ros.children, _topics(ros, count))
+    try:
+        async with running() as ros:
+            return await child.beside(ros.children, _topics(ros, count))
+    except SernError as error:
+        raise SernError(f"discovery: {error}") from error
 
 
 def bench(options: argparse.Namespace, report: common.Report) -> None:

@@ -169,7 +169,7 @@ async def _through(ros: Ros, system: str, load: tuple[float, int, float], measur
                 for number, topic in enumerate(TYPES)
             ]  # fmt: skip
     sink = await ros.role("sink", other, ODOM + suffix, CLOUD + suffix if load[2] else "", WARM_S, measure_s)
-    await within(said(sink, "begin"), START_S + WARM_S, f"ros1: nothing arrived through {system}")
+    await within(said(sink, "begin"), START_S + WARM_S, "not every topic got through")
     pids = [process.process.pid for process in between]
     before_s, began_s = shared.cpu_s(pids), time.monotonic()
     await said(sink, "end")
@@ -179,8 +179,11 @@ async def _through(ros: Ros, system: str, load: tuple[float, int, float], measur
 
 
 async def _measured(system: str, load: tuple[float, int, float], measure_s: float) -> Figures:
-    async with running() as ros:
-        return await child.beside(ros.children, _through(ros, system, load, measure_s))
+    try:
+        async with running() as ros:
+            return await child.beside(ros.children, _through(ros, system, load, measure_s))
+    except SernError as error:
+        raise SernError(f"ros1, {system}: {error}") from error
 
 
 def measure(system: str, load: tuple[float, int, float], measure_s: float) -> Figures:
@@ -192,7 +195,7 @@ async def _found_many(ros: Ros, measure_s: float) -> Figures:
     master = await ros.master()
     await said(await ros.role("many", master, TOPICS), "ready")
     follower = await ros.role("follow", master, TOPICS)
-    found_s = float(await within(said(follower, "found_s"), START_S, f"ros1: {TOPICS} topics were not found"))
+    found_s = float(await within(said(follower, "found_s"), START_S, f"{TOPICS} topics were not found"))
     await asyncio.sleep(WARM_S)
     pids = [follower.process.pid]
     before_s, master_s, began_s = shared.cpu_s(pids), shared.cpu_s(ros.masters), time.monotonic()
@@ -203,8 +206,11 @@ async def _found_many(ros: Ros, measure_s: float) -> Figures:
 
 
 async def _follow(measure_s: float) -> Figures:
-    async with running() as ros:
-        return await child.beside(ros.children, _found_many(ros, measure_s))
+    try:
+        async with running() as ros:
+            return await child.beside(ros.children, _found_many(ros, measure_s))
+    except SernError as error:
+        raise SernError(f"{MANY}: {error}") from error
 
 
 async def _try_zenoh() -> None:

@@ -14,6 +14,7 @@ from benchmarks import child
 from benchmarks.common import MissingError, Report
 from benchmarks.endpoints import __main__ as endpoints
 from benchmarks.endpoints import ros1, shared
+from benchmarks.endpoints.ros1_roles import figures
 from benchmarks.endpoints.shared import ALONE, CHAIN, DIRECT, ROBOT, SITE, Rounds
 from sern_core.errors import SernError
 from sern_runtime.config.client import load_client
@@ -202,6 +203,16 @@ def test_rospy_nodes_need_nothing_but_what_their_python_has() -> None:
     command = [sys.executable, "-I", "-S", "-c", program]
     done = subprocess.run(command, capture_output=True, text=True, timeout=DEADLINE_S, check=False)
     assert (done.stdout, done.stderr) == ("1000 False\n", "")
+
+
+def test_lost_is_what_is_missing_in_between() -> None:
+    noted = [(3, 4_000_000), (4, 1_000_000), (4, 3_000_000), (9, 2_000_000)]
+    assert figures("odom", noted) == {
+        "odom_p50_ms": 2.5,
+        "odom_p99_ms": 4.0,
+        "odom_received": 4,
+        "odom_lost": 4,
+    }
 
 
 async def test_the_cpu_time_of_a_thread_that_has_ended_counts(tmp_path: Path) -> None:
