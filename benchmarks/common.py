@@ -178,8 +178,8 @@ def interleaved(systems: Mapping[str, Callable[[], T]], rounds: int) -> dict[str
 
 
 def medians(runs: Sequence[Mapping[str, float]]) -> dict[str, float]:
-    """The median of each metric over runs that all have the same."""
-    return {name: median(run[name] for run in runs) for name in runs[0]}
+    """The median of each metric that every run has."""
+    return {name: median(run[name] for run in runs) for name in runs[0] if all(name in run for run in runs)}
 
 
 def spread(values: Sequence[float]) -> float:

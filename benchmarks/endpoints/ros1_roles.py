@@ -132,8 +132,10 @@ async def _connect(master: XmlRpcClient, topic: str) -> _Sink:
 
 
 def figures(name: str, noted: Sequence[tuple[int, int]]) -> dict[str, float]:
-    """What came of a topic, from the (number, latency in ns) of each message, at least one. Lost is what is missing
-    between the least and the largest number."""
+    """What came of a topic, from the (number, latency in ns) of each message. Lost is what is missing between the least
+    and the largest number. Where nothing came there is neither latency nor loss to tell."""
+    if not noted:
+        return {f"{name}_received": 0}
     lags_ms = sorted(lag_ns / 1e6 for _, lag_ns in noted)
     numbers = [number for number, _ in noted]
     return {
@@ -152,6 +154,7 @@ async def sink(master_uri: str, odom: str, cloud: str, warm_s: float, measure_s:
     topics = [topic for topic in (odom, cloud) if topic]
     sinks = dict(zip(topics, await asyncio.gather(*(_connect(master, topic) for topic in topics)), strict=True))
     master.close()
+    first = sinks[odom]
     await until(lambda: all(each.noted for each in sinks.values()))
     await asyncio.sleep(warm_s)
     for each in sinks.values():
@@ -159,11 +162,11 @@ async def sink(master_uri: str, odom: str, cloud: str, warm_s: float, measure_s:
     say(begin=True)
     await asyncio.sleep(measure_s)
     say(end=True)
-    if silent := [topic for topic, each in sinks.items() if not each.noted]:
-        say(problem=f"nothing of {' and '.join(silent)} arrived in {measure_s:g} s")
-    else:
+    if first.noted:
         found = [figures(name, each.noted) for name, each in zip(("odom", "cloud"), sinks.values(), strict=False)]
         say(found={metric: value for each in found for metric, value in each.items()})
+    else:
+        say(problem=f"nothing of {odom} arrived in {measure_s:g} s")
     await asyncio.Event().wait()
 
 

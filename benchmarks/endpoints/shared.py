@@ -38,6 +38,8 @@ async def started() -> AsyncIterator[Children]:
                 yield children
             finally:
                 children.kill()
+                for each in children.children:
+                    await each.process.wait()
 
 
 async def start_chain(
@@ -121,7 +123,8 @@ class Rounds:
         return statistics.median(ours[metric] / theirs[metric] for ours, theirs in pairs)
 
     def figures(self, system: str) -> Figures:
-        """One row: medians, but of `_lost` the most of a round; and how far apart the rounds are, if there are more."""
+        """One row: medians, but of `_lost` the most of a round; and how far apart the rounds are, if there are more.
+        A figure that a round does not have (nothing of the topic arrived) is left out."""
         runs = self.runs[system]
         row: Figures = {}
         for metric, value in common.medians(runs).items():

@@ -1,6 +1,7 @@
 """What the endpoints' benchmark starts, reckons and limits, without a ROS system."""
 
 import argparse
+import signal
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
@@ -213,6 +214,26 @@ def test_lost_is_what_is_missing_in_between() -> None:
         "odom_received": 4,
         "odom_lost": 4,
     }
+    assert figures("cloud", []) == {"cloud_received": 0}
+
+
+def test_a_figure_that_a_round_does_not_have_is_left_out() -> None:
+    clouds = {"cloud_p50_ms": 3.0, "cloud_received": 4, "cloud_lost": 0}
+    rounds = Rounds(
+        {DIRECT: [run(1.0, 0.0)] * 2, CHAIN: [run(1.5, 1.0) | clouds, run(1.5, 1.0) | {"cloud_received": 0}]}
+    )
+    assert [name for name in rounds.figures(CHAIN) if name.startswith("cloud")] == ["cloud_received"]
+    assert rounds.figures(CHAIN)["cloud_received"] == 2
+
+
+async def test_what_was_started_has_ended_and_its_folder_is_gone() -> None:
+    async with shared.started() as children:
+        process = await children.start("child", child.python("-c", "print('{}', flush=True); input()"), talks=True)
+        await process.read_object()
+        folder = children.directory
+        assert process.running and folder.is_dir()
+    assert process.process.returncode == -signal.SIGKILL
+    assert not folder.exists()
 
 
 async def test_the_cpu_time_of_a_thread_that_has_ended_counts(tmp_path: Path) -> None:
