@@ -99,8 +99,9 @@ async def _through(children: Children, stack: AsyncExitStack, system: str, progr
     source_domain = free_domain()
     target_domain = source_domain if system == DIRECT else free_domain()
     bodies = {name: _body(name).hex() for name in _DDS}
-    source = await stack.enter_async_context(Peer(program, source_domain))
-    sink = await stack.enter_async_context(Peer(program, target_domain))
+    patience_s = measure_s + START_S
+    source = await stack.enter_async_context(Peer(program, source_domain, deadline_s=patience_s))
+    sink = await stack.enter_async_context(Peer(program, target_domain, deadline_s=patience_s))
     for name, kind in _DDS.items():
         topic = f"rt/bench/{name} {kind} reliable"
         await source.do(f"pub {name} {topic} depth={DEPTHS[f'/bench/{name}']}")
@@ -123,7 +124,7 @@ async def _through(children: Children, stack: AsyncExitStack, system: str, progr
         for name in bodies:
             await source.line(f"flooded {name}")
 
-    await within(flooded(), measure_s + START_S, "not everything could be published")
+    await within(flooded(), patience_s, "not everything could be published")
     took_s = time.monotonic() - began_s
     found: Figures = {}
     for name, rate_hz in RATES_HZ.items():

@@ -20,7 +20,8 @@ from sern_tools.keygen import make_keys
 from sern_tools.processes import Child, Children
 
 HOST: Final = "127.0.0.1"
-START_S: Final = 30.0
+START_S: Final = 60.0
+"""How long processes may take to start and to find each other; the machine may be busy."""
 ROUNDS: Final = 3
 DIRECT, CHAIN, ALONE = "direct", "sern-chain", "sern-in-process"
 RELAY, ROBOT, SITE = "relay", "robot1", "site"

@@ -80,9 +80,10 @@ class PeerError(AssertionError):
 
 
 class Peer:
-    """A running peer. `said` keeps every line but the answers to commands."""
+    """A running peer. `said` keeps every line but the answers to commands; `deadline_s` is for whatever is awaited."""
 
-    def __init__(self, program: Path, domain: int) -> None:
+    def __init__(self, program: Path, domain: int, *, deadline_s: float = DEADLINE_S) -> None:
+        self._deadline_s = deadline_s
         self._program = program
         self._domain = domain
         self._process: asyncio.subprocess.Process | None = None
@@ -109,7 +110,7 @@ class Peer:
         assert self._process is not None and self._process.stdin is not None and self._reading is not None
         self._process.stdin.close()
         try:
-            await asyncio.wait_for(self._process.wait(), DEADLINE_S)
+            await asyncio.wait_for(self._process.wait(), self._deadline_s)
         except TimeoutError:
             self._process.kill()
             await self._process.wait()
@@ -142,10 +143,10 @@ class Peer:
         """It goes without a word to anybody."""
         assert self._process is not None
         self.send("crash")
-        await asyncio.wait_for(self._process.wait(), DEADLINE_S)
+        await asyncio.wait_for(self._process.wait(), self._deadline_s)
 
     async def until(self, condition: Callable[[], bool]) -> None:
-        async with asyncio.timeout(DEADLINE_S):
+        async with asyncio.timeout(self._deadline_s):
             while not condition():
                 if failed := self.lines("failed "):
                     raise PeerError(f"the peer: {' '.join(failed[-1])}")
