@@ -16,10 +16,12 @@ import json
 import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import BrokenExecutor
 from dataclasses import dataclass, field
+from itertools import groupby
 from math import inf, sqrt
 from pathlib import Path
-from statistics import stdev
+from statistics import median, stdev
 from typing import Final, TypeVar
 
 from rich.console import Console
@@ -31,6 +33,10 @@ from sern_tools.checkout import commit
 REALTIME_PRIORITY = 10
 
 T = TypeVar("T")
+
+
+class MissingError(SernError):
+    """What part of a benchmark needs is not installed; the rest can be measured without it."""
 
 
 @dataclass(frozen=True)
@@ -94,25 +100,44 @@ class Report:
         }
 
     def print(self, console: Console) -> None:
-        metrics = list(dict.fromkeys(name for row in self.rows for name in row.metrics))
-        table = Table(title=f"{self.benchmark} ({commit()})", title_justify="left")
-        table.add_column("case")
-        table.add_column("system")
-        for name in metrics:
-            quantity, _, unit = name.rpartition("_")
-            table.add_column(f"{quantity.replace('_', ' ')} [{unit}]", justify="right", header_style="bold")
-        previous = None
-        for row in self.rows:
-            case = "" if row.case == previous else row.case
-            previous = row.case
-            table.add_row(case, row.system, *(_number(row.metrics.get(name)) for name in metrics))
-        console.print(table, markup=False)
+        """A table for each run of cases that have the same metrics, then notes and reaches."""
+        title: str | None = f"{self.benchmark} ({commit()})"
+        for metrics, rows in self._tables():
+            self._print_table(console, title, metrics, rows)
+            title = None
         for text in self.notes:
             console.print(text, markup=False, highlight=False)
         for r in self.reaches:
             verdict = "reached" if r.ok else "MISSED "
             wanted = f"{'≥' if r.at_least else '≤'} {_number(r.limit)}"
             console.print(f"{verdict}  {r.name}: {_number(r.value)} (wanted {wanted})", markup=False, highlight=False)
+
+    def _tables(self) -> list[tuple[list[str], list[Row]]]:
+        found: list[tuple[list[str], list[Row]]] = []
+        for _, group in groupby(self.rows, key=lambda row: row.case):
+            rows = list(group)
+            metrics = list(dict.fromkeys(name for row in rows for name in row.metrics))
+            if found and set(found[-1][0]) == set(metrics):
+                found[-1][1].extend(rows)
+            else:
+                found.append((metrics, rows))
+        return found
+
+    @staticmethod
+    def _print_table(console: Console, title: str | None, metrics: Sequence[str], rows: Sequence[Row]) -> None:
+        table = Table(title=title, title_justify="left")
+        table.add_column("case")
+        table.add_column("system", no_wrap=True)
+        for name in metrics:
+            quantity, _, unit = name.rpartition("_")
+            heading = f"{quantity.replace('_', ' ')} [{'%' if unit == 'percent' else unit}]"
+            table.add_column(heading, justify="right", header_style="bold", overflow="fold")
+        previous = None
+        for row in rows:
+            case = "" if row.case == previous else row.case
+            previous = row.case
+            table.add_row(case, row.system, *(_number(row.metrics.get(name)) for name in metrics))
+        console.print(table, markup=False)
 
 
 def _number(value: float | None) -> str:
@@ -150,6 +175,16 @@ def interleaved(systems: Mapping[str, Callable[[], T]], rounds: int) -> dict[str
             results[name].append(systems[name]())
         order.reverse()
     return results
+
+
+def medians(runs: Sequence[Mapping[str, float]]) -> dict[str, float]:
+    """The median of each metric that every run has."""
+    return {name: median(run[name] for run in runs) for name in runs[0] if all(name in run for run in runs)}
+
+
+def spread(values: Sequence[float]) -> float:
+    """How far apart the least and the largest are."""
+    return max(values) - min(values)
 
 
 def positive(text: str) -> int:
@@ -214,7 +249,7 @@ def main(
         report.print(Console(width=None if sys.stdout.isatty() else 140))
         if options.json is not None:
             options.json.write_text(json.dumps(report.as_json(), indent=2, allow_nan=False) + "\n")
-    except (SernError, OSError) as error:
+    except (SernError, OSError, BrokenExecutor) as error:
         print(f"benchmarks.{benchmark}: {error}", file=sys.stderr)
         return 1
     return 0

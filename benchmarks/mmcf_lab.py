@@ -9,7 +9,6 @@ left out is its own count, so that a class of which nothing was sent is not take
 import argparse
 import json
 import signal
-import subprocess
 import sys
 import tempfile
 import time
@@ -24,7 +23,7 @@ import numpy as np
 
 from benchmarks.common import Report, main, positive, try_realtime
 from benchmarks.link.children import Running
-from benchmarks.link.runs import DRAIN_S, START_S, make_keys, sleep_until, start_relay
+from benchmarks.link.runs import DRAIN_S, START_S, sleep_until, start_daemon, start_relay
 from benchmarks.link.sern import RELAY_PORT
 from benchmarks.mmcf_replay import CLOUD_HZ, EVERY_NTH_POINT, REAL, recorded, tabulate
 from sern_client.endpoints.clouds import read_ply
@@ -37,6 +36,7 @@ from sern_core.types import CLASS_LABELS, CLASSES, DropReason
 from sern_runtime.config.adaptation import AdaptationSection
 from sern_sim.models import LinkModel
 from sern_tools.api import get_json
+from sern_tools.keygen import make_keys
 from sern_tools.lab.lab import Lab, Node
 from sern_tools.message_log import TopicLog, read_logs
 
@@ -222,20 +222,6 @@ def _ask(node: Node, path: str) -> Any:
     return node.inside(lambda: get_json(API, path))
 
 
-def _start(lab: Lab, node: Node, config: Path) -> "subprocess.Popen[bytes]":
-    command = [sys.executable, "-P", "-m", "sern_client.cli", "--config", str(config)]
-    with config.with_suffix(".log").open("wb") as log:
-        return lab.popen(
-            node,
-            command,
-            stdin=subprocess.DEVNULL,
-            stdout=log,
-            stderr=log,
-            cwd=config.parent,
-            start_new_session=True,
-        )
-
-
 def _connected(robot: Node, topics: int) -> bool:
     """Over the datagram lane, and all of the topics have reached somebody."""
     try:
@@ -283,7 +269,7 @@ def rates_bps(duration_s: int) -> list[float]:
 
 def run(lab: Lab, directory: Path, section: AdaptationSection, scans: Sequence[Path], duration_s: int) -> list[Terms]:
     """One run over a link that is thin in its second third; intervals of 1 s. `directory` must be empty."""
-    make_keys(directory)
+    make_keys(directory, "relay", ROBOT, SITE)
     load = recorded(1.0)
     specs = {name: spec for name, (_, spec) in load.specs.items()}
     robot = robot_file(directory, lab.b.address, specs, section, scans)
@@ -293,8 +279,8 @@ def run(lab: Lab, directory: Path, section: AdaptationSection, scans: Sequence[P
     running = Running(directory)
     try:
         running.ends["relay"] = start_relay(lab, directory, udp=True)
-        running.ends[SITE] = _start(lab, lab.b, site)
-        running.ends[ROBOT] = _start(lab, lab.a, robot)
+        running.ends[SITE] = start_daemon(lab, lab.b, "client", site)
+        running.ends[ROBOT] = start_daemon(lab, lab.a, "client", robot)
         _await_connected(running, lab.a, len(specs))
         start_ns = time.monotonic_ns() + int(WARM_S * 1e9)
         capacities_bps = rates_bps(duration_s)

@@ -28,7 +28,6 @@ from collections.abc import Awaitable, Callable
 from ctypes import c_bool, c_uint64
 from dataclasses import dataclass, field
 from functools import partial
-from multiprocessing.process import BaseProcess
 from multiprocessing.sharedctypes import RawValue
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -38,6 +37,7 @@ import uvloop
 import zmq
 
 from benchmarks import common
+from benchmarks.child import Worker, await_workers
 from sern_client.transport import RelayTransport
 from sern_core import wire
 from sern_core.client import ClientCore
@@ -409,29 +409,28 @@ def _relay_main(system: System, ports: Ports, ready: Any) -> None:
 
 def measure(system: System, size_bytes: int, duration_s: float) -> Sample:
     """Start the three processes, wait until messages flow, and look at both ends of `duration_s`."""
-    processes = multiprocessing.get_context("spawn")
-    ports, flow, ready = Ports(*free_ports(2)), Flow(size_bytes), processes.Event()
-    relay = processes.Process(target=_relay_main, args=(system, ports, ready), daemon=True)
-    ends = [
-        processes.Process(target=end, args=(ports, flow), daemon=True) for end in (system.subscriber, system.publisher)
-    ]
+    ports, flow, ready = Ports(*free_ports(2)), Flow(size_bytes), multiprocessing.get_context("spawn").Event()
+    relay = Worker(f"{system.name}, relay", _relay_main, system, ports, ready)
+    ends = [Worker(f"{system.name}, {end.__name__}", end, ports, flow) for end in (system.subscriber, system.publisher)]
+    workers = (relay, *ends)
     try:
         relay.start()
-        if not ready.wait(START_S):
-            raise SernError(f"the relay of {system.name} did not start")
-        for process in ends:
-            process.start()
-        _wait_for_messages(system, flow, (relay, *ends))
+        await_workers(ready.is_set, workers, f"the relay of {system.name} did not start", START_S)
+        for worker in ends:
+            worker.start()
+        await_workers(lambda: flow.received.value >= 2 * BURST, workers, f"no messages through {system.name}", START_S)
         time.sleep(duration_s / 4)
         watched = psutil.Process(relay.pid)
         start_s, start, start_cpu_s = clock.now(), flow.received.value, cpu_s(watched)
         time.sleep(duration_s)
+        for worker in workers:
+            worker.check()
         end_s, end, end_cpu_s = clock.now(), flow.received.value, cpu_s(watched)
     finally:
         flow.stopped.value = True
-        for process in ends:
-            end_process(process, patient=True)
-        end_process(relay, patient=False)
+        for worker in ends:
+            worker.end(patient=True)
+        relay.end(patient=False)
     messages = end - start
     if not messages:
         raise SernError(f"{system.name} carried nothing at {size_bytes} bytes")
@@ -442,29 +441,6 @@ def measure(system: System, size_bytes: int, duration_s: float) -> Sample:
 def cpu_s(process: psutil.Process) -> float:
     times = process.cpu_times()
     return float(times.user + times.system)
-
-
-def _wait_for_messages(system: System, flow: Flow, processes: tuple[BaseProcess, ...]) -> None:
-    give_up_s = clock.now() + START_S
-    while flow.received.value < 2 * BURST:
-        if clock.now() > give_up_s or not all(process.is_alive() for process in processes):
-            raise SernError(f"no messages through {system.name}")
-        time.sleep(0.01)
-
-
-def end_process(process: BaseProcess, *, patient: bool) -> None:
-    """End one of our processes, started or not."""
-    if process.pid is None:
-        return
-    if patient:
-        process.join(2.0)
-    if process.is_alive():
-        process.terminate()
-        process.join(2.0)
-    if process.is_alive():
-        process.kill()
-    process.join()
-    process.close()
 
 
 def bench(options: argparse.Namespace, report: common.Report) -> None:

@@ -18,11 +18,9 @@ import sys
 import tempfile
 import time
 from array import array
-from collections.abc import Callable
 from contextlib import ExitStack
 from ctypes import c_bool, c_uint64
 from functools import partial
-from multiprocessing.process import BaseProcess
 from multiprocessing.sharedctypes import RawValue
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -33,7 +31,8 @@ import uvloop
 import zmq
 
 from benchmarks import common
-from benchmarks.relay import IdleSite, cpu_s, end_process
+from benchmarks.child import Worker, await_workers
+from benchmarks.relay import IdleSite, cpu_s
 from sern_client.transport import RelayTransport
 from sern_core.client import ClientCore
 from sern_core.errors import ConfigError, SernError
@@ -44,8 +43,9 @@ from sern_core.types import CLASS_LABELS, ClientName, Encoding, PriorityClass, T
 from sern_relay.daemon import RelayDaemon
 from sern_runtime import clock, logs
 from sern_runtime.config.relay import load_relay
-from sern_runtime.keys import PublicKey, PublicKeys, generate, load_public, load_secret, write_public, write_secret
+from sern_runtime.keys import load_public, load_secret
 from sern_runtime.loop import Shutdown, run
+from sern_tools.keygen import make_keys
 from sern_tools.ports import free_ports
 
 FLEETS: Final = (1, 5, 10, 20, 50)
@@ -215,14 +215,7 @@ def _robots(folder: Path, port: int, numbers: range, shared: Shared) -> None:
 
 
 def _prepare(folder: Path, robots: int, port: int) -> None:
-    clients = folder / "clients"
-    clients.mkdir()
-    for name in (ClientName("relay"), ClientName("site"), *map(robot_name, range(robots))):
-        key = generate(name)
-        write_secret(folder / f"{name}.key", key)
-        write_public(
-            (folder if name == "relay" else clients) / f"{name}.pub", PublicKeys(name, (PublicKey(key.public_key),))
-        )
+    make_keys(folder, "relay", "site", *map(robot_name, range(robots)))
     (folder / "relay.yaml").write_text(RELAY.format(port=port))
 
 
@@ -234,29 +227,34 @@ def measure(robots: int, duration_s: float) -> Sample:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         _prepare(folder, robots, port)
-        relay = processes.Process(target=_relay, args=(folder, ready), daemon=True)
-        ends: list[BaseProcess] = [
-            processes.Process(target=_site, args=(folder, port, shared, theirs), daemon=True),
+        relay = Worker("relay", _relay, folder, ready)
+        ends = [
+            Worker("site", _site, folder, port, shared, theirs),
             *(
-                processes.Process(target=_robots, args=(folder, port, numbers, shared), daemon=True)
+                Worker(f"robots {numbers.start} to {numbers.stop - 1}", _robots, folder, port, numbers, shared)
                 for host in range(HOSTS)
                 if len(numbers := range(host * robots // HOSTS, (host + 1) * robots // HOSTS))
             ),
         ]
+        workers = (relay, *ends)
         try:
             relay.start()
-            if not ready.wait(START_S):
-                raise SernError("the relay did not start")
-            for process in ends:
-                process.start()
-            _wait(lambda: shared.opened.value == robots * TOPICS, (relay, *ends), f"{robots} robots are not all there")
+            await_workers(ready.is_set, workers, "the relay did not start", START_S)
+            for worker in ends:
+                worker.start()
+            everybody = robots * TOPICS
+            await_workers(
+                lambda: shared.opened.value == everybody, workers, f"{robots} robots were not all there", START_S
+            )
             settled = shared.received.value + int(robots * RATE_HZ)
-            _wait(lambda: shared.received.value > settled, (relay, *ends), "messages do not flow")
+            await_workers(lambda: shared.received.value > settled, workers, "messages did not flow", START_S)
             watched = psutil.Process(relay.pid)
             start_s, start, start_cpu_s = clock.now(), shared.received.value, cpu_s(watched)
             shared.measuring.value = True
             time.sleep(duration_s)
             shared.measuring.value = False
+            for worker in workers:
+                worker.check()
             end_s, end, end_cpu_s = clock.now(), shared.received.value, cpu_s(watched)
             shared.stopped.value = True
             if not ours.poll(START_S):
@@ -264,18 +262,10 @@ def measure(robots: int, duration_s: float) -> Sample:
             ages_s = ours.recv()
         finally:
             shared.stopped.value = True
-            for process in ends:
-                end_process(process, patient=True)
-            end_process(relay, patient=False)
+            for worker in ends:
+                worker.end(patient=True)
+            relay.end(patient=False)
     return Sample(robots, (end - start) / (end_s - start_s), (end_cpu_s - start_cpu_s) / (end - start) * 1e6, ages_s)
-
-
-def _wait(condition: Callable[[], bool], processes: tuple[BaseProcess, ...], problem: str) -> None:
-    give_up_s = clock.now() + START_S
-    while not condition():
-        if clock.now() > give_up_s or not all(process.is_alive() for process in processes):
-            raise SernError(problem)
-        time.sleep(0.02)
 
 
 def bench(options: argparse.Namespace, report: common.Report) -> None:

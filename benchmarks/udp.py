@@ -23,14 +23,15 @@ import struct
 import sys
 import time
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from multiprocessing.connection import Connection
 from typing import Final
 
 import uvloop
 from cryptography.hazmat.primitives.ciphers.aead import AESGCM, ChaCha20Poly1305
 
-from benchmarks.common import Report, interleaved, main, try_realtime
+from benchmarks.child import Worker
+from benchmarks.common import Report, interleaved, main, medians, try_realtime
 from benchmarks.link.forwarder import Forwarder, Hops
 from sern_core.errors import SernError
 from sern_core.types import ClientName
@@ -208,27 +209,27 @@ class ServerProcess:
 
     def __init__(self, *, plain: bool = False, echo: bool = True) -> None:
         self._control, self._far = multiprocessing.Pipe()
-        self._process = multiprocessing.get_context("spawn").Process(
-            target=serve, args=(self._far, plain, echo), daemon=True
-        )
+        self._worker = Worker("the UDP server", serve, self._far, plain, echo)
 
     def __enter__(self) -> "ServerProcess":
-        self._process.start()
-        self.parameters: SessionParameters = self._control.recv()
+        try:
+            self._worker.start()
+            self._far.close()  # the server's copy alone keeps it open
+            self.parameters: SessionParameters = self._worker.hear(self._control)
+        except BaseException:
+            self.__exit__()
+            raise
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._control.send(False)
-        self._process.join(10)
-        if self._process.is_alive():
-            self._process.kill()
-            self._process.join()
+        with suppress(ConnectionError):  # it has ended
+            self._control.send(False)
+        self._worker.end(patient=True)
         self._control.close()
-        self._far.close()
 
     def usage(self) -> tuple[float, float, int]:
-        self._control.send(True)
-        cpu_s, wall_s, received = self._control.recv()
+        """CPU and wall clock in seconds, and datagrams received, so far. SernError when the server has ended."""
+        cpu_s, wall_s, received = self._worker.ask(self._control, True)
         return float(cpu_s), float(wall_s), int(received)
 
 
@@ -301,18 +302,20 @@ def flood(port: int, session_id: int, seconds: float, told: Connection) -> None:
 
 
 def under_junk(known_id: bool, plain: bool, duration_s: float) -> dict[str, float]:
-    context = multiprocessing.get_context("spawn")
     with ServerProcess(plain=plain) as server:
         parameters = server.parameters
         peer = Peer(parameters)
         ours, far = multiprocessing.Pipe()
         session_id = parameters.id if known_id else parameters.id ^ 1
-        seconds = WARM_UP_S + duration_s + 0.3
-        generator = context.Process(target=flood, args=(parameters.port, session_id, seconds, far), daemon=True)
-        generator.start()
+        generator = Worker("the source of junk", flood, parameters.port, session_id, WARM_UP_S + duration_s + 0.3, far)
         round_trips = []
-        with peer.socket, ours, far:
-            ours.recv()  # it is ready
+        with ExitStack() as stack:
+            stack.callback(generator.end, patient=True)
+            stack.enter_context(peer.socket)
+            stack.enter_context(ours)
+            generator.start()
+            far.close()  # the generator's copy alone keeps it open
+            generator.hear(ours)  # it is ready
             ours.send(True)
             time.sleep(WARM_UP_S)
             cpu_s, begun_s, _ = server.usage()
@@ -333,8 +336,7 @@ def under_junk(known_id: bool, plain: bool, duration_s: float) -> dict[str, floa
                     round_trips.append(time.monotonic() - sent_s)
                 time.sleep(1 / ECHO_HZ)
             cpu_end_s, end_s, _ = server.usage()
-            rate_hz = ours.recv()
-            generator.join()
+            rate_hz = generator.hear(ours)
     if not rate_hz or not round_trips:
         raise SernError("no junk could be sent, or nothing came back beside it: is the machine overloaded?")
     round_trips.sort()
@@ -350,22 +352,18 @@ def under_junk(known_id: bool, plain: bool, duration_s: float) -> dict[str, floa
 # --- the report -------------------------------------------------------------------------------------------------------
 
 
-def median(runs: list[dict[str, float]]) -> dict[str, float]:
-    return {name: statistics.median(run[name] for run in runs) for name in runs[0]}
-
-
 def bench(options: argparse.Namespace, report: Report) -> None:
     rounds, duration_s, count = (1, 1.0, 5_000) if options.quick else (3, 3.0, 30_000)
     sealed = interleaved({cipher.value: _sealing(cipher, count) for cipher in Cipher}, max(rounds, 3))
     for cipher in Cipher:
-        report.row("seal", cipher.value, **median(sealed[cipher.value]))
-    report.row("socket", "echo", **median([throughput(duration_s) for _ in range(rounds)]))
-    report.row("forward", "bare", **median([forwarding(duration_s) for _ in range(rounds)]))
+        report.row("seal", cipher.value, **medians(sealed[cipher.value]))
+    report.row("socket", "echo", **medians([throughput(duration_s) for _ in range(rounds)]))
+    report.row("forward", "bare", **medians([forwarding(duration_s) for _ in range(rounds)]))
     for known_id in (False, True):
         case = "junk, bad tag" if known_id else "junk, unknown"
         systems = {"sern": _junk(known_id, False, duration_s), "plain": _junk(known_id, True, duration_s)}
         for name, runs in interleaved(systems, rounds).items():
-            report.row(case, name, **median(runs))
+            report.row(case, name, **medians(runs))
     forward_us = report.value("forward", "bare", "server_cpu_us")
     for case in ("junk, unknown", "junk, bad tag"):
         refuse_us = 1e4 * report.value(case, "sern", "cpu_percent") / report.value(case, "sern", "junk_hz")

@@ -13,10 +13,8 @@ from ruamel.yaml import YAML
 
 from sern_core.errors import ConfigError
 from sern_core.params import SchedulerParams
-from sern_core.rules import client_name
-from sern_runtime import keys
-from sern_runtime.keys import PublicKey, PublicKeys
 from sern_sim.profiles import LinkProfile
+from sern_tools.keygen import make_keys
 from sern_tools.shaping import RateSchedule
 
 HOST: Final = "127.0.0.1"
@@ -159,13 +157,7 @@ class Scenario:
 
 def write_files(directory: Path, scenario: Scenario, ports: Ports) -> dict[str, Path]:
     """Keys and configuration files of one run, by the names relay, robot and site. The directory must be new."""
-    clients = directory / "clients"
-    clients.mkdir(parents=True)
-    for name in (RELAY, ROBOT, SITE):
-        pair = keys.generate(client_name(name))
-        public = PublicKeys(client_name(name), (PublicKey(pair.public_key),))
-        keys.write_secret(directory / f"{name}.key", pair)
-        keys.write_public((directory if name == RELAY else clients) / f"{name}.pub", public)
+    make_keys(directory, RELAY, ROBOT, SITE)
     files = {
         RELAY: _relay(ports),
         ROBOT: _client(

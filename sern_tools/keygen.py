@@ -40,6 +40,22 @@ def run_keygen(role: Role, name: str, *, out: Path = Path(), force: bool = False
     )
 
 
+def make_keys(directory: Path, relay: str, *clients: str) -> None:
+    """New keys of a whole system in one folder: `NAME.key` of each, the relay's `.pub` beside them, those of the
+    clients in a new folder `clients`, as the relay's `clients_dir` wants them.
+
+    Raises UsageError for a bad name, ConfigError when a key cannot be written, OSError when the folder cannot be made.
+    """
+    names = [client_name(name) for name in (relay, *clients)]
+    theirs = directory / "clients"
+    theirs.mkdir(parents=True)
+    for name in names:
+        pair = keys.generate(name)
+        public = keys.PublicKeys(name, (keys.PublicKey(pair.public_key),))
+        keys.write_secret(directory / f"{name}{keys.SECRET_SUFFIX}", pair)
+        keys.write_public((directory if name == relay else theirs) / f"{name}{keys.PUBLIC_SUFFIX}", public)
+
+
 def _relay_advice(name: str, secret: Path, public: Path) -> str:
     return f"""\
 Next:

@@ -27,6 +27,7 @@ DRAIN_S: Final = 45.0
 ABORT_S: Final = 5.0
 """The same when the whole is being given up."""
 TAIL_LINES: Final = 3
+TRACEBACK: Final = "Traceback (most recent call last):"
 LINE_BYTES: Final = 2**20
 _PLAIN_PYTHON: Final = (sys.executable, "-I", "-S")
 """For helpers that import nothing that is installed."""
@@ -52,6 +53,24 @@ def swept(directory: Path) -> Iterator[Path]:
         assert sweeper.stdin is not None
         sweeper.stdin.close()
         sweeper.wait()
+
+
+def failure(name: str, code: int | None, log: Path) -> SernError:
+    """One line about a process that ended: who, how, and its last words from `log`, its standard error.
+
+    `code`: its exit status, negative a signal's number, None while it runs. Of a Python traceback the error remains.
+    """
+    outcome = "output closed"
+    if code is not None:
+        outcome = f"exit status {code}" if code >= 0 else f"signal {signal.Signals(-code).name}"
+    with contextlib.suppress(OSError):
+        lines = [line for line in log.read_text(errors="replace").splitlines() if line.strip()]
+        if TRACEBACK in lines:
+            begin = len(lines) - lines[::-1].index(TRACEBACK)
+            lines = [line for line in lines[begin:] if not line[0].isspace()]
+        if lines:
+            return SernError(f"{name} ended ({outcome}): {' | '.join(lines[-TAIL_LINES:])}")
+    return SernError(f"{name} ended ({outcome}) and said nothing")
 
 
 @dataclass(eq=False)
@@ -92,17 +111,7 @@ class Child:
 
     def failure(self) -> SernError:
         """One line: who ended, how, and its last words."""
-        with contextlib.suppress(OSError):
-            tail = [line for line in self.log.read_text(errors="replace").splitlines() if line.strip()][-TAIL_LINES:]
-            if tail:
-                return SernError(f"{self.name} ended ({self._outcome()}): {' | '.join(tail)}")
-        return SernError(f"{self.name} ended ({self._outcome()}) and said nothing; its log is {self.log}")
-
-    def _outcome(self) -> str:
-        code = self.process.returncode
-        if code is None:
-            return "output closed"
-        return f"exit status {code}" if code >= 0 else f"signal {signal.Signals(-code).name}"
+        return failure(self.name, self.process.returncode, self.log)
 
 
 @dataclass
@@ -130,11 +139,18 @@ class Children:
             raise asyncio.CancelledError
 
     async def start(
-        self, name: str, command: Sequence[str], *, talks: bool = False, environment: Mapping[str, str] | None = None
+        self,
+        name: str,
+        command: Sequence[str],
+        *,
+        talks: bool = False,
+        environment: Mapping[str, str | None] | None = None,
     ) -> Child:
-        """`talks`: its input and output are pipes for `ask` and `read_object`. SernError when it cannot be run."""
+        """`talks`: its input and output are pipes for `ask` and `read_object`. `environment` goes on top of this
+        process's own; None takes a variable away. SernError when it cannot be run."""
         log = self.directory / f"{name}.log"
         pipe = asyncio.subprocess.PIPE if talks else None
+        merged: dict[str, str | None] = {**os.environ, **(environment or {})}
         try:
             with log.open("wb") as stream:
                 process = await asyncio.create_subprocess_exec(
@@ -143,7 +159,7 @@ class Children:
                     stdout=pipe or stream,
                     stderr=stream,
                     start_new_session=True,
-                    env={**os.environ, **(environment or {})},
+                    env={key: value for key, value in merged.items() if value is not None},
                     limit=LINE_BYTES,
                 )
         except OSError as error:

@@ -2,217 +2,177 @@
 
 A Fast DDS peer publishes odometry (1 kHz) and clouds (1 MB at 20 Hz), reliable; another takes both behind the bridge.
 
-    direct         no bridge: both peers in one domain
-    sern           two endpoints in one process, from one domain to another
-    sern-chain     sern-client, sern-relay, sern-client (CURVE), from one domain to another
+    direct             no bridge: both peers in one domain
+    sern-chain         what a user runs: sern-client, sern-relay, sern-client (CURVE), from one domain to another
+    sern-in-process    two endpoints in one process, from one domain to another: what the endpoints alone cost
+    DdsEndpoint+zenoh  two processes joined by zenoh (TCP), each with our own DDS endpoint, from one domain to another
 
-Everything is on loopback. CPU is that of the processes in between.
+The last stands for a zenoh bridge of DDS, which is a program of its own that no package index of Python or Debian has:
+the same zenoh, and at its ends the same Cyclone DDS with bodies unread, but hand-overs in Python. Only the chain
+encrypts, schedules and acknowledges. Everything is on loopback. CPU is that of all processes in between.
 """
 
 import argparse
 import asyncio
-import json
 import statistics
-import subprocess
-import sys
-import tempfile
 import time
-from contextlib import AsyncExitStack, ExitStack
+from contextlib import AsyncExitStack
+from functools import partial
 from pathlib import Path
 from random import Random
 from typing import Any, Final
 
 import numpy as np
 
-from benchmarks import common
-from benchmarks.endpoints.ros1 import cpu_s
-from sern_client.endpoints.dds.domain import DomainOptions
-from sern_client.endpoints.dds.endpoint import DdsEndpoint, DdsOptions
+from benchmarks import child, common
+from benchmarks.common import MissingError
+from benchmarks.endpoints import shared
+from benchmarks.endpoints.dds_roles import DEPTHS, TYPES
+from benchmarks.endpoints.shared import ALONE, CHAIN, DIRECT, HOST, START_S, Figures, within
 from sern_core.errors import SernError
-from sern_core.message import TopicInfo
-from sern_core.types import ClientName, Encoding, TopicName
+from sern_core.types import Encoding
 from sern_runtime import ros_types
-from sern_runtime.keys import PublicKey, PublicKeys, generate, write_public, write_secret
 from sern_tools.ports import free_ports
-from tests.peers.dds.peer import Peer, build_peer, free_domain, missing_packages
+from sern_tools.processes import Child, Children
+from tests.peers.dds.peer import Peer, PeerError, build_peer, free_domain, missing_packages
 
 MEASURE_S: Final = 8.0
 QUICK_S: Final = 3.0
-START_S: Final = 30.0
+LATE_S: Final = 1.0
+"""Messages are lost when after the last one nothing arrives for so long."""
 WARM_SHARE: Final = 0.2
 """This much of each run is not counted: connections, caches and the schedulers settle."""
-ODOM_HZ: Final = 1000
-CLOUD_HZ: Final = 20
+RATES_HZ: Final = {"odom": 1000, "cloud": 20}
 CLOUD_BYTES: Final = 1_000_000
-SYSTEMS: Final = ("direct", "sern", "sern-chain")
+ZENOH: Final = "DdsEndpoint+zenoh"
+SYSTEMS: Final = (DIRECT, CHAIN, ALONE, ZENOH)
 CASE: Final = "dds 1 kHz + 20 MB/s"
-HOST: Final = "127.0.0.1"
-_TYPES: Final = {"odom": "nav_msgs/msg/Odometry", "cloud": "sensor_msgs/msg/PointCloud2"}
+LATENCY_LIMIT_MS: Final = 1.0
 _DDS: Final = {"odom": "nav_msgs::msg::dds_::Odometry_", "cloud": "sensor_msgs::msg::dds_::PointCloud2_"}
-_ROOT: Final = Path(__file__).resolve().parents[2]
 
 
 def _body(name: str) -> bytes:
     fields: dict[str, Any] = {}
     if name == "cloud":
         fields["data"] = np.frombuffer(Random(1).randbytes(CLOUD_BYTES), dtype="uint8")
-    message = ros_types.new(_TYPES[name], Encoding.CDR, **fields)
-    return ros_types.serialise(message, _TYPES[name], Encoding.CDR)
+    type_name = TYPES[f"/bench/{name}"]
+    return ros_types.serialise(ros_types.new(type_name, Encoding.CDR, **fields), type_name, Encoding.CDR)
 
 
-# The bridge, in a process of its own ----------------------------------------------------------------------------------
+async def _role(children: Children, role: str, *arguments: str) -> Child:
+    command = child.python("-m", "benchmarks.endpoints.dds_roles", role, *arguments)
+    return await children.start(role, command, environment=child.environment())
 
 
-class _Through:
-    """`TopicEvents`: what one domain has is published in the other."""
-
-    def __init__(self, source: DdsEndpoint, target: DdsEndpoint) -> None:
-        self._source = source
-        self._target = target
-
-    def topic_added(self, info: TopicInfo) -> None:
-        publisher = self._target.advertise(info)
-
-        def sink(body: bytes, stamp_ns: int) -> bool:
-            publisher.publish(body, stamp_ns)
-            return True
-
-        self._source.subscribe(info.name, sink)
-
-    def topic_removed(self, name: TopicName) -> None:
-        """The run ends with it."""
-
-
-async def _bridge(source_domain: int, target_domain: int) -> None:
-    source = DdsEndpoint(DdsOptions(DomainOptions(source_domain, localhost_only=True)))
-    target = DdsEndpoint(DdsOptions(DomainOptions(target_domain, localhost_only=True), node_name="sern_target"))
-    through = _Through(source, target)
-    await target.start(_Through(target, source))
-    await source.start(through)
-    try:
-        await asyncio.Event().wait()
-    finally:
-        await source.stop()
-        await target.stop()
-
-
-# The run --------------------------------------------------------------------------------------------------------------
-
-
-def _spawn(stack: ExitStack, *command: str) -> int:
-    process = subprocess.Popen(
-        [sys.executable, "-P", "-m", *command], cwd=_ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-    )
-
-    def end() -> None:
-        process.kill()
-        process.wait()
-
-    stack.callback(end)
-    return process.pid
-
-
-def _chain(stack: ExitStack, source_domain: int, target_domain: int) -> list[int]:
-    """A relay and two clients, with keys and nothing else set that a user would not."""
-    folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="sern-bench-")))
-    (folder / "clients").mkdir()
-    for name, public in (("relay", "relay.pub"), ("robot1", "clients/robot1.pub"), ("site", "clients/site.pub")):
-        pair = generate(ClientName(name))
-        write_secret(folder / f"{name}.key", pair)
-        write_public(folder / public, PublicKeys(pair.name, (PublicKey(pair.public_key),)))
-    relay = f"tcp://{HOST}:{free_ports(1)[0]}"
-    files: dict[str, Any] = {
-        "relay": {
-            "relay": {"name": "relay", "listen": [relay], "secret_key_file": "relay.key", "clients_dir": "clients"},
-            "access": [{"client": ".*", "publish": [".*"], "subscribe": [".*"]}],
+async def _between(children: Children, system: str, source: int, target: int) -> list[Child]:
+    """The bridge from one domain to another."""
+    if system == CHAIN:
+        endpoints = {
+            name: {"kind": "dds", "domain": domain, "localhost_only": True}
+            for name, domain in ((shared.ROBOT, source), (shared.SITE, target))
         }
-    }
-    rules = [
-        {"match": ".*/odom", "class": "control", "reliability": "reliable", "depth": 1000},
-        {"match": ".*/cloud", "class": "bulk", "reliability": "reliable", "depth": 10},
-    ]
-    for name, domain, patterns in (("robot1", source_domain, []), ("site", target_domain, ["/bench/.*"])):
-        files[name] = {
-            "client": {"name": name, "namespace": "/"},
-            "relay": {"endpoint": relay, "server_key_file": "relay.pub", "secret_key_file": f"{name}.key"},
-            "endpoint": {"kind": "dds", "domain": domain, "localhost_only": True},
-            "topics": rules,
-            "subscribe": patterns,
-        }
-    pids = []
-    for name, content in files.items():
-        config = folder / f"{name}.yaml"
-        config.write_text(json.dumps(content))  # JSON is YAML
-        pids.append(_spawn(stack, f"sern_{'relay' if name == 'relay' else 'client'}.cli", "--config", str(config)))
-    return pids
+        return await shared.start_chain(children, endpoints, {}, reliability="reliable")
+    if system == ALONE:
+        return [await _role(children, "bridge", str(source), str(target))]
+    if system == ZENOH:
+        locator = f"tcp/{HOST}:{free_ports(1)[0]}"
+        listener = await _role(children, "from-zenoh", str(target), locator)
+        return [listener, await _role(children, "to-zenoh", str(source), locator)]
+    return []
 
 
-async def _measure(system: str, program: Path, measure_s: float) -> dict[str, float]:
+async def _delays_ms(sink: Peer, name: str, expected: int) -> list[float]:
+    """From publishing to arrival, for all messages that arrive, in their order."""
+    delays_ms: list[float] = []
+    for number in range(expected):
+        await sink.do(f"stats {name}")
+        words = await sink.line(f"stats {name} ", number)
+        fresh = [int(text) / 1e6 for text in words[3].split(",") if text]
+        delays_ms += fresh
+        if len(delays_ms) >= expected or (number and not fresh):
+            break
+        await asyncio.sleep(LATE_S)
+    return delays_ms
+
+
+async def _through(children: Children, stack: AsyncExitStack, system: str, program: Path, measure_s: float) -> Figures:
     source_domain = free_domain()
-    target_domain = source_domain if system == "direct" else free_domain()
-    bodies = {name: _body(name).hex() for name in _TYPES}
-    rates = {"odom": ODOM_HZ, "cloud": CLOUD_HZ}
-    depths = {"odom": 1000, "cloud": 20}
-    async with AsyncExitStack() as stack:
-        processes = stack.enter_context(ExitStack())
-        source = await stack.enter_async_context(Peer(program, source_domain))
-        sink = await stack.enter_async_context(Peer(program, target_domain))
-        for name, kind in _DDS.items():
-            await source.do(f"pub {name} rt/bench/{name} {kind} reliable depth={depths[name]}")
-            await sink.do(f"sub {name} rt/bench/{name} {kind} reliable quiet depth={depths[name]}")
-        pids: list[int] = []
-        if system == "sern":
-            pids = [_spawn(processes, "benchmarks.endpoints.dds", str(source_domain), str(target_domain))]
-        elif system == "sern-chain":
-            pids = _chain(processes, source_domain, target_domain)
-        async with asyncio.timeout(START_S):
-            for name in _DDS:
-                await source.line(f"matched {name} 1")
-                await sink.line(f"matched {name} 1")
-        # A daemon says that somebody wants a topic some time after it is there.
-        await asyncio.sleep(1.0)
-        before_s, began_s = cpu_s(pids), time.monotonic()
-        for name, body in bodies.items():
-            await source.do(f"flood {name} {body} {rates[name]} {round(rates[name] * measure_s)}")
-        async with asyncio.timeout(measure_s + START_S):
-            for name in bodies:
-                await source.line(f"flooded {name}")
-        used_s, took_s = cpu_s(pids) - before_s, time.monotonic() - began_s
-        await asyncio.sleep(0.5)  # what is under way
-        found: dict[str, float] = {}
-        for name in _TYPES:
-            await sink.do(f"stats {name}")
-            words = await sink.line(f"stats {name} ")
-            delays_ms = [int(text) / 1e6 for text in words[3].split(",") if text]
-            settled = sorted(delays_ms[round(len(delays_ms) * WARM_SHARE) :])
-            if not settled:
-                raise SernError(f"dds: nothing of {name} arrived through {system}")
-            found[f"{name}_p50_ms"] = statistics.median(settled)
-            found[f"{name}_p99_ms"] = settled[int(0.99 * (len(settled) - 1))]
-            found[f"{name}_lost"] = rates[name] * measure_s - len(delays_ms)
-        return {**found, "cpu_percent": 100 * used_s / took_s}
+    target_domain = source_domain if system == DIRECT else free_domain()
+    bodies = {name: _body(name).hex() for name in _DDS}
+    patience_s = measure_s + START_S
+    source = await stack.enter_async_context(Peer(program, source_domain, deadline_s=patience_s))
+    sink = await stack.enter_async_context(Peer(program, target_domain, deadline_s=patience_s))
+    for name, kind in _DDS.items():
+        topic = f"rt/bench/{name} {kind} reliable"
+        await source.do(f"pub {name} {topic} depth={DEPTHS[f'/bench/{name}']}")
+        await sink.do(f"sub {name} {topic} quiet depth={DEPTHS[f'/bench/{name}']}")
+    pids = [each.process.pid for each in await _between(children, system, source_domain, target_domain)]
+
+    async def matched() -> None:
+        for name in _DDS:
+            await source.line(f"matched {name} 1")
+            await sink.line(f"matched {name} 1")
+
+    await within(matched(), START_S, "the Fast DDS peers did not find each other")
+    # A daemon says that somebody wants a topic some time after it is there.
+    await asyncio.sleep(1.0)
+    before_s, began_s = shared.cpu_s(pids), time.monotonic()
+    for name, body in bodies.items():
+        await source.do(f"flood {name} {body} {RATES_HZ[name]} {round(RATES_HZ[name] * measure_s)}")
+
+    async def flooded() -> None:
+        for name in bodies:
+            await source.line(f"flooded {name}")
+
+    await within(flooded(), patience_s, "not everything could be published")
+    took_s = time.monotonic() - began_s
+    found: Figures = {}
+    for name, rate_hz in RATES_HZ.items():
+        expected = round(rate_hz * measure_s)
+        delays_ms = await _delays_ms(sink, name, expected)
+        settled = sorted(delays_ms[round(len(delays_ms) * WARM_SHARE) :])
+        if not settled:
+            raise SernError(f"nothing of {name} arrived")
+        found[f"{name}_p50_ms"] = statistics.median(settled)
+        found[f"{name}_p99_ms"] = settled[int(0.99 * (len(settled) - 1))]
+        found[f"{name}_lost"] = expected - len(delays_ms)
+    # A bridge that is behind works on after the last message is published: that counts as well.
+    return {**found, "cpu_percent": 100 * (shared.cpu_s(pids) - before_s) / took_s}
+
+
+async def _measured(system: str, program: Path, measure_s: float) -> Figures:
+    try:
+        async with shared.started() as children, AsyncExitStack() as stack:
+            return await child.beside(children, _through(children, stack, system, program, measure_s))
+    except (PeerError, SernError) as error:
+        raise SernError(f"dds, {system}: {error}") from error
+    except TimeoutError as error:
+        raise SernError(f"dds, {system}: a Fast DDS peer does not answer") from error
+
+
+def measure(system: str, program: Path, measure_s: float) -> Figures:
+    """One run of one system."""
+    return asyncio.run(_measured(system, program, measure_s))
 
 
 def bench(options: argparse.Namespace, report: common.Report) -> None:
-    """SernError where the peer cannot be built."""
+    """MissingError where the peer cannot be built."""
     if missing := missing_packages():
-        raise SernError(f"dds: needs the Debian packages {' '.join(missing)}")
+        raise MissingError(f"needs the Debian packages {' '.join(missing)}")
+    systems = list(SYSTEMS)
+    try:
+        shared.zenoh_folder()
+    except MissingError as error:
+        systems.remove(ZENOH)
+        report.note(f"dds without {ZENOH}: {error}")
     program = build_peer()
     measure_s = QUICK_S if options.quick else MEASURE_S
-    for system in SYSTEMS:
-        report.row(CASE, system, **asyncio.run(_measure(system, program, measure_s)))
+    runs = {system: partial(measure, system, program, measure_s) for system in systems}
+    found = shared.bench_rounds(report, CASE, runs, options.rounds)
     report.note("dds: reliable on both sides, messages of 700 bytes and of 1 MB between processes of this host")
-    direct = {metric: report.value(CASE, "direct", metric) for metric in ("odom_p50_ms", "odom_p99_ms", "cloud_p50_ms")}
-    for system in SYSTEMS[1:]:
-        added = {metric: report.value(CASE, system, metric) - direct[metric] for metric in direct}
-        report.note(
-            f"dds {system}: adds {added['odom_p50_ms']:.3f} ms to odometry (p50), {added['odom_p99_ms']:.3f} ms (p99), "
-            f"{added['cloud_p50_ms']:.3f} ms to clouds (p50)"
-        )
-    added_ms = report.value(CASE, "sern", "odom_p50_ms") - direct["odom_p50_ms"]
-    report.reach("dds: latency added to odometry [ms]", added_ms, 1.0)
-    report.reach("dds: odometry lost", report.value(CASE, "sern", "odom_lost"), 0)
-
-
-if __name__ == "__main__":
-    asyncio.run(_bridge(int(sys.argv[1]), int(sys.argv[2])))
+    if ZENOH in systems:
+        times = found.times(CHAIN, ZENOH, "cpu_percent")
+        report.note(f"dds {CHAIN}: {times:.1f} times the CPU of {ZENOH}, which neither encrypts nor schedules")
+    for system, where in ((CHAIN, "dds"), (ALONE, "dds, in one process")):
+        shared.reach_added(report, where, found, system, LATENCY_LIMIT_MS)
+        report.reach(f"{where}: odometry lost", found.figures(system)["odom_lost"], 0)

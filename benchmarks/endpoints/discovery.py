@@ -8,24 +8,25 @@ import argparse
 import asyncio
 import statistics
 import time
-from contextlib import ExitStack
 from typing import Final
 
-from benchmarks import common
-from benchmarks.endpoints.ros1 import Ros
-from benchmarks.endpoints.ros1_roles import HOST, ODOM, TYPES, advertise, body
+from benchmarks import child, common
+from benchmarks.endpoints.ros1 import ROSMASTER, Ros, need, running
+from benchmarks.endpoints.ros1_roles import ODOM, TYPES, advertise, body
+from benchmarks.endpoints.shared import CHAIN, HOST, within
 from sern_client.endpoints.ros1 import Ros1Endpoint, Ros1Options
 from sern_core.errors import SernError
 from sern_core.message import TopicInfo
 from sern_core.types import TopicName
 
-RUNS: Final = 30
-QUICK_RUNS: Final = 5
+TOPICS: Final = 10
+"""A round, one after the other."""
 OBSERVE_HZ: Final = 100.0
 """How often the observer asks the other master: what it adds is a few milliseconds."""
 PERIOD_S: Final = 0.01
 TIMEOUT_S: Final = 30.0
 CASE: Final = "ros1, a new topic"
+LIMIT_MS: Final = 1000.0
 
 
 class _Observer:
@@ -58,43 +59,58 @@ async def _once(source: Ros1Endpoint, observer: _Observer, topic: str) -> tuple[
     began_s = time.monotonic()
     handle = advertise(source, topic, TYPES[ODOM])
     content = bytes(body(ODOM))
-    async with asyncio.timeout(TIMEOUT_S):
+
+    async def first() -> None:
         while topic not in observer.first_s:
             handle.publish(content, 0)
             await asyncio.sleep(PERIOD_S)
-    handle.close()
-    ended_s = time.monotonic()
-    async with asyncio.timeout(TIMEOUT_S):
+
+    async def gone() -> None:
         while topic not in observer.gone_s:  # noqa: ASYNC110  the observer's events have no loop of their own
             await asyncio.sleep(PERIOD_S / 10)
+
+    await within(first(), TIMEOUT_S, f"no message of {topic} got to the other master")
+    handle.close()
+    ended_s = time.monotonic()
+    await within(gone(), TIMEOUT_S, f"{topic} was not gone from the other master")
     return observer.first_s[topic] - began_s, observer.gone_s[topic] - ended_s
 
 
-async def _measure(runs: int) -> dict[str, float]:
-    with ExitStack() as stack:
-        ros = Ros(stack)
-        master, other = ros.master(), ros.master()
-        ros.chain(master, other)
-        source, observer = Ros1Endpoint(Ros1Options(master, HOST, "source")), _Observer(other)
-        await source.start(_Nobody())
-        await observer.endpoint.start(observer)
-        try:
-            await _once(source, observer, "/bench/before/odom")  # the daemons have found each other
-            found = [await _once(source, observer, f"/bench/run{number}/odom") for number in range(runs)]
-        except TimeoutError:
-            raise SernError(f"discovery: nothing happened within {TIMEOUT_S:g} s") from None
-        finally:
-            await observer.endpoint.stop()
-            await source.stop()
-    first, gone = zip(*found, strict=True)
-    return {
-        "first_p50_ms": 1e3 * statistics.median(first), "first_max_ms": 1e3 * max(first),
-        "gone_p50_ms": 1e3 * statistics.median(gone), "gone_max_ms": 1e3 * max(gone),
-    }  # fmt: skip
+async def _topics(ros: Ros, count: int) -> list[tuple[float, float]]:
+    master, other = await ros.master(), await ros.master()
+    await ros.chain(master, other)
+    source, observer = Ros1Endpoint(Ros1Options(master, HOST, "source")), _Observer(other)
+    await source.start(_Nobody())
+    await observer.endpoint.start(observer)
+    try:
+        await _once(source, observer, "/bench/before/odom")  # the daemons have found each other
+        return [await _once(source, observer, f"/bench/run{number}/odom") for number in range(count)]
+    finally:
+        await observer.endpoint.stop()
+        await source.stop()
+
+
+async def _measure(count: int) -> list[tuple[float, float]]:
+    try:
+        async with running() as ros:
+            return await child.beside(ros.children, _topics(ros, count))
+    except SernError as error:
+        raise SernError(f"discovery: {error}") from error
 
 
 def bench(options: argparse.Namespace, report: common.Report) -> None:
-    """SernError where ROS 1 is not installed."""
-    report.row(CASE, "sern-chain", **asyncio.run(_measure(QUICK_RUNS if options.quick else RUNS)))
+    """MissingError where ROS 1 is not installed."""
+    need(ROSMASTER)
+    found = [times for _ in range(options.rounds) for times in asyncio.run(_measure(TOPICS))]
+    first_s, gone_s = zip(*found, strict=True)
+    report.row(
+        CASE,
+        CHAIN,
+        first_p50_ms=1e3 * statistics.median(first_s),
+        first_max_ms=1e3 * max(first_s),
+        gone_p50_ms=1e3 * statistics.median(gone_s),
+        gone_max_ms=1e3 * max(gone_s),
+    )
+    report.note(f"discovery: {len(found)} topics, {TOPICS} after each start of the daemons")
     for what in ("first", "gone"):
-        report.reach(f"discovery: {what}, the slowest [ms]", report.value(CASE, "sern-chain", f"{what}_max_ms"), 1000)
+        report.reach(f"discovery: {what}, the slowest [ms]", report.value(CASE, CHAIN, f"{what}_max_ms"), LIMIT_MS)

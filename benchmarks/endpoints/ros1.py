@@ -2,245 +2,259 @@
 
 A source publishes odometry (1 kHz) and clouds (1 MB at 20 Hz); a sink takes both behind the bridge.
 
-    direct         no bridge: what the source, the sink and loopback take
-    sern           two endpoints in one process, between two masters
-    sern-chain     sern-client, sern-relay, sern-client (CURVE), between two masters
-    topic_tools    one `relay` a topic, C++, at one master
-    rospy          one process, AnyMsg in and out, at one master
+    direct           no bridge: what the source, the sink and loopback take
+    sern-chain       what a user runs: sern-client, sern-relay, sern-client (CURVE), between two masters
+    sern-in-process  two endpoints in one process, between two masters: what the endpoints alone cost
+    topic_tools      one `relay` a topic, C++, at one master
+    rospy            one process, AnyMsg in and out, at one master
+    rospy+zenoh      two processes joined by zenoh (TCP), each a rospy node, AnyMsg, between two masters
 
-The latter two cannot join two masters; that is to their advantage. CPU is that of the processes in between. Source and
-sink are on one CPU, because clocks of different CPUs may differ by microseconds.
+topic_tools and rospy cannot join two masters, and only the chain encrypts, schedules and acknowledges: all that is to
+the others' advantage. CPU is that of all processes in between. Source and sink are on one CPU, because clocks of
+different CPUs may differ by microseconds.
 """
 
 import argparse
-import json
+import asyncio
 import os
-import socket
-import subprocess
-import sys
-import tempfile
 import time
-from collections.abc import Iterable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from functools import partial
 from pathlib import Path
-from typing import Any, Final
-from xmlrpc.client import ServerProxy
+from typing import Final
 
-from benchmarks import common
-from benchmarks.endpoints.ros1_roles import CLOUD, HOST, ODOM, TYPES
+from benchmarks import child, common
+from benchmarks.common import MissingError
+from benchmarks.endpoints import shared
+from benchmarks.endpoints.ros1_roles import CLOUD, ODOM, TYPES
+from benchmarks.endpoints.shared import ALONE, CHAIN, DIRECT, HOST, START_S, Figures, said, within
+from sern_client.endpoints.ros1.xmlrpc import CallError, XmlRpcClient
 from sern_core.errors import SernError
-from sern_core.types import ClientName
-from sern_runtime.keys import PublicKey, PublicKeys, generate, write_public, write_secret
+from sern_tools.ports import free_ports
+from sern_tools.processes import Child, Children
 
 WARM_S: Final = 2.0
 MEASURE_S: Final = 8.0
 QUICK_S: Final = 2.0
-START_S: Final = 30.0
 TOPICS: Final = 300
 MIXED: Final = (1000.0, 1_000_000, 20.0)
 FAST: Final = (3000.0, 0, 0.0)
-CASES: Final = {"1 kHz + 20 MB/s": MIXED, "3 kHz": FAST}
-SYSTEMS: Final = ("direct", "sern", "sern-chain", "topic_tools", "rospy")
+CASES: Final = {"ros1 1 kHz + 20 MB/s": MIXED, "ros1 3 kHz": FAST}
+MANY: Final = f"ros1 {TOPICS} topics, none wanted"
+TOPIC_TOOLS, ROSPY, ZENOH = "topic_tools", "rospy", "rospy+zenoh"
+SYSTEMS: Final = (DIRECT, CHAIN, ALONE, TOPIC_TOOLS, ROSPY, ZENOH)
+LATENCY_LIMIT_MS: Final = 0.5
+CPU_LIMIT: Final = 0.7
+"""Times the CPU of the rospy bridge."""
+FOLLOW_LIMIT_PERCENT: Final = 2.0
 
-_ROOT: Final = Path(__file__).resolve().parents[2]
-_ROSPY: Final = f"""
-import rospy, sys, nav_msgs.msg, sensor_msgs.msg
-rospy.init_node("rospy_bridge", disable_rosout=True)
-for topic, kind in (("{ODOM}", nav_msgs.msg.Odometry), ("{CLOUD}", sensor_msgs.msg.PointCloud2)):
-    out = rospy.Publisher(topic + "_copy", kind, queue_size=1000, tcp_nodelay=True)
-    rospy.Subscriber(topic, rospy.AnyMsg, out.publish, queue_size=1000, tcp_nodelay=True, buff_size=4_000_000)
-rospy.spin()
-"""
+DEBIAN_PYTHON: Final = "/usr/bin/python3"
+"""What Debian's rospy is for."""
+ROSMASTER: Final = "/usr/bin/rosmaster"
+RELAY: Final = "/usr/lib/topic_tools/relay"
+_DEBIAN: Final = "/usr/lib/python3/dist-packages"
+_ROSPY: Final = (f"{_DEBIAN}/rospy", f"{_DEBIAN}/nav_msgs", f"{_DEBIAN}/sensor_msgs")
+PACKAGES: Final = {
+    ROSMASTER: "python3-rosmaster",
+    RELAY: "topic-tools",
+    **dict(zip(_ROSPY, ("python3-rospy", "python3-nav-msgs", "python3-sensor-msgs"), strict=True)),
+}
+NEEDS: Final = {TOPIC_TOOLS: (RELAY,), ROSPY: _ROSPY, ZENOH: _ROSPY}
+"""What a system cannot be measured without."""
+_TOPICS: Final = [f"{topic}={type_name}" for topic, type_name in TYPES.items()]
+
+
+def need(*paths: str) -> None:
+    """MissingError naming the Debian packages of those that are not there."""
+    if missing := [PACKAGES[path] for path in paths if not Path(path).exists()]:
+        raise MissingError(f"needs the Debian packages {' '.join(missing)}")
 
 
 class Ros:
-    """Masters and processes of one run; all end with the context."""
+    """Masters and processes of one run."""
 
-    def __init__(self, stack: ExitStack) -> None:
-        self._stack = stack
+    def __init__(self, children: Children) -> None:
+        self.children = children
         self.masters: list[int] = []
         """Their process ids."""
-        self.directory = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="sern-bench-")))
 
-    def spawn(self, *command: str, master: str = "", out: int = subprocess.DEVNULL) -> subprocess.Popen[str]:
-        environment = {key: value for key, value in os.environ.items() if not key.startswith("ROS_")}
-        environment |= {"ROS_MASTER_URI": master, "ROS_IP": HOST, "ROS_HOME": str(self.directory)}
-        if command[0] != sys.executable:
-            environment.pop("PYTHONPATH", None)
-        process = subprocess.Popen(
-            command, env=environment, cwd=_ROOT, stdout=out, stderr=subprocess.DEVNULL, text=True
-        )
-        self._stack.callback(_end, process)
+    def environment(self, master: str) -> dict[str, str | None]:
+        """What a program at `master` gets; what this shell has set for ROS, or for our Python, does not count."""
+        ours = (name for name in os.environ if name.startswith("ROS_") or name == "PYTHONPATH")
+        home = str(self.children.directory)
+        return {**dict.fromkeys(ours), "ROS_MASTER_URI": master, "ROS_IP": HOST, "ROS_HOME": home}
+
+    async def start(self, name: str, *command: str, master: str) -> Child:
+        """A program that is no part of the project."""
+        return await self.children.start(name, command, environment=self.environment(master))
+
+    async def role(self, role: str, *arguments: object) -> Child:
+        """A process of `ros1_roles`."""
+        command = child.python("-m", "benchmarks.endpoints.ros1_roles", role, *map(str, arguments))
+        environment = {**self.environment(""), **child.environment()}
+        return await self.children.start(role, command, talks=True, environment=environment)
+
+    async def rospy(self, role: str, master: str, *arguments: str) -> Child:
+        """A process of `rospy_roles`, which is ready."""
+        environment = {**self.environment(master), "PYTHONPATH": str(child.ROOT)}
+        command = [DEBIAN_PYTHON, "-m", "benchmarks.endpoints.rospy_roles", role, *arguments, *_TOPICS]
+        process = await self.children.start(f"rospy-{role}", command, talks=True, environment=environment)
+        await within(said(process, "ready"), START_S, f"rospy-{role} was not ready")
         return process
 
-    def role(self, *arguments: object) -> subprocess.Popen[str]:
-        words = [str(argument) for argument in arguments]
-        return self.spawn(
-            sys.executable, "-P", "-m", "benchmarks.endpoints.ros1_roles", *words, out=subprocess.PIPE
-        )  # fmt: skip
-
-    def master(self) -> str:
-        port = _free_port()
+    async def master(self) -> str:
+        """The URI of a new master, which answers."""
+        port = free_ports(1)[0]
         uri = f"http://{HOST}:{port}"
-        self.masters.append(self.spawn("/usr/bin/rosmaster", "--core", "-p", str(port), master=uri).pid)
-        deadline_s = time.monotonic() + START_S
-        while True:
-            try:
-                with ServerProxy(uri) as proxy:
-                    proxy.getPid("/bench")
-                return uri
-            except OSError:
-                if time.monotonic() > deadline_s:
-                    raise SernError(f"no rosmaster at {uri} within {START_S:g} s") from None
-                time.sleep(0.02)
+        name = f"master{len(self.masters)}"
+        process = await self.start(name, ROSMASTER, "--core", "-p", str(port), master=uri)
+        self.masters.append(process.process.pid)
+        client = XmlRpcClient(uri)
 
-    def chain(self, master: str, other: str) -> list[subprocess.Popen[str]]:
-        """A relay and two clients, with keys and nothing else set that a user would not."""
-        (self.directory / "clients").mkdir()
-        relay = f"tcp://{HOST}:{_free_port()}"
-        for name, public in (("relay", "relay.pub"), ("robot1", "clients/robot1.pub"), ("site", "clients/site.pub")):
-            pair = generate(ClientName(name))
-            write_secret(self.directory / f"{name}.key", pair)
-            write_public(self.directory / public, PublicKeys(pair.name, (PublicKey(pair.public_key),)))
-        access = [{"client": ".*", "publish": [".*"], "subscribe": [".*"]}]
-        self._write("relay", {
-            "relay": {"name": "relay", "listen": [relay], "secret_key_file": "relay.key", "clients_dir": "clients"},
-            "access": access,
-        })  # fmt: skip
-        rules = [
-            {"match": ".*/odom", "class": "control", "depth": 1000},
-            {"match": ".*/cloud", "class": "bulk", "depth": 10},
-        ]
-        for name, uri, patterns in (("robot1", master, []), ("site", other, ["/bench/.*"])):
-            self._write(name, {
-                "client": {"name": name, "namespace": "/"},
-                "relay": {"endpoint": relay, "server_key_file": "relay.pub", "secret_key_file": f"{name}.key"},
-                "endpoint": {"kind": "ros1", "master_uri": uri, "host": HOST},
-                "topics": rules, "subscribe": patterns,
-            })  # fmt: skip
-        daemons = []
-        for program, name in (("relay", "relay"), ("client", "robot1"), ("client", "site")):
-            config = str(self.directory / f"{name}.yaml")
-            daemons.append(self.spawn(sys.executable, "-P", "-m", f"sern_{program}.cli", "--config", config))
-        return daemons
+        async def answers() -> None:
+            while True:
+                try:
+                    await client.call("getPid", "/bench")
+                    return
+                except CallError:
+                    await asyncio.sleep(0.02)
 
-    def _write(self, name: str, content: dict[str, Any]) -> None:
-        (self.directory / f"{name}.yaml").write_text(json.dumps(content))  # JSON is YAML
+        await within(answers(), START_S, f"{name} did not answer at {uri}")
+        client.close()
+        return uri
+
+    async def chain(self, master: str, other: str) -> list[Child]:
+        """From one master to another."""
+        endpoints = {
+            name: {"kind": "ros1", "master_uri": uri, "host": HOST}
+            for name, uri in ((shared.ROBOT, master), (shared.SITE, other))
+        }
+        return await shared.start_chain(self.children, endpoints, self.environment(""))
+
+    async def zenoh(self, master: str, other: str) -> list[Child]:
+        """From one master to another."""
+        to = [str(shared.zenoh_folder()), f"tcp/{HOST}:{free_ports(1)[0]}"]
+        listener = await self.rospy("from-zenoh", other, *to)
+        return [listener, await self.rospy("to-zenoh", master, *to)]
 
 
-@contextmanager
-def _ros() -> Iterator[Ros]:
-    with ExitStack() as stack:
-        yield Ros(stack)
+@asynccontextmanager
+async def running() -> AsyncIterator[Ros]:
+    async with shared.started() as children:
+        yield Ros(children)
 
 
-def _end(process: subprocess.Popen[str]) -> None:
-    if process.poll() is None:
-        process.kill()
-    process.wait()
-    if process.stdout is not None:
-        process.stdout.close()
+async def _through(ros: Ros, system: str, load: tuple[float, int, float], measure_s: float) -> Figures:
+    master = await ros.master()
+    other, suffix = master, ""
+    await said(await ros.role("source", master, *load), "ready")
+    between: list[Child] = []
+    if system in (CHAIN, ALONE, ZENOH):
+        other = await ros.master()
+    if system == CHAIN:
+        between = await ros.chain(master, other)
+    elif system == ALONE:
+        between = [await ros.role("bridge", master, other)]
+    elif system == ZENOH:
+        between = await ros.zenoh(master, other)
+    elif system != DIRECT:
+        suffix = "_copy"
+        if system == ROSPY:
+            between = [await ros.rospy("copy", master, suffix)]
+        else:
+            between = [
+                await ros.start(f"relay{number}", RELAY, topic, topic + suffix,
+                                f"__name:=relay{number}", master=master)
+                for number, topic in enumerate(TYPES)
+            ]  # fmt: skip
+    sink = await ros.role("sink", other, ODOM + suffix, CLOUD + suffix if load[2] else "", WARM_S, measure_s)
+    await within(said(sink, "begin"), START_S + WARM_S, "not every topic got through")
+    pids = [process.process.pid for process in between]
+    before_s, began_s = shared.cpu_s(pids), time.monotonic()
+    await said(sink, "end")
+    used_s, took_s = shared.cpu_s(pids) - before_s, time.monotonic() - began_s
+    found: Figures = await said(sink, "found")
+    return {**found, "cpu_percent": 100 * used_s / took_s}
 
 
-def _free_port() -> int:
-    with socket.socket() as sock:
-        sock.bind((HOST, 0))
-        return int(sock.getsockname()[1])
+async def _measured(system: str, load: tuple[float, int, float], measure_s: float) -> Figures:
+    try:
+        async with running() as ros:
+            return await child.beside(ros.children, _through(ros, system, load, measure_s))
+    except SernError as error:
+        raise SernError(f"ros1, {system}: {error}") from error
 
 
-def _line(process: subprocess.Popen[str], word: str) -> Any:
-    """The value of `word` in the next line that has it."""
-    assert process.stdout is not None
-    for line in process.stdout:
-        content = json.loads(line)
-        if "problem" in content:
-            raise SernError(f"the benchmark's sink was refused: {content['problem']}")
-        if word in content:
-            return content[word]
-    raise SernError(f"a process of the benchmark ended with {process.wait()} before it said {word!r}")
+def measure(system: str, load: tuple[float, int, float], measure_s: float) -> Figures:
+    """One run of one system under one load: odometry in Hz, clouds in bytes and in Hz."""
+    return asyncio.run(_measured(system, load, measure_s))
 
 
-def cpu_s(pids: Iterable[int]) -> float:
-    """CPU time of all threads of these processes, in the kernel's nanoseconds rather than in ticks of 10 ms."""
-    files = (path for pid in pids for path in Path(f"/proc/{pid}/task").glob("*/schedstat"))
-    return sum(int(path.read_text().split()[0]) for path in files) / 1e9
+async def _found_many(ros: Ros, measure_s: float) -> Figures:
+    master = await ros.master()
+    await said(await ros.role("many", master, TOPICS), "ready")
+    follower = await ros.role("follow", master, TOPICS)
+    found_s = float(await within(said(follower, "found_s"), START_S, f"{TOPICS} topics were not found"))
+    await asyncio.sleep(WARM_S)
+    pids = [follower.process.pid]
+    before_s, master_s, began_s = shared.cpu_s(pids), shared.cpu_s(ros.masters), time.monotonic()
+    await asyncio.sleep(measure_s)
+    used_s, asked_s = shared.cpu_s(pids) - before_s, shared.cpu_s(ros.masters) - master_s
+    share = 100 / (time.monotonic() - began_s)
+    return {"found_s": found_s, "cpu_percent": share * used_s, "master_cpu_percent": share * asked_s}
 
 
-def measure(system: str, load: tuple[float, int, float], measure_s: float) -> dict[str, float]:
-    """One run of one system under one load."""
-    with _ros() as ros:
-        master = ros.master()
-        other, suffix = master, ""
-        source = ros.role("source", master, *load)
-        _line(source, "ready")
-        between: list[subprocess.Popen[str]] = []
-        match system:
-            case "sern":
-                other = ros.master()
-                between = [ros.role("bridge", master, other)]
-            case "sern-chain":
-                other = ros.master()
-                between = ros.chain(master, other)
-            case "topic_tools":
-                suffix = "_copy"
-                between = [
-                    ros.spawn("/usr/lib/topic_tools/relay", topic, topic + suffix, f"__name:=relay{number}",
-                              master=master)
-                    for number, topic in enumerate(TYPES)
-                ]  # fmt: skip
-            case "rospy":
-                suffix = "_copy"
-                between = [ros.spawn("/usr/bin/python3", "-c", _ROSPY, master=master)]
-        sink = ros.role("sink", other, ODOM + suffix, CLOUD + suffix if load[2] else "", WARM_S, measure_s)
-        _line(sink, "begin")
-        pids = [process.pid for process in between]
-        before_s, began_s = cpu_s(pids), time.monotonic()
-        _line(sink, "end")
-        used_s, took_s = cpu_s(pids) - before_s, time.monotonic() - began_s
-        found: dict[str, float] = _line(sink, "found")
-        return {**found, "cpu_percent": 100 * used_s / took_s}
+async def _follow(measure_s: float) -> Figures:
+    try:
+        async with running() as ros:
+            return await child.beside(ros.children, _found_many(ros, measure_s))
+    except SernError as error:
+        raise SernError(f"{MANY}: {error}") from error
 
 
-def _follow(measure_s: float) -> dict[str, float]:
-    with _ros() as ros:
-        master = ros.master()
-        _line(ros.role("many", master, TOPICS), "ready")
-        follower = ros.role("follow", master, TOPICS)
-        found_s = float(_line(follower, "found_s"))
-        time.sleep(WARM_S)
-        before_s, master_s, began_s = cpu_s([follower.pid]), cpu_s(ros.masters), time.monotonic()
-        time.sleep(measure_s)
-        used_s, asked_s = cpu_s([follower.pid]) - before_s, cpu_s(ros.masters) - master_s
-        share = 100 / (time.monotonic() - began_s)
-        return {"found_s": found_s, "cpu_percent": share * used_s, "master_cpu_percent": share * asked_s}
+async def _try_zenoh() -> None:
+    """MissingError when zenoh is not here, or Debian's Python cannot use what is."""
+    folder = shared.zenoh_folder()
+    program = f"import sys; sys.path.append({str(folder)!r}); import zenoh; print('{{}}')"
+    try:
+        async with shared.started() as children:
+            process = await children.start("zenoh", [DEBIAN_PYTHON, "-I", "-c", program], talks=True)
+            await process.read_object()
+    except SernError as error:
+        raise MissingError(f"{DEBIAN_PYTHON} cannot use the zenoh of this environment ({error})") from None
 
 
 def bench(options: argparse.Namespace, report: common.Report) -> None:
-    """SernError where ROS 1 is not installed."""
-    for path, package in (
-        ("/usr/bin/rosmaster", "python3-rosmaster"),
-        ("/usr/lib/topic_tools/relay", "topic-tools"),
-        ("/usr/lib/python3/dist-packages/rospy", "python3-rospy"),
-        ("/usr/lib/python3/dist-packages/sensor_msgs", "python3-sensor-msgs"),
-    ):
-        if not Path(path).exists():
-            raise SernError(f"ros1: needs the Debian package {package}")
+    """MissingError where ROS 1 is not installed."""
+    need(ROSMASTER)
+    systems = list(SYSTEMS)
+    for system, paths in NEEDS.items():
+        try:
+            need(*paths)
+            if system == ZENOH:
+                asyncio.run(_try_zenoh())
+        except MissingError as error:
+            systems.remove(system)
+            report.note(f"ros1 without {system}: {error}")
     measure_s = QUICK_S if options.quick else MEASURE_S
-    for case, load in CASES.items():
-        for system in SYSTEMS:
-            report.row(f"ros1 {case}", system, **measure(system, load, measure_s))
-    report.row(f"ros1 {TOPICS} topics, none wanted", "sern", **_follow(measure_s))
+    mixed, fast = (
+        shared.bench_rounds(report, case, {name: partial(measure, name, load, measure_s) for name in systems},
+                            options.rounds)
+        for case, load in CASES.items()
+    )  # fmt: skip
+    report.row(
+        MANY, "sern-endpoint", **common.medians([asyncio.run(_follow(measure_s)) for _ in range(options.rounds)])
+    )
     report.note("ros1: source and sink pinned to one CPU, the bridges to none; messages between processes of this host")
-    mixed, fast = (f"ros1 {case}" for case in CASES)
-    direct_ms = report.value(mixed, "direct", "odom_p50_ms")
-    for system in SYSTEMS[1:]:
-        report.note(
-            f"ros1 {system}: adds {report.value(mixed, system, 'odom_p50_ms') - direct_ms:.3f} ms to odometry (p50), "
-            f"{report.value(mixed, system, 'odom_p99_ms') - report.value(mixed, 'direct', 'odom_p99_ms'):.3f} ms (p99)"
-        )
-    sern_cpu = report.value(mixed, "sern", "cpu_percent")
-    report.reach("ros1: latency added to odometry [ms]", report.value(mixed, "sern", "odom_p50_ms") - direct_ms, 0.5)
-    report.reach("ros1: CPU beside the rospy bridge", sern_cpu / report.value(mixed, "rospy", "cpu_percent"), 0.7)
-    report.reach("ros1: lost at 3 kHz", report.value(fast, "sern", "odom_lost"), 0)
-    follow = report.value(f"ros1 {TOPICS} topics, none wanted", "sern", "cpu_percent")
-    report.reach(f"ros1: CPU with {TOPICS} topics [%]", follow, 2.0)
+    if ZENOH in systems:
+        times = mixed.times(CHAIN, ZENOH, "cpu_percent")
+        report.note(f"ros1 {CHAIN}: {times:.1f} times the CPU of {ZENOH}, which neither encrypts nor schedules")
+    for system, where in ((CHAIN, "ros1"), (ALONE, "ros1, in one process")):
+        shared.reach_added(report, where, mixed, system, LATENCY_LIMIT_MS)
+        if ROSPY in systems:
+            times = mixed.times(system, ROSPY, "cpu_percent")
+            report.reach(f"{where}: CPU beside the rospy bridge", times, CPU_LIMIT)
+        report.reach(f"{where}: lost at 3 kHz", fast.figures(system)["odom_lost"], 0)
+    follow = report.value(MANY, "sern-endpoint", "cpu_percent")
+    report.reach(f"ros1, one endpoint: CPU with {TOPICS} topics [%]", follow, FOLLOW_LIMIT_PERCENT)

@@ -9,13 +9,14 @@ import json
 import statistics
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Final
 
 import numpy as np
 import uvloop
 
 from benchmarks import common
+from benchmarks.endpoints.shared import HOST
 from sern_client.endpoints.ros1 import Ros1Endpoint, Ros1Options
 from sern_client.endpoints.ros1.frames import Frames
 from sern_client.endpoints.ros1.header import BRIDGE_FIELD, encode_header
@@ -26,7 +27,6 @@ from sern_core.message import TopicInfo
 from sern_core.types import Encoding, TopicName
 from sern_runtime import ros_types
 
-HOST: Final = "127.0.0.1"
 ODOM, CLOUD = "/bench/odom", "/bench/cloud"
 TYPES: Final = {ODOM: "nav_msgs/msg/Odometry", CLOUD: "sensor_msgs/msg/PointCloud2"}
 
@@ -131,33 +131,43 @@ async def _connect(master: XmlRpcClient, topic: str) -> _Sink:
         return sink
 
 
+def figures(name: str, noted: Sequence[tuple[int, int]]) -> dict[str, float]:
+    """What came of a topic, from the (number, latency in ns) of each message. Lost is what is missing between the least
+    and the largest number. Where nothing came there is neither latency nor loss to tell."""
+    if not noted:
+        return {f"{name}_received": 0}
+    lags_ms = sorted(lag_ns / 1e6 for _, lag_ns in noted)
+    numbers = [number for number, _ in noted]
+    return {
+        f"{name}_p50_ms": statistics.median(lags_ms),
+        f"{name}_p99_ms": lags_ms[int(len(lags_ms) * 0.99)],
+        f"{name}_received": len(noted),
+        f"{name}_lost": max(numbers) - min(numbers) + 1 - len(set(numbers)),
+    }
+
+
 async def sink(master_uri: str, odom: str, cloud: str, warm_s: float, measure_s: float) -> None:
-    """Measures for a while, and says when that begins and what was found. `cloud` may be empty."""
+    """Measures for a while, and says when that begins and what was found; then it waits to be ended. `cloud` may be
+    empty."""
     master = XmlRpcClient(master_uri)
     # Topics may appear with their first message, which the source sends when both have a subscriber.
     topics = [topic for topic in (odom, cloud) if topic]
     sinks = dict(zip(topics, await asyncio.gather(*(_connect(master, topic) for topic in topics)), strict=True))
     master.close()
     first = sinks[odom]
-    await until(lambda: bool(first.noted))
+    await until(lambda: all(each.noted for each in sinks.values()))
     await asyncio.sleep(warm_s)
     for each in sinks.values():
         each.noted.clear()
     say(begin=True)
     await asyncio.sleep(measure_s)
     say(end=True)
-    found: dict[str, float] = {}
-    for name, each in zip(("odom", "cloud"), sinks.values(), strict=False):
-        noted = each.noted[:]
-        lags = sorted(lag_ns / 1e6 for _, lag_ns in noted)
-        numbers = [number for number, _ in noted]
-        found[f"{name}_p50_ms"] = statistics.median(lags)
-        found[f"{name}_p99_ms"] = lags[int(len(lags) * 0.99)]
-        found[f"{name}_received"] = len(noted)
-        found[f"{name}_lost"] = max(numbers) - min(numbers) + 1 - len(set(numbers))
-    say(found=found)
-    for each in sinks.values():
-        each.close()
+    if first.noted:
+        found = [figures(name, each.noted) for name, each in zip(("odom", "cloud"), sinks.values(), strict=False)]
+        say(found={metric: value for each in found for metric, value in each.items()})
+    else:
+        say(problem=f"nothing of {odom} arrived in {measure_s:g} s")
+    await asyncio.Event().wait()
 
 
 class _Forward(_Nothing):

@@ -9,10 +9,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
+from benchmarks import child
 from sern_core.errors import SernError
 
-ROOT: Final = Path(__file__).resolve().parents[2]
-"""The checkout: `benchmarks` is not installed."""
 STOP_S: Final = 20.0
 """Time for a process to end when it is told to."""
 LAST_LINES: Final = 4
@@ -21,9 +20,8 @@ _CPU_CLOCK: Final = 2
 
 
 def environment() -> dict[str, str]:
-    """For a child that imports `benchmarks`, also where PYTHONSAFEPATH keeps the working directory out of the path."""
-    paths = [str(ROOT), os.environ.get("PYTHONPATH", "")]
-    return {**os.environ, "PYTHONPATH": os.pathsep.join(path for path in paths if path)}
+    """All variables of a child of this interpreter."""
+    return {**os.environ, **child.environment()}
 
 
 def last_words(log: Path) -> str:

@@ -4,13 +4,13 @@ import os
 import socket
 import time
 from contextlib import suppress
-from multiprocessing import Pipe, get_context
+from multiprocessing import Pipe
 from multiprocessing.connection import Connection
 from struct import Struct
-from typing import Any, Final, Self
+from typing import Final, Self
 
+from benchmarks.child import Worker
 from benchmarks.link.sern import RELAY_PORT
-from sern_core.errors import SernError
 from sern_runtime.seal import UDP_PAYLOAD_BYTES
 from sern_tools.lab.host import inside
 from sern_tools.lab.lab import Node
@@ -24,34 +24,29 @@ class Junk:
 
     def __init__(self, node: Node, seconds: float) -> None:
         self._ours, self._far = Pipe()
-        self._process = get_context("spawn").Process(
-            target=_flood, args=(node.namespace, seconds, self._far), daemon=True
-        )
+        self._worker = Worker("the source of junk", _flood, node.namespace, seconds, self._far)
 
     def __enter__(self) -> Self:
-        self._process.start()
-        self._far.close()  # so that its end is the end of the pipe
-        self._hear()  # it is ready
+        try:
+            self._worker.start()
+            self._far.close()  # the worker's copy alone keeps it open
+            self._worker.hear(self._ours)  # it is ready
+        except BaseException:
+            self.__exit__()
+            raise
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._process.kill()
-        self._process.join()
+        self._worker.end(patient=False)
         self._ours.close()
 
     def begin(self, session_id: int) -> None:
-        self._ours.send(session_id)
+        with suppress(ConnectionError):  # it has ended; `rate_hz` says so
+            self._ours.send(session_id)
 
     def rate_hz(self) -> float:
-        """What it came to; waits for its end. Raises SernError when it has failed."""
-        return float(self._hear())
-
-    def _hear(self) -> Any:
-        try:
-            return self._ours.recv()
-        except EOFError as error:
-            self._process.join()
-            raise SernError(f"the sender of junk ended with exit status {self._process.exitcode}") from error
+        """What it came to; waits for its end. SernError when it failed."""
+        return float(self._worker.hear(self._ours))
 
 
 def _flood(namespace: str, seconds: float, told: Connection) -> None:

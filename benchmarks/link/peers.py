@@ -1,6 +1,5 @@
 """What SERN is measured beside: a bare datagram (the floor), plain ZeroMQ, zenoh, rospy. Each has two ends."""
 
-import json
 import os
 import socket
 import sys
@@ -12,6 +11,7 @@ from typing import Any, Final
 import zmq
 
 from benchmarks.link.load import Kind, Load, Log, Orders, Spec, offer, ready
+from benchmarks.zenoh_session import open_session
 
 PORT: Final = 7447
 POLL_S: Final = 0.02
@@ -102,25 +102,10 @@ def zmq_receiver(spec: Spec, load: Load, orders: Orders, log: Log) -> dict[str, 
 
 def _zenoh_session(spec: Spec, *, listens: bool) -> Any:
     """A peer; with two links, the urgent half of the priorities has one for itself."""
-    import zenoh
-
     ends = [f"tcp/{spec.address if not listens else '0.0.0.0'}:{PORT}"]
     if spec.system != "zenoh":
         ends = [f"{ends[0]}?prio=0-3", f"{ends[0][:-1]}{PORT % 10 + 1}?prio=4-7"]
-    config = zenoh.Config()
-    settings: dict[str, object] = {
-        "mode": "peer",
-        "scouting/multicast/enabled": False,
-        "scouting/gossip/enabled": False,
-        "transport/shared_memory/enabled": False,  # it would pass by the link
-        "transport/unicast/max_links": len(ends),
-        "listen/endpoints" if listens else "connect/endpoints": ends,
-    }
-    if not listens:
-        settings["listen/endpoints"] = []
-    for key, value in settings.items():
-        config.insert_json5(key, json.dumps(value))
-    return zenoh.open(config)
+    return open_session(ends, listens=listens)
 
 
 def zenoh_sender(spec: Spec, load: Load, orders: Orders, log: Log) -> dict[str, Any]:

@@ -15,15 +15,15 @@ from typing import Any, Final, NamedTuple
 
 import psutil
 
+from benchmarks import child
 from benchmarks.link import peers
 from benchmarks.link.children import Running, environment
 from benchmarks.link.forwarder import FORWARDER, Hops
 from benchmarks.link.load import Load, Records, Spec, read_log
 from benchmarks.link.sern import RELAY_PORT
 from sern_core.errors import SernError
-from sern_core.types import ClientName
-from sern_runtime.keys import PublicKey, PublicKeys, generate, write_public, write_secret
 from sern_sim.models import LinkModel
+from sern_tools.keygen import make_keys
 from sern_tools.lab.backends import DEVICE, NETWORK, PREFIX
 from sern_tools.lab.host import run as run_command
 from sern_tools.lab.lab import Lab, Node
@@ -92,7 +92,7 @@ def run(
     running = Running(directory, system)
     try:
         if system.startswith("sern"):
-            make_keys(directory)
+            make_keys(directory, "relay", "robot", "site")
             running.ends["relay"] = start_relay(lab, directory, udp=system == "sern-udp")
         if system == FORWARDER:
             running.ends["relay"] = _start_forwarder(lab, directory)
@@ -139,16 +139,6 @@ def run(
     )
 
 
-def make_keys(directory: Path) -> None:
-    clients = directory / "clients"
-    clients.mkdir()
-    for name in ("relay", "robot", "site"):
-        pair = generate(ClientName(name))
-        public = PublicKeys(pair.name, (PublicKey(pair.public_key),))
-        write_secret(directory / f"{name}.key", pair)
-        write_public((directory if name == "relay" else clients) / f"{name}.pub", public)
-
-
 def start_relay(lab: Lab, directory: Path, *, udp: bool) -> "subprocess.Popen[bytes]":
     """The daemon, as its user runs it."""
     content = {
@@ -166,23 +156,28 @@ def start_relay(lab: Lab, directory: Path, *, udp: bool) -> "subprocess.Popen[by
     }
     config = directory / "relay.yaml"
     config.write_text(json.dumps(content))
-    command = [sys.executable, "-P", "-m", "sern_relay.cli", "--config", str(config)]
-    return _start_daemon(lab, directory, "relay", command, os.environ)
+    return start_daemon(lab, lab.b, "relay", config)
 
 
-def _start_daemon(
-    lab: Lab, directory: Path, role: str, command: Sequence[str], environ: Mapping[str, str]
+def start_daemon(lab: Lab, node: Node, program: str, config: Path) -> "subprocess.Popen[bytes]":
+    """`program`: relay or client. Its log is beside its configuration, with the suffix .log."""
+    command = child.python("-m", f"sern_{program}.cli", "--config", str(config))
+    return _spawn(lab, node, config.with_suffix(".log"), command, environment())
+
+
+def _spawn(
+    lab: Lab, node: Node, log: Path, command: Sequence[str], environ: Mapping[str, str]
 ) -> "subprocess.Popen[bytes]":
-    """On the site's side; it is told to end by a signal."""
-    with (directory / f"{role}.log").open("wb") as log:
+    """It is told to end by a signal."""
+    with log.open("wb") as stream:
         return lab.popen(
-            lab.b,
+            node,
             command,
             env=environ,
             stdin=subprocess.DEVNULL,
-            stdout=log,
-            stderr=log,
-            cwd=directory,
+            stdout=stream,
+            stderr=stream,
+            cwd=log.parent,
             start_new_session=True,
         )
 
@@ -190,15 +185,15 @@ def _start_daemon(
 def _start_forwarder(lab: Lab, directory: Path) -> "subprocess.Popen[bytes]":
     """Start it in the relay's place."""
     Hops.draw().write(directory)
-    command = [sys.executable, "-m", "benchmarks.link.forwarder", str(directory), lab.b.address]
-    return _start_daemon(lab, directory, "relay", command, environment())
+    command = child.python("-m", "benchmarks.link.forwarder", str(directory), lab.b.address)
+    return _spawn(lab, lab.b, directory / "relay.log", command, environment())
 
 
 def _start_master(lab: Lab, running: Running) -> None:
     """Returns when it listens."""
     command = [sys.executable, "-c", peers.ROS_MASTER, "--core", "-p", str(peers.ROS_PORT)]
     names = {"ROS_MASTER_URI": f"http://{lab.b.address}:{peers.ROS_PORT}", "ROS_IP": lab.b.address}
-    running.ends["master"] = _start_daemon(lab, running.directory, "master", command, {**os.environ, **names})
+    running.ends["master"] = _spawn(lab, lab.b, running.directory / "master.log", command, {**os.environ, **names})
     give_up_s = time.monotonic() + START_S
     with lab.b.socket(socket.SOCK_STREAM) as probe:
         while probe.connect_ex((lab.b.address, peers.ROS_PORT)):
@@ -209,7 +204,7 @@ def _start_master(lab: Lab, running: Running) -> None:
 
 
 def _start(lab: Lab, node: Node, spec: Spec) -> "subprocess.Popen[bytes]":
-    command = [sys.executable, "-m", "benchmarks.link.end", json.dumps(asdict(spec))]
+    command = child.python("-m", "benchmarks.link.end", json.dumps(asdict(spec)))
     with (spec.path / f"{spec.role}.log").open("wb") as log:
         return lab.popen(
             node,

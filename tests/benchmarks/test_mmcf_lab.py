@@ -8,7 +8,6 @@ import pytest
 pytest.importorskip("psutil")
 
 from benchmarks.common import Report, half_width_95
-from benchmarks.link.runs import make_keys
 from benchmarks.mmcf_lab import LINK, ROBOT, THIN_BPS, Edge, intervals, rates_bps, robot_file, site_file, thin_scan
 from benchmarks.mmcf_replay import POLICIES, PROFILES, REAL, tabulate
 from sern_client.endpoints.clouds import read_ply
@@ -19,6 +18,7 @@ from sern_core.mmcf.model import Terms
 from sern_core.types import PriorityClass
 from sern_runtime.config.adaptation import AdaptationSection
 from sern_runtime.config.client import load_client
+from sern_tools.keygen import make_keys
 from sern_tools.message_log import Delivery, Offer, TopicLog
 from tests.daemons import recording
 
@@ -136,7 +136,7 @@ def test_a_thinned_scan_holds_every_nth_point(tmp_path: Path, columns: int) -> N
 
 def test_the_files_are_configurations_of_clients(tmp_path: Path) -> None:
     recording(REAL[0].name)
-    make_keys(tmp_path)
+    make_keys(tmp_path, "relay", "robot", "site")
     scan = tmp_path / "scan.ply"
     thin_scan(recording(REAL[1].name), scan, 1000)
     section = AdaptationSection.model_validate({"policy": "fixed_reliability", "profile": "mapping"})

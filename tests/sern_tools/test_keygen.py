@@ -34,6 +34,20 @@ def test_nothing_is_overwritten_unasked(tmp_path: Path) -> None:
         keygen.run_keygen("relay", "hub", out=tmp_path / "hub.pub" / "x")
 
 
+def test_the_keys_of_a_whole_system(tmp_path: Path) -> None:
+    keygen.make_keys(tmp_path / "new", "hub", "robot1", "site")
+    found = sorted(str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*.*"))
+    pairs = ["new/hub.key", "new/hub.pub", "new/robot1.key", "new/site.key"]
+    assert found == ["new/clients/robot1.pub", "new/clients/site.pub", *pairs]
+    for name, public in (("hub", "hub.pub"), ("robot1", "clients/robot1.pub"), ("site", "clients/site.pub")):
+        theirs = keys.load_public(tmp_path / "new" / public)
+        mine = keys.load_secret(tmp_path / "new" / f"{name}.key")
+        assert (theirs.name, [key.key for key in theirs.keys]) == (name, [mine.public_key])
+    with pytest.raises(UsageError, match="client name 'Site' must be"):
+        keygen.make_keys(tmp_path / "bad", "hub", "Site")
+    assert not (tmp_path / "bad").exists()
+
+
 def test_command_line_alone_and_inside_another(tmp_path: Path) -> None:
     outer = typer.Typer()
     outer.add_typer(keygen.app, name="keygen")

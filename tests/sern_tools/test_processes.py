@@ -104,6 +104,34 @@ async def test_a_child_that_ends_by_itself_is_an_error_with_its_last_words(tmp_p
             await talker.ask("go")
 
 
+async def test_of_a_traceback_the_error_remains(tmp_path: Path) -> None:
+    code = """
+import sys
+print("a warning", file=sys.stderr)
+try:
+    raise KeyError("first")
+except KeyError:
+    raise ValueError("no such link")
+"""
+    async with Children(tmp_path) as children:
+        child = await children.start("relay", python(code))
+        await child.process.wait()
+        with pytest.raises(SernError) as caught:
+            children.check()
+    assert str(caught.value) == "relay ended (exit status 1): ValueError: no such link"
+
+
+async def test_the_environment_is_ours_with_changes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("SERN_KEPT", "SERN_TAKEN", "SERN_CHANGED"):
+        monkeypatch.setenv(name, "ours")
+    code = "import json, os; print(json.dumps({k: v for k, v in os.environ.items() if k.startswith('SERN_')}))"
+    changes = {"SERN_TAKEN": None, "SERN_CHANGED": "theirs", "SERN_NEW": "theirs", "SERN_ABSENT": None}
+    async with Children(tmp_path) as children:
+        child = await children.start("child", python(code), talks=True, environment=changes)
+        found = await child.read_object()
+    assert found == {"SERN_KEPT": "ours", "SERN_CHANGED": "theirs", "SERN_NEW": "theirs"}
+
+
 async def test_a_child_that_dies_silently(tmp_path: Path) -> None:
     async with Children(tmp_path) as children:
         child = await children.start("relay", python("import os; os.kill(os.getpid(), 9)"))

@@ -78,10 +78,15 @@ def free_domain() -> int:
     raise AssertionError("every DDS domain of this host is in use")
 
 
-class Peer:
-    """A running peer. `said` keeps every line but the answers to commands."""
+class PeerError(AssertionError):
+    """The peer could not do what it was told, or has ended."""
 
-    def __init__(self, program: Path, domain: int) -> None:
+
+class Peer:
+    """A running peer. `said` keeps every line but the answers to commands; `deadline_s` is for whatever is awaited."""
+
+    def __init__(self, program: Path, domain: int, *, deadline_s: float = DEADLINE_S) -> None:
+        self._deadline_s = deadline_s
         self._program = program
         self._domain = domain
         self._process: asyncio.subprocess.Process | None = None
@@ -108,7 +113,7 @@ class Peer:
         assert self._process is not None and self._process.stdin is not None and self._reading is not None
         self._process.stdin.close()
         try:
-            await asyncio.wait_for(self._process.wait(), DEADLINE_S)
+            await asyncio.wait_for(self._process.wait(), self._deadline_s)
         except TimeoutError:
             self._process.kill()
             await self._process.wait()
@@ -125,6 +130,7 @@ class Peer:
             else:
                 self.said.append(text)
             self._news.set()
+        self._news.set()  # it has ended
 
     async def do(self, command: str) -> None:
         """Give a command and wait until it is done."""
@@ -140,12 +146,15 @@ class Peer:
         """It goes without a word to anybody."""
         assert self._process is not None
         self.send("crash")
-        await asyncio.wait_for(self._process.wait(), DEADLINE_S)
+        await asyncio.wait_for(self._process.wait(), self._deadline_s)
 
     async def until(self, condition: Callable[[], bool]) -> None:
-        async with asyncio.timeout(DEADLINE_S):
+        async with asyncio.timeout(self._deadline_s):
             while not condition():
-                assert not any(line.startswith("failed ") for line in self.said), self.said[-1]
+                if failed := self.lines("failed "):
+                    raise PeerError(f"the peer: {' '.join(failed[-1])}")
+                if self._reading is None or self._reading.done():
+                    raise PeerError("the peer has ended")
                 self._news.clear()
                 await self._news.wait()
 

@@ -1,0 +1,166 @@
+"""Children of benchmarks: they find the benchmarks from anywhere, and their own words reach the user."""
+
+import argparse
+import asyncio
+import subprocess
+import sys
+from collections.abc import Iterator
+from multiprocessing import Pipe, resource_tracker
+from multiprocessing.connection import Connection
+from pathlib import Path
+
+import pytest
+
+from benchmarks import child, common
+from benchmarks.child import Worker, await_workers
+from sern_core.errors import SernError
+from sern_tools.processes import Children
+from tests.support import DEADLINE_S
+
+IMPORTS = "import json, benchmarks as a, sern_core as b; print(json.dumps({m.__name__: m.__file__ for m in (a, b)}))"
+
+
+def refuses() -> None:
+    raise SernError("no such link")
+
+
+def answers(end: Connection, factor: int) -> None:
+    end.send(factor * end.recv())
+
+
+@pytest.fixture
+def spawning() -> Iterator[None]:
+    """Python keeps a process that looks after what its spawned ones share; it would be left over."""
+    yield
+    resource_tracker._resource_tracker._stop()  # type: ignore[attr-defined]
+
+
+@pytest.fixture
+def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Another folder is the current one, and only what is installed can be imported."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("PYTHONPATH", raising=False)
+    return tmp_path
+
+
+@pytest.mark.usefixtures("elsewhere")
+def test_the_benchmarks_are_not_installed() -> None:
+    command = child.python("-c", IMPORTS)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=DEADLINE_S, check=False)
+    assert done.returncode == 1 and "No module named 'benchmarks'" in done.stderr
+
+
+@pytest.mark.parametrize("safe", ["", "1"])
+async def test_a_child_finds_this_checkout_from_anywhere(
+    elsewhere: Path, monkeypatch: pytest.MonkeyPatch, safe: str
+) -> None:
+    monkeypatch.setenv("PYTHONSAFEPATH", safe)
+    (elsewhere / "benchmarks.py").write_text("raise SystemExit('the wrong one')")
+    async with Children(elsewhere) as children:
+        process = await children.start(
+            "child", child.python("-c", IMPORTS), talks=True, environment=child.environment()
+        )
+        found = await process.read_object()
+    assert found == {name: str(child.ROOT / name / "__init__.py") for name in ("benchmarks", "sern_core")}
+
+
+def test_what_was_to_be_found_before_still_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PYTHONPATH", "/one:/two")
+    assert child.environment() == {"PYTHONPATH": f"{child.ROOT}:/one:/two"}
+
+
+async def test_a_child_that_ends_is_the_error_of_the_work_beside_it(elsewhere: Path) -> None:
+    cancelled = asyncio.Event()
+
+    async def forever() -> None:
+        try:
+            await asyncio.Event().wait()
+        finally:
+            cancelled.set()
+
+    async with Children(elsewhere) as children:
+        await children.start("bridge", child.python("-c", "raise SystemExit('no such master')"))
+        with pytest.raises(SernError, match=r"^bridge ended \(exit status 1\): no such master$"):
+            await child.beside(children, forever())
+        assert cancelled.is_set()
+
+
+async def test_work_beside_children_comes_to_what_it_comes_to(tmp_path: Path) -> None:
+    async def fails() -> None:
+        raise SernError("nothing arrived")
+
+    async def works() -> int:
+        return 3
+
+    async with Children(tmp_path) as children:
+        process = await children.start("echo", child.python("-c", "input()"), talks=True)
+        assert await child.beside(children, works()) == 3
+        with pytest.raises(SernError, match=r"^nothing arrived$"):
+            await child.beside(children, fails())
+        assert process.running
+
+
+def test_the_words_of_a_child_reach_the_user_in_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    async def work(children: Children) -> None:
+        process = await children.start(
+            "source",
+            child.python("-m", "benchmarks.endpoints.ros1_roles", "nothing"),
+            talks=True,
+            environment=child.environment(),
+        )
+        await process.read_object()
+
+    async def part() -> None:
+        async with Children(tmp_path) as children:
+            await child.beside(children, work(children))
+
+    def bench(_options: argparse.Namespace, _report: common.Report) -> None:
+        asyncio.run(part())
+
+    monkeypatch.setattr(sys, "argv", ["endpoints"])
+    assert common.main("endpoints", bench) == 1
+    said = capfd.readouterr()
+    assert said.out == ""
+    assert said.err == "benchmarks.endpoints: source ended (exit status 1): no role nothing with 0 arguments\n"
+
+
+@pytest.mark.usefixtures("spawning")
+def test_of_a_worker_the_error_remains(capfd: pytest.CaptureFixture[str]) -> None:
+    worker = Worker("the relay", refuses)
+    try:
+        worker.start()
+        with pytest.raises(SernError) as caught:
+            await_workers(lambda: False, [worker], "nothing happened", DEADLINE_S)
+    finally:
+        worker.end(patient=True)
+    assert str(caught.value) == "the relay ended (exit status 1): sern_core.errors.SernError: no such link"
+    assert capfd.readouterr().err == ""
+
+
+def test_a_worker_that_was_not_started_is_no_error() -> None:
+    worker = Worker("the relay", refuses)
+    worker.check()
+    worker.end(patient=True)
+
+
+def test_who_waits_for_workers_in_vain_says_so() -> None:
+    with pytest.raises(SernError, match=r"^nothing happened within 0 s$"):
+        await_workers(lambda: False, [], "nothing happened", 0.0)
+    await_workers(lambda: True, [], "nothing happened", 0.0)
+
+
+@pytest.mark.usefixtures("spawning")
+def test_a_worker_answers_and_one_that_ends_instead_is_an_error() -> None:
+    ours, theirs = Pipe()
+    worker = Worker("the server", answers, theirs, 7)
+    with ours:
+        try:
+            worker.start()
+            theirs.close()
+            assert worker.ask(ours, 6) == 42
+            with pytest.raises(SernError, match=r"the server ended \(exit status 0\) and said nothing"):
+                worker.ask(ours, 6)
+        finally:
+            worker.end(patient=True)
