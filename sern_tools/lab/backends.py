@@ -20,7 +20,7 @@ from typing import Final, Self
 
 from sern_tools.lab import appliance
 from sern_tools.lab.appliance import Appliance
-from sern_tools.lab.host import LabError, missing_rights, no_offloads, quiet, run, run_all
+from sern_tools.lab.host import LabError, check_rights, missing_rights, no_offloads, quiet, run, run_all
 from sern_tools.lab.removal import namespace_name
 
 NETWORK: Final = "198.18"
@@ -233,8 +233,8 @@ def choose(lab: str, wanted: str | None = None) -> type[Backend]:
             reasons.append(f"{name} needs {', '.join(lacking)}")
     if not reasons:
         raise LabError(f"no backend {wanted!r}; there are: {', '.join(BACKENDS)}")
-    rights = missing_rights()
-    raise LabError(f"the lab needs {', '.join(rights)}" if rights else f"no lab here: {'; '.join(reasons)}")
+    check_rights()
+    raise LabError(f"no lab here: {'; '.join(reasons)}")
 
 
 def wiring(middle: str, endpoints: Sequence[Endpoint], congestion: str | None) -> list[str]:

@@ -91,6 +91,12 @@ def missing_rights() -> list[str]:
     return lacking
 
 
+def check_rights() -> None:
+    """Raises LabError where `missing_rights` finds something: before anything that only root may even look at."""
+    if rights := missing_rights():
+        raise LabError(f"the lab needs {', '.join(rights)}")
+
+
 def search_path() -> str:
     """PATH with the directories of system commands, which a user's own often leaves out."""
     return os.pathsep.join((os.environ.get("PATH", os.defpath), "/usr/sbin", "/sbin"))

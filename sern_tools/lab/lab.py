@@ -32,7 +32,7 @@ from sern_sim.models import BurstLoss, Jitter, LinkModel
 from sern_sim.netem import netem_options
 from sern_sim.profiles import LinkProfile
 from sern_tools.lab.backends import MIDDLE, Backend, Endpoint, Traffic, build, choose, endpoints_of
-from sern_tools.lab.host import LabError, inside
+from sern_tools.lab.host import LabError, check_rights, inside
 from sern_tools.lab.keeper import Keeper
 from sern_tools.lab.passing import Way, await_passing
 from sern_tools.lab.removal import kill_within, lock, namespace_name, sweep
@@ -139,6 +139,7 @@ class Lab:
 
         A lab that could not be made is removed again.
         """
+        check_rights()
         try:
             sweep()
             self._lock = lock(self.id)

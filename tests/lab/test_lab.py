@@ -267,6 +267,7 @@ async def test_the_next_start_removes_what_a_dead_keeper_left(possible: None) ->
 
 def test_errors_name_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("os.geteuid", lambda: 1000)
+    monkeypatch.setattr("sern_tools.lab.lab.sweep", lambda: pytest.fail("it looks at what is root's"))
     with pytest.raises(LabError, match=r"the lab needs root .*sudo"):
         Lab().start()
 
