@@ -41,8 +41,8 @@ FLOODS: Final = (1.3, 2.0, 4.0, 13.0)
 FLOOD_AGE_S: Final = 0.2
 """Four round trips."""
 BARE_PERCENT: Final = 1.25
-"""CPU of the bare forwarder at 4 Mbit/s on the machine of docs/performance.md. What was set out in shares of a core of
-that machine is held as multiples of this."""
+"""CPU of the bare forwarder at 4 Mbit/s on the machine of docs/performance.md, as estimated from a slower one by what
+else both have run. What was set out in shares of a core of that machine is held as multiples of this."""
 BARE_FAST_PERCENT: Final = 3.9
 """The same at 20 Mbit/s, where a datagram wakes it more cheaply."""
 BARE_US: Final = 33.0
