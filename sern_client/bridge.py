@@ -343,7 +343,8 @@ class Bridge:
             if rewrite is not None:
                 body = rewrite(body)
             accepted = core.send(channel, body, stamp_ns, born_s=born_s, now=clock.now())
-            passed(stream, seq, body)
+            if accepted:
+                passed(stream, seq, body)
             if log is not None:
                 try:
                     log.offered(stream, seq, body, stamp_ns, accepted=accepted)

@@ -4,6 +4,7 @@ import base64
 from collections.abc import Mapping
 from typing import Any, Final
 
+from sern_core.errors import UsageError
 from sern_core.message import StreamId, StreamInfo
 from sern_core.objects import topic_object_id
 from sern_runtime.http import JsonQuery
@@ -11,7 +12,7 @@ from sern_runtime.http import JsonQuery
 MAX_VALUE_BYTES: Final = 4_096
 """As in the relay's registry: of a larger value the size alone is known."""
 MAX_TOPICS: Final = 4_096
-"""What passed longest ago is forgotten first."""
+"""Beyond, the stream that was seen first is forgotten."""
 
 
 class LatestValues:
@@ -32,12 +33,15 @@ class LatestValues:
         self._values.pop(stream, None)
 
     def view(self) -> JsonQuery:
-        """The route `/api/values?topic=NAME`: objects as in the relay's /api/objects, for one topic or for all."""
+        """The route `/api/values?topic=NAME`: objects as in the relay's /api/objects.
+
+        One topic at a time: an answer with all of them would hold up the event loop.
+        """
 
         def read(query: Mapping[str, str]) -> object:
-            topic = query.get("topic")
-            chosen = (value for key, value in self._values.items() if topic is None or key.topic == topic)
-            return {"objects": [_to_json(*value) for value in chosen]}
+            if "topic" not in query:
+                raise UsageError("topic is missing: /api/values?topic=NAME")
+            return {"objects": [_to_json(*value) for key, value in self._values.items() if key.topic == query["topic"]]}
 
         return JsonQuery(("topic",), read)
 

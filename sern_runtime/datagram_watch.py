@@ -43,7 +43,7 @@ class DatagramWatch:
         self._name = name
         self._without_since_s: dict[str, float] = {}
         self._said: set[str] = set()
-        self._passed: set[str] = set()  # peers whose datagrams have passed in this session
+        self._passed: set[str] = set()  # peers whose datagrams have passed since their session began
 
     def tick(self) -> None:
         now = clock.now()

@@ -301,7 +301,6 @@ async def test_a_server_that_is_known_before_it_can_be_reached_is_waited_for(
         with pytest.raises(ServiceError, match=f"{MODE} did not answer within 0.1 s"):
             await ours.call(MODE, b"", timeout_s=0.1)
         call = asyncio.create_task(ours.call(MODE, b"hello", timeout_s=60))
-        await asyncio.sleep(0)  # it has begun
 
         async def handler(asked: bytes) -> bytes:
             return asked[::-1]
@@ -310,6 +309,15 @@ async def test_a_server_that_is_known_before_it_can_be_reached_is_waited_for(
         server.declare(token)
         assert await call == b"olleh"
         server.close()
+        await until(lambda: MODE not in events.services, "the service has ended")
+        assert ours._present == {}
+        alone = theirs._declare_token(names.Kind.SERVER, MODE, dds_name, type_hash, names.Qos())
+        await until(lambda: MODE in events.services, "a token alone")
+        call = asyncio.create_task(ours.call(MODE, b"hello", timeout_s=60))
+        await until(lambda: ours._present, "the call waits")
+        alone.undeclare()
+        with pytest.raises(ServiceError, match=f"{MODE} has ended"):
+            await call
     finally:
         await theirs.stop()
 

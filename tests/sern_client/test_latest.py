@@ -7,6 +7,7 @@ import pytest
 
 from sern_client import latest
 from sern_client.latest import MAX_VALUE_BYTES, LatestValues
+from sern_core.errors import UsageError
 from sern_core.message import StreamId, StreamInfo, TopicInfo, TopicSpec
 from sern_core.types import ClientName, Encoding, TopicName
 
@@ -16,8 +17,8 @@ def stream(topic: str) -> StreamInfo:
     return StreamInfo(StreamId(ClientName("robot1"), 1, TopicName(topic)), info, TopicSpec())
 
 
-def objects(values: LatestValues, **query: str) -> list[dict[str, Any]]:
-    answer = values.view().read(query)
+def objects(values: LatestValues, topic: str = "/a") -> list[dict[str, Any]]:
+    answer = values.view().read({"topic": topic})
     assert isinstance(answer, dict)
     found: list[dict[str, Any]] = answer["objects"]
     return found
@@ -28,14 +29,16 @@ def test_the_newest_is_kept_of_each_topic() -> None:
     values.passed(stream("/a"), 1, b"one")
     values.passed(stream("/b"), 1, b"other")
     values.passed(stream("/a"), 2, b"two")
-    (found,) = objects(values, topic="/a")
+    (found,) = objects(values)
     assert base64.b64decode(found["value"]["base64"]) == b"two"
     assert (found["owner"], found["seq"], found["type"]) == ("robot1", 2, "std_msgs/msg/String")
     assert found["attributes"] == {"topic": "/a", "encoding": "ros1"} and found["definition"] == "string data"
-    assert [item["attributes"]["topic"] for item in objects(values)] == ["/a", "/b"]
+    assert [item["attributes"]["topic"] for item in objects(values, "/b")] == ["/b"]
+    with pytest.raises(UsageError, match="topic is missing"):
+        values.view().read({})
     values.forget(stream("/a").id)
     values.forget(stream("/a").id)
-    assert objects(values, topic="/a") == []
+    assert objects(values) == []
 
 
 def test_of_large_ones_the_size_alone() -> None:
@@ -51,4 +54,4 @@ def test_of_too_many_topics_the_oldest_is_forgotten(monkeypatch: pytest.MonkeyPa
     values = LatestValues()
     for number in range(5):
         values.passed(stream(f"/t{number}"), 1, b"x")
-    assert [item["attributes"]["topic"] for item in objects(values)] == ["/t2", "/t3", "/t4"]
+    assert [bool(objects(values, f"/t{number}")) for number in range(5)] == [False, False, True, True, True]

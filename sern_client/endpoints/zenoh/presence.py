@@ -15,6 +15,7 @@ class Presence:
 
     def __init__(self, session: ZenohSession, key: str) -> None:
         zenoh, handover = session.zenoh, session.handover
+        self._session = session
         self._there = asyncio.Event()
         self._querier: Any = session.opened.declare_querier(key, target=zenoh.QueryTarget.BEST_MATCHING)
 
@@ -32,13 +33,20 @@ class Presence:
         else:
             self._there.clear()
 
-    async def wait(self) -> None:
-        """Return once a request would reach a queryable."""
+    async def wait(self) -> bool:
+        """Return True once a request would reach a queryable, False when `close` is called before."""
         await self._there.wait()
+        return self._querier is not None
 
     def close(self) -> None:
         """Idempotent. Before the session ends."""
-        querier, self._querier = self._querier, None
-        if querier is not None:
-            self._listener.undeclare()
+        listener, querier, self._querier = self._listener, self._querier, None
+        if querier is None:
+            return
+
+        def undeclare() -> None:
+            listener.undeclare()
             querier.undeclare()
+
+        self._session.put(undeclare, 0)
+        self._there.set()

@@ -38,7 +38,7 @@ class Services(ABC):
     def __init__(self) -> None:
         self._service_events: ServiceEvents | None = None
         self._servers: dict[TopicName, dict[str, ServiceInfo]] = {}  # of others, by their key in the graph
-        self._present: dict[TopicName, Presence] = {}  # of those that were called
+        self._present: dict[str, Presence] = {}  # by data key, of services that were called
         self._calls = itertools.count(1)
         self._gid = secrets.token_bytes(names.GID_BYTES)
         self._serving: list[_Server] = []
@@ -63,12 +63,19 @@ class Services(ABC):
                 self._service_events.service_added(info)
             return
         gone = servers.pop(entity.key, None)
+        if gone is not None and all(self._data_key(gone) != self._data_key(info) for info in servers.values()):
+            present = self._present.pop(self._data_key(gone), None)
+            if present is not None:
+                present.close()
         if not servers:
             del self._servers[entity.name]
-            if entity.name in self._present:
-                self._present.pop(entity.name).close()
             if gone is not None and self._service_events is not None:
                 self._service_events.service_removed(entity.name)
+
+    def _data_key(self, info: ServiceInfo) -> str:
+        """What requests of a service are sent to."""
+        dds_name = names.dds_type(info.type_name)
+        return names.data_key(self.options.domain, info.name, dds_name, info.type_hash)
 
     def service_definition(self, type_name: str, encoding: Encoding) -> str | None:
         """As `KnowsServiceTypes`."""
@@ -79,7 +86,7 @@ class Services(ABC):
         if not servers:
             raise ServiceError(f"no service {name}")
         info = next(iter(servers.values()))
-        key = names.data_key(self.options.domain, name, names.dds_type(info.type_name), info.type_hash)
+        key = self._data_key(info)
         zenoh, handover = self.session.zenoh, self.session.handover
         answer: asyncio.Future[bytes] = asyncio.get_running_loop().create_future()
 
@@ -102,11 +109,12 @@ class Services(ABC):
         def ended() -> None:
             handover.put(lambda: settle(None, f"{name} did not answer"))
 
-        if name not in self._present:
-            self._present[name] = Presence(self.session, key)
+        if key not in self._present:
+            self._present[key] = Presence(self.session, key)
         try:
             async with asyncio.timeout(timeout_s):
-                await self._present[name].wait()
+                if not await self._present[key].wait():
+                    raise ServiceError(f"{name} has ended")
                 self.session.opened.get(
                     key,
                     zenoh.handlers.Callback(replied, ended),
