@@ -1,5 +1,7 @@
 """A datagram lane that was wanted and does not come up is named in the logs of both sides once, as is its return."""
 
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
 from pathlib import Path
 
 import pytest
@@ -38,93 +40,81 @@ def scraped(daemon: RelayDaemon | ClientDaemon) -> dict[str, float]:
     return lane_up(generate_latest(server._registry).decode())
 
 
-async def test_blocked_datagrams_are_named_on_both_sides_and_so_is_their_return(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    caplog.set_level("INFO")
+@asynccontextmanager
+async def behind_nat(tmp_path: Path, *, answers: bool = True) -> AsyncIterator[tuple[Lab, Nat, RelayDaemon]]:
+    """A relay, and a NAT that swallows what it answers by datagram unless `answers`."""
     (port,) = free_ports(1)
-    nat = Nat(port)
+    nat = Nat(port, answers=answers)
     async with Lab(tmp_path, "robot1", relay_port=port) as lab:
         try:
             relay = await lab.relay()
             await nat.start()
-            assert nat.outer is not None
-            nat.outer.close()
-            nat.outer = None  # TCP passes, datagrams are swallowed
-            there = {"endpoint": f"tcp://{INSIDE}:{port}"}
-            robot = await lab.connected(lab.client_file("robot1", {"kind": "synthetic", "role": "robot"}, relay=there))
-            ours = f"robot1: no datagram came through from {INSIDE}:{port}/udp in {PATIENCE_S:g} s; using TCP; open UDP"
-            theirs = f"robot1: no datagram came through from it to {port}/udp here in {PATIENCE_S:g} s; using TCP; open"
-            await until(lambda: said(caplog, ours) and said(caplog, theirs), "both sides say what is blocked")
-            assert scraped(robot) == {"relay": 0.0}
-            assert scraped(relay) == {"robot1": 0.0}
-            for _ in range(3):
-                relay.datagrams.tick()
-                robot.datagrams.tick()
-            await nat.rebind("127.0.0.3")
-            back = "robot1: datagrams pass now"
-            await until(lambda: len(said(caplog, back)) == 2, "both sides say that it is up", deadline_s=60.0)
-            assert (len(said(caplog, ours)), len(said(caplog, theirs))) == (1, 1)
-            assert scraped(robot) == {"relay": 1.0}
-            assert scraped(relay) == {"robot1": 1.0}
-            await lab.end(robot)
-            await lab.end(relay)
+            yield lab, nat, relay
         finally:
             await nat.close()
+
+
+async def connected(lab: Lab, nat: Nat) -> ClientDaemon:
+    there = {"endpoint": f"tcp://{INSIDE}:{nat.port}"}
+    return await lab.connected(lab.client_file("robot1", {"kind": "synthetic", "role": "robot"}, relay=there))
+
+
+async def test_blocked_datagrams_are_named_on_both_sides_and_so_is_their_return(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("INFO")
+    async with behind_nat(tmp_path) as (lab, nat, relay):
+        nat.block()
+        robot = await connected(lab, nat)
+        within = f"in {PATIENCE_S:g} s; using TCP; open"
+        ours = f"robot1: no datagram came through from {INSIDE}:{nat.port}/udp {within} UDP"
+        theirs = f"robot1: no datagram came through from it to {nat.port}/udp here {within}"
+        await until(lambda: said(caplog, ours) and said(caplog, theirs), "both sides say what is blocked")
+        assert scraped(robot) == {"relay": 0.0}
+        assert scraped(relay) == {"robot1": 0.0}
+        for _ in range(3):
+            relay.datagrams.tick()
+            robot.datagrams.tick()
+        await nat.rebind("127.0.0.3")
+        back = "robot1: datagrams pass now"
+        await until(lambda: len(said(caplog, back)) == 2, "both sides say that it is up")
+        assert (len(said(caplog, ours)), len(said(caplog, theirs))) == (1, 1)
+        assert scraped(robot) == {"relay": 1.0}
+        assert scraped(relay) == {"robot1": 1.0}
+        await lab.end(robot)
+        await lab.end(relay)
 
 
 async def test_datagrams_that_stop_in_a_session_are_named_on_both_sides_and_so_is_their_return(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level("INFO")
-    (port,) = free_ports(1)
-    nat = Nat(port)
-    async with Lab(tmp_path, "robot1", relay_port=port) as lab:
-        try:
-            relay = await lab.relay()
-            await nat.start()
-            there = {"endpoint": f"tcp://{INSIDE}:{port}"}
-            robot = await lab.connected(lab.client_file("robot1", {"kind": "synthetic", "role": "robot"}, relay=there))
-            await until(
-                lambda: scraped(robot) == {"relay": 1.0} and scraped(relay) == {"robot1": 1.0}, "datagrams pass"
-            )
-            for daemon in (relay, robot):
-                daemon.datagrams.tick()  # it has seen that they pass
-            caplog.clear()  # and has said so, if that took longer than its short patience here
-            assert nat.outer is not None
-            nat.outer.close()
-            nat.outer = None
-            stopped = f"robot1: {datagram_watch.STOPPED}"
-            await until(lambda: len(said(caplog, stopped)) == 2, "both sides say that none passes any more")
-            await nat.rebind("127.0.0.3")
-            back = "robot1: datagrams pass now"
-            await until(lambda: len(said(caplog, back)) == 2, "both sides say that they pass", deadline_s=60.0)
-            assert [line for line in caplog.messages if "datagram" in line] == [
-                *said(caplog, stopped),
-                *said(caplog, back),
-            ]
-        finally:
-            await nat.close()
+    async with behind_nat(tmp_path) as (lab, nat, relay):
+        robot = await connected(lab, nat)
+        await until(lambda: scraped(robot) == {"relay": 1.0} and scraped(relay) == {"robot1": 1.0}, "datagrams pass")
+        for daemon in (relay, robot):
+            daemon.datagrams.tick()  # it has seen that they pass
+        caplog.clear()  # and has said so, if that took longer than its short patience here
+        nat.block()
+        stopped = f"robot1: {datagram_watch.STOPPED}"
+        await until(lambda: len(said(caplog, stopped)) == 2, "both sides say that none passes any more")
+        await nat.rebind("127.0.0.3")
+        back = "robot1: datagrams pass now"
+        await until(lambda: len(said(caplog, back)) == 2, "both sides say that they pass")
+        lines = [line for line in caplog.messages if "datagram" in line]
+        assert lines == [*said(caplog, stopped), *said(caplog, back)]
 
 
 async def test_answers_that_are_lost_are_told_from_datagrams_that_do_not_come(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Datagrams reach the relay, and what it answers is swallowed: each side says what it sees."""
-    (port,) = free_ports(1)
-    nat = Nat(port)
-    monkeypatch.setattr(nat, "_back", lambda data: None)
-    async with Lab(tmp_path, "robot1", relay_port=port) as lab:
-        try:
-            await lab.relay()
-            await nat.start()
-            there = {"endpoint": f"tcp://{INSIDE}:{port}"}
-            await lab.connected(lab.client_file("robot1", {"kind": "synthetic", "role": "robot"}, relay=there))
-            ours = f"robot1: no datagram came through from {INSIDE}:{port}/udp"
-            theirs = "robot1: datagrams come through from it (127.0.0.3), and it has confirmed none of ours"
-            await until(lambda: said(caplog, ours) and said(caplog, theirs), "both sides say what they see")
-        finally:
-            await nat.close()
+    async with behind_nat(tmp_path, answers=False) as (lab, nat, _relay):
+        await connected(lab, nat)
+        ours = f"robot1: no datagram came through from {INSIDE}:{nat.port}/udp"
+        theirs = "robot1: datagrams come through from it (127.0.0.3), and it has confirmed none of ours"
+        await until(lambda: said(caplog, ours) and said(caplog, theirs), "both sides say what they see")
+        assert not said(caplog, "datagrams pass now")
 
 
 @pytest.mark.parametrize("off", ["relay", "client"])

@@ -38,11 +38,12 @@ class Nat(asyncio.DatagramProtocol):
     """Forwards what comes to `INSIDE`:port, datagrams and TCP connections, to the same port of `HOST`.
 
     `rebind` gives datagrams another outer socket; what is sent to the old one is lost. `cut` makes the TCP connections
-    of now hang: neither end is told. New ones pass.
+    of now hang: neither end is told. New ones pass. Without `answers` no datagram comes back.
     """
 
-    def __init__(self, port: int) -> None:
+    def __init__(self, port: int, *, answers: bool = True) -> None:
         self.port = port
+        self._answers = answers
         self.outer: asyncio.DatagramTransport | None = None
         self.mapping = Outer(self._back)
         self._client: tuple[str, int] = ANY
@@ -65,13 +66,19 @@ class Nat(asyncio.DatagramProtocol):
         self.outer, _ = await loop.create_datagram_endpoint(lambda: mapping, local_addr=(address, 0))
         return mapping
 
+    def block(self) -> None:
+        """TCP passes, datagrams are swallowed, until `rebind`."""
+        assert self.outer is not None
+        self.outer.close()
+        self.outer = None
+
     def datagram_received(self, data: bytes, addr: tuple[str, int]) -> None:
         self._client = addr
         if self.outer is not None:
             self.outer.sendto(data, (HOST, self.port))
 
     def _back(self, data: bytes) -> None:
-        if self._inner is not None and self._client is not ANY:
+        if self._answers and self._inner is not None and self._client is not ANY:
             self._inner.sendto(data, self._client)
 
     async def _connected(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
