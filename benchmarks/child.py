@@ -44,6 +44,15 @@ def environment() -> dict[str, str]:
     return {"PYTHONPATH": os.pathsep.join([str(ROOT), others] if others else [str(ROOT)])}
 
 
+def cpu_s(*pids: int) -> float:
+    """CPU time of these processes, all threads, those that have ended as well; also of who was not waited for yet.
+    OSError when one is no more.
+
+    The clock is that of clock_getcpuclockid(3): nanoseconds, where /proc/PID/stat has ticks of 10 ms.
+    """
+    return sum(time.clock_gettime((~pid << 3) | 2) for pid in pids)
+
+
 async def beside(children: Children, work: Coroutine[Any, Any, T]) -> T:
     """What `work` comes to. As soon as a child ends that nobody told to, `work` is cancelled, and the SernError has the
     child's last words."""

@@ -35,7 +35,7 @@ TITLES: Final = {
     "odom_received": "odom got",
     "cloud_received": "clouds got",
 }
-"""Of columns whose metric's name does not say it well."""
+"""Titles of columns whose metric's name does not say it well."""
 PURE: Final = "1"
 """The unit of a number without one."""
 UNITS: Final = {"percent": "%", "Mbps": "Mbit/s", "us": "µs"}

@@ -41,7 +41,7 @@ AS_PRINTED = Ranges(share_of_capacity=False)
 SAME = 1.002
 """Two policies that chose the same configuration all along differ by nothing; this close they count as equal."""
 SETTLED = 0.1
-"""Of the final level: traffic that differs by no more has settled."""
+"""A share of the final level: traffic that differs by no more has settled."""
 SETTLED_INTERVALS = 3
 """Averaged, for clouds are few a second."""
 FINAL_INTERVALS = 6

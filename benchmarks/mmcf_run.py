@@ -17,7 +17,7 @@ from sern_core.types import CLASSES
 
 INTERVAL_S: Final = 1.0
 LAG_S: Final = 0.3
-"""So old is the capacity that the estimator reports, give or take NOISE."""
+"""How old the capacity is that the estimator reports, give or take NOISE."""
 NOISE: Final = 0.05
 SAMPLES: Final = 10
 MEMORY: Final = 3

@@ -25,7 +25,7 @@ from sern_runtime import clock, ros_services, ros_types
 from sern_runtime.loop import Timer
 
 REJECTED, ABORTED = 5, 4
-"""Of actionlib_msgs/GoalStatus."""
+"""Values of actionlib_msgs/GoalStatus."""
 ACCEPT_S: Final = 5.0
 """How long beyond its lifespan on the link a goal may take until its server is heard of it."""
 MAX_GOALS: Final = 1000
@@ -34,7 +34,7 @@ STATUS_TYPE: Final = "actionlib_msgs/msg/GoalStatusArray"
 
 _LITTLE_ENDIAN: Final = b"\x00\x01\x00\x00"
 _UUID: Final = slice(4, 20)
-"""Of the goal, where a request of `send_goal` begins with it."""
+"""Where the goal's id is in a request of `send_goal`."""
 _TIME: Final = struct.Struct("<II")
 _LENGTH: Final = struct.Struct("<I")
 _HEADER_BYTES: Final = 12  # seq and stamp of a std_msgs/Header, before its frame_id

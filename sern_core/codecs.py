@@ -211,7 +211,7 @@ class CodecProfile:
 
 
 RAW_PROFILE: Final = CodecProfile(1.0, 0.0)
-"""Of mode `none`."""
+"""Stands for mode `none`."""
 PROFILE_GAIN: Final = 0.3
 """Share of the newest measurement in a profile."""
 

@@ -12,7 +12,7 @@ from sern_core.routing import UNIT_S, RouteChange, RoutingTable
 from sern_core.types import ClientName
 
 MATCHING_SHARE: Final = 1.0 / 3.0
-"""Of the relay's time, what matching the patterns of one client may take."""
+"""The share of the relay's time that matching the patterns of one client may take."""
 
 
 class Matching:

@@ -129,4 +129,4 @@ class StreamInfo:
     spec: TopicSpec
     attributes: dict[str, str] = field(default_factory=dict)
     definition_hash: str = ""
-    """Of a stream from a peer: the hash of its definition, as it was announced; empty: it has none."""
+    """The hash of its definition, as a peer announced it; empty: it has none."""

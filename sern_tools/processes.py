@@ -26,8 +26,7 @@ DRAIN_S: Final = 45.0
 """How long a child may take to end after SIGTERM when all is well: a daemon drains first."""
 ABORT_S: Final = 5.0
 """The same when the whole is being given up."""
-TAIL_LINES: Final = 3
-TRACEBACK: Final = "Traceback (most recent call last):"
+TAIL_LINES: Final = 4
 LINE_BYTES: Final = 2**20
 _PLAIN_PYTHON: Final = (sys.executable, "-I", "-S")
 """For helpers that import nothing that is installed."""
@@ -55,22 +54,37 @@ def swept(directory: Path) -> Iterator[Path]:
         sweeper.wait()
 
 
+def last_words(log: Path, *, from_traceback: bool = False) -> str:
+    """The last lines of a log as one, without the frames of tracebacks. Empty with no log, or with nothing in it.
+
+    `from_traceback`: of a log with tracebacks what the last of them comes to, and what follows.
+    """
+    try:
+        lines = log.read_text(errors="replace").splitlines()
+    except OSError:
+        return ""
+    kept: list[str] = []
+    inside_traceback = False
+    for line in lines:
+        begins = line.startswith("Traceback (")
+        if begins and from_traceback:
+            kept.clear()
+        inside_traceback = begins or (inside_traceback and line[:1].isspace())
+        if line.strip() and not inside_traceback:
+            kept.append(line.strip())
+    return " | ".join(kept[-TAIL_LINES:])
+
+
 def failure(name: str, code: int | None, log: Path) -> SernError:
     """One line about a process that ended: who, how, and its last words from `log`, its standard error.
 
-    `code`: its exit status, negative a signal's number, None while it runs. Of a Python traceback the error remains.
+    `code`: its exit status, negative a signal's number, None while it runs.
     """
     outcome = "output closed"
     if code is not None:
         outcome = f"exit status {code}" if code >= 0 else f"signal {signal.Signals(-code).name}"
-    with contextlib.suppress(OSError):
-        lines = [line for line in log.read_text(errors="replace").splitlines() if line.strip()]
-        if TRACEBACK in lines:
-            begin = len(lines) - lines[::-1].index(TRACEBACK)
-            lines = [line for line in lines[begin:] if not line[0].isspace()]
-        if lines:
-            return SernError(f"{name} ended ({outcome}): {' | '.join(lines[-TAIL_LINES:])}")
-    return SernError(f"{name} ended ({outcome}) and said nothing")
+    words = last_words(log, from_traceback=True)
+    return SernError(f"{name} ended ({outcome}){f': {words}' if words else ' and said nothing'}")
 
 
 @dataclass(eq=False)

@@ -116,7 +116,7 @@ async def _through(children: Children, stack: AsyncExitStack, system: str, progr
     await within(matched(), START_S, "the Fast DDS peers did not find each other")
     # A daemon says that somebody wants a topic some time after it is there.
     await asyncio.sleep(1.0)
-    before_s, began_s = shared.cpu_s(pids), time.monotonic()
+    before_s, began_s = child.cpu_s(*pids), time.monotonic()
     for name, body in bodies.items():
         await source.do(f"flood {name} {body} {RATES_HZ[name]} {round(RATES_HZ[name] * measure_s)}")
 
@@ -137,7 +137,7 @@ async def _through(children: Children, stack: AsyncExitStack, system: str, progr
         found[f"{name}_p99_ms"] = settled[int(0.99 * (len(settled) - 1))]
         found[f"{name}_lost"] = expected - len(delays_ms)
     # A bridge that is behind works on after the last message is published: that counts as well.
-    return {**found, "cpu_percent": 100 * (shared.cpu_s(pids) - before_s) / took_s}
+    return {**found, "cpu_percent": 100 * (child.cpu_s(*pids) - before_s) / took_s}
 
 
 async def _measured(system: str, program: Path, measure_s: float) -> Figures:

@@ -171,9 +171,9 @@ async def _through(ros: Ros, system: str, load: tuple[float, int, float], measur
     sink = await ros.role("sink", other, ODOM + suffix, CLOUD + suffix if load[2] else "", WARM_S, measure_s)
     await within(said(sink, "begin"), START_S + WARM_S, "not every topic got through")
     pids = [process.process.pid for process in between]
-    before_s, began_s = shared.cpu_s(pids), time.monotonic()
+    before_s, began_s = child.cpu_s(*pids), time.monotonic()
     await said(sink, "end")
-    used_s, took_s = shared.cpu_s(pids) - before_s, time.monotonic() - began_s
+    used_s, took_s = child.cpu_s(*pids) - before_s, time.monotonic() - began_s
     found: Figures = await said(sink, "found")
     return {**found, "cpu_percent": 100 * used_s / took_s}
 
@@ -198,9 +198,9 @@ async def _found_many(ros: Ros, measure_s: float) -> Figures:
     found_s = float(await within(said(follower, "found_s"), START_S, f"{TOPICS} topics were not found"))
     await asyncio.sleep(WARM_S)
     pids = [follower.process.pid]
-    before_s, master_s, began_s = shared.cpu_s(pids), shared.cpu_s(ros.masters), time.monotonic()
+    before_s, master_s, began_s = child.cpu_s(*pids), child.cpu_s(*ros.masters), time.monotonic()
     await asyncio.sleep(measure_s)
-    used_s, asked_s = shared.cpu_s(pids) - before_s, shared.cpu_s(ros.masters) - master_s
+    used_s, asked_s = child.cpu_s(*pids) - before_s, child.cpu_s(*ros.masters) - master_s
     share = 100 / (time.monotonic() - began_s)
     return {"found_s": found_s, "cpu_percent": share * used_s, "master_cpu_percent": share * asked_s}
 

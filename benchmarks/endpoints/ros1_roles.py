@@ -64,7 +64,7 @@ class _Nothing:
 
 
 def advertise(endpoint: Ros1Endpoint, topic: str, type_name: str) -> Handle:
-    """As an ordinary node."""
+    """Advertise a topic as an ordinary node does, which does not say that it is a SERN endpoint."""
     handle = endpoint.advertise(ros_types.topic_info(topic, type_name, Encoding.ROS1))
     for publication in endpoint._publications.values():
         publication.answer.pop(BRIDGE_FIELD, None)

@@ -5,8 +5,7 @@ import importlib.util
 import json
 import statistics
 import tempfile
-import time
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Mapping, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -96,14 +95,6 @@ def zenoh_folder() -> Path:
     if found is None or found.origin is None:
         raise MissingError("needs zenoh: pip install eclipse-zenoh")
     return Path(found.origin).parents[1]
-
-
-def cpu_s(processes: Iterable[int]) -> float:
-    """CPU time of these process ids so far, all threads, those that have ended as well. OSError when one is no more.
-
-    The clock is that of clock_getcpuclockid(3): nanoseconds, where /proc/PID/stat has ticks of 10 ms.
-    """
-    return sum(time.clock_gettime((~pid << 3) | 2) for pid in processes)
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,6 @@
 import os
 import signal
 import subprocess
-import time
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,37 +10,15 @@ from typing import Final
 
 from benchmarks import child
 from sern_core.errors import SernError
+from sern_tools.processes import last_words
 
 STOP_S: Final = 20.0
 """Time for a process to end when it is told to."""
-LAST_LINES: Final = 4
-_CPU_CLOCK: Final = 2
-"""CPUCLOCK_SCHED of linux/posix-timers_types.h: what the scheduler has counted, in ns, all threads."""
 
 
 def environment() -> dict[str, str]:
     """All variables of a child of this interpreter."""
     return {**os.environ, **child.environment()}
-
-
-def last_words(log: Path) -> str:
-    """The last lines of a log as one, of a traceback the exception alone. Empty with no log, or with nothing in it."""
-    try:
-        lines = log.read_text(errors="replace").splitlines()
-    except FileNotFoundError:
-        return ""
-    kept: list[str] = []
-    inside_traceback = False
-    for line in lines:
-        inside_traceback = line.startswith("Traceback (") or (inside_traceback and line[:1].isspace())
-        if line.strip() and not inside_traceback:
-            kept.append(line.strip())
-    return " | ".join(kept[-LAST_LINES:])
-
-
-def cpu_s(pid: int) -> float:
-    """Processor time of a process and its threads so far, user and system, also of one that was not waited for yet."""
-    return time.clock_gettime_ns(~pid << 3 | _CPU_CLOCK) / 1e9
 
 
 @dataclass
@@ -54,7 +31,7 @@ class Running:
     ends: dict[str, "subprocess.Popen[bytes]"] = field(default_factory=dict)
 
     def cpu_s(self) -> dict[str, float]:
-        return {role: cpu_s(process.pid) for role, process in self.ends.items()}
+        return {role: child.cpu_s(process.pid) for role, process in self.ends.items()}
 
     def words(self, role: str) -> str:
         return last_words(self.directory / f"{role}.log")

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from rclpy.subscription import Subscription as RosSubscription
 
 DEPTH: Final = 100
-"""Of our subscriptions: what may wait while the executor's thread is behind."""
+"""The depth of our subscriptions: what may wait while the executor's thread is behind."""
 LATCHED_DEPTH: Final = 10
 
 _log = logging.getLogger(__name__)

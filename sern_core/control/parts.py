@@ -18,7 +18,7 @@ STALL_S: Final = 0.1
 AGREE_S: Final = 2.0
 EASED_S: Final = 0.001
 EASED_SHARE: Final = 0.35
-"""Of the time that a packet takes."""
+"""A share of the time that a packet takes."""
 EASED_PACKETS: Final = 6
 """One after the other."""
 EASED_MEMORY_S: Final = 10.0

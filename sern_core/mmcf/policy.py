@@ -54,13 +54,13 @@ SWING: Final = 0.35
 """A fall by this share is a drop, not noise."""
 
 RAW_SERVED: Final = 0.9
-"""Of what is needed of a class; raw messages of which so many arrive in time fit."""
+"""A share of what is needed of a class: raw messages fit when so many arrive in time."""
 RAW_BACK_SERVED: Final = 0.95
 RAW_BACK_LOAD: Final = 0.8
 """Before a class that is summarised goes back to raw: of what is needed, and the load of the planned capacity."""
 
 FLOOR_KEPT: Final = 0.9
-"""Of a floor: predictions err, and on a lossy link nothing arrives whole."""
+"""The share of a floor that is enough: predictions err, and on a lossy link nothing arrives whole."""
 FLOOR_BACK: Final = 0.95
 FLOOR_BACK_LOAD: Final = 0.8
 """Before a floor that was given up counts again: of the floor, and the load of the planned capacity. In between nothing

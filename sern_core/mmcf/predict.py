@@ -52,9 +52,9 @@ from sern_core.types import CLASSES, PriorityClass
 Bools = NDArray[np.bool_]
 
 PLANNED_SHARE: Final = 0.9
-"""Of the estimated capacity: the predictions are worst near full load."""
+"""The share of the estimated capacity to plan with: the predictions are worst near full load."""
 CONTROL_SHARE_MAX: Final = 0.5
-"""Of the link for class control; its token bucket holds it there in any case."""
+"""The share of the link for class control; its token bucket holds it there in any case."""
 SERIALISE_S: Final = 100e-6
 """CPU time of a message outside its codec, until measured."""
 FRAGMENT_BODY_BYTES: Final = DATAGRAM_BYTES - 31

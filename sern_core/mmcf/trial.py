@@ -24,11 +24,11 @@ GREW: Final = 1.5
 """An estimate that is so many times the least of the last GREW_INTERVALS has been held down by what was sent."""
 GREW_INTERVALS: Final = 3
 POOR: Final = 0.8
-"""Of what a class was let in; where less arrives in time, the link does not carry it."""
+"""A share of what a class was let in: where less arrives in time, the link does not carry it."""
 ENOUGH: Final = 0.9
-"""Of what is assumed; an estimate that has come so far needs no help."""
+"""A share of what is assumed: an estimate that has come so far needs no help."""
 FELL: Final = 0.75
-"""Of its greatest value during a trial; an estimate below that has seen the link get slower."""
+"""A share of its greatest value in a trial: an estimate below that has seen the link get slower."""
 
 
 class CapacityTrial:

@@ -17,7 +17,7 @@ from sern_core.types import Encoding
 
 TF_TYPES: Final = frozenset({"tf2_msgs/TFMessage", "tf/tfMessage"})  # the older one has the same layout
 MAX_TRANSFORMS: Final = 4096
-"""In one message, and frames that are kept."""
+"""Transforms in one message, and frames that are kept, at most."""
 
 
 def is_static(topic: str) -> bool:

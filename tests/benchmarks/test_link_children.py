@@ -10,10 +10,12 @@ import pytest
 
 pytest.importorskip("psutil")
 
+from benchmarks.child import cpu_s
 from benchmarks.link import runs
-from benchmarks.link.children import Running, cpu_s, environment, last_words
+from benchmarks.link.children import Running, environment
 from benchmarks.link.peers import send_datagram
 from sern_core.errors import SernError
+from sern_tools.processes import last_words
 
 Start = Callable[[str, str], "subprocess.Popen[bytes]"]
 WAIT = "import sys; sys.stdin.read()"

@@ -23,7 +23,7 @@ from sern_core.types import TopicName
 SPACE: Final = "@ros2_lv"
 GID_BYTES: Final = 16
 DEFAULT_DEPTH: Final = 10
-"""Of ROS 2's default profile, which an empty depth stands for."""
+"""The depth of ROS 2's default profile, which an empty one stands for."""
 _ATTACHMENT: Final = struct.Struct("<qqB16s")
 _DDS_TYPE: Final = re.compile(r"([A-Za-z]\w*)::(msg|srv|action)::dds_::([A-Za-z]\w*)_", re.ASCII)
 _RELIABLE, _BEST_EFFORT = "1", "2"
