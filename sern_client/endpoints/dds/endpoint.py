@@ -167,7 +167,7 @@ class _Reader:
     @property
     def matched(self) -> int:
         """How many writers it has."""
-        return 0 if self._entity is None else len(self._entity.get_matched_publications())
+        return 0 if self._entity is None else len(raw.matched_writers(self._entity))
 
     @property
     def dropped(self) -> int:
@@ -191,7 +191,7 @@ class _Writer:
     @property
     def matched(self) -> int:
         """How many readers it has."""
-        return 0 if self._writer is None else len(self._writer.get_matched_subscriptions())
+        return 0 if self._writer is None else len(raw.matched_readers(self._writer))
 
     def readers(self, known: set[int]) -> Readers:
         """How many of the `known` readers, by their handles, it has."""

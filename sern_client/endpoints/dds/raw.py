@@ -6,6 +6,7 @@ below its Python class too, because that does not tell what woke it.
 """
 
 import ctypes
+from collections.abc import Callable
 from typing import Any, Final
 
 from cyclonedds import _clayer
@@ -41,8 +42,29 @@ def write(writer: DataWriter[Any], body: bytes, stamp_ns: int | None) -> int:
 
 
 def matched_readers(writer: DataWriter[Any]) -> list[int]:
-    """The handles of the readers that a writer has, as discovery tells them: the binding makes them signed here."""
-    return [handle & 2**64 - 1 for handle in writer.get_matched_subscriptions()]
+    """The handles of the readers that a writer has, as discovery tells them."""
+    return _handles(writer._get_matched_subscriptions, writer)
+
+
+def matched_writers(reader: DataReader[Any]) -> list[int]:
+    """The handles of the writers that a reader has, as discovery tells them."""
+    return _handles(reader._get_matched_publications, reader)
+
+
+def _handles(ask: Callable[[Any, Any, int], int], entity: Entity) -> list[int]:
+    """The handles that `ask` writes into an array, which is made larger until all have room.
+
+    The binding's own function asks for their number first, and raises an IndexError where one came in between.
+    """
+    room = 8
+    while True:
+        handles = (dds_c_t.instance_handle * room)()
+        count = ask(entity._ref, ctypes.cast(handles, ctypes.POINTER(dds_c_t.instance_handle)), room)
+        if count < 0:
+            raise OSError(f"Cyclone DDS does not say whom {entity!r} is matched with (return code {count})")
+        if count <= room:
+            return [handle & 2**64 - 1 for handle in handles[:count]]  # the binding makes them signed
+        room = count
 
 
 class Waiter:

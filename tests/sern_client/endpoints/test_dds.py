@@ -15,7 +15,7 @@ pytest.importorskip("cyclonedds", reason="the dds endpoint needs cyclonedds: pip
 
 from cyclonedds.core import Policy, Qos
 
-from sern_client.endpoints.dds import names, node_info
+from sern_client.endpoints.dds import names, node_info, raw
 from sern_client.endpoints.dds.definitions import Definitions
 from sern_client.endpoints.dds.domain import DomainOptions, close_domain, environment_domain, open_domain
 from sern_client.endpoints.dds.graph import Graph, Local, Participant, Remote, puts_header
@@ -326,3 +326,35 @@ async def test_a_loop_that_is_too_slow_loses_the_oldest(domain_id: int) -> None:
     finally:
         await two.stop()
         await one.stop()
+
+
+@pytest.mark.parametrize("counts", [[0], [8], [9, 9], [9, 17, 17], [17, 3]])
+def test_readers_that_come_while_they_are_counted_are_counted(counts: list[int]) -> None:
+    """Discovery runs on threads of its own: from one answer to the next there may be more of them, or fewer."""
+
+    class Writer:
+        _ref = 7
+        asked = 0
+
+        def _get_matched_subscriptions(self, ref: int, handles: Any, room: int) -> int:
+            assert ref == self._ref
+            count = counts[self.asked]
+            self.asked += 1
+            for number in range(min(room, count)):
+                handles[number] = -1 - number  # signed, as the binding has them
+            return count
+
+    writer: Any = Writer()
+    assert raw.matched_readers(writer) == [2**64 - 1 - number for number in range(counts[-1])]
+
+
+def test_a_writer_that_is_gone_has_no_readers_to_name() -> None:
+    class Writer:
+        _ref = 7
+
+        def _get_matched_subscriptions(self, ref: int, handles: Any, room: int) -> int:
+            return -3
+
+    writer: Any = Writer()
+    with pytest.raises(OSError, match=r"does not say whom .* is matched with \(return code -3\)"):
+        raw.matched_readers(writer)
