@@ -188,7 +188,7 @@ def spread(values: Sequence[float]) -> float:
 
 
 def positive(text: str) -> int:
-    """For arguments: a whole number of 1 or more."""
+    """A whole number of 1 or more, for arguments."""
     value = int(text)
     if value < 1:
         raise argparse.ArgumentTypeError(f"{value} is not 1 or more")

@@ -122,7 +122,7 @@ def _cheapest(results: Sequence[Result]) -> Configuration:
 
 
 def add_best_fixed(results: Sequence[Result]) -> Configuration:
-    """To the runs of all seeds of a trace: the configuration that costs least in their mean.
+    """Find the configuration that costs least in the mean of the runs of all seeds of a trace.
 
     One that was chosen for each seed by itself owes a part of its lead to chance: which of the messages a share lets in
     meet the good moments.

@@ -99,7 +99,8 @@ def seal_us(cipher: Cipher, count: int) -> dict[str, float]:
 
 
 def forward(control: Connection, hops: Hops, target: tuple[str, int]) -> None:
-    """To `target`; tells its own address. Each later word on `control` is answered with (process CPU s, datagrams)."""
+    """Forward to `target`. Tells its own address first; each later word on `control` is answered with (process CPU s,
+    datagrams)."""
     try_realtime()
 
     async def run() -> None:

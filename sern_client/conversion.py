@@ -115,7 +115,7 @@ class Converter:
         self.failures = 0
 
     def advertise(self, endpoint: Endpoint, info: TopicInfo) -> Publisher:
-        """As `Endpoint.advertise`, after conversion where the endpoint wants another encoding than the topic has."""
+        """Call `Endpoint.advertise`, with a conversion where the endpoint wants another encoding than the topic has."""
         wanted = endpoint.encoding
         if wanted is None or wanted is info.encoding:
             return endpoint.advertise(info)
@@ -125,7 +125,7 @@ class Converter:
 
 
 def serve(endpoint: ServiceEndpoint, info: ServiceInfo, handler: ServiceHandler) -> ServiceServer:
-    """As `ServiceEndpoint.serve`, with requests and responses converted where the endpoint wants another encoding."""
+    """Call `ServiceEndpoint.serve`, with requests and responses converted where the endpoint wants another encoding."""
     wanted = endpoint.encoding
     if wanted is None or wanted is info.encoding:
         return endpoint.serve(info, handler)

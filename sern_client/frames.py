@@ -33,11 +33,11 @@ class FramePrefixer:
         self.unreadable = 0
 
     def outgoing(self, info: TopicInfo) -> Rewrite | None:
-        """For a topic that leaves this site; None: bodies go as they are."""
+        """Tell how bodies of a topic that leaves this site are changed; None: they go as they are."""
         return self._rewriter(info, self._add) if self.prefix else None
 
     def incoming(self, info: TopicInfo) -> Rewrite | None:
-        """For a topic that comes to this site; None: bodies go as they are."""
+        """Tell how bodies of a topic that comes to this site are changed; None: they go as they are."""
         return self._rewriter(info, self._remove) if self.prefix else None
 
     def _add(self, frame_id: str) -> str:

@@ -137,7 +137,7 @@ class Guard:
             pause_s = min(2 * pause_s, AGAIN_S[1])
 
     async def _run(self) -> str:
-        """From its start to its end; how it ended."""
+        """Run it from its start to its end, and tell how it ended."""
         command = (sys.executable, "-P", "-m", "sern_client.guard_process", str(os.getpid()))
         try:
             self._spawning = asyncio.create_task(_spawn(*command), name="guard-spawn")

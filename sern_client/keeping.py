@@ -22,7 +22,7 @@ Numbers = tuple[int, ...]
 
 
 SOON_S: Final = 0.005
-"""So long a reliable message waits at least before it is flushed, so that many are flushed together."""
+"""Least wait of a reliable message before it is flushed, so that many are flushed together."""
 
 
 class Keeping:

@@ -10,9 +10,9 @@ from sern_core.objects import topic_object_id
 from sern_runtime.http import JsonQuery
 
 MAX_VALUE_BYTES: Final = 4_096
-"""As in the relay's registry: of a larger value the size alone is known."""
+"""Only the size is known of a larger value, as in the relay's registry."""
 MAX_TOPICS: Final = 4_096
-"""Beyond, the stream that was seen first is forgotten."""
+"""The stream that was seen first is forgotten beyond this number."""
 
 
 class LatestValues:

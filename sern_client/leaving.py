@@ -12,7 +12,7 @@ from sern_core.queues import OutChannel
 from sern_core.types import TopicName
 
 LEAVE_S: Final = 10.0
-"""As long as nothing gets through, say. A topic that comes back meanwhile ends the wait."""
+"""Longest wait for what a topic that ended still has to deliver. It ends early when the topic comes back."""
 
 
 class Leaving:

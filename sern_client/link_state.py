@@ -199,7 +199,7 @@ class LinkState:
         return f"{len(away)} of {len(views)} peers away: {named}"
 
     def to_json(self) -> list[dict[str, object]]:
-        """For /api/peers: a row for each peer."""
+        """A row for each peer, as /api/peers tells it."""
         return [
             {
                 "peer": view.peer,

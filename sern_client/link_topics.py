@@ -51,14 +51,14 @@ class LinkView(NamedTuple):
 
     @property
     def line(self) -> str:
-        """For people: jackal1 is gone for 12 s."""
+        """The state in words: jackal1 is gone for 12 s."""
         if self.status is PeerStatus.CONNECTED:
             return f"{self.peer} is connected"
         why = f" ({self.why})" if self.why else ""
         return f"{self.peer} is {self.status} for {self.since_s:.0f} s{why}"
 
     def values(self) -> dict[str, str]:
-        """For programs; empty where not known."""
+        """The state as keys and values for programs; empty where not known."""
         return {
             "connected": "true" if self.status is PeerStatus.CONNECTED else "false",
             "status": str(self.status),

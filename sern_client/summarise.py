@@ -162,7 +162,7 @@ class TopicSummary:
         return len(self._waiting) + (self._running is not None)
 
     def set_level(self, level: SummaryLevel) -> None:
-        """From the next message on. What is under way goes out first."""
+        """Change the level from the next message on. What is under way goes out first."""
         self.level = level
 
     def audience_changed(self) -> None:

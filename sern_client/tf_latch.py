@@ -46,7 +46,7 @@ class TfLatch:
         return self.merged() or body
 
     def keep(self, source: Hashable, body: bytes) -> None:
-        """As `add`, for whoever asks for the whole later."""
+        """Take a message as `add` does, without the answer, for whoever asks for the whole later."""
         try:
             transforms = read_transforms(body, self._encoding, at_most=MAX_TRANSFORMS)
         except BodyError as error:

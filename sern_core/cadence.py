@@ -19,18 +19,18 @@ SLIP: Final = 0.25
 """An error of more than this share of the period is another rhythm."""
 MAX_MISSED: Final = 4
 MAX_TOPICS: Final = 16
-"""With more of them there is no gap to fit anything into."""
+"""More topics of class 0 than this leave no gap to fit anything into."""
 MIN_DATAGRAMS: Final = 2.5
 """Class 0 that leaves no room for so many full datagrams between two messages, all topics together, is none to wait
 for: all that is sent would be cut small."""
 AFTER_S: Final = 0.0003
-"""Aim so long behind the message: its source may be that late, and what is cut must not end far ahead of it."""
+"""The cut aims this long after the message is due: its source may be that late, and the cut must not end far ahead."""
 MIN_SHARE: Final = 0.25
 """Less than this share of a full datagram is not worth one of its own."""
 HORIZON: Final = 16.0
-"""So many datagrams ahead the cut is spread over those in between: more would not make them larger."""
+"""The cut is spread over at most this many datagrams: more would not make them larger."""
 NEVER_S: Final = 1.0
-"""When nothing is foreseen, look again after so long, or with the next message."""
+"""Look again after this time, or with the next message, when nothing is foreseen."""
 
 
 class Cadence:

@@ -11,7 +11,7 @@ from math import inf
 from typing import Final
 
 PACING_BURST_S: Final = 0.001
-"""By so much a timer may be late; what could have left meanwhile leaves at once."""
+"""A timer may be this late; what could have left meanwhile leaves at once."""
 PACING_DEBT_S: Final = 0.1
 
 

@@ -35,7 +35,7 @@ else:
     from backports import zstd
 
 SIZE: Final = Struct("!I")
-"""In front of every encoded body: how many bytes the raw one has."""
+"""The size of the raw body in bytes, in front of every encoded one."""
 MIN_BYTES: Final = 64
 """Smaller bodies are sent as they are: what a codec could save is less than the header around them."""
 MAX_GAIN: Final = 0.97

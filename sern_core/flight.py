@@ -26,8 +26,9 @@ FIRST_STALL_S: Final = 3.0
 """No acknowledgement for so long: the path is gone; the last one before any round trip was measured."""
 ACK_DELAY_S: Final = 0.010
 ACK_SPACING_S: Final = 0.001
-"""Of a stream, where nobody waits to learn what is lost. Below 1 Gbit/s two full fragments take longer; above it every
-acknowledgement cost each end as much as half a message of 64 kB (measured)."""
+"""Least time between two acknowledgements of a stream, where nobody waits to learn what is lost. Below 1 Gbit/s two
+full fragments take longer; above it each acknowledgement cost each end as much as half a message of 64 kB
+(measured)."""
 SPACED_BYTES: Final = 16 * 1024
 """Smaller datagrams are those of a slow link, or of one whose rate its sender is about to find out."""
 SACK_BITS: Final = 64

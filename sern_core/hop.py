@@ -61,7 +61,7 @@ class Hop(Sender):
     def _pause_reading(
         self, lane: Lane, number: int, stamp_us: int, data: wire.Datagram, position: int, now: float
     ) -> None:
-        """So much was read that others get their turn; the frames from `position` on are left."""
+        """Leave the frames from `position` on for later, so that others get their turn."""
 
     def on_data(
         self,

@@ -33,4 +33,4 @@ class LanePort:
         """A datagram socket has no connection: `Link.open_lane` begins the lane, when its keys are there."""
 
     def disconnected(self, *, now: float) -> None:
-        """Nor can it lose one."""
+        """A datagram socket has no connection to lose."""

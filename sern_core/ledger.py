@@ -205,7 +205,7 @@ class ReceiveLedger:
         self._idle = _Idle()
 
     def tidy(self, used: Collection[TopicName], *, now: float) -> None:
-        """As `SendLedger.tidy`."""
+        """Forget topics as `SendLedger.tidy` does."""
         for topic in self._idle.over(self.topics, used, now):
             counters = self.topics.pop(topic)
             self.topics.setdefault(OTHER_TOPIC, ReceiveCounters(OTHER_TOPIC, counters.priority)).add(counters)

@@ -36,10 +36,11 @@ from sern_core.types import Encoding
 QUANTUM: Final = 0.1
 """Draco's grid, in voxels."""
 MAX_BITS: Final = 24
-"""Beyond that float32 has nothing to say."""
+"""More bits than float32 has to say."""
 DRACO_LEVEL: Final = 5
 DRACO_NUM_POINTS_AT: Final = 11
-"""In a Draco buffer: "DRACO", version u8 u8, geometry u8 (0: point cloud), method u8, flags u16, then points i32."""
+"""Where the number of points stands in a Draco buffer: "DRACO", version u8 u8, geometry u8 (0: point cloud), method u8,
+flags u16, then points i32."""
 MAX_SIDE: Final = 65_500
 """What JPEG can hold."""
 CLOUD_TYPE: Final = "sensor_msgs/PointCloud2"

@@ -116,7 +116,7 @@ class PatternSet:
         return any(regexp.fullmatch(text) is not None for regexp in self._regexps)
 
     def steps(self, name: str) -> int:
-        """For each character of this name, how many instructions a match may take; 0: it is compared as text."""
+        """How many instructions a match may take for each character of this name; 0: it is compared as text."""
         return self.program if self._starts and name.startswith(self._starts) else 0
 
     def __eq__(self, other: object) -> bool:

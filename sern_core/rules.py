@@ -237,7 +237,7 @@ class RuleSet:
     rules: tuple[TopicRule, ...] = ()
     retention_s: float = DEFAULT_RETENTION_S
     implied: int = 0
-    """So many rules at the front follow from other sections: places in messages count from the one after them."""
+    """How many rules at the front follow from other sections; places in messages count from the one after them."""
     _inward: dict[TopicName, TopicName] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:

@@ -49,10 +49,10 @@ RATE_INTERVAL_S: Final = 0.05
 MIN_SHARE_BYTES: Final = 64
 """A fragment smaller than this is not worth its header: the datagram ends instead."""
 CRUMB: Final = 32
-"""Nor is one of less than such a share of a large datagram worth the looking for it."""
+"""A datagram with less than 1/32 of its size free is sent as it is."""
 RIDE_BYTES: Final = 256
-"""So much of a control message travels with each datagram of class 0: where class 0 alone keeps the window shut, what
-would open a better lane, or another stream, must come through all the same."""
+"""Most bytes of a control message that travel with each datagram of class 0. Where class 0 alone keeps the window shut,
+what would open a better lane, or another stream, must come through all the same."""
 MAX_WATERMARKS: Final = 64
 
 

@@ -86,7 +86,7 @@ MAX_SEQ: Final = 2**62
 AGE_UNIT_S: Final = 1e-4
 MAX_AGE_S: Final = AGE_UNIT_S * 0xFFFFFFFF
 AGE_ERRORS_S: Final = (0.0, *(AGE_UNIT_S * 2.0 ** (code / 8) for code in range(254)), float("inf"))
-"""By how much an age may be too young, by its code: every hop adds the uncertainty of its own clock offset."""
+"""How much too young an age may be, by its code: every hop adds the uncertainty of its own clock offset."""
 
 FLAG_TOMBSTONE: Final = 0x01  # the message was dropped upstream; the body is one byte, its DROP_CODES value
 FLAG_REPLAY: Final = 0x02  # a transient_local sample for a late joiner

@@ -103,7 +103,7 @@ class RelayFeed:
         self._after()
 
     def publish(self, stream: StreamInfo, message: Message, *, now: float) -> None:
-        """To the roles' subscribers. They have had what came in through the feed itself."""
+        """Send it to the roles' subscribers. They have had what came in through the feed itself."""
         if stream.id.origin in self._hub.local_owners:
             return
         age_us = max(0, int((now - message.born_s) * 1e6))

@@ -132,7 +132,7 @@ class Adaptation:
             _log.info("%s: %s (%s)", adapter.link.peer, done.decision.chosen, done.decision.reason)
 
     def to_json(self) -> dict[str, Any]:
-        """For /api/mmcf: what is in force, and the last intervals of each link, the oldest first."""
+        """What is in force, and the last intervals of each link, the oldest first, as /api/mmcf tells them."""
         weights, ranges = self._params.weights, self._params.ranges
         return {
             "policy": self._section.policy,

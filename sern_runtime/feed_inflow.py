@@ -23,8 +23,8 @@ from sern_runtime.monitor import ConnectionTable, TcpHandle
 SUBSCRIBER_BYTES: Final = 2**20
 """Some thousand subscriptions, each a few hundred bytes."""
 TOLD_BYTES: Final = 2048
-"""Of messages from this size on it is always said which connection they came from: it takes a quarter of a
-microsecond, and of smaller ones no loop takes enough between two looks to be mistaken for a message without end."""
+"""Messages from this size on are always booked to the connection they came from, which takes a quarter of a
+microsecond. Smaller ones never add up, between two looks, to what could be mistaken for a message without end."""
 GROWTH_MULTIPLE: Final = 3
 """One large frame takes its size, and another time that when it has come out; one of two bytes takes 64."""
 GROWTH_BYTES: Final = 64 * 2**20

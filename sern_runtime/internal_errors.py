@@ -11,7 +11,7 @@ from typing import Any, Final
 from sern_runtime.metrics import Metrics
 
 PLACES: Final = ("core", "callback")
-"""In a core or in what it called, or in any other callback of the event loop."""
+"""Where an error was raised: in a core or in what it called, or in any other callback of the event loop."""
 
 _log = logging.getLogger(__name__)
 

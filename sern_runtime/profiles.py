@@ -33,9 +33,9 @@ class BurstLossSection(Section):
     """Gilbert-Elliott loss, probabilities per packet, in netem's terms p, r, 1-h and 1-k."""
 
     enter: float
-    """From the good state to the bad one."""
+    """Probability of the step from the good state to the bad one."""
     leave: float
-    """From the bad state to the good one; 1 / leave is the mean length of a burst in packets."""
+    """Probability of the step back; 1 / leave is the mean length of a burst in packets."""
     bad_loss: float = 1.0
     """Loss in the bad state."""
     good_loss: float = 0.0
@@ -60,7 +60,7 @@ class LinkSection(Section):
     reorder: float = 0.0
     """Probability that a packet is held back."""
     reorder_delay_s: float = 0.0
-    """For how long."""
+    """How long it lasts."""
     duplicate: float = 0.0
     """Probability that a packet arrives twice."""
     queue_packets: int = LinkModel().queue_packets
@@ -77,7 +77,7 @@ class StepSection(Section):
     rate_bps: float | None = None
     """The rate from then on; null: no limit."""
     blackout_s: Annotated[float, Field(gt=0)] | None = None
-    """For how long nothing gets through."""
+    """How long nothing gets through."""
     direction: Literal["both", "up", "down"] = "both"
     """`up` is client to relay."""
 

@@ -128,7 +128,7 @@ class TypeFiles:
 
 
 def _heading(name: str) -> str:
-    """As a section of a definition names its type."""
+    """The name that a section of a definition gives its type."""
     return name if "/action/" in name else ros_types.ros1_name(name)
 
 

@@ -370,7 +370,7 @@ def rihs01(store: Typestore, type_name: str) -> str:
 
 
 def rihs01_of(fielddefs: Typesdict, type_name: str) -> str:
-    """As `rihs01`, of types that are in no store."""
+    """The RIHS01 hash as in `rihs01`, for types that are in no store."""
     scratch = get_typestore(Stores.EMPTY)
     for name in used_by(type_name, fielddefs):
         constants, fields = fielddefs[name]
@@ -409,7 +409,7 @@ def new(type_name: str, encoding: Encoding, /, **fields: Any) -> Any:
 
 
 def new_in(store: Typestore, type_name: str, /, **fields: Any) -> Any:
-    """As `new`, of a type in any typestore."""
+    """Make a message as `new` does, of a type in any typestore."""
     definition = store.fielddefs[type_name][1]
     if fields and not fields.keys() <= {name for name, _ in definition}:
         raise UsageError(f"{type_name} has no field {sorted(fields.keys() - {name for name, _ in definition})}")

@@ -27,7 +27,7 @@ class Notifier:
 
     @classmethod
     def from_environment(cls, environment: Mapping[str, str] = os.environ) -> "Notifier":
-        """As systemd set us up. WATCHDOG_PID naming another process means that the watchdog is not for us."""
+        """What systemd set up for this process. WATCHDOG_PID naming another means that the watchdog is not for us."""
         watchdog_s = None
         microseconds = environment.get("WATCHDOG_USEC", "")
         if microseconds.isdecimal() and environment.get("WATCHDOG_PID", str(os.getpid())) == str(os.getpid()):

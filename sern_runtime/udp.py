@@ -227,7 +227,7 @@ class UdpSession(Sealed):
 
 
 def ignore(*_: object) -> None:
-    """For what the owner does not want to know."""
+    """Does nothing, for what the owner does not want to know."""
 
 
 class UdpServer:

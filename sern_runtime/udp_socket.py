@@ -34,7 +34,7 @@ from sern_runtime.seal import SEAL_BYTES, UDP_PAYLOAD_BYTES
 from sern_runtime.zmq_socket import SendResult
 
 Address = tuple[str, int] | tuple[str, int, int, int]
-"""As the socket module gives it: (host, port), and for IPv6 flow and scope."""
+"""An address as the socket module gives it: (host, port), and for IPv6 flow and scope."""
 
 BATCH: Final = 64
 """Datagrams taken in one callback, about 0.3 ms with what is done about them: others in the loop get their turn."""
@@ -133,9 +133,9 @@ class DatagramSocket:
         return int(struct.unpack_from("=I", words, 4 * _MEMINFO_DROPS)[0]) if len(words) > 4 * _MEMINFO_DROPS else 0
 
     def send(self, datagram: bytes, address: Address | None, tos: int) -> SendResult:
-        """To `address`, or to the peer of a connected socket, with `tos` as its IP byte (DSCP in the upper six bits).
-        FULL: `on_writable` follows. Whatever else the kernel says is a datagram lost, which UDP allows: OK, counted,
-        and told to `on_error`."""
+        """Send to `address`, or to the peer of a connected socket, with `tos` as its IP byte (DSCP in the upper six
+        bits). FULL: `on_writable` follows. Whatever else the kernel says is a datagram lost, which UDP allows: OK,
+        counted, and told to `on_error`."""
         try:
             if tos != self._tos:
                 self.socket.setsockopt(self._level, self._tos_option, tos)

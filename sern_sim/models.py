@@ -23,7 +23,7 @@ DEFAULT_STALL_S: Final = 0.2
 DEFAULT_DISCONNECT_AFTER_S: Final = 5.0
 """A stream connection breaks when the path is gone for longer; ZMQ's heartbeat timeout as SERN sets it."""
 DEFAULT_RECONNECT_S: Final = 0.5
-"""From the return of the path to a working connection: ZMQ's longest reconnect interval as SERN sets it."""
+"""Time from the return of the path to a working connection: ZMQ's longest reconnect interval as SERN sets it."""
 SEGMENT_BYTES: Final = 1448
 """Payload of one TCP segment on a 1500-byte path; loss and overhead of a stream are counted per segment."""
 
@@ -43,7 +43,7 @@ class Jitter(StrEnum):
 
 
 class RateStep(NamedTuple):
-    """From `at_s` on, the rate is `rate_bps` (None: unlimited)."""
+    """The rate is `rate_bps` from `at_s` on (None: unlimited)."""
 
     at_s: float
     rate_bps: float | None

@@ -40,7 +40,7 @@ from sern_runtime.config.client import ClientFile, load_client
 from sern_tools.message_log import Delivery, MessageLog, Offer
 
 KERNEL_BUFFER_BYTES: Final = 32 * 1024
-"""As requested; the kernel doubles it: 64 kB."""
+"""Bytes of the send buffer as requested; the kernel doubles it: 64 kB."""
 PROBE_INTERVAL_S: Final = 0.02
 PROBE_BYTES: Final = 100
 PROBE_TOPIC: Final = b"\x00probe"

@@ -23,7 +23,7 @@ class Look:
 
     @classmethod
     def of(cls, t_s: float, link: Mapping[str, Any] | None, adaptation: Mapping[str, Any] | None) -> "Look":
-        """From an entry of /api/link, and of `links` in /api/mmcf."""
+        """Read it from an entry of /api/link, and of `links` in /api/mmcf."""
         lane = link["lane"] if link else None
         if not adaptation:
             return cls(t_s, lane)

@@ -37,8 +37,8 @@ class LinkProcess:
         seed: int,
         datagrams: bool = False,
     ) -> "LinkProcess":
-        """With `datagrams` it listens on `FAR_HOST`, TCP and UDP, on the very ports of its targets: a relay tells its
-        clients the number of its UDP port, and not where a proxy has it."""
+        """Start it; with `datagrams` it listens on `FAR_HOST`, TCP and UDP, on the very ports of its targets: a relay
+        tells its clients the number of its UDP port, and not where a proxy has it."""
         command = [sys.executable, "-m", "sern_tools.proxy", "--profile", profile, "--seed", str(seed)]
         for port in targets:
             listen = f"{FAR_HOST}:{port}" if datagrams else f"{HOST}:0"

@@ -29,7 +29,7 @@ STATE_OVERTAKEN_LIMIT: Final = SchedulerParams().floor
 """Class bulk keeps this share of the link while class state is backlogged, so it may overtake as often."""
 CONTROL_OVERTAKEN_LIMIT: Final = 0.01
 COMFORTABLE_BPS: Final = 1e6
-"""From this rate on the small topics run at full rate and size; on slower links they shrink with it."""
+"""The small topics run at full rate and size from this rate on; on slower links they shrink with it."""
 FULL_POSE_RATE_HZ: Final = 50.0
 FULL_MAP_BYTES: Final = 20_000
 CLOUD_RATE_HZ: Final = 10.0

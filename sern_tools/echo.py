@@ -173,7 +173,8 @@ def identity_from_file(path: Path) -> Identity:
 
 
 def identity_from_options(endpoint: str, key: Path | None, server_key: Path | None, name: str | None) -> Identity:
-    """From the command line: both key files, or a `name` alone for a relay on this machine with `insecure: true`."""
+    """The keys of the command line: both key files, or a `name` alone for a relay on this machine with `insecure:
+    true`."""
     if (key is None) != (server_key is None) or (key is None) == (name is None):
         raise UsageError("give --key and --server-key, or --name alone for an insecure relay on this machine")
     try:

@@ -88,7 +88,7 @@ def hex_text(body: bytes, *, max_bytes: int | None = MAX_RAW_BYTES) -> str:
 
 
 class Decoder:
-    """From bodies to text. `raw`: hex, whatever the type. Raises SernError of one line for what cannot be decoded."""
+    """Makes text of bodies. `raw`: hex, whatever the type. Raises SernError of one line for what cannot be decoded."""
 
     def __init__(self, *, raw: bool, full: bool) -> None:
         self._raw = raw

@@ -16,7 +16,7 @@ from sern_tools.message_log import TopicLog
 
 UNCONFIRMED: Final = "unconfirmed"
 MAY_HAVE_ARRIVED: Final = frozenset({UNCONFIRMED, "retention", "lifespan"})
-"""For these the origin of a reliable stream gives up a message that a place further on may have had already."""
+"""Reasons for which the origin of a reliable stream gives up a message that a place further on may have had already."""
 
 
 NO_DROP: Final = frozenset({"delivered", "refused", "waiting"})

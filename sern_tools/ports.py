@@ -14,9 +14,9 @@ from sern_core.errors import SernError
 
 HOST: Final = "127.0.0.1"
 PORTS: Final = range(15_000, 32_000)
-"""Below those that the kernel gives to outgoing connections, which could take one before its owner listens."""
+"""Ports below those that the kernel gives to outgoing connections, which could take one before its owner listens."""
 CLAIMS: Final = 128
-"""So many of the last claims of a process hold; by then the owners of those before listen, or have ended."""
+"""How many of the last claims of a process hold; by then the owners of those before listen, or have ended."""
 
 _claims: Final[deque[socket.socket]] = deque()
 

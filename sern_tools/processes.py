@@ -29,7 +29,7 @@ ABORT_S: Final = 5.0
 TAIL_LINES: Final = 4
 LINE_BYTES: Final = 2**20
 _PLAIN_PYTHON: Final = (sys.executable, "-I", "-S")
-"""For helpers that import nothing that is installed."""
+"""The Python command for helpers that import nothing that is installed."""
 
 
 def bound(command: Sequence[str]) -> list[str]:

@@ -231,7 +231,7 @@ COLUMNS: Final = (
 
 
 def table(rows: list[Row], width: int = PLAIN_WIDTH) -> Table:
-    """For a terminal of so many characters: what there is no room for is left out."""
+    """The table for a terminal of that many characters; what there is no room for is left out."""
     result = Table(box=None, pad_edge=False)
     columns = [column for column in COLUMNS if width >= column.width]
     for column in columns:

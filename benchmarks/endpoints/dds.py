@@ -82,7 +82,7 @@ async def _between(children: Children, system: str, source: int, target: int) ->
 
 
 async def _delays_ms(sink: Peer, name: str, expected: int) -> list[float]:
-    """From publishing to arrival, for all messages that arrive, in their order."""
+    """Latency from publishing to arrival of all messages that arrive, in their order."""
     delays_ms: list[float] = []
     for number in range(expected):
         await sink.do(f"stats {name}")

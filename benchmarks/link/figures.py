@@ -116,7 +116,8 @@ def datagrams_hz(outcome: Outcome) -> float:
 
 
 def bare_load(outcome: Outcome) -> Load:
-    """For the bare forwarder: as many datagrams a second as a run had on its link, each of their mean size."""
+    """What the bare forwarder is given: as many datagrams a second as a run had on its link, each of their mean
+    size."""
     if not outcome.wire_packets:
         raise SernError(f"{outcome.system}: nothing left the link")
     size_bytes = round(outcome.wire_bytes / outcome.wire_packets) - ETHERNET_BYTES - SEAL_BYTES
@@ -154,7 +155,7 @@ def refusing_to_forwarding(spent_percent: float, junk_hz: float, bare: Outcome) 
 
 
 def first_fresh_s(outcome: Outcome, step: str, floor_s: float) -> float:
-    """From the order to restore the link until a fresh pose is there. NEVER_S if none came."""
+    """Time from the order to restore the link until a fresh pose is there. NEVER_S if none came."""
     asked_ns = outcome.events[step][0]
     rows = outcome.arrived[outcome.arrived[:, KIND] == Kind.POSE]
     fresh = rows[(rows[:, AT] >= asked_ns) & (rows[:, AT] - rows[:, STAMP] <= (floor_s + FRESH_S) * 1e9)]
@@ -162,7 +163,8 @@ def first_fresh_s(outcome: Outcome, step: str, floor_s: float) -> float:
 
 
 def settled_s(outcome: Outcome, step: str, capacity_bps: float, until: str | None) -> float:
-    """From the order to change the rate until the sender's estimate is near it for HELD_S. NEVER_S if it never is."""
+    """Time from the order to change the rate until the sender's estimate is near it for HELD_S. NEVER_S if it never
+    is."""
     asked_ns = outcome.events[step][0]
     end_ns = outcome.events[until][0] if until else outcome.start_ns + int(outcome.duration_s * 1e9)
     samples = samples_of(outcome)

@@ -36,7 +36,7 @@ class Hops:
 
     @classmethod
     def draw(cls) -> Self:
-        """With the cipher that the relay and a client of this machine choose."""
+        """New parameters, with the cipher that the relay and a client of this machine choose."""
         cipher = offered_ciphers()[0]
         return cls(SessionParameters.draw(1, cipher, RELAY_PORT), SessionParameters.draw(2, cipher, PORT))
 
@@ -53,7 +53,8 @@ class Hops:
 
 
 class Forwarder:
-    """From `inlet`, bound, to `outlet`, connected; both do not block. Call `step` when `inlet` has a datagram."""
+    """Forwards from `inlet`, bound, to `outlet`, connected; both do not block. Call `step` when `inlet` has a
+    datagram."""
 
     def __init__(self, hops: Hops, inlet: socket.socket, outlet: socket.socket) -> None:
         self._inlet = inlet

@@ -32,7 +32,7 @@ START_S: Final = 60.0
 """How long ends may take to start and to find each other; the machine may be busy, the link lossy. One that ends is
 noticed at once."""
 LEAD_S: Final = 0.3
-"""From the order to go until the first message."""
+"""Time from the order to go until the first message."""
 DRAIN_S: Final = 1.5
 """What is under way at the end of the load may still arrive for so long."""
 POLL_S: Final = 0.1

@@ -49,7 +49,7 @@ class AgingPublisher(Protocol):
     """A `Publisher` that may keep a message back for a moment."""
 
     def publish_within(self, body: bytes, stamp_ns: int, left_s: float) -> None:
-        """As `publish`, and never later than in `left_s`, when the message is too old."""
+        """Publish as `publish` does, and never later than in `left_s`, when the message is too old."""
 
 
 PublishWithin = Callable[[bytes, int, float], None]
@@ -225,7 +225,7 @@ class ServiceEndpoint(Protocol):
 
     @property
     def encoding(self) -> Encoding | None:
-        """As `Endpoint.encoding`."""
+        """The encoding of bodies here, as in `Endpoint.encoding`."""
 
     def watch_services(self, events: ServiceEvents) -> None: ...
 

@@ -1,4 +1,4 @@
-"""From threads of a middleware to the event loop: bounded, in order, one wake-up for many items."""
+"""The way from threads of a middleware to the event loop: bounded, in order, one wake-up for many items."""
 
 import asyncio
 from collections import deque

@@ -61,9 +61,9 @@ _BAG_TAIL: Final = frozenset({2, 4, 6, 7})
 _MCAP_TAIL: Final = frozenset({2, 3, 4, 5, 7, 8, 11, 12, 13, 14, 15})
 """Records that may stand behind the last whole chunk of a recording of ours."""
 _MAX_TAIL_BYTES: Final = 4096
-"""So much may stand there that is not even the beginning of a record."""
+"""Most bytes there that are not even the beginning of a record."""
 _UNREADABLE: Final = (EOFError, ValueError, KeyError, IndexError, struct.error, ReaderError, ConfigError)
-"""What bytes that are no record of theirs raise here."""
+"""What reading raises for bytes that are no record."""
 
 
 class Finished(NamedTuple):

@@ -57,13 +57,13 @@ MAX_GROWTH: Final = 0.25
 CUT: Final = 0.95
 EMERGENCY_CUT: Final = 0.9
 WENT: Final = 0.25
-"""Of the longest queue since the link got slower; one that came down to so much as we made way was ours..."""
+"""A queue that came down to this share of the longest one since the link got slower, as we made way, was ours..."""
 WENT_RTTS: Final = 10
 WENT_SLOWER: Final = 0.1
-"""... if it was so many round trips long, and the rate is so little of what it was: a rival leaves more, and its queue
-is short for a moment whenever it looks at the empty path."""
+"""... if it was `WENT_RTTS` round trips long and the rate fell to this share: a rival leaves more, and its queue is
+short for a moment whenever it looks at the empty path."""
 SLOWER: Final = 0.8
-"""Less than this share of the known rate through a queue that stays: the link got slower."""
+"""The link got slower when less than this share of the known rate passes a queue that stays."""
 EMERGENCY_S: Final = 0.050
 STARTUP_GAIN: Final = 4.0
 STARTUP_PACING: Final = 4.0
@@ -71,21 +71,21 @@ STARTUP_AIM: Final = 0.9
 PACING_GAIN: Final = 1.03
 CALM_PACING: Final = 0.985
 CALM_PACKETS: Final = 0.3
-"""Instead of `PACING_GAIN` and `TARGET_PACKETS` where there is no jitter and a packet takes little: by jitter the rate
-would drift down unseen, and of long packets an epoch has too few."""
+"""These two replace `PACING_GAIN` and `TARGET_PACKETS` where there is no jitter and a packet takes little: with jitter
+the rate would drift down unseen, and an epoch has too few long packets."""
 GENTLE_PACKET_S: Final = 0.0015
 GENTLE_PACKETS: Final = 0.4
 GENTLE_PACING: Final = (1.01, 1.01, 1.01, 1.02, 1.03, 1.05, 1.09, 1.17, 1.3, 1.5)
-"""Where a packet takes longer than that, one more in flight is a step of the queue: the pace steers there, not the
-window. While the path looks empty it is so many times the capacity, epoch by epoch."""
+"""The pace steers, not the window, where a packet takes longer than `GENTLE_PACKET_S`: one more in flight is a step of
+the queue there. These are the pace over the capacity, epoch by epoch, while the path looks empty."""
 CALM_SHARE: Final = 0.05
-"""So much faster is the pace of who has none of the link: shares meet."""
+"""How much faster the pace is of a sender that has none of the link, so that shares meet."""
 CALM_NOISE_S: Final = 0.0005
 CALM_PACKET_S: Final = 0.003
 DRAIN_PACING: Final = 0.98
 INITIAL_WINDOW_BYTES: Final = 12_600
 MIN_WINDOW_FRAGMENTS: Final = 1.5
-"""And the hop commits one fragment beyond the window."""
+"""The least window; the hop commits one fragment beyond it."""
 MAX_WINDOW_BYTES: Final = 64 * 2**20
 IDLE_S: Final = 2.0
 """What was not used for so long is halved, for the link may have changed; start-up brings it back."""

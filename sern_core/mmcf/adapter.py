@@ -57,7 +57,7 @@ class AdapterParams:
 
     ranges: Ranges = field(default_factory=Ranges)
     weights: Weights = field(default_factory=lambda: Weights(0.45, 0.30, 0.10, 0.15))
-    """To cost what was measured; those of the policy."""
+    """The weights of the policy, which price what was measured."""
     interval_s: float = INTERVAL_S
     deadlines_s: tuple[float, ...] = (0.3, 0.5, 1.0)
     """Messages that arrive later do not count as delivered; a shorter lifespan of the topic counts instead."""

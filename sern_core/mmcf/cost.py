@@ -60,7 +60,7 @@ FLOORS: Final = {
     "mapping": (1.0, 0.5, 0.5),
     "balanced": (1.0, 1.0, 0.6),
 }
-"""By profile and class: the share of the offered messages that must arrive in time where the link can carry it. Who
+"""The share of the offered messages that must arrive in time where the link can carry it, by profile and class. Who
 drives wants all that there is room for; who maps shares the link with others, and half the scans make the map."""
 
 

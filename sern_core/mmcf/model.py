@@ -96,7 +96,7 @@ class LinkState:
 
 
 Levels = tuple[bool, ...]
-"""By class (control, state, bulk): whether topics of it that may be are sent as their summaries."""
+"""Whether topics that may be are sent as their summaries, by class (control, state, bulk)."""
 
 
 @dataclass(frozen=True, slots=True)

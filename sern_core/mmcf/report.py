@@ -8,8 +8,7 @@ from sern_core.mmcf.policy import Decision
 from sern_core.types import CLASS_LABELS
 
 CANDIDATES: Final = 6
-"""So many of the best candidates are told, the chosen one among them. Of those that are predicted to come to the same,
-one."""
+"""How many of the best candidates are told, the chosen one among them; one of each group with the same prediction."""
 
 
 def configuration_json(configuration: Configuration) -> dict[str, Any]:

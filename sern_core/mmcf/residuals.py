@@ -78,7 +78,7 @@ class Residuals:
         return {key: exp(value) for key, value in self._ratio_logs.items()}
 
     def snapshot(self) -> dict[str, float]:
-        """For /api/mmcf: factors by name."""
+        """The factors by name, as /api/mmcf tells them."""
         named = {
             f"{metric}{f'/{mode}' if mode else ''}/{'saturated' if saturated else 'unsaturated'}": exp(value)
             for (metric, mode, saturated), value in sorted(self._logs.items())

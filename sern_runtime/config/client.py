@@ -209,7 +209,7 @@ class TopicSection(Section):
     remap: TopicText | None = None
     """Another name for this topic outside this site, before the namespace; needs a plain name in `match`."""
     on_link_loss: LossSection | None = None
-    """For topics of type geometry_msgs/Twist or TwistStamped that come in: what to publish when commands stop."""
+    """What to publish when commands stop, for topics of type geometry_msgs/Twist or TwistStamped that come in."""
     summary: OneOrMoreSummaries = ()
     """Send something smaller in place of heavy messages, or beside them: one mapping, or a list of them. `kind`
     selects what it is."""

@@ -1,4 +1,4 @@
-"""From a file to a checked model, and from each of pydantic's errors to one line a person can act on.
+"""Reads a file into a checked model, and makes one line that a person can act on of each of pydantic's errors.
 
 `file:line: dotted.key: problem`, where the problem names the accepted values or the closest key.
 """

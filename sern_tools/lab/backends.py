@@ -219,7 +219,7 @@ class InAppliance(Backend):
 
 
 BACKENDS: Final[dict[str, type[Backend]]] = {backend.name: backend for backend in (Native, InAppliance)}
-"""In the order in which they are tried."""
+"""The backends, in the order in which they are tried."""
 
 
 def choose(lab: str, wanted: str | None = None) -> type[Backend]:

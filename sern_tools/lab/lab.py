@@ -76,7 +76,7 @@ class Node:
 
     @property
     def namespace(self) -> str:
-        """As `ip netns` knows it."""
+        """The name by which `ip netns` knows it."""
         return self._endpoint.namespace
 
     @property

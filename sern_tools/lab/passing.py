@@ -17,7 +17,7 @@ _NUMBER: Final = struct.Struct("!II")
 
 
 class Way(NamedTuple):
-    """From one bound socket to another, `name` for people: `a to b`."""
+    """Passes datagrams from one bound socket to another; `name` is for people: `a to b`."""
 
     name: str
     source: socket.socket

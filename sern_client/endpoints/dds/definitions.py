@@ -35,7 +35,7 @@ class Definitions:
         return self._files.service(type_name, encoding)
 
     def service(self, type_name: str, request_hash: str = "") -> TypeText:
-        """As `message`, of a service, which DDS tells from others by the hash of its request."""
+        """The definition of a service, as `message` has those of messages; DDS tells it by the hash of its request."""
         found: list[tuple[TypeText, str]] = []
         definition = self._files.service(type_name)
         if definition is not None:

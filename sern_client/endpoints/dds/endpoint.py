@@ -422,7 +422,7 @@ class DdsEndpoint:
         self.services.watch(events)
 
     def service_definition(self, type_name: str, encoding: Encoding) -> str | None:
-        """As `KnowsServiceTypes`."""
+        """The type of a service, as `KnowsServiceTypes` has it."""
         return self.types.service_in(type_name, encoding)
 
     async def call(self, name: TopicName, request: bytes, *, timeout_s: float) -> bytes:
@@ -444,7 +444,7 @@ class DdsEndpoint:
         header: bool = False,
         id_key: str = "clientid",
     ) -> _Reader:
-        """With `header`, of requests or replies, which other SERN endpoints send as well.
+        """Open a reader; with `header`, of requests or replies, which other SERN endpoints send as well.
 
         ConfigError when the topic is in use here with another type, or DDS cannot have the type.
         """

@@ -21,7 +21,8 @@ __all__ += ["type_to_dds", "user_data"]
 DISCOVERY_TOPIC: Final = "ros_discovery_info"
 """Which nodes a participant has: rmw_dds_common/msg/ParticipantEntitiesInfo."""
 SERN_KEY: Final = "sern"
-"""In the USER_DATA of our participants: other SERN endpoints know by it what came over a link already."""
+"""This key stands in the USER_DATA of our participants: other SERN endpoints know by it what came over a link
+already."""
 
 
 class Role(StrEnum):

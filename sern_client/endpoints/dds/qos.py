@@ -125,7 +125,7 @@ def writer_for(info: TopicInfo, *, lifespan: bool) -> EndpointQos:
 
 
 def to_policies(qos: EndpointQos, *, depth: int, writer: bool, id_key: str = "clientid") -> Qos:
-    """For Cyclone DDS. A writer never waits for its readers: the event loop would."""
+    """The policies in Cyclone DDS's terms. A writer never waits for its readers: the event loop would."""
     policies: list[Any] = [
         Policy.Reliability.Reliable(0 if writer else 100_000_000) if qos.reliable else Policy.Reliability.BestEffort,
         Policy.Durability.TransientLocal if qos.transient_local else Policy.Durability.Volatile,

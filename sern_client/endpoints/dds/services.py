@@ -66,7 +66,7 @@ def _layout(body: bytes) -> struct.Struct:
 
 
 def new_service_id() -> str:
-    """As rmw_cyclonedds writes the ids by which it pairs a client's reader with its writer."""
+    """A new id by which rmw_cyclonedds pairs a client's reader with its writer, written as it does."""
     return ".".join(f"{byte:x}" for byte in secrets.token_bytes(16))
 
 

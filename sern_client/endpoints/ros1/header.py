@@ -20,8 +20,8 @@ MAX_HEADER_BYTES: Final = 1_200_000
 MAX_FIELDS: Final = 64
 
 BRIDGE_FIELD: Final = "sern_bridge"
-"""In our headers, with the node's name as its value: what comes from such a publisher or server came over a link
-already, and no SERN endpoint offers it to a link again. Other nodes ignore fields they do not know."""
+"""This field stands in our headers, with the node's name as its value. What comes from such a publisher or server came
+over a link already, and no SERN endpoint offers it to a link again. Other nodes ignore fields they do not know."""
 
 _LENGTH: Final = struct.Struct("<I")
 

@@ -169,7 +169,8 @@ class Source:
             pause_s = min(pause_s * 2, BACKOFF_S[1])
 
     async def _session(self) -> bool:
-        """From asking where to connect until the connection has ended; whether the handshake succeeded."""
+        """Ask where to connect, connect, and read until the connection has ended. Tells whether the handshake
+        succeeded."""
         try:
             async with asyncio.timeout(CONNECT_S):
                 host, port = await self._ask()

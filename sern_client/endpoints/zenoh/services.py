@@ -78,7 +78,7 @@ class Services(ABC):
         return names.data_key(self.options.domain, info.name, dds_name, info.type_hash)
 
     def service_definition(self, type_name: str, encoding: Encoding) -> str | None:
-        """As `KnowsServiceTypes`."""
+        """The type of a service, as `KnowsServiceTypes` has it."""
         return self.types.service(type_name, encoding)
 
     async def call(self, name: TopicName, request: bytes, *, timeout_s: float) -> bytes:
