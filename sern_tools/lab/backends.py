@@ -267,10 +267,13 @@ def wiring(middle: str, endpoints: Sequence[Endpoint], congestion: str | None) -
     return commands
 
 
-def build(middle: str, endpoints: Sequence[Endpoint], congestion: str | None) -> None:
-    """Make the namespaces and wire them, all but the link. LabError when something refuses."""
+def build(middle: str, endpoints: Sequence[Endpoint], congestion: str | None, *, lock: int) -> None:
+    """Make the namespaces and wire them, all but the link. LabError when something refuses.
+
+    What makes a namespace holds the lab's lock: it may outlive this process, and who cleans up after that waits for it.
+    """
     for namespace in (middle, *(end.namespace for end in endpoints)):
-        run(["ip", "netns", "add", namespace])
+        run(["ip", "netns", "add", namespace], held=(lock,))
         quiet(namespace)
     run_all(wiring(middle, endpoints, congestion))
     no_offloads(middle, [end.port for end in endpoints])

@@ -43,12 +43,15 @@ class LabError(SernError):
     """The lab cannot be made or changed; says what is missing or what refused."""
 
 
-def run(command: Sequence[str], *, timeout_s: float = COMMAND_S) -> str:
-    """Run a command of the system and return its output. LabError with its last words when it fails."""
+def run(command: Sequence[str], *, timeout_s: float = COMMAND_S, held: Sequence[int] = ()) -> str:
+    """Run a command of the system and return its output. LabError with its last words when it fails.
+
+    `held` are descriptors that it keeps open until it ends, whatever happens to this process.
+    """
     try:
         done = subprocess.run(
             command, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=timeout_s, check=False,
-            env={**os.environ, "PATH": search_path(), "LC_ALL": "C"},
+            pass_fds=held, env={**os.environ, "PATH": search_path(), "LC_ALL": "C"},
         )  # fmt: skip
     except FileNotFoundError as error:
         raise LabError(f"{command[0]} is not installed: apt-get install {package_of(command[0])}") from error

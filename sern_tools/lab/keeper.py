@@ -2,6 +2,7 @@
 
 Its standard input is a pipe whose other end only the owner holds, so it ends with the owner however that ended,
 kill -9 included. It then removes everything that carries the lab's name, and says on standard error what it could not.
+An owner that was killed may leave a command behind which makes a namespace; the keeper waits for it.
 """
 
 import os
@@ -11,8 +12,10 @@ import sys
 from typing import Final
 
 from sern_tools.lab.host import LabError
-from sern_tools.lab.removal import remove
+from sern_tools.lab.removal import await_commands, remove
 
+RELEASED: Final = b"released"
+"""What an owner says that lives: nothing of it is under way any more."""
 CLOSE_S: Final = 30.0
 """Removing a lab takes a fraction of a second; this is for a machine that is very busy."""
 
@@ -32,7 +35,7 @@ class Keeper:
     def release(self) -> None:
         """Have the lab removed and wait for it. LabError with what is left when that failed."""
         try:
-            _, errors = self._process.communicate(timeout=CLOSE_S)
+            _, errors = self._process.communicate(RELEASED, timeout=CLOSE_S)
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.communicate()
@@ -44,9 +47,12 @@ class Keeper:
 def main() -> int:
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT):
         signal.signal(number, signal.SIG_IGN)
-    while os.read(0, 4096):
-        pass
+    said = b""
+    while word := os.read(0, 4096):
+        said += word
     try:
+        if said != RELEASED:
+            await_commands(sys.argv[1])
         remove(sys.argv[1])
     except LabError as error:
         print(f"{error}: sern lab down removes it", file=sys.stderr)

@@ -146,7 +146,7 @@ class Lab:
             chosen = choose(self.id, self._wanted)
             self._keeper = Keeper(self.id)
             middle = namespace_name(self.id, MIDDLE)
-            build(middle, self._endpoints, self._congestion)
+            build(middle, self._endpoints, self._congestion, lock=self._lock)
             self._backend = chosen(middle)
             self._backend.start()
             self.reset()

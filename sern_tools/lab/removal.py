@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
-from sern_tools.lab.host import NETNS_DIR, LabError, run
+from sern_tools.lab.host import COMMAND_S, NETNS_DIR, LabError, run
 
 RUN_DIR: Final = Path("/run/sern-lab")
 """Locks and control sockets; for root alone."""
@@ -59,8 +59,15 @@ def _matches(directory: Path, pattern: re.Pattern[str]) -> Iterator[re.Match[str
                 yield match
 
 
+def await_commands(lab: str) -> None:
+    """Return when no command of a dead owner can make another namespace of this lab; after `COMMAND_S` anyway."""
+    give_up_s = time.monotonic() + COMMAND_S
+    while (RUN_DIR / f"{lab}.lock").exists() and alive(lab) and time.monotonic() < give_up_s:
+        time.sleep(0.005)
+
+
 def alive(lab: str) -> bool:
-    """Whether the process that made a lab still runs."""
+    """Whether the process that made a lab still runs, or a command with which it was making it."""
     try:
         descriptor = os.open(RUN_DIR / f"{lab}.lock", os.O_RDWR | os.O_CLOEXEC)
     except FileNotFoundError:

@@ -260,9 +260,37 @@ async def test_the_next_start_removes_what_a_dead_keeper_left(possible: None) ->
             owner.kill()
     left = str(owner.pid)
     assert left in labs()
-    assert left in sweep()
+    await until(lambda: left in sweep(), "the command that makes a namespace ends")
     assert namespaces(left) == [] and left not in labs()
     assert not processes_of(left)
+
+
+LATE_COMMAND = """
+import sys
+from sern_tools.lab.host import run
+from sern_tools.lab.removal import lock
+
+held = lock(sys.argv[1])
+print("held", flush=True)
+sys.stdin.readline()
+run(["ip", "netns", "add", f"sern-{sys.argv[1]}-late"])
+"""
+
+
+def test_a_keeper_waits_for_the_command_that_its_dead_owner_left(possible: None) -> None:
+    """`ip netns add` goes on when the owner is killed: what it makes would stay behind for ever."""
+    name = f"{os.getpid()}.999"
+    plain = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+    with (
+        subprocess.Popen([sys.executable, "-c", LATE_COMMAND, name], text=True, **plain) as command,
+        subprocess.Popen([sys.executable, "-P", "-m", "sern_tools.lab.keeper", name], text=True, **plain) as keeper,
+    ):
+        assert command.stdin is not None and command.stdout is not None and keeper.stdin is not None
+        assert command.stdout.readline() == "held\n"
+        keeper.stdin.close()  # as by kill -9
+        command.stdin.close()
+        assert (command.wait(), keeper.wait()) == (0, 0)
+    assert namespaces(name) == [] and name not in labs()
 
 
 def test_errors_name_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
