@@ -6,6 +6,7 @@ and sockets are checked once, at the end of the session.
 
 import asyncio
 import gc
+import os
 import threading
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping
 from pathlib import Path
@@ -25,6 +26,13 @@ from tests.support import DEADLINE_S, Patience
 Context = zmq.Context[zmq.Socket[bytes]]
 PEERS: Final = Path(__file__).parent / "peers"
 
+for name in (
+    "CYCLONEDDS_URI", "FASTRTPS_DEFAULT_PROFILES_FILE", "RMW_IMPLEMENTATION", "ROS_DISCOVERY_SERVER", "ROS_DOMAIN_ID",
+    "ROS_HOSTNAME", "ROS_IP", "ROS_IPV6", "ROS_MASTER_URI", "ROS_NAMESPACE", "ZENOH_CONFIG_OVERRIDE",
+    "ZENOH_SESSION_CONFIG_URI",
+):  # fmt: skip
+    os.environ.pop(name, None)  # a developer's own robots are none of the tests' business
+os.environ["GIT_PYTHON_REFRESH"] = "quiet"  # the zenoh peer imports it, and needs no git
 load_profile()
 raise_open_files()  # as the daemons do, many of which run inside the tests
 

@@ -206,7 +206,12 @@ asyncio.run(main())
 
 def owner_of_a_lab(script: str = OWNER) -> subprocess.Popen[str]:
     """A process that makes a lab and says which, to be killed by the caller."""
-    return subprocess.Popen([sys.executable, "-c", script], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    return process_of("-c", script)
+
+
+def process_of(*words: str) -> subprocess.Popen[str]:
+    """A Python process with a pipe either way."""
+    return subprocess.Popen([sys.executable, *words], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
 
 
 async def test_two_at_once_and_nothing_stays_after_kill_9(lab: Lab) -> None:
@@ -280,10 +285,9 @@ run(["ip", "netns", "add", f"sern-{sys.argv[1]}-late"])
 def test_a_keeper_waits_for_the_command_that_its_dead_owner_left(possible: None) -> None:
     """`ip netns add` goes on when the owner is killed: what it makes would stay behind for ever."""
     name = f"{os.getpid()}.999"
-    plain = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
     with (
-        subprocess.Popen([sys.executable, "-c", LATE_COMMAND, name], text=True, **plain) as command,
-        subprocess.Popen([sys.executable, "-P", "-m", "sern_tools.lab.keeper", name], text=True, **plain) as keeper,
+        process_of("-c", LATE_COMMAND, name) as command,
+        process_of("-P", "-m", "sern_tools.lab.keeper", name) as keeper,
     ):
         assert command.stdin is not None and command.stdout is not None and keeper.stdin is not None
         assert command.stdout.readline() == "held\n"

@@ -16,7 +16,7 @@ from sern_core.message import TopicInfo
 from sern_core.types import Encoding, TopicName
 from tests.daemons import Lab
 from tests.peers.test_zenoh import Router
-from tests.support import Events, until
+from tests.support import DEADLINE_S, Events, until
 
 pytest.importorskip("zenoh", reason="the library eclipse-zenoh is missing: pip install eclipse-zenoh")
 
@@ -77,7 +77,8 @@ class Server:
         return b"\0\1\0\0result of " + request[4:]
 
 
-async def test_an_action_of_ros_2_across_the_link(tmp_path: Path) -> None:
+async def test_an_action_of_ros_2_across_the_link(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sern_runtime.config.client.SERVICE_TIMEOUT_S", DEADLINE_S)
     routers = [Router(), Router()]
     for router in routers:
         router.start()
@@ -90,7 +91,7 @@ async def test_an_action_of_ros_2_across_the_link(tmp_path: Path) -> None:
             await relay.ready()
             manual = {"mode": "manual"}
             match = [{"match": "/fibonacci"}]
-            await lab.connected(
+            robot = await lab.connected(
                 lab.client_file("robot1", _section(routers[0]), discovery=manual, actions={"offer": match})
             )
             match = [{"match": "/robot1/fibonacci"}]
@@ -120,7 +121,7 @@ async def test_an_action_of_ros_2_across_the_link(tmp_path: Path) -> None:
 
                 client.subscribe(name(action, part), take)
             await until(lambda: got["status"], "who comes late gets the last status")
-            answer = await client.call(name(action, "send_goal"), b"\0\1\0\0goal", timeout_s=20)
+            answer = await client.call(name(action, "send_goal"), b"\0\1\0\0goal", timeout_s=DEADLINE_S)
             assert (answer, server.goals) == (b"\0\1\0\0accepted", [b"\0\1\0\0goal"])
             await until(lambda: got["status"][-1] == b"\0\1\0\0executing", "the status follows")
 
@@ -129,17 +130,18 @@ async def test_an_action_of_ros_2_across_the_link(tmp_path: Path) -> None:
                     server.feedback.publish(b"\0\1\0\0half", 3)
                     await asyncio.sleep(0.01)
 
-            await asyncio.wait_for(heard(), 20)
+            await asyncio.wait_for(heard(), DEADLINE_S)
 
             # The result is asked for, and the relay is replaced by another process before it is there.
             result = asyncio.ensure_future(client.call(name(action, "get_result"), b"\0\1\0\0goal", timeout_s=60))
-            await asyncio.wait_for(server.asked.wait(), 20)
+            await asyncio.wait_for(server.asked.wait(), DEADLINE_S)
             relay.kill()
             await until(lambda: site.core.link.lane.stalled, "the link is lost")
             await lab.process(relay.config).ready()
-            answer = await client.call(name(action, "cancel_goal"), b"\0\1\0\0goal", timeout_s=20)
+            await until(lambda: robot.core.link.established and site.core.link.established, "both are back")
+            answer = await client.call(name(action, "cancel_goal"), b"\0\1\0\0goal", timeout_s=DEADLINE_S)
             assert (answer, server.cancelled) == (b"\0\1\0\0cancelling", [b"\0\1\0\0goal"])
-            assert await asyncio.wait_for(result, 30) == b"\0\1\0\0result of goal"
+            assert await asyncio.wait_for(result, DEADLINE_S) == b"\0\1\0\0result of goal"
             assert len(server.goals) == 1
     finally:
         await client.stop()

@@ -34,9 +34,9 @@ async def test_ros_1_and_ros_2_call_each_other(tmp_path: Path, router: Router, p
     async with RosLab(tmp_path) as ros, Lab(tmp_path, "one", "two") as lab:
         await lab.relay()
         ros1 = {"kind": "ros1", "master_uri": ros.uri, "host": HOST}
-        services = {"offer": [{"match": "/lamp"}], "use": [{"match": "/two/mode"}]}
+        services = {"offer": [{"match": "/lamp", "timeout_s": 60}], "use": [{"match": "/two/mode", "timeout_s": 60}]}
         await lab.connected(lab.client_file("one", ros1, discovery=manual, services=services))
-        services = {"offer": [{"match": "/mode"}], "use": [{"match": "/one/lamp"}]}
+        services = {"offer": [{"match": "/mode", "timeout_s": 60}], "use": [{"match": "/one/lamp", "timeout_s": 60}]}
         await lab.connected(lab.client_file("two", zenoh, discovery=manual, services=services))
         ros.python("server", SERVER)
         await peer.do("server", name="/mode")

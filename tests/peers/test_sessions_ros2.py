@@ -10,7 +10,7 @@ from sern_client.endpoints.zenoh.session import SessionOptions
 from sern_core.types import Encoding
 from sern_tools.ports import free_ports
 from tests.exploring import seeds
-from tests.peers.dds.peer import free_domain
+from tests.peers.dds.peer import LEASE_S, free_domain
 from tests.sern_client.sessions import Changes
 from tests.support import Events, until
 
@@ -36,7 +36,7 @@ async def agree(endpoint: Endpoint, events: Events, seed: int) -> None:
 
 @pytest.mark.parametrize("seed", SEEDS)
 async def test_dds(seed: int) -> None:
-    domain = DomainOptions(free_domain(), localhost_only=True, lease_s=3.0)
+    domain = DomainOptions(free_domain(), localhost_only=True, lease_s=LEASE_S)
     endpoint, observer = DdsEndpoint(DdsOptions(domain)), DdsEndpoint(DdsOptions(domain, heed_sern=True))
     events = Events()
     await endpoint.start(Events())

@@ -20,14 +20,14 @@ from sern_core.types import Encoding, TopicName
 from sern_runtime import ros_services, ros_types
 from sern_tools.ports import free_ports
 from tests.daemons import Lab, bodies, under, write_bag
-from tests.support import Events, until
+from tests.support import DEADLINE_S, Events, until
 
 zenoh = pytest.importorskip("zenoh", reason="the library eclipse-zenoh is missing: pip install eclipse-zenoh")
 pytest.importorskip("zenoh_ros2_sdk", reason="the peer zenoh-ros2-sdk is missing: pip install zenoh-ros2-sdk")
 
 DOMAIN = 7
 CHAT = TopicName("/robot/chatter")
-MODE = TopicName("/set_mode")
+MODE, OTHER_MODE = TopicName("/set_mode"), TopicName("/other_mode")
 
 
 def text(data: str) -> bytes:
@@ -166,7 +166,7 @@ async def test_a_node_is_heard_while_it_publishes(endpoint: tuple[ZenohEndpoint,
             await asyncio.sleep(0)
         assert got[0].startswith(text("hello ")[:4])
 
-    await asyncio.wait_for(heard(), 20)
+    await asyncio.wait_for(heard(), DEADLINE_S)
     first = len(got)
     for number in range(50):
         await peer.do("publish", name=CHAT, data=f"number {number}")
@@ -188,7 +188,7 @@ async def test_what_is_published_here_reaches_a_node(endpoint: tuple[ZenohEndpoi
             publisher.publish(text("hello"), 1)
             await asyncio.sleep(0.01)
 
-    await asyncio.wait_for(heard(), 20)
+    await asyncio.wait_for(heard(), DEADLINE_S)
     for number in range(50):
         publisher.publish(text(f"number {number}"), number)
     await until(lambda: (CHAT, "number 49") in peer.got, "all arrive")
@@ -203,6 +203,7 @@ async def test_the_first_messages_wait_for_the_subscribers_there_are(
 ) -> None:
     ours, _ = endpoint
     await peer.do("subscriber", name=CHAT)
+    await until(lambda: ours._subscribers.get(CHAT), "the subscriber is known")
     for number in range(3):  # each time a stream of a moment
         publisher = ours.advertise(chat())
         for letter in "abc":
@@ -267,7 +268,7 @@ async def test_services_both_ways(endpoint: tuple[ZenohEndpoint, Events], peer: 
     assert (info.type_name, info.definition) == ("std_srvs/srv/SetBool", known.definition)
     assert info.type_hash == told["hash"]
     request = b"\0\x01\0\0\x01"
-    answer = await ours.call(MODE, request, timeout_s=20)
+    answer = await ours.call(MODE, request, timeout_s=DEADLINE_S)
     assert answer[4:5] == b"\0" and b"as you say\0" in answer
     with pytest.raises(ServiceError, match="no service /other"):
         await ours.call(TopicName("/other"), request, timeout_s=1)
@@ -313,12 +314,12 @@ async def test_a_server_that_is_known_before_it_can_be_reached_is_waited_for(
         server.close()
         await until(lambda: MODE not in events.services, "the service has ended")
         assert ours._present == {}
-        alone = theirs._declare_token(names.Kind.SERVER, MODE, dds_name, type_hash, names.Qos())
-        await until(lambda: MODE in events.services, "a token alone")
-        call = asyncio.create_task(ours.call(MODE, b"hello", timeout_s=60))
+        alone = theirs._declare_token(names.Kind.SERVER, OTHER_MODE, dds_name, type_hash, names.Qos())
+        await until(lambda: OTHER_MODE in events.services, "a token alone")
+        call = asyncio.create_task(ours.call(OTHER_MODE, b"hello", timeout_s=60))
         await until(lambda: ours._present, "the call waits")
         alone.undeclare()
-        with pytest.raises(ServiceError, match=f"{MODE} has ended"):
+        with pytest.raises(ServiceError, match=f"{OTHER_MODE} has ended"):
             await call
     finally:
         await theirs.stop()

@@ -74,14 +74,14 @@ class Peer:
                     REQUEST_TEXT,
                     RESPONSE_TEXT,
                     type_hash=order["hash"],
-                    timeout=20,
+                    timeout=60,
                     **self.where,
                 )
                 response = client.call(data=order["data"])
                 client.close()
                 return {"answer": None if response is None else [response.success, response.message]}
             case "sees":
-                found = ZenohSession.get_instance().liveliness.get(f"@ros2_lv/**/{order['kind']}/**", timeout=10)
+                found = ZenohSession.get_instance().liveliness.get(f"@ros2_lv/**/{order['kind']}/**", timeout=60)
                 return {"sees": any(reply.ok and f"/{order['name']}/" in str(reply.ok.key_expr) for reply in found)}
             case "close":
                 self.things.pop(order["thing"]).close()

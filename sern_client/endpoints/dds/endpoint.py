@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 from uuid import UUID
 from weakref import WeakValueDictionary
 
@@ -61,10 +61,14 @@ READER_HISTORY: Final = 1000
 """What DDS may hold until the worker takes it, usually within a millisecond. What overflows there nobody could count,
 so the bound that counts is the inbox behind it."""
 
+RELIABLE_DEPTH: Final = 10
+"""How many messages a writer keeps for its slow readers where the stream names no depth, as ROS 2 does."""
 RETRY_S: Final = 1.0
 """A reader that DDS refused is asked for again after so long."""
 
 _log = logging.getLogger(__name__)
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True)
@@ -212,9 +216,10 @@ class _Writer:
             self._endpoint.counters.written += 1
 
     def close(self) -> None:
-        writer, self._writer = self._writer, None
-        if writer is not None:
-            self._endpoint.close_writer(self, writer)
+        if self._writer is not None:
+            kept = [self._writer]  # no name for it: whoever is the last to hold it deletes it
+            self._writer = None
+            self._endpoint.close_writer(self, kept)
 
 
 @dataclass(slots=True)
@@ -329,7 +334,7 @@ class DdsEndpoint:
         """ConfigError for another encoding than CDR, a type nobody defines, or one with another hash than here."""
         resolved = self._resolve(info)
         offered = replace(writer_for(info, lifespan=self.options.offer_lifespan), type_hash=resolved.text.type_hash)
-        depth = info.depth or (10 if offered.reliable else 1)
+        depth = info.depth or (RELIABLE_DEPTH if offered.reliable else 1)
         topic = names.to_dds(info.name)
         writer = self.open_writer(topic, resolved, offered, depth=depth)
         first = FirstMessages(
@@ -457,11 +462,9 @@ class DdsEndpoint:
             if header or sample.handle not in ignored:
                 deliver(sample)
 
-        dds_topic = self._topic(topic, resolved, header=header)
-        try:
-            entity: DataReader[Any] = DataReader(joined.subscriber, dds_topic, policies)
-        except DDSException as error:
-            raise ConfigError(f"{topic}: no reader ({error.msg})") from None
+        entity = self._make(
+            lambda of: DataReader(joined.subscriber, of, policies), "reader", topic, resolved, header=header
+        )
         inbox = Inbox(depth, checked)
         reader = _Reader(self, entity, qos, inbox, joined.worker.watch(entity, inbox))
         self._readers[reader.guid] = reader
@@ -482,11 +485,9 @@ class DdsEndpoint:
         """ConfigError as `open_reader`."""
         policies = to_policies(qos, depth=depth, writer=True, id_key=id_key)
         joined = self._alive()
-        dds_topic = self._topic(topic, resolved, header=header)
-        try:
-            entity: DataWriter[Any] = DataWriter(joined.publisher, dds_topic, policies)
-        except DDSException as error:
-            raise ConfigError(f"{topic}: no writer ({error.msg})") from None
+        entity = self._make(
+            lambda of: DataWriter(joined.publisher, of, policies), "writer", topic, resolved, header=header
+        )
         writer = _Writer(self, entity, entity.guid, stamped=qos.lifespan_ns >= INFINITE_NS)
         self._writers[writer.guid] = writer
         self.graph.local_added(Local(writer.guid, True, topic, names.type_to_dds(resolved.name), qos))
@@ -501,17 +502,32 @@ class DdsEndpoint:
         self._alive().worker.unwatch(number)
         self._info_changed()
 
-    def close_writer(self, writer: _Writer, entity: DataWriter[Any]) -> None:
+    def close_writer(self, writer: _Writer, kept: list[DataWriter[Any]]) -> None:
+        """`kept` holds its entity, which is deleted on the worker's thread."""
         if self._writers.pop(writer.guid, None) is None:
             return
         self.graph.local_removed(writer.guid)
-        self._alive().worker.let_go(entity)
+        self._alive().worker.let_go(kept)
         self._info_changed()
 
     def _alive(self) -> "_Joined":
         if self._joined is None:
             raise UsageError("the dds endpoint is not running")
         return self._joined
+
+    def _make(
+        self, make: "Callable[[Topic[Any]], T]", what: str, topic: str, resolved: ResolvedType, *, header: bool
+    ) -> T:
+        """Make a reader or writer of a topic. ConfigError where DDS refuses it."""
+        try:
+            return make(self._topic(topic, resolved, header=header))
+        except DDSException:
+            # The worker may be deleting the topic with the last that used it, and it is still found here.
+            self._topics.pop(topic, None)
+        try:
+            return make(self._topic(topic, resolved, header=header))
+        except DDSException as error:
+            raise ConfigError(f"{topic}: no {what} ({error.msg})") from None
 
     def _topic(self, name: str, resolved: ResolvedType, *, header: bool) -> "Topic[Any]":
         made = self._maker.make(resolved, header=header)

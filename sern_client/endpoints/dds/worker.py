@@ -119,10 +119,8 @@ class Worker:
 
         self._do(end)
 
-    def let_go(self, entity: object) -> None:
-        """Delete an entity, once the caller has dropped it, here rather than on the event loop: DDS may wait."""
-        kept = [entity]
-        del entity
+    def let_go(self, kept: list[Any]) -> None:
+        """Empty the list, which alone holds an entity, on the thread rather than on the event loop: DDS may wait."""
         self._do(kept.clear)
 
     def _do(self, job: Callable[[], None]) -> None:

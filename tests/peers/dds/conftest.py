@@ -11,7 +11,7 @@ pytest.importorskip("cyclonedds", reason="the dds endpoint needs cyclonedds: pip
 
 from sern_client.endpoints.dds.domain import DomainOptions
 from sern_client.endpoints.dds.endpoint import DdsEndpoint, DdsOptions
-from tests.peers.dds.peer import Peer, build_peer, free_domain
+from tests.peers.dds.peer import LEASE_S, Peer, build_peer, free_domain
 from tests.support import Events
 
 
@@ -28,7 +28,7 @@ class Recorder(Events):
         return self.accepts
 
 
-MakePeer = Callable[[int], Coroutine[Any, Any, Peer]]
+MakePeer = Callable[..., Coroutine[Any, Any, Peer]]
 MakeEndpoint = Callable[..., Coroutine[Any, Any, tuple[DdsEndpoint, Recorder]]]
 
 
@@ -50,10 +50,10 @@ async def stack() -> AsyncIterator[AsyncExitStack]:
 
 @pytest.fixture
 def make_peer(peer_program: Path, stack: AsyncExitStack) -> MakePeer:
-    """`await make_peer(domain)`: a peer that ends with the test."""
+    """`await make_peer(domain, **options)`: a peer that ends with the test."""
 
-    async def make(domain: int) -> Peer:
-        return await stack.enter_async_context(Peer(peer_program, domain))
+    async def make(domain: int, **options: Any) -> Peer:
+        return await stack.enter_async_context(Peer(peer_program, domain, **options))
 
     return make
 
@@ -63,7 +63,7 @@ def make_endpoint(stack: AsyncExitStack) -> MakeEndpoint:
     """`await make_endpoint(domain, **options)`: a started endpoint and its recorder."""
 
     async def make(domain: int, **options: Any) -> tuple[DdsEndpoint, Recorder]:
-        settings = DomainOptions(domain, localhost_only=True, lease_s=3.0)
+        settings = DomainOptions(domain, localhost_only=True, lease_s=LEASE_S)
         endpoint, recorder = DdsEndpoint(DdsOptions(settings, **options)), Recorder()
         endpoint.watch_services(recorder)
         await endpoint.start(recorder)

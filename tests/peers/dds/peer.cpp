@@ -244,7 +244,7 @@ struct Side : DataReaderListener, DataWriterListener {
 
 class Peer {
 public:
-    explicit Peer(int domain) : kinds_(kinds()) {
+    Peer(int domain, int lease_s) : kinds_(kinds()) {
         DomainParticipantQos qos;
         qos.name("peer");
         qos.transport().use_builtin_transports = false;
@@ -257,7 +257,7 @@ public:
         IPLocator::setIPv4(loopback, "127.0.0.1");
         qos.wire_protocol().builtin.initialPeersList.push_back(loopback);
         qos.wire_protocol().builtin.metatrafficUnicastLocatorList.push_back(loopback);
-        qos.wire_protocol().builtin.discovery_config.leaseDuration = eprosima::fastrtps::Duration_t(3, 0);
+        qos.wire_protocol().builtin.discovery_config.leaseDuration = eprosima::fastrtps::Duration_t(lease_s, 0);
         qos.wire_protocol().builtin.discovery_config.leaseDuration_announcementperiod =
             eprosima::fastrtps::Duration_t(1, 0);
         participant_ = DomainParticipantFactory::get_instance()->create_participant(domain, qos);
@@ -394,12 +394,12 @@ private:
 };
 
 int main(int argc, char** argv) {
-    if (argc != 2) {
-        std::cerr << "usage: peer DOMAIN" << std::endl;
+    if (argc != 3) {
+        std::cerr << "usage: peer DOMAIN LEASE_S" << std::endl;
         return 2;
     }
     try {
-        Peer peer(std::stoi(argv[1]));
+        Peer peer(std::stoi(argv[1]), std::stoi(argv[2]));
         std::string line;
         while (std::getline(std::cin, line)) peer.obey(line);
     } catch (const std::exception& error) {

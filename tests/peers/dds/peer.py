@@ -20,6 +20,8 @@ from tests.support import DEADLINE_S
 
 SOURCES: Final = Path(__file__).resolve().parent
 BUILD_TIMEOUT_S: Final = 600
+LEASE_S: Final = 600.0
+"""Nobody is taken for dead: a busy machine may let a process stand still for some seconds."""
 MAX_LINE_BYTES: Final = 64 * 2**20
 HEADER: Final = Path("/usr/include/fastdds/dds/domain/DomainParticipant.hpp")
 
@@ -85,7 +87,8 @@ class PeerError(AssertionError):
 class Peer:
     """A running peer. `said` keeps every line but the answers to commands; `deadline_s` is for whatever is awaited."""
 
-    def __init__(self, program: Path, domain: int, *, deadline_s: float = DEADLINE_S) -> None:
+    def __init__(self, program: Path, domain: int, *, lease_s: float = LEASE_S, deadline_s: float = DEADLINE_S) -> None:
+        self._lease_s = lease_s
         self._deadline_s = deadline_s
         self._program = program
         self._domain = domain
@@ -99,6 +102,7 @@ class Peer:
         self._process = await asyncio.create_subprocess_exec(
             self._program,
             str(self._domain),
+            str(round(self._lease_s)),
             stdin=asyncio.subprocess.PIPE,
             stdout=asyncio.subprocess.PIPE,
             limit=MAX_LINE_BYTES,

@@ -9,10 +9,13 @@ import struct
 from pathlib import Path
 from typing import Any, Final
 
+import pytest
+
 from sern_client.daemon import ClientDaemon
-from tests.daemons import Lab
+from sern_client.endpoints.dds.endpoint import DdsEndpoint
+from tests.daemons import Lab, endpoint_of
 from tests.peers.dds.conftest import MakePeer
-from tests.peers.dds.peer import Peer
+from tests.peers.dds.peer import LEASE_S, Peer
 from tests.support import DEADLINE_S, until
 
 HEAD: Final = b"\0\1\0\0"
@@ -80,7 +83,13 @@ class Side:
 
 
 def _dds(domain: int) -> dict[str, Any]:
-    return {"kind": "dds", "domain": domain, "localhost_only": True, "lease_s": 3.0}
+    return {"kind": "dds", "domain": domain, "localhost_only": True, "lease_s": LEASE_S}
+
+
+@pytest.fixture(autouse=True)
+def patient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Calls that are answered at once may take long on a busy machine, too."""
+    monkeypatch.setattr("sern_runtime.config.client.SERVICE_TIMEOUT_S", DEADLINE_S)
 
 
 async def _sites(lab: Lab, domain: int, timeout_s: float) -> ClientDaemon:
@@ -94,6 +103,12 @@ async def _sites(lab: Lab, domain: int, timeout_s: float) -> ClientDaemon:
     )
 
 
+async def _heard(site: ClientDaemon) -> None:
+    """Until the site's endpoint has found the client: a request that comes before is lost, and not repeated."""
+    servers = endpoint_of(site, DdsEndpoint).services._servers
+    await until(lambda: all(server.reader is not None and server.reader.matched == 1 for server in servers))
+
+
 async def test_a_goal_from_the_site_to_the_robot_and_what_comes_back(
     tmp_path: Path, domain: int, make_peer: MakePeer
 ) -> None:
@@ -101,10 +116,11 @@ async def test_a_goal_from_the_site_to_the_robot_and_what_comes_back(
     client = Side(await make_peer(domain + 1), "robot1/fibonacci", serves=False)
     async with Lab(tmp_path, "robot1", "site") as lab:
         await lab.process(lab.relay_file()).ready()
-        await _sites(lab, domain, 60)
+        site = await _sites(lab, domain, 60)
         await server.open()
         await client.open()
         await client.matched()
+        await _heard(site)
         for what in ("feedback", "status"):
             await client.peer.line(f"matched {what} 1")
 
@@ -144,10 +160,11 @@ async def test_without_a_link_a_goal_is_refused_and_a_result_unknown(
     async with Lab(tmp_path, "robot1", "site") as lab:
         relay = lab.process(lab.relay_file())
         await relay.ready()
-        site = await _sites(lab, domain, 1.5)
+        site = await _sites(lab, domain, 8.0)
         await server.open()
         await client.open()
         await client.matched()
+        await _heard(site)
 
         # Accepted, but its client hears nothing of it: the goal must not be executed behind its back.
         await client.call("send_goal", 1, UUID + struct.pack("<i", 7))

@@ -7,6 +7,7 @@ from random import Random
 from typing import Any
 from xmlrpc.client import ServerProxy
 
+import pytest
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag1 import Reader, Writer
 from rosbags.typesys import Stores, get_typestore
@@ -20,6 +21,7 @@ from sern_runtime import ros_types
 from sern_runtime.ros_types import topic_info
 from tests.daemons import HOST, RELIABLE, Lab, endpoint_of, recording, write_bag
 from tests.peers.dds.conftest import MakePeer
+from tests.peers.dds.peer import LEASE_S
 from tests.peers.dds.test_topics import ODOMETRY, same
 from tests.peers.ros1.lab import SUBSCRIBER, RosLab, need
 from tests.sern_client.messages import made_up
@@ -31,7 +33,7 @@ ENOUGH = 150
 
 
 def dds(domain: int) -> dict[str, Any]:
-    return {"kind": "dds", "domain": domain, "localhost_only": True, "lease_s": 3.0}
+    return {"kind": "dds", "domain": domain, "localhost_only": True, "lease_s": LEASE_S}
 
 
 def as_cdr(bag: Path, topic: str) -> list[bytes]:
@@ -42,8 +44,12 @@ def as_cdr(bag: Path, topic: str) -> list[bytes]:
         return [bytes(store.ros1_to_cdr(raw, ODOM)) for _, _, raw in reader.messages(of_topic)]
 
 
-async def test_a_ros1_recording_reaches_ros2(tmp_path: Path, domain: int, make_peer: MakePeer) -> None:
+async def test_a_ros1_recording_reaches_ros2(
+    tmp_path: Path, domain: int, make_peer: MakePeer, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A real drive in ROS 1, played to a relay; at the site a ROS 2 subscriber gets every message, converted."""
+    # The peer may stand still for a second, and the socket of a usual machine holds less than that.
+    monkeypatch.setattr("sern_client.endpoints.dds.endpoint.RELIABLE_DEPTH", 1000)
     bag = recording("husky_gps_imu_odom.bag")
     topic = "/husky_velocity_controller/odom"
     peer = await make_peer(domain)
@@ -136,10 +142,10 @@ async def test_rospy_calls_a_service_of_ros2(tmp_path: Path, domain: int, make_p
     await peer.do("serve s set_bool userdata=serviceid=1.2.3;")
     async with RosLab(tmp_path, "site_ros") as ros, Lab(tmp_path, "robot1", "site") as lab:
         await lab.relay()
-        offer = {"offer": [{"match": "/set_bool"}]}
+        offer = {"offer": [{"match": "/set_bool", "timeout_s": 60}]}
         await lab.connected(lab.client_file("robot1", dds(domain), services=offer))
         site = {"kind": "ros1", "master_uri": ros.uri, "host": HOST}
-        use = {"use": [{"match": "/robot1/.*"}]}
+        use = {"use": [{"match": "/robot1/.*", "timeout_s": 60}]}
         await lab.connected(lab.client_file("site", site, client={"namespace": "/"}, services=use))
         ros.python("caller", CALLER)
         await ros.until_printed("caller", "['no', 'yes', 'no', 'yes']")

@@ -1,7 +1,10 @@
 """What is published as soon as a stream begins reaches the subscribers that are known."""
 
-from functools import partial
+from collections.abc import Callable
 
+import pytest
+
+from sern_client.endpoints import first
 from sern_core.message import TopicInfo
 from sern_core.types import DropReason, Encoding
 from sern_runtime.ros_types import topic_info
@@ -11,10 +14,24 @@ from tests.support import until
 
 CHAT: TopicInfo = topic_info("/chat", "std_msgs/msg/String", Encoding.CDR, reliable=True)
 BODIES = [body_of(STRING, seed) for seed in range(5)]
+FOREVER_S = 600.0
+
+
+@pytest.fixture
+def patient(monkeypatch: pytest.MonkeyPatch) -> Callable[[float], None]:
+    """Nothing is written by the clock: `patient(0.0)` says that the subscriber knows, where the product waits."""
+    monkeypatch.setattr("sern_client.endpoints.dds.endpoint.LEARN_S", FOREVER_S)
+    monkeypatch.setattr(first, "HOLD_S", FOREVER_S)
+
+    def settle(after_s: float) -> None:
+        monkeypatch.setattr(first, "SETTLE_S", after_s)
+
+    settle(FOREVER_S)
+    return settle
 
 
 async def test_the_first_messages_wait_for_the_subscribers_there_are(
-    domain: int, make_peer: MakePeer, make_endpoint: MakeEndpoint
+    domain: int, make_peer: MakePeer, make_endpoint: MakeEndpoint, patient: Callable[[float], None]
 ) -> None:
     peer = await make_peer(domain)
     endpoint, _ = await make_endpoint(domain)
@@ -25,7 +42,10 @@ async def test_the_first_messages_wait_for_the_subscribers_there_are(
         for body in BODIES:
             stream.publish(body, STAMP_NS + number)
         stream.close()
+        await peer.line("matched b 1", number)
+        patient(0.0)
         await peer.line("got b ", 5 * number + 4)
+        patient(FOREVER_S)
     got = peer.got("b")
     assert len(got) == 15 and all(same(one, other) for one, other in zip(got, BODIES * 3, strict=True))
     await until(lambda: not any(local.topic == "rt/chat" for local in endpoint.graph.locals.values()))
@@ -33,7 +53,7 @@ async def test_the_first_messages_wait_for_the_subscribers_there_are(
 
 
 async def test_a_young_endpoint_waits_until_it_knows(
-    domain: int, make_peer: MakePeer, make_endpoint: MakeEndpoint
+    domain: int, make_peer: MakePeer, make_endpoint: MakeEndpoint, patient: Callable[[float], None]
 ) -> None:
     peer = await make_peer(domain)
     await peer.do(f"sub b rt/chat {STRING} reliable")
@@ -41,13 +61,15 @@ async def test_a_young_endpoint_waits_until_it_knows(
     stream = endpoint.advertise(CHAT)
     for body in BODIES:
         stream.publish(body, STAMP_NS)
+    await peer.line("matched b 1")
+    patient(0.0)
     await peer.line("got b ", 4)
     assert all(same(one, other) for one, other in zip(peer.got("b"), BODIES, strict=True))
     assert endpoint.drops == {}
 
 
 async def test_what_is_too_old_is_dropped_and_the_newest_kept(
-    domain: int, make_peer: MakePeer, make_endpoint: MakeEndpoint
+    domain: int, make_peer: MakePeer, make_endpoint: MakeEndpoint, patient: Callable[[float], None]
 ) -> None:
     peer = await make_peer(domain)
     endpoint, _ = await make_endpoint(domain)
@@ -56,6 +78,8 @@ async def test_what_is_too_old_is_dropped_and_the_newest_kept(
     stream = endpoint.advertise(topic_info("/chat", "std_msgs/msg/String", Encoding.CDR, reliable=False))
     for body in BODIES:
         stream.publish(body, STAMP_NS)
-    await until(partial(endpoint.drops.__eq__, {DropReason.SUPERSEDED: 4}))
+    assert endpoint.drops == {DropReason.SUPERSEDED: 4}
+    await peer.line("matched b 1")
+    patient(0.0)
     await peer.line("got b ")
     assert [same(body, BODIES[-1]) for body in peer.got("b")] == [True]

@@ -13,7 +13,7 @@ from sern_core.errors import ConfigError, ServiceError
 from sern_core.types import DropReason, Encoding, TopicName
 from sern_runtime import ros_services
 from tests.peers.dds.conftest import MakeEndpoint, MakePeer
-from tests.support import until
+from tests.support import DEADLINE_S, until
 
 CDR = Encoding.CDR
 NAME = TopicName("/set_bool")
@@ -45,8 +45,9 @@ async def test_we_call_their_server(domain: int, make_peer: MakePeer, make_endpo
     await peer.do("serve s set_bool userdata=serviceid=1.2.3;")
     await until(lambda: NAME in recorder.services)
     assert recorder.services[NAME] == service()
+    await endpoint.call(NAME, HEAD + b"\0", timeout_s=DEADLINE_S)  # the two know each other then, both ways
     answers = await asyncio.gather(
-        *(endpoint.call(NAME, HEAD + bytes([number % 2]), timeout_s=10) for number in range(20))
+        *(endpoint.call(NAME, HEAD + bytes([number % 2]), timeout_s=DEADLINE_S) for number in range(20))
     )
     for number, answer in enumerate(answers):
         text = b"yes\0" if number % 2 else b"no\0"
@@ -101,7 +102,7 @@ async def test_between_two_endpoints(domain: int, make_endpoint: MakeEndpoint) -
 
     server = one.serve(service(), handler)
     await until(lambda: NAME in recorder.services)
-    assert (await chained.call(NAME, YES, timeout_s=10))[: len(RESPONSE)] == RESPONSE
+    assert (await chained.call(NAME, YES, timeout_s=DEADLINE_S))[: len(RESPONSE)] == RESPONSE
     assert beside.services == {}
     server.close()
     await until(lambda: NAME not in recorder.services)
@@ -133,7 +134,7 @@ async def test_requests_beyond_the_limit_are_counted(
 
     server = one.serve(service(), handler)
     await until(lambda: NAME in recorder.services)
-    calls = [asyncio.create_task(other.call(NAME, YES, timeout_s=20)) for _ in range(3)]
+    calls = [asyncio.create_task(other.call(NAME, YES, timeout_s=DEADLINE_S)) for _ in range(3)]
     await until(lambda: one.drops == {DropReason.QUEUE_FULL: 1})
     release.set()
     await until(lambda: sum(call.done() for call in calls) == 2)
@@ -163,7 +164,7 @@ async def test_a_call_that_is_told_how_it_ends_answers_before_its_service_is_gon
     await peer.line("matched calls 1")
     await until(lambda: server.reader is not None and server.reader.matched == 1)
     await peer.do(f"write calls {(HEAD + struct.pack('<Qq', 99, 1) + bytes([1])).hex()}")
-    await asyncio.wait_for(asked.wait(), 20)
+    await asyncio.wait_for(asked.wait(), DEADLINE_S)
     outcome.set_result(RESPONSE)
     server.close()
     await peer.line("got answers ")

@@ -1,7 +1,9 @@
 """Topics between the dds endpoint and Fast DDS: bytes, policies, coming and going."""
 
+import asyncio
 import logging
 import threading
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from random import Random
 
@@ -154,7 +156,7 @@ async def test_a_late_joiner_gets_the_latched(domain: int, make_peer: MakePeer, 
 async def test_a_peer_that_crashes_is_missed(domain: int, make_peer: MakePeer, make_endpoint: MakeEndpoint) -> None:
     """It leaves when its lease ends, here after 3 s, and what it published with it."""
     _, recorder = await make_endpoint(domain)
-    peer = await make_peer(domain)
+    peer = await make_peer(domain, lease_s=3.0)
     other = await make_peer(domain)
     await peer.do(f"pub a rt/chat {STRING}")
     await other.do(f"pub b rt/other {STRING}")
@@ -238,7 +240,7 @@ async def test_two_sern_endpoints_beside_each_other_make_no_loop(
     ]
     await peer.do(f"sub b rt/tf {STRING} reliable")
     await until(lambda: publisher.matched == 3)  # the peer, and the readers of the other two
-    await peer.line("matched a 3")
+    await peer.line("matched a 4")  # those of all three, and its own
     # Our own writer is not among those of `one`; the others' readers have the peer's and that one.
     await until(lambda: [subscription.matched for subscription in subscriptions] == [1, 2, 2])
     await until(lambda: TopicName("/only/ours") in heard_chain.infos)
@@ -274,6 +276,7 @@ async def test_several_domains_in_one_process(make_peer: MakePeer, make_endpoint
 
 
 async def test_nothing_stays_behind(domain: int, make_endpoint: MakeEndpoint) -> None:
+    asyncio.get_running_loop().set_default_executor(ThreadPoolExecutor(1))  # never a second thread
     before = threading.active_count()
     endpoint, _ = await make_endpoint(domain)
     endpoint.advertise(topic_info("/x", "std_msgs/msg/String", CDR))

@@ -1,7 +1,7 @@
 """The parts of the dds endpoint that need no peer: names, policies, the graph, settings, and its queues."""
 
-import asyncio
 import logging
+import threading
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 
 pytest.importorskip("cyclonedds", reason="the dds endpoint needs cyclonedds: pip install cyclonedds==11.0.1")
 
-from cyclonedds.core import Policy, Qos
+from cyclonedds.core import DDSException, Policy, Qos
+from cyclonedds.pub import DataWriter
 
 from sern_client.endpoints.dds import names, node_info, raw
 from sern_client.endpoints.dds.definitions import Definitions
@@ -285,10 +286,13 @@ def test_definitions_by_hash(tmp_path: Path) -> None:
     assert types.service("std_srvs/srv/Trigger").definition.startswith("---\n")
 
 
-async def test_a_loop_that_is_too_slow_loses_the_oldest(domain_id: int) -> None:
+async def test_a_loop_that_is_too_slow_loses_the_oldest(domain_id: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Writer and reader in two domain participants of this process; the loop does not run while they are busy."""
+    from sern_client.endpoints.dds import endpoint
     from sern_client.endpoints.dds.endpoint import DdsEndpoint, DdsOptions
-    from tests.support import until
+    from tests.support import Patience, until
+
+    monkeypatch.setattr(endpoint, "LEARN_S", 0.0)  # nobody is waited for
 
     class Silent:
         def topic_added(self, info: TopicInfo) -> None: ...
@@ -313,10 +317,11 @@ async def test_a_loop_that_is_too_slow_loses_the_oldest(domain_id: int) -> None:
         subscription = two.subscribe(info.name, sink)
         await until(lambda: publisher.matched == 1)
         bodies = [b"\0\x01\0\0\x04\0\0\0" + b"%03d\0" % number for number in range(100)]
-        give_up_s = asyncio.get_running_loop().time() + 20
+        assert publisher.first.over  # what is published goes out at once
         for body in bodies:
             publisher.publish(body, 1)
-        while two.overruns() < 50 and asyncio.get_running_loop().time() < give_up_s:
+        patience = Patience()
+        while two.overruns() < 50 and not patience.over():
             pass  # the loop is busy with something else
         await until(lambda: bodies[-1] in got)
         assert two.overruns() + len(got) == 100 and two.overruns() >= 50
@@ -358,3 +363,62 @@ def test_a_writer_that_is_gone_has_no_readers_to_name() -> None:
     writer: Any = Writer()
     with pytest.raises(OSError, match=r"does not say whom .* is matched with \(return code -3\)"):
         raw.matched_readers(writer)
+
+
+def test_a_writer_is_deleted_on_the_thread_that_may_wait() -> None:
+    """However quick that thread is: deleting waits for slow readers, and the event loop must not."""
+    from sern_client.endpoints.dds.endpoint import _Writer
+
+    deleted_on: list[str] = []
+
+    class Entity:
+        def __del__(self) -> None:
+            deleted_on.append(threading.current_thread().name)
+
+    class Endpoint:
+        def close_writer(self, writer: _Writer, kept: list[Any]) -> None:
+            worker = threading.Thread(target=kept.clear, name="worker")
+            worker.start()
+            worker.join()
+
+    endpoint: Any = Endpoint()
+    entity: Any = Entity()
+    writer = _Writer(endpoint, entity, UUID(int=1), stamped=False)
+    del entity
+    writer.close()
+    assert deleted_on == ["worker"]
+
+
+@pytest.mark.parametrize("refusals", [1, 2])
+async def test_a_topic_that_is_just_being_deleted_is_made_anew(
+    domain_id: int, monkeypatch: pytest.MonkeyPatch, refusals: int
+) -> None:
+    """The worker deletes it with its last reader or writer; until that is done it is found, and of no use."""
+    from sern_client.endpoints.dds import endpoint as module
+
+    topics: list[Any] = []
+
+    def refuse(publisher: Any, topic: Any, policies: Any) -> Any:
+        topics.append(topic)
+        if len(topics) <= refusals:
+            raise DDSException(DDSException.DDS_RETCODE_BAD_PARAMETER)
+        return DataWriter(publisher, topic, policies)
+
+    class Silent:
+        def topic_added(self, info: TopicInfo) -> None: ...
+
+        def topic_removed(self, name: TopicName) -> None: ...
+
+    one = module.DdsEndpoint(module.DdsOptions(DomainOptions(domain_id, localhost_only=True)))
+    await one.start(Silent())
+    try:
+        monkeypatch.setattr(module, "DataWriter", refuse)
+        info = topic_info("/chat", "std_msgs/msg/String", Encoding.CDR)
+        if refusals == 1:
+            one.advertise(info)
+        else:
+            with pytest.raises(ConfigError, match="rt/chat: no writer"):
+                one.advertise(info)
+        assert len(topics) == 2 and topics[0] is not topics[1]
+    finally:
+        await one.stop()
