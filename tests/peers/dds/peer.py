@@ -37,7 +37,13 @@ def build_peer() -> Path:
     if missing := missing_packages():
         pytest.skip(f"no independent DDS peer: apt-get install {' '.join(missing)}")
     sources = [SOURCES / "Peer.idl", SOURCES / "peer.cpp"]
-    digest = hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()[:16]
+    # A checkout may be shared by systems with other libraries, and by users who cannot write each other's folders.
+    made_of = [
+        Path("/etc/os-release").read_bytes(),
+        str(os.getuid()).encode(),
+        *(path.read_bytes() for path in sources),
+    ]
+    digest = hashlib.sha256(b"\0".join(made_of)).hexdigest()[:16]
     cache = SOURCES.parents[2] / "build" / f"dds-peer-{digest}"
     program = cache / "peer"
     if program.exists():
