@@ -7,14 +7,30 @@ abstract socket of its name, which every process of this network namespace sees 
 import random
 import socket
 from collections import deque
+from collections.abc import Sequence
 from contextlib import ExitStack
+from pathlib import Path
 from typing import Final
 
 from sern_core.errors import SernError
 
 HOST: Final = "127.0.0.1"
-PORTS: Final = range(15_000, 32_000)
-"""Ports below those that the kernel gives to outgoing connections, which could take one before its owner listens."""
+OUTGOING: Final = Path("/proc/sys/net/ipv4/ip_local_port_range")
+"""First and last port that the kernel gives to outgoing connections, which could take one before its owner listens."""
+USUAL: Final = range(15_000, 32_000)
+"""Ports below those, unless it was told otherwise."""
+
+
+def own_ports(outgoing: Path = OUTGOING) -> list[int]:
+    """Those of USUAL that outgoing connections never have; all of them where that leaves none, or cannot be read."""
+    try:
+        first, last = map(int, outgoing.read_text().split())
+    except (OSError, ValueError):
+        return list(USUAL)
+    return [port for port in USUAL if not first <= port <= last] or list(USUAL)
+
+
+PORTS: Final[Sequence[int]] = own_ports()
 CLAIMS: Final = 128
 """How many of the last claims of a process hold; by then the owners of those before listen, or have ended."""
 
@@ -58,4 +74,4 @@ def free_ports(count: int) -> list[int]:
                 found.append(port)
             if len(found) == count:
                 return found
-    raise SernError(f"no {count} free ports on {HOST} between {PORTS.start} and {PORTS.stop}")
+    raise SernError(f"no {count} free ports on {HOST} between {min(PORTS)} and {max(PORTS)}")

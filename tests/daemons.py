@@ -33,6 +33,9 @@ from sern_tools.ports import free_ports
 from tests.support import until
 
 HOST: Final = "127.0.0.1"
+CALLER_HOST: Final = "127.0.0.2"
+"""Where polling comes from: from HOST itself, a port that nobody listens on yet could be given to the very call that
+asks whether it answers, which would then be connected to itself."""
 ALLOW_ALL: Final = ({"client": ".*", "publish": [".*"], "subscribe": [".*"]},)
 RELIABLE: Final = ({"match": ".*", "class": "state", "reliability": "reliable"},)
 STOP_S: Final = 60.0
@@ -125,13 +128,13 @@ class Process:
         return int(content["http"]["listen"].rpartition(":")[2])
 
     def get(self, path: str) -> tuple[int, str]:
-        """Status and body of a GET; (0, "") while nobody listens."""
-        connection = http.client.HTTPConnection(HOST, self.port, timeout=10)
+        """Status and body of a GET; (0, "") while nobody listens or answers."""
+        connection = http.client.HTTPConnection(HOST, self.port, timeout=10, source_address=(CALLER_HOST, 0))
         try:
             connection.request("GET", path)
             answer = connection.getresponse()
             return answer.status, answer.read().decode()
-        except ConnectionError:
+        except (ConnectionError, TimeoutError):
             return 0, ""
         finally:
             connection.close()

@@ -62,6 +62,9 @@ _MCAP_TAIL: Final = frozenset({2, 3, 4, 5, 7, 8, 11, 12, 13, 14, 15})
 """Records that may stand behind the last whole chunk of a recording of ours."""
 _MAX_TAIL_BYTES: Final = 4096
 """Most bytes there that are not even the beginning of a record."""
+_FLOCK: Final = struct.Struct("hhqqi0q")
+"""The kernel's struct flock: kind, whence, start, length, process."""
+_WHOLE_FILE: Final = _FLOCK.pack(fcntl.F_WRLCK, os.SEEK_SET, 0, 0, 0)
 _UNREADABLE: Final = (EOFError, ValueError, KeyError, IndexError, struct.error, ReaderError, ConfigError)
 """What reading raises for bytes that are no record."""
 
@@ -79,22 +82,28 @@ class _BadFileError(Exception):
 
 
 def in_use(active: Path) -> bool:
-    """Whether a living process is recording there: it holds a lock on the file that grows."""
+    """Whether a living process is recording there: it holds a lock on the file that grows.
+
+    To ask takes no lock: a recording that begins just now would find its own file locked.
+    """
     try:
-        handle = lock(_growing(active))
-    except BlockingIOError:
-        return True
+        handle = os.open(_growing(active), os.O_RDONLY | os.O_CLOEXEC)
     except OSError:
-        return False  # no such file, or a file system without locks
-    os.close(handle)
-    return False
+        return False  # no such file
+    try:
+        found = _FLOCK.unpack(fcntl.fcntl(handle, fcntl.F_OFD_GETLK, _WHOLE_FILE))
+    except OSError:
+        return False  # a file system without locks
+    finally:
+        os.close(handle)
+    return bool(found[0] != fcntl.F_UNLCK)
 
 
 def lock(path: Path) -> int:
     """A descriptor that says that `path` is in use until it is closed. BlockingIOError when another says so."""
-    handle = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+    handle = os.open(path, os.O_RDWR | os.O_CLOEXEC)
     try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        fcntl.fcntl(handle, fcntl.F_OFD_SETLK, _WHOLE_FILE)
     except OSError:
         os.close(handle)
         raise

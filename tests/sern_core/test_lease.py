@@ -33,6 +33,16 @@ def test_stop_is_repeated_for_one_second_and_then_ends() -> None:
     assert lease.fired == 1
 
 
+def test_a_robot_that_is_commanded_steadily_is_never_stopped() -> None:
+    lease = CommandLease(0.5)
+    for number in range(200):
+        born_s = 10.0 + number * 0.49
+        assert lease.deadline() is None or fire_times(lease, born_s - 0.49, born_s) == []
+        lease.renew(born_s=born_s)
+        assert lease.deadline() == pytest.approx(born_s + 0.5) and not lease.due(now=born_s)
+    assert lease.fired == 0 and not lease.expired
+
+
 def test_a_fresh_command_ends_the_stop() -> None:
     lease = CommandLease(0.5)
     lease.renew(born_s=10.0)

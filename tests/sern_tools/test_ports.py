@@ -6,6 +6,7 @@ import subprocess
 import sys
 from collections import deque
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
@@ -36,6 +37,37 @@ def test_the_oldest_claims_end_first(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ports, "CLAIMS", 2)
     assert all(ports.claim(f"{NAME}-{number}") for number in range(3))
     assert ports.claim(f"{NAME}-0") and not ports.claim(f"{NAME}-2")
+
+
+@pytest.mark.parametrize(
+    ("outgoing", "left"),
+    [
+        ("32768\t60999\n", [range(15_000, 32_000)]),
+        ("16000 65535\n", [range(15_000, 16_000)]),
+        ("10000 15999", [range(16_000, 32_000)]),
+        ("20000 20999", [range(15_000, 20_000), range(21_000, 32_000)]),
+        ("1024 65535", [range(15_000, 32_000)]),  # nothing is left: any is better than none
+        ("nonsense", [range(15_000, 32_000)]),
+    ],
+)
+def test_ports_that_the_kernel_gives_to_outgoing_connections_are_left_to_it(
+    outgoing: str, left: list[range], tmp_path: Path
+) -> None:
+    said = tmp_path / "ip_local_port_range"
+    said.write_text(outgoing)
+    assert ports.own_ports(said) == [port for part in left for port in part]
+
+
+def test_without_word_of_the_kernel_the_usual_ports_are_taken(tmp_path: Path) -> None:
+    assert ports.own_ports(tmp_path / "none") == list(range(15_000, 32_000))
+
+
+def test_the_ports_given_here_are_none_that_this_kernel_gives() -> None:
+    first, last = map(int, ports.OUTGOING.read_text().split())
+    if first <= ports.USUAL.start and last >= ports.USUAL.stop - 1:
+        pytest.skip("this kernel leaves no port to others")
+    assert not set(ports.PORTS) & set(range(first, last + 1))
+    assert ports.free_ports(1)[0] in ports.PORTS
 
 
 def test_ports_that_are_in_use_or_claimed_are_not_given(monkeypatch: pytest.MonkeyPatch) -> None:

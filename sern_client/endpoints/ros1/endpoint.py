@@ -383,7 +383,7 @@ class Ros1Endpoint:
                     source.link.received_messages, 0)
             for topic in self._topics.values()
             for source in topic.sources.values()
-            if source.link is not None
+            if source.link is not None and source.link.open
         ]  # fmt: skip
         links += [
             BusLink(feed.number, feed.caller, "o", publication.topic, feed.sent_bytes, 0, feed.sent_messages,

@@ -73,11 +73,18 @@ class _Link(Frames):
         self.closed = asyncio.get_running_loop().create_future()
         self.greeted: asyncio.Future[dict[str, str]] = asyncio.get_running_loop().create_future()
         self._source = source
+        self._accepted = False
+
+    @property
+    def open(self) -> bool:
+        """Whether the publisher has accepted the connection, and it lasts. The kernel completes one before that."""
+        return self._accepted and not self.closed.done()
 
     def header(self, fields: dict[str, str]) -> None:
         if not self.greeted.done():
             self.greeted.set_result(fields)
         self._source.greet(self, fields)
+        self._accepted = True
 
     def message(self, body: bytes) -> None:
         self._source.topic.deliver(self._source, body)

@@ -7,18 +7,20 @@ import asyncio
 import json
 import os
 import subprocess
+from http.client import HTTPConnection
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, Self
-from xmlrpc.client import ServerProxy
+from xmlrpc.client import ServerProxy, Transport
 
 import pytest
 
 from sern_client.endpoints.ros1 import Ros1Endpoint, Ros1Options
 from sern_tools.ports import free_ports
-from tests.daemons import HOST
-from tests.support import Events, until
+from tests.daemons import CALLER_HOST, HOST
+from tests.support import DEADLINE_S, Events, Patience, until
 
+GEOMETRY_MSGS: Final = "/usr/lib/python3/dist-packages/geometry_msgs"
 PACKAGES: Final = {
     "/usr/bin/rosmaster": "python3-rosmaster",
     "/usr/bin/rostopic": "python3-rostopic",
@@ -32,13 +34,14 @@ PACKAGES: Final = {
     "/usr/lib/python3/dist-packages/roscpp": "python3-roscpp-msg",
     "/usr/lib/python3/dist-packages/rospy": "python3-rospy",
     "/usr/lib/python3/dist-packages/std_srvs": "python3-std-srvs",
+    GEOMETRY_MSGS: "python3-geometry-msgs",
     "/usr/lib/python3/dist-packages/nav_msgs": "python3-nav-msgs",
     "/usr/lib/python3/dist-packages/sensor_msgs": "python3-sensor-msgs",
     "/usr/lib/python3/dist-packages/actionlib": "python3-actionlib",
     "/usr/lib/python3/dist-packages/tf2_msgs": "python3-tf2-msgs",
 }
 PYTHON: Final = "/usr/bin/python3"
-TOOL_S: Final = 30.0
+TOOL_S: Final = DEADLINE_S
 
 
 def need(*paths: str) -> None:
@@ -120,9 +123,12 @@ class RosLab:
 
     def call(self, method: str, *params: object) -> Any:
         """A call of the master's API by a stranger; its value."""
-        with ServerProxy(self.uri) as proxy:
-            triple: Any = getattr(proxy, method)("/test", *params)
-        return triple[2]
+        return _call(self.uri, method, *params)
+
+    def bus_info(self, node: str) -> list[Any]:
+        """A node's connections as `rosnode info` sees them: [id, peer, "i" or "o", transport, topic, ...]."""
+        rows: list[Any] = _call(str(self.call("lookupNode", node)), "getBusInfo")
+        return rows
 
     def publishers(self, topic: str) -> list[str]:
         return next((nodes for name, nodes in self.call("getSystemState")[0] if name == topic), [])
@@ -140,10 +146,15 @@ class RosLab:
             *command, env=self.environment, cwd=self.directory,
             stdin=asyncio.subprocess.DEVNULL, stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.STDOUT,
         )  # fmt: skip
+        ended = asyncio.create_task(process.communicate())
+        patience = Patience(timeout_s)
         try:
-            async with asyncio.timeout(timeout_s):
-                output, _ = await process.communicate()
+            while not ended.done():
+                assert not patience.over(), f"{' '.join(command)} has not ended within {timeout_s:g} s"
+                await asyncio.wait([ended], timeout=0.5)
+            output, _ = ended.result()
         finally:
+            ended.cancel()
             if process.returncode is None:
                 process.kill()
                 await process.wait()
@@ -176,6 +187,22 @@ class RosLab:
         return path.read_bytes().count(b"\n") if path.exists() else 0
 
 
+class _Transport(Transport):
+    """HTTP from another address of loopback. Polling a port that nobody listens on yet could connect to itself where
+    the kernel gives that port to the caller: it would read its own request, and occupy the port."""
+
+    def make_connection(self, host: Any) -> HTTPConnection:
+        connection = HTTPConnection(str(host), source_address=(CALLER_HOST, 0))
+        self._connection = host, connection  # to be closed with the rest
+        return connection
+
+
+def _call(uri: str, method: str, *params: object) -> Any:
+    with ServerProxy(uri, transport=_Transport()) as proxy:
+        triple: Any = getattr(proxy, method)("/test", *params)
+    return triple[2]
+
+
 def publisher(topic: str, type_name: str, body: str, *, rate_hz: float = 20, latch: bool = False) -> str:
     """A rospy script that publishes `body`, an expression over the module `m` and the number `n`."""
     package, name = type_name.split("/")
@@ -201,7 +228,7 @@ def got(message, topic):
     os.write(1, line.encode() + b"\\n")  # at once: every topic has a thread of its own
 for topic in sys.argv[2:]:
     rospy.Subscriber(topic, rospy.AnyMsg, got, topic, queue_size=None, tcp_nodelay=True)
-print("ready")
+os.write(1, b"ready\\n")
 rospy.spin()
 """
 """A rospy node that takes any type and prints a JSON line for each message."""

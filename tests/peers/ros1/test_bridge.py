@@ -1,20 +1,18 @@
 """From one ROS 1 system to another: two masters, a robot's client, the relay and a site's client."""
 
-import asyncio
 import signal
 import subprocess
 import zlib
 from functools import partial
 from pathlib import Path
 from typing import Any
-from xmlrpc.client import ServerProxy
 
 from rosbags.rosbag1 import Reader
 
 from sern_core.types import Encoding
 from sern_runtime import ros_types
 from tests.daemons import HOST, Lab, bodies, recording
-from tests.peers.ros1.lab import SUBSCRIBER, RosLab, need, publisher
+from tests.peers.ros1.lab import GEOMETRY_MSGS, SUBSCRIBER, RosLab, need, publisher
 from tests.support import until
 
 STRING = "std_msgs/msg/String"
@@ -37,10 +35,10 @@ async def test_a_real_drive_reaches_rospy_at_the_other_master_byte_for_byte(tmp_
     ):
         await lab.process(lab.relay_file()).ready()
         robot = lab.process(lab.client_file("robot1", endpoint(robot_ros), topics=robot_rules))
+        patient = endpoint(site_ros) | {"queue_messages": 100_000}  # rospy need not keep up
         site = lab.process(
             lab.client_file(
-                "site", endpoint(site_ros), client={"namespace": "/"}, subscribe=["/robot1/.*"],
-                discovery={"mode": "manual"},
+                "site", patient, client={"namespace": "/"}, subscribe=["/robot1/.*"], discovery={"mode": "manual"},
             )
         )  # fmt: skip
         await robot.ready()
@@ -61,15 +59,16 @@ async def test_a_real_drive_reaches_rospy_at_the_other_master_byte_for_byte(tmp_
 
         await until(connected, "the topics are at the other master")
         # A rospy subscriber connects some time after the master told it.
-        await until(lambda: _connections(site_ros, "/sern_site") >= len(with_prefix), "the listener is connected")
-        await until(lambda: _connections(robot_ros, "/sern_robot1") >= len(with_prefix), "the robot's client is too")
+        await until(lambda: _connected(site_ros, "/sern_site", "o") >= set(with_prefix), "the listener is connected")
+        topics = bodies(bag).keys()
+        await until(lambda: _connected(robot_ros, "/sern_robot1", "i") >= topics, "the robot's client is too")
         assert play.stdin is not None
         play.stdin.write(b" ")
         play.stdin.flush()
         expected = {f"/robot1{topic}": crcs for topic, crcs in _played(bag).items()}
         total = sum(len(crcs) for crcs in expected.values())
         before = 1  # "ready"
-        await until(lambda: site_ros.line_count("listener") >= total + before, "all comes", deadline_s=30)
+        await until(lambda: site_ros.line_count("listener") >= total + before, "all comes")
         play.stdin.close()
         got: dict[str, list[int]] = {topic: [] for topic in expected}
         for line in site_ros.lines("listener"):
@@ -77,10 +76,9 @@ async def test_a_real_drive_reaches_rospy_at_the_other_master_byte_for_byte(tmp_
         assert got == expected
 
 
-def _connections(ros: RosLab, node: str) -> int:
-    with ServerProxy(str(ros.call("lookupNode", node))) as proxy:
-        answer: Any = proxy.getBusInfo("/test")
-    return len(answer[2])
+def _connected(ros: RosLab, node: str, direction: str) -> set[str]:
+    """The topics that a node has connections of: those it receives ("i") or those it sends ("o")."""
+    return {row[4] for row in ros.bus_info(node) if row[2] == direction}
 
 
 def _played(bag: Path) -> dict[str, list[int]]:
@@ -110,10 +108,10 @@ async def test_the_one_message_of_rostopic_pub_reaches_who_listens_at_the_other_
             )
             ros.python("listener", SUBSCRIBER, "listener", f"/{other}/sure", f"/{other}/any")
             await until(partial(ros.subscribers, f"/{other}/any"), "the listener has subscribed")
-        ways = [(robot_ros, "sure"), (robot_ros, "any"), (site_ros, "sure"), (site_ros, "any")]
-        await asyncio.gather(
-            *(ros.tool("rostopic", "pub", "-1", f"/{topic}", "std_msgs/String", f"my {topic}") for ros, topic in ways)
-        )
+        for ros in (robot_ros, site_ros):
+            for topic in ("sure", "any"):
+                # Without -1 it stays: with it, it ends after three seconds, whether anybody has connected or not.
+                ros.spawn("pub", "/usr/bin/rostopic", "pub", f"/{topic}", "std_msgs/String", f"my {topic}")
         expected = sorted(f"my {topic}".encode().hex() for topic in ("sure", "any"))
         for ros in (robot_ros, site_ros):
             await ros.until_printed("listener", *expected)
@@ -121,7 +119,7 @@ async def test_the_one_message_of_rostopic_pub_reaches_who_listens_at_the_other_
 
 
 async def test_a_late_joiner_gets_the_map_and_commands_come_back_with_a_stop(tmp_path: Path) -> None:
-    need("/usr/bin/rostopic")
+    need("/usr/bin/rostopic", GEOMETRY_MSGS)
     robot_rules = [
         {
             "match": "/cmd_vel", "class": "control", "direction": "receive", "lifespan_s": 0.3,
@@ -160,10 +158,10 @@ async def test_a_late_joiner_gets_the_map_and_commands_come_back_with_a_stop(tmp
         def commands() -> list[str]:
             return [line["hex"] for line in robot_ros.lines("motors")]
 
-        await until(lambda: len(commands()) > 5, "commands arrive")
-        assert zero.hex() not in commands()
+        # On a busy machine a gap between two commands may be a stop already.
+        await until(lambda: len(commands()) > 5 and commands()[-1] != zero.hex(), "commands arrive")
         driver.send_signal(signal.SIGSTOP)  # it hangs: its connections stay
-        await until(lambda: commands().count(zero.hex()) >= 3, "the robot is told to stand still")
+        await until(lambda: commands()[-3:] == [zero.hex()] * 3, "the robot is told to stand still")
         driver.send_signal(signal.SIGCONT)
         await until(lambda: commands()[-1] != zero.hex(), "it drives on")
         site_ros.kill(driver)

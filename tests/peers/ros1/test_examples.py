@@ -10,7 +10,7 @@ from sern_core.types import Encoding
 from sern_runtime import ros_types
 from sern_tools.ports import free_ports
 from tests.daemons import HOST, Lab
-from tests.peers.ros1.lab import SUBSCRIBER, RosLab, publisher
+from tests.peers.ros1.lab import GEOMETRY_MSGS, SUBSCRIBER, RosLab, need, publisher
 from tests.support import until
 
 EXAMPLES: Final = Path(__file__).resolve().parents[3] / "deploy" / "examples"
@@ -33,6 +33,7 @@ def adapt(lab: Lab, name: str, *, to: str, ros: RosLab | None = None) -> Path:
 
 
 async def test_a_jackal_and_a_van(tmp_path: Path) -> None:
+    need("/usr/lib/python3/dist-packages/nav_msgs", GEOMETRY_MSGS)
     async with (
         RosLab(tmp_path, "robot_ros") as robot_ros,
         RosLab(tmp_path, "van_ros") as van_ros,
@@ -57,8 +58,8 @@ async def test_a_jackal_and_a_van(tmp_path: Path) -> None:
         def seen(topic: str) -> list[Any]:
             return [line for line in van_ros.lines("viewer") if line["topic"] == topic]
 
-        await until(lambda: len(seen("/jackal1/odometry/filtered")) > 5, "the pose arrives", deadline_s=60)
-        await until(lambda: seen("/jackal1/map"), "the map arrives", deadline_s=60)
+        await until(lambda: len(seen("/jackal1/odometry/filtered")) > 5, "the pose arrives")
+        await until(lambda: seen("/jackal1/map"), "the map arrives")
         (frame,) = {line["hex"] for line in seen("/jackal1/odometry/filtered")[-1:]}
         assert b"jackal1/base_link".hex() in frame, "frames are the robot's own"
         assert seen("/jackal1/map")[0]["bytes"] > 40_000
@@ -69,8 +70,8 @@ async def test_a_jackal_and_a_van(tmp_path: Path) -> None:
         def commands() -> list[str]:
             return [line["hex"] for line in robot_ros.lines("motors")]
 
-        await until(lambda: len(commands()) > 5, "commands arrive", deadline_s=60)
-        assert zero.hex() not in commands()
+        # On a busy machine a gap between two commands may be a stop already.
+        await until(lambda: len(commands()) > 5 and commands()[-1] != zero.hex(), "commands arrive")
         van_ros.kill(driver)
-        await until(lambda: zero.hex() in commands(), "without the driver the robot is told to stand still")
+        await until(lambda: commands()[-1] == zero.hex(), "without the driver the robot is told to stand still")
         assert not van_ros.publishers("/jackal1/joy_teleop/cmd_vel"), "what no rule names stays at the robot"

@@ -1,9 +1,7 @@
 """Services of C++ nodes, called from C++ nodes and the tools, both ways across the link."""
 
-import hashlib
 import shutil
 import subprocess
-import tempfile
 from pathlib import Path
 from typing import Any, Final
 
@@ -17,27 +15,18 @@ BUILD_S: Final = 300
 SERVICES: Final = "/lamp/(?:set|get)"
 
 
-@pytest.fixture(scope="session")
-def program() -> str:
-    """The program, compiled unless that was done before."""
+@pytest.fixture(scope="module")
+def program(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """The program, compiled for the ROS that is installed here now."""
     need("/usr/include/ros/ros.h")
     for tool in ("g++", "pkg-config"):
         if shutil.which(tool) is None:
             pytest.skip(f"no C++ node: install the Debian package {tool}")
-    digest = hashlib.sha256(SOURCE.read_bytes()).hexdigest()[:16]
-    folder = SOURCE.parents[3] / "build" / f"ros1-services-{digest}"
-    built = folder / "services"
-    if not built.exists():
-        flags = subprocess.run(
-            ["pkg-config", "--cflags", "--libs", "roscpp"], capture_output=True, text=True, check=True
-        )
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=folder) as name:
-            made = Path(name) / "services"
-            command = ["g++", "-O0", "-std=c++17", "-o", str(made), str(SOURCE), *flags.stdout.split()]
-            done = subprocess.run(command, capture_output=True, text=True, timeout=BUILD_S, check=False)
-            assert done.returncode == 0, done.stderr[-2000:]
-            made.replace(built)
+    built = tmp_path_factory.mktemp("services") / "services"
+    flags = subprocess.run(["pkg-config", "--cflags", "--libs", "roscpp"], capture_output=True, text=True, check=True)
+    command = ["g++", "-O0", "-std=c++17", "-o", str(built), str(SOURCE), *flags.stdout.split()]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=BUILD_S, check=False)
+    assert done.returncode == 0, done.stderr[-2000:]
     return str(built)
 
 

@@ -12,6 +12,7 @@ from rosbags.rosbag2 import Writer as Writer2
 
 from sern_core.types import Encoding
 from sern_runtime import ros_types
+from tests import support
 from tests.support import Events
 
 START_NS = 1_700_000_000_000_000_000
@@ -36,16 +37,10 @@ class VirtualClock:
         await asyncio.sleep(0)
 
 
-async def _until(condition: Callable[[], bool]) -> None:
-    async with asyncio.timeout(20):
-        while not condition():  # noqa: ASYNC110  the condition is somebody else's state
-            await asyncio.sleep(0.002)
-
-
 @pytest.fixture
-def until() -> Callable[[Callable[[], bool]], Awaitable[None]]:
+def until() -> Callable[[Callable[[], object]], Awaitable[None]]:
     """Poll a condition with a generous deadline."""
-    return _until
+    return support.until
 
 
 @pytest.fixture

@@ -86,16 +86,17 @@ async def test_a_stream_that_ends_ends_after_its_messages() -> None:
     assert empty.ended == 1 and empty.first.over
 
 
-async def test_what_is_kept_is_bounded_and_every_drop_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_what_is_kept_is_bounded_and_every_drop_counted() -> None:
     topic = Topic(1, 0)
     topic.publish(b"0", b"1", b"2", b"3")
     assert topic.dropped == [DropReason.QUEUE_FULL]
     topic.publish(bytes(90), bytes(20))
     assert topic.dropped == [DropReason.QUEUE_FULL] * 5 and len(topic.first) == 1
-    monkeypatch.setattr(first, "HOLD_S", 0.05)  # its subscriber has crashed
     late = Topic(1, 0)
     late.publish(b"old", left_s=0.0)
     late.publish(b"new")
+    assert not late.first.over and late.dropped == []
+    late.first._give_up_s = 0.0  # its subscriber has crashed: HOLD_S is over
     await until(lambda: late.first.over)
     assert late.written == [b"new"]
     assert sorted(late.dropped) == [DropReason.DISCONNECTED, DropReason.DISCONNECTED, DropReason.LIFESPAN]

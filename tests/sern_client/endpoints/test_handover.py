@@ -18,7 +18,7 @@ async def test_items_of_a_thread_arrive_in_order() -> None:
 
     thread = Thread(target=produce)
     thread.start()
-    await asyncio.wait_for(done.wait(), 20)
+    await until(done.is_set)
     thread.join()
     assert got == list(range(1000))
     assert handover.dropped == 0
@@ -30,7 +30,7 @@ async def test_a_loop_that_is_behind_gets_what_is_fresh_and_all_the_news() -> No
         handover.put(lambda number=number: got.append(f"data {number}"), 10)  # type: ignore[misc]
         handover.put(lambda number=number: got.append(f"news {number}"))  # type: ignore[misc]
     handover.put(done.set)
-    await asyncio.wait_for(done.wait(), 20)
+    await until(done.is_set)
     assert [item for item in got if item.startswith("news")] == [f"news {number}" for number in range(10)]
     assert [item for item in got if item.startswith("data")] == ["data 7", "data 8", "data 9"]
     assert handover.dropped == 7

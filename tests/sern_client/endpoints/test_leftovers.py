@@ -210,6 +210,44 @@ async def test_a_lock_is_seen_by_others(tmp_path: Path) -> None:
     assert not in_use(tmp_path / "x.bag.active")
 
 
+def test_who_only_looks_is_in_nobodys_way(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A recording takes its lock a little after it has made its file: in between, another process may look."""
+    active = tmp_path / "x.bag.active"
+    active.write_bytes(b"")
+    taken: list[int] = []
+    close = os.close
+
+    def while_it_looks(handle: int) -> None:
+        monkeypatch.undo()
+        taken.append(lock(active))
+        close(handle)
+
+    monkeypatch.setattr(os, "close", while_it_looks)
+    assert not in_use(active)
+    (handle,) = taken
+    assert in_use(active)
+    with pytest.raises(BlockingIOError):
+        lock(active)
+    os.close(handle)
+    assert not in_use(active)
+
+
+def test_who_may_only_read_a_recording_sees_that_it_is_in_use(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    active = tmp_path / "x.bag.active"
+    active.write_bytes(b"")
+    handle = lock(active)
+    opened: list[int] = []
+    really_open = os.open
+
+    def reading(path: Path, flags: int) -> int:
+        opened.append(flags & os.O_ACCMODE)
+        return really_open(path, flags)
+
+    monkeypatch.setattr(os, "open", reading)
+    assert in_use(active) and opened == [os.O_RDONLY]
+    os.close(handle)
+
+
 async def test_kept_is_said_by_time_and_by_size(tmp_path: Path) -> None:
     """A message alone is flushed after `flush_s`; a megabyte at once."""
     recorder = RecordEndpoint(RecordOptions(tmp_path / "run.bag", flush_s=0.05))

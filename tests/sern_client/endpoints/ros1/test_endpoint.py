@@ -46,6 +46,38 @@ async def test_announces_what_the_header_says_and_passes_bytes_on(master: FakeMa
     await until(lambda: not master.tables[1].get("/chat"))  # unregistered when it stopped
 
 
+async def test_a_connection_is_shown_once_its_publisher_has_accepted_it(master: FakeMaster) -> None:
+    """The kernel completes a connection that a busy publisher knows nothing of yet, and it sends nothing there."""
+    async with running(master) as (endpoint, events), FakePublisher(master) as talker:
+        await until(lambda: CHAT in events.infos and not endpoint.bus_links())
+        talker.greeting = b""
+        collect(endpoint)
+        await until(lambda: len(talker.writers) == 2)
+        assert endpoint.bus_links() == []
+        talker.send(encode_header(talker.fields))
+        await until(endpoint.bus_links)
+        (link,) = endpoint.bus_links()
+        assert (link.direction, link.topic) == ("i", "/chat")
+
+
+async def test_a_connection_that_a_publisher_refuses_is_never_shown(master: FakeMaster) -> None:
+    async with running(master) as (endpoint, events), FakePublisher(master) as talker:
+        await until(lambda: CHAT in events.infos and not endpoint.bus_links())
+        talker.greeting = b""
+        collect(endpoint)
+        await until(lambda: len(talker.writers) == 2)
+        talker.greeting = encode_header({"error": "no"})
+        shown: list[object] = []
+
+        def tried_again() -> bool:
+            shown.extend(endpoint.bus_links())
+            return len(talker.requests) >= 4
+
+        talker.hang_up()
+        await until(tried_again)
+        assert shown == []
+
+
 async def test_a_publisher_that_hangs_up_is_connected_again(master: FakeMaster) -> None:
     async with running(master) as (endpoint, events), FakePublisher(master) as talker:
         await until(lambda: CHAT in events.infos)

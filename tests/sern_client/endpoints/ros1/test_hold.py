@@ -153,17 +153,21 @@ async def test_without_subscribers_nothing_is_held_and_nothing_lost(master: Fake
 
 
 async def test_a_dead_subscriber_is_waited_for_only_so_long(
-    known: FakeMaster, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    known: FakeMaster, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(hold, "HOLD_S", 1.0)
     known.add(1, "/chat", "/leaving", "http://127.0.0.1:1/")
     async with running(known) as (endpoint, _):
         stream = endpoint.advertise(STRING)
+        publication = endpoint._publications["/chat"]
         await known_to_subscribe(known)
         known.remove(1, "/chat", "/leaving")
         stream.publish(text("one"), 0)
+        asked = known.calls["getSystemState"]
+        await until(lambda: known.calls["getSystemState"] >= asked + 2, "it has read who subscribes now")
         stream.close()
+        assert endpoint.drops == {} and known.tables[0]["/chat"] == ["/sern"]
         with caplog.at_level(logging.WARNING):
+            publication.hold._timed_out()  # as after HOLD_S
             await until(lambda: not known.tables[0])
         assert endpoint.drops == {DropReason.DISCONNECTED: 1}
-    assert "/chat: /listener has not connected within 1 s; it missed 1 message" in caplog.messages
+    assert "/chat: /listener has not connected within 60 s; it missed 1 message" in caplog.messages

@@ -1,0 +1,11 @@
+"""What every test with a real ROS 1 shares."""
+
+import pytest
+
+from sern_client.endpoints.ros1 import hold
+
+
+@pytest.fixture(autouse=True)
+def patient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A node that a busy machine lets connect late misses nothing: endpoints of this process wait for it longer."""
+    monkeypatch.setattr(hold, "HOLD_S", 60.0)
