@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -99,6 +100,20 @@ def test_losses_are_as_many_as_asked(lab: Lab, model: LinkModel, bursts: bool) -
         assert within_binomial(lost, count, 0.05)
         assert lost < 1.3 * runs
     assert len(datagrams(lab.a, lab.b, 500, gap_s=0.0003)) == 500
+
+
+def test_nothing_is_lost_while_the_guest_does_not_run(lab: Lab) -> None:
+    if lab.backend != "appliance":
+        pytest.skip("there is no guest")
+    guest = lab._running.guest._process  # type: ignore[attr-defined]
+    lab.link(up=LinkModel(queue_packets=3000))
+    guest.send_signal(signal.SIGSTOP)
+    try:
+        resume = partial(guest.send_signal, signal.SIGCONT)
+        arrivals = datagrams(lab.a, lab.b, 2000, quiet_s=5.0, then=resume)
+    finally:
+        guest.send_signal(signal.SIGCONT)
+    assert [arrival.number for arrival in arrivals] == list(range(2000))
 
 
 @pytest.mark.lab_long
@@ -205,9 +220,14 @@ asyncio.run(main())
 """
 
 
+def piped(*arguments: str) -> subprocess.Popen[str]:
+    """This interpreter with `arguments`, and pipes to talk to it."""
+    return subprocess.Popen([sys.executable, *arguments], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+
+
 def owner_of_a_lab(script: str = OWNER) -> subprocess.Popen[str]:
     """A process that makes a lab and says which, to be killed by the caller."""
-    return subprocess.Popen([sys.executable, "-c", script], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    return piped("-c", script)
 
 
 async def test_two_at_once_and_nothing_stays_after_kill_9(lab: Lab) -> None:
@@ -281,11 +301,7 @@ run(["ip", "netns", "add", f"sern-{sys.argv[1]}-late"])
 def test_a_keeper_waits_for_the_command_that_its_dead_owner_left(possible: None) -> None:
     """`ip netns add` goes on when the owner is killed: what it makes would stay behind for ever."""
     name = f"{os.getpid()}.999"
-    plain = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
-    with (
-        subprocess.Popen([sys.executable, "-c", LATE_COMMAND, name], text=True, **plain) as command,
-        subprocess.Popen([sys.executable, "-P", "-m", "sern_tools.lab.keeper", name], text=True, **plain) as keeper,
-    ):
+    with piped("-c", LATE_COMMAND, name) as command, piped("-P", "-m", "sern_tools.lab.keeper", name) as keeper:
         assert command.stdin is not None and command.stdout is not None and keeper.stdin is not None
         assert command.stdout.readline() == "held\n"
         keeper.stdin.close()  # as by kill -9

@@ -7,7 +7,7 @@ import socket
 import struct
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Final
@@ -47,9 +47,16 @@ def _pair(source: Node, target: Node) -> Iterator[tuple[socket.socket, socket.so
 
 
 def datagrams(
-    source: Node, target: Node, count: int, *, size_bytes: int = 100, gap_s: float = 0.0, quiet_s: float = _QUIET_S
+    source: Node,
+    target: Node,
+    count: int,
+    *,
+    size_bytes: int = 100,
+    gap_s: float = 0.0,
+    quiet_s: float = _QUIET_S,
+    then: Callable[[], object] = lambda: None,
 ) -> list[Arrival]:
-    """Send `count` numbered datagrams, `gap_s` apart; those that have arrived when none came for `quiet_s`.
+    """Send `count` numbered datagrams, `gap_s` apart, then call `then`; what arrives until nothing does for `quiet_s`.
 
     A sender that stood still catches up with `_BURST` at most: queues beside the link's would not hold many more.
     """
@@ -61,6 +68,7 @@ def datagrams(
                 time.sleep(gap_s / 4)
             due_s = max(due_s, time.monotonic() - _BURST * gap_s) + gap_s
             sender.send(struct.pack("Id", number, time.time()).ljust(size_bytes, b"\0"))
+        then()
         receiver.settimeout(quiet_s)
         arrivals: list[Arrival] = []
         while True:

@@ -338,7 +338,7 @@ async def test_no_relay(tmp_path: Path) -> None:
 def test_a_long_handshake_takes_nothing_of_the_topics_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing says that the relay is gone, and once it is there, the topic has its own time."""
     now_s = 100.0
-    monkeypatch.setattr(echo.clock, "now", lambda: now_s)
+    monkeypatch.setattr("sern_tools.echo.clock.now", lambda: now_s)
     link, transport = SimpleNamespace(established=False, peer="relay"), SimpleNamespace(rebuilds=0)
     identity = identity_from_options(Lab(tmp_path, "viewer").endpoint, None, None, "viewer")
 
