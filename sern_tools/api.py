@@ -57,10 +57,13 @@ def local_api() -> str:
     )
 
 
-def get_json(api: str, path: str, *, timeout_s: float = TIMEOUT_S) -> Any:
-    """The JSON at `path` of the daemon at `api`. Raises NotFoundError for a path it lacks, else SernError."""
+def get_json(api: str, path: str, *, timeout_s: float | None = None) -> Any:
+    """The JSON at `path` of the daemon at `api`. Raises NotFoundError for a path it lacks, else SernError.
+
+    `timeout_s`: how long it may be silent; None: `TIMEOUT_S`.
+    """
     try:
-        with _opener.open(api + path, timeout=timeout_s) as answer:
+        with _opener.open(api + path, timeout=TIMEOUT_S if timeout_s is None else timeout_s) as answer:
             return json.load(answer)
     except urllib.error.HTTPError as error:
         with error:

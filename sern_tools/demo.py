@@ -10,6 +10,7 @@ Whatever happens, no process and no temporary file is left: children are stopped
 """
 
 import asyncio
+import math
 import shlex
 import signal
 import sys
@@ -50,7 +51,7 @@ from sern_tools.demo_scenario import (
 )
 from sern_tools.message_log import TopicLog, read_logs
 from sern_tools.ports import free_ports
-from sern_tools.processes import Child, Children, program, swept
+from sern_tools.processes import DRAIN_S, Child, Children, program, swept
 from sern_tools.shaping import RateSchedule
 from sern_tools.summary import RunFacts, analyse, judge
 
@@ -61,8 +62,8 @@ EXIT_INTERRUPTED: Final = 130
 IDLE_S: Final = 2.0
 """How long the idle link is measured."""
 POLL_S: Final = 0.5
-START_S: Final = 30.0
-"""Time for the daemons to be ready and for the first message to arrive."""
+START_S: Final = 120.0
+"""Time for the daemons to be ready and for the first message to arrive, also where the machine is small and busy."""
 TAIL_S: Final = 3.0
 """After the load has ended, what is under way may still arrive for so long."""
 SERN_NAME: Final = "SERN"
@@ -255,7 +256,7 @@ class Demo:
                 run.behaviour = behaviour
                 # Upstream first: what the robot still has goes to the relay, and from there to the site.
                 await children.stop([daemons[ROBOT]])
-                await self._drained(session, web[RELAY])
+                await _drained(children, partial(_get, session, f"{web[RELAY]}/api/link"))
                 await children.stop([daemons[SITE]])
                 await children.stop([daemons[RELAY]])
                 for child in daemons.values():
@@ -272,15 +273,6 @@ class Demo:
             if time.monotonic() > deadline_s:
                 where = f"the logs are in {children.directory}" if self.options.keep else "--keep keeps the logs"
                 raise SernError(f"not within {START_S:g} s: {what}; {where}")
-            await asyncio.sleep(0.05)
-
-    async def _drained(self, session: aiohttp.ClientSession, relay: str) -> None:
-        """Wait until nothing waits for the site any more, but no longer than `TAIL_S`."""
-        deadline_s = time.monotonic() + TAIL_S
-        while time.monotonic() < deadline_s:
-            links = await _get(session, f"{relay}/api/link") or []
-            if not any(_waiting(entry) or entry.get("inflight_bytes") for entry in links if entry.get("peer") == SITE):
-                break
             await asyncio.sleep(0.05)
 
     # -- both ------------------------------------------------------------------------------------------------------
@@ -378,6 +370,25 @@ async def _ready(session: aiohttp.ClientSession, url: str) -> bool:
 async def _arriving(session: aiohttp.ClientSession, url: str) -> bool:
     topics = await _get(session, f"{url}/api/topics") or {}
     return any(counters.get("delivered") for name, counters in topics.items() if name != COMMAND_TOPIC)
+
+
+async def _drained(children: Children, ask: Callable[[], Awaitable[list[Mapping[str, Any]] | None]]) -> None:
+    """Wait until nothing waits for the site any more, or until it has not got less for `DRAIN_S`.
+
+    `ask`: the relay's /api/link, None while it does not answer. SernError when a child ended that nobody told to.
+    """
+    least = math.inf
+    deadline_s = time.monotonic() + DRAIN_S
+    while time.monotonic() < deadline_s:
+        children.check()
+        links = await ask()
+        if links is not None:
+            left = sum(_waiting(entry) + entry.get("inflight_bytes", 0) for entry in links if entry.get("peer") == SITE)
+            if not left:
+                return
+            if left < least:
+                least, deadline_s = left, time.monotonic() + DRAIN_S
+        await asyncio.sleep(0.05)
 
 
 def _waiting(link: Mapping[str, Any]) -> int:

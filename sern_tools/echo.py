@@ -41,6 +41,7 @@ from sern_runtime import clock
 from sern_runtime.config.client import RelayConnection, load_client
 from sern_runtime.keys import SecretKey, load_public, load_secret
 from sern_runtime.loop import Shutdown, run
+from sern_runtime.zmq_socket import HANDSHAKE_IVL_MS
 from sern_tools.api import NotFoundError, checked_api, drop_output, get_json, is_stream, local_api, say
 from sern_tools.echo_text import Decoder
 
@@ -53,7 +54,11 @@ RIVAL_TURNS: Final = 3
 """New sessions on one connection, after which somebody else must be using our name."""
 NEW_SESSION: Final = "new session"
 """The reason that `sern_core.link` gives when the relay has it begin anew on a connection that is up."""
+UNHEARD: Final = "the relay does not answer"
+"""The reason while nothing has come of the connection, neither way."""
 TAKEN: Final = "another process connected as "
+DAEMON_S: Final = 1.0
+"""How long to wait for an answer of the daemon whose name we would take."""
 _CHECK_S: Final = 0.05
 
 
@@ -309,7 +314,8 @@ async def listen(
 ) -> None:
     """Print `topic` until `shutdown`, or until the printer has had enough. Raises SernError.
 
-    `timeout_s`: how long the relay, and then the topic, may take to appear; 0: for ever.
+    `timeout_s`: how long the relay, and from then on the topic, may take to appear; 0: for ever. As long as nothing is
+    known of the relay, it has the time of a whole handshake, even where `timeout_s` is less.
     """
     _refuse_a_running_daemon(identity)
     listener = Listener(printer, warn)
@@ -322,7 +328,7 @@ async def listen(
         now=clock.now(),
     )
     core.subscribe((re.escape(topic),), now=clock.now())
-    reason = "the relay does not answer"
+    reason = UNHEARD
 
     def note(text: str) -> None:
         nonlocal reason
@@ -342,6 +348,7 @@ async def listen(
             on_reason=note,
         )
         began_s = clock.now()
+        up_s: float | None = None
         while not (shutdown.requested or listener.done):
             await asyncio.sleep(_CHECK_S)
             if listener.problem is not None:
@@ -351,8 +358,10 @@ async def listen(
                     f"another program is connected to {identity.endpoint} as {identity.name}; "
                     "use a key of your own: sern keygen client NAME"
                 )
+            if core.link.established and up_s is None:
+                up_s = clock.now()
             if not listener.seen:
-                _check_patience(topic, identity, core, transport, reason, began_s, timeout_s)
+                _check_patience(topic, identity, core, transport, reason, began_s, up_s, timeout_s)
             elif printer.tick():
                 break
         listener.done = True
@@ -370,15 +379,22 @@ def _check_patience(
     transport: RelayTransport,
     reason: str,
     began_s: float,
+    up_s: float | None,
     timeout_s: float,
 ) -> None:
-    """Raises SernError when what is missing will not come, or has not come in time."""
+    """Raises SernError when what is missing will not come, or has not come in time.
+
+    The topic has its time from `up_s` on, when the relay was there: a long handshake takes nothing of it.
+    """
     if transport.rebuilds and not core.link.established:
         raise SernError(f"{identity.endpoint}: {reason}")
-    if not timeout_s or clock.now() - began_s < timeout_s:
+    limit_s = timeout_s
+    if up_s is None and reason is UNHEARD:  # a relay that is far away, or a busy machine: nothing says that it is gone
+        limit_s = max(timeout_s, HANDSHAKE_IVL_MS / 1000)
+    if not timeout_s or clock.now() - (began_s if up_s is None else up_s) < limit_s:
         return
     if not core.link.established:
-        raise SernError(f"{identity.endpoint}: {reason} (waited {timeout_s:g} s)")
+        raise SernError(f"{identity.endpoint}: {reason} (waited {limit_s:g} s)")
     raise SernError(
         f"{topic} has not appeared at {core.link.peer} within {timeout_s:g} s: nobody publishes it "
         "(`sern topics` at the relay lists what there is)"
@@ -403,7 +419,7 @@ def _refuse_a_running_daemon(identity: Identity) -> None:
         return
     url = f"http://{identity.http}"
     try:
-        get_json(url, "/api/link", timeout_s=1.0)
+        get_json(url, "/api/link", timeout_s=DAEMON_S)
     except SernError:
         return
     raise UsageError(
@@ -546,7 +562,8 @@ def echo(
     full: Annotated[bool, typer.Option("--full", help="Arrays and bytes in full length.")] = False,
     rate: Annotated[bool, typer.Option("--rate", help="Rate, bytes, ages and gaps once a second instead.")] = False,
     timeout_s: Annotated[
-        float, typer.Option("--timeout", min=0, help="Seconds for relay and topic to appear; 0: for ever.")
+        float,
+        typer.Option("--timeout", min=0, help="Seconds for the relay, and then the topic, to appear; 0: for ever."),
     ] = DEFAULT_TIMEOUT_S,
 ) -> None:
     """Print the messages of a topic as they pass.

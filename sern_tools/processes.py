@@ -113,9 +113,10 @@ class Child:
     async def ask(self, word: str) -> dict[str, Any]:
         """Send one line to its input and return the line it answers."""
         assert self.process.stdin is not None
-        with contextlib.suppress(ConnectionError):  # it has ended; the missing answer says so
-            self.process.stdin.write(word.encode() + b"\n")
-            await self.process.stdin.drain()
+        if not self.process.stdin.is_closing():  # else it has ended, and uvloop raises RuntimeError for a write
+            with contextlib.suppress(ConnectionError):  # it has ended; the missing answer says so
+                self.process.stdin.write(word.encode() + b"\n")
+                await self.process.stdin.drain()
         return await self.read_object()
 
     def signal(self, number: int) -> None:

@@ -7,10 +7,11 @@ and sockets are checked once, at the end of the session.
 import asyncio
 import gc
 import os
+import signal
 import threading
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import pytest
 import uvloop
@@ -25,6 +26,7 @@ from tests.support import DEADLINE_S, Patience
 
 Context = zmq.Context[zmq.Socket[bytes]]
 PEERS: Final = Path(__file__).parent / "peers"
+LAB: Final = Path(__file__).parent / "lab"
 
 for name in (
     "CYCLONEDDS_URI", "FASTRTPS_DEFAULT_PROFILES_FILE", "RMW_IMPLEMENTATION", "ROS_DISCOVERY_SERVER", "ROS_DOMAIN_ID",
@@ -45,17 +47,25 @@ def pytest_asyncio_loop_factories(
     return {"uvloop": uvloop.new_event_loop}
 
 
+@pytest.hookimpl(tryfirst=True)  # before pytest-xdist takes `-n` for "--dist load", which knows no groups
+def pytest_cmdline_main(config: pytest.Config) -> None:
+    """Let the groups hold also where nobody says `--dist loadgroup`."""
+    if getattr(config.option, "numprocesses", None) and config.option.dist in ("no", "load"):
+        config.option.dist = "loadgroup"
+
+
 @pytest.hookimpl(tryfirst=True)  # before pytest-xdist reads the groups
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Ask for `no_leftover_tasks` ahead of all other fixtures, so that it is torn down after them.
 
-    Name the groups whose tests run one after the other where several processes share the tests: those of a file, and
-    all with ROS peers, which share the host's ROS domains and its multicast.
+    Name the groups whose tests run one after the other where several processes share the tests: those of a file, all
+    with ROS peers, which share the host's ROS domains and its multicast, and all of the lab, which has the machine.
     """
     for item in items:
         if isinstance(item, pytest.Function) and asyncio.iscoroutinefunction(item.function):
             item.fixturenames.insert(0, "no_leftover_tasks")
-        group = "peers" if PEERS in item.path.parents else str(item.path)
+        apart = [folder for folder in (PEERS, LAB) if folder in item.path.parents]
+        group = apart[0].name if apart else str(item.path)
         item.add_marker(pytest.mark.xdist_group(group))
 
 
@@ -86,6 +96,20 @@ def zmq_context() -> Iterator[Context]:
     terminator.join(DEADLINE_S)
     assert not terminator.is_alive(), "the context did not end: a socket is used elsewhere, or lingers"
     assert not left, f"sockets left open: {left}"
+
+
+@pytest.fixture
+def default_signals() -> Iterator[None]:
+    """As in a terminal: whoever started the tests may have some ignored (nohup, a shell's background job)."""
+    usual: dict[signal.Signals, Any] = {
+        signal.SIGTERM: signal.SIG_DFL,
+        signal.SIGINT: signal.default_int_handler,
+        signal.SIGHUP: signal.SIG_DFL,
+    }
+    before = {number: signal.signal(number, handler) for number, handler in usual.items()}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
 
 
 @pytest.fixture(scope="session")

@@ -10,6 +10,7 @@ from random import Random
 from typing import Final
 
 from hypothesis import HealthCheck, settings
+from hypothesis.internal.conjecture import providers
 
 SEED: Final = os.environ.get("SERN_EXPLORE", "")
 TIMES: Final = 10
@@ -30,13 +31,26 @@ def seeds(count: int) -> list[int]:
 
 
 def load_profile() -> None:
-    """For all property tests. A busy machine, which draws and runs examples slowly, is no failure."""
+    """For all property tests. A busy machine, which draws and runs examples slowly, is no failure, and neither is what
+    the draws of a seed happen to look like: large, or many that a filter takes away."""
     settings.register_profile(
         "sern",
         derandomize=not SEED,
         database=None,
         deadline=None,
         print_blob=bool(SEED),
-        suppress_health_check=[HealthCheck.too_slow],
+        suppress_health_check=[HealthCheck.too_slow, HealthCheck.filter_too_much, HealthCheck.data_too_large],
     )
     settings.load_profile("sern")
+    _draw_no_constants_of_modules()
+
+
+def _draw_no_constants_of_modules() -> None:
+    """Hypothesis draws some values from the constants of whatever local modules are imported: that depends on which
+    tests the process has run before. It keeps its own constants. There is no setting for it; versions of hypothesis
+    that have no such pool need none."""
+    kind = getattr(providers, "HypothesisProvider", None)
+    constants = getattr(providers, "Constants", None)
+    if kind is not None and constants is not None and hasattr(kind, "_local_constants"):
+        none = constants()
+        kind._local_constants = property(lambda self: none)

@@ -3,6 +3,7 @@
 import asyncio
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Final
 
 from sern_client.endpoints.base import ServiceInfo
@@ -38,6 +39,14 @@ async def until(condition: Callable[[], object], what: str = "", *, deadline_s: 
         if patience.over():
             raise AssertionError(f"not within {deadline_s:g} s: {what or condition}")
         await asyncio.sleep(_POLL_S)
+
+
+def ended(pid: int) -> bool:
+    """Gone, or dead and waiting for somebody to ask after it: orphans are left to whatever is process 1."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
+    except (FileNotFoundError, ProcessLookupError):
+        return True
 
 
 class Events:

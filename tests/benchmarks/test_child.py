@@ -152,7 +152,8 @@ def test_who_waits_for_workers_in_vain_says_so() -> None:
 
 
 @pytest.mark.usefixtures("spawning")
-def test_a_worker_answers_and_one_that_ends_instead_is_an_error() -> None:
+def test_a_worker_answers_and_one_that_ends_instead_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(child, "PATIENCE_S", DEADLINE_S)  # an interpreter ends some time after its connection
     ours, theirs = Pipe()
     worker = Worker("the server", answers, theirs, 7)
     with ours:

@@ -78,6 +78,7 @@ def test_libzmq_is_not_locked_out(name: str) -> None:
     assert not values(name, "MemoryDenyWriteExecute")
 
 
+@pytest.mark.usefixtures("default_signals")
 def test_reload_is_for_the_relay_and_needs_no_program_but_the_shell() -> None:
     command = shlex.split(values("sern-relay.service", "ExecReload")[0])
     assert command[:2] == ["/bin/sh", "-c"]

@@ -31,6 +31,7 @@ from sern_tools.lab.lab import Lab, Node
 from sern_tools.message_log import read_logs
 from sern_tools.summary import RunFacts, analyse, judge
 from tests.lab.test_sern import (
+    BUSY_S,
     COUNTER,
     MAP,
     Placed,
@@ -48,8 +49,6 @@ RUN_S = 4.0
 RUNS_S = {"satcom": 2.5}  # which takes seconds to connect
 RECOVERY_S = 15.0
 """A fresh pose is there so soon after a blackout: no measure of speed, as the machine may be busy with anything."""
-BUSY_S = 1.0
-"""For the same reason so much may pass between the last check of a command's age and the line in the log."""
 NEW_ADDRESS = "198.18.0.77"
 CALM_WAY = LinkModel(rate_bps=4e6, delay_s=0.025)
 CALM = LinkProfile("calm", "4 Mbit/s, 50 ms round trip", CALM_WAY, CALM_WAY)

@@ -7,12 +7,13 @@ import socket
 import struct
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Final
 
 from sern_tools.lab.lab import Node
+from tests.support import Patience
 
 HEADERS_BYTES: Final = 42
 """Ethernet, IPv4 and UDP: what netem counts beside the payload of a datagram."""
@@ -21,6 +22,7 @@ _TIMESTAMPNS: Final = 35
 _RCVBUFFORCE: Final = 33
 _BUFFER_BYTES: Final = 2**23
 _QUIET_S: Final = 0.4
+_BURST: Final = 20
 
 
 @dataclass(frozen=True)
@@ -45,16 +47,28 @@ def _pair(source: Node, target: Node) -> Iterator[tuple[socket.socket, socket.so
 
 
 def datagrams(
-    source: Node, target: Node, count: int, *, size_bytes: int = 100, gap_s: float = 0.0, quiet_s: float = _QUIET_S
+    source: Node,
+    target: Node,
+    count: int,
+    *,
+    size_bytes: int = 100,
+    gap_s: float = 0.0,
+    quiet_s: float = _QUIET_S,
+    then: Callable[[], object] = lambda: None,
 ) -> list[Arrival]:
-    """Send `count` numbered datagrams, `gap_s` apart; those that have arrived when none came for `quiet_s`."""
+    """Send `count` numbered datagrams, `gap_s` apart, then call `then`; what arrives until nothing does for `quiet_s`.
+
+    A sender that stood still catches up with `_BURST` at most: queues beside the link's would not hold many more.
+    """
     with _pair(source, target) as (sender, receiver):
-        began_s = time.monotonic()
+        due_s = time.monotonic()
         for number in range(count):
             # Busy waiting, because sleeping is too coarse for some thousand a second.
-            while gap_s and time.monotonic() < began_s + number * gap_s:
+            while gap_s and time.monotonic() < due_s:
                 time.sleep(gap_s / 4)
+            due_s = max(due_s, time.monotonic() - _BURST * gap_s) + gap_s
             sender.send(struct.pack("Id", number, time.time()).ljust(size_bytes, b"\0"))
+        then()
         receiver.settimeout(quiet_s)
         arrivals: list[Arrival] = []
         while True:
@@ -74,8 +88,17 @@ def rate_bps(arrivals: list[Arrival], size_bytes: int) -> float:
 
 
 def reaches(source: Node, target: Node, *, within_s: float = 0.5) -> bool:
-    """Whether one datagram gets through."""
+    """Whether one datagram gets through. False means little on a machine that stands still: see `comes_to_reach`."""
     return bool(datagrams(source, target, 1, quiet_s=within_s))
+
+
+def comes_to_reach(source: Node, target: Node) -> bool:
+    """Whether one of some datagrams gets through before a deadline."""
+    patience = Patience()
+    while not reaches(source, target):
+        if patience.over():
+            return False
+    return True
 
 
 def stream(source: Node, target: Node, count_bytes: int) -> float:

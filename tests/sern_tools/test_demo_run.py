@@ -6,6 +6,7 @@ Figures are not judged here (the machine may be busy); what does not depend on s
 import asyncio
 import json
 import os
+import re
 import signal
 import sys
 import uuid
@@ -24,8 +25,13 @@ profiles:
     schedule: [{at_s: 1.0, blackout_s: 0.5}]
     duration_s: 3
 """
-RUN_S = 90.0
-INDEPENDENT_OF_SPEED = {"reliable_faults", "corrupted_messages", "expired_commands", "uncounted_messages"}
+RUN_S = 300.0
+"""More than `demo.START_S`, so that a demo that waits in vain has said so."""
+LIVE = "|  control "
+"""In every line that is printed while a load runs, whenever the first one comes."""
+INDEPENDENT_OF_SPEED = {"reliable_faults", "corrupted_messages", "uncounted_messages"}
+LATE_LOG_S = 1.0
+"""A busy machine may take so much between the last check of a command's age and the line in the log."""
 
 
 class Started:
@@ -61,11 +67,11 @@ class Started:
             self.output += data.decode()
 
     async def ended(self) -> int:
-        """The exit status, once it has ended; RUN_S is for a very slow machine."""
+        """The exit status, once it has ended."""
         assert self.process is not None and self._reading is not None
-        async with asyncio.timeout(RUN_S):
-            await self._reading
-            return await self.process.wait()
+        await until(self._reading.done, "the demo ends", deadline_s=RUN_S)
+        await self._reading
+        return await self.process.wait()
 
     async def reaches(self, stage: str, *, processes: int = 0) -> asyncio.subprocess.Process:
         """Wait until it has printed `stage` and has more than so many processes; it must not end before."""
@@ -116,6 +122,8 @@ async def test_a_whole_run_leaves_its_report_and_nothing_else(tmp_path: Path) ->
     assert {name: ok for name, ok in reach.items() if name in INDEPENDENT_OF_SPEED} == dict.fromkeys(
         INDEPENDENT_OF_SPEED, True
     ), demo.output
+    late = re.search(r"the latest ([0-9.]+) s too late", " ".join(demo.output.split()))
+    assert reach["expired_commands"] or (late is not None and float(late[1]) < LATE_LOG_S), demo.output
     assert {"control_p99_s", "first_fresh_pose_s", "control_overtaken_share"} < reach.keys()
     assert status == (EXIT_OK if all(reach.values()) else EXIT_BROKEN)
     assert {row["system"] for row in figures["rows"]} == {"SERN", "plain ZMQ"}
@@ -125,7 +133,7 @@ async def test_a_whole_run_leaves_its_report_and_nothing_else(tmp_path: Path) ->
 
 @pytest.mark.parametrize(
     ("stage", "number"),
-    [("1/3", signal.SIGINT), ("2/3", signal.SIGTERM), ("  0.0 s", signal.SIGINT), ("3/3", signal.SIGHUP)],
+    [("1/3", signal.SIGINT), ("2/3", signal.SIGTERM), (LIVE, signal.SIGINT), ("3/3", signal.SIGHUP)],
 )
 async def test_ctrl_c_stops_everything_at_any_stage(tmp_path: Path, stage: str, number: signal.Signals) -> None:
     demo = Started(tmp_path)
@@ -157,7 +165,7 @@ async def test_what_is_wrong_is_one_line(tmp_path: Path, arguments: list[str], w
     demo.assert_nothing_left()
 
 
-@pytest.mark.parametrize("stage", ["1/3", "  0.0 s", "3/3"])
+@pytest.mark.parametrize("stage", ["1/3", LIVE, "3/3"])
 async def test_kill_9_leaves_nothing_behind(tmp_path: Path, stage: str) -> None:
     """No process, and no directory with keys."""
     demo = Started(tmp_path)

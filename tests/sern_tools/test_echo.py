@@ -11,6 +11,7 @@ from collections.abc import Callable
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from io import StringIO
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -25,7 +26,8 @@ from sern_core.message import Message, StreamId, StreamInfo, TopicInfo, TopicSpe
 from sern_core.types import ClientName, DropReason, Encoding, TopicName
 from sern_runtime import ros_types
 from sern_runtime.loop import Shutdown
-from sern_runtime.transport_watch import CUT, ENDED
+from sern_runtime.transport_watch import CUT, ENDED, LOST, NOBODY
+from sern_tools import echo
 from sern_tools.commands import app
 from sern_tools.echo import (
     Listener,
@@ -39,7 +41,7 @@ from sern_tools.echo import (
 from sern_tools.echo_text import Decoder, hex_text, scalar, text_of
 from sern_tools.ports import free_ports
 from tests.daemons import Lab, write_bag
-from tests.support import until
+from tests.support import DEADLINE_S, until
 
 TEXT = "std_msgs/msg/String"
 ROS1 = Encoding.ROS1
@@ -333,7 +335,34 @@ async def test_no_relay(tmp_path: Path) -> None:
         await Show(lab).run(timeout_s=0.3)
 
 
-async def test_a_running_client_is_not_pushed_aside(tmp_path: Path) -> None:
+def test_a_long_handshake_takes_nothing_of_the_topics_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing says that the relay is gone, and once it is there, the topic has its own time."""
+    now_s = 100.0
+    monkeypatch.setattr("sern_tools.echo.clock.now", lambda: now_s)
+    link, transport = SimpleNamespace(established=False, peer="relay"), SimpleNamespace(rebuilds=0)
+    identity = identity_from_options(Lab(tmp_path, "viewer").endpoint, None, None, "viewer")
+
+    def check(reason: str, *, up_s: float | None = None) -> None:
+        echo._check_patience("/a", identity, SimpleNamespace(link=link), transport, reason, 100.0, up_s, 0.3)  # type: ignore[arg-type]
+
+    now_s = 109.9
+    check(echo.UNHEARD)
+    with pytest.raises(SernError, match=r"connecting failed \(waited 0\.3 s\)"):
+        check(NOBODY)
+    now_s = 110.0
+    with pytest.raises(SernError, match=r"the relay does not answer \(waited 10 s\)"):
+        check(echo.UNHEARD)
+    link.established = True
+    check(echo.UNHEARD, up_s=109.8)
+    with pytest.raises(SernError, match=r"/a has not appeared at relay within 0\.3 s"):
+        check(echo.UNHEARD, up_s=109.6)
+    link.established = False
+    with pytest.raises(SernError, match=r"lost \(waited 0\.3 s\)"):
+        check(LOST, up_s=109.6)
+
+
+async def test_a_running_client_is_not_pushed_aside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(echo, "DAEMON_S", DEADLINE_S)
     async with Lab(tmp_path, "robot1", "viewer") as lab:
         await lab.relay()
         config = lab.recorder_file("viewer", "/robot1/.*")
@@ -364,7 +393,7 @@ async def test_the_latest_value_without_a_key(tmp_path: Path) -> None:
             out = StringIO()
             printer, url = Printer(decoder, out, count=1), f"http://127.0.0.1:{process.port}"
             options: dict[str, Any] = {"warn": lambda text: None}
-            await poll("/robot1/text", url, printer, Shutdown(), decoder, timeout_s=20.0, **options)
+            await poll("/robot1/text", url, printer, Shutdown(), decoder, timeout_s=DEADLINE_S, **options)
             assert out.getvalue().startswith("# robot1 seq ")
             assert read_yaml(out.getvalue().split("---\n")[0])["data"].startswith("/text ")
             with pytest.raises(SernError, match=f"{nothing} /robot1/none"):

@@ -13,7 +13,7 @@ from sern_core.errors import SernError
 from sern_tools import child as launcher
 from sern_tools import processes
 from sern_tools.processes import Child, Children, program
-from tests.support import until
+from tests.support import ended, until
 
 ECHO = 'import sys\nfor line in sys.stdin: print(\'{"word": "%s"}\' % line.strip(), flush=True)'
 STUBBORN = (
@@ -102,6 +102,8 @@ async def test_a_child_that_ends_by_itself_is_an_error_with_its_last_words(tmp_p
         talker = await children.start("talker", python("import sys; sys.exit(3)"), talks=True)
         with pytest.raises(SernError, match="exit status 3"):
             await talker.ask("go")
+        with pytest.raises(SernError, match="exit status 3"):  # also when its end was noticed before
+            await talker.ask("go")
 
 
 async def test_of_a_traceback_the_error_remains(tmp_path: Path) -> None:
@@ -122,10 +124,12 @@ except KeyError:
 
 
 async def test_the_environment_is_ours_with_changes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in ("SERN_KEPT", "SERN_TAKEN", "SERN_CHANGED"):
+    monkeypatch.delenv("SERN_NEW", raising=False)
+    for name in ("SERN_KEPT", "SERN_TAKEN", "SERN_CHANGED", "SERN_ABSENT"):
         monkeypatch.setenv(name, "ours")
-    code = "import json, os; print(json.dumps({k: v for k, v in os.environ.items() if k.startswith('SERN_')}))"
     changes = {"SERN_TAKEN": None, "SERN_CHANGED": "theirs", "SERN_NEW": "theirs", "SERN_ABSENT": None}
+    asked = ["SERN_KEPT", *changes]
+    code = f"import json, os; print(json.dumps({{k: v for k, v in os.environ.items() if k in {asked}}}))"
     async with Children(tmp_path) as children:
         child = await children.start("child", python(code), talks=True, environment=changes)
         found = await child.read_object()
@@ -174,14 +178,6 @@ async def test_children_end_with_a_parent_that_is_killed(tmp_path: Path) -> None
     process.kill()
     await process.wait()
     await until(lambda: ended(child), "the child is gone")
-
-
-def ended(pid: int) -> bool:
-    """Gone, or dead and waiting for somebody to ask after it: orphans are left to whatever is process 1."""
-    try:
-        return (Path("/proc") / str(pid) / "stat").read_text().rpartition(")")[2].split()[0] == "Z"
-    except FileNotFoundError:
-        return True
 
 
 def launched(parent: int, *command: str) -> subprocess.CompletedProcess[str]:

@@ -255,6 +255,7 @@ async def test_a_real_relay_and_its_client(tmp_path: Path) -> None:
         ]
         assert {row["type_name"] for row in rows} == {"std_msgs/msg/String"}
         assert rows[1]["takers"] == 1
+        await site.until(lambda: "/robot1/text" in site.json("/api/topics"), "has the topic")
         for client in (site, robot):
             (row,) = listed(client.port, pattern=".*/text")
             assert (row["topic"], row["owner"], row["type_name"]) == ("/robot1/text", "robot1", "std_msgs/msg/String")
