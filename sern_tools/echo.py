@@ -389,7 +389,7 @@ def _check_patience(
     if transport.rebuilds and not core.link.established:
         raise SernError(f"{identity.endpoint}: {reason}")
     limit_s = timeout_s
-    if up_s is None and reason is UNHEARD:  # a relay that is far away, or a busy machine: nothing says that it is gone
+    if up_s is None and reason == UNHEARD:  # a relay that is far away, or a busy machine: nothing says that it is gone
         limit_s = max(timeout_s, HANDSHAKE_IVL_MS / 1000)
     if not timeout_s or clock.now() - (began_s if up_s is None else up_s) < limit_s:
         return
