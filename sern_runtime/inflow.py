@@ -92,6 +92,7 @@ class Inflow(Generic[H]):
         self._at_s = clock()
         self._progress = socket.emptied, socket.messages
         self._seen: dict[H, _Look] = {}
+        self._ended: set[H] = set()
         self._timer: asyncio.TimerHandle | None = self._loop.call_later(period_s, self._tick)
 
     def close(self) -> None:
@@ -119,7 +120,11 @@ class Inflow(Generic[H]):
         forgiven = (now - self._at_s) * FORGIVEN_BYTES_PER_S
         self._at_s = now
         seen: dict[H, _Look] = {}
+        ended: set[H] = set()
         for handle, taken in list(self._connections()):
+            if handle in self._ended:
+                ended.add(handle)  # libzmq reads on what had arrived, and lists it until then
+                continue
             read_bytes = handle.read_bytes()
             if read_bytes is None:
                 continue
@@ -134,10 +139,12 @@ class Inflow(Generic[H]):
                 self._on_endless(handle)
                 handle.cut()
                 trim_memory()
+                ended.add(handle)
                 continue
             known.read_bytes = read_bytes
             seen[handle] = known
         self._seen = seen
+        self._ended = ended
 
 
 def resident_bytes() -> int:

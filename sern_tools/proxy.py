@@ -49,6 +49,8 @@ EARLY_S: Final = 0.0005
 """What is due within this time goes with the current burst: timers are no finer than a millisecond."""
 READ_PACKETS: Final = 4
 """Packets one connection may take in a row before the next one has its turn."""
+PORT_TRIES: Final = 32
+"""Ports of the kernel's choice that are tried until one is free for connections and for datagrams."""
 STATISTICS_BUCKET_S: Final = 0.1
 NOT_STARTED_S: Final = 1e6
 """Before `start`, time 0 of the schedule lies this far ahead."""
@@ -336,18 +338,21 @@ class ShapingProxy:
     # -- connections -----------------------------------------------------------------------------------------------
 
     def _listen(self, route: Route) -> None:
-        listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+        up, down = self._directions["up"].carry, self._directions["down"].carry
+        for left in reversed(range(PORT_TRIES if route.listen[1] == 0 else 1)):
+            listener = _listening(route.listen)
+            if self._carries_datagrams:
+                try:
+                    self._datagrams.append(DatagramRoute(listener.getsockname(), route.target, up=up, down=down))
+                except OSError as error:
+                    listener.close()
+                    if left and error.errno == errno.EADDRINUSE:
+                        continue  # the kernel chose a port that is free for connections only
+                    raise
+            break
         self._listeners.append(listener)
-        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        _small_buffers(listener)  # accepted sockets inherit them, and the window is announced from the first packet
-        listener.setblocking(False)
-        listener.bind(route.listen)
-        listener.listen(128)
         self.addresses.append(listener.getsockname())
         self.loop.add_reader(listener, self._accept, listener, route)
-        if self._carries_datagrams:
-            up, down = self._directions["up"].carry, self._directions["down"].carry
-            self._datagrams.append(DatagramRoute(listener.getsockname(), route.target, up=up, down=down))
 
     def _accept(self, listener: socket.socket, route: Route) -> None:
         now = time.monotonic()
@@ -469,6 +474,21 @@ class ShapingProxy:
         other = connection.pipes["down" if pipe is connection.pipes["up"] else "up"]
         if connection.ended == 2 or other.dead:
             self._drop(connection)
+
+
+def _listening(address: tuple[str, int]) -> socket.socket:
+    """A socket that listens for connections; raises OSError."""
+    listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+    try:
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        _small_buffers(listener)  # accepted sockets inherit them, and the window is announced from the first packet
+        listener.setblocking(False)
+        listener.bind(address)
+        listener.listen(128)
+    except OSError:
+        listener.close()
+        raise
+    return listener
 
 
 def _small_buffers(sock: socket.socket) -> None:

@@ -30,7 +30,7 @@ from sern_runtime.config.client import load_client
 from sern_runtime.config.relay import load_relay
 from sern_runtime.keys import PublicKey, PublicKeys, SecretKey, generate, write_public, write_secret
 from sern_tools.ports import free_ports
-from tests.support import until
+from tests.support import DEADLINE_S, until
 
 HOST: Final = "127.0.0.1"
 CALLER_HOST: Final = "127.0.0.2"
@@ -128,8 +128,8 @@ class Process:
         return int(content["http"]["listen"].rpartition(":")[2])
 
     def get(self, path: str) -> tuple[int, str]:
-        """Status and body of a GET; (0, "") while nobody listens or answers."""
-        connection = http.client.HTTPConnection(HOST, self.port, timeout=10, source_address=(CALLER_HOST, 0))
+        """Status and body of a GET; (0, "") while nobody listens, and where there is no answer in a test's deadline."""
+        connection = http.client.HTTPConnection(HOST, self.port, timeout=DEADLINE_S, source_address=(CALLER_HOST, 0))
         try:
             connection.request("GET", path)
             answer = connection.getresponse()

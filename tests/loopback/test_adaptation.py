@@ -10,6 +10,7 @@ from sern_core.types import Encoding, TopicName
 from sern_runtime.metrics import Metrics
 from sern_sim.models import LinkModel, RateStep
 from sern_tools.proxy import Route, ShapingProxy
+from sern_tools.shaping import RateSchedule
 from tests.daemons import HOST, Lab, Process, bodies
 from tests.sern_core.summaries import scenes
 from tests.support import until
@@ -68,10 +69,10 @@ RAW = dict.fromkeys(THIN, False)
 
 
 async def test_a_cloud_goes_to_its_summary_when_the_link_gets_thin_and_comes_back(tmp_path: Path) -> None:
-    """Through the shaping proxy: 40 Mbit/s, for some seconds 0.3, then 40 again. Nothing overtakes, as the clouds' own
-    counts show."""
-    steps = (RateStep(0.5, 0.3e6), RateStep(4.0, 40e6))
-    up, down = LinkModel(rate_bps=40e6, delay_s=0.005, rate_steps=steps), LinkModel(rate_bps=40e6, delay_s=0.005)
+    """Through the shaping proxy: 40 Mbit/s, 0.3 until thin clouds go, then 40 again. Nothing overtakes, as the clouds'
+    own counts show."""
+    good = LinkModel(rate_bps=40e6, delay_s=0.005)
+    thin = LinkModel(rate_bps=40e6, delay_s=0.005, rate_steps=(RateStep(0.5, 0.3e6),))
     endpoint = {"kind": "synthetic", "role": "robot", "topics": ["/points"], "encoding": "ros1"}
     clouds = {"cloud_rate_hz": 10.0, "cloud_bytes": 100_000}
     summary = {"kind": "voxel", "voxel_m": 2.0, "in_place": True, "adapt": True, "level": "raw"}
@@ -80,7 +81,7 @@ async def test_a_cloud_goes_to_its_summary_when_the_link_gets_thin_and_comes_bac
     async with Lab(tmp_path, "robot1", "site") as lab:
         relay = await lab.relay()
         site = await lab.connected(lab.recorder_file("site", topic))
-        async with ShapingProxy(up, down, [Route((HOST, 0), (HOST, lab.port))], seed=1) as proxy:
+        async with ShapingProxy(thin, good, [Route((HOST, 0), (HOST, lab.port))], seed=1) as proxy:
             host, port = proxy.addresses[0]
             file = lab.client_file(
                 "robot1",
@@ -105,6 +106,7 @@ async def test_a_cloud_goes_to_its_summary_when_the_link_gets_thin_and_comes_bac
             adaptation.register(Metrics(registry, process=False))
             peer = {"peer": robot.core.link.peer, "class": "bulk"}
             assert registry.get_sample_value("sern_mmcf_summarised", peer) == 1.0
+            proxy._directions["up"].shaper.schedule = RateSchedule.of(good)
             # A raw message is sent every 5 to 30 intervals to see whether the link got better.
             await until(lambda: chosen() == RAW, "raw clouds go again", deadline_s=90)
             before = site.core.received.topics[topic].delivered

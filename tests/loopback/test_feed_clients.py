@@ -14,7 +14,7 @@ from sern_client.endpoints.synthetic import SyntheticEndpoint
 from sern_core.types import ClientName, DropReason, Encoding, PriorityClass, TopicName
 from sern_relay.daemon import RelayDaemon
 from sern_relay.feed import InjectCounters, RelayFeed
-from sern_runtime import clock, ros_types
+from sern_runtime import ros_types
 from sern_runtime.feed import HEADER, FeedHeader
 from sern_tools.ports import free_ports
 from tests.daemons import Lab, endpoint_of
@@ -241,9 +241,10 @@ async def test_a_quiet_topic_gives_its_name_back_and_latched_state_does_not(tmp_
         send(publisher, CMD, TWIST.pack(*[0.0] * 6))
         send(publisher, "/jackal1/goal", goal)
         await until(lambda: counters(relay).injected == 2, "both came in")
-        feed_of(relay).sweep(now=clock.now() + 29.0)
+        last_s = feed_of(relay)._sources["unity", CMD].last_s
+        feed_of(relay).sweep(now=last_s + 29.0)
         assert len(relay.hub.relayed) == 2
-        feed_of(relay).sweep(now=clock.now() + 31.0)
+        feed_of(relay).sweep(now=last_s + 31.0)
         assert [identity.topic for identity in relay.hub.relayed] == ["/jackal1/goal"]
         assert relay.hub.replays.held_bytes == len(goal)
         send(publisher, CMD, TWIST.pack(*[0.0] * 6))

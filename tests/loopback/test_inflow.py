@@ -216,11 +216,13 @@ class Looks:
     def __init__(self) -> None:
         self.socket = FakeSocket()
         self.handle = FakeHandle()
+        self.listed = True
         self.taken = 0
         self.now = 0.0
-        self.inflow = Inflow(
-            self.socket, lambda: [(self.handle, self.taken)], lambda _: None, period_s=3600.0, clock=lambda: self.now
-        )
+        self.inflow = Inflow(self.socket, self._connections, lambda _: None, period_s=3600.0, clock=lambda: self.now)
+
+    def _connections(self) -> list[tuple[FakeHandle, int]]:
+        return [(self.handle, self.taken)] if self.listed else []
 
     def look(self, read: int | None, *, taken: int = 0, after_s: float = 0.05) -> bool:
         self.now += after_s
@@ -244,6 +246,25 @@ async def test_bytes_without_a_message_are() -> None:
     assert not looks.handle.gone  # they may be of messages that come out now
     assert looks.look(LIMIT_BYTES + 1000)
     assert looks.inflow.endless == 1
+    looks.inflow.close()
+
+
+async def test_a_connection_is_ended_once_although_libzmq_reads_on() -> None:
+    """What had arrived is read after the cut, too, and the connection is listed until then."""
+    looks = Looks()
+    looks.look(0)
+    looks.look(LIMIT_BYTES + 1000)
+    assert looks.look(LIMIT_BYTES + 1000)
+    for number in range(2, 10):
+        looks.look(number * 2 * LIMIT_BYTES)
+    assert looks.inflow.endless == 1
+    looks.listed = False  # it is gone; another one has its number
+    looks.look(0)
+    looks.listed, looks.handle.gone = True, False
+    looks.look(0)
+    looks.look(LIMIT_BYTES + 1000)
+    assert looks.look(LIMIT_BYTES + 1000)
+    assert looks.inflow.endless == 2
     looks.inflow.close()
 
 

@@ -46,6 +46,12 @@ def connected(process: Process, peer: str) -> bool | None:
     return rows.get(peer)
 
 
+def is_ready(process: Process, words: str = "") -> bool:
+    """Whether /readyz says yes, with these words."""
+    code, line = process.get("/readyz")
+    return code == 200 and words in line
+
+
 async def test_a_robot_that_is_killed_is_gone_on_every_way_and_comes_back(tmp_path: Path) -> None:
     async with Lab(tmp_path, "robot1", "robot2", "site") as lab:
         await lab.process(lab.relay_file()).ready()
@@ -62,8 +68,9 @@ async def test_a_robot_that_is_killed_is_gone_on_every_way_and_comes_back(tmp_pa
         await site.until(lambda: connected(site, "robot1") is False, "says so")
         assert connected(site, "robot2") is True
         await site.said("robot1 is gone")
-        code, line = site.get("/readyz")
-        assert code == 200 and "1 of 2 peers away: robot1 is gone for" in line
+        await site.until(
+            lambda: is_ready(site, "1 of 2 peers away: robot1 is gone for"), "is ready, and says who is away"
+        )
         metrics = site.get("/metrics")[1]
         assert 'sern_peer_connected{peer="robot1"} 0.0' in metrics
         assert 'sern_peer_connected{peer="robot2"} 1.0' in metrics
@@ -71,7 +78,9 @@ async def test_a_robot_that_is_killed_is_gone_on_every_way_and_comes_back(tmp_pa
         lab.process(tmp_path / "robot1.yaml")
         await site.until(lambda: connected(site, "robot1"), "has it back")
         await site.said("robot1 is back after")
-        assert "peers away" not in site.get("/readyz")[1]
+        await site.until(
+            lambda: is_ready(site) and "peers away" not in site.get("/readyz")[1], "says nothing more of it"
+        )
 
 
 async def test_what_the_nodes_are_told_when_robot_and_relay_go(tmp_path: Path) -> None:
@@ -121,7 +130,7 @@ async def test_topics_of_a_robot_that_is_gone_end_and_come_back(tmp_path: Path) 
             return {publisher.name for publisher in here._publishers if publisher.name.startswith("/robot1/")}
 
         received = here.received
-        await until(lambda: (got := received("/robot1/map")) is not None and got.count == 1, "the map came")
+        await until(lambda: (got := received("/robot1/map")) is not None and got.count >= 1, "the map came")
         everything = {"/robot1/pose", "/robot1/map", "/robot1/sern/link"}
         await until(lambda: open_() == everything, "all is there")
         robot.signal(signal.SIGSTOP)  # SIGSTOP: its streams go on when it does

@@ -14,7 +14,8 @@ from sern_relay.transforms import TransformObjects
 from sern_runtime.adaptation import Adaptation
 from sern_runtime.link_metrics import AgeHistograms
 from sern_runtime.message_log import MessageLog
-from tests.daemons import Lab
+from sern_tools.ports import free_ports
+from tests.daemons import HOST, Lab
 from tests.support import until
 
 ROBOT = {"kind": "synthetic", "role": "robot", "topics": 3}
@@ -53,7 +54,7 @@ async def get(url: str) -> tuple[int, str]:
 async def test_forwarding_goes_on(
     kind: type, method: str, part: str, where: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    role = {"name": "unity", "publish_endpoint": f"ipc://{tmp_path}/feed", "subscribe": [".*"]}
+    role = {"name": "unity", "publish_endpoint": f"tcp://{HOST}:{free_ports(1)[0]}", "subscribe": [".*"]}
     more = {"feed": {"roles": [role]}} if kind is RelayFeed else {}
     async with Lab(tmp_path, "robot1", "site") as lab:
         relay = await lab.relay(lab.relay_file(adaptation=QUICK, **more))

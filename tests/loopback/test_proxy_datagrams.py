@@ -12,8 +12,9 @@ import pytest
 
 from sern_sim.models import BurstLoss, LinkModel, Window
 from sern_tools import proxy_datagrams
+from sern_tools.ports import free_ports
 from sern_tools.proxy import EARLY_S, Route, ShapingProxy
-from sern_tools.proxy_datagrams import Loss
+from sern_tools.proxy_datagrams import Address, Carry, DatagramRoute, Loss
 from tests.support import until
 
 HOST = "127.0.0.1"
@@ -37,8 +38,8 @@ def answered(client: socket.socket, answers: list[tuple[bytes, tuple[str, int]]]
 class Target:
     """Notes what comes, from where and when."""
 
-    def __init__(self) -> None:
-        self.socket = udp()
+    def __init__(self, port: int = 0) -> None:
+        self.socket = udp(port=port)
         self.port = self.socket.getsockname()[1]
         self.got: list[tuple[float, bytes, tuple[str, int]]] = []
         asyncio.get_running_loop().add_reader(self.socket, self._take)
@@ -89,6 +90,39 @@ async def test_each_client_has_a_mapping_and_gets_its_own_answers() -> None:
             client.close()
 
 
+@pytest.mark.parametrize("free", [True, False], ids=["any port", "this port"])
+async def test_a_port_that_is_taken_for_datagrams_only(monkeypatch: pytest.MonkeyPatch, free: bool) -> None:
+    """The kernel chooses one for connections, at which somebody else takes datagrams: another one will do, unless that
+    one was asked for."""
+    others: list[socket.socket] = []
+
+    class Late(DatagramRoute):
+        def __init__(self, listen: Address, target: Address, *, up: Carry, down: Carry) -> None:
+            if not others:
+                others.append(udp(*listen))
+            super().__init__(listen, target, up=up, down=down)
+
+    monkeypatch.setattr("sern_tools.proxy.DatagramRoute", Late)
+    target = Target()
+    route = Route((HOST, 0 if free else free_ports(1)[0]), (HOST, target.port))
+    proxy = ShapingProxy(FAST, FAST, [route], seed=1, datagrams=True)
+    try:
+        if free:
+            async with proxy:
+                (address,) = proxy.addresses
+                assert address != others[0].getsockname() and len(proxy._listeners) == 1
+                with udp() as client:
+                    client.sendto(b"through", address)
+                    await until(lambda: target.got, "it arrives")
+        else:
+            with pytest.raises(OSError, match="in use"):
+                await proxy.__aenter__()
+            assert others[0].getsockname() == route.listen
+    finally:
+        target.close()
+        others[0].close()
+
+
 async def test_they_take_the_time_of_the_link_and_its_rate() -> None:
     target = Target()
     model = LinkModel(rate_bps=800_000, delay_s=0.05, queue_packets=100)
@@ -120,7 +154,7 @@ async def test_what_finds_the_queue_full_is_dropped() -> None:
 
 async def test_connections_and_datagrams_share_the_bottleneck() -> None:
     """Datagrams alone would be through at once; they wait behind the bytes of the connection, and those behind them."""
-    target = Target()
+    target = Target(*free_ports(1))
     model = LinkModel(rate_bps=800_000, delay_s=0.0, queue_packets=40)
     got: list[tuple[float, int]] = []
     done = asyncio.Event()

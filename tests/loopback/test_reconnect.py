@@ -33,8 +33,8 @@ async def test_a_reliable_stream_goes_on_over_a_restart_of_the_relay(
         site = await lab.connected(lab.recorder_file("site", "/.*"))
         robot = await lab.connected(lab.player_file("robot1", bag, play=STEADY))
         for _restart in (1, 2):
-            before = count(site)
-            await until(lambda before=before: count(site) > before + 200)  # type: ignore[misc]
+            least = min(count(site) + 200, 1999)
+            await until(lambda least=least: count(site) > least)  # type: ignore[misc]
             relay.signal(number)
             assert await relay.ended() == (0 if number is signal.SIGTERM else -number)
             relay = await lab.process(relay.config).ready()
@@ -79,13 +79,13 @@ async def test_a_site_that_restarts_misses_nothing_and_gets_nothing_twice(tmp_pa
         arrived: list[bytes] = []
         for path in ("first", "second", "third"):
             site = await lab.process(lab.recorder_file("site", "/.*", path=path)).ready()
-            wanted = len(arrived) + 400 if path != "third" else 2500
+            wanted = min(len(arrived) + 400, 2500) if path != "third" else 2500
             base = len(arrived)
             await site.until(lambda base=base, site=site, wanted=wanted: base + delivered(site) >= wanted, "has more")
             await site.stop()
             recording = tmp_path / f"{path}.bag"
             if recording.exists():  # on a slow machine the earlier ones may have had everything
-                arrived += bodies(recording)["/robot1/chat"]
+                arrived += bodies(recording).get("/robot1/chat", [])
         await lab.end(robot)
     assert arrived == bodies(bag)["/chat"]
 

@@ -51,14 +51,15 @@ async def test_a_killed_site_has_recorded_all_it_confirmed(encoding: Encoding, t
         await robot.until(lambda: delivered(robot) > COUNT // 5, "has had a fifth confirmed")
         site.kill()
         confirmed = delivered(robot)
-        assert confirmed < COUNT
         again = lab.process(config)
+        await again.said("connected to relay")
         await robot.until(lambda: delivered(robot) == COUNT, "has had everything confirmed")
         await robot.stop()
         await again.stop()
         assert "was left by a recording that did not finish" in again.text
         await relay.stop()
     left = bodies(tmp_path / f"site.1.{kind}")[TOPIC]
-    rest = bodies(tmp_path / f"site.{kind}")[TOPIC]
+    second = tmp_path / f"site.{kind}"
+    rest = bodies(second).get(TOPIC, []) if second.exists() else []  # a slow machine may have had all confirmed before
     assert left == sent[: len(left)] and len(left) >= confirmed
     assert rest == sent[COUNT - len(rest) :] and len(left) + len(rest) >= COUNT

@@ -39,6 +39,11 @@ async def test_a_relay_that_does_not_resolve_is_said_at_once_and_again(
 ) -> None:
     monkeypatch.setattr(relay_name, "ASK_AGAIN_S", 0.0)
     monkeypatch.setattr(relay_name, "SAY_AGAIN_S", (0.0, 0.0))
+
+    async def unknown(_host: str, _port: int) -> str:
+        return "name or service not known"
+
+    monkeypatch.setattr(relay_name, "unresolved", unknown)
     async with Lab(tmp_path, "robot1") as lab:
         config = lab.client_file("robot1", ROBOT, relay={"endpoint": f"tcp://relay.example:{lab.port}"})
         robot = await lab.client(config)
@@ -57,6 +62,13 @@ async def test_a_relay_that_does_not_resolve_is_said_at_once_and_again(
         monkeypatch.setattr(relay_name, "unresolved", resolves)
         await until(lambda: any("relay.example resolves again, after" in message for message in caplog.messages))
         assert "does not resolve" not in robot._ready().reason
+
+
+async def test_why_a_name_does_not_resolve() -> None:
+    assert await relay_name.unresolved("localhost", 5555) is None
+    for name in ("::1", "no..host"):  # no IPv4 address, and no name: nobody else is asked
+        why = await relay_name.unresolved(name, 5555)
+        assert why and "\n" not in why
 
 
 def test_only_names_are_looked_up() -> None:
@@ -109,6 +121,7 @@ async def test_a_relay_that_hangs_is_not_said_to_be_there(tmp_path: Path) -> Non
     async with Lab(tmp_path, "robot1") as lab:
         relay = await lab.process(lab.relay_file()).ready()
         robot = await lab.process(lab.client_file("robot1", ROBOT)).ready()
+        await robot.until(lambda: robot.json("/api/link")[0]["lane"] == "udp", "uses datagrams")
         relay.signal(signal.SIGSTOP)
         await robot.until(lambda: robot.get("/readyz") == (503, f"{SILENT}\n"), "says that it does not answer")
         await robot.said("WARNING", f"{lab.endpoint}: {SILENT}")

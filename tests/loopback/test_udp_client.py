@@ -15,6 +15,7 @@ from sern_runtime.seal import Cipher, SessionParameters, Side, make_seals
 from sern_runtime.udp import INNER_BYTES, TYPE_CHALLENGE, TYPE_RESPONSE
 from sern_runtime.udp_socket import connected_socket
 from sern_runtime.zmq_socket import SendResult
+from sern_tools.ports import free_ports
 from tests.loopback.udp_support import ROBOT, Client, Relay
 from tests.support import until
 
@@ -90,14 +91,12 @@ async def test_a_rebind_in_the_middle_of_both_streams_loses_nothing(relay: Relay
     session = relay.server.sessions[client.udp.parameters.id]
     await until(lambda: session.validated)
     count, down = 600, 0
-    addresses = {client.local}
     for number in range(count):
         await until(partial(client.udp.send, b"%d" % number))
         if session.ready() and session.send(b"down %d" % down):
             down += 1
         if number % 150 == 75:
             client.udp.rebind()
-            addresses.add(client.local)
         if number % 10 == 0:  # so that kernel buffers never overflow
             await until(lambda: len(relay.received) > number - 10)  # noqa: B023 - awaited at once
     await until(lambda: len(relay.received) == count)
@@ -106,7 +105,7 @@ async def test_a_rebind_in_the_middle_of_both_streams_loses_nothing(relay: Relay
     for number in range(down, count):
         await until(partial(session.send, b"down %d" % number))
     await until(lambda: sum(data.startswith(b"down") for data in client.received) == count)
-    assert client.udp.rebinds == 4 and len(addresses) == 5
+    assert client.udp.rebinds == 4
     assert sorted(data for data in client.received if data.startswith(b"down")) == sorted(
         b"down %d" % number for number in range(count)
     )
@@ -127,9 +126,7 @@ async def test_the_old_socket_is_left_after_a_while(
 async def test_a_refused_port_is_not_fatal_and_the_relay_that_comes_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(udp_client, "REBIND_MIN_S", 0.01)
     monkeypatch.setattr(udp_client, "REBIND_MAX_S", 0.02)
-    with socketlib.socket(socketlib.AF_INET, socketlib.SOCK_DGRAM) as place:
-        place.bind(("127.0.0.1", 0))
-        port = place.getsockname()[1]
+    (port,) = free_ports(1)
     relay = Relay()
     session = relay.open()
     client = Client(session.parameters, port=port)
