@@ -121,8 +121,9 @@ class Child:
 
     def signal(self, number: int) -> None:
         if self.running:
+            # asyncio's own send_signal first asks whether it has ended, and then nobody learns its exit status.
             with contextlib.suppress(ProcessLookupError):
-                self.process.send_signal(number)
+                os.kill(self.process.pid, number)
 
     def failure(self) -> SernError:
         """One line: who ended, how, and its last words."""

@@ -13,7 +13,7 @@ from sern_core.errors import SernError
 from sern_tools import child as launcher
 from sern_tools import processes
 from sern_tools.processes import Child, Children, program
-from tests.support import ended, until
+from tests.support import Patience, ended, until
 
 ECHO = 'import sys\nfor line in sys.stdin: print(\'{"word": "%s"}\' % line.strip(), flush=True)'
 STUBBORN = (
@@ -104,6 +104,24 @@ async def test_a_child_that_ends_by_itself_is_an_error_with_its_last_words(tmp_p
             await talker.ask("go")
         with pytest.raises(SernError, match="exit status 3"):  # also when its end was noticed before
             await talker.ask("go")
+
+
+def test_a_signal_at_the_moment_of_its_end_does_not_hide_its_exit_status(tmp_path: Path) -> None:
+    """On asyncio's own loop, which the tools run on."""
+
+    async def work() -> int:
+        async with Children(tmp_path) as children:
+            child = await children.start("quick", python("import sys; sys.stdin.readline(); sys.exit(3)"), talks=True)
+            assert child.process.stdin is not None
+            child.process.stdin.write(b"\n")
+            await child.process.stdin.drain()
+            patience = Patience()
+            while not ended(child.process.pid):  # the loop does not turn meanwhile, and knows nothing of it
+                assert not patience.over()
+            child.signal(signal.SIGTERM)
+            return await child.process.wait()
+
+    assert asyncio.run(work()) == 3
 
 
 async def test_of_a_traceback_the_error_remains(tmp_path: Path) -> None:
