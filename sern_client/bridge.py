@@ -204,6 +204,7 @@ class Bridge:
         self._timer.close()
         self._keep_timer.cancel()
         self._again.cancel()
+        self.rebuilds.close()
         if self.goals is not None:
             self.goals.close()
         for incoming in self._incoming.values():

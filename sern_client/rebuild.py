@@ -4,11 +4,15 @@ The origin announces `<topic>` (whole grids, now and then) with the attribute `s
 `<topic>_updates` with what changed in between. Here every complete change is published as a whole
 nav_msgs/OccupancyGrid on the topic itself, as if it had come that way; a site that takes the topic asks for the updates
 by itself. They are published as well, under their own name, only if the site has asked for them.
+
+A change of some bytes makes a whole grid of megabytes. So writing and publishing grids takes a share of the event loop
+only: what is complete before its turn waits, and a newer grid takes its place.
 """
 
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Final
 
 from sern_core.errors import BodyError
 from sern_core.message import Message, StreamId, StreamInfo
@@ -16,6 +20,13 @@ from sern_core.summaries.grids import GRID_TYPE, UPDATE_TYPE
 from sern_core.summaries.patches import GridRebuilder
 from sern_core.summaries.spec import SummaryKind
 from sern_core.types import Encoding, TopicName
+from sern_runtime.clock import now as clock_now
+from sern_runtime.loop import Timer
+
+REST: Final = 4.0
+"""After a grid the loop is left alone for this multiple of the time that the grid took."""
+MAX_BYTES: Final = 256 * 2**20
+"""What all grids of a site keep together; beyond, the one that is known longest is forgotten until it comes anew."""
 
 Show = Callable[[bytes, int], None]
 """`show(body, stamp_ns)`: publish a whole grid."""
@@ -28,6 +39,7 @@ class _Grid:
     rebuilder: GridRebuilder
     show: Show | None = None
     complained: bool = False
+    stamp_ns: int = 0  # of the grid that is due
 
 
 def _source(stream: StreamInfo) -> StreamId | None:
@@ -43,12 +55,23 @@ def _source(stream: StreamInfo) -> StreamId | None:
 
 
 class Rebuilds:
-    """Every grid of patches that arrives here."""
+    """Every grid of patches that arrives here. `close` it at the end."""
 
-    def __init__(self) -> None:
+    def __init__(self, *, clock: Callable[[], float] = clock_now, max_bytes: int = MAX_BYTES) -> None:
         self.undecodable = 0
+        self._clock = clock
+        self._max_bytes = max_bytes
         self._gaps = 0  # of grids that have ended
         self._grids: dict[StreamId, _Grid] = {}
+        self._due: dict[StreamId, _Grid] = {}
+        self._next_s = 0.0  # when the loop has rested
+        self._timer: Timer | None = None
+
+    def close(self) -> None:
+        """Publish nothing more."""
+        self._due.clear()
+        if self._timer is not None:
+            self._timer.cancel()
 
     @property
     def gaps(self) -> int:
@@ -73,6 +96,7 @@ class Rebuilds:
 
     def closed(self, stream: StreamInfo) -> None:
         """The whole grids have ended: what was known of them is forgotten."""
+        self._due.pop(stream.id, None)
         grid = self._grids.pop(stream.id, None)
         self._gaps += 0 if grid is None else grid.rebuilder.gaps
 
@@ -85,15 +109,52 @@ class Rebuilds:
         whole = stream.id == source
         try:
             if whole:
+                self._due.pop(stream.id, None)
                 body = grid.rebuilder.keyframe(message.body, stamp_ns=message.stamp_ns)
+                if body is not None and grid.show is not None:
+                    grid.show(body, message.stamp_ns)
+                self._bound(stream.id)
             else:
-                body = grid.rebuilder.update(message.body, seq=message.seq, stamp_ns=message.stamp_ns)
+                grid.rebuilder.accept(message.body, seq=message.seq, stamp_ns=message.stamp_ns)
         except BodyError as error:
             self.undecodable += 1
             if not grid.complained:
                 grid.complained = True
                 _log.warning("%s from %s: a patch cannot be applied: %s", stream.id.topic, stream.id.origin, error)
             return False  # a whole grid that cannot be read here is published as it came
-        if body is not None and grid.show is not None:
-            grid.show(body, message.stamp_ns)
+        if grid.rebuilder.due and source is not None:
+            grid.stamp_ns = message.stamp_ns
+            self._due[source] = grid
+            self._show_due()
         return whole
+
+    def _show_due(self) -> None:
+        """Publish what is due and has its turn."""
+        while self._due and self._clock() >= self._next_s:
+            grid = self._due.pop(next(iter(self._due)))
+            began_s = self._clock()
+            body = grid.rebuilder.whole()
+            if body is not None and grid.show is not None:
+                grid.show(body, grid.stamp_ns)
+            ended_s = self._clock()
+            self._next_s = ended_s + REST * (ended_s - began_s)
+        if self._due:
+            self._timer = self._timer or Timer(self._show_due, clock=self._clock)
+            self._timer.arm(self._next_s)
+
+    def _bound(self, latest: StreamId) -> None:
+        """Forget the grids that are known longest while all together keep too much."""
+        self._grids[latest] = self._grids.pop(latest)
+        kept_bytes = sum(grid.rebuilder.nbytes for grid in self._grids.values())
+        for source, grid in self._grids.items():
+            if kept_bytes <= self._max_bytes or source == latest:
+                return
+            nbytes = grid.rebuilder.nbytes
+            if nbytes:
+                grid.rebuilder.forget()
+                self._due.pop(source, None)
+                kept_bytes -= nbytes - grid.rebuilder.nbytes
+                _log.warning(
+                    "%s from %s: its grid is forgotten until it comes whole again: all grids that are put together "
+                    "here take more than %d MiB", source.topic, source.origin, self._max_bytes // 2**20,
+                )  # fmt: skip

@@ -15,7 +15,7 @@ The origin gives all messages of a change one stamp, and updates have gapless se
 for certain whether it has everything. Until it does it keeps the last complete grid, and the next keyframe mends it.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -184,6 +184,9 @@ class _Waiting(NamedTuple):
 class GridRebuilder:
     """The receiving side of one topic: whole grids from keyframes and updates, never one that is incomplete.
 
+    `update` gives a grid for every complete change. Writing one costs its size, and the change may be of a few bytes:
+    who cannot trust the origin calls `accept` instead, and `whole` when a grid that is `due` may cost what it does.
+
     `gaps` counts how often something was missing, so that the next keyframe had to be waited for.
     """
 
@@ -196,16 +199,35 @@ class GridRebuilder:
         self._next_seq: int | None = None  # of the update that goes on from what we have; None: its mark is awaited
         self._waiting: dict[int, _Waiting] = {}  # by seq, ascending
         self._waiting_bytes = 0
+        self._due: Header | None = None
+
+    @property
+    def due(self) -> bool:
+        """Whether there is a complete grid that `whole` has not given yet."""
+        return self._due is not None
+
+    @property
+    def nbytes(self) -> int:
+        """What it keeps: the grid, and what waits for another."""
+        return self._cells.nbytes + self._waiting_bytes
+
+    def forget(self) -> None:
+        """Let go of the grid; the next keyframe is waited for."""
+        self.gaps += self._base is not None
+        self._base, self._next_seq, self._due = None, None, None
+        self._cells = np.empty((0, 0), np.int8)
 
     def keyframe(self, body: bytes, *, stamp_ns: int) -> bytes | None:
         """A whole grid has arrived. Returns the grid to show, None when a newer one is shown already. BodyError."""
         if self._base is not None and stamp_ns <= self._base_ns:
             return None
         grid = read_grid(body, self._encoding)
-        self._base, self._base_ns = grid, stamp_ns
         self._cells = grid.cells.copy()
+        self._base, self._base_ns = replace(grid, cells=self._cells), stamp_ns
         self._next_seq = next((seq for seq, item in self._waiting.items() if self._is_mark(item)), None)
-        return self._advance() or body
+        self._due = None
+        self._advance()
+        return self.whole() or body
 
     def _is_mark(self, item: _Waiting) -> bool:
         return item.keyframe and item.stamp_ns == self._base_ns
@@ -213,8 +235,20 @@ class GridRebuilder:
     def update(self, body: bytes, *, seq: int, stamp_ns: int) -> bytes | None:
         """An update has arrived, `seq` its number in its stream. Returns the grid to show, None: nothing complete.
         BodyError; then what follows waits for the next keyframe."""
-        if self._next_seq is not None and seq < self._next_seq:
+        self.accept(body, seq=seq, stamp_ns=stamp_ns)
+        return self.whole()
+
+    def whole(self) -> bytes | None:
+        """Write the grid that is due; None: none is."""
+        header, self._due = self._due, None
+        if header is None or self._base is None:
             return None
+        return write_grid(replace(self._base, header=header, cells=self._cells), self._encoding)
+
+    def accept(self, body: bytes, *, seq: int, stamp_ns: int) -> None:
+        """Take an update as `update` does, without writing the grid that comes of it."""
+        if self._next_seq is not None and seq < self._next_seq:
+            return
         item = _Waiting(stamp_ns, read_update(body, self._encoding))
         if self._next_seq is not None and seq > self._next_seq:
             # A stream keeps its order, so what is missing will not come any more.
@@ -226,17 +260,15 @@ class GridRebuilder:
         self._waiting_bytes += item.update.cells.size
         while len(self._waiting) > MAX_WAITING or self._waiting_bytes > MAX_WAITING_BYTES:
             self._forget(next(iter(self._waiting)))
-        return self._advance()
+        self._advance()
 
     def _forget(self, seq: int) -> None:
         self._waiting_bytes -= self._waiting.pop(seq).update.cells.size
 
-    def _advance(self) -> bytes | None:
-        """Apply what waits and goes on from what we have; the last complete grid that comes of it."""
-        header: Header | None = None
-        shown: bytes | None = None
-        base = self._base
-        while base is not None and self._next_seq is not None and (item := self._waiting.get(self._next_seq)):
+    def _advance(self) -> None:
+        """Apply what waits and goes on from what we have. The last complete grid that comes of it is due; one that was
+        due before is not any more once another change has begun."""
+        while self._base is not None and self._next_seq is not None and (item := self._waiting.get(self._next_seq)):
             if item.keyframe and not self._is_mark(item):
                 self._next_seq = None  # its whole grid is still on its way; this and what follows waits for it
                 break
@@ -244,11 +276,10 @@ class GridRebuilder:
                 self._forget(seq)
             self._next_seq += 1
             if item.complete:
-                header = item.update.header
-                shown = write_grid(Grid(header, base.load_time, base.frame, self._cells), self._encoding)
+                self._due = item.update.header
             elif not item.keyframe:
+                self._due = None
                 self._apply(item.update)
-        return shown
 
     def _apply(self, update: GridUpdate) -> None:
         height, width = update.cells.shape
