@@ -166,7 +166,7 @@ class Bridge:
         self._unreceived: dict[StreamId, str] = {}  # streams that could not be published here, and why
         self._again = Timer(self._reconsider)
         self._again_s = AGAIN_S[0]
-        self.rebuilds = Rebuilds()
+        self.rebuilds = Rebuilds(self._grid_shown, self._settle)
         self._asked: tuple[str, ...] | None = None  # the patterns we were started with
         self.keeping = Keeping(keepers_of(endpoint), self._hold, self._release_kept, self._keep_in)
         self._keep_timer = Timer(self.keeping.keep_soon)
@@ -499,15 +499,17 @@ class Bridge:
             incoming.lease.renew(born_s=message.born_s)
             self._arm()
             self._tell_guard(incoming)  # before it is published: no stop command of before may come after it
-        if not self.rebuilds.message(stream, message):
+        mark = self.keeping.mark() if stream.spec.reliable and self.keeping else None
+        if not self.rebuilds.message(stream, message, owed=mark is not None):
             lifespan_s = stream.spec.lifespan_s
             left_s = inf if lifespan_s is None else max(lifespan_s - age_s, 0.0)
-            if stream.spec.reliable and self.keeping:
-                mark = self.keeping.mark()
-                self._show(incoming, message.body, message.stamp_ns, left_s)
-                self.keeping.published(stream.id, message.seq, mark)
-            else:
-                self._show(incoming, message.body, message.stamp_ns, left_s)
+            self._show(incoming, message.body, message.stamp_ns, left_s)
+        if mark is None:
+            pass
+        elif self.rebuilds.owes(stream, message.seq):
+            self._hold(stream.id, message.seq)
+        else:
+            self.keeping.published(stream.id, message.seq, mark)
         if self.goals is not None:
             self.goals.message(incoming.local, stream.info.encoding, message.body)
         try:
@@ -521,6 +523,16 @@ class Bridge:
                 self._log.delivered(stream, message, age_s)
         except Exception as error:  # noqa: BLE001  (of the log alone)
             self.parts.failed("message_log", error)
+
+    def _grid_shown(self, publish: Callable[[], None], owed: Sequence[tuple[StreamId, int]]) -> None:
+        """Publish a grid; the updates in it are kept when it is."""
+        mark = self.keeping.mark()
+        publish()
+        self._settle([(stream, seq) for stream, seq in owed if not self.keeping.published(stream, seq, mark)])
+
+    def _settle(self, owed: Sequence[tuple[StreamId, int]]) -> None:
+        for stream, seq in owed:
+            self.core.release(stream, seq, now=clock.now())
 
     def _hold(self, stream: StreamId, seq: int) -> None:
         self.core.hold(stream, seq)

@@ -53,11 +53,12 @@ class Keeping:
     def mark(self) -> Numbers:
         return tuple(keeper.taken for keeper in self._keepers)
 
-    def published(self, stream: StreamId, seq: int, mark: Numbers) -> None:
-        """The keepers that have taken something since `mark` have taken this message."""
+    def published(self, stream: StreamId, seq: int, mark: Numbers) -> bool:
+        """The keepers that have taken something since `mark` have taken this message. False: there are none, and it is
+        not held."""
         takers = [i for i, keeper in enumerate(self._keepers) if keeper.taken > mark[i]]
         if not takers:
-            return
+            return False
         self._left[stream, seq] = len(takers)
         self._hold(stream, seq)
         if not self._asked:
@@ -65,6 +66,7 @@ class Keeping:
             self._soon(SOON_S)
         for index in takers:
             self._waiting[index].append((self._keepers[index].taken, stream, seq))
+        return True
 
     def keep_soon(self) -> None:
         """Have what waits kept, if that is cheap."""

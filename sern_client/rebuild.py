@@ -10,8 +10,10 @@ only: what is complete before its turn waits, and a newer grid takes its place.
 """
 
 import logging
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import partial
 from typing import Final
 
 from sern_core.errors import BodyError
@@ -19,17 +21,27 @@ from sern_core.message import Message, StreamId, StreamInfo
 from sern_core.summaries.grids import GRID_TYPE, UPDATE_TYPE
 from sern_core.summaries.patches import GridRebuilder
 from sern_core.summaries.spec import SummaryKind
-from sern_core.types import Encoding, TopicName
+from sern_core.types import ClientName, Encoding, TopicName
 from sern_runtime.clock import now as clock_now
 from sern_runtime.loop import Timer
 
 REST: Final = 4.0
 """After a grid the loop is left alone for this multiple of the time that the grid took."""
 MAX_BYTES: Final = 256 * 2**20
-"""What all grids of a site keep together; beyond, the one that is known longest is forgotten until it comes anew."""
+"""What all grids of a site keep together. Beyond, a grid of the origin that has most is forgotten: it comes anew with
+its next whole one."""
+MAX_OWED: Final = 4_096
+"""Updates of a grid that are confirmed only when it has been published."""
 
 Show = Callable[[bytes, int], None]
 """`show(body, stamp_ns)`: publish a whole grid."""
+
+Owed = tuple[StreamId, int]
+"""An update by its stream and seq."""
+Shown = Callable[[Callable[[], None], Sequence[Owed]], None]
+"""`shown(publish, owed)`: call `publish`; these updates are in what it published."""
+Settle = Callable[[Sequence[Owed]], None]
+"""`settle(owed)`: these updates will be in nothing that is published."""
 
 _log = logging.getLogger(__name__)
 
@@ -40,6 +52,8 @@ class _Grid:
     show: Show | None = None
     complained: bool = False
     stamp_ns: int = 0  # of the grid that is due
+    streams: set[StreamId] = field(default_factory=set)  # that are open
+    owed: list[Owed] = field(default_factory=list)  # what was taken, and is in no grid that was published yet
 
 
 def _source(stream: StreamInfo) -> StreamId | None:
@@ -49,19 +63,27 @@ def _source(stream: StreamInfo) -> StreamId | None:
     topic = stream.attributes.get("summary_of", "")
     if stream.info.type_name not in (GRID_TYPE, UPDATE_TYPE):
         return None
-    if (stream.info.type_name == GRID_TYPE) != (topic == stream.id.topic):
+    if stream.id.topic != (topic if stream.info.type_name == GRID_TYPE else f"{topic}_updates"):
         return None
     return StreamId(stream.id.origin, stream.id.boot, TopicName(topic))
 
 
 class Rebuilds:
-    """Every grid of patches that arrives here. `close` it at the end."""
+    """Every grid of patches that arrives here. `close` it at the end.
 
-    def __init__(self, *, clock: Callable[[], float] = clock_now, max_bytes: int = MAX_BYTES) -> None:
+    Updates that somebody waits to have confirmed are owed: `shown` and `settle` are told what became of them.
+    """
+
+    def __init__(
+        self, shown: Shown, settle: Settle, *, clock: Callable[[], float] = clock_now, max_bytes: int = MAX_BYTES
+    ) -> None:
         self.undecodable = 0
+        self._shown = shown
+        self._settle = settle
         self._clock = clock
         self._max_bytes = max_bytes
         self._gaps = 0  # of grids that have ended
+        self._kept_bytes = 0
         self._grids: dict[StreamId, _Grid] = {}
         self._due: dict[StreamId, _Grid] = {}
         self._next_s = 0.0  # when the loop has rested
@@ -84,6 +106,7 @@ class Rebuilds:
         if source is None:
             return None
         grid = self._grids.setdefault(source, _Grid(GridRebuilder(stream.info.encoding)))
+        grid.streams.add(stream.id)
         if stream.id != source:
             return None
         grid.show = show
@@ -95,34 +118,64 @@ class Rebuilds:
         return source is not None and source != stream.id
 
     def closed(self, stream: StreamInfo) -> None:
-        """The whole grids have ended: what was known of them is forgotten."""
-        self._due.pop(stream.id, None)
-        grid = self._grids.pop(stream.id, None)
-        self._gaps += 0 if grid is None else grid.rebuilder.gaps
-
-    def message(self, stream: StreamInfo, message: Message) -> bool:
-        """A message of any stream. True: it was a whole grid, and is published from here if it is to be."""
+        """A stream has ended: what was known by it is forgotten."""
         source = _source(stream)
         grid = self._grids.get(source) if source is not None else None
-        if grid is None:
+        if grid is None or source is None:
+            return
+        self._kept_bytes -= grid.rebuilder.nbytes
+        if stream.id == source:
+            gaps = grid.rebuilder.gaps
+            grid.show = None
+            grid.rebuilder.forget()
+            grid.rebuilder.gaps = gaps  # to end is no gap
+            self._due.pop(source, None)
+            self._give_up(grid)
+        else:
+            grid.rebuilder.updates_ended()
+            self._give_up(grid)
+        self._kept_bytes += grid.rebuilder.nbytes
+        grid.streams.discard(stream.id)
+        if not grid.streams:
+            self._gaps += grid.rebuilder.gaps
+            del self._grids[source]
+
+    def message(self, stream: StreamInfo, message: Message, *, owed: bool = False) -> bool:
+        """A message of any stream. True: it was a whole grid, and is published from here if it is to be.
+
+        `owed`: it is an update that may be confirmed only when it has been published; `owes` tells whether it waits.
+        """
+        source = _source(stream)
+        grid = self._grids.get(source) if source is not None else None
+        if grid is None or source is None:
             return False
         whole = stream.id == source
+        before_bytes = grid.rebuilder.nbytes
         try:
             if whole:
                 self._due.pop(stream.id, None)
+                self._grids[source] = self._grids.pop(source)  # the first of an origin makes room first
                 body = grid.rebuilder.keyframe(message.body, stamp_ns=message.stamp_ns)
+                self._give_up(grid)  # a newer grid has them, or is without them
                 if body is not None and grid.show is not None:
                     grid.show(body, message.stamp_ns)
-                self._bound(stream.id)
             else:
                 grid.rebuilder.accept(message.body, seq=message.seq, stamp_ns=message.stamp_ns)
+                if owed and grid.show is not None:
+                    grid.owed.append((stream.id, message.seq))
+                    if len(grid.owed) > MAX_OWED:
+                        self._give_up(grid, keep=MAX_OWED // 2)
         except BodyError as error:
             self.undecodable += 1
             if not grid.complained:
                 grid.complained = True
                 _log.warning("%s from %s: a patch cannot be applied: %s", stream.id.topic, stream.id.origin, error)
             return False  # a whole grid that cannot be read here is published as it came
-        if grid.rebuilder.due and source is not None:
+        finally:
+            self._kept_bytes += grid.rebuilder.nbytes - before_bytes
+            if self._kept_bytes > self._max_bytes:
+                self._make_room()
+        if grid.rebuilder.due:
             grid.stamp_ns = message.stamp_ns
             self._due[source] = grid
             self._show_due()
@@ -133,27 +186,52 @@ class Rebuilds:
         while self._due and self._clock() >= self._next_s:
             grid = self._due.pop(next(iter(self._due)))
             began_s = self._clock()
-            body = grid.rebuilder.whole()
-            if body is not None and grid.show is not None:
-                grid.show(body, grid.stamp_ns)
+            self._show(grid)
             ended_s = self._clock()
             self._next_s = ended_s + REST * (ended_s - began_s)
         if self._due:
             self._timer = self._timer or Timer(self._show_due, clock=self._clock)
             self._timer.arm(self._next_s)
 
-    def _bound(self, latest: StreamId) -> None:
-        """Forget the grids that are known longest while all together keep too much."""
-        self._grids[latest] = self._grids.pop(latest)
-        kept_bytes = sum(grid.rebuilder.nbytes for grid in self._grids.values())
-        for source, grid in self._grids.items():
-            if kept_bytes <= self._max_bytes or source == latest:
-                return
-            nbytes = grid.rebuilder.nbytes
-            if nbytes:
-                grid.rebuilder.forget()
-                self._due.pop(source, None)
-                kept_bytes -= nbytes - grid.rebuilder.nbytes
+    def _show(self, grid: _Grid) -> None:
+        body, owed = grid.rebuilder.whole(), grid.owed
+        grid.owed = []
+        if body is None or grid.show is None:
+            self._settle(owed)
+            return
+        self._shown(partial(grid.show, body, grid.stamp_ns), owed)
+
+    def _give_up(self, grid: _Grid, *, keep: int = 0) -> None:
+        """All owed updates but the latest `keep` wait for nothing any more."""
+        count = len(grid.owed) - keep
+        if count > 0:
+            owed, grid.owed = grid.owed[:count], grid.owed[count:]
+            self._settle(owed)
+
+    def owes(self, stream: StreamInfo, seq: int) -> bool:
+        """Whether an update waits for the grid that it is part of to be published."""
+        source = _source(stream)
+        grid = self._grids.get(source) if source is not None else None
+        return grid is not None and bool(grid.owed) and grid.owed[-1] == (stream.id, seq)
+
+    def _make_room(self) -> None:
+        """Forget grids, each time the first of the origin that has most, until the others keep no more than allowed."""
+        while self._kept_bytes > self._max_bytes:
+            kept_bytes: Counter[ClientName] = Counter()
+            for source, grid in self._grids.items():
+                kept_bytes[source.origin] += grid.rebuilder.nbytes
+            ((most, _),) = kept_bytes.most_common(1)
+            source, grid = next(
+                (source, grid)
+                for source, grid in self._grids.items()
+                if source.origin == most and grid.rebuilder.nbytes
+            )
+            self._kept_bytes -= grid.rebuilder.nbytes
+            grid.rebuilder.forget()
+            self._due.pop(source, None)
+            self._give_up(grid)
+            if not grid.complained:
+                grid.complained = True
                 _log.warning(
                     "%s from %s: its grid is forgotten until it comes whole again: all grids that are put together "
                     "here take more than %d MiB", source.topic, source.origin, self._max_bytes // 2**20,

@@ -212,10 +212,17 @@ class GridRebuilder:
         return self._cells.nbytes + self._waiting_bytes
 
     def forget(self) -> None:
-        """Let go of the grid; the next keyframe is waited for."""
+        """Let go of everything; the next keyframe is waited for."""
         self.gaps += self._base is not None
-        self._base, self._next_seq, self._due = None, None, None
+        self._base, self._due = None, None
         self._cells = np.empty((0, 0), np.int8)
+        self.updates_ended()
+
+    def updates_ended(self) -> None:
+        """No update goes on from those that there were."""
+        self._next_seq = None
+        self._waiting.clear()
+        self._waiting_bytes = 0
 
     def keyframe(self, body: bytes, *, stamp_ns: int) -> bytes | None:
         """A whole grid has arrived. Returns the grid to show, None when a newer one is shown already. BodyError."""
