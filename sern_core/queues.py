@@ -10,9 +10,11 @@ A message is in exactly one of four places: queued (nothing sent yet), in flight
 reason. `OutChannel.validate` checks that the counters agree.
 """
 
+from bisect import bisect_left, insort
 from collections import deque
 from collections.abc import Callable, Sequence
 from math import inf
+from operator import attrgetter
 from typing import Any, Final
 
 from sern_core.encoding import ChannelCodec, Coding
@@ -35,6 +37,7 @@ _NOTHING: Final[Any] = ()
 """Where nothing waits: an empty deque takes 760 bytes, and most channels of most subscribers are quiet."""
 _NO_CAP: Final = RateCap(None)
 _NEVER: Final = -inf
+_SEQ: Final = attrgetter("seq")
 
 
 class OutChannel:
@@ -333,8 +336,7 @@ class OutChannel:
             self._activate(out)
             return
         del self.flying[out.seq]
-        if out in self.active:
-            self.active.remove(out)
+        self._deactivate(out)
         self._drop(out, reason)
 
     def _entomb(self, out: OutMessage, reason: DropReason) -> None:
@@ -404,7 +406,7 @@ class OutChannel:
         assert popped is out
         self.flying[out.seq] = out
         if out.has_unsent:
-            self.active.append(out)
+            self._activate(out)
         self.begun_seq = out.seq
         self.last_sent_s = now
 
@@ -427,7 +429,7 @@ class OutChannel:
         if not out.started:
             self.begin(out, now)
         elif not out.ranges:
-            self.active.remove(out)
+            self._deactivate(out)
         out.fragments_inflight += 1
         if end == out.size:  # fragments leave in their order, so those before it have left as well
             out.exposed = True
@@ -473,8 +475,7 @@ class OutChannel:
             return False
         if out.ranges is None:
             out.ranges = []
-        out.ranges.append((start, end))
-        out.ranges.sort()
+        insort(out.ranges, (start, end))
         self._activate(out)
         return True
 
@@ -492,12 +493,20 @@ class OutChannel:
     def _activate(self, out: OutMessage) -> None:
         """A begun message has bytes to send (again): put it back in its place."""
         self.flying[out.seq] = out
-        if out in self.active:
-            return
-        position = 0
-        while position < len(self.active) and self.active[position].seq < out.seq:
-            position += 1
-        self.active.insert(position, out)
+        if not out.active:
+            out.active = True
+            insort(self.active, out, key=_SEQ)
+
+    def _deactivate(self, out: OutMessage) -> None:
+        """It has no more bytes to send, or is given up."""
+        if out.active:
+            out.active = False
+            del self.active[bisect_left(self.active, out.seq, key=_SEQ)]
+
+    def _deactivate_all(self) -> None:
+        for out in self.active:
+            out.active = False
+        self.active.clear()
 
     def delivered_to(self, watermark: int) -> None:
         """The peer's delivered watermark moved: reliable messages up to it are done."""
@@ -564,8 +573,7 @@ class OutChannel:
         else:
             if self.flying.get(out.seq) is out:
                 del self.flying[out.seq]
-            if out in self.active:
-                self.active.remove(out)
+            self._deactivate(out)
 
     def reported(self, seq: int, reason: DropReason, where: str = "", count: int = 1) -> None:
         """A later hop dropped `count` messages from `seq` on, for the client `where`, and said so before its watermark
@@ -646,7 +654,7 @@ class OutChannel:
         self.queue = deque(again) if again else _NOTHING
         self.queued_bytes = sum(out.size for out in again)
         self.flying.clear()
-        self.active.clear()
+        self._deactivate_all()
         self.acked_seq = self.begun_seq = 0
 
     def clear(self, reason: DropReason) -> None:
@@ -665,7 +673,7 @@ class OutChannel:
                 self._drop(out, reason)
             self._drop_newest(reason)
         self.flying.clear()
-        self.active.clear()
+        self._deactivate_all()
         self.queue = _NOTHING
         self.queued_bytes = 0
 
@@ -694,7 +702,9 @@ class OutChannel:
         check(self.queued_bytes == sum(out.size for out in self.queue), f"{name}: queued bytes do not add up")
         check(all(not out.started for out in self.queue), f"{name}: a begun message is in the queue")
         check(
-            all(out.started and out.has_unsent and self.flying.get(out.seq) is out for out in self.active),
+            all(
+                out.started and out.active and out.has_unsent and self.flying.get(out.seq) is out for out in self.active
+            ),
             f"{name}: an active message was not begun, has nothing to send, or is not in flight",
         )
         if not self.reliable:
@@ -704,8 +714,8 @@ class OutChannel:
                 self.newest is None or all(out.seq < self.newest.seq for out in self.queue),
                 f"{name}: a message is held back behind a newer one",
             )
-            unsent = [out for out in self.flying.values() if out.has_unsent]
-            check(all(out in self.active for out in unsent), f"{name}: bytes to send are forgotten")
+            unsent = sorted((out for out in self.flying.values() if out.has_unsent), key=_SEQ)
+            check(unsent == self.active, f"{name}: bytes to send are forgotten")
             check(
                 all(out.has_unsent or out.fragments_inflight > 0 for out in self.flying.values()),
                 f"{name}: a message waits for nothing",
@@ -721,4 +731,4 @@ class OutChannel:
             f"{name}: queued and retained messages differ",
         )
         unsent = [out for out in self.retained if out.started and out.has_unsent]
-        check(all(out in self.active for out in unsent), f"{name}: bytes to send are forgotten")
+        check(unsent == self.active, f"{name}: bytes to send are forgotten")

@@ -325,6 +325,36 @@ def test_replays_go_first_and_gaps_between_them_are_known(reliable: bool) -> Non
     sender.check()
 
 
+class CountedSeq(int):
+    """A seq that counts how often it is compared."""
+
+    compared = 0
+
+    def __lt__(self, other: int) -> bool:
+        CountedSeq.compared += 1
+        return int(self) < other
+
+    __hash__ = int.__hash__
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_what_a_lost_connection_held_is_taken_back_without_a_walk_for_each(order: int) -> None:
+    sender = Sender(spec(reliable=True))
+    channel = sender.channel
+    for seq in range(1, 2001):
+        message = sender.message(seq)
+        message.seq = CountedSeq(seq)
+        channel.submit(message, now=0.0, forced=True)
+    parts = [part for part in (sender.take() for _ in range(2000)) if part is not None]
+    assert len(parts) == len(channel.flying) == 2000
+    CountedSeq.compared = 0
+    for out, generation, start, end in parts[::order]:
+        assert channel.fragment_lost(out, generation, start, end, now=0.1)
+    assert CountedSeq.compared <= 2000 * 12
+    assert [out.seq for out in channel.active] == list(range(1, 2001))
+    sender.check()
+
+
 class Channel(RuleBasedStateMachine):
     """Whatever happens to a channel in whatever order, everything adds up and nothing is delivered twice."""
 
