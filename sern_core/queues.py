@@ -365,20 +365,41 @@ class OutChannel:
             self._drop(self._pop_queue(), reason)
 
     def shed(self, reason: DropReason, *, seq: int | None = None) -> int:
-        """Give up one message that has not been begun: the oldest, of a reliable stream the newest (or number `seq`),
-        whose tombstone goes on. Returns the bytes that are free now, 0 when there is none."""
+        """Give up one message that has not been begun. Returns the bytes that are free now, overhead included; 0: there
+        is none.
+
+        It is the oldest, of a reliable stream the newest, and the peer is told in its turn that the stream goes on
+        behind it (`next_gap`). Of number `seq` of a reliable stream a tombstone stays.
+        """
         if not self.reliable:
-            if not self.queue:
-                return self._drop_newest(reason)
-            out = self._pop_queue()
+            if self.queue:
+                out = self._pop_queue()
+                self._drop(out, reason)
+                return out.size + MESSAGE_OVERHEAD_BYTES
+            if self.newest is None:
+                return 0
+            return self._drop_newest(reason) + MESSAGE_OVERHEAD_BYTES
+        if seq is not None:
+            for out in reversed(self.queue):
+                if out.seq == seq and not out.message.tombstone:
+                    size = out.size
+                    self._entomb(out, reason)
+                    return size - out.size
+            return 0
+        if not self.queue:
+            return 0
+        out = self.queue.pop()
+        self.retained.pop()  # what has not been begun is behind all that has been
+        self.queued_bytes -= out.size
+        self.retained_bytes -= out.size
+        last_seq = self.retained[-1].seq if self.retained else self.watermark
+        while self.gaps and self.gaps[-1][0] >= last_seq:
+            self.gaps.pop()
+        self._add_gap(last_seq, self.next_seq)
+        out.coding = Coding.DONE
+        if not out.counted:
             self._drop(out, reason)
-            return out.size
-        for out in reversed(self.queue):
-            size = out.size
-            if not out.message.tombstone and seq in (None, out.seq):
-                self._entomb(out, reason)
-                return size - out.size
-        return 0
+        return out.size + MESSAGE_OVERHEAD_BYTES
 
     def has_room(self, size_bytes: int) -> bool:
         """Whether one more reliable message keeps within the stream's bound."""
@@ -388,7 +409,8 @@ class OutChannel:
     @property
     def kept_bytes(self) -> int:
         """`held_bytes`, and what keeping these messages takes beside their bodies."""
-        count = len(self.retained) if self.reliable else len(self.queue) + len(self.flying)
+        waiting = len(self.queue) + (self.newest is not None)
+        count = len(self.retained) if self.reliable else waiting + len(self.flying)
         return self.held_bytes + MESSAGE_OVERHEAD_BYTES * count
 
     @property
@@ -532,10 +554,13 @@ class OutChannel:
             if self.gaps and self.gaps[-1][1] == self.next_seq:  # nothing was kept since that gap
                 self.gaps[-1] = (self.gaps[-1][0], first)
             else:
-                if self.gaps is _NOTHING:
-                    self.gaps = deque()
-                self.gaps.append((self.next_seq - 1, first))
+                self._add_gap(self.next_seq - 1, first)
             self.next_seq = first
+
+    def _add_gap(self, last_seq: int, first: int) -> None:
+        if self.gaps is _NOTHING:
+            self.gaps = deque()
+        self.gaps.append((last_seq, first))
 
     def leave_out(self, message: Message, reason: DropReason) -> None:
         """There is no room for this reliable message, nor for a tombstone: the stream goes on behind it."""

@@ -3,21 +3,26 @@
 import pytest
 
 from sern_core import wire
+from sern_core.access import AccessRule, AccessTable
 from sern_core.control.fixed import FixedWindow
+from sern_core.queues import MESSAGE_OVERHEAD_BYTES
+from sern_core.types import PriorityClass
 from tests.fuzz.price import Input, Make, within_budget
 from tests.fuzz.test_hostile_peer import Hostile, _whole
-from tests.fuzz.test_price_datagrams import control, said
+from tests.fuzz.test_price_datagrams import control, filled, one_more_slice, said
 from tests.world import World
 
 WINDOW_BYTES = 640_000
 IN_FLIGHT = 4_000
+BOUND_BYTES = 5_200_000
+STREAMS = 100
 
 
 def origin_and_reader() -> tuple[Hostile, Hostile]:
     """A client that publishes the reliable topic /origin/log, and one that subscribes to whatever it publishes."""
     world = World()
     reader, origin = Hostile(world, "reader"), Hostile(world, "origin")
-    origin.announce(1, "/origin/log", reliable=True)
+    origin.announce(1, "/origin/log", reliable=True, priority=PriorityClass.BULK)
     reader.control({"t": "subscribe", "patterns": ["/origin/.*"], "more": False})
     return origin, reader
 
@@ -48,7 +53,34 @@ def connection_that_ends() -> Input:
     return Input(0, take)
 
 
-EVENTS = (connection_that_ends,)
+def messages_that_need_room() -> Input:
+    """A datagram of small messages for a client whose bound is full of small reliable ones of a lower class."""
+    origin, reader = origin_and_reader()
+    hub = origin.hub
+    for channel in range(2, 2 + STREAMS):
+        origin.announce(channel, f"/origin/t{channel}")
+    reader.port.disconnected(now=reader.now)
+    hub.revoke(
+        AccessTable([AccessRule(client=".*", publish=(".*",), subscribe=(".*",), max_queue_bytes=BOUND_BYTES)]),
+        now=origin.now,
+    )
+    channels = hub.links[reader.name].channels
+    waits = BOUND_BYTES // (MESSAGE_OVERHEAD_BYTES + 2)
+    for first in range(1, waits, 1_000):
+        said(origin, *(_whole(1, seq, b"yy") for seq in range(first, min(first + 1_000, waits + 1))))
+    assert sum(len(channel.queue) for channel in channels.values()) == waits
+    frames = b"".join(filled(lambda index: _whole(2 + index % STREAMS, 1 + index // STREAMS, b"y" * 8)))
+
+    def rest() -> bool:
+        more = one_more_slice(origin)
+        if not more:
+            assert 0 < waits - len(next(iter(channels.values())).queue) <= 1.05 * STREAMS
+        return more
+
+    return Input(len(frames), lambda: origin.say(frames), rest=rest)
+
+
+EVENTS = (connection_that_ends, messages_that_need_room)
 
 
 @pytest.mark.parametrize("make", EVENTS, ids=lambda make: make.__name__)
