@@ -28,6 +28,10 @@ MESSAGE_OVERHEAD_BYTES: Final = 256
 """What a retained message counts for beside its body, about what its objects take: else the bound of a stream of many
 small ones would not bound memory."""
 
+GIVEN_UP_US: Final = 3
+"""What giving up one message, and telling its origin, is charged with to whoever sets it off
+(`Reassembly.work_us`)."""
+
 SHARE_HOLD_S: Final = 1.0
 """The longest that the newest message is held back by a `share`."""
 
@@ -409,9 +413,14 @@ class OutChannel:
     @property
     def kept_bytes(self) -> int:
         """`held_bytes`, and what keeping these messages takes beside their bodies."""
-        waiting = len(self.queue) + (self.newest is not None)
-        count = len(self.retained) if self.reliable else waiting + len(self.flying)
-        return self.held_bytes + MESSAGE_OVERHEAD_BYTES * count
+        return self.held_bytes + MESSAGE_OVERHEAD_BYTES * self.kept
+
+    @property
+    def kept(self) -> int:
+        """How many messages wait here or are under way, tombstones included."""
+        if self.reliable:
+            return len(self.retained)
+        return len(self.queue) + len(self.flying) + (self.newest is not None)
 
     @property
     def held_bytes(self) -> int:
@@ -530,18 +539,20 @@ class OutChannel:
             out.active = False
         self.active.clear()
 
-    def delivered_to(self, watermark: int) -> None:
-        """The peer's delivered watermark moved: reliable messages up to it are done."""
+    def delivered_to(self, watermark: int) -> int:
+        """The peer's delivered watermark moved: reliable messages up to it are done. Returns how many were kept."""
         if watermark <= self.watermark:
-            return
+            return 0
         self.watermark = watermark
         retained = self.retained
+        before = len(retained)
         while retained and retained[0].seq <= watermark:
             out = retained.popleft()
             self.retained_bytes -= out.size
             if not out.counted:
                 self.counters.deliver(out.offered_bytes)
             self._forget(out)
+        return before - len(retained)
 
     def settle(self) -> None:
         """Let go of reliable messages that the peer has whole, in order: for a stream without a watermark."""
@@ -600,9 +611,10 @@ class OutChannel:
                 del self.flying[out.seq]
             self._deactivate(out)
 
-    def reported(self, seq: int, reason: DropReason, where: str = "", count: int = 1) -> None:
+    def reported(self, seq: int, reason: DropReason, where: str = "", count: int = 1) -> int:
         """A later hop dropped `count` messages from `seq` on, for the client `where`, and said so before its watermark
-        passed them."""
+        passed them. Returns how many of them are news."""
+        news = 0
         for out in self.retained:
             if out.seq >= seq + count:
                 break
@@ -610,7 +622,9 @@ class OutChannel:
                 self._count(out.seq, reason, out.offered_bytes)
                 out.counted = True
                 out.lost_to = where
+                news += 1
                 self.on_drop(self, out, reason)
+        return news
 
     def sweep(self, now: float, *, up: bool) -> None:
         """Expire what nobody will send: lifespan and retention, also while the link is down."""
