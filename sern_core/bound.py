@@ -24,7 +24,7 @@ TOMBSTONE_BYTES: Final = 1 + MESSAGE_OVERHEAD_BYTES
 ADDED_UP_PER_US: Final = 2
 """Channels of a link that are added up in a microsecond. That and the next are charged to whoever sent the message that
 needs room (`Reassembly.work_us`)."""
-SHED_US: Final = 12
+SHED_US: Final = 4
 """What giving up one message, and reporting it to its origin, is charged with."""
 
 
