@@ -12,7 +12,7 @@ from sern_core.announce import Want, encode_dropped
 from sern_core.errors import WireError
 from sern_core.fragments import InStream
 from sern_core.interest import Interest
-from sern_core.queues import OutChannel
+from sern_core.queues import GIVEN_UP_US, OutChannel
 from sern_core.session import Session, SessionArguments
 from sern_core.types import DROP_CODES, DropReason
 
@@ -174,6 +174,8 @@ class Answering(Session):
         self, channel: OutChannel, wanted: bool, now: float, *, reason: DropReason = DropReason.UNWANTED
     ) -> None:
         watermark = channel.watermark
+        if not wanted:
+            self.reassembly.work_us += GIVEN_UP_US * channel.kept
         channel.set_wanted(wanted, reason)
         if channel.watermark > watermark:
             self._watermark_moved(channel)

@@ -30,6 +30,8 @@ from sern_core.types import (
 MAX_CONTROL_BYTES: Final = 2 + wire.MAX_ENVELOPE_BYTES + wire.MAX_ATTACHMENT_BYTES + 1024
 """A control message: envelope and packed attachment (what cannot be packed grows a little)."""
 WATERMARK_US: Final = 4
+DONE_PER_US: Final = 2
+"""Kept messages that are let go of in a microsecond when the peer has them."""
 
 
 class Hop(Sender):
@@ -270,10 +272,10 @@ class Hop(Sender):
         # It may lie beyond what was submitted here: the peer had more from an earlier relay (`OutChannel.submit`).
         wide = wire.widen_seq(delivered, out_channel.watermark)
         if wide > out_channel.watermark:
-            out_channel.delivered_to(wide)
+            done = out_channel.delivered_to(wide)
             self._refresh(out_channel, self._now)
             self._watermark_moved(out_channel)
-            self.reassembly.work_us += WATERMARK_US
+            self.reassembly.work_us += WATERMARK_US + done // DONE_PER_US
         return self.reassembly.work_us > SLICE_US
 
     def on_ping(self) -> None:

@@ -707,7 +707,9 @@ class Hub(LocalStreams):
                 if bound is None:
                     out_link.submit(channel, message, now=now, forced=True)
                 else:
-                    bound.submit(out_link, channel, message, now=now)
+                    spent_us = bound.submit(out_link, channel, message, now=now)
+                    if relayed.source is not None:
+                        relayed.source.reassembly.work_us += spent_us
             except Exception as error:  # noqa: BLE001  (of that client's link: the others get theirs)
                 self._not_taken(relayed, out_link, channel, message, error, now)
             behind = behind or channel.watermark >= message.seq

@@ -34,7 +34,7 @@ from sern_core.fragments import SLICE_US, InStream
 from sern_core.message import Message, StreamId, StreamInfo
 from sern_core.out_message import OutMessage
 from sern_core.params import LinkParams, SchedulerParams
-from sern_core.queues import OutChannel
+from sern_core.queues import GIVEN_UP_US, OutChannel
 from sern_core.trace import DecisionTrace, TraceEvent
 from sern_core.types import CLASS_LABELS, DROP_REASONS, ClientName, DropReason, PriorityClass
 
@@ -618,7 +618,8 @@ class Link(Answering):
             where = wire.take_str(envelope, "to", max_length=64, default="")
             self.reassembly.work_us += len(channel.retained) // RETAINED_PER_US
             count = wire.take_int(envelope, "n", low=1, high=wire.MAX_SEQ, default=1)
-            channel.reported(wire.take_int(envelope, "seq"), reason, where, count)
+            news = channel.reported(wire.take_int(envelope, "seq"), reason, where, count)
+            self.reassembly.work_us += GIVEN_UP_US * news
         else:
             code, why = wire.take_str(envelope, "code", max_length=64), wire.take_str(envelope, "why")
             self._set_wanted(

@@ -12,6 +12,7 @@ class OutMessage:
     """
 
     __slots__ = (
+        "active",
         "coding",
         "counted",
         "exposed",
@@ -39,6 +40,7 @@ class OutMessage:
         self.some_acked = False
         self.fragments_inflight = 0
         self.started = False
+        self.active = False  # in the list of those that were begun and have bytes still to send
         self.counted = False  # already accounted as dropped (a tombstone now)
         self.lost_to = ""  # the client further on that will not get it; empty: nobody did, or nobody was named
         self.retain_from_s = message.born_s  # retention counts from here

@@ -10,9 +10,11 @@ A message is in exactly one of four places: queued (nothing sent yet), in flight
 reason. `OutChannel.validate` checks that the counters agree.
 """
 
+from bisect import bisect_left, insort
 from collections import deque
 from collections.abc import Callable, Sequence
 from math import inf
+from operator import attrgetter
 from typing import Any, Final
 
 from sern_core.encoding import ChannelCodec, Coding
@@ -26,6 +28,10 @@ MESSAGE_OVERHEAD_BYTES: Final = 256
 """What a retained message counts for beside its body, about what its objects take: else the bound of a stream of many
 small ones would not bound memory."""
 
+GIVEN_UP_US: Final = 3
+"""What giving up one message, and telling its origin, is charged with to whoever sets it off
+(`Reassembly.work_us`)."""
+
 SHARE_HOLD_S: Final = 1.0
 """The longest that the newest message is held back by a `share`."""
 
@@ -35,6 +41,7 @@ _NOTHING: Final[Any] = ()
 """Where nothing waits: an empty deque takes 760 bytes, and most channels of most subscribers are quiet."""
 _NO_CAP: Final = RateCap(None)
 _NEVER: Final = -inf
+_SEQ: Final = attrgetter("seq")
 
 
 class OutChannel:
@@ -333,8 +340,7 @@ class OutChannel:
             self._activate(out)
             return
         del self.flying[out.seq]
-        if out in self.active:
-            self.active.remove(out)
+        self._deactivate(out)
         self._drop(out, reason)
 
     def _entomb(self, out: OutMessage, reason: DropReason) -> None:
@@ -363,20 +369,41 @@ class OutChannel:
             self._drop(self._pop_queue(), reason)
 
     def shed(self, reason: DropReason, *, seq: int | None = None) -> int:
-        """Give up one message that has not been begun: the oldest, of a reliable stream the newest (or number `seq`),
-        whose tombstone goes on. Returns the bytes that are free now, 0 when there is none."""
+        """Give up one message that has not been begun. Returns the bytes that are free now, overhead included; 0: there
+        is none.
+
+        It is the oldest, of a reliable stream the newest, and the peer is told in its turn that the stream goes on
+        behind it (`next_gap`). Of number `seq` of a reliable stream a tombstone stays.
+        """
         if not self.reliable:
-            if not self.queue:
-                return self._drop_newest(reason)
-            out = self._pop_queue()
+            if self.queue:
+                out = self._pop_queue()
+                self._drop(out, reason)
+                return out.size + MESSAGE_OVERHEAD_BYTES
+            if self.newest is None:
+                return 0
+            return self._drop_newest(reason) + MESSAGE_OVERHEAD_BYTES
+        if seq is not None:
+            for out in reversed(self.queue):
+                if out.seq == seq and not out.message.tombstone:
+                    size = out.size
+                    self._entomb(out, reason)
+                    return size - out.size
+            return 0
+        if not self.queue:
+            return 0
+        out = self.queue.pop()
+        self.retained.pop()  # what has not been begun is behind all that has been
+        self.queued_bytes -= out.size
+        self.retained_bytes -= out.size
+        last_seq = self.retained[-1].seq if self.retained else self.watermark
+        while self.gaps and self.gaps[-1][0] >= last_seq:
+            self.gaps.pop()
+        self._add_gap(last_seq, self.next_seq)
+        out.coding = Coding.DONE
+        if not out.counted:
             self._drop(out, reason)
-            return out.size
-        for out in reversed(self.queue):
-            size = out.size
-            if not out.message.tombstone and seq in (None, out.seq):
-                self._entomb(out, reason)
-                return size - out.size
-        return 0
+        return out.size + MESSAGE_OVERHEAD_BYTES
 
     def has_room(self, size_bytes: int) -> bool:
         """Whether one more reliable message keeps within the stream's bound."""
@@ -386,8 +413,14 @@ class OutChannel:
     @property
     def kept_bytes(self) -> int:
         """`held_bytes`, and what keeping these messages takes beside their bodies."""
-        count = len(self.retained) if self.reliable else len(self.queue) + len(self.flying)
-        return self.held_bytes + MESSAGE_OVERHEAD_BYTES * count
+        return self.held_bytes + MESSAGE_OVERHEAD_BYTES * self.kept
+
+    @property
+    def kept(self) -> int:
+        """How many messages wait here or are under way, tombstones included."""
+        if self.reliable:
+            return len(self.retained)
+        return len(self.queue) + len(self.flying) + (self.newest is not None)
 
     @property
     def held_bytes(self) -> int:
@@ -404,7 +437,7 @@ class OutChannel:
         assert popped is out
         self.flying[out.seq] = out
         if out.has_unsent:
-            self.active.append(out)
+            self._activate(out)
         self.begun_seq = out.seq
         self.last_sent_s = now
 
@@ -427,7 +460,7 @@ class OutChannel:
         if not out.started:
             self.begin(out, now)
         elif not out.ranges:
-            self.active.remove(out)
+            self._deactivate(out)
         out.fragments_inflight += 1
         if end == out.size:  # fragments leave in their order, so those before it have left as well
             out.exposed = True
@@ -473,8 +506,7 @@ class OutChannel:
             return False
         if out.ranges is None:
             out.ranges = []
-        out.ranges.append((start, end))
-        out.ranges.sort()
+        insort(out.ranges, (start, end))
         self._activate(out)
         return True
 
@@ -492,25 +524,35 @@ class OutChannel:
     def _activate(self, out: OutMessage) -> None:
         """A begun message has bytes to send (again): put it back in its place."""
         self.flying[out.seq] = out
-        if out in self.active:
-            return
-        position = 0
-        while position < len(self.active) and self.active[position].seq < out.seq:
-            position += 1
-        self.active.insert(position, out)
+        if not out.active:
+            out.active = True
+            insort(self.active, out, key=_SEQ)
 
-    def delivered_to(self, watermark: int) -> None:
-        """The peer's delivered watermark moved: reliable messages up to it are done."""
+    def _deactivate(self, out: OutMessage) -> None:
+        """It has no more bytes to send, or is given up."""
+        if out.active:
+            out.active = False
+            del self.active[bisect_left(self.active, out.seq, key=_SEQ)]
+
+    def _deactivate_all(self) -> None:
+        for out in self.active:
+            out.active = False
+        self.active.clear()
+
+    def delivered_to(self, watermark: int) -> int:
+        """The peer's delivered watermark moved: reliable messages up to it are done. Returns how many were kept."""
         if watermark <= self.watermark:
-            return
+            return 0
         self.watermark = watermark
         retained = self.retained
+        before = len(retained)
         while retained and retained[0].seq <= watermark:
             out = retained.popleft()
             self.retained_bytes -= out.size
             if not out.counted:
                 self.counters.deliver(out.offered_bytes)
             self._forget(out)
+        return before - len(retained)
 
     def settle(self) -> None:
         """Let go of reliable messages that the peer has whole, in order: for a stream without a watermark."""
@@ -523,10 +565,13 @@ class OutChannel:
             if self.gaps and self.gaps[-1][1] == self.next_seq:  # nothing was kept since that gap
                 self.gaps[-1] = (self.gaps[-1][0], first)
             else:
-                if self.gaps is _NOTHING:
-                    self.gaps = deque()
-                self.gaps.append((self.next_seq - 1, first))
+                self._add_gap(self.next_seq - 1, first)
             self.next_seq = first
+
+    def _add_gap(self, last_seq: int, first: int) -> None:
+        if self.gaps is _NOTHING:
+            self.gaps = deque()
+        self.gaps.append((last_seq, first))
 
     def leave_out(self, message: Message, reason: DropReason) -> None:
         """There is no room for this reliable message, nor for a tombstone: the stream goes on behind it."""
@@ -564,12 +609,12 @@ class OutChannel:
         else:
             if self.flying.get(out.seq) is out:
                 del self.flying[out.seq]
-            if out in self.active:
-                self.active.remove(out)
+            self._deactivate(out)
 
-    def reported(self, seq: int, reason: DropReason, where: str = "", count: int = 1) -> None:
+    def reported(self, seq: int, reason: DropReason, where: str = "", count: int = 1) -> int:
         """A later hop dropped `count` messages from `seq` on, for the client `where`, and said so before its watermark
-        passed them."""
+        passed them. Returns how many of them are news."""
+        news = 0
         for out in self.retained:
             if out.seq >= seq + count:
                 break
@@ -577,7 +622,9 @@ class OutChannel:
                 self._count(out.seq, reason, out.offered_bytes)
                 out.counted = True
                 out.lost_to = where
+                news += 1
                 self.on_drop(self, out, reason)
+        return news
 
     def sweep(self, now: float, *, up: bool) -> None:
         """Expire what nobody will send: lifespan and retention, also while the link is down."""
@@ -646,7 +693,7 @@ class OutChannel:
         self.queue = deque(again) if again else _NOTHING
         self.queued_bytes = sum(out.size for out in again)
         self.flying.clear()
-        self.active.clear()
+        self._deactivate_all()
         self.acked_seq = self.begun_seq = 0
 
     def clear(self, reason: DropReason) -> None:
@@ -665,7 +712,7 @@ class OutChannel:
                 self._drop(out, reason)
             self._drop_newest(reason)
         self.flying.clear()
-        self.active.clear()
+        self._deactivate_all()
         self.queue = _NOTHING
         self.queued_bytes = 0
 
@@ -694,7 +741,9 @@ class OutChannel:
         check(self.queued_bytes == sum(out.size for out in self.queue), f"{name}: queued bytes do not add up")
         check(all(not out.started for out in self.queue), f"{name}: a begun message is in the queue")
         check(
-            all(out.started and out.has_unsent and self.flying.get(out.seq) is out for out in self.active),
+            all(
+                out.started and out.active and out.has_unsent and self.flying.get(out.seq) is out for out in self.active
+            ),
             f"{name}: an active message was not begun, has nothing to send, or is not in flight",
         )
         if not self.reliable:
@@ -704,8 +753,8 @@ class OutChannel:
                 self.newest is None or all(out.seq < self.newest.seq for out in self.queue),
                 f"{name}: a message is held back behind a newer one",
             )
-            unsent = [out for out in self.flying.values() if out.has_unsent]
-            check(all(out in self.active for out in unsent), f"{name}: bytes to send are forgotten")
+            unsent = sorted((out for out in self.flying.values() if out.has_unsent), key=_SEQ)
+            check(unsent == self.active, f"{name}: bytes to send are forgotten")
             check(
                 all(out.has_unsent or out.fragments_inflight > 0 for out in self.flying.values()),
                 f"{name}: a message waits for nothing",
@@ -721,4 +770,4 @@ class OutChannel:
             f"{name}: queued and retained messages differ",
         )
         unsent = [out for out in self.retained if out.started and out.has_unsent]
-        check(all(out in self.active for out in unsent), f"{name}: bytes to send are forgotten")
+        check(unsent == self.active, f"{name}: bytes to send are forgotten")

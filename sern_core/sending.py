@@ -257,10 +257,12 @@ class Sender(ABC):
 
     def shed(self, channel: OutChannel, reason: DropReason, *, seq: int | None = None, now: float) -> int:
         """Give up one message that waits and has not been begun (of a reliable stream, number `seq` if given); returns
-        the bytes that are free now, 0: none."""
+        the bytes that are free now, overhead included, 0: none."""
         self._now = now
         freed_bytes = channel.shed(reason, seq=seq)
         self._refresh(channel, now)
+        if channel.gaps and channel.watermark >= channel.gaps[0][0]:  # nothing of the stream is left before it
+            self._watermark_moved(channel)
         return freed_bytes
 
     def _refresh(self, channel: OutChannel, now: float) -> None:

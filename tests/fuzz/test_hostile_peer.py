@@ -13,7 +13,7 @@ from sern_core import link as hop_end
 from sern_core.announce import Announcement, definition_hash, encode_announcement
 from sern_core.errors import WireError
 from sern_core.message import StreamId, StreamInfo, TopicInfo
-from sern_core.types import ClientName, Encoding, TopicName
+from sern_core.types import ClientName, Encoding, PriorityClass, TopicName
 from tests.fuzz.test_fuzz_wire import Duet
 from tests.world import World, spec
 
@@ -68,10 +68,11 @@ class Hostile:
         reliable: bool = False,
         depth: int = 1,
         owed: tuple[str, ...] = (),
+        priority: PriorityClass = PriorityClass.STATE,
     ) -> None:
         identity = StreamId(self.name, self.boot, TopicName(topic))
         info = TopicInfo(identity.topic, "a/b", Encoding.CDR)
-        stream = StreamInfo(identity, info, spec(reliable=reliable, depth=depth))
+        stream = StreamInfo(identity, info, spec(priority, reliable=reliable, depth=depth))
         self.control(encode_announcement(Announcement(channel, stream, digest, first, owed)))
 
 

@@ -112,9 +112,43 @@ def test_urgent_messages_pass_over_reliable_bulk() -> None:
     robot.send(command, b"g" * 5_000)
     world.run(30.0)
     assert site.seqs("/cmd") == [1]
-    assert site.seqs("/log") == [1, 2, 3, 4]
-    assert site.expired_seqs["/log"] == [5]  # the newest: those before it keep their order
-    assert queue_full(world, "/log") == 1
+    assert site.seqs("/log") == [1, 2, 3, 4]  # the newest went: those before it keep their order
+    assert site.skipped_count["/log"] == 1 and not site.expired_seqs["/log"]
+    assert [(drop.seq, drop.reason) for drop in robot.dropped_out] == [(5, DropReason.QUEUE_FULL)]
+    assert queue_full(world, "/log") == 1 and log.held_bytes == 0
+    robot.send(log, b"again")
+    world.until(lambda: site.seqs("/log")[-1] == 6)
+
+
+@pytest.mark.parametrize("away", [True, False])
+def test_of_small_messages_about_one_goes_for_each_that_needs_room(away: bool) -> None:
+    world = bounded_world().watch(0.5)
+    robot, site = world.clients["robot"], world.clients["site"]
+    log = robot.publish("/log", spec(PriorityClass.BULK, reliable=True))
+    poses = robot.publish("/pose", spec(PriorityClass.STATE, depth=100))
+    world.run(1.0)
+    if away:
+        world.hops["site"].break_connection(reconnect_s=5.0)
+        world.run(0.5)
+    large = 0 if away else 4  # so that the small ones are not begun
+    for _ in range(large):
+        robot.send(log, b"l" * 10_000)
+    for _ in range((LIMIT_BYTES - large * LARGE_BYTES) // (MESSAGE_OVERHEAD_BYTES + 2)):
+        robot.send(log, b"xx")
+    world.run(0.5)
+    assert queue_full(world, "/log") == 0
+    for _ in range(10):
+        robot.send(poses, b"p" * 8)
+    world.run(0.2)
+    assert 1 <= queue_full(world, "/log") <= 12
+    world.run(60.0)
+    sent, got = log.next_seq - 1, site.seqs("/log")
+    assert len(site.seqs("/pose")) == 10
+    assert got == list(range(1, len(got) + 1)) and site.skipped_count["/log"] == sent - len(got)
+    assert sorted(drop.seq for drop in robot.dropped_out) == list(range(len(got) + 1, sent + 1))
+    assert log.held_bytes == 0 and waiting(world) == 0
+    robot.send(log, b"again")
+    world.until(lambda: site.seqs("/log")[-1] == sent + 1)
 
 
 def test_a_single_message_above_the_bound_is_refused_entry() -> None:

@@ -1,5 +1,6 @@
 """The sending side of one stream: what is kept, dropped, resent and reported, and that the counters always add up."""
 
+from itertools import pairwise
 from math import inf
 from random import Random
 
@@ -11,7 +12,7 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, pr
 from sern_core.ledger import SendLedger
 from sern_core.message import Message, StreamId, StreamInfo, TopicInfo, TopicSpec
 from sern_core.out_message import OutMessage
-from sern_core.queues import OutChannel
+from sern_core.queues import MESSAGE_OVERHEAD_BYTES, OutChannel
 from sern_core.types import ClientName, DropReason, Encoding, TopicName
 from tests.exploring import cases
 from tests.world import spec
@@ -312,6 +313,53 @@ def test_gaps_are_told_in_their_turn() -> None:
     sender.check()
 
 
+def test_what_makes_room_leaves_nothing_behind_but_one_gap() -> None:
+    sender = Sender(spec(reliable=True))
+    channel = sender.channel
+    sender.submit(2, 3000)
+    assert sender.take() is not None  # 1 has begun
+    sender.submit(3)
+    kept_bytes = channel.kept_bytes
+    freed_bytes = [channel.shed(DropReason.QUEUE_FULL) for _ in range(3)]
+    assert freed_bytes == [100 + MESSAGE_OVERHEAD_BYTES] * 3 and channel.kept_bytes == kept_bytes - sum(freed_bytes)
+    assert sender.waiting == [2] and list(channel.gaps) == [(2, 6)]
+    channel.leave_out(sender.message(6), DropReason.QUEUE_FULL)
+    sender.submit(1)
+    assert sender.waiting == [2, 7] and list(channel.gaps) == [(2, 7)]
+    assert channel.shed(DropReason.QUEUE_FULL) and channel.shed(DropReason.QUEUE_FULL)
+    assert list(channel.gaps) == [(1, 8)] and sender.waiting == []
+    assert channel.shed(DropReason.QUEUE_FULL) == 0, "what has begun goes on"
+    assert sorted(seq for seq, _ in sender.drops) == [2, 3, 4, 5, 6, 7]
+    assert channel.next_gap() is None
+    channel.delivered_to(1)
+    assert channel.next_gap() == 8 and channel.watermark == 7
+    sender.check()
+
+
+def test_what_makes_room_and_was_reported_before_is_not_reported_again() -> None:
+    sender = Sender(spec(reliable=True, lifespan_s=1.0), first=5)
+    channel = sender.channel
+    sender.submit(3)
+    channel.reported(6, DropReason.RATE_CAP)
+    assert channel.shed(DropReason.UNWANTED, seq=7) == 99 and channel.shed(DropReason.UNWANTED, seq=7) == 0
+    assert [bool(out.message.tombstone) for out in channel.queue] == [False, False, True]
+    for size in (1, 100, 100):
+        assert channel.shed(DropReason.QUEUE_FULL) == size + MESSAGE_OVERHEAD_BYTES
+    assert sender.drops == [(6, DropReason.RATE_CAP), (7, DropReason.UNWANTED), (5, DropReason.QUEUE_FULL)]
+    assert channel.next_gap() == 8 and channel.kept_bytes == 0
+    sender.check()
+
+
+def test_what_an_earlier_process_may_have_makes_room_as_unconfirmed() -> None:
+    sender = Sender(spec(reliable=True))
+    sender.submit(2)
+    assert sender.take() is not None
+    sender.channel.peer_restarted()
+    assert sender.channel.shed(DropReason.QUEUE_FULL) and sender.channel.shed(DropReason.QUEUE_FULL)
+    assert sender.drops == [(2, DropReason.QUEUE_FULL), (1, DropReason.UNCONFIRMED)]
+    sender.check()
+
+
 @pytest.mark.parametrize("reliable", [True, False])
 def test_replays_go_first_and_gaps_between_them_are_known(reliable: bool) -> None:
     sender = Sender(spec(reliable=reliable, latched=True, depth=3), first=8)
@@ -322,6 +370,36 @@ def test_replays_go_first_and_gaps_between_them_are_known(reliable: bool) -> Non
         assert sender.channel.watermark == 1 and list(sender.channel.gaps) == [(2, 4), (4, 7)]
         sender.channel.sweep(120.0, up=True)
         assert not sender.drops, "retention counts from the replay"
+    sender.check()
+
+
+class CountedSeq(int):
+    """A seq that counts how often it is compared."""
+
+    compared = 0
+
+    def __lt__(self, other: int) -> bool:
+        CountedSeq.compared += 1
+        return int(self) < other
+
+    __hash__ = int.__hash__
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_what_a_lost_connection_held_is_taken_back_without_a_walk_for_each(order: int) -> None:
+    sender = Sender(spec(reliable=True))
+    channel = sender.channel
+    for seq in range(1, 2001):
+        message = sender.message(seq)
+        message.seq = CountedSeq(seq)
+        channel.submit(message, now=0.0, forced=True)
+    parts = [part for part in (sender.take() for _ in range(2000)) if part is not None]
+    assert len(parts) == len(channel.flying) == 2000
+    CountedSeq.compared = 0
+    for out, generation, start, end in parts[::order]:
+        assert channel.fragment_lost(out, generation, start, end, now=0.1)
+    assert CountedSeq.compared <= 2000 * 12
+    assert [out.seq for out in channel.active] == list(range(1, 2001))
     sender.check()
 
 
@@ -393,9 +471,22 @@ class Channel(RuleBasedStateMachine):
     def drop_head(self) -> None:
         self.sender.channel.drop_head(DropReason.STALE, self.now)
 
+    @rule(count=st.integers(1, 3))
+    def shed(self, count: int) -> None:
+        for _ in range(count):
+            self.sender.channel.shed(DropReason.QUEUE_FULL)
+
+    @precondition(lambda self: self.sender.channel.reliable)
     @rule()
-    def shed(self) -> None:
-        self.sender.channel.shed(DropReason.QUEUE_FULL)
+    def leave_out(self) -> None:
+        channel = self.sender.channel
+        channel.leave_out(self.sender.message(channel.next_seq, now=self.now), DropReason.QUEUE_FULL)
+
+    @rule()
+    def tell_a_gap(self) -> None:
+        channel = self.sender.channel
+        first = channel.next_gap()
+        assert first is None or channel.watermark >= first - 1
 
     @invariant()
     def adds_up(self) -> None:
@@ -403,6 +494,18 @@ class Channel(RuleBasedStateMachine):
             self.sender.check()
             dropped = [seq for seq, _ in self.sender.drops]
             assert len(dropped) == len(set(dropped)), "reported twice"
+
+    @invariant()
+    def the_peer_waits_for_nothing(self) -> None:
+        if hasattr(self, "sender") and self.sender.channel.reliable:
+            channel = self.sender.channel
+            coming = {out.seq for out in channel.retained}
+            for last_seq, first in channel.gaps:
+                coming.update(range(last_seq + 1, first))
+            assert coming.issuperset(range(channel.watermark + 1, channel.next_seq)), "neither kept nor in a gap"
+            assert all(a[1] <= b[0] + 1 and a[0] < b[0] for a, b in pairwise(channel.gaps)), "gaps out of order"
+            seqs = [out.seq for out in channel.retained if out.seq > channel.watermark]
+            assert not any(last_seq < seq < first for last_seq, first in channel.gaps for seq in seqs)
 
 
 TestChannel = Channel.TestCase

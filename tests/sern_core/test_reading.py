@@ -1,6 +1,7 @@
 """What costs more than its bytes is read in slices: in order, and nothing is acknowledged before it is read."""
 
 from collections.abc import Callable
+from typing import Any
 
 import pytest
 
@@ -235,3 +236,39 @@ def test_streams_that_were_left_out_are_retracted_in_slices() -> None:
     read_all(peer)
     assert [identity.topic for identity in peer.hub.relayed] == ["/robot/t1"]
     peer.hub.validate()
+
+
+KEPT = 4_000
+
+
+@pytest.mark.parametrize(
+    ("what", "each_us"),
+    [("want", 3.0), ("dropped", 3.0), ("refuse", 3.0), ("watermark", 0.5)],
+)
+def test_what_ends_many_messages_at_once_is_charged_with_them(what: str, each_us: float) -> None:
+    count = KEPT * 4 if what == "watermark" else KEPT
+    world = World()
+    reader, origin = Hostile(world, "reader"), Hostile(world, "origin")
+    origin.announce(1, "/origin/log", reliable=True)
+    reader.control({"t": "subscribe", "patterns": ["/origin/.*"], "more": False})
+    read_all(origin)
+    for first in range(1, count, 1_000):
+        origin.say(*(_whole(1, seq) for seq in range(first, first + 1_000)))
+        read_all(origin)
+    (channel,) = link_of(reader).channels.values()
+    assert channel.kept == count
+    control: dict[str, Any] = {
+        "want": {"t": "want", "ch": 1, "on": False},
+        "dropped": {"t": "dropped", "ch": 1, "seq": 1, "code": 1, "to": "reader", "n": count},
+        "refuse": {"t": "refuse", "ch": 1, "code": "forbidden", "why": "no"},
+    }
+    said_s = reader.now
+    if what == "watermark":
+        reader.say(wire.encode_watermark(1, count))
+    else:
+        reader.control(control[what])
+    assert sum(not out.counted for out in channel.retained) == 0
+    charged_us = link_of(reader).reassembly.work_us
+    assert each_us * count <= charged_us <= 2 * each_us * count
+    assert link_of(reader).read_due_s == pytest.approx(said_s + 1e-6 * charged_us)
+    reader.hub.validate()
