@@ -70,8 +70,18 @@ def cancel_request(send_goal_request: bytes) -> bytes | None:
     return send_goal_request[:4] + send_goal_request[_UUID] + bytes(8)  # GoalInfo: UUID goal_id, Time stamp
 
 
+class _Ros1Text(str):
+    """A text that goes out with the bytes it came with, UTF-8 or not; ROS 1 does not ask."""
+
+    __slots__ = ()
+
+    def encode(self, encoding: str = "utf-8", errors: str = "surrogateescape") -> bytes:
+        return super().encode(encoding, errors)
+
+
 class GoalId(NamedTuple):
-    """actionlib_msgs/GoalID: when the client gave the goal, and what it calls it."""
+    """actionlib_msgs/GoalID: when the client gave the goal, and what it calls it. Bytes of `text` that are no UTF-8
+    are lone surrogates in it."""
 
     secs: int
     nsecs: int
@@ -80,6 +90,11 @@ class GoalId(NamedTuple):
     def pack(self) -> bytes:
         text = self.text.encode(errors="surrogateescape")
         return _TIME.pack(self.secs, self.nsecs) + _LENGTH.pack(len(text)) + text
+
+    @property
+    def shown(self) -> str:
+        """The text for people: what is no UTF-8 is escaped."""
+        return self.text.encode(errors="surrogateescape").decode(errors="backslashreplace")
 
 
 def goal_id(body: bytes) -> GoalId:
@@ -105,7 +120,7 @@ def result_body(info: TopicInfo, goal: GoalId, status: int, text: str) -> bytes:
     try:
         result.status.goal_id.stamp.sec = goal.secs
         result.status.goal_id.stamp.nanosec = goal.nsecs
-        result.status.goal_id.id = goal.text
+        result.status.goal_id.id = _Ros1Text(goal.text)
         result.status.status = status
         result.status.text = text
     except AttributeError:
@@ -287,9 +302,12 @@ class GoalWatch:
         if action.goals.get(goal.ident.text) is not goal:
             return
         self._forget(action, goal.ident.text)
-        if action.cancel is not None:
-            action.cancel(goal.ident.pack(), time.time_ns())
-        _log.warning("%s: goal %s is given up and cancelled: %s", action.name, goal.ident.text, why)
+        _log.warning("%s: goal %s is given up and cancelled: %s", action.name, goal.ident.shown, why)
+        try:
+            if action.cancel is not None:
+                action.cancel(goal.ident.pack(), time.time_ns())
+        except Exception:  # noqa: BLE001  (a fault of one goal; its client is told, and the other goals go on)
+            _log.exception("%s: goal %s could not be cancelled", action.name, goal.ident.shown)
         if action.result is None:
             return  # its client has never seen a server either
         try:
@@ -301,6 +319,9 @@ class GoalWatch:
                 publisher.publish(body, time.time_ns())
                 publisher.close()
         except ConfigError as error:
-            _log.error("%s: the client of goal %s cannot be told: %s", action.name, goal.ident.text, error)
+            _log.error("%s: the client of goal %s cannot be told: %s", action.name, goal.ident.shown, error)
+            return
+        except Exception:  # noqa: BLE001  (a fault of one goal)
+            _log.exception("%s: the client of goal %s could not be told", action.name, goal.ident.shown)
             return
         self.reported += 1

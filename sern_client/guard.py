@@ -28,8 +28,8 @@ from sern_runtime.entry import end_tasks
 
 PING_S: Final = 1.0
 SILENT_S: Final = 15.0
-"""A guard that answers nothing for so long is killed and started again: longer than it needs to start on a busy
-machine."""
+"""A guard that answers no ping for so long is killed and started again: longer than it needs to start on a busy
+machine. Pings are counted, not time: while this process stands still, time goes on and the guard is not asked."""
 AGAIN_S: Final = (1.0, 30.0)
 """First and longest pause before it is started again."""
 END_S: Final = 3.0
@@ -64,7 +64,7 @@ class Guard:
         self._topics: dict[int, _Topic] = {}
         self._next_key = 1
         self._process: Process | None = None
-        self._heard_s = 0.0
+        self._unanswered = 0  # pings since something was heard
         self._task: asyncio.Task[None] | None = None
         self._spawning: asyncio.Task[Process] | None = None
 
@@ -150,24 +150,23 @@ class Guard:
             self._say(_opening(key, topic))
             if topic.due_s is not None:
                 self._say({"lease": key, "due": topic.due_s})
-        loop = asyncio.get_running_loop()
-        self._heard_s = loop.time()
+        self._unanswered = 0
         silence = asyncio.create_task(self._listen_for_silence(process), name="guard-silence")
         try:
             assert process.stdout is not None
             while line := await process.stdout.readline():
-                self._heard_s = loop.time()
+                self._unanswered = 0
                 self._answered(json.loads(line))
             return f"exit code {await process.wait()}"
         finally:
             await end_tasks([silence])
 
     async def _listen_for_silence(self, process: Process) -> None:
-        loop = asyncio.get_running_loop()
         number = 0
-        while loop.time() - self._heard_s < SILENT_S:
+        while self._unanswered < SILENT_S / PING_S:
             await asyncio.sleep(PING_S)
             number += 1
+            self._unanswered += 1
             self._say({"ping": number})
         _log.error("the guard of the command topics has not answered for %g s; it is killed", SILENT_S)
         process.kill()

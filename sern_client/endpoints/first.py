@@ -43,7 +43,8 @@ class FirstMessages:
     """Keeps what one publisher writes first, until `over`, when everything kept has been given to `write`.
 
     At most `max_messages` and `max_bytes` are kept, the newest; what is above is told to `dropped` as `overflow`, what
-    is too old meanwhile as LIFESPAN. `learning_s`: how much longer the graph may be incomplete.
+    is too old meanwhile as LIFESPAN, what `write` does not take as FAULT. `learning_s`: how much longer the graph may
+    be incomplete.
     """
 
     def __init__(
@@ -136,13 +137,25 @@ class FirstMessages:
             return
         self.over = True
         now = self._loop.time()
+        self._nbytes = 0
+        try:
+            self._write_kept(now)
+        finally:
+            done, self._done = self._done, None
+            if done is not None:
+                done()
+
+    def _write_kept(self, now: float) -> None:
+        complained = False
         while self._kept:
             body, stamp_ns, until_s = self._kept.popleft()
             if until_s < now:
                 self._dropped(DropReason.LIFESPAN)
-            else:
+                continue
+            try:
                 self._write(body, stamp_ns)
-        self._nbytes = 0
-        done, self._done = self._done, None
-        if done is not None:
-            done()
+            except Exception:  # noqa: BLE001  (a fault of one message; those behind it are written all the same)
+                self._dropped(DropReason.FAULT)
+                if not complained:
+                    complained = True
+                    _log.exception("%s: a message could not be published here", self._topic)

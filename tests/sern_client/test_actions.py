@@ -215,6 +215,43 @@ async def test_clients_that_are_gone_are_told_nothing(site: Site) -> None:
     assert len(site.results) == 1 and site.watch.reported == 1
 
 
+async def test_goals_beside_one_that_nobody_can_be_told_of(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(actions, "ACCEPT_S", 0.05)
+    site = Site()
+    told: list[bytes] = []
+
+    def publish(data: bytes) -> None:
+        if goal_id(data).text == "bad":
+            raise OSError("no message")
+        told.append(data)
+
+    site.watch.opened(RESULT, publish)
+    latin = goal_body(GoalId(0, 0, "uber")).replace(b"uber", b"\xfcber")
+    for data in (goal_body(GoalId(0, 0, "bad")), latin, goal_body(GoalId(0, 0, "last"))):
+        site.give(data, 1)
+    await until(lambda: site.watch.reported == 2, "the others are told")
+    assert [goal_id(data).pack()[12:] for data in told] == [b"\xfcber", b"last"]
+    assert [data[12:] for data in site.cancels] == [b"bad", b"\xfcber", b"last"]
+    assert "the client of goal bad could not be told" in caplog.text and r"goal \xfcber is given up" in caplog.text
+    site.give(goal_body(GoalId(0, 0, "later")), 1)
+    await until(lambda: site.watch.reported == 3, "the timer goes on")
+    site.watch.close()
+
+
+async def test_a_goal_that_cannot_be_cancelled_is_told_all_the_same(site: Site) -> None:
+    def broken(_data: bytes, _stamp_ns: int) -> bool:
+        raise OSError("no message")
+
+    site.watch.outgoing(topic("cancel"), site.channel, broken)
+    site.server_appears()
+    site.accepts = False
+    site.give(goal_body(), 1)
+    await until(lambda: site.watch.reported == 1)
+    assert [result_of(data).status.status for data in site.results] == [REJECTED]
+
+
 async def test_other_topics_are_left_alone(site: Site) -> None:
     sink: Sink = lambda _body, _stamp_ns: True  # noqa: E731
     for name, encoding in (("/robot2/count/goal", Encoding.ROS1), (GOAL.name, Encoding.CDR), ("/goal", Encoding.ROS1)):

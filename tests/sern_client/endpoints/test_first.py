@@ -100,3 +100,22 @@ async def test_what_is_kept_is_bounded_and_every_drop_counted() -> None:
     await until(lambda: late.first.over)
     assert late.written == [b"new"]
     assert sorted(late.dropped) == [DropReason.DISCONNECTED, DropReason.DISCONNECTED, DropReason.LIFESPAN]
+
+
+async def test_one_that_cannot_be_written_costs_none_behind_it(caplog: pytest.LogCaptureFixture) -> None:
+    topic = Topic(1, 0, messages=9)
+    written = topic.written
+
+    def write(body: bytes, _stamp_ns: int) -> None:
+        if body.startswith(b"bad"):
+            raise OSError("no message")
+        written.append(body)
+
+    topic.first._write = write
+    topic.publish(b"bad", b"one", b"bad too", b"stop")
+    topic.first.end(topic.end)
+    topic.now = Readers(1, 1)
+    await until(lambda: topic.ended == 1)
+    assert written == [b"one", b"stop"] and len(topic.first) == 0
+    assert topic.dropped == [DropReason.FAULT] * 2
+    assert [record.message for record in caplog.records] == ["/chat: a message could not be published here"]
