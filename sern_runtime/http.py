@@ -1,5 +1,6 @@
 """The daemon's small HTTP server: /metrics, /healthz, /readyz and JSON for the tools. Read-only."""
 
+import asyncio
 import errno
 import json
 import logging
@@ -12,6 +13,7 @@ from prometheus_client import CollectorRegistry
 from prometheus_client.exposition import choose_encoder
 
 from sern_core.errors import ConfigError, UsageError
+from sern_runtime.metrics import exposition
 from sern_runtime.optional import OptionalParts
 
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
@@ -106,6 +108,7 @@ class HttpServer:
         self._registry = registry
         self._runner: web.AppRunner | None = None
         self._requests = _RequestLog()
+        self._scraping = asyncio.Lock()
         self._app = web.Application(middlewares=[self._survive])
         self._app.router.add_get("/metrics", self._metrics)
         self._app.router.add_get("/healthz", _health_route(health))
@@ -170,7 +173,12 @@ class HttpServer:
 
     async def _metrics(self, request: web.Request) -> web.Response:
         encode, content_type = choose_encoder(request.headers.get("Accept", ""))
-        return web.Response(body=encode(self._registry), headers={"Content-Type": content_type})
+        parts: list[bytes] = []
+        async with self._scraping:
+            for part in exposition(self._registry, encode):
+                parts.append(part)
+                await asyncio.sleep(0)
+        return web.Response(body=b"".join(parts), headers={"Content-Type": content_type})
 
 
 def _problem(error: OSError) -> str:

@@ -7,14 +7,17 @@ The parts of SERN count in plain attributes and know nothing of Prometheus; at e
                     lambda: [((client, reason), n) ...], known=lambda: [(client, reason) ...])
 
 Rules kept here: every known label set exists at 0 from the first scrape (a counter that first appears at 1 never
-fires an alert on `increase()`); label values come from configuration, anything else is added up under `other`; one
-callable that raises costs its own metric only, and `sern_metrics_failures_total` says which.
+fires an alert on `increase()`); label values come from configuration, anything else is added up under `other`; labels
+whose values are few and ours (class, reason) always keep their values, so that an alert which looks for a reason finds
+it however many topics there are; one callable that raises costs its own metric only, and `sern_metrics_failures_total`
+says which.
 """
 
 import logging
 import re
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from operator import itemgetter
 from typing import Final
 
 from prometheus_client import CollectorRegistry, ProcessCollector
@@ -28,8 +31,13 @@ Numbers = Iterable[tuple[Labels, float]]
 KnownLabels = Callable[[], Iterable[Labels]]
 
 OTHER: Final = "other"
-MAX_LABEL_SETS: Final = 2000
-"""Label sets of one metric, at most; what comes after that is added up under `other` in every label."""
+OPEN_LABELS: Final = frozenset({"client", "peer", "service", "topic"})
+"""Labels whose values others choose. A metric that has none of them counts as one with open labels only."""
+MAX_LABEL_SETS: Final = 6000
+"""Sets of values of the open labels, such as pairs of peer and topic, that have rows of their own. What comes after is
+added up under `other` in these labels; the closed ones keep their values."""
+SLICE_ROWS: Final = 500
+"""Rows that `exposition` writes at a time: about 7 ms."""
 
 LATENCY_EDGES_S: Final = (0.001, 0.0025, 0.005, 0.01, 0.02, 0.03, 0.05, 0.1, 0.2, 0.3, 0.5, 1.0, 2.0, 5.0, 10.0, 30.0)
 """Histogram edges for ages and delays, 1 ms to 30 s, with one on each service level."""
@@ -72,16 +80,54 @@ class Histogram:
         return HistogramCounts(tuple(self.counts), self.total)
 
 
+class _Names:
+    """Which sets of open label values have rows of their own, for all metrics with the same open labels.
+
+    A set stays what it was at its first scrape as long as it exists: a counter that came out of `other` above 0 would
+    hide what happened since the scrape before.
+    """
+
+    def __init__(self) -> None:
+        self._named: dict[object, bool] = {}
+        self._before: dict[object, bool] = {}
+        self._taken = 0
+
+    def begin(self) -> None:
+        """A scrape begins: what the one before did not meet is forgotten."""
+        self._before, self._named = self._named, {}
+        self._taken = sum(self._before.values())
+
+    def own(self, values: object) -> bool:
+        named = self._named.get(values)
+        if named is None:
+            named = self._before.get(values)
+            if named is None:
+                named = self._taken < MAX_LABEL_SETS
+                self._taken += named
+            self._named[values] = named
+        return named
+
+
 @dataclass(slots=True)
 class _Definition:
     name: str
     help: str
     labels: Labels
     known: KnownLabels | None
+    names: _Names
     allowed: Mapping[str, Callable[[], Collection[str]]] = field(default_factory=dict)
+    open: tuple[int, ...] = ()  # positions
+    values: Callable[[Labels], object] = tuple
+    others: dict[Labels, tuple[float, float]] = field(default_factory=dict)
+    """Of a counter, for each row under `other`: the sum at the last scrape, and what has left that sum before."""
+
+    def __post_init__(self) -> None:
+        self.open = tuple(n for n, label in enumerate(self.labels) if label in _open(self.labels))
+        if self.open:
+            self.values = itemgetter(*self.open)
 
     def guarded(self, labels: Labels, seen: Collection[Labels]) -> Labels:
-        """These labels with every value that is not allowed, or too many, replaced by `other`."""
+        """These labels with every value that is not allowed, or open and one too many, replaced by `other`."""
         if len(labels) != len(self.labels):
             raise UsageError(f"{self.name} has the labels {self.labels}, got {labels}")
         if self.allowed:
@@ -89,9 +135,24 @@ class _Definition:
                 value if name not in self.allowed or value in self.allowed[name]() else OTHER
                 for name, value in zip(self.labels, labels, strict=True)
             )
-        if labels not in seen and len(seen) >= MAX_LABEL_SETS:
-            return (OTHER,) * len(self.labels)
-        return labels
+        if labels in seen or not self.open or self.names.own(self.values(labels)):
+            return labels
+        return tuple(OTHER if n in self.open else value for n, value in enumerate(labels))
+
+    def growing(self, sums: dict[Labels, float]) -> dict[Labels, float]:
+        """The sums with those under `other` kept from falling when one of their parts is forgotten, which would look
+        like a restart and count everything again. What is added in the same interval is hidden up to what left."""
+        for labels in self.others.keys() | {key for key in sums if any(key[n] == OTHER for n in self.open)}:
+            now = sums.get(labels, 0.0)
+            last, gone = self.others.get(labels, (0.0, 0.0))
+            gone += max(0.0, last - now)
+            self.others[labels] = now, gone
+            sums[labels] = now + gone
+        return sums
+
+
+def _open(labels: Labels) -> Labels:
+    return tuple(label for label in labels if label in OPEN_LABELS) or labels
 
 
 class Metrics(Collector):
@@ -104,6 +165,7 @@ class Metrics(Collector):
         self.registry = registry
         self._sources: list[tuple[_Definition, Callable[[_Definition], Metric]]] = []
         self._failures: dict[str, int] = {}
+        self._names: dict[Labels, _Names] = {}
         registry.register(self)
         if process:
             ProcessCollector(registry=registry)
@@ -123,9 +185,9 @@ class Metrics(Collector):
             raise UsageError(f"the counter {name} must end in _total")
 
         def collect(definition: _Definition) -> Metric:
-            return _family(CounterMetricFamily, definition, _sums(definition, read()))
+            return _family(CounterMetricFamily, definition, definition.growing(_sums(definition, read())))
 
-        self._add(_Definition(name, text, labels, known, allowed or {}), collect)
+        self._add(_Definition(name, text, labels, known, self._named(labels), allowed or {}), collect)
 
     def gauge(
         self,
@@ -142,7 +204,7 @@ class Metrics(Collector):
         def collect(definition: _Definition) -> Metric:
             return _family(GaugeMetricFamily, definition, _maxima(definition, read()))
 
-        self._add(_Definition(name, text, labels, known, allowed or {}), collect)
+        self._add(_Definition(name, text, labels, known, self._named(labels), allowed or {}), collect)
 
     def histogram(
         self,
@@ -168,9 +230,12 @@ class Metrics(Collector):
                 family.add_metric(key, _cumulative(edges, counts.counts), counts.total)
             return family
 
-        self._add(_Definition(name, text, labels, known, allowed or {}), collect)
+        self._add(_Definition(name, text, labels, known, self._named(labels), allowed or {}), collect)
 
     def collect(self) -> Iterator[Metric]:
+        """The families one after another, each read when it is its turn. One scrape at a time."""
+        for names in self._names.values():
+            names.begin()
         for definition, collect in self._sources:
             try:
                 yield collect(definition)
@@ -188,11 +253,44 @@ class Metrics(Collector):
         """Nothing: registering must not read state that is not there yet."""
         return iter(())
 
+    def _named(self, labels: Labels) -> _Names:
+        return self._names.setdefault(_open(labels), _Names())
+
     def _add(self, definition: _Definition, collect: Callable[[_Definition], Metric]) -> None:
         if definition.name in self._failures:
             raise UsageError(f"the metric {definition.name} exists already")
         self._failures[definition.name] = 0
         self._sources.append((definition, collect))
+
+
+class _Slice(Collector):
+    """A family to be written, in whole or in part."""
+
+    def __init__(self, family: Metric) -> None:
+        self._family = family
+
+    def collect(self) -> Iterator[Metric]:
+        yield self._family
+
+
+def exposition(registry: CollectorRegistry, encode: Callable[[Collector], bytes]) -> Iterator[bytes]:
+    """What `encode` makes of the whole registry, in parts of SLICE_ROWS rows, so that its caller can do something else
+    in between. One scrape at a time."""
+    end = b""
+    for family in registry.collect():
+        rows = list(family.samples)
+        for first in range(0, max(1, len(rows)), SLICE_ROWS):
+            family.samples = rows[first : first + SLICE_ROWS]
+            text = encode(_Slice(family))
+            if text.endswith(_END):  # OpenMetrics has it once
+                text, end = text.removesuffix(_END), _END
+            if first:  # the head of the family is written
+                text = b"".join(line for line in text.splitlines(keepends=True) if not line.startswith(b"#"))
+            yield text
+    yield end
+
+
+_END: Final = b"# EOF\n"
 
 
 def _family(
