@@ -66,23 +66,24 @@ def register_links(metrics: Metrics, links: Callable[[], Collection[Link]]) -> N
 
         return collect
 
-    def per_topic(read: str) -> Callable[[], list[tuple[Labels, float]]]:
-        def collect() -> list[tuple[Labels, float]]:
-            return [
-                ((link.peer, counters.topic, CLASS_LABELS[counters.priority]), float(getattr(counters, read)))
-                for link in links()
-                for counters in link.ledger.topics.values()
-            ]
+    # A list for each link: links and topics come and go while the next is waited for.
+    def per_topic(read: str) -> Callable[[], Iterator[tuple[Labels, float]]]:
+        def collect() -> Iterator[tuple[Labels, float]]:
+            for link in tuple(links()):
+                yield from [
+                    ((link.peer, counters.topic, CLASS_LABELS[counters.priority]), float(getattr(counters, read)))
+                    for counters in link.ledger.topics.values()
+                ]
 
         return collect
 
-    def drops() -> list[tuple[Labels, float]]:
-        return [
-            ((link.peer, counters.topic, CLASS_LABELS[counters.priority], reason), count)
-            for link in links()
-            for counters in link.ledger.topics.values()
-            for reason, count in _by_reason(counters.by_reason, LOSSES)
-        ]
+    def drops() -> Iterator[tuple[Labels, float]]:
+        for link in tuple(links()):
+            yield from [
+                ((link.peer, counters.topic, CLASS_LABELS[counters.priority], reason), count)
+                for counters in link.ledger.topics.values()
+                for reason, count in _by_reason(counters.by_reason, LOSSES)
+            ]
 
     gauge, counter = metrics.gauge, metrics.counter
     peer = ("peer",)

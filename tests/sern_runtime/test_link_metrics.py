@@ -111,6 +111,25 @@ def test_parts_make_the_same_text_and_each_is_small(encode: Any) -> None:
     assert max(part.count(b"\n") for part in parts) <= SLICE_ROWS + 2
 
 
+def test_links_and_topics_may_go_while_a_scrape_is_made(monkeypatch: pytest.MonkeyPatch) -> None:
+    """More rows than are read in a step, and no more than a step's and a link's are read at a time."""
+    monkeypatch.setattr(module, "STEP_ROWS", 50)
+    scene = Scene(40, 20)
+    parts = []
+    for number, part in enumerate(exposition(scene.registry, generate_latest)):
+        parts.append(part)
+        if not part and number % 4 == 0:
+            scene.links.append(link(f"new{number}", 20))
+            for at in scene.links[:-1]:
+                at.ledger.topics.pop(f"/r/t{number % 20}", None)
+            del scene.links[number % len(scene.links)]
+    assert parts.count(b"") > 20
+    text = b"".join(parts).decode()
+    assert list(text_string_to_metric_families(text))
+    failures = [line for line in text.splitlines() if line.startswith("sern_metrics_failures_total{")]
+    assert failures and all(line.endswith(" 0.0") for line in failures)
+
+
 def test_what_is_lost_on_arrival_has_rows_from_the_start_on() -> None:
     registry, received = CollectorRegistry(), ReceiveLedger()
     register_received(Metrics(registry, process=False), received, AgeHistograms())
