@@ -192,13 +192,13 @@ def _mismatch(topic: str, type_name: str, offered: str, computed: str) -> Config
 
 
 def _ros1_to_cdr(source: ResolvedType, target: ResolvedType) -> Convert:
-    plan = ros_bodies.plan(target.name, target.store.fielddefs, ros1=source.store.fielddefs)
+    plan = ros_bodies.plan_of(target, ros1=source)
     return lambda body: ros_bodies.convert(plan, body, Encoding.ROS1, Encoding.CDR)
 
 
 def _cdr_to_ros1(source: ResolvedType, target: ResolvedType) -> Convert:
-    plan = ros_bodies.plan(source.name, source.store.fielddefs, ros1=target.store.fielddefs)
-    parts = ros_bodies.plan(source.name, source.store.fielddefs, one_by_one=True)
+    plan = ros_bodies.plan_of(source, ros1=target)
+    parts = ros_bodies.plan_of(source, one_by_one=True)
     by_value = _by_value(source, target)
 
     def convert(body: bytes) -> bytes:

@@ -51,7 +51,7 @@ class FramePrefixer:
     def _rewriter(self, info: TopicInfo, change: Callable[[str], str]) -> Rewrite | None:
         try:
             resolved = ros_types.resolve(info.type_name, info.definition, info.encoding)
-            plan = ros_bodies.plan(resolved.name, resolved.store.fielddefs)
+            plan = ros_bodies.plan_of(resolved)
         except ConfigError as error:
             if info.encoding is Encoding.RAW:
                 return None  # no ROS message: there are no frame ids to speak of

@@ -4,6 +4,7 @@ import base64
 from collections.abc import Mapping
 from typing import Any, Final
 
+from sern_core.announce import definition_hash
 from sern_core.errors import UsageError
 from sern_core.message import StreamId, StreamInfo
 from sern_core.objects import topic_object_id
@@ -41,7 +42,12 @@ class LatestValues:
         def read(query: Mapping[str, str]) -> object:
             if "topic" not in query:
                 raise UsageError("topic is missing: /api/values?topic=NAME")
-            return {"objects": [_to_json(*value) for key, value in self._values.items() if key.topic == query["topic"]]}
+            found = [value for key, value in self._values.items() if key.topic == query["topic"]]
+            texts = (stream.info.definition for stream, *_ in found)
+            return {
+                "objects": [_to_json(*value) for value in found],
+                "definitions": {definition_hash(text): text for text in texts if text},
+            }
 
         return JsonQuery(("topic",), read)
 
@@ -55,7 +61,7 @@ def _to_json(stream: StreamInfo, seq: int, size: int, body: bytes | None) -> dic
         "id": topic_object_id(stream.id),
         "owner": stream.id.origin,
         "type": info.type_name,
-        "definition": info.definition,
+        "definition_key": definition_hash(info.definition),
         "attributes": {"topic": stream.id.topic, "encoding": info.encoding.value},
         "seq": seq,
         "version": seq,

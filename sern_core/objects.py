@@ -21,17 +21,17 @@ Theory of operation
 import hashlib
 import re
 from collections import OrderedDict, deque
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any, Final
+from typing import Final
 
 from sern_core.codecs import Codec, Work, decode, raw_size
 from sern_core.errors import CodecError, RefusedError
 from sern_core.message import StreamId, StreamInfo
 from sern_core.rules import COMMAND_TYPES, plain_type
-from sern_core.types import ClientName, ObjectKind, PriorityClass
-from sern_core.xr_object import ObjectChanges, XrObject, object_to_json
+from sern_core.types import ClientName, ObjectKind, PriorityClass, TopicName
+from sern_core.xr_object import ChangedIds, ObjectChanges, XrObject
 
 COMMAND_OBJECT_TYPES: Final = COMMAND_TYPES | {
     "ackermann_msgs/AckermannDrive",
@@ -346,13 +346,34 @@ class ObjectRegistry:
             if kind is None or self._entries[object_id].kind is kind
         )
 
+    def named(self, *, owner: ClientName | None = None, topic: TopicName | None = None) -> list[str]:
+        """Ids of the objects of an owner, and of those of a topic (None: any)."""
+        if topic is None:
+            return list(self._entries if owner is None else self._owned.get(owner, ()))
+        owners = self._owned if owner is None else (owner,)
+        return [object_id for name in owners if (object_id := f"{topic}@{name}") in self._entries]
+
+    def about(self, object_id: str) -> tuple[ObjectKind, ClientName, StreamId | None] | None:
+        """Kind, owner and the stream an object stands for, if any; None: there is no such object."""
+        entry = self._entries.get(object_id)
+        return None if entry is None else (entry.kind, entry.owner, entry.stream)
+
     def unread(
-        self, *, kind: ObjectKind | None = None, owner: ClientName | None = None, version: int = 0
+        self,
+        *,
+        kind: ObjectKind | None = None,
+        owner: ClientName | None = None,
+        topic: TopicName | None = None,
+        version: int = 0,
     ) -> list[ValueRequest]:
         """What has to be done before the values of these objects, changed after `version`, can be told. Nothing while
         `inline_bytes` is None."""
         found: list[ValueRequest] = []
-        for entry in reversed(self._entries.values()):
+        entries: Iterable[_Entry] = reversed(self._entries.values())
+        if topic is not None:
+            of_topic = [self._entries[object_id] for object_id in self.named(owner=owner, topic=topic)]
+            entries = sorted(of_topic, key=lambda entry: -entry.version)
+        for entry in entries:
             if entry.version <= version:
                 break
             wanted = kind in (None, entry.kind) and owner in (None, entry.owner)
@@ -375,28 +396,29 @@ class ObjectRegistry:
 
     def since(self, version: int, *, epoch: int | None = None) -> ObjectChanges:
         """What changed after `version`; start with 0. `epoch` None: the reader knows that it is this run."""
+        changed = self.changed(version, epoch=epoch)
+        return ObjectChanges(
+            changed.epoch,
+            changed.version,
+            changed.resync,
+            tuple(self._seen(self._entries[object_id]) for object_id in changed.updated),
+            changed.deleted,
+        )
+
+    def changed(self, version: int, *, epoch: int | None = None) -> ChangedIds:
+        """`since` for who looks at the objects one by one later on. One that is gone by then is among those deleted
+        after the version given here; one that has changed is told again."""
         foreign = version < 0 or version > self._version or (epoch is not None and epoch != self.epoch)
         if foreign or (version and version < self._forgotten_version):
-            everything = tuple(self._seen(entry) for entry in self._entries.values())
-            return ObjectChanges(self.epoch, self._version, True, everything, ())
-        updated: list[XrObject] = []
+            return ChangedIds(self.epoch, self._version, True, tuple(self._entries), ())
+        updated: list[str] = []
         for entry in reversed(self._entries.values()):
             if entry.version <= version:
                 break
-            updated.append(self._seen(entry))
+            updated.append(entry.id)
         gone = dict.fromkeys(object_id for at, object_id in self._deletions if at > version and version)
         deleted = tuple(object_id for object_id in gone if object_id not in self._entries)
-        return ObjectChanges(self.epoch, self._version, False, tuple(reversed(updated)), deleted)
-
-    def to_json(
-        self, *, kind: ObjectKind | None = None, owner: ClientName | None = None, definitions: bool = True
-    ) -> dict[str, Any]:
-        """The JSON shape of `sern_core.xr_object`; without `definitions` the texts are left out and the hashes stay."""
-        return {
-            "epoch": self.epoch,
-            "version": self._version,
-            "objects": [object_to_json(item, definition=definitions) for item in self.select(kind=kind, owner=owner)],
-        }
+        return ChangedIds(self.epoch, self._version, False, tuple(reversed(updated)), deleted)
 
     def validate(self) -> None:
         """Check counts, sums and orders against the objects; raises AssertionError."""

@@ -1,16 +1,16 @@
 """A cross-reality object as its readers see it, and its JSON shape.
 
-`ObjectRegistry.to_json`, served at /api/objects
+Served at /api/objects
 
     {"epoch": 7, "version": 120, "objects": [{
         "id": "/jackal1/odom@jackal1", "owner": "jackal1", "kind": "topic", "type": "nav_msgs/Odometry",
-        "definition": "...", "definition_hash": "<64 hex digits>", "attributes": {"class": "control"},
+        "definition_hash": "<64 hex digits>", "definition_key": "<32 hex digits>", "attributes": {"class": "control"},
         "version": 119, "seq": 42, "created_s": 12.5, "updated_s": 99.0,       monotonic seconds of the registry's host
         "ros_stamp_ns": null or int, "wall_ns": int,                           nanoseconds
         "value": {"bytes": 720, "base64": "..."}                               up to 4 KiB
               or {"bytes": 1000000, "sha256": "<64 hex digits>" or null}       larger
               or null                                                          nothing seen yet
-    }]}
+    }], "definitions": {"<32 hex digits>": "..."}}                             each text once, by its definition_key
 """
 
 import base64
@@ -60,25 +60,18 @@ class ObjectChanges(NamedTuple):
     deleted: tuple[str, ...]  # ids, oldest first, without those that exist again
 
 
-def changes_to_json(
-    changes: ObjectChanges, *, kind: ObjectKind | None = None, owner: ClientName | None = None, definitions: bool = True
-) -> dict[str, Any]:
-    """What `since` gave, of a kind and an owner (None: any); ids of deleted objects are all there."""
-    return {
-        "epoch": changes.epoch,
-        "version": changes.version,
-        "resync": changes.resync,
-        "objects": [
-            object_to_json(item, definition=definitions)
-            for item in changes.updated
-            if kind in (None, item.kind) and owner in (None, item.owner)
-        ],
-        "deleted": list(changes.deleted),
-    }
+class ChangedIds(NamedTuple):
+    """`ObjectChanges` with ids in place of objects."""
+
+    epoch: int
+    version: int
+    resync: bool
+    updated: tuple[str, ...]
+    deleted: tuple[str, ...]
 
 
-def object_to_json(item: XrObject, *, definition: bool = True) -> dict[str, Any]:
-    """One element of `objects` in the module's JSON shape."""
+def object_to_json(item: XrObject, *, key: str = "", values: bool = True) -> dict[str, Any]:
+    """One element of `objects` in the module's JSON shape; `key` of its definition, without `values` none."""
     value: dict[str, Any] | None = None
     if item.value is not None:
         value = {"bytes": item.value_bytes, "base64": base64.b64encode(item.value).decode("ascii")}
@@ -89,8 +82,8 @@ def object_to_json(item: XrObject, *, definition: bool = True) -> dict[str, Any]
         "owner": item.owner,
         "kind": item.kind.value,
         "type": item.type_name,
-        **({"definition": item.definition} if definition else {}),
         "definition_hash": item.definition_hash,
+        "definition_key": key,
         "attributes": dict(item.attributes),
         "version": item.version,
         "seq": item.seq,
@@ -98,5 +91,5 @@ def object_to_json(item: XrObject, *, definition: bool = True) -> dict[str, Any]
         "updated_s": item.updated_s,
         "ros_stamp_ns": item.ros_stamp_ns,
         "wall_ns": item.wall_ns,
-        "value": value,
+        **({"value": value} if values else {}),
     }

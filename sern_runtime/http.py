@@ -1,9 +1,10 @@
 """The daemon's small HTTP server: /metrics, /healthz, /readyz and JSON for the tools. Read-only."""
 
+import asyncio
 import errno
 import json
 import logging
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable, Iterator, Mapping
 from typing import Final, NamedTuple
 
 from aiohttp import web
@@ -12,6 +13,7 @@ from prometheus_client import CollectorRegistry
 from prometheus_client.exposition import choose_encoder
 
 from sern_core.errors import ConfigError, UsageError
+from sern_runtime.metrics import exposition
 from sern_runtime.optional import OptionalParts
 
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
@@ -19,9 +21,18 @@ JsonSource = Callable[[], object]
 """Gives what `json.dumps` takes, from state, at once."""
 
 
+class JsonParts(NamedTuple):
+    """A large answer: pieces of JSON text, each made when it is asked for, some of them in a turn of the loop. Above
+    MAX_ANSWER_BYTES it is refused with `too_large`, one line."""
+
+    pieces: Iterator[str]
+    too_large: str
+
+
 class JsonQuery(NamedTuple):
     """A JSON source with parameters, all optional: `?name=value`. `read` gets those that were given, and raises
-    UsageError for a value it does not take; that and unknown names are answered with 400 and one line."""
+    UsageError for a value it does not take; that and unknown names are answered with 400 and one line. What it gives is
+    what `json.dumps` takes, or JsonParts."""
 
     accepts: tuple[str, ...]
     read: Callable[[Mapping[str, str]], object]
@@ -32,6 +43,10 @@ class JsonQuery(NamedTuple):
 _SHUTDOWN_S: Final = 1.0
 IDLE_S: Final = 75.0
 """A connection without a whole request for so long is closed, half a request or none; longer than between scrapes."""
+MAX_ANSWER_BYTES: Final = 64 * 2**20
+SLICE_PIECES: Final = 100
+SLICE_BYTES: Final = 2**18
+"""Pieces and bytes of a large answer that are made in one turn of the loop: about 5 ms."""
 PART: Final = "http"
 _log = logging.getLogger(__name__)
 
@@ -106,6 +121,7 @@ class HttpServer:
         self._registry = registry
         self._runner: web.AppRunner | None = None
         self._requests = _RequestLog()
+        self._scraping = asyncio.Lock()
         self._app = web.Application(middlewares=[self._survive])
         self._app.router.add_get("/metrics", self._metrics)
         self._app.router.add_get("/healthz", _health_route(health))
@@ -170,7 +186,12 @@ class HttpServer:
 
     async def _metrics(self, request: web.Request) -> web.Response:
         encode, content_type = choose_encoder(request.headers.get("Accept", ""))
-        return web.Response(body=encode(self._registry), headers={"Content-Type": content_type})
+        parts: list[bytes] = []
+        async with self._scraping:
+            for part in exposition(self._registry, encode):
+                parts.append(part)
+                await asyncio.sleep(0)
+        return web.Response(body=b"".join(parts), headers={"Content-Type": content_type})
 
 
 def _problem(error: OSError) -> str:
@@ -201,14 +222,40 @@ def _asked(source: JsonQuery, query: Mapping[str, str]) -> object:
     return source.read({name: query[name] for name in query})
 
 
+async def joined(parts: JsonParts) -> bytes:
+    """The whole of a large answer, with the loop's other work in between. UsageError when it is too large."""
+    made: list[bytes] = []
+    size = pieces = turn_bytes = 0
+    for piece in parts.pieces:
+        made.append(piece.encode())
+        size += len(made[-1])
+        turn_bytes += len(made[-1])
+        pieces += 1
+        if size > MAX_ANSWER_BYTES:
+            raise UsageError(parts.too_large)
+        if pieces >= SLICE_PIECES or turn_bytes >= SLICE_BYTES:
+            pieces = turn_bytes = 0
+            await asyncio.sleep(0)
+    return b"".join(made)
+
+
 def _json_route(source: JsonSource | JsonQuery) -> Handler:
+    making = asyncio.Lock()  # one large answer at a time: what two hold is more than one may
+
     async def handle(request: web.Request) -> web.Response:
         try:
             if isinstance(source, JsonQuery) and source.prepare is not None:
                 await source.prepare(request.query)
-            text = json.dumps(_asked(source, request.query) if isinstance(source, JsonQuery) else source())
+            answer = _asked(source, request.query) if isinstance(source, JsonQuery) else source()
+            if isinstance(answer, JsonParts):
+                async with making:
+                    body = await joined(answer)
+            else:
+                body = json.dumps(answer).encode()
         except UsageError as error:
             return web.json_response({"error": str(error)}, status=400)
-        return web.Response(text=text, content_type="application/json", headers={"Cache-Control": "no-store"})
+        return web.Response(
+            body=body, content_type="application/json", charset="utf-8", headers={"Cache-Control": "no-store"}
+        )
 
     return handle

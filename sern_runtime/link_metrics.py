@@ -1,14 +1,30 @@
 """Metrics that both daemons have: their links, what goes out over them, what arrives, and how old it is."""
 
 import math
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from typing import Final
 
 from sern_core.codecs import Coder
-from sern_core.ledger import ReceiveLedger
+from sern_core.ledger import NO_DROPS, ReceiveLedger
 from sern_core.link import Link
-from sern_core.types import CLASS_LABELS
+from sern_core.types import CLASS_LABELS, DropReason
 from sern_runtime import clock
 from sern_runtime.metrics import LATENCY_EDGES_S, Histogram, HistogramCounts, Labels, Metrics
+
+LOSSES: Final = (DropReason.RETENTION, DropReason.DISCONNECTED, DropReason.SHUTDOWN)
+"""Reasons that an alert looks for: rows at 0 from the start on, so that `increase()` sees the first message. The others
+have a row from their first message on: twenty rows for each topic of each link are too many to write."""
+RECEIVED_LOSSES: Final = (DropReason.LOST, DropReason.UNDECODABLE, DropReason.FAULT)
+"""The same for what arrives."""
+
+
+def _by_reason(drops: Mapping[DropReason, int], always: Sequence[DropReason]) -> Iterator[tuple[str, float]]:
+    for reason in always:
+        yield reason.value, float(drops[reason])
+    if drops is not NO_DROPS:
+        for reason, count in drops.items():
+            if count and reason not in always:
+                yield reason.value, float(count)
 
 
 class AgeHistograms:
@@ -50,23 +66,24 @@ def register_links(metrics: Metrics, links: Callable[[], Collection[Link]]) -> N
 
         return collect
 
-    def per_topic(read: str) -> Callable[[], list[tuple[Labels, float]]]:
-        def collect() -> list[tuple[Labels, float]]:
-            return [
-                ((link.peer, counters.topic, CLASS_LABELS[counters.priority]), float(getattr(counters, read)))
-                for link in links()
-                for counters in link.ledger.topics.values()
-            ]
+    # A list for each link: links and topics come and go while the next is waited for.
+    def per_topic(read: str) -> Callable[[], Iterator[tuple[Labels, float]]]:
+        def collect() -> Iterator[tuple[Labels, float]]:
+            for link in tuple(links()):
+                yield from [
+                    ((link.peer, counters.topic, CLASS_LABELS[counters.priority]), float(getattr(counters, read)))
+                    for counters in link.ledger.topics.values()
+                ]
 
         return collect
 
-    def drops() -> list[tuple[Labels, float]]:
-        return [
-            ((link.peer, counters.topic, CLASS_LABELS[counters.priority], str(reason)), float(count))
-            for link in links()
-            for counters in link.ledger.topics.values()
-            for reason, count in counters.by_reason.items()
-        ]
+    def drops() -> Iterator[tuple[Labels, float]]:
+        for link in tuple(links()):
+            yield from [
+                ((link.peer, counters.topic, CLASS_LABELS[counters.priority], reason), count)
+                for counters in link.ledger.topics.values()
+                for reason, count in _by_reason(counters.by_reason, LOSSES)
+            ]
 
     gauge, counter = metrics.gauge, metrics.counter
     peer = ("peer",)
@@ -145,9 +162,9 @@ def register_received(metrics: Metrics, received: ReceiveLedger, ages: AgeHistog
 
     def drops() -> list[tuple[Labels, float]]:
         return [
-            ((c.topic, CLASS_LABELS[c.priority], str(reason)), float(count))
+            ((c.topic, CLASS_LABELS[c.priority], reason), count)
             for c in received.topics.values()
-            for reason, count in c.by_reason.items()
+            for reason, count in _by_reason(c.by_reason, RECEIVED_LOSSES)
         ]
 
     topic = ("topic", "class")

@@ -4,13 +4,16 @@ A body is walked field by field as its type says. What has a fixed layout is cop
 messages without padding too, so that a walk takes half a microsecond for each text and each group of fields, and none
 for a point or a pixel. These steps are counted before they are done: a count in a body may claim four thousand million
 messages that have no bytes, and a compressed body of a kilobyte may hold a million that have some. Above MAX_STEPS the
-body is refused. No code is generated, so a type costs nothing before its first body and little then.
+body is refused. No code is generated, so a type costs nothing before its first body and little then. The steps of a
+type in another are among those of the other, so that a definition of a kilobyte could claim a million of them: they are
+counted as they are made, and above MAX_PLAN_STEPS the type is refused.
 
     ROS 1     little endian, no padding, text without a terminator, Header begins with `seq`
     CDR       numbers aligned to their size, text with a terminator, a message without fields is one byte
 """
 
 from collections.abc import Callable, Sequence
+from functools import lru_cache
 from struct import Struct, error
 from typing import Final, NamedTuple
 
@@ -19,9 +22,16 @@ from rosbags.interfaces.typing import FieldDesc, Typesdict
 
 from sern_core.errors import BodyError, ConfigError
 from sern_core.types import Encoding
+from sern_runtime.ros_types import ResolvedType
 
 MAX_STEPS: Final = 24_000
 """Texts and groups of fields in one body: about 8 ms. A path of 4800 poses, or as many transforms."""
+
+MAX_PLAN_STEPS: Final = 5_000
+"""Steps in all plans of the types that a type uses: some milliseconds. All types of a ROS distribution together have
+less than 2000."""
+PLANS: Final = 128
+"""Plans that are kept for the next stream of their type."""
 
 _HEADER: Final = "std_msgs/msg/Header"
 _FILLER: Final = "structure_needs_at_least_one_member"
@@ -62,11 +72,29 @@ class Plan(NamedTuple):
     has_frames: bool
 
 
+def plan_of(target: ResolvedType, *, ros1: ResolvedType | None = None, one_by_one: bool = False) -> Plan:
+    """`plan` of a type that is resolved, made once for all streams of it. ConfigError, which is found out once, too."""
+    found = _planned(target, ros1, one_by_one)
+    if isinstance(found, str):
+        raise ConfigError(found)
+    return found
+
+
+@lru_cache(maxsize=PLANS)
+def _planned(target: ResolvedType, ros1: ResolvedType | None, one_by_one: bool) -> Plan | str:
+    other = None if ros1 is None else ros1.store.fielddefs
+    try:
+        return plan(target.name, target.store.fielddefs, ros1=other, one_by_one=one_by_one)
+    except ConfigError as error:
+        return str(error)
+
+
 def plan(type_name: str, fielddefs: Typesdict, *, ros1: Typesdict | None = None, one_by_one: bool = False) -> Plan:
     """The plan of a type whose fields, and those of the types it uses, are in `fielddefs` of either encoding.
 
     `ros1`: `fielddefs` is of CDR, and fields may be missing here. `one_by_one`: messages without padding between them
-    are steps of their own, for whoever only counts. ConfigError for a field of a kind that does not exist in both.
+    are steps of their own, for whoever only counts. ConfigError for a field of a kind that does not exist in both, and
+    for more than MAX_PLAN_STEPS.
     """
     planner = _Planner(fielddefs, ros1, one_by_one)
     ops = planner.ops_of(type_name)
@@ -102,6 +130,7 @@ class _Planner:
         self._fielddefs = fielddefs
         self._ros1 = ros1
         self._one_by_one = one_by_one
+        self._left = MAX_PLAN_STEPS
 
     def ops_of(self, name: str) -> tuple[_Op, ...]:
         if name not in self.known:
@@ -116,6 +145,9 @@ class _Planner:
                 if name == _HEADER and field == "seq":
                     continue
                 own = self._field(name, field, desc)
+                self._left -= len(own)
+                if self._left < 0:
+                    raise ConfigError(f"type {name} has too many parts in each other: over {MAX_PLAN_STEPS}")
                 if there is not None and field.lower() not in there and field != _FILLER:
                     own = [op._replace(only_cdr=True) for op in own]
                 for op in own:

@@ -431,15 +431,15 @@ def _refuse_a_running_daemon(identity: Identity) -> None:
 # --- without a key: the values that a daemon has ----------------------------------------------------------------
 
 
-def _values(api: str, topic: str) -> tuple[list[dict[str, Any]], str]:
-    """What the daemon has of `topic`, and what it means that there is nothing."""
+def _values(api: str, topic: str) -> tuple[list[dict[str, Any]], dict[str, str], str]:
+    """What the daemon has of `topic`, texts of definitions by their key, and what it means that there is nothing."""
+    query = f"?topic={quote(topic, safe='')}"
     try:
-        objects, nothing = get_json(api, "/api/objects")["objects"], "no topic {topic}"
+        answer, nothing = get_json(api, f"/api/objects{query}"), "no topic {topic}"
     except NotFoundError:  # a client
-        objects = get_json(api, f"/api/values?topic={quote(topic, safe='')}")["objects"]
-        nothing = "no message of {topic} has passed this client"
-    found = [item for item in objects if is_stream(item) and item["attributes"]["topic"] == topic]
-    return found, nothing.format(topic=topic)
+        answer, nothing = get_json(api, f"/api/values{query}"), "no message of {topic} has passed this client"
+    found = [item for item in answer["objects"] if is_stream(item) and item["attributes"]["topic"] == topic]
+    return found, answer["definitions"], nothing.format(topic=topic)
 
 
 async def poll(
@@ -457,7 +457,7 @@ async def poll(
     began_s = clock.now()
     warned = False
     while not shutdown.requested:
-        found, nothing = await asyncio.to_thread(_values, api, topic)
+        found, definitions, nothing = await asyncio.to_thread(_values, api, topic)
         if not found and not shown and timeout_s and clock.now() - began_s > timeout_s:
             raise SernError(f"{api}: {nothing} within {timeout_s:g} s; `sern topics` lists what there is")
         if found and not shown and not warned and timeout_s and clock.now() - began_s > timeout_s:
@@ -478,7 +478,7 @@ async def poll(
                 )
             encoding = Encoding(item["attributes"]["encoding"])
             if item["id"] not in shown:
-                decoder.prepare(topic, item["type"], item["definition"], encoding)
+                decoder.prepare(topic, item["type"], definitions.get(item["definition_key"], ""), encoding)
             shown[item["id"]] = item["version"]
             comment = f"# {item['owner']} seq {item['seq']} latest value"
             if printer.write(comment, topic, item["type"], encoding, base64.b64decode(value["base64"])):

@@ -27,6 +27,9 @@ from sern_tools.api import NotFoundError, checked_api, drop_output, get_json, is
 MIN_INTERVAL_S: Final = 0.1
 PLAIN_WIDTH: Final = 200
 """Characters of a line where the output is no terminal: nothing is cut short in a file."""
+REREAD_S: Final = 30.0
+"""How long to wait before it is asked again whose a topic is that nobody had."""
+OBJECTS_PATH: Final = "/api/objects?definitions=no&values=no"
 NOT_LOSSES: Final = frozenset({"duplicate"})
 """Reasons that do not mean that a message is missing."""
 
@@ -167,6 +170,8 @@ class Watcher:
         self._get = get
         self._clock = clock
         self._identities: dict[str, Identity] = {}
+        self._asked: set[str] = set()
+        self._asked_s = 0.0
         self._has_registry = True
         self._at_s, self._before = self._look()
 
@@ -186,10 +191,12 @@ class Watcher:
     def rows(self) -> list[Row]:
         """What changed since the call before. Raises SernError when the daemon does not answer."""
         at_s, now = self._look()
-        # The registry holds values too and is large: it is read only for names that are new.
-        if self._has_registry and not now.keys() <= self._identities.keys():
+        # The registry is large: it is read for names that are new. Some have counters and no object there, or none yet.
+        missing = now.keys() - self._identities.keys()
+        if self._has_registry and missing and (not missing <= self._asked or at_s - self._asked_s >= REREAD_S):
+            self._asked, self._asked_s = missing, at_s
             try:
-                self._identities = parse_identities(self._get(self.api, "/api/objects"))
+                self._identities = parse_identities(self._get(self.api, OBJECTS_PATH))
             except NotFoundError:
                 self._has_registry = False
         rows = compare(self._before, now, max(at_s - self._at_s, 1e-3), self._identities)

@@ -66,6 +66,25 @@ definition("arrays of texts", "string[4900] x\n")
 definition("arrays of numbers", "float64[1048576] x\n" * 1)
 definition("huge arrays", "uint8[4294967295] x\n")
 definition("in each other", "B0 x\n" + "".join(f"{SEP}\nMSG: evil/B{n}\nB{n + 1} x\nB{n + 1} y\n" for n in range(30)))
+
+
+def of_one_large_type(users: int, fields: tuple[str, str]) -> str:
+    """Types that are nothing but sequences for who looks at the first, each with 4500 fields by way of others."""
+    text = "".join(f"C{n}[] c{n}\n" for n in range(users))
+    text += f"{SEP}\nMSG: evil/L0\n" + "".join(f"{fields[n % 2]} s{n}\n" for n in range(9))
+    for level, times in enumerate((8, 8, 7)):
+        text += f"{SEP}\nMSG: evil/L{level + 1}\n" + "".join(f"L{level} f{n}\n" for n in range(times))
+    return text + "".join(f"{SEP}\nMSG: evil/C{n}\nL3 b\n" for n in range(users))
+
+
+definition("sequences of one large type", of_one_large_type(220, ("string", "string")))
+definition("sequences of one large type of numbers", of_one_large_type(220, ("uint8", "float64")))
+definition("a few of one large type", of_one_large_type(1, ("uint8", "float64")))
+definition(
+    "types that are known",
+    "".join(f"C{n}[] c{n}\n" for n in range(50))
+    + "".join(f"{SEP}\nMSG: evil/C{n}\n" + "".join(f"nav_msgs/Odometry x{k}\n" for k in range(18)) for n in range(50)),
+)
 definition("a long number", "int32 X=" + "9" * 100_000 + "\n")
 definition("quotes", ("string X='" + "\\\\" * 1_900 + "\n") * 60)
 definition("underscores", ("a_" * 2_000 + "\n") * 60)

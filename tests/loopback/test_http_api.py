@@ -10,8 +10,9 @@ from prometheus_client import CollectorRegistry
 from prometheus_client.parser import text_string_to_metric_families
 
 from sern_client.daemon import ClientDaemon
-from sern_core.types import CLASS_LABELS, ClientName, DropReason
+from sern_core.types import CLASS_LABELS, ClientName
 from sern_relay.daemon import RelayDaemon
+from sern_runtime.link_metrics import LOSSES, RECEIVED_LOSSES
 from sern_runtime.metrics import check_names
 from tests.daemons import Lab, write_bag
 from tests.support import until
@@ -103,13 +104,13 @@ async def test_metrics_and_json_of_a_running_system(tmp_path: Path) -> None:
             offered = found["sern_messages_offered_total"]
             assert len(offered) >= 5
             for labels in offered:
-                for reason in DropReason:
+                for reason in LOSSES:
                     assert tuple(sorted((*labels, ("reason", reason)))) in dropped
         arrived = await samples(site)
         received = arrived["sern_received_messages_total"]
         assert received[("class", "state"), ("topic", "/robot1/chat")] == 50.0
         for labels in received:
-            for reason in DropReason:
+            for reason in RECEIVED_LOSSES:
                 assert tuple(sorted((*labels, ("reason", reason)))) in arrived["sern_received_dropped_total"]
         for label in CLASS_LABELS:
             assert (("class", label),) in arrived["sern_message_age_seconds_count"]

@@ -64,7 +64,7 @@ async def test_the_five_kinds_of_object(tmp_path: Path) -> None:
         status, everything = await ask(relay, definitions="no")
         assert status == 200
         assert {item["kind"] for item in everything["objects"]} == set(ObjectKind)
-        assert all("definition" not in item for item in everything["objects"])
+        assert "definitions" not in everything
 
         status, transforms = await ask(relay, kind="transform", owner="jackal1")
         assert status == 200
@@ -76,6 +76,8 @@ async def test_the_five_kinds_of_object(tmp_path: Path) -> None:
         assert static
 
         assert (await ask(relay, owner="operator1", kind="transform"))[1]["objects"] == []
+        (odom,) = (await ask(relay, topic="/jackal1/odometry/filtered"))[1]["objects"]
+        assert odom["id"] == expected[ObjectKind.TOPIC]
 
         # What changes is listed once, and what is gone by its id.
         first = (await ask(relay, since=0))[1]
@@ -97,11 +99,12 @@ async def test_the_five_kinds_of_object(tmp_path: Path) -> None:
     ("parameters", "said"),
     [
         ({"kind": "thing"}, "kind is 'thing'; accepted: topic, transform, node, patch, command"),
-        ({"kin": "node"}, "unknown parameter 'kin'; accepted: kind, owner, definitions, since, epoch"),
+        ({"kin": "node"}, "unknown parameter 'kin'; accepted: kind, owner, topic, definitions, values, since, epoch"),
         ({"since": "x"}, "since is 'x'; a version or epoch of an earlier answer is needed"),
         ({"since": "-1"}, "since is '-1'; a version or epoch of an earlier answer is needed"),
         ({"epoch": "1"}, "epoch has no use without since"),
         ({"definitions": "maybe"}, "definitions is 'maybe'; accepted: yes, no"),
+        ({"values": "maybe"}, "values is 'maybe'; accepted: yes, no"),
     ],
 )
 async def test_a_wrong_question_is_answered_in_one_line(tmp_path: Path, parameters: dict[str, str], said: str) -> None:

@@ -32,7 +32,9 @@ def test_the_newest_is_kept_of_each_topic() -> None:
     (found,) = objects(values)
     assert base64.b64decode(found["value"]["base64"]) == b"two"
     assert (found["owner"], found["seq"], found["type"]) == ("robot1", 2, "std_msgs/msg/String")
-    assert found["attributes"] == {"topic": "/a", "encoding": "ros1"} and found["definition"] == "string data"
+    assert found["attributes"] == {"topic": "/a", "encoding": "ros1"} and len(found["definition_key"]) == 32
+    answer: Any = values.view().read({"topic": "/a"})
+    assert answer["definitions"] == {found["definition_key"]: "string data"}
     assert [item["attributes"]["topic"] for item in objects(values, "/b")] == ["/b"]
     with pytest.raises(UsageError, match="topic is missing"):
         values.view().read({})

@@ -15,6 +15,7 @@ from sern_core.errors import RefusedError
 from sern_core.message import StreamId, StreamInfo, TopicInfo, TopicSpec
 from sern_core.objects import ObjectLimits, ObjectRegistry, kind_of, topic_object_id
 from sern_core.types import ClientName, Encoding, ObjectKind, PriorityClass, TopicName
+from sern_core.xr_object import object_to_json
 from tests.exploring import cases
 
 A, B = ClientName("a"), ClientName("b")
@@ -54,10 +55,10 @@ def put(
 
 
 def refused(registry: ObjectRegistry, object_id: str, owner: ClientName = A, **more: str) -> RefusedError:
-    before = registry.to_json()
+    before = registry.version, registry.select()
     with pytest.raises(RefusedError) as caught:
         put(registry, object_id, owner, **more)  # type: ignore[arg-type]
-    assert registry.to_json() == before
+    assert (registry.version, registry.select()) == before
     assert "\n" not in str(caught.value)
     registry.validate()
     return caught.value
@@ -259,16 +260,14 @@ def test_json_shape() -> None:
     registry.observe(info.id, 1, b"\x00\xff", wall_ns=5, now=2.0)
     put(registry, "big", value=b"12345")
     put(registry, "none")
-    view = json.loads(json.dumps(registry.to_json()))
-    assert (view["epoch"], view["version"]) == (7, 4)
-    odom, big, none = view["objects"]
+    odom, big, none = json.loads(json.dumps([object_to_json(item, key="k") for item in registry.select()]))
     assert odom == {
         "id": "/odom@a",
         "owner": "a",
         "kind": "topic",
         "type": "nav_msgs/Odometry",
-        "definition": "float64 x",
         "definition_hash": "cafe",
+        "definition_key": "k",
         "attributes": {
             "frame_id": "base",
             "topic": "/odom",
@@ -287,8 +286,10 @@ def test_json_shape() -> None:
     }
     assert big["value"] == {"bytes": 5, "sha256": hashlib.sha256(b"12345").hexdigest()}
     assert none["value"] is None
-    assert "definition" not in registry.to_json(definitions=False)["objects"][0]
-    assert [item["id"] for item in registry.to_json(kind=ObjectKind.TOPIC)["objects"]] == ["/odom@a"]
+    assert "value" not in object_to_json(registry.select()[0], values=False)
+    assert registry.named(topic=TopicName("/odom")) == registry.named(owner=A, topic=TopicName("/odom")) == ["/odom@a"]
+    assert registry.named(owner=ClientName("c"), topic=TopicName("/odom")) == []
+    assert sorted(registry.named()) == sorted(registry.named(owner=A)) == ["/odom@a", "big", "none"]
 
 
 # Against a model -----------------------------------------------------------------------------------------------------
@@ -310,7 +311,7 @@ def test_where_it_must_not_take_long_large_values_are_read_elsewhere() -> None:
     object_id = topic_object_id(info.id)
 
     def told() -> object:
-        return registry.to_json()["objects"][0]["value"]
+        return object_to_json(registry.select()[0])["value"]
 
     assert told() == {"bytes": len(raw), "sha256": None}
     assert registry.unread(kind=ObjectKind.NODE) == [] == registry.unread(version=registry.version)

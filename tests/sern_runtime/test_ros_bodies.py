@@ -15,7 +15,7 @@ from sern_client.frames import FramePrefixer
 from sern_core.errors import BodyError, ConfigError
 from sern_core.message import TopicInfo
 from sern_core.types import Encoding, TopicName
-from sern_runtime import ros_bodies, ros_types
+from sern_runtime import ros_bodies, ros_text, ros_types
 
 ROS1, CDR = Encoding.ROS1, Encoding.CDR
 
@@ -175,3 +175,42 @@ def test_any_bytes_are_a_body_or_an_error() -> None:
                 except BodyError:
                     continue
                 assert len(out) <= 8 * len(damaged) + 64
+
+
+@pytest.mark.parametrize("encoding", [ROS1, CDR])
+def test_plans_of_all_shipped_types_take_a_fraction_of_what_may_be(encoding: Encoding) -> None:
+    store = ros_types.typestore(encoding)
+    planner = ros_bodies._Planner(store.fielddefs, None, one_by_one=True)
+    for name in store.fielddefs:
+        planner.ops_of(name)  # what the others have made is not made again: this is the sum of them all
+    assert 0 < ros_bodies.MAX_PLAN_STEPS - planner._left < ros_bodies.MAX_PLAN_STEPS / 2
+
+
+def test_steps_of_types_behind_sequences_are_counted_as_they_are_made(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = 0
+    original = ros_bodies._append
+
+    def count(ops: list[ros_bodies._Op], op: ros_bodies._Op) -> None:
+        nonlocal made
+        made += 1
+        original(ops, op)
+
+    monkeypatch.setattr(ros_bodies, "_append", count)
+    users = 200
+    text = "".join(f"C{n}[] c{n}\n" for n in range(users))
+    text += f"{ros_text.SEPARATOR}\nMSG: my_msgs/B\n" + "".join(f"string s{n}\n" for n in range(500))
+    text += "".join(f"{ros_text.SEPARATOR}\nMSG: my_msgs/C{n}\nB b\n" for n in range(users))
+    resolved = ros_types.resolve("my_msgs/msg/A", text, CDR)
+    for _ in range(3):  # what is wrong with it is found out once
+        with pytest.raises(ConfigError, match="too many parts in each other: over 5000"):
+            ros_bodies.plan_of(resolved)
+    assert made <= ros_bodies.MAX_PLAN_STEPS
+
+
+def test_the_plan_of_a_type_is_made_once_for_all_its_streams() -> None:
+    text = "Header header\nfloat64 x\n"
+    first = ros_bodies.plan_of(ros_types.resolve("my_msgs/msg/Kept", text, CDR))
+    assert ros_bodies.plan_of(ros_types.resolve("my_msgs/msg/Kept", text, CDR)) is first
+    other = ros_bodies.plan_of(ros_types.resolve("my_msgs/msg/Kept", text + "string y\n", CDR))
+    assert len(other.ops) == len(first.ops) + 1
+    assert ros_bodies._planned.cache_info().maxsize == ros_bodies.PLANS

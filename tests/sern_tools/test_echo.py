@@ -426,10 +426,13 @@ class Registry(BaseHTTPRequestHandler):
     def do_GET(self) -> None:
         value = {"base64": base64.b64encode(ros_types.serialise(message_of(TEXT, data="here"), TEXT, ROS1)).decode()}
         attributes = {"topic": "/r/text", "encoding": "ros1"}
-        item = {"id": "1", "version": 1, "owner": "r", "type": TEXT, "definition": "", "seq": 7, "value": value}
+        item = {"id": "1", "version": 1, "owner": "r", "type": TEXT, "definition_key": "", "seq": 7, "value": value}
         self.send_response(200)
         self.end_headers()
-        self.wfile.write(json.dumps({"objects": [item | {"attributes": attributes}]}).encode())
+        objects = (
+            [item | {"attributes": attributes}] if self.path in ("/api/objects?topic=%2Fr%2Ftext", "/api/link") else []
+        )
+        self.wfile.write(json.dumps({"objects": objects, "definitions": {}}).encode())
 
     def log_message(self, *_: object) -> None:
         """Say nothing."""

@@ -18,6 +18,8 @@ from sern_tools import api
 from sern_tools.commands import app
 from sern_tools.ports import free_ports
 from sern_tools.topics import (
+    OBJECTS_PATH,
+    REREAD_S,
     UNTAKEN_NOTE,
     Counts,
     Identity,
@@ -136,13 +138,16 @@ def test_the_registry_is_read_when_a_name_is_new() -> None:
 
     def get(_api: str, path: str) -> Any:
         asked.append(path)
-        return OBJECTS if path == "/api/objects" else {"links": {}, "received": {"/r/odom": arrived(1)}}
+        received = {"/r/odom": arrived(1), "/r/ended": arrived(1)}  # one of them has no object
+        return OBJECTS if path == OBJECTS_PATH else {"links": {}, "received": received}
 
-    clock = iter((0.0, 1.0, 2.0))
+    clock = iter((0.0, 1.0, 2.0, 1.0 + REREAD_S))
     watcher = Watcher(URL, compile_pattern("/r/.*"), get=get, clock=lambda: next(clock))
-    assert watcher.rows()[0].owner == "r"
-    assert watcher.rows()[0].owner == "r"
-    assert asked.count("/api/objects") == 1
+    for _ in range(2):
+        assert {row.topic: row.owner for row in watcher.rows()} == {"/r/odom": "r", "/r/ended": None}
+    assert asked.count(OBJECTS_PATH) == 1
+    watcher.rows()
+    assert asked.count(OBJECTS_PATH) == 2
 
 
 @pytest.mark.parametrize(
@@ -156,7 +161,7 @@ def test_the_registry_is_read_when_a_name_is_new() -> None:
 def test_streams_of_services_are_shown_when_asked_for(options: dict[str, Any], expected: list[str] | None) -> None:
     def get(_api: str, path: str) -> Any:
         answer = {"links": {}, "received": {"/r/odom": arrived(1), "/r/go/_call/a": arrived(1)}}
-        return OBJECTS if path == "/api/objects" else answer
+        return OBJECTS if path == OBJECTS_PATH else answer
 
     clock = iter((0.0, 1.0))
     watcher = Watcher(URL, get=get, clock=lambda: next(clock), **options)
