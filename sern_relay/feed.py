@@ -121,6 +121,7 @@ class RelayFeed:
                 ("malformed", fed.malformed),
                 ("limited", fed.limited),
                 ("endless", fed.endless),
+                ("capped", fed.capped),
                 ("injected", injected.injected),
                 ("untyped", injected.untyped),
                 ("dropped", injected.dropped),

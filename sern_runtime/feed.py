@@ -36,7 +36,7 @@ from sern_core.access import RateGuard
 from sern_core.rules import FeedRole
 from sern_core.types import CLASSES, PriorityClass, TopicName
 from sern_runtime.clock import now
-from sern_runtime.feed_inflow import TOLD_BYTES, FeedInflow
+from sern_runtime.feed_inflow import SUBSCRIBER_BYTES, TOLD_BYTES, FeedInflow
 from sern_runtime.zmq_socket import (
     BACKLOG,
     ZERO_COPY_BYTES,
@@ -53,7 +53,11 @@ HEADER: Final = struct.Struct("!BBHIqQ")
 MAX_TOPIC_BYTES: Final = 512
 MAX_FRAMES: Final = 8
 MAX_MESSAGE_BYTES: Final = 16 * 2**20
-"""A frame above this closes its connection. The local network carries maps and images whole."""
+"""A publisher's frame above this closes its connection. The local network carries maps and images whole."""
+MAX_SUBSCRIPTION_BYTES: Final = MAX_TOPIC_BYTES + 64
+"""A subscriber's frame above this closes its connection: a longer prefix is that of no topic frame, and libzmq keeps
+some hundred bytes for each of its bytes, on our thread. 64: the name of a command (10), and CURVE's box around it
+(33)."""
 HIGH_WATER: Final = 1000
 """Messages that may wait for a slow subscriber; libzmq drops what comes after them, for that subscriber alone."""
 MAX_PREFIXES: Final = 4096
@@ -113,6 +117,7 @@ class FeedCounters:
     malformed: int = 0
     limited: int = 0  # more than the role's limits let in
     endless: int = 0  # connections that were cut: bytes arrived on them, and no message did
+    capped: int = 0  # connections that were cut: the role had as many as it may
 
 
 Accept = Callable[[FeedRole, TopicName], bool]
@@ -129,6 +134,8 @@ class Feed:
     of wanted prefixes has changed. `keys` makes the sockets CURVE servers in the ZAP domain `feed.NAME`; without
     keys the role's addresses are the only guard, which the configuration has to allow. Raises ConfigError when an
     endpoint cannot be had. `close()` once.
+
+    A subscriber's frames are bounded by what can name a topic, and its connection by `SUBSCRIBER_BYTES` of them.
     """
 
     def __init__(
@@ -214,6 +221,9 @@ class Feed:
 
     def counters(self) -> dict[str, FeedCounters]:
         """Counters by role name."""
+        for name, outlet in self._outlets.items():
+            inlet = self._inlets.get(name)
+            outlet.counters.capped = outlet.inflow.capped + (inlet.inflow.capped if inlet is not None else 0)
         return {name: outlet.counters for name, outlet in self._outlets.items()}
 
     def endpoints(self) -> dict[str, tuple[str, str | None]]:
@@ -235,7 +245,14 @@ class Feed:
     def _bound(self, kind: int, role: FeedRole, endpoint: str) -> "zmq.Socket[bytes]":
         socket = self._ctx.socket(kind)
         try:
-            apply_common_options(socket, max_message_bytes=self.max_message_bytes, sndhwm=HIGH_WATER, rcvhwm=HIGH_WATER)
+            if kind == zmq.XPUB:
+                # One at a time: libzmq takes in all that waits before it lets go of our thread, and meanwhile nobody
+                # sees how much a connection brings.
+                limit_bytes, rcvhwm = MAX_SUBSCRIPTION_BYTES, 1
+                socket.setsockopt(zmq.RCVBUF, SUBSCRIBER_BYTES)  # what has arrived is read also after a cut
+            else:
+                limit_bytes, rcvhwm = self.max_message_bytes, HIGH_WATER
+            apply_common_options(socket, max_message_bytes=limit_bytes, sndhwm=HIGH_WATER, rcvhwm=rcvhwm)
             socket.setsockopt(zmq.HEARTBEAT_IVL, 0)  # not every implementation answers ZMTP pings; TCP looks instead
             socket.setsockopt(zmq.TCP_KEEPALIVE, 1)
             socket.setsockopt(zmq.BACKLOG, BACKLOG)
