@@ -265,7 +265,7 @@ class RelayDaemon:
             now = clock.now()
             self.hub.sweep(now=now)
             if self.server is not None:
-                self.server.express.look()
+                self.server.look()
             self.datagrams.tick()
             if self.message_log is not None:
                 with self.parts.survive("message_log"):
@@ -404,6 +404,8 @@ class RelayDaemon:
             "routing_id": socket.refused_routing_ids,
             "multipart": socket.malformed + server.inflow.endless,
             "revoked": server.revoked,
+            "surplus": server.surplus,
+            "silent": server.silent,
             "join": server.express.refused,
         }
         return [((reason,), float(count)) for reason, count in counts.items()]

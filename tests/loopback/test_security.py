@@ -9,7 +9,8 @@ import re
 import shutil
 import socket as socketlib
 from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager
+from contextlib import AsyncExitStack, asynccontextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from sern_client.daemon import ClientDaemon
 from sern_core import wire
 from sern_core.types import TopicName
 from sern_relay.daemon import REFUSAL_CODES, RelayDaemon
+from sern_relay.server import MAX_PORTS
 from sern_runtime.keys import SecretKey, load_public, load_secret
 from sern_runtime.monitor import SocketMonitor
 from sern_runtime.zmq_socket import DealerSocket, make_client
@@ -205,6 +207,56 @@ async def test_nobody_joins_the_session_of_another(tmp_path: Path, caplog: pytes
             assert server.express.refused == number
         await world.refused("join")
         assert not any(joined.client == "robot2" for joined in server.express.joined.values())
+
+
+async def test_one_client_has_a_few_connections(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    async with bystanders(tmp_path, caplog) as world, AsyncExitStack() as stack:
+        server = world.relay.server
+        assert server is not None
+        keys = load_secret(world.lab.directory / "robot2.key")
+        stray = wire.encode_header(wire.Kind.DATA, 1, 1, 0)
+        strangers = [await stack.enter_async_context(Stranger(world.lab, keys)) for _ in range(MAX_PORTS + 4)]
+        await strangers[0].send(hello("robot2"))
+        await until(lambda: strangers[0].received, "one has a session")
+        for stranger in strangers[1:]:
+            await stranger.send(stray)
+            await until(lambda each=stranger: each.received, "it is told that there is none")  # type: ignore[misc]
+        for stranger in strangers[1:5]:
+            await stranger.cut()
+        assert len(server.connections.handles_of("robot2")) == MAX_PORTS
+        assert zmq.Event.DISCONNECTED not in strangers[0].events, "the one with the session stays"
+        assert server.surplus == 4
+        await world.refused("surplus")
+        assert sum("robot2 has more than" in message for message in caplog.messages) == 1
+
+
+async def test_connections_for_class_control_count_over_all_sessions(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    async with bystanders(tmp_path, caplog) as world, AsyncExitStack() as stack:
+        server = world.relay.server
+        assert server is not None
+        keys = load_secret(world.lab.directory / "robot2.key")
+        lane = await stack.enter_async_context(Stranger(world.lab, keys))
+        server_express = server.express
+        for tag in range(1, 4):
+            await lane.send(hello("robot2", tag))
+            await until(lambda: "robot2" in world.relay.hub.links, "a session")
+            envelope: wire.Envelope = {"name": "robot2", "boot": 7, "relay": world.relay.hub.boot}
+            join = wire.encode_handshake(wire.Kind.JOIN, tag, 0, envelope)
+
+            def joined(count: int) -> bool:
+                lanes = server_express._lanes
+                return "robot2" in lanes and len(lanes["robot2"].paths) == count
+
+            for count in (1, 2):
+                express = await stack.enter_async_context(Stranger(world.lab, keys))
+                await express.send(join)
+                await until(partial(joined, count), "it has joined")
+            await lane.send(wire.encode_handshake(wire.Kind.CLOSE, tag, 0, {"code": "bye", "why": "bye"}))
+            await until(lambda: "robot2" not in world.relay.hub.links, "it is forgotten")
+            assert sum(each.client == "robot2" for each in server.express.joined.values()) <= 2
+        assert server.express.refused == 0
 
 
 def oversize() -> list[bytes]:
