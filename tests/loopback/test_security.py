@@ -8,22 +8,25 @@ import json
 import re
 import shutil
 import socket as socketlib
+import time
 from collections.abc import AsyncIterator, Callable
 from contextlib import AsyncExitStack, asynccontextmanager
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import zmq
 
 import sern_core
+import sern_relay.daemon
 from sern_client.daemon import ClientDaemon
 from sern_core import wire
-from sern_core.types import TopicName
+from sern_core.types import ClientName, TopicName
 from sern_relay.daemon import REFUSAL_CODES, RelayDaemon
 from sern_relay.server import MAX_PORTS
-from sern_runtime.keys import SecretKey, load_public, load_secret
+from sern_runtime.keys import PublicKey, PublicKeys, SecretKey, generate, load_public, load_secret, write_public
 from sern_runtime.monitor import SocketMonitor
 from sern_runtime.zmq_socket import DealerSocket, make_client
 from tests.daemons import ALLOW_ALL, HOST, Lab, bodies, write_bag
@@ -416,6 +419,33 @@ async def test_a_rotated_key_ends_the_connections_of_the_old_one(
         await lab.end(robot)
         robot = await lab.connected(tmp_path / "robot1.yaml")
         await lab.end(robot)
+        await lab.end(relay)
+
+
+async def test_a_silent_connection_does_not_outlive_its_key(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    async with Lab(tmp_path, *CLIENTS) as lab:
+        old, new = load_secret(tmp_path / "robot2.key"), generate(ClientName("robot2"))
+        end_s = int(time.time()) + 3600
+        keys = (PublicKey(old.public_key, None, end_s), PublicKey(new.public_key))
+        write_public(lab.clients_dir / "robot2.pub", PublicKeys(old.name, keys), replace=True)
+        relay = await lab.relay()
+        assert relay.server is not None
+        async with Stranger(lab, old) as silent, Stranger(lab, old) as loud:
+            await loud.send(hello("robot2"))
+            await until(lambda: loud.received, "it has a session")
+            await until(lambda: zmq.Event.HANDSHAKE_SUCCEEDED in silent.events, "admitted by its key, that holds")
+            relay._end_lapsed()
+            assert zmq.Event.DISCONNECTED not in (*silent.events, *loud.events)
+            wall = SimpleNamespace(time=lambda: end_s + 1.0, time_ns=time.time_ns)
+            monkeypatch.setattr(sern_relay.daemon, "time", wall)
+            table = relay.server.connections._connections
+            assert len(table) == 2 and not any(connection.ended for connection in table.values())
+            relay._end_lapsed()
+            assert all(connection.ended for connection in table.values())
+            assert relay.server._sessions == {}
+            await loud.cut()
+            await silent.cut()
+            monkeypatch.undo()
         await lab.end(relay)
 
 
