@@ -3,13 +3,16 @@
 import asyncio
 import socket as socketlib
 from collections.abc import AsyncIterator, Iterable
+from typing import cast
 
 import pytest
 import zmq
 
+from sern_core.hub import Hub
 from sern_core.patterns import compile_pattern
 from sern_core.rules import FeedRole
 from sern_core.types import PriorityClass, TopicName
+from sern_relay.feed import INTEREST_STREAMS, RelayFeed
 from sern_runtime import feed_inflow
 from sern_runtime.feed import MAX_SUBSCRIPTION_BYTES, MAX_TOPIC_BYTES, Feed, FeedHeader, topic_frame
 from tests.loopback.test_inflow import GREETING
@@ -140,3 +143,72 @@ async def test_a_role_has_so_many_connections(feed: Feed) -> None:
     assert feed.counters()["unity"].capped == 2
     for peer in peers:
         peer.close()
+
+
+async def test_many_subscriptions_are_told_once(zmq_context: Context) -> None:
+    changes: list[tuple[bytes, ...]] = []
+    feed = Feed(
+        zmq_context,
+        [FeedRole("unity", "tcp://127.0.0.1:*", subscribe=(ANY,))],
+        on_interest=lambda: changes.append(feed.prefixes()["unity"]),
+    )
+    outlet = feed._outlets["unity"]
+    for number in range(1000):
+        outlet._subscribed(b"/t%03d" % number)
+    assert changes == []
+    await until(lambda: changes, "told")
+    assert len(changes[0]) == 1000 and len(outlet._lengths) == 1
+    for number in range(1000):
+        outlet._unsubscribed(b"/t%03d" % number)
+    await until(lambda: changes[-1] == (), "told of the end")
+    assert len(changes) == 2 and not outlet._lengths
+    outlet._subscribed(b"/late")
+    telling = feed._telling
+    assert telling is not None
+    feed.close()
+    assert telling.cancelled(), "nothing is told after the end"
+
+
+async def test_prefixes_match_as_they_do_at_libzmq(feed: Feed) -> None:
+    outlet = feed._outlets["unity"]
+    names = [TopicName(name) for name in ("/a", "/ab", "/a/b", "/a/bc", "/b", "/b/" + "c" * 100)]
+    prefixes = [b"", b"/", b"/a", b"/a\0", b"/a/b", b"/a/b\0", b"/b/ccc", b"/b\0", b"/a/bcd", b"/b/" + b"c" * 200]
+    for prefix in prefixes:
+        outlet._subscribed(prefix)
+        outlet._subscribed(b"/zz")
+        for name in names:
+            assert outlet.wants(topic_frame(name), name) == topic_frame(name).startswith(prefix)
+        outlet._unsubscribed(prefix)
+        outlet._unsubscribed(b"/zz")
+
+
+class Streams:
+    """What `RelayFeed` asks of a hub with so many streams."""
+
+    def __init__(self, count: int) -> None:
+        self.relayed = dict.fromkeys(range(count))
+        self.local_owners: set[str] = set()
+        self.tap: object = None
+        self.told: list[list[int]] = []
+
+    def refresh_interest(self, streams: list[int], *, now: float) -> None:
+        self.told.append(streams)
+
+
+async def test_the_origins_are_told_in_slices(zmq_context: Context) -> None:
+    count = 3 * INTEREST_STREAMS + 7
+    hub = Streams(count)
+    role = FeedRole("unity", "tcp://127.0.0.1:*", subscribe=(ANY,))
+    feed = RelayFeed(
+        zmq_context, cast("Hub", hub), (role,), after=lambda: None, refused=lambda *_refusal: None, clock=lambda: 0.0
+    )
+    feed._interest()
+    assert [len(each) for each in hub.told] == [INTEREST_STREAMS]
+    feed._interest()  # it changes again and again before all have heard
+    feed._interest()
+    assert len(hub.told) == 1
+    await until(lambda: feed._going_on is None, "all have heard")
+    assert all(len(each) <= INTEREST_STREAMS for each in hub.told)
+    heard = [stream for each in hub.told for stream in each]
+    assert sorted(heard[:count]) == sorted(heard[count:]) == list(range(count))
+    feed.close()
