@@ -419,10 +419,12 @@ class Hub(LocalStreams):
             stream = relayed.stream.stream
             yield stream, bool(relayed.outs or relayed.waiting) or self.tap(stream)
 
-    def refresh_interest(self, *, now: float) -> None:
-        """The answer of `tap` may have changed: tell the origins."""
-        for relayed in self.relayed.values():
-            self._answer(relayed, now)
+    def refresh_interest(self, streams: Iterable[StreamId] | None = None, *, now: float) -> None:
+        """The answer of `tap` may have changed: tell the origins of these streams that there still are, or of all."""
+        for identity in list(self.relayed) if streams is None else streams:
+            relayed = self.relayed.get(identity)
+            if relayed is not None:
+                self._answer(relayed, now)
 
     def _open(self, client: ClientName, identity: StreamId, now: float, first: int | None) -> None:
         relayed = self.relayed[identity]

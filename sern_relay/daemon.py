@@ -235,12 +235,16 @@ class RelayDaemon:
 
     def _end_lapsed(self) -> None:
         """Cut the connections of every client of which a key was taken away or has expired. Which key a connection
-        was made with is not known here: one with a key that still holds is back at once."""
+        was made with is not known here: one with a key that still holds is back at once. Nor is it known whose those
+        are that have not said anything yet, which would be taken for admitted when they do: they go, too."""
         before, self._valid = self._valid, self._valid_keys()
-        for client, keys in before.items():
-            if keys - self._valid.get(client, frozenset()) and self.server is not None:
-                _log.warning("%s lost a key; %d connections cut", client, self.server.cut_client(client))
-                self.hub.end_session(client, "the key no longer holds", now=clock.now())
+        lapsed = [client for client, keys in before.items() if keys - self._valid.get(client, frozenset())]
+        if not lapsed or self.server is None:
+            return
+        self.server.cut_unbound()
+        for client in lapsed:
+            _log.warning("%s lost a key; %d connections cut", client, self.server.cut_client(client))
+            self.hub.end_session(client, "the key no longer holds", now=clock.now())
 
     def _after(self) -> None:
         """Something came in: before the loop comes round again, whoever has something to send sends it."""
@@ -265,7 +269,7 @@ class RelayDaemon:
             now = clock.now()
             self.hub.sweep(now=now)
             if self.server is not None:
-                self.server.express.look()
+                self.server.look()
             self.datagrams.tick()
             if self.message_log is not None:
                 with self.parts.survive("message_log"):
@@ -404,6 +408,8 @@ class RelayDaemon:
             "routing_id": socket.refused_routing_ids,
             "multipart": socket.malformed + server.inflow.endless,
             "revoked": server.revoked,
+            "surplus": server.surplus,
+            "silent": server.silent,
             "join": server.express.refused,
         }
         return [((reason,), float(count)) for reason, count in counts.items()]

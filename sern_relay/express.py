@@ -80,10 +80,10 @@ class RelayExpress:
             pump = Pump(LanePort(link, LANE_EXPRESS), paths.send, on_gone=lambda: None)
             lane = self._lanes[joined.client] = _Lane(link, paths, pump)
         older = None
-        if routing_id not in lane.paths and len(lane.paths) >= CONNECTIONS:
-            oldest = lane.paths.oldest()
-            older = self.joined.pop(oldest)
-            lane.paths.discard(oldest)
+        others = [rid for rid, other in self.joined.items() if other.client == joined.client and rid != routing_id]
+        if len(others) >= CONNECTIONS:  # those of a session that is over count, too
+            older = self.joined.pop(others[0])
+            lane.paths.discard(others[0])
         self.joined[routing_id] = joined
         if routing_id not in lane.paths:
             handle = joined.connection.handle if joined.connection is not None else None

@@ -6,6 +6,7 @@ object registry. Its name is taken with the first message and given back after `
 plain ZeroMQ does not say that it has gone.
 """
 
+import asyncio
 import logging
 import time
 from collections.abc import Callable, Iterator
@@ -17,7 +18,7 @@ import zmq
 from sern_core.errors import RefusedError
 from sern_core.hub import Hub
 from sern_core.hub_events import Relayed
-from sern_core.message import Message, StreamInfo
+from sern_core.message import Message, StreamId, StreamInfo
 from sern_core.rules import FeedRole, FeedTopic, RuleSet
 from sern_core.types import ClientName, Durability, PriorityClass, TopicName
 from sern_runtime import ros_types
@@ -25,6 +26,10 @@ from sern_runtime.clock import now
 from sern_runtime.feed import Feed, FeedHeader
 
 IDLE_S: Final = 30.0
+INTEREST_STREAMS: Final = 200
+"""Streams whose origins are told in one go what the feed wants now; about 2 ms."""
+INTEREST_REST_S: Final = 0.004
+"""Between two such goes: the others in the loop get their turn."""
 MAX_TOLD: Final = 1024
 """Lines about topics that are logged once each."""
 
@@ -81,12 +86,18 @@ class RelayFeed:
         self._wall_ns = wall_ns
         self._sources: dict[tuple[str, TopicName], _Source] = {}
         self._told: set[tuple[str, TopicName, str]] = set()
+        self._untold: list[StreamId] = []  # whose origins have yet to hear of what the feed wants
+        self._going_on: asyncio.TimerHandle | None = None
+        self._again = False  # it has changed since then
         self.counters: dict[str, InjectCounters] = {role.name: InjectCounters() for role in roles}
         hub.local_owners.update(role.owner for role in roles if role.ingest_endpoint is not None)
         self.feed = Feed(ctx, roles, on_publish=self._published, on_interest=self._interest, accept=self._may_own)
         hub.tap = self._wants
 
     def close(self) -> None:
+        if self._going_on is not None:
+            self._going_on.cancel()
+            self._going_on = None
         self.feed.close()
 
     def update(self, roles: tuple[FeedRole, ...], *, now: float) -> None:
@@ -121,6 +132,7 @@ class RelayFeed:
                 ("malformed", fed.malformed),
                 ("limited", fed.limited),
                 ("endless", fed.endless),
+                ("capped", fed.capped),
                 ("injected", injected.injected),
                 ("untyped", injected.untyped),
                 ("dropped", injected.dropped),
@@ -143,7 +155,22 @@ class RelayFeed:
         return self.feed.wants(stream.id.topic)
 
     def _interest(self) -> None:
-        self._hub.refresh_interest(now=self._clock())
+        """What the feed wants has changed: the origins are told, in slices. One pass ends before the next begins, so
+        that no stream is never reached; what is announced meanwhile is told by itself."""
+        if self._going_on is not None:
+            self._again = True
+            return
+        self._untold = list(self._hub.relayed)
+        self._tell_origins()
+
+    def _tell_origins(self) -> None:
+        told = [self._untold.pop() for _ in range(min(INTEREST_STREAMS, len(self._untold)))]
+        if not self._untold and self._again:
+            self._again = False
+            self._untold = list(self._hub.relayed)
+        loop = asyncio.get_running_loop()
+        self._going_on = loop.call_later(INTEREST_REST_S, self._tell_origins) if self._untold else None
+        self._hub.refresh_interest(told, now=self._clock())
         self._after()
 
     def _may_own(self, role: FeedRole, name: TopicName) -> bool:

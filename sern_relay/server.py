@@ -2,6 +2,7 @@
 
 import logging
 from collections.abc import Callable, Iterator
+from typing import Final
 
 import zmq
 
@@ -19,6 +20,15 @@ from sern_runtime.inflow import Inflow
 from sern_runtime.monitor import ConnectionTable, TcpHandle
 from sern_runtime.pump import LANE_MESSAGE_BYTES, Pump
 from sern_runtime.zmq_socket import CurvePair, RouterSocket, SendResult, make_server
+
+MAX_PORTS: Final = 4
+"""Connections of one client for its session: the one that has it, another process under the same name, and those that
+a change of network left behind. Those for class control alone are bounded by `RelayExpress`."""
+SILENT_INTERVALS: Final = 2.0
+"""Times `handshake_interval_s` until a connection must have spoken: once for the handshake, and once for what is said
+right after it."""
+MAX_TOLD: Final = 1024
+"""Clients of which is logged, once each, that they have too many connections."""
 
 _log = logging.getLogger(__name__)
 
@@ -63,6 +73,12 @@ class RelayServer:
         self.bad_frames = 0
         self.revoked = 0
         """Connections that spoke first when their key was no longer known."""
+        self.surplus = 0
+        """Connections that were cut because their client had `MAX_PORTS` others."""
+        self.silent = 0
+        """Connections that were cut because nothing was said on them."""
+        self._silent_s = SILENT_INTERVALS * handshake_interval_s
+        self._told: set[ClientName] = set()
         self._admits = admits
         self._marks = marks or Marks()
         self._insecure = keys is None
@@ -167,6 +183,8 @@ class RelayServer:
             return None
         self.connections.bind_user(details.fd, name)
         connection = self.connections.by_fd(details.fd)
+        if connection is not None and connection.ended:
+            return None  # what had arrived before it was cut
         handle = connection.handle if connection is not None else None
         if handle is not None:
             express = data[2:3] == JOIN
@@ -175,6 +193,7 @@ class RelayServer:
         if data[2:3] == JOIN:
             self._join(routing_id, Joined(name, details.fd, connection), data)
             return None
+        self._make_room(name)
         port = HubPort(self.hub, name, details.address if handle is None else "{}:{}".format(*handle.peer))
 
         def send(datagram: bytes) -> SendResult:
@@ -183,6 +202,23 @@ class RelayServer:
         pump = Pump(port, send, on_gone=lambda: self._gone(routing_id))
         session = self._sessions[routing_id] = Session(port, pump, details.fd, connection)
         return session
+
+    def _make_room(self, client: ClientName) -> None:
+        """One more connection of a client is to come: where it has enough, the oldest without its session goes."""
+        ports = [(rid, session) for rid, session in self._sessions.items() if session.port.client == client]
+        spare = [(rid, session) for rid, session in ports if not session.port.current]
+        for routing_id, session in spare[: max(0, len(ports) + 1 - MAX_PORTS)]:
+            self.surplus += 1
+            if client not in self._told and len(self._told) < MAX_TOLD:
+                self._told.add(client)
+                _log.warning("%s has more than %d connections; the oldest without its session end", client, MAX_PORTS)
+            self._gone(routing_id)
+            self.connections.cut(session.fd)
+
+    def look(self) -> None:
+        """See to connections. Call about once a second."""
+        self.silent += self.connections.cut_silent(self._silent_s)
+        self.express.look()
 
     def _send(self, routing_id: bytes, datagram: bytes) -> SendResult:
         return self.socket.send_to(routing_id, datagram)

@@ -22,10 +22,11 @@ There is one pair of sockets for each role, filtered before sending: on a shared
 kept apart. A role is what its address gives; publishing is off unless the role has an ingest endpoint.
 """
 
+import asyncio
 import logging
 import struct
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Final, NamedTuple
@@ -36,7 +37,7 @@ from sern_core.access import RateGuard
 from sern_core.rules import FeedRole
 from sern_core.types import CLASSES, PriorityClass, TopicName
 from sern_runtime.clock import now
-from sern_runtime.feed_inflow import TOLD_BYTES, FeedInflow
+from sern_runtime.feed_inflow import SUBSCRIBER_BYTES, TOLD_BYTES, FeedInflow
 from sern_runtime.zmq_socket import (
     BACKLOG,
     ZERO_COPY_BYTES,
@@ -53,11 +54,17 @@ HEADER: Final = struct.Struct("!BBHIqQ")
 MAX_TOPIC_BYTES: Final = 512
 MAX_FRAMES: Final = 8
 MAX_MESSAGE_BYTES: Final = 16 * 2**20
-"""A frame above this closes its connection. The local network carries maps and images whole."""
+"""A publisher's frame above this closes its connection. The local network carries maps and images whole."""
+MAX_SUBSCRIPTION_BYTES: Final = MAX_TOPIC_BYTES + 64
+"""A subscriber's frame above this closes its connection: a longer prefix is that of no topic frame, and libzmq keeps
+some hundred bytes for each of its bytes, on our thread. 64: the name of a command (10), and CURVE's box around it
+(33)."""
 HIGH_WATER: Final = 1000
 """Messages that may wait for a slow subscriber; libzmq drops what comes after them, for that subscriber alone."""
 MAX_PREFIXES: Final = 4096
 """Distinct subscriptions of a role that are looked at; more are served, but no longer tracked one by one."""
+INTEREST_S: Final = 0.05
+"""Between two calls of `on_interest`: one message of subscriptions is cheap, and what follows from it is not."""
 _MAX_VERDICTS: Final = 4096
 _NOBLOCK: Final = int(zmq.NOBLOCK)
 _NOBLOCK_MORE: Final = int(zmq.NOBLOCK | zmq.SNDMORE)
@@ -113,6 +120,7 @@ class FeedCounters:
     malformed: int = 0
     limited: int = 0  # more than the role's limits let in
     endless: int = 0  # connections that were cut: bytes arrived on them, and no message did
+    capped: int = 0  # connections that were cut: the role had as many as it may
 
 
 Accept = Callable[[FeedRole, TopicName], bool]
@@ -125,10 +133,12 @@ OnPublish = Callable[[FeedRole, TopicName, FeedHeader, bytes], None]
 class Feed:
     """The feed of a relay: one XPUB, and where configured one XSUB, for each role.
 
-    `on_publish` None: what comes in goes to the feed's own subscribers only. `on_interest` is called after the set
-    of wanted prefixes has changed. `keys` makes the sockets CURVE servers in the ZAP domain `feed.NAME`; without
-    keys the role's addresses are the only guard, which the configuration has to allow. Raises ConfigError when an
-    endpoint cannot be had. `close()` once.
+    `on_publish` None: what comes in goes to the feed's own subscribers only. `on_interest` is called soon after the
+    set of wanted prefixes has changed, once for all that changes within `INTEREST_S`. `keys` makes the sockets CURVE
+    servers in the ZAP domain `feed.NAME`; without keys the role's addresses are the only guard, which the
+    configuration has to allow. Raises ConfigError when an endpoint cannot be had. `close()` once.
+
+    A subscriber's frames are bounded by what can name a topic, and its connection by `SUBSCRIBER_BYTES` of them.
     """
 
     def __init__(
@@ -154,6 +164,9 @@ class Feed:
         self.max_message_bytes = max_message_bytes
         self._outlets: dict[str, _Outlet] = {}
         self._inlets: dict[str, _Inlet] = {}
+        self._loop = asyncio.get_running_loop()
+        self._telling: asyncio.TimerHandle | None = None
+        self._told_s = -INTEREST_S
         try:
             self.update(roles)
         except BaseException:
@@ -186,6 +199,9 @@ class Feed:
             outlet.forget()
 
     def close(self) -> None:
+        if self._telling is not None:
+            self._telling.cancel()
+            self._telling = None
         for inlet in self._inlets.values():
             inlet.close()
         for outlet in self._outlets.values():
@@ -214,6 +230,9 @@ class Feed:
 
     def counters(self) -> dict[str, FeedCounters]:
         """Counters by role name."""
+        for name, outlet in self._outlets.items():
+            inlet = self._inlets.get(name)
+            outlet.counters.capped = outlet.inflow.capped + (inlet.inflow.capped if inlet is not None else 0)
         return {name: outlet.counters for name, outlet in self._outlets.items()}
 
     def endpoints(self) -> dict[str, tuple[str, str | None]]:
@@ -235,7 +254,14 @@ class Feed:
     def _bound(self, kind: int, role: FeedRole, endpoint: str) -> "zmq.Socket[bytes]":
         socket = self._ctx.socket(kind)
         try:
-            apply_common_options(socket, max_message_bytes=self.max_message_bytes, sndhwm=HIGH_WATER, rcvhwm=HIGH_WATER)
+            if kind == zmq.XPUB:
+                # One at a time: libzmq takes in all that waits before it lets go of our thread, and meanwhile nobody
+                # sees how much a connection brings.
+                limit_bytes, rcvhwm = MAX_SUBSCRIPTION_BYTES, 1
+                socket.setsockopt(zmq.RCVBUF, SUBSCRIBER_BYTES)  # what has arrived is read also after a cut
+            else:
+                limit_bytes, rcvhwm = self.max_message_bytes, HIGH_WATER
+            apply_common_options(socket, max_message_bytes=limit_bytes, sndhwm=HIGH_WATER, rcvhwm=rcvhwm)
             socket.setsockopt(zmq.HEARTBEAT_IVL, 0)  # not every implementation answers ZMTP pings; TCP looks instead
             socket.setsockopt(zmq.TCP_KEEPALIVE, 1)
             socket.setsockopt(zmq.BACKLOG, BACKLOG)
@@ -249,6 +275,13 @@ class Feed:
     def interest_changed(self) -> None:
         """A subscription came or went."""
         self.refresh()
+        if self.on_interest is not None and self._telling is None:
+            rest_s = max(0.0, self._told_s + INTEREST_S - self._loop.time())
+            self._telling = self._loop.call_later(rest_s, self._tell)
+
+    def _tell(self) -> None:
+        self._telling = None
+        self._told_s = self._loop.time()
         if self.on_interest is not None:
             self.on_interest()
 
@@ -264,6 +297,7 @@ class _Outlet(FrameSocket):
         self.prefixes: set[bytes] = set()
         self._feed = feed
         self.inflow = FeedInflow(role.name, self, socket, self._endless)
+        self._lengths: Counter[int] = Counter()  # of the prefixes: few, so that none of them need be tried in turn
         self._untracked = 0
         self._wanted: dict[bytes, bool] = {}
 
@@ -277,7 +311,7 @@ class _Outlet(FrameSocket):
     def wants(self, frame: bytes, name: TopicName) -> bool:
         wanted = self._wanted.get(frame)
         if wanted is None:
-            matched = self._untracked > 0 or any(frame.startswith(prefix) for prefix in self.prefixes)
+            matched = self._untracked > 0 or any(frame[:length] in self.prefixes for length in self._lengths)
             wanted = matched and self.role.may_see(name)
             if len(self._wanted) >= _MAX_VERDICTS:
                 self._wanted.clear()
@@ -304,6 +338,8 @@ class _Outlet(FrameSocket):
 
     def _subscribed(self, prefix: bytes) -> None:
         if len(self.prefixes) < MAX_PREFIXES:
+            if prefix not in self.prefixes:
+                self._lengths[len(prefix)] += 1
             self.prefixes.add(prefix)  # XPUB reports the first subscriber of a prefix and the end of the last
         else:
             self._untracked += 1
@@ -312,6 +348,9 @@ class _Outlet(FrameSocket):
     def _unsubscribed(self, prefix: bytes) -> None:
         if prefix in self.prefixes:
             self.prefixes.remove(prefix)
+            self._lengths[len(prefix)] -= 1
+            if not self._lengths[len(prefix)]:
+                del self._lengths[len(prefix)]
         else:
             self._untracked -= 1
         self._changed()

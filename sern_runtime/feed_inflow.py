@@ -20,8 +20,10 @@ import zmq
 from sern_runtime.inflow import LIMIT_BYTES, Inflow, Socket, resident_bytes
 from sern_runtime.monitor import ConnectionTable, TcpHandle
 
-SUBSCRIBER_BYTES: Final = 2**20
-"""Some thousand subscriptions, each a few hundred bytes."""
+SUBSCRIBER_BYTES: Final = 64 * 1024
+"""Some hundred subscriptions, each a hundred bytes. libzmq's table of them takes up to a hundred times that."""
+MAX_CONNECTIONS: Final = 256
+"""Of one socket of a role; further ones are cut at once. Programs may have one for each topic."""
 TOLD_BYTES: Final = 2048
 """Messages from this size on are always booked to the connection they came from, which takes a quarter of a
 microsecond. Smaller ones never add up, between two looks, to what could be mistaken for a message without end."""
@@ -51,6 +53,7 @@ class FeedInflow:
         on_endless: Callable[[], None],
         *,
         max_message_bytes: int | None = None,
+        max_connections: int = MAX_CONNECTIONS,
         memory: Callable[[], int] = resident_bytes,
     ) -> None:
         """`max_message_bytes`: of a publisher's frame; None for subscribers. `memory`: of the process, bytes."""
@@ -63,12 +66,19 @@ class FeedInflow:
         self._taken: dict[int, int] = {}
         self._memory = memory
         self._seen: dict[TcpHandle, _Seen] = {}
-        self.connections = ConnectionTable(raw, max_half_open_per_source=0, max_half_open=0, max_connections=0)
+        self.connections = ConnectionTable(
+            raw, max_half_open_per_source=0, max_half_open=0, max_connections=max_connections
+        )
         self._inflow = Inflow(socket, self._connections, self._endless, limit_bytes=self._limit_bytes)
 
     def close(self) -> None:
         self._inflow.close()
         self.connections.close()
+
+    @property
+    def capped(self) -> int:
+        """Connections that were cut as there were enough."""
+        return self.connections.capped
 
     def came(self, fd: int) -> None:
         self._taken[fd] = self._taken.get(fd, 0) + 1

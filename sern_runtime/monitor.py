@@ -299,11 +299,21 @@ def port_of(endpoint: str) -> int | None:
 
 @dataclass(slots=True)
 class Connection:
-    """One accepted connection. `user` is empty until `ConnectionTable.bind_user`."""
+    """One accepted connection. `user` is empty until `ConnectionTable.bind_user`; `ended`: it was cut, and may still be
+    listed, and heard, until libzmq has noticed."""
 
     handle: TcpHandle | None
     source: str
+    accepted_s: float
     user: str = ""
+    ended: bool = False
+
+    def cut(self) -> bool:
+        """End it now. False when it is gone already, or was cut before."""
+        if self.ended or self.handle is None:
+            return False
+        self.ended = True
+        return self.handle.cut()
 
 
 class ConnectionTable:
@@ -373,15 +383,20 @@ class ConnectionTable:
         if connection is None:  # the frame overtook its event
             self._monitor.drain()
             connection = self._connections.get(fd)
-        if connection is not None and connection.handle is not None:
-            connection.handle.cut()
+        if connection is not None:
+            connection.cut()
 
     def handles_of(self, user: str) -> list[TcpHandle]:
         return [c.handle for c in self._connections.values() if c.user == user and c.handle is not None]
 
     def cut_user(self, user: str) -> int:
         """End every connection of a user; returns how many."""
-        return sum(handle.cut() for handle in self.handles_of(user))
+        return sum(connection.cut() for connection in self._connections.values() if connection.user == user)
+
+    def cut_silent(self, after_s: float) -> int:
+        """End every connection that has no user `after_s` after it was accepted; returns how many."""
+        until_s = self._clock() - after_s
+        return sum(c.cut() for c in self._connections.values() if not c.user and c.accepted_s <= until_s)
 
     def _on_event(self, event: MonitorEvent) -> None:
         match event.kind:
@@ -405,13 +420,13 @@ class ConnectionTable:
         self.accepted += 1
         handle = TcpHandle.of(fd, local_port=port_of(event.endpoint))
         source = handle.peer[0] if handle is not None else ""
-        self._connections[fd] = Connection(handle, source)
+        connection = self._connections[fd] = Connection(handle, source, self._clock())
         self._expire()
         self._half_open_until_s[fd] = self._clock() + HANDSHAKE_IVL_MS / 1000
         self._half_open_by_source[source] += 1
         if handle is not None and self._above_cap(source):
             self.capped += 1
-            handle.cut()
+            connection.cut()
 
     def _above_cap(self, source: str) -> bool:
         return any(

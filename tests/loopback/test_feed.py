@@ -107,7 +107,7 @@ async def received(socket: "zmq.Socket[bytes]") -> list[bytes]:
 async def test_a_message_reaches_a_plain_subscriber(world: World) -> None:
     feed = world.start([role()])
     subscriber = await world.subscriber(feed, "viewer", b"/r/odom\0")
-    assert world.changes == 1
+    await until(lambda: world.changes == 1, "told")
     assert feed.publish(ODOM, HEADER, b"body") == 1
     frames = await received(subscriber)
     assert frames == [b"/r/odom\0", HEADER.pack(), b"body"]

@@ -199,6 +199,26 @@ async def test_half_open_connections_are_capped_and_age_out(zmq_context: Context
     server.close()
 
 
+async def test_whoever_says_nothing_is_cut_after_a_while(zmq_context: Context) -> None:
+    server = Server(zmq_context)
+    client = Client(zmq_context, server.endpoint)
+    await until(lambda: client.dealer.send(b"robot1"))
+    await until(lambda: server.seen == [b"robot1"])
+    silent = [socketlib.create_connection(server.address) for _ in range(3)]
+    await until(lambda: server.table.accepted == 4)
+    server.now_s = 19.9
+    assert server.table.cut_silent(20.0) == 0
+    server.now_s = 20.0
+    assert server.table.cut_silent(20.0) == 3
+    assert server.table.cut_silent(20.0) == 0, "each is counted once"
+    await until(lambda: len(server.table) == 1)
+    assert len(server.table.handles_of("robot1")) == 1
+    for connection in silent:
+        connection.close()
+    client.close()
+    server.close()
+
+
 async def test_all_connections_are_capped(zmq_context: Context) -> None:
     server = Server(zmq_context, max_connections=2, max_half_open_per_source=0, max_half_open=0)
     first = [Client(zmq_context, server.endpoint) for _ in range(2)]

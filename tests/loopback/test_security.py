@@ -8,20 +8,25 @@ import json
 import re
 import shutil
 import socket as socketlib
+import time
 from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager
+from contextlib import AsyncExitStack, asynccontextmanager
+from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import zmq
 
 import sern_core
+import sern_relay.daemon
 from sern_client.daemon import ClientDaemon
 from sern_core import wire
-from sern_core.types import TopicName
+from sern_core.types import ClientName, TopicName
 from sern_relay.daemon import REFUSAL_CODES, RelayDaemon
-from sern_runtime.keys import SecretKey, load_public, load_secret
+from sern_relay.server import MAX_PORTS
+from sern_runtime.keys import PublicKey, PublicKeys, SecretKey, generate, load_public, load_secret, write_public
 from sern_runtime.monitor import SocketMonitor
 from sern_runtime.zmq_socket import DealerSocket, make_client
 from tests.daemons import ALLOW_ALL, HOST, Lab, bodies, write_bag
@@ -207,6 +212,56 @@ async def test_nobody_joins_the_session_of_another(tmp_path: Path, caplog: pytes
         assert not any(joined.client == "robot2" for joined in server.express.joined.values())
 
 
+async def test_one_client_has_a_few_connections(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    async with bystanders(tmp_path, caplog) as world, AsyncExitStack() as stack:
+        server = world.relay.server
+        assert server is not None
+        keys = load_secret(world.lab.directory / "robot2.key")
+        stray = wire.encode_header(wire.Kind.DATA, 1, 1, 0)
+        strangers = [await stack.enter_async_context(Stranger(world.lab, keys)) for _ in range(MAX_PORTS + 4)]
+        await strangers[0].send(hello("robot2"))
+        await until(lambda: strangers[0].received, "one has a session")
+        for stranger in strangers[1:]:
+            await stranger.send(stray)
+            await until(lambda each=stranger: each.received, "it is told that there is none")  # type: ignore[misc]
+        for stranger in strangers[1:5]:
+            await stranger.cut()
+        assert len(server.connections.handles_of("robot2")) == MAX_PORTS
+        assert zmq.Event.DISCONNECTED not in strangers[0].events, "the one with the session stays"
+        assert server.surplus == 4
+        await world.refused("surplus")
+        assert sum("robot2 has more than" in message for message in caplog.messages) == 1
+
+
+async def test_connections_for_class_control_count_over_all_sessions(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    async with bystanders(tmp_path, caplog) as world, AsyncExitStack() as stack:
+        server = world.relay.server
+        assert server is not None
+        keys = load_secret(world.lab.directory / "robot2.key")
+        lane = await stack.enter_async_context(Stranger(world.lab, keys))
+        server_express = server.express
+        for tag in range(1, 4):
+            await lane.send(hello("robot2", tag))
+            await until(lambda: "robot2" in world.relay.hub.links, "a session")
+            envelope: wire.Envelope = {"name": "robot2", "boot": 7, "relay": world.relay.hub.boot}
+            join = wire.encode_handshake(wire.Kind.JOIN, tag, 0, envelope)
+
+            def joined(count: int) -> bool:
+                lanes = server_express._lanes
+                return "robot2" in lanes and len(lanes["robot2"].paths) == count
+
+            for count in (1, 2):
+                express = await stack.enter_async_context(Stranger(world.lab, keys))
+                await express.send(join)
+                await until(partial(joined, count), "it has joined")
+            await lane.send(wire.encode_handshake(wire.Kind.CLOSE, tag, 0, {"code": "bye", "why": "bye"}))
+            await until(lambda: "robot2" not in world.relay.hub.links, "it is forgotten")
+            assert sum(each.client == "robot2" for each in server.express.joined.values()) <= 2
+        assert server.express.refused == 0
+
+
 def oversize() -> list[bytes]:
     return [bytes(80 * 1024)]
 
@@ -364,6 +419,33 @@ async def test_a_rotated_key_ends_the_connections_of_the_old_one(
         await lab.end(robot)
         robot = await lab.connected(tmp_path / "robot1.yaml")
         await lab.end(robot)
+        await lab.end(relay)
+
+
+async def test_a_silent_connection_does_not_outlive_its_key(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    async with Lab(tmp_path, *CLIENTS) as lab:
+        old, new = load_secret(tmp_path / "robot2.key"), generate(ClientName("robot2"))
+        end_s = int(time.time()) + 3600
+        keys = (PublicKey(old.public_key, None, end_s), PublicKey(new.public_key))
+        write_public(lab.clients_dir / "robot2.pub", PublicKeys(old.name, keys), replace=True)
+        relay = await lab.relay()
+        assert relay.server is not None
+        async with Stranger(lab, old) as silent, Stranger(lab, old) as loud:
+            await loud.send(hello("robot2"))
+            await until(lambda: loud.received, "it has a session")
+            await until(lambda: zmq.Event.HANDSHAKE_SUCCEEDED in silent.events, "admitted by its key, that holds")
+            relay._end_lapsed()
+            assert zmq.Event.DISCONNECTED not in (*silent.events, *loud.events)
+            wall = SimpleNamespace(time=lambda: end_s + 1.0, time_ns=time.time_ns)
+            monkeypatch.setattr(sern_relay.daemon, "time", wall)
+            table = relay.server.connections._connections
+            assert len(table) == 2 and not any(connection.ended for connection in table.values())
+            relay._end_lapsed()
+            assert all(connection.ended for connection in table.values())
+            assert relay.server._sessions == {}
+            await loud.cut()
+            await silent.cut()
+            monkeypatch.undo()
         await lab.end(relay)
 
 

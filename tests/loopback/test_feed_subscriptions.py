@@ -1,0 +1,214 @@
+"""What a program on the feed may subscribe to: what may name topics, and not more than a table of it may take."""
+
+import asyncio
+import socket as socketlib
+from collections.abc import AsyncIterator, Iterable
+from typing import cast
+
+import pytest
+import zmq
+
+from sern_core.hub import Hub
+from sern_core.patterns import compile_pattern
+from sern_core.rules import FeedRole
+from sern_core.types import PriorityClass, TopicName
+from sern_relay.feed import INTEREST_STREAMS, RelayFeed
+from sern_runtime import feed_inflow
+from sern_runtime.feed import MAX_SUBSCRIPTION_BYTES, MAX_TOPIC_BYTES, Feed, FeedHeader, topic_frame
+from tests.loopback.test_inflow import GREETING
+from tests.support import until
+
+Context = zmq.Context[zmq.Socket[bytes]]
+ANY = compile_pattern(".*")
+READY = b"\x05READY\x0bSocket-Type\x00\x00\x00\x03SUB"
+HEADER = FeedHeader(PriorityClass.STATE, 7, 1)
+LONGEST = TopicName("/" + "a" * (MAX_TOPIC_BYTES - 2))
+
+
+@pytest.fixture
+async def feed(zmq_context: Context) -> AsyncIterator[Feed]:
+    feed = Feed(zmq_context, [FeedRole("unity", "tcp://127.0.0.1:*", subscribe=(ANY,))])
+    yield feed
+    feed.close()
+
+
+def port_of(feed: Feed) -> int:
+    return int(feed.endpoints()["unity"][0].rpartition(":")[2])
+
+
+class Raw:
+    """A program that speaks ZMTP 3.0 as a SUB does, and says what it likes."""
+
+    def __init__(self, port: int) -> None:
+        self.connection = socketlib.create_connection(("127.0.0.1", port))
+        self.ended = False
+
+    async def greet(self) -> None:
+        await self.send(GREETING + b"\x04" + bytes([len(READY)]) + READY)
+
+    async def subscribe(self, prefixes: Iterable[bytes]) -> None:
+        for prefix in prefixes:
+            await self.send(b"\x02" + (1 + len(prefix)).to_bytes(8, "big") + b"\1" + prefix)
+
+    async def send(self, data: bytes) -> None:
+        def send() -> None:
+            try:
+                self.connection.sendall(data)
+            except OSError:
+                self.ended = True
+
+        if not self.ended:
+            await asyncio.to_thread(send)
+
+    def cut(self) -> bool:
+        """Whether the feed has closed the connection."""
+        self.connection.setblocking(False)
+        try:
+            while not self.ended:
+                self.ended = not self.connection.recv(4096)
+        except BlockingIOError:
+            return False
+        except OSError:
+            self.ended = True
+        return True
+
+    def close(self) -> None:
+        self.connection.close()
+
+
+async def test_the_longest_topic_can_be_subscribed_to(zmq_context: Context, feed: Feed) -> None:
+    prefix = topic_frame(LONGEST)
+    assert len(prefix) == MAX_TOPIC_BYTES
+    subscriber = zmq_context.socket(zmq.SUB)
+    subscriber.subscribe(prefix)
+    subscriber.connect(feed.endpoints()["unity"][0])
+    await until(lambda: feed.prefixes()["unity"] == (prefix,), "subscribed")
+    assert feed.publish(LONGEST, HEADER, b"body") == 1
+    await until(lambda: subscriber.poll(0), "a message")
+    assert subscriber.recv_multipart()[0] == prefix
+    subscriber.close(linger=0)
+
+
+async def test_what_is_longer_than_a_topic_ends_the_connection(zmq_context: Context, feed: Feed) -> None:
+    peer = Raw(port_of(feed))
+    await peer.greet()
+    await peer.subscribe([b"/" * MAX_SUBSCRIPTION_BYTES])
+    await until(peer.cut, "cut")
+    assert feed.prefixes()["unity"] == ()
+    peer.close()
+
+
+async def test_a_connection_has_so_many_bytes_of_subscriptions(feed: Feed) -> None:
+    scene, endless = Raw(port_of(feed)), Raw(port_of(feed))
+    await scene.greet()
+    await scene.subscribe(b"/jackal%d/%s\0" % (number, b"x" * 80) for number in range(400))
+    await until(lambda: len(feed.prefixes()["unity"]) == 400, "a scene of some hundred topics is served")
+    await endless.greet()
+    more = feed_inflow.SUBSCRIBER_BYTES // 400
+    await endless.subscribe(b"/%d/%s" % (number, b"y" * 450) for number in range(more))
+    await until(endless.cut, "cut")
+    await until(lambda: len(feed.prefixes()["unity"]) == 400, "what it subscribed to is gone")
+    assert feed.counters()["unity"].endless == 1 and not scene.cut()
+    scene.close()
+    endless.close()
+
+
+async def test_a_flood_of_subscriptions_ends_long_before_its_end(feed: Feed, monkeypatch: pytest.MonkeyPatch) -> None:
+    outlet = feed._outlets["unity"]
+    subscribed = outlet._subscribed
+    taken_bytes = 0
+
+    def count(prefix: bytes) -> None:
+        nonlocal taken_bytes
+        taken_bytes += len(prefix)
+        subscribed(prefix)
+
+    monkeypatch.setattr(outlet, "_subscribed", count)
+    peer = Raw(port_of(feed))
+    await peer.greet()
+    frames = (b"\x00\xc9\x01" + (b"/%d/" % number).ljust(200, b"z") for number in range(75_000))
+    await peer.send(b"".join(frames))
+    await until(peer.cut, "cut")
+    await until(lambda: not feed.prefixes()["unity"], "what it subscribed to is gone")
+    assert feed_inflow.SUBSCRIBER_BYTES // 2 < taken_bytes < 4 * 2**20
+    peer.close()
+
+
+async def test_a_role_has_so_many_connections(feed: Feed) -> None:
+    connections = feed._outlets["unity"].inflow.connections
+    assert connections.max_connections == feed_inflow.MAX_CONNECTIONS > 0
+    connections.max_connections = 3
+    peers = [Raw(port_of(feed)) for _ in range(5)]
+    await until(lambda: sum(peer.cut() for peer in peers) == 2, "those above the cap are cut")
+    assert feed.counters()["unity"].capped == 2
+    for peer in peers:
+        peer.close()
+
+
+async def test_many_subscriptions_are_told_once(zmq_context: Context) -> None:
+    changes: list[tuple[bytes, ...]] = []
+    feed = Feed(
+        zmq_context,
+        [FeedRole("unity", "tcp://127.0.0.1:*", subscribe=(ANY,))],
+        on_interest=lambda: changes.append(feed.prefixes()["unity"]),
+    )
+    outlet = feed._outlets["unity"]
+    for number in range(1000):
+        outlet._subscribed(b"/t%03d" % number)
+    assert changes == []
+    await until(lambda: changes, "told")
+    assert len(changes[0]) == 1000 and len(outlet._lengths) == 1
+    for number in range(1000):
+        outlet._unsubscribed(b"/t%03d" % number)
+    await until(lambda: changes[-1] == (), "told of the end")
+    assert len(changes) == 2 and not outlet._lengths
+    outlet._subscribed(b"/late")
+    telling = feed._telling
+    assert telling is not None
+    feed.close()
+    assert telling.cancelled(), "nothing is told after the end"
+
+
+async def test_prefixes_match_as_they_do_at_libzmq(feed: Feed) -> None:
+    outlet = feed._outlets["unity"]
+    names = [TopicName(name) for name in ("/a", "/ab", "/a/b", "/a/bc", "/b", "/b/" + "c" * 100)]
+    prefixes = [b"", b"/", b"/a", b"/a\0", b"/a/b", b"/a/b\0", b"/b/ccc", b"/b\0", b"/a/bcd", b"/b/" + b"c" * 200]
+    for prefix in prefixes:
+        outlet._subscribed(prefix)
+        outlet._subscribed(b"/zz")
+        for name in names:
+            assert outlet.wants(topic_frame(name), name) == topic_frame(name).startswith(prefix)
+        outlet._unsubscribed(prefix)
+        outlet._unsubscribed(b"/zz")
+
+
+class Streams:
+    """What `RelayFeed` asks of a hub with so many streams."""
+
+    def __init__(self, count: int) -> None:
+        self.relayed = dict.fromkeys(range(count))
+        self.local_owners: set[str] = set()
+        self.tap: object = None
+        self.told: list[list[int]] = []
+
+    def refresh_interest(self, streams: list[int], *, now: float) -> None:
+        self.told.append(streams)
+
+
+async def test_the_origins_are_told_in_slices(zmq_context: Context) -> None:
+    count = 3 * INTEREST_STREAMS + 7
+    hub = Streams(count)
+    role = FeedRole("unity", "tcp://127.0.0.1:*", subscribe=(ANY,))
+    feed = RelayFeed(
+        zmq_context, cast("Hub", hub), (role,), after=lambda: None, refused=lambda *_refusal: None, clock=lambda: 0.0
+    )
+    feed._interest()
+    assert [len(each) for each in hub.told] == [INTEREST_STREAMS]
+    feed._interest()  # it changes again and again before all have heard
+    feed._interest()
+    assert len(hub.told) == 1
+    await until(lambda: feed._going_on is None, "all have heard")
+    assert all(len(each) <= INTEREST_STREAMS for each in hub.told)
+    heard = [stream for each in hub.told for stream in each]
+    assert sorted(heard[:count]) == sorted(heard[count:]) == list(range(count))
+    feed.close()
