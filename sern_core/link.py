@@ -51,6 +51,8 @@ CONTROL_BYTES_PER_US: Final = 16
 ATTACHMENT_BYTES_PER_US: Final = 250
 RETAINED_PER_US: Final = 16
 """What a control message is charged with: itself, its size, what its attachment unpacks to, what it looks through."""
+ANNOUNCE_US: Final = 12
+"""What a session that begins is charged with for each stream that is announced in it."""
 MAX_UNHEARD: Final = 20_000
 """Control messages that a peer may have answered, beside four for each channel, before it reads an answer."""
 
@@ -181,6 +183,7 @@ class Link(Answering):
             for identity in self.streams:
                 self._missing.setdefault(identity, now)
         self.handler.on_up(self, resumed=resumed, now=now)
+        self.reassembly.work_us += ANNOUNCE_US * len(self.channels)
         for channel in list(self.channels.values()):
             self._announce(channel, now)
         self.send_control({"t": "synced", "batch": True}, now=now)

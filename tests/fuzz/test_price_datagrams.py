@@ -279,6 +279,23 @@ def answers_about_many_channels(peer: Hostile) -> list[bytes]:
         {"t": "want", "ch": 1, "on": bool(index % 2), "chs": [2, 0xFFFF]})))  # fmt: skip
 
 
+def hello_after_long_lists() -> Input:
+    """A subscriber that has said of all its streams that it owes them to thousands of others greets anew."""
+    peer = Hostile()
+    with_channels(peer, 300)
+    names = [f"{index:x}" for index in range(8190)]
+    rows = [names[start : start + 48] for start in range(0, len(names), 48)]
+    for row in rows[:-1]:
+        said(peer, control(peer, wire.encode_control({"t": "want", "ch": 1, "on": True, "owed": row, "more": True})))
+    runs = [2, len(peer.hub.links[peer.name].channels)]
+    said(peer, control(peer, wire.encode_control({"t": "want", "ch": 1, "on": True, "owed": rows[-1], "chs": runs})))
+    said(peer, control(peer, wire.encode_control({"t": "want", "ch": 1, "on": True, "add": ["x"], "chs": runs})))
+    return Input(peer.said_bytes, partial(peer.hello, 2))
+
+
+INPUTS["datagram: HELLO after long lists"] = FEWER["datagram: HELLO after long lists"] = hello_after_long_lists
+
+
 @for_fifty
 def runs_of_dropped_messages(peer: Hostile) -> list[bytes]:
     other = Hostile(peer.world, "other")
