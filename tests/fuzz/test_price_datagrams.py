@@ -350,6 +350,39 @@ def none_below(peer: Hostile) -> list[bytes]:
     return [control(peer, wire.encode_control({"t": "first", "ch": 1, "seq": 100_000}))]
 
 
+WAITING: Final = 60_000
+
+
+def full(peer: Hostile, frame: Callable[[int], bytes]) -> None:
+    """Messages that wait for those before them fill the memory that a link may have."""
+    peer.announce(1, "/robot/a", reliable=True)
+    for start in range(1_000_000, 1_000_000 + WAITING, 1500):
+        said(peer, *(frame(seq) for seq in range(start, start + 1500)))
+
+
+def step_by_step(peer: Hostile) -> list[bytes]:
+    return filled(lambda index: control(peer, wire.encode_control({"t": "first", "ch": 1, "seq": 2 + index})))
+
+
+@datagram
+def first_of_ever_one_more_before_many_that_wait(peer: Hostile) -> list[bytes]:
+    full(peer, lambda seq: _whole(1, seq))
+    return step_by_step(peer)
+
+
+@datagram
+def first_of_ever_one_more_before_many_half_received(peer: Hostile) -> list[bytes]:
+    full(peer, lambda seq: _piece(1, seq, 0, 2))
+    return step_by_step(peer)
+
+
+def none_of_the_half_received(peer: Hostile) -> list[bytes]:
+    full(peer, lambda seq: _piece(1, seq, 0, 2))
+    return [control(peer, wire.encode_control({"t": "first", "ch": 1, "seq": 2_000_000}))]
+
+
+datagram(none_of_the_half_received, sets_off=True)
+
 for set_off in (all_streams_at_once, the_one_they_wait_for, none_below):
     datagram(set_off, sets_off=True)
     datagram(set_off, sets_off=True, clients=50)
