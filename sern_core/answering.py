@@ -5,6 +5,7 @@ and become runs of messages meanwhile; they survive the session.
 """
 
 from abc import abstractmethod
+from dataclasses import replace
 from typing import Final, Unpack
 
 from sern_core import wire
@@ -24,7 +25,8 @@ ANSWER_PRICE: Final = 16
 """What an answer about an open channel costs, next to one about a channel that is closed."""
 NAMED_PER_US: Final = 16
 ANSWER_US: Final = 6
-"""What naming channels, and answers about open ones, are charged with (`Reassembly.work_us`)."""
+OWED_PER_US: Final = 16
+"""What naming channels, answers about open ones, and lists of names are charged with (`Reassembly.work_us`)."""
 MAX_REPORTS_UNHEARD: Final = 64
 """Control messages that may wait for the peer's acknowledgement before reports of drops wait as well."""
 
@@ -35,7 +37,8 @@ class Answering(Session):
     def __init__(self, **session: Unpack[SessionArguments]) -> None:
         self._interest = Interest()
         self._reporting: dict[InStream, None] = {}  # streams with drops that the peer is still to be told of
-        self._owed_parts: dict[tuple[str, int], tuple[str, ...]] = {}  # by message and channel: more will come
+        self._owed_parts: dict[tuple[str, int], list[str]] = {}  # by message and channel: more will come
+        self._owed_unfinished = 0  # names in them
         self._price = self._priced_us = 0  # of the answers that came at this time
         super().__init__(**session)
 
@@ -51,6 +54,7 @@ class Answering(Session):
         self._interest.begin()
         self._reporting.clear()
         self._owed_parts.clear()
+        self._owed_unfinished = 0
         self._unsaid = False
 
     def _forget_answers(self, stream: InStream) -> None:
@@ -122,19 +126,31 @@ class Answering(Session):
     def _owed_so_far(self, key: tuple[str, int], names: tuple[str, ...], *, more: bool) -> tuple[str, ...] | None:
         """The names of a list that travels in parts, once it is complete."""
         if more:
-            if sum(map(len, self._owed_parts.values())) + len(names) > MAX_OWED:
+            self._owed_unfinished += len(names)
+            if self._owed_unfinished > MAX_OWED:
                 raise WireError(f"{self.peer} leaves lists of more than {MAX_OWED} names unfinished")
-            self._owed_parts[key] = self._owed_parts.get(key, ()) + names
+            if names:
+                self._owed_parts.setdefault(key, []).extend(names)
             return None
-        return self._owed_parts.pop(key, ()) + names
+        if key not in self._owed_parts:
+            return names
+        parts = self._owed_parts.pop(key)
+        self._owed_unfinished -= len(parts)
+        return (*parts, *names)
 
     def _answers(self, want: Want, now: float) -> None:
         """The peer has said whether it wants streams of ours."""
+        if not self.initiator:
+            # Who is owed is for origins to remember: a client that takes a stream is owed it itself, and no more.
+            want = replace(want, owed=(), add=(), drop=())
+            if want.more:
+                return
         first = want.runs[0][0]
         if want.more:
             self._owed_so_far(("want", first), want.owed or (), more=True)
             return
         owed = None if want.owed is None else self._owed_so_far(("want", first), want.owed, more=False)
+        changed: dict[int, tuple[tuple[str, ...], tuple[str, ...]]] = {}  # by identity: what was owed, what is now
         for first, last in want.runs:
             self._charge(last - first + 1, now)
             self.reassembly.work_us += (last - first + 1) // NAMED_PER_US
@@ -143,7 +159,24 @@ class Answering(Session):
                 if channel is not None:  # else closed meanwhile
                     self._charge(ANSWER_PRICE, now)
                     self.reassembly.work_us += ANSWER_US
-                    self._answer_came(channel, want, owed, now)
+                    if owed is None:
+                        before = channel.owed
+                        if id(before) not in changed:  # channels that are owed alike share one list
+                            changed[id(before)] = before, self._changed(before, want)
+                        channel.owed = changed[id(before)][1]
+                    else:
+                        channel.owed = owed
+                    self._answer_came(channel, want, now)
+
+    def _changed(self, before: tuple[str, ...], want: Want) -> tuple[str, ...]:
+        """What an answer by difference makes of a list of names."""
+        self.reassembly.work_us += len(before) // OWED_PER_US
+        names = dict.fromkeys(before) | dict.fromkeys(want.add)
+        for name in want.drop:
+            names.pop(name, None)
+        if len(names) > MAX_OWED:
+            raise WireError(f"{self.peer} owes a stream to more than {MAX_OWED} names")
+        return tuple(names)
 
     def _charge(self, price: int, now: float) -> None:
         """Raises WireError if the peer answers more in one datagram than there is to be answered."""
@@ -154,15 +187,7 @@ class Answering(Session):
         if self._price > MAX_NAMED + 2 * ANSWER_PRICE * len(self.channels):
             raise WireError(f"{self.peer} answers the announcements of {len(self.channels)} channels again and again")
 
-    def _answer_came(self, channel: OutChannel, want: Want, owed: tuple[str, ...] | None, now: float) -> None:
-        if owed is None:
-            names = dict.fromkeys(channel.owed) | dict.fromkeys(want.add)
-            for name in want.drop:
-                names.pop(name, None)
-            owed = tuple(names)
-            if len(owed) > MAX_OWED:
-                raise WireError(f"{self.peer} owes a stream to more than {MAX_OWED} names")
-        channel.owed = owed
+    def _answer_came(self, channel: OutChannel, want: Want, now: float) -> None:
         if want.on and channel.wanted is False and channel.reliable:
             self.send_control({"t": "first", "ch": channel.slot, "seq": channel.first_seq}, now=now)
         self._set_wanted(channel, want.on, now)

@@ -10,6 +10,7 @@ new process and everything is sent again.
 from bisect import bisect_right
 from collections import OrderedDict, deque
 from collections.abc import Callable
+from heapq import heappop, heappush
 from itertools import islice
 from typing import Final
 
@@ -41,6 +42,9 @@ SLICE_US: Final = 6000
 """What reading may cost before others get their turn, in microseconds as they are charged here and by the owner."""
 TURN_US: Final = 4
 """A message that waited and has its turn, without what its owner does with it."""
+STALE_US: Final = 1
+LOOKED_AT_PER_US: Final = 16
+"""A half-received message that will not be completed, and how many are looked through for those."""
 SEEN_BITS: Final = 64
 SEEN_MASK: Final = (1 << SEEN_BITS) - 1
 
@@ -210,8 +214,10 @@ class InStream:
     """One stream as it arrives. `delivered` is the highest seq up to which everything has had its turn."""
 
     # Seldom set: there are thousands of streams.
-    _below: list[int] | None = None  # of what waits: what lies below `_first`, falling
+    _stale: list[int] | None = None  # half-received and below `_first`
     _first = 0  # nothing below it will come; 0: that is done
+    left_out = 0
+    """How many messages the last `skip_to` leaves out, once nothing of the stream is behind any more."""
 
     def __init__(
         self, stream: StreamInfo, reassembly: Reassembly, deliver: Deliver, on_drop: OnInDrop, *, first: int
@@ -235,25 +241,26 @@ class InStream:
         self._partials: dict[int, Partial] = {}  # best effort: untouched for longest first
         self._lowest = 0  # no half-received message has a seq below it
         self._waiting: dict[int, Message] = {}
+        self._order: list[int] = []  # a heap of their seqs
         self._reassembly = reassembly
         self._deliver = deliver
         self._on_drop = on_drop
         self._now = 0.0
 
-    def skip_to(self, first: int, now: float) -> int:
-        """The sender says that nothing below `first` will come. Returns how many messages that leaves out; what waited
-        may have its turn later (`Reassembly.behind`)."""
-        left_out = first - 1 - self.delivered
-        if left_out <= 0 or not self.reliable:
-            return 0
+    def skip_to(self, first: int, now: float) -> None:
+        """The sender says that nothing below `first` will come. `left_out` counts the messages that this leaves out;
+        what waited may have its turn later (`Reassembly.behind`)."""
+        self.left_out = 0
+        if first - 1 <= self.delivered or not self.reliable:
+            return
         self._now = now
-        for seq in [seq for seq in self._partials if seq < first]:
-            self._discard_partial(seq)
-        self._below = sorted((seq for seq in self._waiting if seq < first), reverse=True) or None
+        self.left_out = first - 1 - self.delivered
         self._first = first
-        left_out -= len(self._below or ())
+        if self._partials and self._lowest < first:
+            self._reassembly.work_us += len(self._partials) // LOOKED_AT_PER_US
+            self._stale = [seq for seq in self._partials if seq < first]
+            self._lowest = first
         self._advance()
-        return left_out
 
     def fragment(
         self,
@@ -465,6 +472,7 @@ class InStream:
             if not self._reassembly.make_room(len(message.body) + HELD_OVERHEAD_BYTES):
                 raise WireError(f"more messages out of order than {self._reassembly.limit_bytes} bytes hold")
         self._waiting[seq] = message
+        heappush(self._order, seq)
 
     def go_on(self, now: float) -> None:
         """Go on with the messages whose turn has come."""
@@ -473,26 +481,30 @@ class InStream:
 
     def _advance(self) -> None:
         """Hand out what waited and waits for nothing more, at most so much that others do not wait for it."""
-        reassembly, waiting = self._reassembly, self._waiting
+        reassembly, order = self._reassembly, self._order
         while True:
-            if self._below:
-                seq = self._below[-1]
-            else:
+            stale = self._stale
+            below = bool(order) and order[0] < self._first
+            if not stale and not below:
                 if self._first:
                     self.delivered, self._first = max(self.delivered, self._first - 1), 0
-                seq = self.delivered + 1
-                if seq not in waiting:
+                if not order or order[0] != self.delivered + 1:
                     reassembly.behind.pop(self, None)
                     return
             if reassembly.work_us > SLICE_US:
                 reassembly.behind[self] = None
                 return
-            if self._below:
-                self._below.pop()
-            self._take_turn(seq)
+            if stale:
+                self._discard_partial(stale.pop())
+                reassembly.work_us += STALE_US
+            else:
+                self._stale = None
+                self.left_out -= below
+                self._take_turn()
 
-    def _take_turn(self, seq: int) -> None:
-        """A message that waited for those before it."""
+    def _take_turn(self) -> None:
+        """The lowest of the messages that waited for those before them."""
+        seq = heappop(self._order)
         message = self._waiting.pop(seq)
         self._reassembly.held_bytes -= len(message.body) + HELD_OVERHEAD_BYTES
         self._reassembly.work_us += TURN_US
@@ -540,8 +552,8 @@ class InStream:
             self._lose(seq, reason)
         self._reassembly.held_bytes -= self._waiting_bytes()
         self._waiting.clear()
-        if self._below:
-            self._below = None
+        self._order.clear()
+        self._stale = None
         self._advance()
 
     def _waiting_bytes(self) -> int:
@@ -556,9 +568,14 @@ class InStream:
     def validate(self, check: Callable[[bool, str], None]) -> None:
         name = self.stream.id.topic
         check(all(seq > self.delivered for seq in self._waiting), f"{name}: a delivered message still waits")
-        check(all(seq > self.delivered for seq in self._partials), f"{name}: a stale partial message is kept")
+        check(sorted(self._order) == sorted(self._waiting), f"{name}: the order of what waits is another")
         behind = self in self._reassembly.behind
+        check(all(seq > self.delivered for seq in self._partials), f"{name}: a stale partial message is kept")
+        check(
+            not self._partials or self._lowest <= min(self._partials.keys() - {*(self._stale or ())}, default=2**63),
+            f"{name}: a half-received message lies below the lowest",
+        )
         check(behind or self.delivered + 1 not in self._waiting, f"{name}: a message waits for nothing")
-        check(behind or not (self._below or self._first), f"{name}: it was to go on at {self._first}")
+        check(behind or not (self._stale or self._first), f"{name}: it was to go on at {self._first}")
         check(not self._partials.keys() & self._waiting.keys(), f"{name}: a whole message is half-received as well")
         check(self.confirmed <= self.delivered, f"{name}: more was confirmed than had its turn")

@@ -40,7 +40,7 @@ from sern_core.out_message import OutMessage
 from sern_core.params import LinkParams, SchedulerParams
 from sern_core.presence import Presence
 from sern_core.queues import OutChannel
-from sern_core.replay import ReplayStore
+from sern_core.replay import ReplayStore, as_replays, kept_bytes, newest_that_fit
 from sern_core.routing import UNIT_S, BadPatternError, RouteChange, RoutingTable
 from sern_core.rules import is_client_name, name_problem
 from sern_core.session import DISPLACED
@@ -50,8 +50,9 @@ from sern_core.types import DROP_CODES, ClientName, DropReason, TopicName
 STREAM_US: Final = 50
 FORWARD_US: Final = 5
 CONFIRMED_PER_US: Final = 8
+REPLAY_US: Final = 2
 """What work for a client is charged to it, in microseconds: to take or end a stream, to hand on a message to a
-subscriber, and how many subscribers are asked for their share of a confirmation."""
+subscriber, and how many subscribers are asked for their share of a confirmation; to replay a message."""
 MAX_SUBSCRIPTION_PARTS: Final = 64
 ORPHAN_S: Final = 60.0
 """A session that a blackout cost its TCP connection has ended when its datagram lane says nothing for so long: longer
@@ -100,6 +101,7 @@ class Hub(LocalStreams):
         self.events = GuardedEvents(events)
         self.params = params or HubParams()
         self.routing = RoutingTable(access)
+        self.routing.route_units = self._replay_units
         self.objects = ObjectRegistry(epoch=boot)
         self.definitions = DefinitionStore()
         self.trace = trace or DecisionTrace(enabled=False)
@@ -125,6 +127,7 @@ class Hub(LocalStreams):
         self._absent_since: dict[ClientName, float] = {}
         self._draining = Draining(self._end_channel)
         self._unsubscribed: OutChannel | None = None  # is being closed because its taker wants it no more
+        self._room: tuple[ClientName, float, int] | None = None  # for replays to a client at this time
         self._tidy_due_s = now + TIDY_S
         self.after: Callable[[], None] = lambda: None
         """Called when something was done by time that may have given any client's link something to send; set by the
@@ -443,7 +446,7 @@ class Hub(LocalStreams):
                 stream,
                 first=first,
                 now=now,
-                replays=self._replays(client, relayed),
+                replays=self._replays(link, relayed, first, now),
             )
         except UsageError as error:
             relayed.unopened.add(client)
@@ -457,15 +460,39 @@ class Hub(LocalStreams):
             relayed.outs[client] = (link, channel)
             self.presence.joined(identity.origin, client)
 
-    def _replays(self, client: ClientName, relayed: Relayed) -> list[Message]:
-        """The latched messages that a late joiner may have."""
-        if relayed.cache is None:
+    def _replays(self, link: Link, relayed: Relayed, first: int, now: float) -> list[Message]:
+        """The latched messages that a late joiner may have before `first`: of those that are not too many for what may
+        wait for it the newest, the others are counted as `queue_full`."""
+        client, stream, cache = link.peer, relayed.stream.stream, relayed.cache
+        if cache is None or cache.empty or not self.access.may_replay(client, stream.id.topic):
             return []
-        if not self.access.may_replay(client, relayed.stream.stream.id.topic):
-            return []
-        if client in self._bounds:
-            self._bounds[client].recount()
-        return self.replays.replay(relayed.cache)
+        messages = self.replays.below(cache, first)
+        for payer in (link, relayed.source):  # whoever of them is being read has set it off, and it counts there
+            if payer is not None:
+                payer.reassembly.work_us += REPLAY_US * len(messages)
+        bound = self._bounds.get(client)
+        if bound is None:
+            return as_replays(messages)
+        bound.recount()
+        if self._room is None or self._room[:2] != (client, now):
+            # Adding up is too dear to be done for each of the streams that a client subscribes to at once.
+            held_bytes = sum(channel.kept_bytes for channel in link.channels.values())
+            self._room = client, now, bound.max_bytes - held_bytes
+        room_bytes = self._room[2]
+        start = len(messages) - newest_that_fit(messages, room_bytes)
+        counters = link.ledger.topic(stream.id.topic, stream.spec.priority)
+        for message in messages[:start]:
+            counters.offer(len(message.body))
+            counters.drop(DropReason.QUEUE_FULL, len(message.body))
+        self._room = client, now, room_bytes - sum(map(kept_bytes, messages[start:]))
+        return as_replays(messages[start:])
+
+    def _replay_units(self, identity: StreamId) -> int:
+        """What replaying a stream costs, in the routing table's unit."""
+        relayed = self.relayed.get(identity)
+        if relayed is None or relayed.cache is None:
+            return 0
+        return int(relayed.cache.count * REPLAY_US * 1e-6 / UNIT_S)
 
     def _remove(self, identity: StreamId, now: float, *, drain: bool = True, source: Link | None = None) -> None:
         """The stream has ended. `drain`: what was owed of it is still delivered; `source`: who said so, so that
@@ -524,7 +551,8 @@ class Hub(LocalStreams):
         if not resumed:
             for relayed in self.relayed.values():
                 if link.peer in relayed.outs:
-                    relayed.outs[link.peer][1].prime(self._replays(link.peer, relayed), now=now)
+                    channel = relayed.outs[link.peer][1]
+                    channel.prime(self._replays(link, relayed, channel.first_seq, now), now=now)
         self.presence.changed(link.peer, now=now)
         self.events.client_up(link.peer, resumed=resumed)
 

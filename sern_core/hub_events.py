@@ -8,7 +8,7 @@ from sern_core.fragments import InStream
 from sern_core.link import Link
 from sern_core.message import Message, StreamInfo
 from sern_core.queues import OutChannel
-from sern_core.replay import LatchedCache, ReplayStore
+from sern_core.replay import MAX_REPLAY_MESSAGES, LatchedCache, ReplayStore
 from sern_core.types import ClientName
 
 
@@ -106,7 +106,7 @@ class Relayed:
     def keep_latched(self, replays: ReplayStore) -> None:
         """Keep as many messages for late joiners as the stream's properties say by now."""
         spec, old = self.stream.stream.spec, self.cache
-        if old is not None and spec.latched and old.depth == spec.depth:
+        if old is not None and spec.latched and old.depth == min(spec.depth, MAX_REPLAY_MESSAGES):
             return
         self.cache = replays.open(spec.depth) if spec.latched else None
         if old is not None:

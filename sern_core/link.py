@@ -51,6 +51,8 @@ CONTROL_BYTES_PER_US: Final = 16
 ATTACHMENT_BYTES_PER_US: Final = 250
 RETAINED_PER_US: Final = 16
 """What a control message is charged with: itself, its size, what its attachment unpacks to, what it looks through."""
+ANNOUNCE_US: Final = 12
+"""What a session that begins is charged with for each stream that is announced in it."""
 MAX_UNHEARD: Final = 20_000
 """Control messages that a peer may have answered, beside four for each channel, before it reads an answer."""
 
@@ -150,7 +152,7 @@ class Link(Answering):
         self._attachments_s = 0.0
         self._announcing: deque[tuple[int, OutChannel]] = deque()  # may send once that control message is on its way
         self._gone: deque[InStream] = deque()  # streams that the peer no longer has, to be retracted
-        self._skipping: dict[InStream, int] = {}  # how many messages a stream leaves out that goes on in a while
+        self._skipping: dict[InStream, None] = {}  # streams that leave messages out, and go on in a while
         self._missing: dict[StreamId, float] = {}  # not announced by a new peer, and since when
         self.finish: Callable[[Link, float], bool] | None = None
         """Called before more is read: whether all that came of what was read before is done by now."""
@@ -181,6 +183,7 @@ class Link(Answering):
             for identity in self.streams:
                 self._missing.setdefault(identity, now)
         self.handler.on_up(self, resumed=resumed, now=now)
+        self.reassembly.work_us += ANNOUNCE_US * len(self.channels)
         for channel in list(self.channels.values()):
             self._announce(channel, now)
         self.send_control({"t": "synced", "batch": True}, now=now)
@@ -384,15 +387,15 @@ class Link(Answering):
         return None
 
     def _skip(self, stream: InStream, first: int, now: float) -> None:
-        left_out = stream.skip_to(first, now)
+        stream.skip_to(first, now)
         if stream in self.reassembly.behind:
-            self._skipping[stream] = left_out
+            self._skipping[stream] = None
         else:
-            self._skipped(stream, left_out, now)
+            self._skipped(stream, now)
 
-    def _skipped(self, stream: InStream, left_out: int, now: float) -> None:
-        if left_out:
-            self._tell(self.handler.on_skipped, self, stream, left_out, now=now)
+    def _skipped(self, stream: InStream, now: float) -> None:
+        if stream.left_out:
+            self._tell(self.handler.on_skipped, self, stream, stream.left_out, now=now)
             self._confirm_own(stream)
         if stream.wanted:
             stream.paused = False
@@ -507,7 +510,8 @@ class Link(Answering):
                 return False
             self._confirm_own(stream)
             if stream in self._skipping:
-                self._skipped(stream, self._skipping.pop(stream), now)
+                del self._skipping[stream]
+                self._skipped(stream, now)
         while self._gone:
             if reassembly.work_us > SLICE_US:
                 return False

@@ -1,22 +1,63 @@
 """Replay of latched state: the last `depth` messages of each transient_local publisher, for whoever joins later."""
 
 from collections import OrderedDict, deque
+from collections.abc import Iterable, Sequence
+from itertools import takewhile
 from typing import Final
 
 from sern_core.message import Message
+from sern_core.queues import MESSAGE_OVERHEAD_BYTES
 
 UNBOUNDED_BYTES: Final = 2**62
+MAX_REPLAY_MESSAGES: Final = 1000
+"""Messages of one stream that a relay keeps for late joiners, whatever its depth: each of those gets all at once."""
+
+
+def kept_bytes(message: Message) -> int:
+    """What a kept message counts for: its body and what its objects take."""
+    return len(message.body) + MESSAGE_OVERHEAD_BYTES
+
+
+def newest_that_fit(messages: Sequence[Message], room_bytes: int) -> int:
+    """How many of the messages, counted from the newest and last, fit into the room."""
+    count = 0
+    for message in reversed(messages):
+        room_bytes -= kept_bytes(message)
+        if room_bytes < 0:
+            break
+        count += 1
+    return count
+
+
+def as_replays(messages: Iterable[Message]) -> list[Message]:
+    """Copies marked as replay."""
+    return [
+        Message(
+            message.stream,
+            message.seq,
+            message.body,
+            message.stamp_ns,
+            message.born_s,
+            0,
+            True,
+            message.error_s,
+            message.codec,
+        )
+        for message in messages
+    ]
 
 
 class LatchedCache:
     """Bounded by the stream's depth and by `max_bytes` (the oldest go first; the newest is always kept)."""
 
-    __slots__ = ("_bytes", "_max_bytes", "_messages")
+    __slots__ = ("_bytes", "_max_bytes", "_messages", "cut")
 
     def __init__(self, depth: int, max_bytes: int) -> None:
         self._messages: deque[Message] = deque(maxlen=depth)
         self._max_bytes = max_bytes
         self._bytes = 0
+        self.cut = False
+        """Whether the stream has more depth than is kept."""
 
     def add(self, message: Message) -> None:
         """Keep `message`; tombstones have nothing to replay."""
@@ -24,15 +65,15 @@ class LatchedCache:
             return
         messages = self._messages
         if len(messages) == messages.maxlen:
-            self._bytes -= len(messages[0].body)
+            self._bytes -= kept_bytes(messages[0])
         messages.append(message)
-        self._bytes += len(message.body)
+        self._bytes += kept_bytes(message)
         while self._bytes > self._max_bytes and len(messages) > 1:
             self.drop_oldest()
 
     def drop_oldest(self) -> int:
         """Let go of the oldest message; returns its bytes. There must be one."""
-        size = len(self._messages.popleft().body)
+        size = kept_bytes(self._messages.popleft())
         self._bytes -= size
         return size
 
@@ -45,25 +86,24 @@ class LatchedCache:
         return not self._messages
 
     @property
+    def count(self) -> int:
+        return len(self._messages)
+
+    @property
+    def full(self) -> bool:
+        return len(self._messages) == self._messages.maxlen
+
+    @property
     def held_bytes(self) -> int:
         return self._bytes
 
     def replay(self) -> list[Message]:
         """Copies marked as replay, oldest first."""
-        return [
-            Message(
-                message.stream,
-                message.seq,
-                message.body,
-                message.stamp_ns,
-                message.born_s,
-                0,
-                True,
-                message.error_s,
-                message.codec,
-            )
-            for message in self._messages
-        ]
+        return as_replays(self._messages)
+
+    def below(self, seq: int) -> list[Message]:
+        """The messages below `seq`, oldest first."""
+        return list(takewhile(lambda message: message.seq < seq, self._messages))
 
 
 class ReplayStore:
@@ -80,8 +120,10 @@ class ReplayStore:
         self._by_use: OrderedDict[LatchedCache, None] = OrderedDict()  # least recently used first
 
     def open(self, depth: int) -> LatchedCache:
-        """A cache for one more stream. Write and read it through this store, and `close` it once."""
-        cache = LatchedCache(depth, UNBOUNDED_BYTES)
+        """A cache for one more stream, of `MAX_REPLAY_MESSAGES` at most: a full one of a deeper stream counts what it
+        loses as evicted. Write and read it through this store, and `close` it once."""
+        cache = LatchedCache(min(depth, MAX_REPLAY_MESSAGES), UNBOUNDED_BYTES)
+        cache.cut = depth > MAX_REPLAY_MESSAGES
         self._by_use[cache] = None
         return cache
 
@@ -92,11 +134,12 @@ class ReplayStore:
     def add(self, cache: LatchedCache, message: Message) -> None:
         """Keep `message` in its stream's cache."""
         self._by_use.move_to_end(cache)
-        if len(message.body) > self.max_bytes:
+        if kept_bytes(message) > self.max_bytes:
             self.evicted += 1
             self._shrink(cache, -1)  # replayed as the latest, what came before it would be wrong
             return
         before_bytes = cache.held_bytes
+        self.evicted += cache.cut and cache.full and not message.tombstone
         cache.add(message)
         self.held_bytes += cache.held_bytes - before_bytes
         for least_used in self._by_use:
@@ -104,10 +147,10 @@ class ReplayStore:
                 break
             self._shrink(least_used, least_used.held_bytes - (self.held_bytes - self.max_bytes))
 
-    def replay(self, cache: LatchedCache) -> list[Message]:
-        """What a late joiner of the stream gets, oldest first."""
+    def below(self, cache: LatchedCache, seq: int) -> list[Message]:
+        """What a late joiner of the stream gets if it has room, oldest first: what comes before its first message."""
         self._by_use.move_to_end(cache)
-        return cache.replay()
+        return cache.below(seq)
 
     def _shrink(self, cache: LatchedCache, to_bytes: int) -> None:
         while not cache.empty and cache.held_bytes > to_bytes:

@@ -23,7 +23,7 @@ Who announces is the caller's business: `StreamInfo.id.origin` must be the name 
 
 from bisect import bisect_left
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
@@ -152,6 +152,8 @@ class RoutingTable:
         self._interests: dict[ClientName, _Interest] = {}
         self.spent_units = 0
         """What the last `announce`, `subscribe`, `go_on` or `set_access` has cost."""
+        self.route_units: Callable[[StreamId], int] = lambda _stream: 0
+        """What a new route of a stream costs beside `ROUTE_UNITS`; set by the owner."""
 
     # Look-ups --------------------------------------------------------------------------------------------------------
 
@@ -436,6 +438,8 @@ class RoutingTable:
                 (interest.topics.add if takes else interest.topics.discard)(name)
                 self._set_taker(client, name, change, takes=takes)
                 self.spent_units += ROUTE_UNITS
+                if takes:
+                    self.spent_units += sum(map(self.route_units, self._topics[name].streams.values()))
             if self.spent_units >= SLICE_UNITS:
                 return
         if not interest.patterns.texts and not interest.exact:

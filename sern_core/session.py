@@ -37,6 +37,14 @@ RESET_INTERVAL_S: Final = 0.5
 REFUSED_INTERVAL_S: Final = 5.0
 ABORT_INTERVAL_S: Final = 1.0
 """Sessions that end because something went wrong follow each other no faster: else both ends would do nothing else."""
+BEGIN_US: Final = 60
+KEPT_US: Final = 2
+"""What a session that begins at the relay's end is charged with, beside what its owner does then: itself, and each
+message that is kept for the peer."""
+BEGIN_SHARE: Final = 1.0 / 3.0
+BEGIN_AHEAD_S: Final = 0.1
+"""The share of the relay's time that beginning the sessions of one peer may take, and how far they may be ahead of it.
+A HELLO that comes too early is not answered; the initiator says it again after `HELLO_INTERVAL_S`."""
 SHORT_SESSION_S: Final = 5.0
 """A session that is taken from us sooner than this was short."""
 DISPLACED_S: Final = (0.5, 10.0)
@@ -90,6 +98,7 @@ class Session(Hop):
         self._hello_stamp_us = -1
         self._reset_due_s = -float("inf")
         self._abort_due_s = -float("inf")
+        self._begun_paid_s = -float("inf")  # until then, beginning sessions has used up its share of the time
         self._short_sessions = 0  # in a row
         self._displaced_pauses = 0  # in a row, after refusals that said so
         self._resumed = False
@@ -243,8 +252,8 @@ class Session(Hop):
     ) -> bool:
         """The relay's end: a peer whose name and key were checked says hello; WELCOME is queued.
 
-        False: an old HELLO that the network delivered late. Raises WireError, or VersionError when no wire version is
-        common; the caller refuses then.
+        False: an old HELLO that the network delivered late, or one that comes too soon. Raises WireError, or
+        VersionError when no wire version is common; the caller refuses then.
         """
         try:
             return self._accept(hello, tag, stamp_us, now, another_connection=another_connection)
@@ -259,9 +268,11 @@ class Session(Hop):
         version = wire.agree_version(wire.take_int(hello, "vmin"), wire.take_int(hello, "vmax"))
         if boot == self.peer_boot and stamp_us < self._hello_stamp_us:
             return False
+        again = self.established and tag == self.tag and boot == self.peer_boot  # our WELCOME was lost
+        if not again and now < self._begun_paid_s - BEGIN_AHEAD_S:
+            return False
         self._hello_stamp_us = stamp_us
         self.transport_up = True
-        again = self.established and tag == self.tag and boot == self.peer_boot  # our WELCOME was lost
         if not again:
             self._end_session("new session", now)
             self.tag = tag
@@ -282,8 +293,19 @@ class Session(Hop):
         self.dirty = True
         self.lanes[LANE_ZMQ].up = True
         if not again:
-            self._establish(boot, now)
+            self._begin_charged(boot, now)
         return True
+
+    def _begin_charged(self, peer_boot: int, now: float) -> None:
+        """Begin a session and charge the peer's HELLOs with it: a hundred bytes announce thousands of streams anew."""
+        reassembly = self.reassembly
+        kept = sum(len(c.retained) or len(c.queue) + len(c.flying) for c in self.channels.values())
+        reassembly.work_us = BEGIN_US + KEPT_US * kept
+        try:
+            self._establish(peer_boot, now)
+        finally:
+            spent_s = reassembly.work_us * 1e-6
+            self._begun_paid_s = max(now, self._begun_paid_s) + spent_s / BEGIN_SHARE
 
     def close(self, reason: str, *, now: float) -> None:
         """End the session on purpose and tell the peer. The transport stays."""

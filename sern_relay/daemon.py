@@ -366,7 +366,7 @@ class RelayDaemon:
                       read=lambda: [((), float(len(self.server.connections) if self.server else 0))])  # fmt: skip
         metrics.counter("sern_relay_connections_refused_total", "Connections or messages refused, by reason.",
                         ("reason",), self._refused_connections)  # fmt: skip
-        metrics.counter("sern_relay_replay_evicted_total", "Latched messages let go because of replay.cache_bytes.",
+        metrics.counter("sern_relay_replay_evicted_total", "Latched messages let go because of their bounds.",
                         read=lambda: [((), float(self.hub.replays.evicted))])  # fmt: skip
         metrics.gauge("sern_relay_replay_bytes", "Latched messages kept for late joiners, bytes.",
                       read=lambda: [((), float(self.hub.replays.held_bytes))])  # fmt: skip

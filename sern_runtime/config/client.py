@@ -172,7 +172,8 @@ class TopicSection(Section):
     """`reliable`: kept and resent until delivered or `retention_s` is over; `best_effort`: freshest first;
     `auto`: as the publisher offers (ROS 1: reliable if latched)."""
     durability: Literal["auto", "volatile", "transient_local"] = "auto"
-    """`transient_local`: the last `depth` messages reach late joiners; `auto`: as the publisher offers."""
+    """`transient_local`: the last `depth` messages, at most 1,000, reach late joiners; `auto`: as the publisher
+    offers."""
     history: Literal["keep_last"] = "keep_last"
     """The only kind of history there is; its length is `depth`."""
     depth: Annotated[int, Field(ge=1, le=10_000)] | None = None

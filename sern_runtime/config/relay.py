@@ -144,7 +144,7 @@ class FeedTypeSection(Section):
     reliability: Literal["reliable", "best_effort"] = "best_effort"
     """`reliable`: kept until delivered; `best_effort`: freshest first."""
     durability: Literal["volatile", "transient_local"] = "volatile"
-    """`transient_local`: the last `depth` messages reach late joiners."""
+    """`transient_local`: the last `depth` messages, at most 1,000, reach late joiners."""
     depth: Annotated[int, Field(ge=1, le=10_000)] | None = None
     """Messages kept; null: 10 if reliable, else 1."""
     lifespan_s: Annotated[

@@ -7,7 +7,7 @@ from typing import Any, Final
 
 import pytest
 
-from sern_core import definitions, wire
+from sern_core import definitions, session, wire
 from sern_core import hub as relay_core
 from sern_core import link as hop_end
 from sern_core.announce import Announcement, definition_hash, encode_announcement
@@ -352,6 +352,47 @@ def test_answers_to_greetings_do_not_pile_up(name: str) -> None:
         peer.hello(tag=index % 255 + 1, name=name)
     waiting = sum(1 for _ in range(2000) if peer.port.next_datagram(now=peer.now) is not None)
     assert waiting < 10
+
+
+def test_sessions_begin_no_faster_than_their_price_allows() -> None:
+    """A hundred bytes of HELLO announce hundreds of streams anew."""
+    peer = Hostile()
+    other = Hostile(peer.world, "other")
+    for index in range(300):
+        other.announce(1 + index, f"/other/t{index}", reliable=True)
+    peer.control({"t": "subscribe", "patterns": ["/other/.*"], "more": False})
+    while peer.hub.matching.due_s:
+        peer.now = max(peer.now, *peer.hub.matching.due_s.values())
+        peer.port.handle_timeout(now=peer.now)
+    link = peer.hub.links[peer.name]
+    assert len(link.channels) == 300
+    begun = 0
+    for index in range(1000):  # in a second
+        peer.now += 0.001
+        tag = link.tag
+        peer.boot = 100 + index
+        peer.hello(tag=index % 250 + 2)
+        begun += link.tag != tag
+    assert 2 <= begun < 150
+    peer.now += session.HELLO_INTERVAL_S
+    peer.hello(tag=254)
+    assert link.tag == 254, "its next HELLO has its session"
+    peer.hub.validate()
+
+
+def test_a_client_that_connects_again_and_again_has_its_session_each_time() -> None:
+    peer = Hostile()
+    other = Hostile(peer.world, "other")
+    for index in range(50):
+        other.announce(1 + index, f"/other/t{index}", reliable=True)
+    peer.control({"t": "subscribe", "patterns": ["/other/.*"], "more": False})
+    link = peer.hub.links[peer.name]
+    for index in range(100):
+        peer.now += 0.05
+        peer.port.disconnected(now=peer.now)
+        peer.port = peer.world.relay.port(peer.name)
+        peer.hello(tag=index + 2)
+        assert link.tag == index + 2 and link.established
 
 
 def test_origins_cannot_have_any_number_of_streams_kept_for_an_absent_client(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -279,6 +279,23 @@ def answers_about_many_channels(peer: Hostile) -> list[bytes]:
         {"t": "want", "ch": 1, "on": bool(index % 2), "chs": [2, 0xFFFF]})))  # fmt: skip
 
 
+def hello_after_long_lists() -> Input:
+    """A subscriber that has said of all its streams that it owes them to thousands of others greets anew."""
+    peer = Hostile()
+    with_channels(peer, 300)
+    names = [f"{index:x}" for index in range(8190)]
+    rows = [names[start : start + 48] for start in range(0, len(names), 48)]
+    for row in rows[:-1]:
+        said(peer, control(peer, wire.encode_control({"t": "want", "ch": 1, "on": True, "owed": row, "more": True})))
+    runs = [2, len(peer.hub.links[peer.name].channels)]
+    said(peer, control(peer, wire.encode_control({"t": "want", "ch": 1, "on": True, "owed": rows[-1], "chs": runs})))
+    said(peer, control(peer, wire.encode_control({"t": "want", "ch": 1, "on": True, "add": ["x"], "chs": runs})))
+    return Input(peer.said_bytes, partial(peer.hello, 2))
+
+
+INPUTS["datagram: HELLO after long lists"] = FEWER["datagram: HELLO after long lists"] = hello_after_long_lists
+
+
 @for_fifty
 def runs_of_dropped_messages(peer: Hostile) -> list[bytes]:
     other = Hostile(peer.world, "other")
@@ -332,6 +349,39 @@ def none_below(peer: Hostile) -> list[bytes]:
     the_one_they_wait_for(peer)
     return [control(peer, wire.encode_control({"t": "first", "ch": 1, "seq": 100_000}))]
 
+
+WAITING: Final = 60_000
+
+
+def full(peer: Hostile, frame: Callable[[int], bytes]) -> None:
+    """Messages that wait for those before them fill the memory that a link may have."""
+    peer.announce(1, "/robot/a", reliable=True)
+    for start in range(1_000_000, 1_000_000 + WAITING, 1500):
+        said(peer, *(frame(seq) for seq in range(start, start + 1500)))
+
+
+def step_by_step(peer: Hostile) -> list[bytes]:
+    return filled(lambda index: control(peer, wire.encode_control({"t": "first", "ch": 1, "seq": 2 + index})))
+
+
+@datagram
+def first_of_ever_one_more_before_many_that_wait(peer: Hostile) -> list[bytes]:
+    full(peer, lambda seq: _whole(1, seq))
+    return step_by_step(peer)
+
+
+@datagram
+def first_of_ever_one_more_before_many_half_received(peer: Hostile) -> list[bytes]:
+    full(peer, lambda seq: _piece(1, seq, 0, 2))
+    return step_by_step(peer)
+
+
+def none_of_the_half_received(peer: Hostile) -> list[bytes]:
+    full(peer, lambda seq: _piece(1, seq, 0, 2))
+    return [control(peer, wire.encode_control({"t": "first", "ch": 1, "seq": 2_000_000}))]
+
+
+datagram(none_of_the_half_received, sets_off=True)
 
 for set_off in (all_streams_at_once, the_one_they_wait_for, none_below):
     datagram(set_off, sets_off=True)

@@ -15,6 +15,7 @@ from sern_core.fragments import (
     MAX_PIECES,
     PARTIAL_IDLE_S,
     PIECE_BYTES,
+    SLICE_US,
     InStream,
     Partial,
     Reassembly,
@@ -55,6 +56,13 @@ class Receiver:
     def whole(self, seq: int, *, now: float = 0.0, born_s: float = 0.0, error_s: float = 0.0) -> None:
         self.stream.fragment(0, seq, 0, 8, _body(seq, 8), 7, born_s, error_s, now)
         self.check()
+
+    def skip_to(self, first: int) -> int:
+        self.stream.skip_to(first, 0.0)
+        assert self.stream not in self.room.behind, "more than one slice"
+        self.room.work_us = 0
+        self.check()
+        return self.stream.left_out
 
     def tombstone(self, seq: int, reason: DropReason) -> None:
         self.stream.fragment(FLAG_TOMBSTONE, seq, 0, 1, bytes([DROP_CODES[reason]]), 0, 0.0, 0.0, 0.0)
@@ -206,10 +214,63 @@ def test_skipping_delivers_what_waited_and_counts_the_rest() -> None:
     receiver.whole(3)
     receiver.whole(6)
     receiver.piece(4, 0, 50, 100)
-    assert receiver.stream.skip_to(6, 0.0) == 4
+    assert receiver.skip_to(6) == 4
     assert receiver.seqs == [3, 6] and receiver.stream.delivered == 6 and receiver.room.held_bytes == 0
-    assert receiver.stream.skip_to(2**60, 0.0) == 2**60 - 7
-    assert receiver.stream.skip_to(5, 0.0) == 0
+    assert receiver.skip_to(2**60) == 2**60 - 7
+    assert receiver.skip_to(5) == 0
+
+
+@pytest.mark.parametrize("whole", [True, False])
+def test_skipping_one_of_many_looks_at_no_more_than_it_leaves_out(whole: bool) -> None:
+    receiver = Receiver(reliable=True, limit_bytes=10**9)
+    stream, count = receiver.stream, 20_000
+    for seq in range(1_000_000, 1_000_000 + count):
+        stream.fragment(0, seq, 0, 8, bytes(8 if whole else 4), 7, 0.0, 0.0, 0.0)
+    for first in range(2, 500):
+        stream.skip_to(first, 0.0)
+        assert stream.left_out == 1
+    assert receiver.room.work_us == 0 and stream not in receiver.room.behind
+    receiver.check()
+
+
+def test_many_half_received_messages_are_left_out_in_slices() -> None:
+    receiver = Receiver(reliable=True, limit_bytes=10**9)
+    stream, room, count = receiver.stream, receiver.room, 20_000
+    for seq in range(1000, 1000 + count):
+        stream.fragment(0, seq, 0, 8, bytes(8 if seq % 1000 == 999 else 4), 7, 0.0, 0.0, 0.0)
+    stream.skip_to(1000 + count, 0.0)
+    slices = 1
+    while stream in room.behind:
+        assert room.work_us < 2 * SLICE_US
+        room.work_us = 0
+        stream.go_on(0.0)
+        slices += 1
+        receiver.check()
+    assert slices > 3 and room.held_bytes == 0
+    assert stream.delivered == 999 + count and stream.left_out == stream.delivered - count // 1000
+    assert receiver.seqs == list(range(1999, 1000 + count, 1000))
+
+
+@settings(max_examples=cases(100), deadline=None)
+@given(st.lists(st.tuples(st.integers(1, 40), st.sampled_from(["whole", "piece", "first"])), max_size=40))
+def test_skipping_whatever_has_arrived(steps: list[tuple[int, str]]) -> None:
+    receiver = Receiver(reliable=True)
+    arrived: set[int] = set()
+    left_out = first = 0
+    for seq, what in steps:
+        if what == "first":
+            left_out += receiver.skip_to(seq)
+            first = max(first, seq)
+        elif what == "whole":
+            if seq > receiver.stream.delivered:
+                arrived.add(seq)
+            receiver.whole(seq)
+        else:
+            receiver.piece(seq, 0, 4, 8)
+        receiver.check()
+    turns = receiver.seqs
+    assert turns == sorted(arrived & set(range(1, receiver.stream.delivered + 1)))
+    assert receiver.stream.delivered >= first - 1 and len(turns) + left_out == receiver.stream.delivered
 
 
 def test_closing_lets_go_of_everything() -> None:

@@ -1,12 +1,13 @@
 """Interest is told when it changes: by difference, many streams at a time, and nothing that was undone meanwhile."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from random import Random
 from typing import Any
 
 import pytest
 
-from sern_core import wire
+from sern_core import answering, wire
 from sern_core.announce import decode_want
 from sern_core.errors import WireError
 from sern_core.fragments import InStream, Reassembly
@@ -191,6 +192,61 @@ def test_what_an_answer_may_name_has_an_end() -> None:
 
     with pytest.raises(WireError, match="again and again"):
         again_and_again()
+
+
+def test_a_relay_keeps_no_names_that_a_subscriber_says_it_owes() -> None:
+    peer = Hostile()
+    other = Hostile(peer.world, "other")
+    for index in range(3):
+        other.announce(1 + index, f"/other/t{index}", reliable=True)
+    peer.control({"t": "subscribe", "patterns": ["/other/.*"], "more": False})
+    channels = peer.hub.links[peer.name].channels.values()
+    for _ in range(300):  # without end
+        peer.control({"t": "want", "ch": 1, "on": True, "owed": ["x"] * 48, "more": True})
+    peer.control({"t": "want", "ch": 1, "on": True, "owed": ["y"], "chs": [2, 3]})
+    peer.control({"t": "want", "ch": 1, "on": True, "add": ["z"], "chs": [2, 3]})
+    assert [(channel.wanted, channel.owed) for channel in channels] == [(True, ())] * 3
+
+
+def told_robot(topics: int) -> tuple[SimClient, Callable[[wire.Envelope], None]]:
+    """A client with reliable topics, and what says a control message of the relay to it."""
+    world = World()
+    robot = world.client("robot")
+    for index in range(topics):
+        robot.publish(f"/robot/log{index}", spec(reliable=True))
+    world.run(2.0)
+
+    def tell(envelope: wire.Envelope) -> None:
+        world.relay.hub.links[robot.name].send_control(envelope, now=world.now)
+        world.run(2.0)
+
+    return robot, tell
+
+
+def test_channels_that_are_owed_alike_share_one_list() -> None:
+    robot, tell = told_robot(50)
+    channels = list(robot.core.link.channels.values())
+    slots = sorted(channel.slot for channel in channels)
+    runs = [slots[0] + 1, slots[-1]]
+    tell({"t": "want", "ch": slots[0], "on": True, "chs": runs, "owed": ["site1", "site2"]})
+    tell({"t": "want", "ch": slots[0], "on": True, "chs": runs, "add": ["site3"], "drop": ["site1"]})
+    assert {channel.owed for channel in channels} == {("site2", "site3")}
+    assert len({id(channel.owed) for channel in channels}) == 1
+
+
+def test_lists_that_are_finished_leave_room_for_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(answering, "MAX_OWED", 10)
+    robot, tell = told_robot(1)
+    channel = next(iter(robot.core.link.channels.values()))
+    for row in range(5):
+        names = [f"site{row}{index}" for index in range(6)]
+        tell({"t": "want", "ch": channel.slot, "on": True, "owed": names[:5], "more": True})
+        tell({"t": "want", "ch": channel.slot, "on": True, "owed": names[5:]})
+        assert channel.owed == tuple(names)
+    for slot in (1, 2):
+        tell({"t": "want", "ch": slot, "on": True, "owed": ["a"] * 5, "more": True})
+    with pytest.raises(WireError, match="unfinished"):
+        tell({"t": "want", "ch": 3, "on": True, "owed": ["a"], "more": True})
 
 
 @pytest.mark.parametrize("bad", [[1], [3, 2], [1, 1], [5, 6, 6, 7], [2, 70_000], ["2", "3"], [True, True], 7, None])
