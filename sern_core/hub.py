@@ -11,7 +11,7 @@ and so is one whose name is revoked.
 """
 
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Final
@@ -41,7 +41,7 @@ from sern_core.params import LinkParams, SchedulerParams
 from sern_core.presence import Presence
 from sern_core.queues import OutChannel
 from sern_core.replay import ReplayStore, as_replays, kept_bytes, newest_that_fit
-from sern_core.routing import UNIT_S, BadPatternError, RouteChange, RoutingTable
+from sern_core.routing import UNIT_S, BadPatternError, Denied, Match, RouteChange, RoutingTable
 from sern_core.rules import is_client_name, name_problem
 from sern_core.session import DISPLACED
 from sern_core.trace import DecisionTrace
@@ -51,8 +51,11 @@ STREAM_US: Final = 50
 FORWARD_US: Final = 5
 CONFIRMED_PER_US: Final = 8
 REPLAY_US: Final = 2
+AWAIT_US: Final = 50
+OWED_PER_US: Final = 2
 """What work for a client is charged to it, in microseconds: to take or end a stream, to hand on a message to a
-subscriber, and how many subscribers are asked for their share of a confirmation; to replay a message."""
+subscriber, and how many subscribers are asked for their share of a confirmation; to replay a message; to wait for a
+client that is owed a stream, and how many names of such clients are looked at."""
 MAX_SUBSCRIPTION_PARTS: Final = 64
 ORPHAN_S: Final = 60.0
 """A session that a blackout cost its TCP connection has ended when its datagram lane says nothing for so long: longer
@@ -609,7 +612,7 @@ class Hub(LocalStreams):
             raise
         if stream.reliable:
             relayed.source = None  # one answer for all who are awaited
-            self._await(announcement.owed, identity, now)
+            self._await(announcement.owed, identity, link, now)
         relayed.source = link
         link.answer(stream, self._wanted(relayed), now=now, owed=relayed.owed())
         return None
@@ -648,8 +651,12 @@ class Hub(LocalStreams):
         self._apply(change, now, source=source)
         return relayed
 
-    def _await(self, owed: Iterable[str], identity: StreamId, now: float) -> None:
+    def _await(self, owed: Sequence[str], identity: StreamId, source: Link, now: float) -> None:
         """Hold a reliable stream for clients that an earlier run of this relay owed it to."""
+        source.reassembly.work_us += len(owed) // OWED_PER_US
+        own: list[Match] = []
+        others: list[Match] = []  # of the same name (many_writers)
+        denied: list[Denied] = []
         for text in owed:
             client = ClientName(text)
             # Connected is not enough: it may not have come to say what it wants yet.
@@ -659,17 +666,24 @@ class Hub(LocalStreams):
                 continue
             if client not in self.links and len(self._awaited) >= MAX_AWAITED_CLIENTS:
                 continue
+            source.reassembly.work_us += AWAIT_US
             self._link(client, now)
             topics = self._awaited.setdefault(client, set())
             if len(topics) >= MAX_AWAITED_TOPICS and identity.topic not in topics:
                 continue
             topics.add(identity.topic)
-            if self.routing.info(identity) is not None and client not in self.routing.subscribers(identity):
-                try:
-                    self._apply(self.routing.subscribe(client, (), exact=topics), now)
-                except RefusedError as refusal:
-                    self.events.refused(client, refusal.code, str(refusal))
-                self.matching.look(client, now=now)
+            if self.routing.info(identity) is None or client in self.routing.subscribers(identity):
+                continue
+            try:
+                change = self.routing.also(client, identity.topic)
+            except RefusedError as refusal:
+                self.events.refused(client, refusal.code, str(refusal))
+                continue
+            denied += change.denied
+            for match in change.matched:
+                (own if match.stream == identity else others).append(match)
+        self._apply(RouteChange(matched=tuple(others), denied=tuple(denied)), now)
+        self._apply(RouteChange(matched=tuple(own)), now, source=source)
 
     def on_retract(self, link: Link, stream: InStream, *, now: float) -> None:
         link.reassembly.work_us += STREAM_US

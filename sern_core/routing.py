@@ -117,7 +117,7 @@ class _Interest:
 
     __slots__ = ("exact", "left", "patterns", "topics")
 
-    def __init__(self, patterns: PatternSet, exact: frozenset[TopicName]) -> None:
+    def __init__(self, patterns: PatternSet, exact: set[TopicName]) -> None:
         self.patterns = patterns
         self.exact = exact
         self.topics: set[TopicName] = set()
@@ -252,7 +252,7 @@ class RoutingTable:
         """
         self.spent_units = NAME_UNITS
         texts = tuple(dict.fromkeys(patterns))
-        names = frozenset(exact)
+        names = set(exact)
         if len(texts) > self._limits.max_patterns or len(names) > self._limits.max_exact:
             raise RefusedError(
                 "too_many_patterns",
@@ -272,6 +272,29 @@ class RoutingTable:
         change = _Collector()
         change.denied.update(denied)
         self._set_interest(client, _Interest(wanted, names), change)
+        return change.result(self._routes)
+
+    def also(self, client: ClientName, topic: TopicName) -> RouteChange:
+        """The client wants one more name beside what it wants: that costs one look, whatever it has.
+
+        Raises RefusedError with code `too_many_patterns`.
+        """
+        self.spent_units = NAME_UNITS
+        interest = self._interests.get(client)
+        exact: set[TopicName] = set() if interest is None else interest.exact
+        if topic not in exact and len(exact) >= self._limits.max_exact:
+            raise RefusedError(
+                "too_many_patterns", f"{client} has {len(exact)} names already, which is the limit; use a pattern"
+            )
+        if interest is None:
+            interest = self._interests[client] = _Interest(PatternSet(()), exact)
+        exact.add(topic)
+        change = _Collector()
+        if not self._access.may_subscribe(client, topic):
+            change.denied.add(Denied(client, topic))
+        elif topic in self._topics and topic not in interest.topics:
+            interest.topics.add(topic)
+            self._set_taker(client, topic, change, takes=True)
         return change.result(self._routes)
 
     def go_on(self, client: ClientName) -> RouteChange:

@@ -296,6 +296,29 @@ def hello_after_long_lists() -> Input:
 INPUTS["datagram: HELLO after long lists"] = FEWER["datagram: HELLO after long lists"] = hello_after_long_lists
 
 
+def streams_owed_to_absent_clients() -> Input:
+    """An origin says of each of its streams that clients are owed it that have not come back yet."""
+    peer = Hostile()
+    peer.hub.known = lambda _client: True
+    peer.hub.links[peer.name].reassembly.limit_bytes = 64 * 2**20
+    absent = tuple(f"site{number}" for number in range(48))
+
+    def owed(index: int) -> bytes:
+        identity = StreamId(peer.name, peer.boot, TopicName(f"/robot/t{index}"))
+        stream = StreamInfo(identity, TopicInfo(identity.topic, "a/b", Encoding.CDR), spec(reliable=True))
+        return control(peer, wire.encode_control(encode_announcement(Announcement(1 + index, stream, "", 1, absent))))
+
+    for index in range(100):
+        said(peer, owed(index))
+    frames = [owed(index) for index in range(100, 160)]
+
+    return Input(sum(map(len, frames)), lambda: peer.say(*frames), len(absent), lambda: one_more_slice(peer))
+
+
+AWAITED: Final = "datagram: streams owed to absent clients"
+INPUTS[AWAITED] = FEWER[AWAITED] = streams_owed_to_absent_clients
+
+
 @for_fifty
 def runs_of_dropped_messages(peer: Hostile) -> list[bytes]:
     other = Hostile(peer.world, "other")

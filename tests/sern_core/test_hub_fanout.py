@@ -73,6 +73,30 @@ def test_one_announcement_for_many_is_told_in_slices() -> None:
     peer.hub.validate()
 
 
+def test_clients_that_have_not_come_back_are_awaited_in_slices() -> None:
+    peer = Hostile()
+    peer.hub.known = lambda _client: True
+    absent = tuple(f"site{number:02}" for number in range(48))
+    for slot in range(1, 11):
+        peer.announce(slot, f"/robot/t{slot}", reliable=True, owed=absent)
+        peer.say(_whole(slot, 1))
+    slices = 0
+    before = opened = 0
+    while due_s(peer) is not None:
+        peer.hub.validate()
+        turn(peer)
+        opened = sum(len(relayed.outs) for relayed in peer.hub.relayed.values())
+        assert opened - before <= 2 * A_SLICE
+        before = opened
+        slices += 1
+    assert slices > 5 and opened == 480
+    for slot in range(1, 11):
+        relayed = stream_of(peer, f"/robot/t{slot}")
+        assert set(relayed.outs) == set(absent)
+        assert all([out.seq for out in channel.retained] == [1] for _link, channel in relayed.outs.values())
+    peer.hub.validate()
+
+
 def test_the_origin_is_told_at_once_who_is_owed() -> None:
     world = World()
     reading(world, READERS)

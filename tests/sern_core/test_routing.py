@@ -12,7 +12,7 @@ from sern_core import routing
 from sern_core.access import AccessRule, AccessTable
 from sern_core.errors import RefusedError
 from sern_core.message import StreamId, StreamInfo, TopicInfo, TopicSpec
-from sern_core.routing import NO_CHANGE, Denied, Match, RouteChange, RoutingLimits, RoutingTable
+from sern_core.routing import NAME_UNITS, NO_CHANGE, Denied, Match, RouteChange, RoutingLimits, RoutingTable
 from sern_core.types import ClientName, Encoding, PriorityClass, TopicName
 from tests.exploring import cases
 
@@ -343,6 +343,21 @@ def test_all_streams_together_have_channel_numbers() -> None:
     assert RoutingLimits().max_all_streams < 0xFFFF
 
 
+def test_one_more_name_costs_one_look_and_has_an_end() -> None:
+    table = RoutingTable(OPEN, limits=RoutingLimits(max_exact=50))
+    for index in range(50):
+        table.announce(stream(A, f"/t{index}"))
+        change = table.also(B, TopicName(f"/t{index}"))
+        assert [match.stream.topic for match in change.matched] == [f"/t{index}"]
+        assert table.spent_units == NAME_UNITS and not table.unfinished(B)
+    with pytest.raises(RefusedError) as refused:
+        table.also(B, TopicName("/another"))
+    assert refused.value.code == "too_many_patterns"
+    assert table.also(B, TopicName("/t0")) == NO_CHANGE
+    assert len(table.received_by(B)) == 50
+    table.validate()
+
+
 # Against brute force -------------------------------------------------------------------------------------------------
 
 CLIENTS = tuple(ClientName(name) for name in "abc")
@@ -441,6 +456,15 @@ class RoutingMachine(RuleBasedStateMachine):
         before, streams_before = self.matches(), set(self.streams)
         change = self.table.subscribe(client, patterns, exact=exact)
         self.interests[client] = (tuple(patterns), exact)
+        self.apply(change, before, streams_before)
+
+    @rule(client=st.sampled_from(CLIENTS), topic=st.sampled_from(TOPICS))
+    def also(self, client: ClientName, topic: TopicName) -> None:
+        before, streams_before = self.matches(), set(self.streams)
+        change = self.table.also(client, topic)
+        patterns, exact = self.interests.get(client, ((), frozenset()))
+        self.interests[client] = (patterns, exact | {topic})
+        assert change.denied == (() if self.access.may_subscribe(client, topic) else (Denied(client, topic),))
         self.apply(change, before, streams_before)
 
     @rule(client=st.sampled_from(CLIENTS))
