@@ -30,6 +30,8 @@ ACCEPT_S: Final = 5.0
 """How long beyond its lifespan on the link a goal may take until its server is heard of it."""
 MAX_GOALS: Final = 1000
 """Goals of one action that are watched at a time; of more, the oldest are watched no longer."""
+MAX_STATUSES: Final = 4000
+"""Goals that one status message may mention: 5 ms of the event loop. A server mentions those of the last seconds."""
 STATUS_TYPE: Final = "actionlib_msgs/msg/GoalStatusArray"
 
 _LITTLE_ENDIAN: Final = b"\x00\x01\x00\x00"
@@ -113,6 +115,32 @@ def goal_id(body: bytes) -> GoalId:
     return GoalId(secs, nsecs, body[at : at + length].decode(errors="surrogateescape"))
 
 
+def mentioned_goals(body: bytes) -> list[str]:
+    """The texts of the goal ids in a GoalStatusArray of ROS 1. ConfigError for bytes that are none, and for more than
+    MAX_STATUSES."""
+    found: list[str] = []
+    try:
+        (length,) = _LENGTH.unpack_from(body, _HEADER_BYTES)
+        at = _HEADER_BYTES + _LENGTH.size + length
+        (count,) = _LENGTH.unpack_from(body, at)
+        if count > MAX_STATUSES:
+            raise ConfigError(f"it mentions {count} goals, more than {MAX_STATUSES}")
+        at += _LENGTH.size
+        for _ in range(count):
+            at += _TIME.size
+            (length,) = _LENGTH.unpack_from(body, at)
+            at += _LENGTH.size
+            found.append(body[at : at + length].decode(errors="surrogateescape"))
+            at += length + 1  # uint8 status
+            (length,) = _LENGTH.unpack_from(body, at)
+            at += _LENGTH.size + length
+    except struct.error:
+        at = len(body) + 1
+    if at > len(body):
+        raise ConfigError(f"{len(body)} bytes are no {STATUS_TYPE}")
+    return found
+
+
 def result_body(info: TopicInfo, goal: GoalId, status: int, text: str) -> bytes:
     """An action result without content. ConfigError when its type is not known, or is none."""
     resolved = ros_types.resolve(info.type_name, info.definition, Encoding.ROS1)
@@ -147,6 +175,8 @@ class _Action:
     patience_s: float
     accept_s: float = ACCEPT_S
     goals: dict[str, _Goal] = field(default_factory=dict)
+    tells: bool = False  # whether its status is of the type that is read
+    complained: bool = False
     result: TopicInfo | None = None  # as it was last seen
     publish: Callable[[bytes], None] | None = None  # while the far side has its result
     cancel: Sink | None = None
@@ -242,9 +272,14 @@ class GoalWatch:
     def opened(self, info: TopicInfo, publish: Callable[[bytes], None]) -> None:
         """A stream from another site is published here."""
         found = self._part(info.name, info.encoding)
-        if found is not None and found[1] == "result":
-            found[0].result = info
-            found[0].publish = publish
+        if found is None:
+            return
+        action, part = found
+        if part == "result":
+            action.result = info
+            action.publish = publish
+        elif part == "status":
+            action.tells = info.type_name == STATUS_TYPE
 
     def ended(self, name: TopicName) -> None:
         found = self._part(name, Encoding.ROS1)
@@ -258,16 +293,8 @@ class GoalWatch:
         if known is None or not known.goals or encoding is not Encoding.ROS1 or part not in {"status", "result"}:
             return
         if part == "status":
-            try:
-                mentioned = ros_types.deserialise(body, STATUS_TYPE, Encoding.ROS1).status_list
-            except ConfigError:
-                return
-            for status in mentioned:
-                goal = known.goals.get(status.goal_id.id)
-                if goal is not None:
-                    goal.heard = True
-                    goal.due_s = clock.now() + known.patience_s
-            self._arm()
+            if known.tells:
+                self._mentioned(known, body)
             return
         try:
             ended = goal_id(body)  # a result begins as a goal does: header, then status, then goal id
@@ -275,6 +302,22 @@ class GoalWatch:
             return
         if ended.text in known.goals:
             self._forget(known, ended.text)
+
+    def _mentioned(self, action: _Action, body: bytes) -> None:
+        try:
+            texts = mentioned_goals(body)
+        except ConfigError as error:
+            if not action.complained:
+                action.complained = True
+                _log.warning("%s: a status of its goals is not read: %s", action.name, error)
+            return
+        due_s = clock.now() + action.patience_s
+        for text in texts:
+            goal = action.goals.get(text)
+            if goal is not None:
+                goal.heard = True
+                goal.due_s = due_s
+        self._arm()
 
     # Who waits
 

@@ -32,6 +32,7 @@ from sern_client.services import ServiceBridge
 from sern_client.summarise import Send, Source, Summaries
 from sern_client.tf_merge import LatchedTransforms, MergedTransforms
 from sern_client.udp import ClientLane
+from sern_client.update_topics import UpdateTopics
 from sern_client.withdrawal import Kept, Withdrawable, Withdrawal
 from sern_core import wire
 from sern_core.client import ClientCore
@@ -39,7 +40,6 @@ from sern_core.errors import ConfigError, UsageError
 from sern_core.lease import CommandLease
 from sern_core.ledger import MAX_TOPICS, OTHER_TOPIC
 from sern_core.message import Message, StreamId, StreamInfo, TopicInfo
-from sern_core.patterns import PatternSet
 from sern_core.queues import OutChannel
 from sern_core.rules import Discovery, ResolvedTopic, RuleSet, to_global
 from sern_core.services import parse as parse_service
@@ -167,7 +167,7 @@ class Bridge:
         self._again = Timer(self._reconsider)
         self._again_s = AGAIN_S[0]
         self.rebuilds = Rebuilds(self._grid_shown, self._settle)
-        self._asked: tuple[str, ...] | None = None  # the patterns we were started with
+        self._updates = UpdateTopics(lambda: self.core.patterns, self._subscribe)
         self.keeping = Keeping(keepers_of(endpoint), self._hold, self._release_kept, self._keep_in)
         self._keep_timer = Timer(self.keeping.keep_soon)
 
@@ -205,6 +205,7 @@ class Bridge:
         self._keep_timer.cancel()
         self._again.cancel()
         self.rebuilds.close()
+        self._updates.close()
         if self.goals is not None:
             self.goals.close()
         for incoming in self._incoming.values():
@@ -415,7 +416,7 @@ class Bridge:
             self.goals.opened(info, lambda body: self._publish(incoming, body, time.time_ns()))
         updates = self.rebuilds.opened(stream, lambda body, stamp_ns: self._show(incoming, body, stamp_ns))
         if updates is not None:
-            self._ask_for(updates)
+            self._updates.opened(stream.id, updates)
         _log.info("receiving %s from %s as %s", stream.id.topic, stream.id.origin, local)
 
     def _advertise(self, info: TopicInfo) -> Publisher:
@@ -447,18 +448,11 @@ class Bridge:
     def _published_here(self, stream: StreamInfo) -> bool:
         """Whether a stream is published: updates of patches are taken to make whole grids of them, unless somebody here
         has asked for them."""
-        if not self.rebuilds.is_updates(stream) or self._asked is None:
-            return True
-        return PatternSet(self._asked).fullmatch(stream.id.topic)
+        return not self.rebuilds.is_updates(stream) or self._updates.of_site(stream.id.topic)
 
-    def _ask_for(self, topic: TopicName) -> None:
-        """Subscribe to one more topic, unless our patterns have it already."""
-        patterns = self.core.patterns
-        if self._asked is None:
-            self._asked = patterns
-        if not PatternSet(patterns).fullmatch(topic):
-            self.core.subscribe((*patterns, topic), now=clock.now())
-            self._kick()
+    def _subscribe(self, patterns: tuple[str, ...]) -> None:
+        self.core.subscribe(patterns, now=clock.now())
+        self._kick()
 
     def _show(self, incoming: Incoming, body: bytes, stamp_ns: int, left_s: float = inf) -> None:
         """Publish what came, or was put together here."""
@@ -473,6 +467,7 @@ class Bridge:
 
     def stream_closed(self, stream: StreamInfo) -> None:
         self.rebuilds.closed(stream)
+        self._updates.closed(stream.id)
         if self.core.refused and not self._closed:  # it may have been in their way
             self._again_s = AGAIN_S[0]
             self._again.arm(clock.now())

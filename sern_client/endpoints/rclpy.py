@@ -147,6 +147,8 @@ class RclpyEndpoint:
         )
         if not self._thread.is_alive():
             found.append(Difference(TopicName(""), "the thread of rclpy has ended; start the client again"))
+        if self._task.done():
+            found.append(Difference(TopicName(""), "nobody looks at the graph any more; start the client again"))
         return found
 
     def closed(self, part: "_Publisher | _Subscription") -> None:
@@ -195,52 +197,64 @@ class RclpyEndpoint:
     async def _watch(self) -> None:
         while True:
             await asyncio.sleep(1 / self.options.poll_hz)
-            self._poll()
+            try:
+                self._poll()
+            except Exception as error:  # noqa: BLE001  (of this look; the next may succeed)
+                self._say_once(f"the graph could not be looked at: {ros_types.one_line(error)}", error)
 
     def _poll(self) -> None:
-        """Announce what appeared, retract what went. Topics that only we publish are not there."""
+        """Announce what appeared, retract what went. A topic that cannot be looked at stays as it was."""
+        found: set[TopicName] = set()
+        for text, type_names in self._node.get_topic_names_and_types():
+            name = TopicName(text)
+            try:
+                there = self._look_at(name, type_names)
+            except Exception as error:  # noqa: BLE001  (a fault of one topic)
+                self._say_once(f"{name} could not be looked at: {ros_types.one_line(error)}", error)
+                there = True
+            if there:
+                found.add(name)
+        for name in [name for name in self._announced if name not in found]:
+            del self._announced[name]
+            self._events.topic_removed(name)
+
+    def _look_at(self, name: TopicName, type_names: list[str]) -> bool:
+        """Announce a topic if it is new. False: it is not there, as far as others are concerned; one that only we
+        publish is not."""
         from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 
         own, namespace = self._node.get_name(), self._node.get_namespace()
         ours = {(own, namespace), (own + GUARD_SUFFIX, namespace)}
-        found: set[TopicName] = set()
-        for text, type_names in self._node.get_topic_names_and_types():
-            name = TopicName(text)
-            publishers = [
-                info
-                for info in self._node.get_publishers_info_by_topic(name)
-                if (info.node_name, info.node_namespace) not in ours
-            ]
-            if not publishers:
-                continue
-            if len(type_names) > 1:
-                self._say_once(f"{name} is published with several types ({', '.join(type_names)}); left out")
-                continue
-            if self._announced.get(name) == type_names[0]:
-                found.add(name)
-                continue
-            if name in self._announced:  # with another type: that is another topic
-                del self._announced[name]
-                self._events.topic_removed(name)
-            found.add(name)
-            try:
-                self._message_type(name, type_names[0])
-            except ConfigError as error:
-                self._say_once(f"{error}; left out")
-                continue
-            self._announced[name] = type_names[0]
-            first = publishers[0].qos_profile
-            self._events.topic_added(
-                self._info(
-                    name,
-                    type_names[0],
-                    latched=first.durability is DurabilityPolicy.TRANSIENT_LOCAL,
-                    reliable=first.reliability is ReliabilityPolicy.RELIABLE,
-                )
-            )
-        for name in [name for name in self._announced if name not in found]:
+        publishers = [
+            info
+            for info in self._node.get_publishers_info_by_topic(name)
+            if (info.node_name, info.node_namespace) not in ours
+        ]
+        if not publishers:
+            return False
+        if len(type_names) > 1:
+            self._say_once(f"{name} is published with several types ({', '.join(type_names)}); left out")
+            return False
+        if self._announced.get(name) == type_names[0]:
+            return True
+        if name in self._announced:  # with another type: that is another topic
             del self._announced[name]
             self._events.topic_removed(name)
+        try:
+            self._message_type(name, type_names[0])
+        except ConfigError as error:
+            self._say_once(f"{error}; left out")
+            return True
+        first = publishers[0].qos_profile
+        info = self._info(
+            name,
+            type_names[0],
+            latched=first.durability is DurabilityPolicy.TRANSIENT_LOCAL,
+            reliable=first.reliability is ReliabilityPolicy.RELIABLE,
+        )
+        self._announced[name] = type_names[0]
+        self._events.topic_added(info)
+        return True
 
     def _info(self, name: TopicName, type_name: str, *, latched: bool, reliable: bool) -> TopicInfo:
         definition = type_hash = ""
@@ -254,10 +268,11 @@ class RclpyEndpoint:
             self._say_once(str(error))
         return TopicInfo(name, type_name, Encoding.CDR, type_hash, definition, latched, reliable)
 
-    def _say_once(self, text: str) -> None:
+    def _say_once(self, text: str, error: Exception | None = None) -> None:
+        """`error`: one that nobody expects, shown with where it came from."""
         if text not in self._said:
             self._said.add(text)
-            _log.warning("%s", text)
+            _log.log(logging.WARNING if error is None else logging.ERROR, "%s", text, exc_info=error)
 
 
 class _Subscription:

@@ -7,7 +7,7 @@ from typing import Final
 
 import pytest
 
-from sern_client import conversion
+from sern_client import actions, conversion
 from sern_client.frames import FramePrefixer
 from sern_client.tf_latch import TfLatch
 from sern_core.errors import BodyError, ConfigError
@@ -170,6 +170,25 @@ def transforms_of(count: int) -> None:
 
 transforms_of(1_900)
 transforms_of(10**5)
+
+
+def statuses_of(count: int) -> None:
+    def make() -> Input:
+        data = HEAD + struct.pack("<I", count) + bytes(17) * count
+
+        def take() -> object:
+            try:
+                return actions.mentioned_goals(data)
+            except ConfigError:
+                return None
+
+        return Input(len(data), take)
+
+    INPUTS[f"body: {count} goals in a status"] = make
+
+
+statuses_of(actions.MAX_STATUSES)
+statuses_of(240_000)
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -7,7 +7,18 @@ from typing import Any
 import pytest
 
 from sern_client import actions
-from sern_client.actions import ABORTED, REJECTED, STATUS_TYPE, GoalId, GoalWatch, cancel_request, goal_id, refusal
+from sern_client.actions import (
+    ABORTED,
+    MAX_STATUSES,
+    REJECTED,
+    STATUS_TYPE,
+    GoalId,
+    GoalWatch,
+    cancel_request,
+    goal_id,
+    mentioned_goals,
+    refusal,
+)
 from sern_client.endpoints.base import ServiceInfo, Sink
 from sern_core.errors import ConfigError
 from sern_core.ledger import SendCounters
@@ -40,6 +51,9 @@ def topic(part: str, kind: str = "count/msg/Any", definition: str = "") -> Topic
 
 GOAL = topic("goal", "count/msg/CountActionGoal", GOAL_TEXT)
 RESULT = topic("result", "count/msg/CountActionResult", RESULT_TEXT)
+
+
+STATUS = topic("status", STATUS_TYPE)
 
 
 def body(definition: str, name: str, fill: Callable[[Any], None]) -> bytes:
@@ -113,6 +127,7 @@ class Site:
 
     def server_appears(self) -> None:
         self.watch.opened(RESULT, self.results.append)
+        self.watch.opened(STATUS, lambda _data: None)
 
     async def told(self, status: int, *words: str) -> None:
         await until(lambda: self.results, "the client is told")
@@ -171,9 +186,42 @@ async def test_a_goal_that_was_heard_of_and_then_no_more() -> None:
     site = Site(patience_s=0.05)
     site.server_appears()
     site.give(goal_body(), 1)
-    site.watch.message(TopicName(f"{ACTION}/status"), Encoding.ROS1, status_body("/other", IDENT.text))
+    site.watch.message(STATUS.name, Encoding.ROS1, status_body("/other", IDENT.text))
     await site.told(ABORTED, "nothing was heard of it for 0.05 s")
     site.watch.close()
+
+
+def test_goals_are_read_from_the_bytes_of_a_status() -> None:
+    data = status_body("", "/other", IDENT.text)
+    assert mentioned_goals(data) == ["", "/other", IDENT.text]
+    assert mentioned_goals(data.replace(b"/o", b"\xfco")) == ["", "\udcfcother", IDENT.text]
+    assert mentioned_goals(status_body()) == []
+    for size in range(len(data)):
+        with pytest.raises(ConfigError, match="are no actionlib_msgs/msg/GoalStatusArray"):
+            mentioned_goals(data[:size])
+
+
+async def test_a_status_of_too_many_goals_is_not_read(caplog: pytest.LogCaptureFixture) -> None:
+    site = Site(patience_s=0.0)
+    site.server_appears()
+    site.give(goal_body(), 1)
+    many = status_body(IDENT.text, *[""] * MAX_STATUSES)
+    for _ in range(3):
+        site.watch.message(STATUS.name, Encoding.ROS1, many)
+    assert not site.watch._actions[ACTION].goals[IDENT.text].heard
+    (record,) = caplog.records
+    assert record.message == f"{ACTION}: a status of its goals is not read: it mentions 4001 goals, more than 4000"
+    site.watch.close()
+
+
+async def test_a_status_of_another_type_is_not_read(site: Site) -> None:
+    site.server_appears()
+    site.give(goal_body(), 1)
+    goal = site.watch._actions[ACTION].goals[IDENT.text]
+    for kind, heard in (("evil/msg/GoalStatusArray", False), (STATUS_TYPE, True)):
+        site.watch.opened(topic("status", kind), lambda _data: None)
+        site.watch.message(STATUS.name, Encoding.ROS1, status_body(IDENT.text))
+        assert goal.heard == heard
 
 
 async def test_a_server_that_is_gone_is_spoken_for(site: Site) -> None:
@@ -194,7 +242,7 @@ async def test_a_goal_with_a_result_is_done_and_what_is_no_goal_is_let_through(s
         message.status.goal_id.id = IDENT.text
 
     site.watch.message(RESULT.name, Encoding.ROS1, b"\0")
-    site.watch.message(TopicName(f"{ACTION}/status"), Encoding.ROS1, b"\0")
+    site.watch.message(STATUS.name, Encoding.ROS1, b"\0")
     site.watch.message(RESULT.name, Encoding.ROS1, body(RESULT_TEXT, RESULT.type_name, fill))
     site.watch.send_dropped(site.channel.stream.id, seq, DropReason.LIFESPAN)
     site.accepts = False

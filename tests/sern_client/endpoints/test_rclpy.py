@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from sern_client.endpoints.base import Endpoint
+from sern_client.endpoints.base import Endpoint, Held
 from sern_client.endpoints.rclpy import RclpyEndpoint, RclpyOptions
 from sern_core.errors import ConfigError, UsageError
 from sern_core.message import TopicInfo
@@ -206,6 +206,56 @@ async def test_a_type_that_is_not_installed_is_one_line(graph: Graph, caplog: py
     assert "/two is published with several types (std_msgs/msg/Bool, std_msgs/msg/String)" in caplog.text
     with pytest.raises(ConfigError, match=r"/chatter: my_msgs/msg/Thing is not in this ROS 2 installation"):
         endpoint.advertise(TopicInfo(CHAT, "my_msgs/msg/Thing", Encoding.CDR))
+    await endpoint.stop()
+
+
+async def test_a_topic_that_cannot_be_looked_at_costs_no_other(
+    graph: Graph, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    endpoint, events = RclpyEndpoint(RclpyOptions(poll_hz=100)), Events()
+    graph.offer(CHAT)
+    await endpoint.start(events)
+    look, looks = graph.get_publishers_info_by_topic, 0
+
+    def broken(topic: str) -> list[Any]:
+        nonlocal looks
+        looks += 1
+        if topic == CHAT:
+            raise ValueError("Invalid topic name")
+        return look(topic)
+
+    monkeypatch.setattr(graph, "get_publishers_info_by_topic", broken)
+    graph.offer("/late")
+    await until(lambda: looks > 6 or endpoint._task.done())
+    assert set(events.infos) == {CHAT, "/late"}, "what was there stays, what is new comes"
+    assert caplog.text.count("/chatter could not be looked at: Invalid topic name") == 1
+    await endpoint.stop()
+
+
+async def test_a_graph_that_cannot_be_looked_at_is_looked_at_again(
+    graph: Graph, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    endpoint, events = RclpyEndpoint(RclpyOptions(poll_hz=100)), Events()
+    await endpoint.start(events)
+    look, looks = graph.get_topic_names_and_types, 0
+
+    def broken() -> list[tuple[str, list[str]]]:
+        nonlocal looks
+        looks += 1
+        if looks < 4:
+            raise RuntimeError("no graph")
+        return look()
+
+    monkeypatch.setattr(graph, "get_topic_names_and_types", broken)
+    graph.offer(CHAT)
+    await until(lambda: CHAT in events.infos or endpoint._task.done())
+    assert set(events.infos) == {CHAT} and endpoint.validate(Held()) == []
+    assert caplog.text.count("the graph could not be looked at: no graph") == 1
+    endpoint._task.cancel()
+    await until(endpoint._task.done)
+    assert [str(found) for found in endpoint.validate(Held())] == [
+        "nobody looks at the graph any more; start the client again"
+    ]
     await endpoint.stop()
 
 
