@@ -49,9 +49,10 @@ from sern_core.types import DROP_CODES, ClientName, DropReason, TopicName
 
 STREAM_US: Final = 50
 FORWARD_US: Final = 5
+LANE_US: Final = 300
 CONFIRMED_PER_US: Final = 8
 """What work for a client is charged to it, in microseconds: to take or end a stream, to hand on a message to a
-subscriber, and how many subscribers are asked for their share of a confirmation."""
+subscriber, to open a datagram lane, and how many subscribers are asked for their share of a confirmation."""
 MAX_SUBSCRIPTION_PARTS: Final = 64
 ORPHAN_S: Final = 60.0
 """A session that a blackout cost its TCP connection has ended when its datagram lane says nothing for so long: longer
@@ -790,6 +791,7 @@ class Hub(LocalStreams):
             except RefusedError as refusal:
                 self.events.refused(link.peer, refusal.code, str(refusal))
         elif kind == "lane_ask":
+            link.reassembly.work_us += LANE_US
             self.events.lane_asked(link.peer, wire.take_strings(envelope, "ciphers", max_length=64))
         else:
             raise WireError(f"unknown control message {kind!r}")
