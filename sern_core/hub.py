@@ -11,7 +11,7 @@ and so is one whose name is revoked.
 """
 
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Final
@@ -49,13 +49,14 @@ from sern_core.types import DROP_CODES, ClientName, DropReason, TopicName
 
 STREAM_US: Final = 50
 FORWARD_US: Final = 5
+LANE_US: Final = 300
 CONFIRMED_PER_US: Final = 8
 REPLAY_US: Final = 2
 AWAIT_US: Final = 50
 OWED_PER_US: Final = 2
 """What work for a client is charged to it, in microseconds: to take or end a stream, to hand on a message to a
-subscriber, and how many subscribers are asked for their share of a confirmation; to replay a message; to wait for a
-client that is owed a stream, and how many names of such clients are looked at."""
+subscriber, to open a datagram lane, and how many subscribers are asked for their share of a confirmation; to replay a
+message; to wait for a client that is owed a stream, and how many names of such clients are looked at."""
 MAX_SUBSCRIPTION_PARTS: Final = 64
 ORPHAN_S: Final = 60.0
 """A session that a blackout cost its TCP connection has ended when its datagram lane says nothing for so long: longer
@@ -834,6 +835,7 @@ class Hub(LocalStreams):
             except RefusedError as refusal:
                 self.events.refused(link.peer, refusal.code, str(refusal))
         elif kind == "lane_ask":
+            link.reassembly.work_us += LANE_US
             self.events.lane_asked(link.peer, wire.take_strings(envelope, "ciphers", max_length=64))
         else:
             raise WireError(f"unknown control message {kind!r}")

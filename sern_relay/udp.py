@@ -1,7 +1,9 @@
 """The relay's datagram lanes: one UDP socket for each listener, one session for each client that asks for one."""
 
+import asyncio
 import logging
 from collections.abc import Callable, Sequence
+from typing import Final
 
 from sern_core.errors import RefusedError, RemoteError
 from sern_core.hub import Hub
@@ -16,6 +18,9 @@ from sern_runtime.pump import Pump
 from sern_runtime.udp import UdpServer, UdpSession
 from sern_runtime.udp_socket import Address
 from sern_runtime.zmq_socket import SendResult
+
+ASK_REST_S: Final = 0.5
+"""Between two lanes that a client is given for the asking: keys and the kernel's filter cost much more than an ask."""
 
 _log = logging.getLogger(__name__)
 
@@ -37,6 +42,7 @@ class RelayLanes:
         self.hub = hub
         marks = marks or Marks()
         self._tos = marks.tos
+        self._after = after
         self.bad_frames = 0
         self.moved = 0
         """Times a client's address changed."""
@@ -44,6 +50,8 @@ class RelayLanes:
         """Lanes opened anew because the relay's own key was used up."""
         self._lanes: dict[ClientName, tuple[UdpSession, Pump]] = {}
         self._ciphers: dict[ClientName, tuple[str, ...]] = {}  # what the client of a lane has offered
+        self._resting: dict[ClientName, asyncio.TimerHandle] = {}  # who was given a lane just now
+        self._waiting: dict[ClientName, tuple[str, ...]] = {}  # the newest that these have asked for since
         self.server = UdpServer(
             udp_endpoints(listen),
             self._received,
@@ -54,13 +62,33 @@ class RelayLanes:
         )
 
     def close(self) -> None:
+        for timer in self._resting.values():
+            timer.cancel()
+        self._resting.clear()
+        self._waiting.clear()
         for _, pump in self._lanes.values():
             pump.close()
         self._lanes.clear()
         self.server.close()
 
     def asked(self, client: ClientName, ciphers: Sequence[str]) -> None:
-        """A client would like a datagram lane: give it one, over the session that its CURVE key opened."""
+        """A client would like a datagram lane: give it one, over the session that its CURVE key opened. Of what it asks
+        for within `ASK_REST_S` of that, it is given the newest when the time is over."""
+        if client in self._resting:
+            self._waiting[client] = tuple(ciphers)
+            return
+        self._resting[client] = asyncio.get_running_loop().call_later(ASK_REST_S, self._rested, client)
+        self._open(client, ciphers)
+
+    def _rested(self, client: ClientName) -> None:
+        del self._resting[client]
+        ciphers = self._waiting.pop(client, None)
+        link = self.hub.links.get(client)
+        if ciphers is not None and link is not None and link.established:
+            self.asked(client, ciphers)
+            self._after()
+
+    def _open(self, client: ClientName, ciphers: Sequence[str]) -> None:
         self.closed(client)
         link = self.hub.links[client]
         link.close_lane(now=clock.now())
@@ -83,6 +111,7 @@ class RelayLanes:
 
     def closed(self, client: ClientName) -> None:
         """The core has closed the client's lane."""
+        self._waiting.pop(client, None)
         lane = self._lanes.pop(client, None)
         self._ciphers.pop(client, None)
         if lane is not None:
@@ -132,7 +161,7 @@ class RelayLanes:
         lane = self._lanes.get(client)
         if lane is not None and lane[0] is session:
             self.rekeyed += 1
-            self.asked(client, self._ciphers[client])
+            self._open(client, self._ciphers[client])
 
     def _gone(self, client: ClientName, session: UdpSession) -> None:
         """The client sent what no honest one does."""

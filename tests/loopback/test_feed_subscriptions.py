@@ -147,12 +147,12 @@ async def test_a_role_has_so_many_connections(feed: Feed) -> None:
 
 async def test_many_subscriptions_are_told_once(zmq_context: Context) -> None:
     changes: list[tuple[bytes, ...]] = []
-    feed = Feed(
+    plain = Feed(
         zmq_context,
         [FeedRole("unity", "tcp://127.0.0.1:*", subscribe=(ANY,))],
-        on_interest=lambda: changes.append(feed.prefixes()["unity"]),
+        on_interest=lambda: changes.append(plain.prefixes()["unity"]),
     )
-    outlet = feed._outlets["unity"]
+    outlet = plain._outlets["unity"]
     for number in range(1000):
         outlet._subscribed(b"/t%03d" % number)
     assert changes == []
@@ -163,9 +163,9 @@ async def test_many_subscriptions_are_told_once(zmq_context: Context) -> None:
     await until(lambda: changes[-1] == (), "told of the end")
     assert len(changes) == 2 and not outlet._lengths
     outlet._subscribed(b"/late")
-    telling = feed._telling
+    telling = plain._telling
     assert telling is not None
-    feed.close()
+    plain.close()
     assert telling.cancelled(), "nothing is told after the end"
 
 

@@ -9,7 +9,7 @@ import re
 import shutil
 import socket as socketlib
 import time
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import AsyncExitStack, asynccontextmanager
 from functools import partial
 from pathlib import Path
@@ -28,6 +28,7 @@ from sern_relay.daemon import REFUSAL_CODES, RelayDaemon
 from sern_relay.server import MAX_PORTS
 from sern_runtime.keys import PublicKey, PublicKeys, SecretKey, generate, load_public, load_secret, write_public
 from sern_runtime.monitor import SocketMonitor
+from sern_runtime.udp import UdpSession
 from sern_runtime.zmq_socket import DealerSocket, make_client
 from tests.daemons import ALLOW_ALL, HOST, Lab, bodies, write_bag
 from tests.support import until
@@ -250,7 +251,8 @@ async def test_connections_for_class_control_count_over_all_sessions(
 
             def joined(count: int) -> bool:
                 lanes = server_express._lanes
-                return "robot2" in lanes and len(lanes["robot2"].paths) == count
+                lane = lanes.get(ClientName("robot2"))
+                return lane is not None and len(lane.paths) == count
 
             for count in (1, 2):
                 express = await stack.enter_async_context(Stranger(world.lab, keys))
@@ -260,6 +262,35 @@ async def test_connections_for_class_control_count_over_all_sessions(
             await until(lambda: "robot2" not in world.relay.hub.links, "it is forgotten")
             assert sum(each.client == "robot2" for each in server.express.joined.values()) <= 2
         assert server.express.refused == 0
+
+
+async def test_a_client_is_given_a_lane_now_and_then(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    async with Lab(tmp_path, *CLIENTS) as lab:
+        relay = await lab.relay()
+        robot = await lab.connected(lab.client_file("robot1", DEAD_ENDS))
+        lanes = relay.lanes
+        assert lanes is not None
+        name = ClientName("robot1")
+        await until(lambda: name in lanes._lanes and name not in lanes._resting, "it has a lane, and has rested")
+        opened: list[Sequence[str]] = []
+        open_session = lanes.server.open_session
+
+        def counted(client: ClientName, offered: Sequence[str]) -> UdpSession:
+            opened.append(offered)
+            return open_session(client, offered)
+
+        monkeypatch.setattr(lanes.server, "open_session", counted)
+        ciphers = list(lanes._ciphers[name])
+        for number in range(100):
+            lanes.asked(name, [*ciphers, f"of the future {number}"])
+        assert opened == [[*ciphers, "of the future 0"]]
+        await until(lambda: len(opened) > 1, "it is given the newest it has asked for")
+        assert opened[1] == (*ciphers, "of the future 99")
+        lanes.asked(name, ciphers)
+        lanes.closed(name)  # with its session
+        assert not lanes._waiting
+        for daemon in (robot, relay):
+            await lab.end(daemon)
 
 
 def oversize() -> list[bytes]:
