@@ -545,8 +545,8 @@ class HybridWindow(CapacityEstimator):
             return
         self._pacing = PACING_GAIN * self._window / rtt_s
         rate = self._rate
-        if rate is None:
-            return
+        if rate is None or not self._peak:
+            return  # nothing has been delivered in an epoch yet
         if self._queue_s < 0.25 * self._target_s:
             if self._gentle and self._saturated:
                 pacing = self._probing * rate / (1 - self._loss)

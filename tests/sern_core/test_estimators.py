@@ -174,3 +174,14 @@ def test_a_link_takes_any_acknowledgement(
     world.run(1.0)
     assert len(site.on("/robot/pose")) >= before + 15
     world.validate()
+
+
+def test_start_up_may_end_with_a_rate_and_before_any_epoch_has_seen_one() -> None:
+    """An epoch without a rate says that the path is calm; the first rate may come just before start-up ends."""
+    estimator = HybridWindow()
+    estimator._rtt_s, estimator._queue_s, estimator._target_s = 0.01, 0.001, 0.001
+    estimator._calm, estimator._rate = True, 1e5
+    assert estimator._peak == 0.0
+    estimator._end_startup(10_000)
+    check(estimator)
+    assert estimator.pacing_bps is not None and estimator.pacing_bps > 8e6
