@@ -51,7 +51,6 @@ class _Grid:
     rebuilder: GridRebuilder
     show: Show | None = None
     complained: bool = False
-    stamp_ns: int = 0  # of the grid that is due
     streams: set[StreamId] = field(default_factory=set)  # that are open
     owed: list[Owed] = field(default_factory=list)  # what was taken, and is in no grid that was published yet
 
@@ -130,10 +129,9 @@ class Rebuilds:
             grid.rebuilder.forget()
             grid.rebuilder.gaps = gaps  # to end is no gap
             self._due.pop(source, None)
-            self._give_up(grid)
         else:
             grid.rebuilder.updates_ended()
-            self._give_up(grid)
+        self._give_up(grid)
         self._kept_bytes += grid.rebuilder.nbytes
         grid.streams.discard(stream.id)
         if not grid.streams:
@@ -153,12 +151,7 @@ class Rebuilds:
         before_bytes = grid.rebuilder.nbytes
         try:
             if whole:
-                self._due.pop(stream.id, None)
-                self._grids[source] = self._grids.pop(source)  # the first of an origin makes room first
-                body = grid.rebuilder.keyframe(message.body, stamp_ns=message.stamp_ns)
-                self._give_up(grid)  # a newer grid has them, or is without them
-                if body is not None and grid.show is not None:
-                    grid.show(body, message.stamp_ns)
+                self._keyframe(source, grid, message)
             else:
                 grid.rebuilder.accept(message.body, seq=message.seq, stamp_ns=message.stamp_ns)
                 if owed and grid.show is not None:
@@ -176,30 +169,37 @@ class Rebuilds:
             if self._kept_bytes > self._max_bytes:
                 self._make_room()
         if grid.rebuilder.due:
-            grid.stamp_ns = message.stamp_ns
             self._due[source] = grid
             self._show_due()
         return whole
+
+    def _keyframe(self, source: StreamId, grid: _Grid, message: Message) -> None:
+        """Publish a whole grid at once. One that is late changes nothing, neither what is due nor what is owed."""
+        body = grid.rebuilder.keyframe(message.body, stamp_ns=message.stamp_ns)
+        if body is None:
+            return
+        self._due.pop(source, None)
+        self._grids[source] = self._grids.pop(source)  # the first of an origin makes room first
+        self._publish(grid, body)  # it has what is owed, or is newer
 
     def _show_due(self) -> None:
         """Publish what is due and has its turn."""
         while self._due and self._clock() >= self._next_s:
             grid = self._due.pop(next(iter(self._due)))
             began_s = self._clock()
-            self._show(grid)
+            self._publish(grid, grid.rebuilder.whole())
             ended_s = self._clock()
             self._next_s = ended_s + REST * (ended_s - began_s)
         if self._due:
             self._timer = self._timer or Timer(self._show_due, clock=self._clock)
             self._timer.arm(self._next_s)
 
-    def _show(self, grid: _Grid) -> None:
-        body, owed = grid.rebuilder.whole(), grid.owed
-        grid.owed = []
+    def _publish(self, grid: _Grid, body: bytes | None) -> None:
+        owed, grid.owed = grid.owed, []
         if body is None or grid.show is None:
             self._settle(owed)
             return
-        self._shown(partial(grid.show, body, grid.stamp_ns), owed)
+        self._shown(partial(grid.show, body, grid.rebuilder.stamp_ns), owed)
 
     def _give_up(self, grid: _Grid, *, keep: int = 0) -> None:
         """All owed updates but the latest `keep` wait for nothing any more."""

@@ -13,7 +13,7 @@ from typing import Final
 
 from sern_core.link import Link
 from sern_core.message import Message
-from sern_core.queues import MESSAGE_OVERHEAD_BYTES, OutChannel
+from sern_core.queues import GIVEN_UP_US, MESSAGE_OVERHEAD_BYTES, OutChannel
 from sern_core.types import CLASSES, DropReason
 
 UNKNOWN: Final = math.inf
@@ -22,10 +22,8 @@ FULL_S: Final = 0.01
 holds is too dear to be done for each."""
 TOMBSTONE_BYTES: Final = 1 + MESSAGE_OVERHEAD_BYTES
 ADDED_UP_PER_US: Final = 2
-"""Channels of a link that are added up in a microsecond. That and the next are charged to whoever sent the message that
-needs room (`Reassembly.work_us`)."""
-SHED_US: Final = 4
-"""What giving up one message, and reporting it to its origin, is charged with."""
+"""Channels of a link that are added up in a microsecond. That and what is given up are charged to whoever sent the
+message that needs room (`Reassembly.work_us`)."""
 
 
 class QueueBound:
@@ -94,5 +92,5 @@ class QueueBound:
                 for channel in chosen:
                     while excess_bytes > 0 and (freed_bytes := link.shed(channel, DropReason.QUEUE_FULL, now=now)):
                         excess_bytes -= freed_bytes
-                        self._work_us += SHED_US
+                        self._work_us += GIVEN_UP_US
         return excess_bytes

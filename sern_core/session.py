@@ -299,7 +299,7 @@ class Session(Hop):
     def _begin_charged(self, peer_boot: int, now: float) -> None:
         """Begin a session and charge the peer's HELLOs with it: a hundred bytes announce thousands of streams anew."""
         reassembly = self.reassembly
-        kept = sum(len(c.retained) or len(c.queue) + len(c.flying) for c in self.channels.values())
+        kept = sum(channel.kept for channel in self.channels.values())
         reassembly.work_us = BEGIN_US + KEPT_US * kept
         try:
             self._establish(peer_boot, now)

@@ -28,7 +28,7 @@ from sern_core.mmcf.model import LinkState
 from sern_core.mmcf.queueing import MIN_SHARE, Floats, Outcome, Service, arrives_whole
 
 STEPS: Final = 30
-"""At most; more are averaged."""
+"""The most points that are played; more are averaged."""
 FRAGMENT_BITS: Final = 8.0 * (DATAGRAM_BYTES + OVERHEAD_BYTES)
 MIN_BITS: Final = 1.0
 """That a step carries, so that time goes on."""

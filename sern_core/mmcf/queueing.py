@@ -13,7 +13,7 @@ from sern_core.mmcf.model import ClassDemand, LinkState
 Floats = NDArray[np.float64]
 
 REPAIR_S: Final = 0.02
-"""Beyond a round trip, until a lost fragment is sent again."""
+"""What a lost fragment waits beyond a round trip until it is sent again."""
 MIN_VARIABILITY: Final = 0.25
 MIN_SHARE: Final = 1e-3
 

@@ -187,11 +187,13 @@ class GridRebuilder:
     `update` gives a grid for every complete change. Writing one costs its size, and the change may be of a few bytes:
     who cannot trust the origin calls `accept` instead, and `whole` when a grid that is `due` may cost what it does.
 
-    `gaps` counts how often something was missing, so that the next keyframe had to be waited for.
+    `gaps` counts how often something was missing, so that the next keyframe had to be waited for; `stamp_ns` is when
+    the last complete grid was taken.
     """
 
     def __init__(self, encoding: Encoding) -> None:
         self.gaps = 0
+        self.stamp_ns = 0
         self._encoding = encoding
         self._base: Grid | None = None
         self._base_ns = 0
@@ -232,7 +234,7 @@ class GridRebuilder:
         self._cells = grid.cells.copy()
         self._base, self._base_ns = replace(grid, cells=self._cells), stamp_ns
         self._next_seq = next((seq for seq, item in self._waiting.items() if self._is_mark(item)), None)
-        self._due = None
+        self._due, self.stamp_ns = None, stamp_ns
         self._advance()
         return self.whole() or body
 
@@ -283,7 +285,7 @@ class GridRebuilder:
                 self._forget(seq)
             self._next_seq += 1
             if item.complete:
-                self._due = item.update.header
+                self._due, self.stamp_ns = item.update.header, item.stamp_ns
             elif not item.keyframe:
                 self._due = None
                 self._apply(item.update)

@@ -15,7 +15,7 @@ from sern_core.interest import PAUSE_MAX_S, Interest
 from sern_core.message import StreamId, StreamInfo, TopicInfo
 from sern_core.types import ClientName, Encoding, TopicName
 from tests.exploring import seeds
-from tests.fuzz.test_hostile_peer import Hostile
+from tests.fuzz.test_hostile_peer import Hostile, subscriber_of
 from tests.make_vectors import Frames
 from tests.world import SimClient, World, spec
 
@@ -195,11 +195,7 @@ def test_what_an_answer_may_name_has_an_end() -> None:
 
 
 def test_a_relay_keeps_no_names_that_a_subscriber_says_it_owes() -> None:
-    peer = Hostile()
-    other = Hostile(peer.world, "other")
-    for index in range(3):
-        other.announce(1 + index, f"/other/t{index}", reliable=True)
-    peer.control({"t": "subscribe", "patterns": ["/other/.*"], "more": False})
+    peer = subscriber_of(3)
     channels = peer.hub.links[peer.name].channels.values()
     for _ in range(300):  # without end
         peer.control({"t": "want", "ch": 1, "on": True, "owed": ["x"] * 48, "more": True})

@@ -143,7 +143,7 @@ async def test_a_path_that_ends_in_a_slash_is_a_folder_to_be_made(tmp_path: Path
 
 
 def make_record(folder: Path, path: str) -> RecordEndpoint:
-    """As the configuration names it."""
+    """The endpoint as the configuration names it."""
     section = sections.RecordEndpoint(kind="record", path=path)
     endpoint = make_section(section, lambda name: folder / name)
     assert isinstance(endpoint, RecordEndpoint)

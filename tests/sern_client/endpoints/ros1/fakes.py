@@ -48,7 +48,7 @@ class FakeMaster:
         self.nodes: dict[str, str] = {}
         self.services: dict[str, str] = {}
         self.types: dict[str, str] = {}
-        """Of topics, as they were registered last."""
+        """The types of topics as they were registered last."""
         self.refused: set[str] = set()
         """Methods that it answers with no."""
         self.run_id = "one"
@@ -69,7 +69,7 @@ class FakeMaster:
         return f"http://{HOST}:{self.port}"
 
     def forget(self) -> None:
-        """As after a restart."""
+        """Forget all that is registered, as a restart does."""
         for table in self.tables:
             table.clear()
         self.run_id += "+"

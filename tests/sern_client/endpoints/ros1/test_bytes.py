@@ -165,7 +165,7 @@ class Taken(Frames):
         self.problem = str(error)
 
     def receive(self, data: bytes, pieces: list[int]) -> None:
-        """As a transport does: into the buffer that is offered, at most a piece at a time."""
+        """Fill the buffer that is offered, at most a piece at a time, as a transport does."""
         at, turn = 0, 0
         while at < len(data) and self.transport is not None:
             buffer = self.get_buffer(-1)
