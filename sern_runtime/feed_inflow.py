@@ -23,7 +23,7 @@ from sern_runtime.monitor import ConnectionTable, TcpHandle
 SUBSCRIBER_BYTES: Final = 64 * 1024
 """Some hundred subscriptions, each a hundred bytes. libzmq's table of them takes up to a hundred times that."""
 MAX_CONNECTIONS: Final = 256
-"""Of one socket of a role; further ones are cut at once. Programs may have one for each topic."""
+"""Connections of one socket of a role; further ones are cut at once. Programs may have one for each topic."""
 TOLD_BYTES: Final = 2048
 """Messages from this size on are always booked to the connection they came from, which takes a quarter of a
 microsecond. Smaller ones never add up, between two looks, to what could be mistaken for a message without end."""

@@ -123,7 +123,7 @@ class _Definition:
     open: tuple[int, ...] = ()  # positions
     values: Callable[[Labels], object] = tuple
     others: dict[Labels, tuple[float, float]] = field(default_factory=dict)
-    """Of a counter, for each row under `other`: the sum at the last scrape, and what has left that sum before."""
+    """For counters, by the row under `other`: the sum at the last scrape, and what has left that sum before."""
 
     def __post_init__(self) -> None:
         self.open = tuple(n for n, label in enumerate(self.labels) if label in _open(self.labels))

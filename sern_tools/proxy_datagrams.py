@@ -16,7 +16,7 @@ DATAGRAM_BYTES: Final = 65_536
 BATCH: Final = 64
 """Datagrams taken in a row before others have their turn."""
 MAPPINGS: Final = 64
-"""Beyond it the oldest is forgotten."""
+"""The most that are kept; then the oldest is forgotten."""
 BUFFER_BYTES: Final = 1 << 20
 """What may wait for the proxy while it is busy; the queue of the link is its own."""
 

@@ -100,7 +100,7 @@ def zmq_context() -> Iterator[Context]:
 
 @pytest.fixture
 def default_signals() -> Iterator[None]:
-    """As in a terminal: whoever started the tests may have some ignored (nohup, a shell's background job)."""
+    """Handle signals as in a terminal: whoever started the tests may have some ignored (nohup, a shell's job)."""
     usual: dict[signal.Signals, Any] = {
         signal.SIGTERM: signal.SIG_DFL,
         signal.SIGINT: signal.default_int_handler,

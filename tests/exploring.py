@@ -14,7 +14,7 @@ from hypothesis.internal.conjecture import providers
 
 SEED: Final = os.environ.get("SERN_EXPLORE", "")
 TIMES: Final = 10
-"""So many times the cases of a usual run."""
+"""How many times the cases of a usual run are tried."""
 
 
 def cases(count: int) -> int:
@@ -31,8 +31,8 @@ def seeds(count: int) -> list[int]:
 
 
 def load_profile() -> None:
-    """For all property tests. A busy machine, which draws and runs examples slowly, is no failure, and neither is what
-    the draws of a seed happen to look like: large, or many that a filter takes away."""
+    """Set what all property tests go by. A busy machine, which draws and runs examples slowly, is no failure, and
+    neither is what the draws of a seed happen to look like: large, or many that a filter takes away."""
     settings.register_profile(
         "sern",
         derandomize=not SEED,

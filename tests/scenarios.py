@@ -193,7 +193,7 @@ class Run:
         self._check_memory()
 
     def _check_stream(self, life: SimClient, stream: StreamId, topic: Topic) -> None:
-        """Of every subscriber, however late, of every stream: order, once, bodies, lifespans."""
+        """Every subscriber of every stream, however late, has order, each once, the bodies, and the lifespans."""
         turns = [seq for seq in life.turns[stream] if seq > 0]
         assert all(a < b for a, b in pairwise(turns)), f"{life.name} {stream.topic}: out of order {turns}"
         for got in life.got:

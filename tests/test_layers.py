@@ -13,7 +13,7 @@ OWN_CLOCK = {"loop.py", "logs.py"}  # how long the loop was held, how often a li
 
 
 def test_layers_import_only_downward() -> None:
-    """In a process of its own: import-linter sets up logging for its process and would silence other tests' loggers."""
+    """Check in another process: import-linter sets up logging for its process and silences other loggers."""
     code = "import sys; from importlinter.cli import lint_imports; sys.exit(lint_imports(no_cache=True))"
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr

@@ -190,7 +190,7 @@ class SimClient:
     closed: list[StreamInfo] = field(default_factory=list)
     wants: dict[str, list[bool]] = field(default_factory=lambda: defaultdict(list))
     ups: list[bool] = field(default_factory=list)
-    """Of each session, whether it was with the same relay process as the one before."""
+    """Whether each session was with the same relay process as the one before."""
     downs: list[str] = field(default_factory=list)
     undecodables: list[tuple[str, str]] = field(default_factory=list)
     more_ports: list[Port] = field(default_factory=list)

@@ -324,7 +324,7 @@ def subscriptions_on_and_off(peer: Hostile) -> Iterator[None]:
 HELD_BYTES: Final = 2 * 2**20
 """Half-received and waiting messages of one link, for these tests."""
 ALLOWED_BYTES: Final = 18 * 2**20
-"""With the limits that the test lowers: of everything, what one peer may make a relay hold."""
+"""What one peer may make a relay hold of everything together, with the limits that the test lowers."""
 
 
 @pytest.mark.parametrize("name", ATTACKS)
@@ -354,13 +354,19 @@ def test_answers_to_greetings_do_not_pile_up(name: str) -> None:
     assert waiting < 10
 
 
-def test_sessions_begin_no_faster_than_their_price_allows() -> None:
-    """A hundred bytes of HELLO announce hundreds of streams anew."""
+def subscriber_of(streams: int) -> Hostile:
+    """A peer that takes the reliable streams of another client."""
     peer = Hostile()
     other = Hostile(peer.world, "other")
-    for index in range(300):
+    for index in range(streams):
         other.announce(1 + index, f"/other/t{index}", reliable=True)
     peer.control({"t": "subscribe", "patterns": ["/other/.*"], "more": False})
+    return peer
+
+
+def test_sessions_begin_no_faster_than_their_price_allows() -> None:
+    """A hundred bytes of HELLO announce hundreds of streams anew."""
+    peer = subscriber_of(300)
     while peer.hub.matching.due_s:
         peer.now = max(peer.now, *peer.hub.matching.due_s.values())
         peer.port.handle_timeout(now=peer.now)
@@ -381,11 +387,7 @@ def test_sessions_begin_no_faster_than_their_price_allows() -> None:
 
 
 def test_a_client_that_connects_again_and_again_has_its_session_each_time() -> None:
-    peer = Hostile()
-    other = Hostile(peer.world, "other")
-    for index in range(50):
-        other.announce(1 + index, f"/other/t{index}", reliable=True)
-    peer.control({"t": "subscribe", "patterns": ["/other/.*"], "more": False})
+    peer = subscriber_of(50)
     link = peer.hub.links[peer.name]
     for index in range(100):
         peer.now += 0.05

@@ -87,7 +87,7 @@ def for_fifty(prepare: Prepare) -> Prepare:
 
 
 def filled(piece: Callable[[int], bytes]) -> list[bytes]:
-    """As many frames as a datagram takes."""
+    """Fill a datagram with as many frames as it takes."""
     frames: list[bytes] = []
     size = index = 0
     while True:

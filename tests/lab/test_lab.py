@@ -27,7 +27,7 @@ from tests.support import ended, until
 
 pytestmark = pytest.mark.root
 SIGMAS = 5.0
-"""Of random losses: right once more than once in a million runs."""
+"""How far random losses may lie from their mean: wrong less than once in a million runs."""
 
 
 def within_binomial(lost: int, count: int, probability: float) -> bool:
@@ -104,7 +104,7 @@ def test_losses_are_as_many_as_asked(lab: Lab, model: LinkModel, bursts: bool) -
 
 def test_nothing_is_lost_while_the_guest_does_not_run(lab: Lab) -> None:
     if lab.backend != "appliance":
-        pytest.skip("there is no guest")
+        pytest.skip("this kernel has netem: the lab needs no guest that could stand still")
     guest = lab._running.guest._process  # type: ignore[attr-defined]
     lab.link(up=LinkModel(queue_packets=3000))
     guest.send_signal(signal.SIGSTOP)
@@ -183,9 +183,9 @@ def test_sides_with_several_namespaces(lab: Lab) -> None:
 
 
 def test_native_wiring_on_a_kernel_that_has_netem(lab: Lab) -> None:
-    """In the guest, whose kernel can do it: two namespaces and their link, made with the commands of the backend."""
+    """The guest's kernel can do it: two namespaces and their link, made with the commands of the backend."""
     if lab.backend != "appliance":
-        pytest.skip("the lab itself is native here")
+        pytest.skip("this kernel has netem: every lab test here uses the native wiring")
     guest = lab._running.guest  # type: ignore[attr-defined]
     ends = [Endpoint("a", "a", 0, 1), Endpoint("b", "b", 1, 1)]
     native = Native("m")

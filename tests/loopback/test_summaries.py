@@ -103,8 +103,7 @@ async def test_clouds_arrive_as_thin_clouds_scans_and_masks(tmp_path: Path, enco
 
 
 async def test_the_level_may_change_at_any_time(tmp_path: Path) -> None:
-    """In place, between whole clouds and thin ones: nothing is lost and nothing overtakes, as the clouds' own counts
-    show."""
+    """A level changes between whole clouds and thin ones: nothing is lost or overtaken, by the clouds' own counts."""
     endpoint = robot_section("ros1", "/points", cloud_rate_hz=40.0, cloud_bytes=100_000)
     summary = {"kind": "voxel", "voxel_m": 1.0, "in_place": True}
     rule = {"match": "/points", "class": "bulk", "reliability": "reliable", "depth": 100, "summary": summary}

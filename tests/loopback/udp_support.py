@@ -1,4 +1,4 @@
-"""For tests of the UDP lane: a relay that notes what happens, and a client made by hand that may misbehave."""
+"""What tests of the UDP lane use: a relay that notes what happens, and a client made by hand that may misbehave."""
 
 import socket as socketlib
 from collections.abc import Callable, Sequence

@@ -23,7 +23,7 @@ COMMANDS = TopicName("/cmd_vel")
 
 
 def dds() -> tuple[sections.DdsEndpoint, sections.DdsEndpoint]:
-    """Of the client, and of another node at the same place that takes what SERN endpoints publish."""
+    """The guards of the client, and of another node at the same place that takes what SERN endpoints publish."""
     pytest.importorskip("cyclonedds", reason="the dds endpoint needs cyclonedds: pip install cyclonedds==11.0.1")
     from tests.peers.dds.peer import free_domain
 

@@ -368,7 +368,7 @@ def test_a_message_whose_pieces_find_no_room_is_given_up(reliable: bool) -> None
 
 
 def test_the_stream_untouched_for_longest_makes_way_whatever_there_are() -> None:
-    """Of a thousand streams with half a message each the first to be found costs no search."""
+    """Finding the first of a thousand streams with half a message each costs no search."""
     streams = [Receiver() for _ in range(4)]
     room = Reassembly(3 * (100 + HELD_OVERHEAD_BYTES))
     for receiver in streams:

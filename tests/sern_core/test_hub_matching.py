@@ -51,7 +51,7 @@ def test_a_client_without_a_connection_gets_its_turn_too() -> None:
 
 
 def flood(world: World, mallory: Hostile, *, subscriptions: int) -> list[int]:
-    """So many different subscriptions in a second; the units of each piece of work that the relay did for them."""
+    """Subscribe differently so many times in a second; the units of each piece of work that the relay did for them."""
     hub = world.relay.hub
     done: list[int] = []
     for number in range(subscriptions):

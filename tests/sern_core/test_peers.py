@@ -100,7 +100,7 @@ def test_what_the_relay_itself_publishes_is_nobodys() -> None:
 
 
 def test_a_client_that_does_not_ask_is_told_nothing() -> None:
-    """Of an earlier version: a control message that it does not know would end its session."""
+    """Peers of an earlier version: a control message that it does not know would end its session."""
     world = World().watch()
     robot = world.client("robot")
     site = world.client("site")

@@ -1,4 +1,4 @@
-"""In every state that random operations reach, the choice is the one that rescoring everything would make."""
+"""The choice is the one that rescoring everything would make, in every state that random operations reach."""
 
 from hypothesis import assume, settings
 from hypothesis import strategies as st

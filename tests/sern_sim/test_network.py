@@ -304,7 +304,7 @@ def test_a_burst_at_one_instant_is_not_stuck() -> None:
 
 
 def test_the_hook_runs_before_sending_and_again_until_it_has_nothing_to_do() -> None:
-    """As a codec does: the port asks for something, the application answers, and the port sends in the same event."""
+    """A codec needs this: the port asks for something, the application answers, the port sends in the same event."""
     wire, far = Wire(), Wire()
     requests = 3
 

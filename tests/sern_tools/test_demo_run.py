@@ -28,7 +28,7 @@ profiles:
 RUN_S = 300.0
 """More than `demo.START_S`, so that a demo that waits in vain has said so."""
 LIVE = "|  control "
-"""In every line that is printed while a load runs, whenever the first one comes."""
+"""What every line has that is printed while a load runs, whenever the first one comes."""
 INDEPENDENT_OF_SPEED = {"reliable_faults", "corrupted_messages", "uncounted_messages"}
 LATE_LOG_S = 1.0
 """A busy machine may take so much between the last check of a command's age and the line in the log."""

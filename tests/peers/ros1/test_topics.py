@@ -107,7 +107,7 @@ async def test_publishes_to_rospy_and_the_tools_byte_for_byte(tmp_path: Path) ->
 
 
 async def test_what_is_published_at_once_and_ended_reaches_who_was_there(tmp_path: Path) -> None:
-    """As a far side does that has one message only; its subscribers connect when the master has told them."""
+    """Publish as a far side does that has one message only; its subscribers connect when the master has told them."""
     need("/usr/lib/rosbag/record")
     async with RosLab(tmp_path) as ros:
         endpoint, _ = await ros.started()

@@ -129,7 +129,7 @@ def test_only_the_fields_that_are_asked_for_travel(encoding: Encoding) -> None:
 
 
 def test_fields_that_overlap_stay_where_they_are() -> None:
-    """As PCL does: rgb as a float and as a number, at one place."""
+    """The fields that PCL writes: rgb as a float and as a number, at one place."""
     message = scenes.cloud_message(scenes.structured(np.eye(3, dtype=np.float32)), Encoding.ROS1)
     message.fields += [scenes.cloud_message(scenes.structured(np.zeros((0, 3))), Encoding.ROS1).fields[3]] * 2
     thin = scenes.read(
