@@ -1,10 +1,12 @@
 """Estimators take any acknowledgement: what a peer says of its clock and its counters may be anything."""
 
+import heapq
 import math
+import random
 from collections.abc import Callable
 
 import pytest
-from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import HealthCheck, Phase, example, given, settings
 from hypothesis import strategies as st
 
 from sern_core import wire
@@ -185,3 +187,74 @@ def test_start_up_may_end_with_a_rate_and_before_any_epoch_has_seen_one() -> Non
     estimator._end_startup(10_000)
     check(estimator)
     assert estimator.pacing_bps is not None and estimator.pacing_bps > 8e6
+
+
+@st.composite
+def _paths(draw: st.DrawFn) -> list[tuple[float, float, float, float, float, int, bool]]:
+    """What a path and a sender are like, one after the other: for how long, the rate, the delay, the jitter, the share
+    that is lost, the bytes of a packet, and whether there is always more to send."""
+    return draw(
+        st.lists(
+            st.tuples(
+                st.sampled_from([0.02, 0.2, 1.0, 3.0]) | st.integers(1, 40).map(lambda count: count * 0.01),
+                st.sampled_from([2e3, 6e4, 5e5, 1e7]),
+                st.sampled_from([0.0, 1e-4, 0.01, 0.3]),
+                st.sampled_from([0.0, 0.001, 0.05]),
+                st.sampled_from([0.0, 0.0, 0.05, 0.9]),
+                st.sampled_from([76, 600, 1260, 9000]),
+                st.booleans(),
+            ),
+            min_size=1,
+            max_size=6,
+        )
+    )
+
+
+@pytest.mark.parametrize("name", ESTIMATORS)
+@settings(SETTINGS, max_examples=cases(100))
+@given(stretches=_paths(), seed=st.integers(0, 2**16))
+@example(  # the first rate was known before an epoch had seen one: a division by zero
+    stretches=[
+        (3.0, 1e7, 0.0, 0.001, 0.0, 1260, True),
+        (1.0, 6e4, 1e-4, 0.05, 0.9, 1260, False),
+        (0.27, 5e5, 0.0, 0.05, 0.0, 76, False),
+    ],
+    seed=1720,
+)
+def test_on_any_path_window_and_rates_stay_numbers(
+    name: str, stretches: list[tuple[float, float, float, float, float, int, bool]], seed: int
+) -> None:
+    """Random acknowledgements hardly ever make the history that a path makes: this one is a queue with a rate."""
+    chance = random.Random(seed)
+    estimator, pacer = ESTIMATORS[name](), Pacer()
+    now, free_s, inflight_bytes, cum_bytes = 10.0, 0.0, 0, 0
+    acks: list[tuple[float, float, float, int, bool, bool]] = []  # (due, sent, arrived, bytes, app limited, lost)
+    for lasts_s, rate, delay_s, jitter_s, loss, nbytes, greedy in stretches:
+        until_s = now + lasts_s
+        for _ in range(400):
+            if acks and (acks[0][0] <= now or inflight_bytes + nbytes > estimator.window_bytes):
+                due_s, sent_s, arrived_s, size, limited, lost = heapq.heappop(acks)
+                now = max(now, due_s)
+                inflight_bytes -= size
+                if lost:
+                    estimator.on_loss(now=now, nbytes=size)
+                else:
+                    cum_bytes += size
+                    sample = AckSample(
+                        now, now - sent_s, size, inflight_bytes, arrived_s, cum_bytes, limited, sent_s, size
+                    )
+                    estimator.on_ack(sample)
+                check(estimator)
+            elif now < until_s:
+                inflight_bytes += nbytes
+                estimator.on_sent(now=now, nbytes=nbytes, inflight_bytes=inflight_bytes)
+                pacer.sent(now=now, nbytes=nbytes, pacing_bps=estimator.pacing_bps)
+                free_s = max(now, free_s) + nbytes / rate
+                arrived_s = free_s + delay_s + chance.random() * jitter_s
+                lost = chance.random() < loss
+                heapq.heappush(acks, (arrived_s + delay_s, now, arrived_s, nbytes, not greedy, lost))
+                check(estimator)
+                now = max(now, pacer.due_s) if greedy else now + 0.01
+            else:
+                break
+        now = max(now, until_s)
