@@ -23,6 +23,7 @@ from rosbags.rosbag2 import Writer as Writer2
 from rosbags.rosbag2.storage_mcap import McapWriter, PendingChunk
 
 from sern_client.endpoints.bag_index import (
+    SchemaName,
     bag_chunk_head,
     mcap_chunk_head,
     mcap_chunk_index,
@@ -309,6 +310,7 @@ class McapFile(RecordFile):
         self._writer.open()
         assert isinstance(self._writer.storage, McapWriter)
         self._storage = self._writer.storage
+        self._schemas: dict[tuple[str, str], SchemaName] = {}  # by type and hash
         self._take_lock(self._storage.path)
         self._storage.close_chunk = _nothing  # type: ignore[method-assign]  # chunks are ended here
         self._file().flush()
@@ -316,12 +318,16 @@ class McapFile(RecordFile):
 
     @staticmethod
     def key(info: TopicInfo) -> tuple[object, ...]:
-        return info.name, info.type_name, info.latched, info.reliable
+        return info.name, info.type_name, info.type_hash, info.latched, info.reliable
 
     def _connect(self, info: TopicInfo) -> Connection:
-        return self._writer.add_connection(
-            info.name, info.type_name, msgdef=info.definition, rihs01=info.type_hash, offered_qos_profiles=[_qos(info)]
+        schema = self._schemas.setdefault((info.type_name, info.type_hash), SchemaName(info.type_name))
+        connection = self._writer.add_connection(
+            info.name, schema, msgdef=info.definition, rihs01=info.type_hash, offered_qos_profiles=[_qos(info)]
         )
+        # For the metadata, whose writer takes no other text than a plain one.
+        plain = self._writer.connections[-1] = connection._replace(msgtype=info.type_name)
+        return plain
 
     def _put(self, connection: Connection, stamp_ns: int, body: bytes) -> None:
         self._writer.write(connection, stamp_ns, body)

@@ -125,7 +125,6 @@ class RecordEndpoint:
         self._lock = threading.Lock()  # for the counters that both sides raise
         self._files: dict[Encoding, RecordFile | None] = {}  # None: could not be opened
         self._claimed: set[Encoding] = set()
-        self._mcap_hashes: dict[str, str] = {}
         self._thread: threading.Thread | None = None
         self._open = False
         self._loop: asyncio.AbstractEventLoop | None = None
@@ -311,13 +310,10 @@ class RecordEndpoint:
                 f"{info.name}: {type_name} came with hash {offered}, but its definition here has {computed}; "
                 "both sides need the same version of the type"
             )
-        if info.encoding is Encoding.CDR:
-            first = self._mcap_hashes.setdefault(type_name, computed)
-            if first != computed:
-                raise self._error(
-                    f"{info.name}: {type_name} has hash {computed} here and {first} on another topic; "
-                    "one .mcap holds one definition of a type"
-                )
+        try:
+            definition.encode()
+        except UnicodeEncodeError:  # the writers would find out with half of it in the file
+            raise self._error(f"{info.name}: the definition of {type_name} is no UTF-8") from None
         return TopicInfo(info.name, type_name, info.encoding, computed, definition, info.latched, info.reliable)
 
     # On the writer thread
