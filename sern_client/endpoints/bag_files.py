@@ -11,6 +11,7 @@ import os
 import shutil
 from abc import ABC, abstractmethod
 from collections import Counter, defaultdict
+from dataclasses import replace
 from io import BufferedWriter, BytesIO, FileIO
 from pathlib import Path
 from typing import BinaryIO, Final, cast
@@ -31,10 +32,17 @@ from sern_client.endpoints.bag_index import (
     write_mcap_index,
 )
 from sern_client.endpoints.leftovers import lock
+from sern_core.errors import ConfigError
 from sern_core.message import TopicInfo
+from sern_core.types import TopicName
 
 MAX_TIME: Final = 2**63 - 1
 CHUNK_BYTES: Final = 2**20
+MAX_TOPIC_CONNECTIONS: Final = 32
+"""Connections of one topic: one for each definition of its type, and for each latching and reliability."""
+MAX_CONNECTIONS: Final = 10_000
+MAX_DEFINITION_BYTES: Final = 64 * 2**20
+"""Connections in one file, and bytes of their definitions, each counted once. Both are in memory until its end."""
 _NO_LIMIT: Final = QosTime(MAX_TIME // 10**9, MAX_TIME % 10**9)
 
 
@@ -58,6 +66,9 @@ class RecordFile(ABC):
         self.messages = 0
         """Messages in the file, safe or not."""
         self._connections: dict[tuple[object, ...], Connection] = {}
+        self._per_topic: Counter[TopicName] = Counter()
+        self._definitions: dict[str, str] = {}  # each once in memory
+        self._definition_bytes = 0
         self._unsafe: Counter[int] = Counter()  # messages per connection since the last flushed chunk
         self._lock: int | None = None  # says that a living process writes here
         self._begin: int | None = None  # where in the file the open chunk begins; None: nothing of it is there
@@ -70,10 +81,26 @@ class RecordFile(ABC):
         """What makes a connection of its own in this format."""
 
     def add(self, info: TopicInfo) -> None:
-        """Announces a topic; again is harmless. `info` must have a definition and a hash."""
-        key = self.key(info)
-        if key not in self._connections and not self.full:
-            self._connections[key] = self._connect(info)
+        """Announces a topic; again is harmless. `info` must have a definition and a hash.
+
+        ConfigError for one more connection than a topic or a file may have.
+        """
+        if self.full or self.key(info) in self._connections:
+            return
+        if self._per_topic[info.name] >= MAX_TOPIC_CONNECTIONS:
+            raise ConfigError(f"the file has {MAX_TOPIC_CONNECTIONS} definitions or qualities of service of it already")
+        if len(self._connections) >= MAX_CONNECTIONS:
+            raise ConfigError(f"the file has {MAX_CONNECTIONS} topics already")
+        definition = self._definitions.get(info.definition)
+        if definition is None:
+            definition, size = info.definition, len(info.definition.encode())
+            if self._definition_bytes + size > MAX_DEFINITION_BYTES:
+                raise ConfigError(f"the file has {self._definition_bytes} bytes of definitions already")
+            self._definition_bytes += size
+            self._definitions[definition] = definition
+        info = replace(info, definition=definition)
+        self._connections[self.key(info)] = self._connect(info)
+        self._per_topic[info.name] += 1
 
     def knows(self, info: TopicInfo) -> bool:
         """Whether the topic was announced."""

@@ -39,6 +39,8 @@ MAX_STAMP_NS: Final = 2**32 * 10**9 - 1
 """The latest time a ROS 1 bag can hold (32-bit seconds)."""
 JOIN_AT_EXIT_S: Final = 30.0
 """How long an interpreter that exits without `stop` waits for the file to be finished."""
+MAX_COMPLAINTS: Final = 1000
+"""Topics of which it is said that they are not recorded."""
 _OVERHEAD_BYTES: Final = 256
 """What a buffered message costs besides its body."""
 
@@ -136,6 +138,7 @@ class RecordEndpoint:
         # Of the writer thread:
         self._lost: dict[int, DropReason] = {}  # by number, not told of yet
         self._unsafe: dict[Encoding, list[int]] = {}  # numbers of messages that are written and not flushed
+        self._unrecorded: set[TopicName] = set()  # of which was said that not all of them is written
         self._done = 0  # number of the last message that was dealt with
         self._flush_due_s: float | None = None
 
@@ -380,7 +383,9 @@ class RecordEndpoint:
         try:
             file.add(info)
         except Exception as error:  # noqa: BLE001  (of one topic; what comes of it is counted as dropped)
-            self._complain(f"{info.name} is not recorded ({_reason(error)})", info.encoding)
+            if info.name not in self._unrecorded and len(self._unrecorded) < MAX_COMPLAINTS:
+                self._unrecorded.add(info.name)
+                self._complain(f"{info.name} is not recorded ({_reason(error)})", info.encoding)
 
     def _file(self, encoding: Encoding) -> RecordFile | None:
         if encoding not in self._files:

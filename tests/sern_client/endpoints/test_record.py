@@ -16,6 +16,7 @@ from rosbags.interfaces import ConnectionExtRosbag1, ConnectionExtRosbag2, QosDu
 from rosbags.rosbag1 import Reader as Reader1
 from rosbags.rosbag2 import Reader as Reader2
 
+from sern_client.endpoints import bag_files
 from sern_client.endpoints.bag import BagEndpoint, BagOptions
 from sern_client.endpoints.bag_files import active_path
 from sern_client.endpoints.leftovers import finish
@@ -23,7 +24,7 @@ from sern_client.endpoints.record import RecordEndpoint, RecordOptions
 from sern_client.factory import make_section
 from sern_core.errors import ConfigError, UsageError
 from sern_core.message import TopicInfo
-from sern_core.types import Encoding, TopicName
+from sern_core.types import DropReason, Encoding, TopicName
 from sern_runtime import ros_types
 from sern_runtime.config import endpoints as sections
 from sern_runtime.ros_types import topic_info
@@ -243,6 +244,55 @@ async def test_a_false_definition_of_a_type_costs_others_nothing(
     assert connections(path) == {"/evil": {(kind, "uint8 x\n"), (kind, UNKNOWN)}, "/true": {(kind, UNKNOWN)}}
 
 
+@pytest.mark.parametrize("encoding", [Encoding.ROS1, Encoding.CDR])
+async def test_fresh_definitions_of_one_topic_are_bounded(
+    encoding: Encoding, tmp_path: Path, events: Any, caplog: pytest.LogCaptureFixture
+) -> None:
+    """What comes beyond the bound is counted as dropped and said once; other topics go on."""
+    recorder = RecordEndpoint(RecordOptions(tmp_path / "run"))
+    await recorder.start(events)
+    count = bag_files.MAX_TOPIC_CONNECTIONS + 5
+    for number in range(count):
+        info = replace(unknown(encoding, "/evil"), definition=f"uint8 f{number}\n", type_hash="")
+        publisher = recorder.advertise(info)
+        publisher.publish(bytes(5), START_NS + number)
+        publisher.close()
+    first = replace(unknown(encoding, "/evil"), definition="uint8 f0\n", type_hash="")
+    recorder.advertise(first).publish(bytes(6), START_NS + count)
+    recorder.advertise(unknown(encoding, "/true")).publish(bytes(7), START_NS + count)
+    await recorder.stop()
+    (path,) = recorder.paths.values()
+    found = bodies(path)
+    assert len(found["/evil"]) == bag_files.MAX_TOPIC_CONNECTIONS + 1 and found["/evil"][-1][0] == "uint8 f0\n"
+    assert found["/true"] == [(UNKNOWN, bytes(7))]
+    assert recorder.drops[DropReason.STORAGE] == recorder.counters.dropped == 5
+    said = [record.getMessage() for record in caplog.records if "/evil is not recorded" in record.getMessage()]
+    assert len(said) == 1 and "32 definitions" in said[0]
+
+
+@pytest.mark.parametrize("encoding", [Encoding.ROS1, Encoding.CDR])
+async def test_definitions_of_one_file_are_bounded(
+    encoding: Encoding, tmp_path: Path, events: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A definition that the file has costs nothing more."""
+    monkeypatch.setattr(bag_files, "MAX_DEFINITION_BYTES", 200)
+    monkeypatch.setattr(bag_files, "MAX_CONNECTIONS", 4)
+    recorder = RecordEndpoint(RecordOptions(tmp_path / "run"))
+    await recorder.start(events)
+    long = f"uint8 {'x' * 90}\nuint8 {'y' * 90}\n"
+    for number, (topic, definition) in enumerate(
+        [("/a", UNKNOWN), ("/b", long), ("/c", "uint8 x\n"), ("/d", UNKNOWN), ("/e", UNKNOWN), ("/f", UNKNOWN)]
+    ):
+        info = replace(unknown(encoding, topic), definition=definition, type_hash="")
+        recorder.advertise(info).publish(bytes(5), START_NS + number)
+    await recorder.stop()
+    (path,) = recorder.paths.values()
+    assert {topic: definition for topic, [(definition, _)] in bodies(path).items()} == {
+        "/a": UNKNOWN, "/c": "uint8 x\n", "/d": UNKNOWN, "/e": UNKNOWN
+    }  # fmt: skip
+    assert recorder.drops[DropReason.STORAGE] == 2
+
+
 async def test_overwrites_only_when_asked(tmp_path: Path, events: Any) -> None:
     (tmp_path / "run.bag").write_text("precious")
     with pytest.raises(ConfigError, match="exists already") as caught:
@@ -364,8 +414,6 @@ async def test_the_index_of_written_chunks_is_not_kept(tmp_path: Path, events: A
 INTERRUPTED = """
 import asyncio, os, signal, sys
 from pathlib import Path
-from sern_client.endpoints.bag_files import active_path
-from sern_client.endpoints.leftovers import finish
 from sern_client.endpoints.record import RecordEndpoint, RecordOptions
 from sern_runtime.ros_types import topic_info
 from sern_core.types import Encoding
