@@ -11,9 +11,12 @@ import os
 import shutil
 from abc import ABC, abstractmethod
 from collections import Counter, defaultdict
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from io import BufferedWriter, BytesIO, FileIO
 from pathlib import Path
+from tempfile import mkdtemp
 from typing import BinaryIO, Final, cast
 
 from rosbags.interfaces import Connection, Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
@@ -159,6 +162,21 @@ class RecordFile(ABC):
             raise FileNotFoundError(errno.ENOENT, "it was deleted while it was being written")
         self._unsafe.clear()
 
+    def _appear(self, made: Path, growing: Path) -> None:
+        """Give the new file or folder `made`, in which `growing` grows, its active name, locked.
+
+        Who looks for leftovers never sees it without its lock. FileExistsError when the name is not free.
+        """
+        try:
+            self._file().flush()
+            self._end = self._file().tell()
+            self._take_lock(growing)
+            _move(made, self.active)
+        except BaseException:
+            self._abandon()
+            self._unlock()
+            raise
+
     def _take_lock(self, growing: Path) -> None:
         try:
             self._lock = lock(growing)
@@ -261,12 +279,12 @@ class BagFile(RecordFile):
 
     def __init__(self, path: Path, *, sync: bool = False) -> None:
         super().__init__(path, sync=sync)
-        self._writer = Writer1(self.active)
-        self._writer.open()
-        self._take_lock(self.active)
+        with _hidden_folder(self.active) as folder:
+            self._writer = Writer1(folder / self.active.name)
+            self._writer.open()
+            self._appear(self._writer.path, self._writer.path)
+        self._writer.path = self.active
         self._writer.chunk_threshold = MAX_TIME  # chunks are ended here
-        self._file().flush()
-        self._end = self._file().tell()
 
     @staticmethod
     def key(info: TopicInfo) -> tuple[object, ...]:
@@ -333,15 +351,17 @@ class McapFile(RecordFile):
 
     def __init__(self, path: Path, *, sync: bool = False) -> None:
         super().__init__(path, sync=sync)
-        self._writer = Writer2(self.active, version=Writer2.VERSION_LATEST, storage_plugin=StoragePlugin.MCAP)
-        self._writer.open()
-        assert isinstance(self._writer.storage, McapWriter)
-        self._storage = self._writer.storage
-        self._schemas: dict[tuple[str, str], SchemaName] = {}  # by type and hash
-        self._take_lock(self._storage.path)
+        with _hidden_folder(self.active) as folder:
+            made = folder / self.active.name
+            self._writer = Writer2(made, version=Writer2.VERSION_LATEST, storage_plugin=StoragePlugin.MCAP)
+            self._writer.open()
+            assert isinstance(self._writer.storage, McapWriter)
+            self._storage = self._writer.storage
+            self._appear(made, self._storage.path)
+        self._writer.path, self._writer.metapath = self.active, self.active / self._writer.metapath.name
+        self._storage.path = self.active / self._storage.path.name
         self._storage.close_chunk = _nothing  # type: ignore[method-assign]  # chunks are ended here
-        self._file().flush()
-        self._end = self._file().tell()
+        self._schemas: dict[tuple[str, str], SchemaName] = {}  # by type and hash
 
     @staticmethod
     def key(info: TopicInfo) -> tuple[object, ...]:
@@ -405,6 +425,33 @@ class McapFile(RecordFile):
     def _take_name(self) -> None:
         self._storage.path.replace(self.path)
         shutil.rmtree(self.active)
+
+
+@contextmanager
+def _hidden_folder(active: Path) -> Iterator[Path]:
+    """A new folder beside `active`, under a name that nobody looks for; it is gone in the end."""
+    folder = Path(mkdtemp(prefix=f".{active.name}.", dir=active.parent))
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder)
+
+
+def _move(made: Path, target: Path) -> None:
+    """Rename a file or folder. FileExistsError when there is something of that name."""
+    if not made.is_dir():
+        try:
+            os.link(made, target)
+        except FileExistsError:
+            raise
+        except OSError:
+            pass  # a file system without links
+        else:
+            made.unlink()
+            return
+    if target.exists():
+        raise FileExistsError(errno.EEXIST, "it exists already", str(target))
+    made.rename(target)  # a folder never takes the place of another that holds something
 
 
 def _cut(old: BinaryIO | None, path: Path, position: int) -> BufferedWriter:
