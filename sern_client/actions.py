@@ -270,6 +270,8 @@ class GoalWatch:
             ident = goal_id(body)
         except ConfigError:
             return None
+        if ident.text in action.goals:
+            self._forget(action, ident.text)
         while len(action.goals) >= MAX_GOALS:
             self._forget(action, next(iter(action.goals)))
         goal = _Goal(ident, channel.stream.id, channel.next_seq, clock.now() + action.accept_s)

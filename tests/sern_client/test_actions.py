@@ -337,6 +337,18 @@ async def test_a_goal_with_a_result_is_done_and_what_is_no_goal_is_let_through(s
     assert [result_of(data).status.goal_id.id for data in site.results] == ["another"]
 
 
+async def test_a_goal_that_is_given_again_is_watched_in_place_of_the_one_before(site: Site) -> None:
+    """As a client does that does not see its server; what becomes of the first makes no difference any more."""
+    site.server_appears()
+    seq = site.channel.next_seq
+    for _ in range(3):
+        site.give(goal_body(), 1)
+    assert site.watch.watched == 1
+    site.watch.message(RESULT.name, Encoding.ROS1, result_for(IDENT.text))
+    site.watch.send_dropped(site.channel.stream.id, seq, DropReason.LIFESPAN)
+    assert site.watch.watched == 0 and site.results == []
+
+
 async def test_clients_that_are_gone_are_told_nothing(site: Site) -> None:
     site.server_appears()
     seq = site.channel.next_seq
