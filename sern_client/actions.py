@@ -13,6 +13,9 @@ import struct
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from heapq import heapify, heappop, heappush
+from itertools import count
+from math import inf
 from typing import Any, Final, NamedTuple
 
 from sern_client.endpoints.base import Publisher, ServiceInfo, Sink
@@ -30,6 +33,8 @@ ACCEPT_S: Final = 5.0
 """How long beyond its lifespan on the link a goal may take until its server is heard of it."""
 MAX_GOALS: Final = 1000
 """Goals of one action that are watched at a time; of more, the oldest are watched no longer."""
+SPARE_ENTRIES: Final = 64
+"""How many times of goals that have ended may be queued beside as many as there are goals."""
 MAX_STATUSES: Final = 4000
 """Goals that one status message may mention: 5 ms of the event loop. A server mentions those of the last seconds."""
 STATUS_TYPE: Final = "actionlib_msgs/msg/GoalStatusArray"
@@ -158,13 +163,18 @@ def result_body(info: TopicInfo, goal: GoalId, status: int, text: str) -> bytes:
 
 @dataclass(slots=True)
 class _Goal:
-    """One that is on its way or under way. `due_s`: when we give it up, unless something is heard of it."""
+    """One that is on its way or under way. `due_s`: when we give it up, unless something is heard of it.
+
+    `queued_s`: when we look at it next, never later than `due_s`.
+    """
 
     ident: GoalId
     stream: StreamId
     seq: int
     due_s: float
     heard: bool = False
+    queued_s: float = inf
+    watched: bool = True
 
 
 @dataclass(slots=True, eq=False)
@@ -192,12 +202,20 @@ class GoalWatch:
         self._advertise = advertise
         self._actions: dict[str, _Action] = {}
         self._by_message: dict[tuple[StreamId, int], tuple[_Action, str]] = {}
+        self._due_next: list[tuple[float, int, _Action, _Goal]] = []  # a heap: when to look, and at which goal
+        self._entries = count()
         self._timer = Timer(self._due)
+
+    @property
+    def watched(self) -> int:
+        """Goals that are watched now."""
+        return len(self._by_message)
 
     def close(self) -> None:
         self._timer.cancel()
         self._actions.clear()
         self._by_message.clear()
+        self._due_next.clear()
 
     def _part(self, name: TopicName, encoding: Encoding) -> tuple[_Action, str] | None:
         """The action that a topic of ours belongs to, and what it is there."""
@@ -252,11 +270,14 @@ class GoalWatch:
             ident = goal_id(body)
         except ConfigError:
             return None
+        if ident.text in action.goals:
+            self._forget(action, ident.text)
         while len(action.goals) >= MAX_GOALS:
             self._forget(action, next(iter(action.goals)))
         goal = _Goal(ident, channel.stream.id, channel.next_seq, clock.now() + action.accept_s)
         action.goals[ident.text] = goal
         self._by_message[goal.stream, goal.seq] = action, ident.text
+        self._queue(action, goal)
         self._arm()
         return goal
 
@@ -317,24 +338,47 @@ class GoalWatch:
             if goal is not None:
                 goal.heard = True
                 goal.due_s = due_s
+                if due_s < goal.queued_s:
+                    self._queue(action, goal)
         self._arm()
 
     # Who waits
 
     def _forget(self, action: _Action, text: str) -> None:
         goal = action.goals.pop(text)
+        goal.watched = False
         self._by_message.pop((goal.stream, goal.seq), None)
 
+    def _queue(self, action: _Action, goal: _Goal) -> None:
+        goal.queued_s = goal.due_s
+        heappush(self._due_next, (goal.due_s, next(self._entries), action, goal))
+        if len(self._due_next) > 2 * self.watched + SPARE_ENTRIES:
+            self._due_next = [entry for entry in self._due_next if self._is_current(entry)]
+            heapify(self._due_next)
+
+    @staticmethod
+    def _is_current(entry: tuple[float, int, _Action, _Goal]) -> bool:
+        """Whether it is to be looked at: the goal has not ended, and is not queued for earlier."""
+        at_s, _, _, goal = entry
+        return goal.watched and at_s == goal.queued_s
+
     def _arm(self) -> None:
-        due = [goal.due_s for action in self._actions.values() for goal in action.goals.values()]
-        self._timer.arm(min(due) if due else None)
+        while self._due_next and not self._is_current(self._due_next[0]):
+            heappop(self._due_next)
+        self._timer.arm(self._due_next[0][0] if self._due_next else None)
 
     def _due(self) -> None:
         now = clock.now()
-        for action in list(self._actions.values()):
-            for goal in [goal for goal in action.goals.values() if goal.due_s <= now]:
-                for_s = action.patience_s if goal.heard else action.accept_s
-                self._fail(action, goal, f"nothing was heard of it for {for_s:g} s")
+        while self._due_next and self._due_next[0][0] <= now:
+            entry = heappop(self._due_next)
+            _, _, action, goal = entry
+            if not self._is_current(entry):
+                continue
+            if goal.due_s > now:  # it was heard of since
+                self._queue(action, goal)
+                continue
+            for_s = action.patience_s if goal.heard else action.accept_s
+            self._fail(action, goal, f"nothing was heard of it for {for_s:g} s")
         self._arm()
 
     def _fail_soon(self, action: _Action, goal: _Goal, why: str) -> None:

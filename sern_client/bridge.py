@@ -29,7 +29,7 @@ from sern_client.leaving import Leaving
 from sern_client.link_state import LinkState
 from sern_client.rebuild import Rebuilds
 from sern_client.services import ServiceBridge
-from sern_client.summarise import Send, Source, Summaries
+from sern_client.summarise import Send, Source, Summaries, streams_of
 from sern_client.tf_merge import LatchedTransforms, MergedTransforms
 from sern_client.udp import ClientLane
 from sern_client.update_topics import UpdateTopics
@@ -198,6 +198,8 @@ class Bridge:
         for outgoing in self._outgoing.values():
             if outgoing.source is not None:
                 outgoing.source.close()
+                for channel in outgoing.source.own:
+                    self._unpublish(channel)
         self.summaries.close()
         self._outgoing.clear()
         self.leaving.close()
@@ -286,7 +288,8 @@ class Bridge:
     def _withdraw(self, channel: OutChannel, source: Source | None) -> None:
         """Offer a topic no more."""
         self._forget_source(source)
-        self._unpublish(channel)
+        for each in streams_of(channel, source):
+            self._unpublish(each)
 
     def _unpublish(self, channel: OutChannel) -> None:
         self.values.forget(channel.stream.id)
@@ -325,7 +328,7 @@ class Bridge:
                 self.goals.withdrawn(name)
             outgoing.subscription.close()
             self._forget_source(outgoing.source)
-            self.leaving.leave(name, outgoing.channel, now=clock.now())
+            self.leaving.leave(name, *streams_of(outgoing.channel, outgoing.source), now=clock.now())
             self._kick()
 
     def _sink(self, channel: OutChannel, rewrite: Rewrite | None) -> Callable[[bytes, int], bool]:

@@ -2,7 +2,7 @@
 
 A node that publishes a few messages and ends is usual (`rostopic pub -1`, `rosbag play`). The stream goes on until the
 relay has got them all, or for `LEAVE_S`: what has not arrived then is reported as ever. What subscribers behind the
-relay are still owed is the relay's to keep.
+relay are still owed is the relay's to keep. The streams of one topic (a grid and its changes) end together.
 """
 
 from collections.abc import Callable
@@ -20,25 +20,24 @@ class Leaving:
 
     def __init__(self, withdraw: Callable[[OutChannel], None]) -> None:
         self._withdraw = withdraw
-        self._until_s: dict[TopicName, tuple[OutChannel, float]] = {}
+        self._until_s: dict[TopicName, tuple[tuple[OutChannel, ...], float]] = {}
 
-    def leave(self, name: TopicName, channel: OutChannel, *, now: float) -> None:
-        """The local topic has no publisher any more."""
-        if _owes(channel):
-            self._until_s[name] = (channel, now + LEAVE_S)
-        else:
-            self._withdraw(channel)
+    def leave(self, name: TopicName, *channels: OutChannel, now: float) -> None:
+        """The local topic has no publisher any more; `channels` are its streams, withdrawn in this order."""
+        self._until_s[name] = (channels, now + LEAVE_S)
+        if not any(map(_owes, channels)):
+            self.come_back(name)
 
     def come_back(self, name: TopicName) -> None:
         """The topic has a publisher again, whose messages are another stream."""
-        channel, _ = self._until_s.pop(name, (None, 0.0))
-        if channel is not None:
+        channels, _ = self._until_s.pop(name, ((), 0.0))
+        for channel in channels:
             self._withdraw(channel)
 
     def look(self, *, now: float) -> None:
         """End what has been sent, or has taken too long."""
-        for name, (channel, until_s) in list(self._until_s.items()):
-            if now >= until_s or not _owes(channel):
+        for name, (channels, until_s) in list(self._until_s.items()):
+            if now >= until_s or not any(map(_owes, channels)):
                 self.come_back(name)
 
     def close(self) -> None:

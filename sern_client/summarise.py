@@ -430,8 +430,18 @@ class Source(Protocol):
 
     def lost(self, stream: StreamId) -> None: ...
 
+    @property
+    def own(self) -> tuple[OutChannel, ...]:
+        """The streams it has beside the topic's, which are withdrawn with that."""
+        ...
+
     def close(self) -> None:
-        """Withdraw the streams that are its own: all but the topic's."""
+        """Give up what waits; offer no more. The streams stay."""
+
+
+def streams_of(channel: OutChannel, source: Source | None) -> tuple[OutChannel, ...]:
+    """All streams of a local topic: those of its source's own, then the topic's."""
+    return (channel,) if source is None else (*source.own, channel)
 
 
 class SummarisedTopic:
@@ -505,15 +515,16 @@ class SummarisedTopic:
             if output.owns(stream):
                 output.lost()
 
+    @property
+    def own(self) -> tuple[OutChannel, ...]:
+        return tuple(output.channel for output in self.outputs if output.channel is not self._channel)
+
     def close(self) -> None:
-        now = clock.now()
         if self._timer is not None:
             self._timer.cancel()
         self._drop_newest(DropReason.SHUTDOWN)
         for output in self.outputs:
             output.close()
-            if output.channel is not self._channel:
-                self._core.unpublish(output.channel, now=now)
 
 
 class Summaries:

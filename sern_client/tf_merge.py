@@ -51,6 +51,10 @@ class _Transforms:
     def pending(self) -> int:
         return 0
 
+    @property
+    def own(self) -> tuple[OutChannel, ...]:
+        return ()
+
     def audience_changed(self) -> None:
         """Nothing to do: what is latched is complete, and the rest is soon sent anew."""
 
@@ -58,7 +62,7 @@ class _Transforms:
         """Nothing to do: the next transform of the same pair replaces it."""
 
     def close(self) -> None:
-        """There is nothing to withdraw beside the topic."""
+        """Nothing waits."""
 
 
 class MergedTransforms(_Transforms):

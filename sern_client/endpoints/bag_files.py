@@ -11,8 +11,12 @@ import os
 import shutil
 from abc import ABC, abstractmethod
 from collections import Counter, defaultdict
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
 from io import BufferedWriter, BytesIO, FileIO
 from pathlib import Path
+from tempfile import mkdtemp
 from typing import BinaryIO, Final, cast
 
 from rosbags.interfaces import Connection, Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
@@ -23,6 +27,7 @@ from rosbags.rosbag2 import Writer as Writer2
 from rosbags.rosbag2.storage_mcap import McapWriter, PendingChunk
 
 from sern_client.endpoints.bag_index import (
+    SchemaName,
     bag_chunk_head,
     mcap_chunk_head,
     mcap_chunk_index,
@@ -30,10 +35,17 @@ from sern_client.endpoints.bag_index import (
     write_mcap_index,
 )
 from sern_client.endpoints.leftovers import lock
+from sern_core.errors import ConfigError
 from sern_core.message import TopicInfo
+from sern_core.types import TopicName
 
 MAX_TIME: Final = 2**63 - 1
 CHUNK_BYTES: Final = 2**20
+MAX_TOPIC_CONNECTIONS: Final = 32
+"""Connections of one topic: one for each definition of its type, and for each latching and reliability."""
+MAX_CONNECTIONS: Final = 10_000
+MAX_DEFINITION_BYTES: Final = 64 * 2**20
+"""Connections in one file, and bytes of their definitions, each counted once. Both are in memory until its end."""
 _NO_LIMIT: Final = QosTime(MAX_TIME // 10**9, MAX_TIME % 10**9)
 
 
@@ -57,6 +69,9 @@ class RecordFile(ABC):
         self.messages = 0
         """Messages in the file, safe or not."""
         self._connections: dict[tuple[object, ...], Connection] = {}
+        self._per_topic: Counter[TopicName] = Counter()
+        self._definitions: dict[str, str] = {}  # each once in memory
+        self._definition_bytes = 0
         self._unsafe: Counter[int] = Counter()  # messages per connection since the last flushed chunk
         self._lock: int | None = None  # says that a living process writes here
         self._begin: int | None = None  # where in the file the open chunk begins; None: nothing of it is there
@@ -69,10 +84,26 @@ class RecordFile(ABC):
         """What makes a connection of its own in this format."""
 
     def add(self, info: TopicInfo) -> None:
-        """Announces a topic; again is harmless. `info` must have a definition and a hash."""
-        key = self.key(info)
-        if key not in self._connections and not self.full:
-            self._connections[key] = self._connect(info)
+        """Announces a topic; again is harmless. `info` must have a definition and a hash.
+
+        ConfigError for one more connection than a topic or a file may have.
+        """
+        if self.full or self.key(info) in self._connections:
+            return
+        if self._per_topic[info.name] >= MAX_TOPIC_CONNECTIONS:
+            raise ConfigError(f"the file has {MAX_TOPIC_CONNECTIONS} definitions or qualities of service of it already")
+        if len(self._connections) >= MAX_CONNECTIONS:
+            raise ConfigError(f"the file has {MAX_CONNECTIONS} topics already")
+        definition = self._definitions.get(info.definition)
+        if definition is None:
+            definition, size = info.definition, len(info.definition.encode())
+            if self._definition_bytes + size > MAX_DEFINITION_BYTES:
+                raise ConfigError(f"the file has {self._definition_bytes} bytes of definitions already")
+            self._definition_bytes += size
+            self._definitions[definition] = definition
+        info = replace(info, definition=definition)
+        self._connections[self.key(info)] = self._connect(info)
+        self._per_topic[info.name] += 1
 
     def knows(self, info: TopicInfo) -> bool:
         """Whether the topic was announced."""
@@ -130,6 +161,21 @@ class RecordFile(ABC):
         if not os.fstat(self._file().fileno()).st_nlink:
             raise FileNotFoundError(errno.ENOENT, "it was deleted while it was being written")
         self._unsafe.clear()
+
+    def _appear(self, made: Path, growing: Path) -> None:
+        """Give the new file or folder `made`, in which `growing` grows, its active name, locked.
+
+        Who looks for leftovers never sees it without its lock. FileExistsError when the name is not free.
+        """
+        try:
+            self._file().flush()
+            self._end = self._file().tell()
+            self._take_lock(growing)
+            _move(made, self.active)
+        except BaseException:
+            self._abandon()
+            self._unlock()
+            raise
 
     def _take_lock(self, growing: Path) -> None:
         try:
@@ -233,12 +279,12 @@ class BagFile(RecordFile):
 
     def __init__(self, path: Path, *, sync: bool = False) -> None:
         super().__init__(path, sync=sync)
-        self._writer = Writer1(self.active)
-        self._writer.open()
-        self._take_lock(self.active)
+        with _hidden_folder(self.active) as folder:
+            self._writer = Writer1(folder / self.active.name)
+            self._writer.open()
+            self._appear(self._writer.path, self._writer.path)
+        self._writer.path = self.active
         self._writer.chunk_threshold = MAX_TIME  # chunks are ended here
-        self._file().flush()
-        self._end = self._file().tell()
 
     @staticmethod
     def key(info: TopicInfo) -> tuple[object, ...]:
@@ -305,23 +351,30 @@ class McapFile(RecordFile):
 
     def __init__(self, path: Path, *, sync: bool = False) -> None:
         super().__init__(path, sync=sync)
-        self._writer = Writer2(self.active, version=Writer2.VERSION_LATEST, storage_plugin=StoragePlugin.MCAP)
-        self._writer.open()
-        assert isinstance(self._writer.storage, McapWriter)
-        self._storage = self._writer.storage
-        self._take_lock(self._storage.path)
+        with _hidden_folder(self.active) as folder:
+            made = folder / self.active.name
+            self._writer = Writer2(made, version=Writer2.VERSION_LATEST, storage_plugin=StoragePlugin.MCAP)
+            self._writer.open()
+            assert isinstance(self._writer.storage, McapWriter)
+            self._storage = self._writer.storage
+            self._appear(made, self._storage.path)
+        self._writer.path, self._writer.metapath = self.active, self.active / self._writer.metapath.name
+        self._storage.path = self.active / self._storage.path.name
         self._storage.close_chunk = _nothing  # type: ignore[method-assign]  # chunks are ended here
-        self._file().flush()
-        self._end = self._file().tell()
+        self._schemas: dict[tuple[str, str], SchemaName] = {}  # by type and hash
 
     @staticmethod
     def key(info: TopicInfo) -> tuple[object, ...]:
-        return info.name, info.type_name, info.latched, info.reliable
+        return info.name, info.type_name, info.type_hash, info.latched, info.reliable
 
     def _connect(self, info: TopicInfo) -> Connection:
-        return self._writer.add_connection(
-            info.name, info.type_name, msgdef=info.definition, rihs01=info.type_hash, offered_qos_profiles=[_qos(info)]
+        schema = self._schemas.setdefault((info.type_name, info.type_hash), SchemaName(info.type_name))
+        connection = self._writer.add_connection(
+            info.name, schema, msgdef=info.definition, rihs01=info.type_hash, offered_qos_profiles=[_qos(info)]
         )
+        # For the metadata, whose writer takes no other text than a plain one.
+        plain = self._writer.connections[-1] = connection._replace(msgtype=info.type_name)
+        return plain
 
     def _put(self, connection: Connection, stamp_ns: int, body: bytes) -> None:
         self._writer.write(connection, stamp_ns, body)
@@ -372,6 +425,33 @@ class McapFile(RecordFile):
     def _take_name(self) -> None:
         self._storage.path.replace(self.path)
         shutil.rmtree(self.active)
+
+
+@contextmanager
+def _hidden_folder(active: Path) -> Iterator[Path]:
+    """A new folder beside `active`, under a name that nobody looks for; it is gone in the end."""
+    folder = Path(mkdtemp(prefix=f".{active.name}.", dir=active.parent))
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder)
+
+
+def _move(made: Path, target: Path) -> None:
+    """Rename a file or folder. FileExistsError when there is something of that name."""
+    if not made.is_dir():
+        try:
+            os.link(made, target)
+        except FileExistsError:
+            raise
+        except OSError:
+            pass  # a file system without links
+        else:
+            made.unlink()
+            return
+    if target.exists():
+        raise FileExistsError(errno.EEXIST, "it exists already", str(target))
+    made.rename(target)  # a folder never takes the place of another that holds something
 
 
 def _cut(old: BinaryIO | None, path: Path, position: int) -> BufferedWriter:

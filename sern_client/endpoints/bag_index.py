@@ -18,6 +18,24 @@ _U32: Final = struct.Struct("<I")
 _TIME: Final = struct.Struct("<II")
 
 
+class SchemaName(str):
+    """The name of one schema of an MCAP file. It equals no other, however that is written.
+
+    A file may hold two definitions of one type. rosbags looks for the schema of a channel by its name.
+    """
+
+    __slots__ = ()
+
+    def __eq__(self, other: object) -> bool:
+        return self is other
+
+    def __ne__(self, other: object) -> bool:
+        return self is not other
+
+    def __hash__(self) -> int:
+        return id(self)
+
+
 def _bag_header(*fields: bytes) -> bytes:
     header = b"".join(_U32.pack(len(field)) + field for field in fields)
     return _U32.pack(len(header)) + header

@@ -120,11 +120,10 @@ class FirstMessages:
         if now >= self._give_up_s:
             if connected < known and self._kept:
                 _log.warning(
-                    "%s: %d of %d subscribers have not connected within %.1f s; they missed %d messages",
+                    "%s: %d of %d subscribers have not connected within %.1f s; they miss %d messages",
                     self._topic, known - connected, known, now - self._since_s, len(self._kept),
                 )  # fmt: skip
-                for _ in self._kept:
-                    self._dropped(DropReason.DISCONNECTED)
+            # Written all the same, for those that are there and for late joiners of a latched topic; so not dropped.
             self._flush()
         elif not known:
             if now >= self._learned_s:

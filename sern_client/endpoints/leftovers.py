@@ -37,6 +37,7 @@ from rosbags.rosbag2.storage_mcap import (
 from sern_client.endpoints.bag_index import (
     MCAP_CHUNK,
     MCAP_RECORD,
+    SchemaName,
     bag_chunk_head,
     mcap_chunk_head,
     mcap_chunk_index,
@@ -360,7 +361,7 @@ class _Scan:
         inner = BytesIO(data)
         number = int.from_bytes(inner.read(2), "little")
         if op == 0x03:
-            schema = Schema(number, read_string(inner), read_string(inner), read_string(inner))
+            schema = Schema(number, SchemaName(read_string(inner)), read_string(inner), read_string(inner))
             self.schemas.setdefault(number, schema)
         elif op == 0x04:
             of = int.from_bytes(inner.read(2), "little")
@@ -468,15 +469,16 @@ def _end_mcap(file: BinaryIO, path: Path, folder: Path, scan: _Scan) -> None:
     writer.min_timestamp, writer.max_timestamp = scan.start_ns, scan.end_ns
     schemas = {schema.name: schema for schema in scan.schemas.values()}
     for channel in scan.channels.values():
+        type_name = str(channel.schema)
         definition = schemas[channel.schema].data
         extension = ConnectionExtRosbag2(channel.message_encoding, get_qos(channel.metadata))
         writer.connections.append(
             Connection(
                 channel.id,
                 channel.topic,
-                channel.schema,
+                type_name,
                 MessageDefinition(MessageDefinitionFormat.MSG, definition),
-                _hash_of(channel.schema, definition),
+                _hash_of(type_name, definition),
                 0,
                 extension,
                 writer,

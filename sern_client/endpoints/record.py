@@ -39,6 +39,8 @@ MAX_STAMP_NS: Final = 2**32 * 10**9 - 1
 """The latest time a ROS 1 bag can hold (32-bit seconds)."""
 JOIN_AT_EXIT_S: Final = 30.0
 """How long an interpreter that exits without `stop` waits for the file to be finished."""
+MAX_COMPLAINTS: Final = 1000
+"""Topics of which it is said that they are not recorded."""
 _OVERHEAD_BYTES: Final = 256
 """What a buffered message costs besides its body."""
 
@@ -125,7 +127,6 @@ class RecordEndpoint:
         self._lock = threading.Lock()  # for the counters that both sides raise
         self._files: dict[Encoding, RecordFile | None] = {}  # None: could not be opened
         self._claimed: set[Encoding] = set()
-        self._mcap_hashes: dict[str, str] = {}
         self._thread: threading.Thread | None = None
         self._open = False
         self._loop: asyncio.AbstractEventLoop | None = None
@@ -137,6 +138,7 @@ class RecordEndpoint:
         # Of the writer thread:
         self._lost: dict[int, DropReason] = {}  # by number, not told of yet
         self._unsafe: dict[Encoding, list[int]] = {}  # numbers of messages that are written and not flushed
+        self._unrecorded: set[TopicName] = set()  # of which was said that not all of them is written
         self._done = 0  # number of the last message that was dealt with
         self._flush_due_s: float | None = None
 
@@ -311,13 +313,10 @@ class RecordEndpoint:
                 f"{info.name}: {type_name} came with hash {offered}, but its definition here has {computed}; "
                 "both sides need the same version of the type"
             )
-        if info.encoding is Encoding.CDR:
-            first = self._mcap_hashes.setdefault(type_name, computed)
-            if first != computed:
-                raise self._error(
-                    f"{info.name}: {type_name} has hash {computed} here and {first} on another topic; "
-                    "one .mcap holds one definition of a type"
-                )
+        try:
+            definition.encode()
+        except UnicodeEncodeError:  # the writers would find out with half of it in the file
+            raise self._error(f"{info.name}: the definition of {type_name} is no UTF-8") from None
         return TopicInfo(info.name, type_name, info.encoding, computed, definition, info.latched, info.reliable)
 
     # On the writer thread
@@ -384,7 +383,9 @@ class RecordEndpoint:
         try:
             file.add(info)
         except Exception as error:  # noqa: BLE001  (of one topic; what comes of it is counted as dropped)
-            self._complain(f"{info.name} is not recorded ({_reason(error)})", info.encoding)
+            if info.name not in self._unrecorded and len(self._unrecorded) < MAX_COMPLAINTS:
+                self._unrecorded.add(info.name)
+                self._complain(f"{info.name} is not recorded ({_reason(error)})", info.encoding)
 
     def _file(self, encoding: Encoding) -> RecordFile | None:
         if encoding not in self._files:

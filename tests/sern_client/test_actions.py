@@ -1,7 +1,9 @@
 """Goals that nobody will answer: what their clients are told."""
 
 import struct
+import sys
 from collections.abc import AsyncIterator, Callable
+from types import FrameType
 from typing import Any
 
 import pytest
@@ -9,6 +11,7 @@ import pytest
 from sern_client import actions
 from sern_client.actions import (
     ABORTED,
+    MAX_GOALS,
     MAX_STATUSES,
     REJECTED,
     STATUS_TYPE,
@@ -26,7 +29,7 @@ from sern_core.message import StreamId, StreamInfo, TopicInfo, TopicSpec
 from sern_core.patterns import compile_pattern
 from sern_core.queues import OutChannel
 from sern_core.types import ClientName, DropReason, Encoding, PriorityClass, TopicName
-from sern_runtime import ros_types
+from sern_runtime import clock, ros_types
 from tests.support import until
 
 HEADER = "Header header\n"
@@ -70,6 +73,13 @@ def goal_body(ident: GoalId = IDENT) -> bytes:
         message.goal.goal = 3
 
     return body(GOAL_TEXT, "count/msg/CountActionGoal", fill)
+
+
+def result_for(text: str) -> bytes:
+    def fill(message: Any) -> None:
+        message.status.goal_id.id = text
+
+    return body(RESULT_TEXT, RESULT.type_name, fill)
 
 
 def result_of(data: bytes) -> Any:
@@ -214,6 +224,86 @@ async def test_a_status_of_too_many_goals_is_not_read(caplog: pytest.LogCaptureF
     site.watch.close()
 
 
+def steps(work: Callable[[], None]) -> int:
+    """Bytecode that `work` runs in sern_client.actions."""
+    count = 0
+
+    def trace(frame: FrameType, event: str, _arg: object) -> Any:
+        nonlocal count
+        if frame.f_code.co_filename != actions.__file__:
+            return None
+        frame.f_trace_opcodes = True
+        count += event == "opcode"
+        return trace
+
+    before = sys.gettrace()
+    sys.settrace(trace)
+    try:
+        work()
+    finally:
+        sys.settrace(before)
+    return count
+
+
+async def test_what_a_status_costs_does_not_grow_with_the_goals_it_does_not_mention() -> None:
+    costs = []
+    for goals in (10, MAX_GOALS - 1):
+        site = Site()
+        site.server_appears()
+        for number in range(goals):
+            site.give(goal_body(GoalId(1, 2, f"goal {number}")), 1)
+        one = status_body("goal 5")
+        costs.append(steps(lambda watch=site.watch, one=one: watch.message(STATUS.name, Encoding.ROS1, one)))  # type: ignore[misc]
+        costs.append(steps(lambda site=site: site.give(goal_body(), 1)))  # type: ignore[misc]
+        site.watch.close()
+    assert costs[0] > 100 and costs[2:] == costs[:2]
+
+
+async def test_goals_that_end_leave_nothing_that_grows() -> None:
+    """A client that gives goals again and again, while one of before is under way."""
+    site = Site()
+    site.server_appears()
+    site.give(goal_body(), 1)
+    for number in range(2000):
+        site.give(goal_body(GoalId(1, 2, f"goal {number}")), 1)
+        site.watch.message(RESULT.name, Encoding.ROS1, result_for(f"goal {number}"))
+        site.watch.message(STATUS.name, Encoding.ROS1, status_body(IDENT.text))
+    assert site.watch.watched == 1 and len(site.watch._due_next) < 100
+    site.watch.close()
+
+
+async def test_each_goal_is_given_up_when_it_is_its_turn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is heard of one moves its time, earlier or later, and no other's."""
+    now = 100.0
+    monkeypatch.setattr(clock, "now", lambda: now)
+    site = Site(patience_s=2.0)  # ACCEPT_S is longer
+    site.server_appears()
+    given, armed = [], []
+    for number in range(4):
+        site.give(goal_body(GoalId(1, 2, f"goal {number}")), 1)
+        now += 1.0
+    site.watch.message(STATUS.name, Encoding.ROS1, status_body("goal 3"))  # due at 106; the others at 105, 106, 107
+    now = 105.0
+    site.watch._due()
+    given.append(len(site.cancels))
+    site.watch.message(STATUS.name, Encoding.ROS1, status_body("goal 2"))  # due at 107, as before
+    now = 106.0
+    site.watch.message(STATUS.name, Encoding.ROS1, status_body("goal 3"))  # due at 108
+    site.watch._due()
+    given.append(len(site.cancels))
+    armed.append(site.watch._timer.deadline_s)
+    now = 107.0
+    site.watch._due()
+    given.append(len(site.cancels))
+    now = 108.0
+    site.watch._due()
+    given.append(len(site.cancels))
+    armed.append(site.watch._timer.deadline_s)
+    assert given == [1, 2, 3, 4] and armed == [107.0, None] and site.watch.watched == 0
+    assert [goal_id(bytes(16) + cancel).text for cancel in site.cancels] == ["goal 0", "goal 1", "goal 2", "goal 3"]
+    site.watch.close()
+
+
 async def test_a_status_of_another_type_is_not_read(site: Site) -> None:
     site.server_appears()
     site.give(goal_body(), 1)
@@ -237,18 +327,26 @@ async def test_a_goal_with_a_result_is_done_and_what_is_no_goal_is_let_through(s
     site.server_appears()
     seq = site.channel.next_seq
     assert site.give(b"\1\2\3", 1) and site.give(goal_body(), 1)
-
-    def fill(message: Any) -> None:
-        message.status.goal_id.id = IDENT.text
-
     site.watch.message(RESULT.name, Encoding.ROS1, b"\0")
     site.watch.message(STATUS.name, Encoding.ROS1, b"\0")
-    site.watch.message(RESULT.name, Encoding.ROS1, body(RESULT_TEXT, RESULT.type_name, fill))
+    site.watch.message(RESULT.name, Encoding.ROS1, result_for(IDENT.text))
     site.watch.send_dropped(site.channel.stream.id, seq, DropReason.LIFESPAN)
     site.accepts = False
     site.give(goal_body(GoalId(0, 0, "another")), 1)
     await until(lambda: site.results, "the next is told of")
     assert [result_of(data).status.goal_id.id for data in site.results] == ["another"]
+
+
+async def test_a_goal_that_is_given_again_is_watched_in_place_of_the_one_before(site: Site) -> None:
+    """As a client does that does not see its server; what becomes of the first makes no difference any more."""
+    site.server_appears()
+    seq = site.channel.next_seq
+    for _ in range(3):
+        site.give(goal_body(), 1)
+    assert site.watch.watched == 1
+    site.watch.message(RESULT.name, Encoding.ROS1, result_for(IDENT.text))
+    site.watch.send_dropped(site.channel.stream.id, seq, DropReason.LIFESPAN)
+    assert site.watch.watched == 0 and site.results == []
 
 
 async def test_clients_that_are_gone_are_told_nothing(site: Site) -> None:

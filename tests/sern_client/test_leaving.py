@@ -2,9 +2,18 @@
 
 from collections.abc import Callable
 
+from sern_client.bridge import Bridge
+from sern_client.endpoints.base import Sink
 from sern_client.leaving import LEAVE_S, Leaving
+from sern_core.client import ClientCore
+from sern_core.params import LinkParams, SchedulerParams
+from sern_core.patterns import compile_pattern
 from sern_core.queues import OutChannel
-from sern_core.types import TopicName
+from sern_core.rules import Discovery, DiscoveryMode, RuleSet, TopicRule
+from sern_core.summaries.patches import PatchParams
+from sern_core.summaries.spec import SummarySpec
+from sern_core.types import ClientName, Encoding, TopicName
+from sern_runtime import clock, ros_types
 from sern_sim.models import LinkModel, Window
 from tests.world import SimClient, World, spec
 
@@ -85,3 +94,75 @@ def test_a_topic_that_comes_back_is_another_stream() -> None:
     assert case.withdrawn == [case.channel]
     case.leaving.come_back(NAME)
     assert case.withdrawn == [case.channel]
+
+
+def test_the_streams_of_one_topic_end_together() -> None:
+    """Changes of a grid are worth nothing without the whole one, at any place between here and there."""
+    case = Case(THIN)
+    whole = case.robot.publish(TOPIC + "/whole", spec(reliable=True, depth=1000))
+    case.publish()
+    case.leaving.leave(NAME, whole, case.channel, now=case.robot.now)
+    case.leaving.look(now=case.robot.now)
+    assert case.withdrawn == []
+    case.until(lambda: case.withdrawn, LEAVE_S)
+    assert case.withdrawn == [whole, case.channel] and not case.channel.queue and not case.channel.flying
+    again = Case(THIN)
+    again.publish()
+    again.leaving.leave(NAME, again.channel, again.channel, now=again.robot.now)
+    again.leaving.come_back(NAME)
+    assert again.withdrawn == [again.channel] * 2
+    again.leaving.look(now=again.robot.now + LEAVE_S)
+    assert again.withdrawn == [again.channel] * 2
+
+
+class Grids:
+    """The local side of a robot with a map, which takes what is offered."""
+
+    def subscribe(self, name: TopicName, sink: Sink) -> "Grids":
+        assert name == MAP
+        self.sink = sink
+        return self
+
+    def close(self) -> None:
+        self.closed = True
+
+
+MAP = TopicName("/map")
+
+
+async def test_changes_of_a_grid_have_the_same_patience_as_the_grid() -> None:
+    """Its node has ended while changes were on their way; the link is down."""
+    rule = TopicRule(compile_pattern("/map"), summaries=(SummarySpec(PatchParams()),))
+    bridge = Bridge(
+        Grids(), RuleSet((rule,)), Discovery(DiscoveryMode.MANUAL), "/robot", log=None,  # type: ignore[arg-type]
+        kick=lambda: None, on_up=lambda: None, on_down=lambda _reason: None, on_fault=lambda _error: None,
+    )  # fmt: skip
+    core = ClientCore(
+        name=ClientName("robot"), boot=1, events=bridge, link=LinkParams(), scheduler=SchedulerParams(), now=0.0
+    )
+    bridge.attach(core)
+
+    def channels() -> dict[str, OutChannel]:
+        return {channel.stream.id.topic: channel for channel in core.link.channels.values()}
+
+    names = {"/robot/map", "/robot/map_updates"}
+    info = ros_types.topic_info(MAP, "nav_msgs/msg/OccupancyGrid", Encoding.CDR)
+    for owing in ("/robot/map", "/robot/map_updates"):
+        bridge.topic_added(info)
+        assert channels().keys() == names
+        core.send(channels()[owing], b"change", 1, now=clock.now())
+        bridge.topic_removed(MAP)
+        bridge.leaving.look(now=clock.now() + LEAVE_S / 2)
+        assert channels().keys() == names, owing
+        bridge.leaving.look(now=clock.now() + LEAVE_S)
+        assert channels() == {}
+    bridge.topic_added(info)
+    bridge.topic_removed(MAP)  # it owes nothing
+    assert channels() == {}
+    bridge.topic_added(info)
+    core.send(channels()["/robot/map_updates"], b"change", 1, now=clock.now())
+    before = channels()
+    bridge.topic_removed(MAP)
+    bridge.topic_added(info)  # its node is back
+    assert channels().keys() == names and not set(channels().values()) & set(before.values())
+    bridge.close()

@@ -9,7 +9,9 @@ from pathlib import Path
 import pytest
 from rosbags.highlevel import AnyReader
 
+from sern_client.endpoints import bag_files
 from sern_client.endpoints.bag import BagEndpoint, BagOptions
+from sern_client.endpoints.bag_files import BagFile, McapFile, RecordFile
 from sern_client.endpoints.leftovers import finish, in_use, lock
 from sern_client.endpoints.record import RecordEndpoint, RecordOptions
 from sern_core.errors import ConfigError
@@ -338,3 +340,52 @@ async def test_an_unfinished_recording_says_what_it_is_when_played(encoding: Enc
     with pytest.raises(ConfigError, match="sern recover") as caught:
         await BagEndpoint(BagOptions(left, rate=0)).start(None)  # type: ignore[arg-type]
     assert "was not finished" in str(caught.value) and "\n" not in str(caught.value)
+
+
+@ENCODINGS
+async def test_who_looks_for_leftovers_never_sees_a_recording_that_begins(
+    encoding: Encoding, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Another process looks at the worst moment: the file is there and its lock is not."""
+    path = tmp_path / f"run{KINDS[encoding]}"
+    looked: list[list[Path]] = []
+
+    def late(growing: Path) -> int:
+        free = [active for active in tmp_path.glob("*.active") if not in_use(active)]
+        looked.append([finish(active).path for active in free])
+        return lock(growing)
+
+    monkeypatch.setattr(bag_files, "lock", late)
+    recorder = RecordEndpoint(RecordOptions(path))
+    await recorder.start(None)  # type: ignore[arg-type]
+    recorder.advertise(topic_info("/chat", "std_msgs/msg/String", encoding)).publish(b"\x01", START_NS)
+    await until(lambda: bool(looked))
+    active = path.with_name(f"{path.name}.active")
+    await until(active.exists)
+    assert in_use(active) and list(tmp_path.iterdir()) == [active]
+    await recorder.stop()
+    assert looked == [[]] and recorder.problem is None
+    assert read(path) == [("/chat", START_NS, b"\x01")] and list(tmp_path.iterdir()) == [path]
+
+
+@ENCODINGS
+async def test_a_recording_does_not_take_the_place_of_one_that_began_before_it(
+    encoding: Encoding, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two that begin at once: one has the name, the other says that it cannot be written and leaves nothing."""
+    path = tmp_path / f"run{KINDS[encoding]}"
+    kind = McapFile if encoding is Encoding.CDR else BagFile
+    other: list[RecordFile] = []
+
+    def slow(growing: Path) -> int:
+        monkeypatch.setattr(bag_files, "lock", lock)
+        other.append(kind(path))
+        return lock(growing)
+
+    monkeypatch.setattr(bag_files, "lock", slow)
+    with pytest.raises(OSError, match="exists"):
+        kind(path)
+    (first,) = other
+    assert [found.name for found in tmp_path.iterdir()] == [first.active.name] and in_use(first.active)
+    first.finish()
+    assert list(tmp_path.iterdir()) == [path]

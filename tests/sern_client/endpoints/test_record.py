@@ -2,22 +2,29 @@
 
 import asyncio
 import resource
+import shutil
 import sys
 from collections.abc import Awaitable, Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import ConnectionExtRosbag1, ConnectionExtRosbag2, QosDurability
+from rosbags.rosbag1 import Reader as Reader1
+from rosbags.rosbag2 import Reader as Reader2
 
+from sern_client.endpoints import bag_files
 from sern_client.endpoints.bag import BagEndpoint, BagOptions
+from sern_client.endpoints.bag_files import active_path
+from sern_client.endpoints.leftovers import finish
 from sern_client.endpoints.record import RecordEndpoint, RecordOptions
 from sern_client.factory import make_section
 from sern_core.errors import ConfigError, UsageError
 from sern_core.message import TopicInfo
-from sern_core.types import Encoding, TopicName
+from sern_core.types import DropReason, Encoding, TopicName
 from sern_runtime import ros_types
 from sern_runtime.config import endpoints as sections
 from sern_runtime.ros_types import topic_info
@@ -168,20 +175,122 @@ async def test_refuses_what_it_could_not_read_back(tmp_path: Path, events: Any) 
         (TopicInfo(name, "std_msgs/msg/String", Encoding.RAW), "raw bodies"),
         (TopicInfo(name, "no_msgs/msg/Such", Encoding.CDR), "no definition"),
         (TopicInfo(name, "no_msgs/msg/Such", Encoding.ROS1, "", "not { a definition"), "cannot be parsed"),
+        (TopicInfo(name, "no_msgs/msg/Such", Encoding.ROS1, "", "int8 x  # \ud800"), "no UTF-8"),
+        (TopicInfo(name, "no_msgs/msg/Such", Encoding.CDR, "", "int8 x  # \ud800"), "no UTF-8"),
         (TopicInfo(name, "std_msgs/msg/String", Encoding.ROS1, "0" * 32), "0{32}.*992ce8a1687cec8c8bd883ec73ca41d1"),
     ]:
         with pytest.raises(ConfigError, match=said):
             recorder.advertise(info)
-    recorder.advertise(unknown(Encoding.CDR))
-    other = TopicInfo(TopicName("/b"), "recorder_test_msgs/msg/Gait", Encoding.CDR, "", "int64 x\n")
-    with pytest.raises(ConfigError, match="one definition of a type"):
-        recorder.advertise(other)
     with pytest.raises(UsageError):
         recorder.subscribe(name, lambda body, stamp_ns: True)
     # Without definition or hash, a known type is completed from the typestore.
     recorder.advertise(TopicInfo(TopicName("/s"), "std_msgs/String", Encoding.ROS1)).publish(b"\x01\x00\x00\x00a", 5)
     await recorder.stop()
     assert read(tmp_path / "x.bag") == [("/s", 5, b"\x01\x00\x00\x00a")]
+
+
+def connections(path: Path) -> dict[str, set[tuple[str, str]]]:
+    """Definitions and hashes by topic, as the file has them; the readers know nothing of ours."""
+    reader = Reader1(path) if path.suffix == ".bag" else Reader2(path)
+    with reader:
+        found: dict[str, set[tuple[str, str]]] = {}
+        for connection in reader.connections:
+            found.setdefault(connection.topic, set()).add((connection.msgtype, connection.msgdef.data))
+        return found
+
+
+def bodies(path: Path) -> dict[str, list[tuple[str, bytes]]]:
+    """What each topic holds, each body with the definition it is to be read with."""
+    found: dict[str, list[tuple[str, bytes]]] = {}
+    reader = Reader1(path) if path.suffix == ".bag" else Reader2(path)
+    with reader:
+        for connection, _, body in reader.messages():
+            found.setdefault(connection.topic, []).append((connection.msgdef.data, bytes(body)))
+    return found
+
+
+@pytest.mark.parametrize("encoding", [Encoding.ROS1, Encoding.CDR])
+@pytest.mark.parametrize("killed", [False, True])
+async def test_a_false_definition_of_a_type_costs_others_nothing(
+    encoding: Encoding, killed: bool, tmp_path: Path, events: Any, until: Until
+) -> None:
+    """Each topic keeps its own, also two on one topic, and also in what a killed process leaves."""
+    recorder = RecordEndpoint(RecordOptions(tmp_path / "run"))
+    kept = []
+    recorder.watch_kept(lambda upto, lost: kept.append(upto))
+    await recorder.start(events)
+    true, false = unknown(encoding, "/true"), replace(unknown(encoding, "/evil"), definition="uint8 x\n", type_hash="")
+    recorder.advertise(false).publish(b"\0\1\0\0" + b"f", START_NS)
+    recorder.advertise(true).publish(b"\0\1\0\0" + b"t", START_NS + 1)
+    recorder.advertise(replace(true, name=false.name)).publish(b"\0\1\0\0" + b"u", START_NS + 2)
+    recorder.flush()
+    await until(lambda: kept[-1:] == [3])
+    path = tmp_path / f"run{'.bag' if encoding is Encoding.ROS1 else '.mcap'}"
+    if killed:
+        left = path.with_name(f"left{path.suffix}.active")
+        active = active_path(path)
+        (shutil.copytree if active.is_dir() else shutil.copy)(active, left)
+        await recorder.stop()
+        assert finish(left).messages == 3
+        path = path.with_name(f"left{path.suffix}")
+    else:
+        await recorder.stop()
+    assert recorder.counters.errors == recorder.counters.dropped == 0
+    assert bodies(path) == {
+        "/evil": [("uint8 x\n", b"\0\1\0\0f"), (UNKNOWN, b"\0\1\0\0u")],
+        "/true": [(UNKNOWN, b"\0\1\0\0t")],
+    }
+    kind = "recorder_test_msgs/msg/Gait"
+    assert connections(path) == {"/evil": {(kind, "uint8 x\n"), (kind, UNKNOWN)}, "/true": {(kind, UNKNOWN)}}
+
+
+@pytest.mark.parametrize("encoding", [Encoding.ROS1, Encoding.CDR])
+async def test_fresh_definitions_of_one_topic_are_bounded(
+    encoding: Encoding, tmp_path: Path, events: Any, caplog: pytest.LogCaptureFixture
+) -> None:
+    """What comes beyond the bound is counted as dropped and said once; other topics go on."""
+    recorder = RecordEndpoint(RecordOptions(tmp_path / "run"))
+    await recorder.start(events)
+    count = bag_files.MAX_TOPIC_CONNECTIONS + 5
+    for number in range(count):
+        info = replace(unknown(encoding, "/evil"), definition=f"uint8 f{number}\n", type_hash="")
+        publisher = recorder.advertise(info)
+        publisher.publish(bytes(5), START_NS + number)
+        publisher.close()
+    first = replace(unknown(encoding, "/evil"), definition="uint8 f0\n", type_hash="")
+    recorder.advertise(first).publish(bytes(6), START_NS + count)
+    recorder.advertise(unknown(encoding, "/true")).publish(bytes(7), START_NS + count)
+    await recorder.stop()
+    (path,) = recorder.paths.values()
+    found = bodies(path)
+    assert len(found["/evil"]) == bag_files.MAX_TOPIC_CONNECTIONS + 1 and found["/evil"][-1][0] == "uint8 f0\n"
+    assert found["/true"] == [(UNKNOWN, bytes(7))]
+    assert recorder.drops[DropReason.STORAGE] == recorder.counters.dropped == 5
+    said = [record.getMessage() for record in caplog.records if "/evil is not recorded" in record.getMessage()]
+    assert len(said) == 1 and "32 definitions" in said[0]
+
+
+@pytest.mark.parametrize("encoding", [Encoding.ROS1, Encoding.CDR])
+async def test_definitions_of_one_file_are_bounded(
+    encoding: Encoding, tmp_path: Path, events: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A definition that the file has costs nothing more."""
+    monkeypatch.setattr(bag_files, "MAX_DEFINITION_BYTES", 200)
+    monkeypatch.setattr(bag_files, "MAX_CONNECTIONS", 4)
+    recorder = RecordEndpoint(RecordOptions(tmp_path / "run"))
+    await recorder.start(events)
+    long = f"uint8 {'x' * 90}\nuint8 {'y' * 90}\n"
+    for number, (topic, definition) in enumerate(
+        [("/a", UNKNOWN), ("/b", long), ("/c", "uint8 x\n"), ("/d", UNKNOWN), ("/e", UNKNOWN), ("/f", UNKNOWN)]
+    ):
+        info = replace(unknown(encoding, topic), definition=definition, type_hash="")
+        recorder.advertise(info).publish(bytes(5), START_NS + number)
+    await recorder.stop()
+    (path,) = recorder.paths.values()
+    assert {topic: definition for topic, [(definition, _)] in bodies(path).items()} == {
+        "/a": UNKNOWN, "/c": "uint8 x\n", "/d": UNKNOWN, "/e": UNKNOWN
+    }  # fmt: skip
+    assert recorder.drops[DropReason.STORAGE] == 2
 
 
 async def test_overwrites_only_when_asked(tmp_path: Path, events: Any) -> None:
