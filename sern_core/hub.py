@@ -129,6 +129,7 @@ class Hub(LocalStreams):
         self._fanout = Fanout(self._offer, self._told, self._let_go)
         self.presence = Presence(self.links, self.local_owners, self._for, self._was_read)
         self._awaited: dict[ClientName, set[TopicName]] = {}
+        self._forgettable = 0  # messages that this sweep may still give up for clients that stay away
         self._forgotten: deque[Link] = deque()  # links that are given up; what is left of them goes in slices
         self._heard: set[ClientName] = set()  # said what they want, to this run of the relay
         self._absent_since: dict[ClientName, float] = {}
@@ -227,16 +228,14 @@ class Hub(LocalStreams):
 
     def sweep(self, *, now: float) -> None:
         """Let go of clients that stay away, and of ended streams that are fully delivered. Call about once a second."""
-        most = FORGOTTEN_MESSAGES
+        self._forgettable = FORGOTTEN_MESSAGES
         for client, since_s in list(self._absent_since.items()):
             link = self.links[client]
             if link.established:
                 continue
             link.handle_timeout(now=now)  # retention goes on while a client is away
             if now - since_s > self.params.resume_s:
-                most -= link.wind_down(DropReason.DISCONNECTED, most, now=now)
-                if link.idle:
-                    self._for(client, now, partial(self._forget, client, now))
+                self._for(client, now, partial(self._wind_down, client, now))
         for client, link in self.links.items():
             if client not in self.port_of and link.established:  # only its datagram lane is left
                 link.handle_timeout(now=now)
@@ -287,6 +286,13 @@ class Hub(LocalStreams):
         if client in self.links:
             self.end_session(client, reason, now=now)
             self._forget(client, now, reason=DropReason.FORBIDDEN)
+
+    def _wind_down(self, client: ClientName, now: float) -> None:
+        """The client stays away: give up what waits for it, as far as this sweep goes, and then its state."""
+        link = self.links[client]
+        self._forgettable -= link.wind_down(DropReason.DISCONNECTED, self._forgettable, now=now)
+        if link.idle:
+            self._forget(client, now)
 
     def _forget(self, client: ClientName, now: float, *, reason: DropReason = DropReason.DISCONNECTED) -> None:
         link = self.links[client]
