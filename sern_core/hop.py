@@ -5,13 +5,15 @@
 """
 
 from abc import abstractmethod
+from collections.abc import Callable
+from functools import partial
 from typing import Any, Final
 
 from sern_core import wire
 from sern_core.capacity import AckSample
 from sern_core.codecs import KNOWN_CODECS
 from sern_core.errors import RemoteError, WireError
-from sern_core.fragments import SLICE_US, InStream
+from sern_core.fragments import SLICE_US, STALE_US, InStream
 from sern_core.lanes import (
     LANE_EXPRESS,
     LANE_UDP,
@@ -21,6 +23,7 @@ from sern_core.lanes import (
     PROVEN_ACKS,
     Lane,
 )
+from sern_core.queues import OutChannel
 from sern_core.sending import CONTROL_CHANNEL, RATE_INTERVAL_S, SWEEP_INTERVAL_S, Sender, SentData, SentWatermark
 from sern_core.trace import LINK, TraceEvent
 from sern_core.types import (
@@ -58,6 +61,11 @@ class Hop(Sender):
         position = wire.decode_frames(data, self, position or wire.HEADER_BYTES)
         if position:
             self._pause_reading(lane, number, stamp_us, data, position, now)
+
+    @abstractmethod
+    def _in_slices(self, step: Callable[[], bool]) -> None:
+        """Do something in steps, each charged to `Reassembly.work_us`, until one returns True. Beyond a slice the rest
+        comes later, before anything more is read."""
 
     @abstractmethod
     def _pause_reading(
@@ -272,11 +280,17 @@ class Hop(Sender):
         # It may lie beyond what was submitted here: the peer had more from an earlier relay (`OutChannel.submit`).
         wide = wire.widen_seq(delivered, out_channel.watermark)
         if wide > out_channel.watermark:
-            done = out_channel.delivered_to(wide)
-            self._refresh(out_channel, self._now)
-            self._watermark_moved(out_channel)
-            self.reassembly.work_us += WATERMARK_US + done // DONE_PER_US
+            self._in_slices(partial(self._delivered, out_channel, wide))
         return self.reassembly.work_us > SLICE_US
+
+    def _delivered(self, channel: OutChannel, watermark: int) -> bool:
+        reassembly = self.reassembly
+        done = channel.delivered_to(watermark, DONE_PER_US * max(1, SLICE_US - reassembly.work_us))
+        if self.channels.get(channel.slot) is channel:  # else closed meanwhile
+            self._refresh(channel, self._now)
+            self._watermark_moved(channel)
+        reassembly.work_us += WATERMARK_US + done // DONE_PER_US
+        return channel.watermark >= watermark
 
     def on_ping(self) -> None:
         """FrameSink: the peer asks for an acknowledgement now."""
@@ -367,7 +381,8 @@ class Hop(Sender):
                 self._refresh(channel, now)
             if channel.watermark > watermark:
                 self._watermark_moved(channel)
+        most = SLICE_US // STALE_US
         for stream in self.incoming.values():
             stream.heard(self._control.watermark)
-            if 0 < stream.pause_seq <= self._control.watermark:
-                stream.forget(DropReason.UNWANTED)
+            if 0 < stream.pause_seq <= self._control.watermark and stream not in self.reassembly.behind:
+                most -= stream.forget(DropReason.UNWANTED, most)

@@ -10,7 +10,7 @@ dropped, and what it was owed is reported to the origins. One that says goodbye 
 and so is one whose name is revoked.
 """
 
-from collections import Counter, defaultdict
+from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -47,6 +47,8 @@ from sern_core.session import DISPLACED
 from sern_core.trace import DecisionTrace
 from sern_core.types import DROP_CODES, ClientName, DropReason, TopicName
 
+FORGOTTEN_MESSAGES: Final = 4000
+"""Messages for clients that stay away that are given up in one sweep; each is told to its origin."""
 STREAM_US: Final = 50
 FORWARD_US: Final = 5
 LANE_US: Final = 300
@@ -127,6 +129,8 @@ class Hub(LocalStreams):
         self._fanout = Fanout(self._offer, self._told, self._let_go)
         self.presence = Presence(self.links, self.local_owners, self._for, self._was_read)
         self._awaited: dict[ClientName, set[TopicName]] = {}
+        self._forgettable = 0  # messages that this sweep may still give up for clients that stay away
+        self._forgotten: deque[Link] = deque()  # links that are given up; what is left of them goes in slices
         self._heard: set[ClientName] = set()  # said what they want, to this run of the relay
         self._absent_since: dict[ClientName, float] = {}
         self._draining = Draining(self._end_channel)
@@ -224,13 +228,14 @@ class Hub(LocalStreams):
 
     def sweep(self, *, now: float) -> None:
         """Let go of clients that stay away, and of ended streams that are fully delivered. Call about once a second."""
+        self._forgettable = FORGOTTEN_MESSAGES
         for client, since_s in list(self._absent_since.items()):
             link = self.links[client]
             if link.established:
                 continue
             link.handle_timeout(now=now)  # retention goes on while a client is away
             if now - since_s > self.params.resume_s:
-                self._for(client, now, partial(self._forget, client, now))
+                self._for(client, now, partial(self._wind_down, client, now))
         for client, link in self.links.items():
             if client not in self.port_of and link.established:  # only its datagram lane is left
                 link.handle_timeout(now=now)
@@ -256,6 +261,11 @@ class Hub(LocalStreams):
                 link.reassembly.work_us = 0
                 self._fanout.go_on(link, now=now)
         self.presence.sweep(now=now)
+        if self._forgotten:
+            link = self._forgotten[0]
+            link.handle_timeout(now=now)
+            if link.idle:
+                self._forgotten.popleft()
 
     def left(self, client: ClientName, *, now: float) -> None:
         """A client has said goodbye. One that has streams, or wants reliable ones, may come back to them (a daemon that
@@ -277,17 +287,27 @@ class Hub(LocalStreams):
             self.end_session(client, reason, now=now)
             self._forget(client, now, reason=DropReason.FORBIDDEN)
 
+    def _wind_down(self, client: ClientName, now: float) -> None:
+        """The client stays away: give up what waits for it, as far as this sweep goes, and then its state."""
+        link = self.links[client]
+        self._forgettable -= link.wind_down(DropReason.DISCONNECTED, self._forgettable, now=now)
+        if link.idle:
+            self._forget(client, now)
+
     def _forget(self, client: ClientName, now: float, *, reason: DropReason = DropReason.DISCONNECTED) -> None:
         link = self.links[client]
         self._fanout.forget(client, now=now)
         self._apply(self.routing.drop_client(client), now, reason=reason)
         for channel in list(link.channels.values()):
-            link.close_channel(channel, reason, now=now)
+            self._end_channel(client, link, channel, reason, now)
         self._draining.forget(client)
         if reason is DropReason.FORBIDDEN:
             self._draining.keep(lambda _client, stream: stream.origin != client, reason, now=now)
         self.events.lane_closed(client)
         link.close_streams()
+        link.finish = None
+        if not link.idle:
+            self._forgotten.append(link)
         del self.links[client]
         port = self.port_of.pop(client, None)
         if port is not None:
@@ -415,7 +435,9 @@ class Hub(LocalStreams):
             self._unsubscribed = None
 
     def _end_channel(self, client: ClientName, link: Link, channel: OutChannel, reason: DropReason, now: float) -> None:
-        self._for(client, now, partial(link.close_channel, channel, reason, now=now))
+        # Nobody is to be told of drops: it is owed nothing any more, or there is no origin.
+        silent = channel is self._unsubscribed or not channel.reliable or channel.stream.id not in self.relayed
+        self._for(client, now, partial(link.close_channel, channel, reason, now=now, silent=silent))
 
     def _wanted(self, relayed: Relayed) -> bool:
         return bool(relayed.outs or relayed.waiting) or relayed.cache is not None or self.tap(relayed.stream.stream)

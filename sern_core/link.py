@@ -30,11 +30,11 @@ from sern_core.answering import Answering
 from sern_core.definitions import DefinitionStore, PeerDefinitions
 from sern_core.errors import RefusedError, RemoteError, UsageError, WireError
 from sern_core.fates import Fates
-from sern_core.fragments import SLICE_US, InStream
+from sern_core.fragments import SLICE_US, STALE_US, InStream
 from sern_core.message import Message, StreamId, StreamInfo
 from sern_core.out_message import OutMessage
 from sern_core.params import LinkParams, SchedulerParams
-from sern_core.queues import GIVEN_UP_US, OutChannel
+from sern_core.queues import OutChannel
 from sern_core.trace import DecisionTrace, TraceEvent
 from sern_core.types import CLASS_LABELS, DROP_REASONS, ClientName, DropReason, PriorityClass
 
@@ -49,8 +49,7 @@ and takes 2 ms to unpack it."""
 CONTROL_US: Final = 30
 CONTROL_BYTES_PER_US: Final = 16
 ATTACHMENT_BYTES_PER_US: Final = 250
-RETAINED_PER_US: Final = 16
-"""What a control message is charged with: itself, its size, what its attachment unpacks to, what it looks through."""
+"""What a control message is charged with: itself, its size, what its attachment unpacks to."""
 ANNOUNCE_US: Final = 12
 """What a session that begins is charged with for each stream that is announced in it."""
 MAX_UNHEARD: Final = 20_000
@@ -152,6 +151,8 @@ class Link(Answering):
         self._attachments_s = 0.0
         self._announcing: deque[tuple[int, OutChannel]] = deque()  # may send once that control message is on its way
         self._gone: deque[InStream] = deque()  # streams that the peer no longer has, to be retracted
+        self._closed: dict[OutChannel, None] = {}  # what is left in them goes in slices
+        self._closing: dict[InStream, None] = {}  # they have ended, and what they hold goes in slices
         self._skipping: dict[InStream, None] = {}  # streams that leave messages out, and go on in a while
         self._missing: dict[StreamId, float] = {}  # not announced by a new peer, and since when
         self.finish: Callable[[Link, float], bool] | None = None
@@ -264,15 +265,17 @@ class Link(Answering):
         fates.dropped(stream, seq, reason, self.peer)
 
     def _dropped(self, channel: OutChannel, out: OutMessage, reason: DropReason) -> None:
+        topic = channel.stream.id.topic
+        self.trace.record(self._now, topic, TraceEvent.DROPPED, seq=out.seq, reason=reason, peer=self.peer)
         if self.channels.get(channel.slot) is channel:
-            topic = channel.stream.id.topic
-            self.trace.record(self._now, topic, TraceEvent.DROPPED, seq=out.seq, reason=reason, peer=self.peer)
             self._tell(self.handler.on_out_drop, self, channel, out, reason)
 
-    def close_channel(self, channel: OutChannel, reason: DropReason, *, now: float) -> None:
-        """The stream is gone: tell the peer, drop what is left for `reason`."""
+    def close_channel(self, channel: OutChannel, reason: DropReason, *, now: float, silent: bool = False) -> None:
+        """The stream is gone: tell the peer, drop what is left for `reason`. `silent`: nobody is owed any of it, so the
+        owner is not told of drops, and much goes in slices."""
         self._now = now
-        channel.clear(reason)
+        if not silent:
+            channel.clear(reason)
         channel.ready = False
         self._refresh(channel, now)
         self.channels.pop(channel.slot, None)
@@ -282,6 +285,15 @@ class Link(Answering):
         self.texts.use_outgoing(channel.slot, "")
         if self.established:
             self.send_control({"t": "retract", "ch": channel.slot}, now=now)
+        if channel.kept:
+            self._closed[channel] = None
+            self._in_slices(partial(self._clear_closed, channel, reason))
+
+    def _clear_closed(self, channel: OutChannel, reason: DropReason) -> bool:
+        done = self._clear(channel, reason)
+        if done:
+            del self._closed[channel]
+        return done
 
     def _announce(self, channel: OutChannel, now: float) -> None:
         stream = channel.stream
@@ -343,7 +355,7 @@ class Link(Answering):
             if replaced is not None:  # the origin was configured anew: what was delivered stays delivered
                 stream.delivered, stream.confirmed = replaced.delivered, replaced.confirmed
                 stream.unhandled = replaced.unhandled
-                replaced.close()
+                self._close_stream(replaced)
             self.streams[identity] = stream
         self._missing.pop(identity, None)
         stream.channel_id = slot
@@ -362,7 +374,7 @@ class Link(Answering):
             self.texts.use_incoming(identity, "")
             self._watermarks.pop(slot, None)
             stream.channel_id = None
-            stream.close()
+            self._close_stream(stream)
             self.send_control({"t": "refuse", "ch": slot, "code": refusal.code, "why": str(refusal)[:400]}, now=now)
             return
         self._skip(stream, announcement.first, now)
@@ -537,8 +549,21 @@ class Link(Answering):
         self._forget_answers(stream)
         self._skipping.pop(stream, None)
         self._tell(self.handler.on_retract, self, stream, now=now)
-        stream.close()
+        self._close_stream(stream)
         stream.channel_id = None
+
+    def _close_stream(self, stream: InStream) -> None:
+        """It has ended: let go of what it holds."""
+        stream.close(most=0)
+        if stream.holds_any:
+            self._closing[stream] = None
+            self._in_slices(partial(self._close_some, stream))
+
+    def _close_some(self, stream: InStream) -> bool:
+        self.reassembly.work_us += STALE_US * stream.close(self._at_most(STALE_US))
+        if not stream.holds_any:
+            del self._closing[stream]
+        return stream not in self._closing
 
     def _sweep(self, now: float) -> None:
         super()._sweep(now)
@@ -620,10 +645,9 @@ class Link(Answering):
         if kind == "dropped":
             reason = DROP_REASONS.get(wire.take_int(envelope, "code"), DropReason.LOST)
             where = wire.take_str(envelope, "to", max_length=64, default="")
-            self.reassembly.work_us += len(channel.retained) // RETAINED_PER_US
             count = wire.take_int(envelope, "n", low=1, high=wire.MAX_SEQ, default=1)
-            news = channel.reported(wire.take_int(envelope, "seq"), reason, where, count)
-            self.reassembly.work_us += GIVEN_UP_US * news
+            seq = wire.take_int(envelope, "seq")
+            self._reported(channel, seq, seq + count, reason, where)
         else:
             code, why = wire.take_str(envelope, "code", max_length=64), wire.take_str(envelope, "why")
             self._set_wanted(
@@ -643,12 +667,31 @@ class Link(Answering):
     def close_streams(self) -> None:
         """The link is given up: its incoming streams are gone for good."""
         for stream in self.streams.values():
-            stream.close()
+            self._close_stream(stream)
         self.streams.clear()
         self._skipping.clear()
         self.incoming.clear()
         self._missing.clear()
         self.texts.close()
+
+    def wind_down(self, reason: DropReason, most: int, *, now: float) -> int:
+        """The link is about to be given up: drop what waits, at most so many messages. Returns how many; `idle` says
+        whether that was all."""
+        self._now = now
+        left = most
+        for channel in list(self.channels.values()):
+            if left > 0 and channel.kept:
+                watermark = channel.watermark
+                left -= channel.clear(reason, left)
+                self._refresh(channel, now)
+                if channel.watermark > watermark:
+                    self._watermark_moved(channel)
+        return most - left
+
+    @property
+    def idle(self) -> bool:
+        """Whether nothing waits or is under way, and nothing that has ended is left."""
+        return not self._steps and not any(channel.kept for channel in self.channels.values())
 
     @property
     def now(self) -> float:
@@ -699,8 +742,11 @@ class Link(Answering):
             channel.validate(check)
             waits = bool(channel.ready and channel.wanted and (channel.active or channel.queue))
             check(waits == channel.offered, f"{channel.stream.id.topic}: the scheduler does not know what waits")
-        self.ledger.validate([(channel.counters, *channel.held()) for channel in self.channels.values()], check)
-        held_bytes = sum(stream.held_bytes for stream in self.streams.values()) + self._control_in.held_bytes
+        open_or_not = (*self.channels.values(), *self._closed)
+        self.ledger.validate([(channel.counters, *channel.held()) for channel in open_or_not], check)
+        there_or_not = (*self.streams.values(), *self._closing, self._control_in)
+        held_bytes = sum(stream.held_bytes for stream in there_or_not)
+        check(bool(self._steps) or not (self._closed or self._closing), "what has ended is kept for ever")
         check(self.reassembly.held_bytes == held_bytes, "reassembly bytes do not add up")
         for stream in self.streams.values():
             stream.validate(check)

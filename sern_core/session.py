@@ -109,6 +109,7 @@ class Session(Hop):
         self.cut_off = False
         """The stream lane ended when the datagram lane was silent already: the path is gone, not the peer's process."""
         self._unread: deque[tuple[int, int, int, bytes, int]] = deque()  # lane, number, stamp, datagram, where to go on
+        self._steps: deque[Callable[[], bool]] = deque()  # what is done in steps, before any of that is read
         self._unread_bytes = 0
         self.read_due_s: float | None = None
         """When to go on reading; None: nothing that has arrived waits to be read."""
@@ -491,12 +492,29 @@ class Session(Hop):
             raise WireError(f"{self.peer} goes on sending although {len(self._unread)} datagrams wait to be read")
         self._unread.append((lane, number, stamp_us, data, 0))
 
+    def _in_slices(self, step: Callable[[], bool]) -> None:
+        self._steps.append(step)
+        if not self._step_on() and self.read_due_s is None:
+            self.read_due_s = self._now
+            self.dirty = True  # the owner looks at the deadline again
+
+    def _step_on(self) -> bool:
+        """One slice of what is done in steps. True: all of it is done."""
+        steps = self._steps
+        while steps:
+            if self.reassembly.work_us > SLICE_US:
+                return False
+            step = steps.popleft()  # one that fails does not come again
+            if not step():
+                steps.appendleft(step)
+        return True
+
     def _read_on(self, now: float) -> None:
         self._now = now
         reassembly = self.reassembly
         reassembly.work_us = 0
         self.read_due_s = None
-        done = self._go_on(now)
+        done = self._step_on() and self._go_on(now)
         while done and self._unread and reassembly.work_us <= SLICE_US:
             lane, number, stamp_us, data, position = self._unread.popleft()
             self._unread_bytes -= len(data) + UNREAD_OVERHEAD_BYTES
@@ -507,7 +525,7 @@ class Session(Hop):
             if state is not None:  # else it is closed, and what came over it comes again
                 self._receive_data(state, number, stamp_us, data, now, position)
             done = self.read_due_s is None
-        if not done or self._unread:
+        if not done or self._unread or self._steps:
             self.read_due_s = now + reassembly.work_us * 1e-6
         if self.on_read is not None:
             self.on_read()
