@@ -307,6 +307,8 @@ class Connection:
     accepted_s: float
     user: str = ""
     ended: bool = False
+    number: int = 0
+    """Rises with every connection of the table."""
 
     def cut(self) -> bool:
         """End it now. False when it is gone already, or was cut before."""
@@ -333,8 +335,10 @@ class ConnectionTable:
         max_half_open: int = 256,
         max_connections: int = 1024,
         on_change: Callable[[], None] | None = None,
+        on_gone: Callable[[int], None] | None = None,
         clock: Callable[[], float] = now,
     ) -> None:
+        """`on_gone(fd)`: a connection has ended, and its number may be another's next."""
         self.capped = 0
         self.accepted = 0
         self.accept_failed = 0
@@ -346,6 +350,7 @@ class ConnectionTable:
         self._half_open_until_s: dict[int, float] = {}  # by fd, oldest first
         self._half_open_by_source: Counter[str] = Counter()
         self._on_change = on_change
+        self._on_gone = on_gone
         self._clock = clock
         self._monitor = SocketMonitor(socket, self._on_event)
 
@@ -362,6 +367,12 @@ class ConnectionTable:
         return len(self._half_open_until_s)
 
     def by_fd(self, fd: int) -> Connection | None:
+        return self._connections.get(fd)
+
+    def current(self, fd: int) -> Connection | None:
+        """The connection that a frame came over which has just been read: what has happened to connections since
+        is taken in first."""
+        self._monitor.drain()
         return self._connections.get(fd)
 
     def bind_user(self, fd: int, user: str) -> None:
@@ -420,7 +431,7 @@ class ConnectionTable:
         self.accepted += 1
         handle = TcpHandle.of(fd, local_port=port_of(event.endpoint))
         source = handle.peer[0] if handle is not None else ""
-        connection = self._connections[fd] = Connection(handle, source, self._clock())
+        connection = self._connections[fd] = Connection(handle, source, self._clock(), number=self.accepted)
         self._expire()
         self._half_open_until_s[fd] = self._clock() + HANDSHAKE_IVL_MS / 1000
         self._half_open_by_source[source] += 1
@@ -450,6 +461,8 @@ class ConnectionTable:
         connection = self._connections.pop(fd, None)
         if connection is not None:
             self._not_half_open(fd, connection)
+            if self._on_gone is not None:
+                self._on_gone(fd)
 
     def _not_half_open(self, fd: int, connection: Connection) -> None:
         if self._half_open_until_s.pop(fd, None) is not None:
