@@ -72,6 +72,12 @@ class Outgoing:
         self.subscription = subscription
         self.source = source
 
+    @property
+    def streams(self) -> set[StreamId]:
+        """All that its messages go to, in whatever form."""
+        own = {self.channel.stream.id}
+        return own if self.source is None else own | self.source.streams
+
 
 class Incoming:
     """A stream from elsewhere that is published here, as `info`. `stop` is the body that a lost link makes us publish.
@@ -154,6 +160,7 @@ class Bridge:
         self._closed = False
         self._core: ClientCore | None = None
         self._outgoing: dict[TopicName, Outgoing] = {}
+        self._by_stream: dict[StreamId, tuple[TopicName, Outgoing]] = {}  # the same, by each stream it goes to
         self.leaving = Leaving(self._unpublish)
         self.values = LatestValues()
         self._incoming: dict[StreamId, Incoming] = {}
@@ -202,6 +209,7 @@ class Bridge:
                     self._unpublish(channel)
         self.summaries.close()
         self._outgoing.clear()
+        self._by_stream.clear()
         self.leaving.close()
         self._timer.close()
         self._keep_timer.cancel()
@@ -275,7 +283,8 @@ class Bridge:
             _log.error("%s cannot be taken: %s", info.name, error)
             self._withdraw(channel, source)
             return
-        self._outgoing[info.name] = Outgoing(channel, subscription, source, sink)
+        outgoing = self._outgoing[info.name] = Outgoing(channel, subscription, source, sink)
+        self._by_stream.update(dict.fromkeys(outgoing.streams, (info.name, outgoing)))
         self._kick()
 
     def _say_unnamed(self, info: TopicInfo) -> None:
@@ -324,6 +333,8 @@ class Bridge:
     def topic_removed(self, name: TopicName) -> None:
         outgoing = self._outgoing.pop(name, None)
         if outgoing is not None:
+            for stream in outgoing.streams:
+                del self._by_stream[stream]
             if self.goals is not None:
                 self.goals.withdrawn(name)
             outgoing.subscription.close()
@@ -562,21 +573,22 @@ class Bridge:
         _log.warning("%s: %d reliable messages were given up while we were away", stream.id.topic, count)
 
     def wanted(self, stream: StreamInfo, wanted: bool) -> None:
-        for local, outgoing in self._outgoing.items():
-            source = outgoing.source
-            if source is not None and (source.owns(stream.id) or outgoing.channel.stream.id == stream.id):
-                if wanted:
-                    source.audience_changed()
-                self.endpoint.interest(local, source.wanted)
-                break
-            if outgoing.channel.stream.id == stream.id:
-                self.endpoint.interest(local, wanted)
-                break
+        found = self._by_stream.get(stream.id)
+        if found is None:
+            return
+        local, outgoing = found
+        source = outgoing.source
+        if source is None:
+            self.endpoint.interest(local, wanted)
+            return
+        if wanted:
+            source.audience_changed()
+        self.endpoint.interest(local, source.wanted)
 
     def send_dropped(self, stream: StreamInfo, seq: int, reason: DropReason, where: str) -> None:
-        for outgoing in self._outgoing.values():
-            if outgoing.source is not None:
-                outgoing.source.lost(stream.id)
+        found = self._by_stream.get(stream.id)
+        if found is not None and found[1].source is not None:
+            found[1].source.lost(stream.id)
         if self.services is not None:
             self.services.send_dropped(stream, seq, reason)
         if self.goals is not None:

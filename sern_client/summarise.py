@@ -149,8 +149,9 @@ class TopicSummary:
     def channel(self) -> OutChannel:
         return self._channels[-1]
 
-    def owns(self, stream: StreamId) -> bool:
-        return any(channel.stream.id == stream for channel in self._channels)
+    @property
+    def streams(self) -> set[StreamId]:
+        return {channel.stream.id for channel in self._channels}
 
     @property
     def wanted(self) -> bool:
@@ -416,7 +417,10 @@ class Source(Protocol):
 
     def sink(self, body: bytes, stamp_ns: int) -> bool: ...
 
-    def owns(self, stream: StreamId) -> bool: ...
+    @property
+    def streams(self) -> set[StreamId]:
+        """Those that messages made here go to; the same from its beginning to its end."""
+        ...
 
     @property
     def wanted(self) -> bool: ...
@@ -495,8 +499,9 @@ class SummarisedTopic:
         if newest is not None:
             self._core.drop(self._channel, len(newest[0]), reason, now=clock.now())
 
-    def owns(self, stream: StreamId) -> bool:
-        return any(output.owns(stream) for output in self.outputs)
+    @property
+    def streams(self) -> set[StreamId]:
+        return {stream for output in self.outputs for stream in output.streams}
 
     @property
     def wanted(self) -> bool:
@@ -512,7 +517,7 @@ class SummarisedTopic:
 
     def lost(self, stream: StreamId) -> None:
         for output in self.outputs:
-            if output.owns(stream):
+            if stream in output.streams:
                 output.lost()
 
     @property

@@ -40,8 +40,9 @@ class _Transforms:
             _log.warning("%s: not merged, such messages are sent as they are: %s", self._topic, problem)
         return self._send(body, stamp_ns, now)
 
-    def owns(self, stream: StreamId) -> bool:
-        return self._channel.stream.id == stream
+    @property
+    def streams(self) -> set[StreamId]:
+        return {self._channel.stream.id}
 
     @property
     def wanted(self) -> bool:

@@ -133,6 +133,7 @@ class RelayFeed:
                 ("limited", fed.limited),
                 ("endless", fed.endless),
                 ("capped", fed.capped),
+                ("crowded", fed.crowded),
                 ("injected", injected.injected),
                 ("untyped", injected.untyped),
                 ("dropped", injected.dropped),

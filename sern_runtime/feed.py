@@ -26,7 +26,7 @@ import asyncio
 import logging
 import struct
 import time
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Final, NamedTuple
@@ -38,6 +38,7 @@ from sern_core.rules import FeedRole
 from sern_core.types import CLASSES, PriorityClass, TopicName
 from sern_runtime.clock import now
 from sern_runtime.feed_inflow import SUBSCRIBER_BYTES, TOLD_BYTES, FeedInflow
+from sern_runtime.feed_subscriptions import Subscriptions
 from sern_runtime.zmq_socket import (
     BACKLOG,
     ZERO_COPY_BYTES,
@@ -61,8 +62,6 @@ some hundred bytes for each of its bytes, on our thread. 64: the name of a comma
 (33)."""
 HIGH_WATER: Final = 1000
 """Messages that may wait for a slow subscriber; libzmq drops what comes after them, for that subscriber alone."""
-MAX_PREFIXES: Final = 4096
-"""Distinct subscriptions of a role that are looked at; more are served, but no longer tracked one by one."""
 INTEREST_S: Final = 0.05
 """Between two calls of `on_interest`: one message of subscriptions is cheap, and what follows from it is not."""
 _MAX_VERDICTS: Final = 4096
@@ -121,6 +120,7 @@ class FeedCounters:
     limited: int = 0  # more than the role's limits let in
     endless: int = 0  # connections that were cut: bytes arrived on them, and no message did
     capped: int = 0  # connections that were cut: the role had as many as it may
+    crowded: int = 0  # connections that were cut: they subscribed to more than there is room for
 
 
 Accept = Callable[[FeedRole, TopicName], bool]
@@ -138,7 +138,8 @@ class Feed:
     servers in the ZAP domain `feed.NAME`; without keys the role's addresses are the only guard, which the
     configuration has to allow. Raises ConfigError when an endpoint cannot be had. `close()` once.
 
-    A subscriber's frames are bounded by what can name a topic, and its connection by `SUBSCRIBER_BYTES` of them.
+    A subscriber's frames are bounded by what can name a topic, and its connection by `SUBSCRIBER_BYTES` of them. What
+    subscribers keep is bounded for each of them and for all of a role (`feed_subscriptions`).
     """
 
     def __init__(
@@ -226,12 +227,13 @@ class Feed:
 
     def prefixes(self) -> dict[str, tuple[bytes, ...]]:
         """The subscriptions by role, as they came in: prefixes of the topic frame, the empty one meaning all."""
-        return {name: tuple(sorted(outlet.prefixes)) for name, outlet in self._outlets.items()}
+        return {name: outlet.subscriptions.prefixes for name, outlet in self._outlets.items()}
 
     def counters(self) -> dict[str, FeedCounters]:
         """Counters by role name."""
         for name, outlet in self._outlets.items():
             inlet = self._inlets.get(name)
+            outlet.counters.crowded = outlet.subscriptions.crowded
             outlet.counters.capped = outlet.inflow.capped + (inlet.inflow.capped if inlet is not None else 0)
         return {name: outlet.counters for name, outlet in self._outlets.items()}
 
@@ -258,6 +260,7 @@ class Feed:
                 # One at a time: libzmq takes in all that waits before it lets go of our thread, and meanwhile nobody
                 # sees how much a connection brings.
                 limit_bytes, rcvhwm = MAX_SUBSCRIPTION_BYTES, 1
+                socket.setsockopt(zmq.XPUB_VERBOSE, 1)  # also the second subscriber of a prefix is told
                 socket.setsockopt(zmq.RCVBUF, SUBSCRIBER_BYTES)  # what has arrived is read also after a cut
             else:
                 limit_bytes, rcvhwm = self.max_message_bytes, HIGH_WATER
@@ -294,11 +297,9 @@ class _Outlet(FrameSocket):
         self.role = role
         self.endpoint = socket.getsockopt_string(zmq.LAST_ENDPOINT)
         self.counters = FeedCounters()
-        self.prefixes: set[bytes] = set()
         self._feed = feed
-        self.inflow = FeedInflow(role.name, self, socket, self._endless)
-        self._lengths: Counter[int] = Counter()  # of the prefixes: few, so that none of them need be tried in turn
-        self._untracked = 0
+        self.inflow = FeedInflow(role.name, self, socket, self._endless, on_gone=self._gone)
+        self.subscriptions = Subscriptions(role.name, self.inflow.connections)
         self._wanted: dict[bytes, bool] = {}
 
     def _endless(self) -> None:
@@ -311,8 +312,7 @@ class _Outlet(FrameSocket):
     def wants(self, frame: bytes, name: TopicName) -> bool:
         wanted = self._wanted.get(frame)
         if wanted is None:
-            matched = self._untracked > 0 or any(frame[:length] in self.prefixes for length in self._lengths)
-            wanted = matched and self.role.may_see(name)
+            wanted = self.subscriptions.match(frame) and self.role.may_see(name)
             if len(self._wanted) >= _MAX_VERDICTS:
                 self._wanted.clear()
             self._wanted[frame] = wanted
@@ -332,28 +332,20 @@ class _Outlet(FrameSocket):
             return
         message = frames[0].bytes
         if message[:1] == b"\1":
-            self._subscribed(message[1:])
+            self._subscribed(message[1:], _origin(frames[0]))
         elif message[:1] == b"\0":
             self._unsubscribed(message[1:])
 
-    def _subscribed(self, prefix: bytes) -> None:
-        if len(self.prefixes) < MAX_PREFIXES:
-            if prefix not in self.prefixes:
-                self._lengths[len(prefix)] += 1
-            self.prefixes.add(prefix)  # XPUB reports the first subscriber of a prefix and the end of the last
-        else:
-            self._untracked += 1
-        self._changed()
+    def _subscribed(self, prefix: bytes, fd: int | None) -> None:
+        if self.subscriptions.subscribed(prefix, fd):
+            self._changed()
 
     def _unsubscribed(self, prefix: bytes) -> None:
-        if prefix in self.prefixes:
-            self.prefixes.remove(prefix)
-            self._lengths[len(prefix)] -= 1
-            if not self._lengths[len(prefix)]:
-                del self._lengths[len(prefix)]
-        else:
-            self._untracked -= 1
-        self._changed()
+        if self.subscriptions.unsubscribed(prefix):
+            self._changed()
+
+    def _gone(self, fd: int) -> None:
+        self.subscriptions.gone(fd)
 
     def _changed(self) -> None:
         self._wanted.clear()
@@ -528,6 +520,14 @@ _MALFORMED: Final = _Verdict(None, frozenset(), ())
 def _opening(priority: PriorityClass) -> bytes:
     """The first four bytes of every header of a class."""
     return bytes((VERSION, priority, 0, 0))
+
+
+def _origin(frame: zmq.Frame) -> int | None:
+    """The descriptor of the connection that a frame came over, None where there is none."""
+    try:
+        return int(frame.get(zmq.SRCFD))
+    except zmq.ZMQError:
+        return None
 
 
 def _bytes_of(frame: "bytes | zmq.Frame") -> bytes:

@@ -1,9 +1,9 @@
 """Ends connections of the feed on which bytes arrive and no message does (`sern_runtime.inflow` says why).
 
 A publisher's message may be one frame as large as the feed takes, so that much may arrive first; which connection a
-message came from is asked for of large ones, and of small ones only while a connection brings much of that. What
-a subscriber sends does not say where it came from: of it, so many bytes are let in over the life of a connection,
-beside a trickle.
+message came from is asked for of large ones, and of small ones only while a connection brings much of that. Of what
+a subscriber sends, so many bytes are let in over the life of a connection, beside a trickle; what of that it keeps is
+bounded by `sern_runtime.feed_subscriptions`.
 
 As much as one large frame may bring in tiny ones takes thirty times its size, and nobody sees how many frames there
 are. What shows is the process's memory: where that has grown by more than `GROWTH_MULTIPLE` times of what all messages
@@ -54,6 +54,7 @@ class FeedInflow:
         *,
         max_message_bytes: int | None = None,
         max_connections: int = MAX_CONNECTIONS,
+        on_gone: Callable[[int], None] | None = None,
         memory: Callable[[], int] = resident_bytes,
     ) -> None:
         """`max_message_bytes`: of a publisher's frame; None for subscribers. `memory`: of the process, bytes."""
@@ -67,7 +68,11 @@ class FeedInflow:
         self._memory = memory
         self._seen: dict[TcpHandle, _Seen] = {}
         self.connections = ConnectionTable(
-            raw, max_half_open_per_source=0, max_half_open=0, max_connections=max_connections
+            raw,
+            max_half_open_per_source=0,
+            max_half_open=0,
+            max_connections=max_connections,
+            on_gone=on_gone,
         )
         self._inflow = Inflow(socket, self._connections, self._endless, limit_bytes=self._limit_bytes)
 

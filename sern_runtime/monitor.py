@@ -50,6 +50,9 @@ SO_MAX_PACING_RATE: Final = 47
 """Linux; not yet in the socket module."""
 PACING_BPS: Final = 10e9
 """No bound of its own: any value makes the kernel pace."""
+HANDSHAKE_GRACE_S: Final = 3.0
+"""So long a half-open connection keeps its place whatever comes: the four round trips of a handshake over 600 ms, and
+more."""
 RTO_MAX_MS: Final = 1000
 """Bounds the kernel's backoff in a blackout: a fresh pose 0.65 s after 30 s without a link, instead of 7.1 s."""
 
@@ -307,6 +310,8 @@ class Connection:
     accepted_s: float
     user: str = ""
     ended: bool = False
+    number: int = 0
+    """Rises with every connection of the table."""
 
     def cut(self) -> bool:
         """End it now. False when it is gone already, or was cut before."""
@@ -320,7 +325,9 @@ class ConnectionTable:
     """The accepted connections of a server socket, by fd: caps, and cutting a user off.
 
     Half-open connections are capped by source address and in all, connections in all too; what comes above a cap is
-    cut at once and counted in `capped`. A cap of 0 means none. libzmq does not say which connection finished its
+    cut at once and counted in `capped`. Above a cap of half-open ones the oldest gives way instead if it is older than
+    HANDSHAKE_GRACE_S: whoever gets a place has the time for a handshake, and each place is free again after that time.
+    A cap of 0 means none. libzmq does not say which connection finished its
     handshake, but it ends those that did not after HANDSHAKE_IVL: so a connection is half-open until `bind_user`,
     or until it is older than that.
     """
@@ -333,8 +340,10 @@ class ConnectionTable:
         max_half_open: int = 256,
         max_connections: int = 1024,
         on_change: Callable[[], None] | None = None,
+        on_gone: Callable[[int], None] | None = None,
         clock: Callable[[], float] = now,
     ) -> None:
+        """`on_gone(fd)`: a connection has ended, and its number may be another's next."""
         self.capped = 0
         self.accepted = 0
         self.accept_failed = 0
@@ -346,6 +355,7 @@ class ConnectionTable:
         self._half_open_until_s: dict[int, float] = {}  # by fd, oldest first
         self._half_open_by_source: Counter[str] = Counter()
         self._on_change = on_change
+        self._on_gone = on_gone
         self._clock = clock
         self._monitor = SocketMonitor(socket, self._on_event)
 
@@ -362,6 +372,12 @@ class ConnectionTable:
         return len(self._half_open_until_s)
 
     def by_fd(self, fd: int) -> Connection | None:
+        return self._connections.get(fd)
+
+    def current(self, fd: int) -> Connection | None:
+        """The connection that a frame came over which has just been read: what has happened to connections since
+        is taken in first."""
+        self._monitor.drain()
         return self._connections.get(fd)
 
     def bind_user(self, fd: int, user: str) -> None:
@@ -420,23 +436,38 @@ class ConnectionTable:
         self.accepted += 1
         handle = TcpHandle.of(fd, local_port=port_of(event.endpoint))
         source = handle.peer[0] if handle is not None else ""
-        connection = self._connections[fd] = Connection(handle, source, self._clock())
+        connection = self._connections[fd] = Connection(handle, source, self._clock(), number=self.accepted)
         self._expire()
         self._half_open_until_s[fd] = self._clock() + HANDSHAKE_IVL_MS / 1000
         self._half_open_by_source[source] += 1
-        if handle is not None and self._above_cap(source):
-            self.capped += 1
-            connection.cut()
+        if handle is None:
+            return
+        if self.max_connections and len(self._connections) > self.max_connections:
+            self._cap(fd, connection)
+            return
+        if self.max_half_open_per_source and self._half_open_by_source[source] > self.max_half_open_per_source:
+            self._give_way(fd, source)
+        elif self.max_half_open and len(self._half_open_until_s) > self.max_half_open:
+            self._give_way(fd, None)
 
-    def _above_cap(self, source: str) -> bool:
-        return any(
-            cap and value > cap
-            for cap, value in (
-                (self.max_half_open_per_source, self._half_open_by_source[source]),
-                (self.max_half_open, len(self._half_open_until_s)),
-                (self.max_connections, len(self._connections)),
-            )
-        )
+    def _give_way(self, newest_fd: int, source: str | None) -> None:
+        """Cut the oldest half-open connection, of one source or of all, if it had its time, else the newest."""
+        until_s = self._clock() - HANDSHAKE_GRACE_S
+        for fd in self._half_open_until_s:  # oldest first
+            connection = self._connections[fd]
+            if connection.accepted_s > until_s:
+                break
+            if connection.handle is not None and source in (None, connection.source):
+                self._cap(fd, connection)
+                return
+        self._cap(newest_fd, self._connections[newest_fd])
+
+    def _cap(self, fd: int, connection: Connection) -> None:
+        """It is no longer half-open from now on, and not only when libzmq has noticed: whoever comes again and again,
+        faster than that, must not take the places of others with what was cut."""
+        self.capped += 1
+        connection.cut()
+        self._not_half_open(fd, connection)
 
     def _expire(self) -> None:
         now_s = self._clock()
@@ -450,6 +481,8 @@ class ConnectionTable:
         connection = self._connections.pop(fd, None)
         if connection is not None:
             self._not_half_open(fd, connection)
+            if self._on_gone is not None:
+                self._on_gone(fd)
 
     def _not_half_open(self, fd: int, connection: Connection) -> None:
         if self._half_open_until_s.pop(fd, None) is not None:

@@ -13,8 +13,9 @@ from sern_core.patterns import compile_pattern
 from sern_core.rules import FeedRole
 from sern_core.types import PriorityClass, TopicName
 from sern_relay.feed import INTEREST_STREAMS, RelayFeed
-from sern_runtime import feed_inflow
+from sern_runtime import feed_inflow, feed_subscriptions
 from sern_runtime.feed import MAX_SUBSCRIPTION_BYTES, MAX_TOPIC_BYTES, Feed, FeedHeader, topic_frame
+from sern_runtime.feed_subscriptions import ENTRY_BYTES, Subscriptions
 from tests.loopback.test_inflow import GREETING
 from tests.support import until
 
@@ -44,7 +45,20 @@ class Raw:
         self.ended = False
 
     async def greet(self) -> None:
-        await self.send(GREETING + b"\x04" + bytes([len(READY)]) + READY)
+        """As a SUB: it says nothing more before it has heard that it may."""
+        await self.send(GREETING)
+        await asyncio.to_thread(self._read, 64)
+        await self.send(b"\x04" + bytes([len(READY)]) + READY)
+        head = await asyncio.to_thread(self._read, 2)
+        await asyncio.to_thread(self._read, head[1])
+
+    def _read(self, size: int) -> bytes:
+        data = b""
+        while len(data) < size:
+            more = self.connection.recv(size - len(data))
+            assert more, "the feed has closed the connection"
+            data += more
+        return data
 
     async def subscribe(self, prefixes: Iterable[bytes]) -> None:
         for prefix in prefixes:
@@ -118,10 +132,10 @@ async def test_a_flood_of_subscriptions_ends_long_before_its_end(feed: Feed, mon
     subscribed = outlet._subscribed
     taken_bytes = 0
 
-    def count(prefix: bytes) -> None:
+    def count(prefix: bytes, fd: int | None) -> None:
         nonlocal taken_bytes
         taken_bytes += len(prefix)
-        subscribed(prefix)
+        subscribed(prefix, fd)
 
     monkeypatch.setattr(outlet, "_subscribed", count)
     peer = Raw(port_of(feed))
@@ -132,6 +146,86 @@ async def test_a_flood_of_subscriptions_ends_long_before_its_end(feed: Feed, mon
     await until(lambda: not feed.prefixes()["unity"], "what it subscribed to is gone")
     assert feed_inflow.SUBSCRIBER_BYTES // 2 < taken_bytes < 4 * 2**20
     peer.close()
+
+
+def room_for(feed: Feed, *, kept_bytes: int, role_bytes: int, max_connections: int = 4) -> Subscriptions:
+    """The feed has only so much room from now on."""
+    outlet = feed._outlets["unity"]
+    outlet.subscriptions = Subscriptions(
+        "unity",
+        outlet.inflow.connections,
+        kept_bytes=kept_bytes,
+        role_bytes=role_bytes,
+        max_connections=max_connections,
+    )
+    return outlet.subscriptions
+
+
+async def joined(feed: Feed, prefixes: Iterable[bytes]) -> Raw:
+    peer = Raw(port_of(feed))
+    await peer.greet()
+    wanted = set(prefixes)
+    await peer.subscribe(sorted(wanted))
+    await until(lambda: peer.cut() or wanted <= set(feed.prefixes()["unity"]), "subscribed")
+    return peer
+
+
+def names(tag: str, count: int) -> list[bytes]:
+    """So many prefixes, each of 100 bytes with what it counts."""
+    return [(b"/%s/%d/" % (tag.encode(), number)).ljust(100 - ENTRY_BYTES, b"z") for number in range(count)]
+
+
+async def test_what_grows_for_ever_ends(feed: Feed, monkeypatch: pytest.MonkeyPatch) -> None:
+    """However slowly: the trickle that a connection may bring is no way round what it may keep."""
+    kept = room_for(feed, kept_bytes=1000, role_bytes=100_000)
+    peer = await joined(feed, names("slow", 10))
+    assert kept.total_bytes == 1000 and not peer.cut()
+    await peer.subscribe(names("slow", 10) * 20)
+    await peer.send(b"".join(b"\x00\x05\x00/no%d" % number for number in range(9)))  # ends that are none
+    await peer.subscribe([b"/one-too-many"])
+    await until(peer.cut, "cut")
+    await until(lambda: not feed.prefixes()["unity"], "what it subscribed to is gone")
+    assert feed.counters()["unity"].crowded == 1 and feed.counters()["unity"].endless == 0
+    assert kept.total_bytes == 0
+    peer.close()
+
+
+async def test_the_newest_above_its_share_makes_room(feed: Feed, caplog: pytest.LogCaptureFixture) -> None:
+    kept = room_for(feed, kept_bytes=3000, role_bytes=4000)  # a share is 1000
+    old = await joined(feed, names("old", 18))
+    evil = await joined(feed, names("evil", 20))
+    small = await joined(feed, names("small", 2))
+    assert kept.total_bytes == 4000
+    await old.subscribe(names("late", 1))
+    await until(evil.cut, "cut")
+    await until(lambda: set(feed.prefixes()["unity"]) == {*names("old", 18), *names("late", 1), *names("small", 2)})
+    assert kept.total_bytes == 2100 and not old.cut() and not small.cut()
+    assert feed.counters()["unity"].crowded == 1
+    assert caplog.text.count("connection of feed role unity from 127.0.0.1 closed") == 1
+    again = await joined(feed, names("evil", 20))
+    assert again.cut() and feed.counters()["unity"].crowded == 2
+    for peer in (old, small, evil, again):
+        peer.close()
+
+
+async def test_one_prefix_of_many_counts_for_each(feed: Feed) -> None:
+    kept = room_for(feed, kept_bytes=3000, role_bytes=4000)
+    peers = [await joined(feed, names("same", 10)) for _ in range(3)]
+    await until(lambda: kept.total_bytes == 3000)
+    assert len(kept) == 10
+    peers[0].close()
+    await until(lambda: kept.total_bytes == 2000)
+    assert len(kept) == 10
+    for peer in peers[1:]:
+        peer.close()
+    await until(lambda: kept.total_bytes == 0 and not feed.prefixes()["unity"])
+
+
+async def test_a_role_may_have_what_its_connections_share(feed: Feed) -> None:
+    outlet = feed._outlets["unity"].subscriptions
+    assert outlet._role_bytes == feed_subscriptions.ROLE_BYTES
+    assert outlet._share_bytes * feed_inflow.MAX_CONNECTIONS <= feed_subscriptions.ROLE_BYTES
+    assert feed_inflow.SUBSCRIBER_BYTES < outlet._kept_bytes < feed_subscriptions.ROLE_BYTES // 4
 
 
 async def test_a_role_has_so_many_connections(feed: Feed) -> None:
@@ -154,15 +248,15 @@ async def test_many_subscriptions_are_told_once(zmq_context: Context) -> None:
     )
     outlet = plain._outlets["unity"]
     for number in range(1000):
-        outlet._subscribed(b"/t%03d" % number)
+        outlet._subscribed(b"/t%03d" % number, None)
     assert changes == []
     await until(lambda: changes, "told")
-    assert len(changes[0]) == 1000 and len(outlet._lengths) == 1
+    assert len(changes[0]) == 1000 and len(outlet.subscriptions._lengths) == 1
     for number in range(1000):
         outlet._unsubscribed(b"/t%03d" % number)
     await until(lambda: changes[-1] == (), "told of the end")
-    assert len(changes) == 2 and not outlet._lengths
-    outlet._subscribed(b"/late")
+    assert len(changes) == 2 and not outlet.subscriptions._lengths
+    outlet._subscribed(b"/late", None)
     telling = plain._telling
     assert telling is not None
     plain.close()
@@ -174,8 +268,8 @@ async def test_prefixes_match_as_they_do_at_libzmq(feed: Feed) -> None:
     names = [TopicName(name) for name in ("/a", "/ab", "/a/b", "/a/bc", "/b", "/b/" + "c" * 100)]
     prefixes = [b"", b"/", b"/a", b"/a\0", b"/a/b", b"/a/b\0", b"/b/ccc", b"/b\0", b"/a/bcd", b"/b/" + b"c" * 200]
     for prefix in prefixes:
-        outlet._subscribed(prefix)
-        outlet._subscribed(b"/zz")
+        outlet._subscribed(prefix, None)
+        outlet._subscribed(b"/zz", None)
         for name in names:
             assert outlet.wants(topic_frame(name), name) == topic_frame(name).startswith(prefix)
         outlet._unsubscribed(prefix)

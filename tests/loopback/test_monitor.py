@@ -8,7 +8,7 @@ import pytest
 import zmq
 
 from sern_runtime.keys import SecretKey
-from sern_runtime.monitor import ConnectionTable, TcpHandle, port_of
+from sern_runtime.monitor import HANDSHAKE_GRACE_S, ConnectionTable, EventKind, MonitorEvent, TcpHandle, port_of
 from sern_runtime.transport_watch import CUT, ENDED, HALF_WAY, OTHER, SHUT, SILENT, UNFINISHED, TransportWatch
 from sern_runtime.zap import ZapHandler
 from sern_runtime.zmq_socket import HANDSHAKE_IVL_MS, DealerSocket, RouterSocket, make_client, make_server
@@ -197,6 +197,81 @@ async def test_half_open_connections_are_capped_and_age_out(zmq_context: Context
     client.close()
     await until(lambda: len(server.table) == 0)
     server.close()
+
+
+class FakeHandle:
+    """A connection that libzmq notices the end of when the test says so."""
+
+    def __init__(self, source: str) -> None:
+        self.peer = (source, 1)
+        self.was_cut = False
+
+    def cut(self) -> bool:
+        self.was_cut = True
+        return True
+
+
+class Crowd:
+    """Connections of a table that come and end in the order of the test."""
+
+    def __init__(self, context: Context, monkeypatch: pytest.MonkeyPatch, **caps: int) -> None:
+        self.server = Server(context, **caps)
+        self.table = self.server.table
+        self._monkeypatch = monkeypatch
+        self._fd = 10_000
+
+    def comes(self, source: str = "192.0.2.1") -> tuple[int, FakeHandle]:
+        handle = FakeHandle(source)
+        self._monkeypatch.setattr(TcpHandle, "of", lambda *_args, **_kwargs: handle)
+        self._fd += 1
+        self.table._on_event(MonitorEvent(EventKind.ACCEPTED, self._fd, self.server.endpoint))
+        return self._fd, handle
+
+
+async def test_what_was_cut_takes_no_place_of_a_source(zmq_context: Context, monkeypatch: pytest.MonkeyPatch) -> None:
+    """However fast somebody comes again and again, faster than the ends of what was cut are noticed."""
+    crowd = Crowd(zmq_context, monkeypatch, max_half_open_per_source=4)
+    first = [crowd.comes() for _ in range(4)]
+    assert all(crowd.comes()[1].was_cut for _ in range(100))
+    assert crowd.table.half_open == 4 and crowd.table.capped == 100
+    crowd.table._on_event(MonitorEvent(EventKind.DISCONNECTED, first[0][0], crowd.server.endpoint))
+    assert not crowd.comes()[1].was_cut, "there is a place"
+    assert crowd.comes()[1].was_cut and not any(handle.was_cut for _, handle in first)
+    crowd.server.close()
+
+
+async def test_the_oldest_of_a_source_gives_way_when_it_had_its_time(
+    zmq_context: Context, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    crowd = Crowd(zmq_context, monkeypatch, max_half_open_per_source=4)
+    other = crowd.comes("192.0.2.2")
+    bound = crowd.comes()
+    crowd.table.bind_user(bound[0], "robot1")
+    old = [crowd.comes() for _ in range(4)]
+    crowd.server.now_s = HANDSHAKE_GRACE_S - 0.1
+    assert crowd.comes()[1].was_cut and not any(handle.was_cut for _, handle in old)
+    crowd.server.now_s = HANDSHAKE_GRACE_S
+    for number in range(4):
+        assert not crowd.comes()[1].was_cut
+        assert [handle.was_cut for _, handle in old] == [each <= number for each in range(4)], "the oldest alone"
+        assert crowd.table.half_open == 5
+    assert crowd.comes()[1].was_cut, "those that came just now have their time, too"
+    assert not other[1].was_cut and not bound[1].was_cut
+    assert crowd.table.capped == 6
+    crowd.server.close()
+
+
+async def test_the_oldest_of_all_gives_way_when_it_had_its_time(
+    zmq_context: Context, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    crowd = Crowd(zmq_context, monkeypatch, max_half_open=4)
+    old = [crowd.comes(f"192.0.2.{number}") for number in range(4)]
+    assert crowd.comes("192.0.2.9")[1].was_cut
+    crowd.server.now_s = HANDSHAKE_GRACE_S
+    assert not crowd.comes("192.0.2.9")[1].was_cut
+    assert [handle.was_cut for _, handle in old] == [True, False, False, False]
+    assert crowd.table.half_open == 4
+    crowd.server.close()
 
 
 async def test_whoever_says_nothing_is_cut_after_a_while(zmq_context: Context) -> None:

@@ -182,8 +182,8 @@ class Ros1Endpoint:
     # Endpoint
 
     def subscribe(self, name: TopicName, sink: Sink) -> Subscription:
-        topic = next((t for t in self._topics.values() if t.local == name and t.announced is not None), None)
-        if topic is None:
+        topic = self._topic(name)
+        if topic is None or topic.announced is None:
             raise UsageError(f"{name}: no such topic was announced from {self.master_uri}")
         subscription = topic.subscribe(sink, self._graph.poll_now)
         self._graph.poll_now()
@@ -216,9 +216,9 @@ class Ros1Endpoint:
         return Handle(publication)
 
     def interest(self, name: TopicName, wanted: bool) -> None:
-        for topic in self._topics.values():
-            if topic.local == name:
-                topic.interest(wanted)
+        topic = self._topic(name)
+        if topic is not None:
+            topic.interest(wanted)
 
     def validate(self, held: Held) -> list[Difference]:
         """Publishers that the master does not list differ too, unless there is no master."""
@@ -268,6 +268,10 @@ class Ros1Endpoint:
 
     def _local(self, name: str) -> str:
         return self._prefix + name
+
+    def _topic(self, name: TopicName) -> Topic | None:
+        """The topic that is announced under a name, or will be."""
+        return self._topics.get(name[len(self._prefix) :]) if name.startswith(self._prefix + "/") else None
 
     def _at_master(self, name: TopicName) -> str:
         if not name.startswith(self._prefix + "/"):

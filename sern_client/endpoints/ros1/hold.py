@@ -25,13 +25,13 @@ class Hold:
     """Holds what one publication has from its beginning until `over`.
 
     At most `max_messages` and `max_bytes` are kept, each for `HOLD_S` and no longer than it has left. What a subscriber
-    has missed for good is told to `dropped(reason)`, for what is above the limits `overflow`; `done` is called once,
-    when nobody is waited for any more.
+    has missed for good is told to `dropped(reason, count)`, for what is above the limits `overflow`; `done` is called
+    once, when nobody is waited for any more.
     """
 
     def __init__(
         self, topic: str, *, max_messages: int, max_bytes: int, overflow: DropReason,
-        dropped: Callable[[DropReason], None], done: Callable[[], None],
+        dropped: Callable[[DropReason, int], None], done: Callable[[], None],
     ) -> None:  # fmt: skip
         self.over = False
         self._topic = topic
@@ -112,8 +112,8 @@ class Hold:
             self._done()
 
     def _count_lost(self) -> None:
-        for why in self._lost.elements():
-            self._dropped(why)
+        for why, count in self._lost.items():
+            self._dropped(why, count)
         self._lost.clear()
 
     def _timed_out(self) -> None:
@@ -136,6 +136,6 @@ class Hold:
         body, _, _ = self._kept.popleft()
         self._nbytes -= len(body)
         if self._waited_for is not None:
-            self._dropped(why)
+            self._dropped(why, 1)
         else:
             self._lost[why] += 1

@@ -114,8 +114,8 @@ class Limits:
         self.bytes = size_bytes
         self.dropped: dict[DropReason, int] = {}
 
-    def drop(self, why: DropReason) -> None:
-        self.dropped[why] = self.dropped.get(why, 0) + 1
+    def drop(self, why: DropReason, count: int = 1) -> None:
+        self.dropped[why] = self.dropped.get(why, 0) + count
 
 
 class Publication:
