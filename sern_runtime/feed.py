@@ -259,7 +259,9 @@ class Feed:
             if kind == zmq.XPUB:
                 # One at a time: libzmq takes in all that waits before it lets go of our thread, and meanwhile nobody
                 # sees how much a connection brings.
-                limit_bytes, rcvhwm = MAX_SUBSCRIPTION_BYTES, 1
+                # With keys libzmq writes the user before the first message, and that keeps a place for ever: with one
+                # place no subscription would ever come through.
+                limit_bytes, rcvhwm = MAX_SUBSCRIPTION_BYTES, 1 if self._keys is None else 2
                 socket.setsockopt(zmq.XPUB_VERBOSE, 1)  # also the second subscriber of a prefix is told
                 socket.setsockopt(zmq.RCVBUF, SUBSCRIBER_BYTES)  # what has arrived is read also after a cut
             else:
