@@ -280,7 +280,7 @@ def test_a_new_process_is_not_given_what_the_one_before_confirmed() -> None:
     assert not link.established
     assert goes_on(reader) and channel.kept == 0
     reader.hello(tag=3)
-    assert link.established and channel.first_seq == MANY + 1
+    assert backlog.hub.links[reader.name].established and channel.first_seq == MANY + 1
     said(backlog.origin, _whole(1, MANY + 1))
     assert [out.seq for out in channel.queue] == [MANY + 1]
     backlog.hub.validate()
