@@ -63,9 +63,13 @@ class Hop(Sender):
             self._pause_reading(lane, number, stamp_us, data, position, now)
 
     @abstractmethod
-    def _in_slices(self, step: Callable[[], bool]) -> None:
+    def _in_slices(self, step: Callable[[], bool], *, later: bool = False) -> None:
         """Do something in steps, each charged to `Reassembly.work_us`, until one returns True. Beyond a slice the rest
-        comes later, before anything more is read."""
+        comes later, before anything more is read; `later`: all of it does."""
+
+    @property
+    @abstractmethod
+    def unfinished(self) -> bool: ...
 
     @abstractmethod
     def _pause_reading(
@@ -374,7 +378,7 @@ class Hop(Sender):
         self._sweep_due_s = now + SWEEP_INTERVAL_S
         if now >= self._held_back_due_s:
             self._release_held_back(now)
-        for channel in list(self.channels.values()):
+        for channel in () if self.unfinished else list(self.channels.values()):  # what is confirmed does not expire
             watermark = channel.watermark
             channel.sweep(now, up=self.established)
             if channel.offered or channel.active:

@@ -10,7 +10,7 @@ dropped, and what it was owed is reported to the origins. One that says goodbye 
 and so is one whose name is revoked.
 """
 
-from collections import Counter, defaultdict, deque
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -130,7 +130,7 @@ class Hub(LocalStreams):
         self.presence = Presence(self.links, self.local_owners, self._for, self._was_read)
         self._awaited: dict[ClientName, set[TopicName]] = {}
         self._forgettable = 0  # messages that this sweep may still give up for clients that stay away
-        self._forgotten: deque[Link] = deque()  # links that are given up; what is left of them goes in slices
+        self._forgotten: dict[ClientName, Link] = {}  # given up; what is left of them goes in slices
         self._heard: set[ClientName] = set()  # said what they want, to this run of the relay
         self._absent_since: dict[ClientName, float] = {}
         self._draining = Draining(self._end_channel)
@@ -147,6 +147,8 @@ class Hub(LocalStreams):
 
     def greet(self, port: HubPort, hello: wire.Envelope, header: wire.Header, *, now: float) -> None:
         """A client says hello on a connection. A newer connection of the same client retires the older one."""
+        if port.client in self._forgotten:
+            return  # it says HELLO again; until then `unfinished` goes on: nobody keeps more than one link holds
         link = self._link(port.client, now)
         older = self.port_of.get(port.client)
         another = older is not port
@@ -189,6 +191,21 @@ class Hub(LocalStreams):
             self._limit(client, now)
             self._absent_since[client] = now
         return link
+
+    def unfinished(self, client: ClientName) -> Link | None:
+        """The link of a client without a session that has something to finish before it gets one."""
+        link = self._forgotten.get(client)
+        if link is None and client not in self.port_of:
+            link = self.links.get(client)
+        return link if link is not None and link.unfinished else None
+
+    def finish(self, client: ClientName, *, now: float) -> None:
+        """One slice of that."""
+        link = self.unfinished(client)
+        if link is not None:
+            self._for(client, now, partial(link.handle_timeout, now=now))
+        if client in self._forgotten and self._forgotten[client].idle:
+            del self._forgotten[client]
 
     def _was_read(self) -> None:
         self.after()
@@ -236,7 +253,7 @@ class Hub(LocalStreams):
             link.handle_timeout(now=now)  # retention goes on while a client is away
             if now - since_s > self.params.resume_s:
                 self._for(client, now, partial(self._wind_down, client, now))
-        for client, link in self.links.items():
+        for client, link in list(self.links.items()):
             if client not in self.port_of and link.established:  # only its datagram lane is left
                 link.handle_timeout(now=now)
                 waiting_s = link.lane.flight.waiting_since_s
@@ -262,10 +279,9 @@ class Hub(LocalStreams):
                 self._fanout.go_on(link, now=now)
         self.presence.sweep(now=now)
         if self._forgotten:
-            link = self._forgotten[0]
-            link.handle_timeout(now=now)
-            if link.idle:
-                self._forgotten.popleft()
+            client = next(iter(self._forgotten))
+            self._forgotten[client] = self._forgotten.pop(client)  # the others have their turn
+            self.finish(client, now=now)
 
     def left(self, client: ClientName, *, now: float) -> None:
         """A client has said goodbye. One that has streams, or wants reliable ones, may come back to them (a daemon that
@@ -307,7 +323,9 @@ class Hub(LocalStreams):
         link.close_streams()
         link.finish = None
         if not link.idle:
-            self._forgotten.append(link)
+            if client in self._forgotten:  # of a link that others had made anew in the meantime
+                self._forgotten[client].finish_steps()
+            self._forgotten[client] = link
         del self.links[client]
         port = self.port_of.pop(client, None)
         if port is not None:

@@ -52,6 +52,8 @@ ATTACHMENT_BYTES_PER_US: Final = 250
 """What a control message is charged with: itself, its size, what its attachment unpacks to."""
 ANNOUNCE_US: Final = 12
 """What a session that begins is charged with for each stream that is announced in it."""
+FEW: Final = 64
+"""So many messages of a stream that has ended are dropped at once, more in slices."""
 MAX_UNHEARD: Final = 20_000
 """Control messages that a peer may have answered, beside four for each channel, before it reads an answer."""
 
@@ -275,6 +277,7 @@ class Link(Answering):
         owner is not told of drops, and much goes in slices."""
         self._now = now
         if not silent:
+            self.finish_steps()  # what it has confirmed is not dropped
             channel.clear(reason)
         channel.ready = False
         self._refresh(channel, now)
@@ -287,12 +290,16 @@ class Link(Answering):
             self.send_control({"t": "retract", "ch": channel.slot}, now=now)
         if channel.kept:
             self._closed[channel] = None
-            self._in_slices(partial(self._clear_closed, channel, reason))
+            # It may be one of many, for something that another client has said.
+            self._in_slices(partial(self._clear_closed, channel, reason), later=channel.kept > FEW)
 
     def _clear_closed(self, channel: OutChannel, reason: DropReason) -> bool:
-        done = self._clear(channel, reason)
-        if done:
-            del self._closed[channel]
+        done = True  # also if it fails
+        try:
+            done = self._clear(channel, reason)
+        finally:
+            if done:
+                del self._closed[channel]
         return done
 
     def _announce(self, channel: OutChannel, now: float) -> None:
@@ -560,10 +567,14 @@ class Link(Answering):
             self._in_slices(partial(self._close_some, stream))
 
     def _close_some(self, stream: InStream) -> bool:
-        self.reassembly.work_us += STALE_US * stream.close(self._at_most(STALE_US))
-        if not stream.holds_any:
-            del self._closing[stream]
-        return stream not in self._closing
+        done = True  # also if it fails
+        try:
+            self.reassembly.work_us += STALE_US * stream.close(self._at_most(STALE_US))
+            done = not stream.holds_any
+        finally:
+            if done:
+                del self._closing[stream]
+        return done
 
     def _sweep(self, now: float) -> None:
         super()._sweep(now)
@@ -675,11 +686,14 @@ class Link(Answering):
         self.texts.close()
 
     def wind_down(self, reason: DropReason, most: int, *, now: float) -> int:
-        """The link is about to be given up: drop what waits, at most so many messages. Returns how many; `idle` says
-        whether that was all."""
+        """The link is about to be given up: drop what waits, at most so many messages, and at once what comes from now
+        on. Returns how many; `idle` says whether that was all."""
         self._now = now
         left = most
         for channel in list(self.channels.values()):
+            if channel.wanted is not False:
+                channel.wanted = False
+                self._refresh(channel, now)
             if left > 0 and channel.kept:
                 watermark = channel.watermark
                 left -= channel.clear(reason, left)

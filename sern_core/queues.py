@@ -143,18 +143,17 @@ class OutChannel:
         counters = self.counters
         size = len(message.body)
         if self.reliable:
-            if not forced and not self.has_room(size):
+            unwanted = self.wanted is False and message.seq > self.watermark
+            if not (forced or unwanted or self.has_room(size)):
                 counters.refuse(size)
                 return False
             counters.offer(size)
+            if unwanted:
+                self._leave_unwanted(message)
+                return True
             self.next_seq = message.seq + 1
             if message.seq <= self.watermark:
                 counters.deliver(size)  # the peer has it already, from an earlier run of this relay
-                return True
-            if self.wanted is False and not self.retained:
-                reason = DROP_REASONS[message.tombstone] if message.tombstone else DropReason.UNWANTED
-                self._count(message.seq, reason, size)
-                self.watermark = message.seq
                 return True
             out = OutMessage(message)
             if message.tombstone:
@@ -182,6 +181,15 @@ class OutChannel:
             out = OutMessage(message)
         self._keep(out)
         return True
+
+    def _leave_unwanted(self, message: Message) -> None:
+        """Nobody wants a reliable message: it is passed, and behind what is still being dropped in its turn."""
+        reason = DROP_REASONS[message.tombstone] if message.tombstone else DropReason.UNWANTED
+        self._count(message.seq, reason, len(message.body))
+        if self.retained:
+            self.skip_to(message.seq + 1)
+        else:
+            self.next_seq, self.watermark = message.seq + 1, message.seq
 
     def reject(self, message: Message, reason: DropReason) -> None:
         """Drop a message that cannot travel at all; a reliable stream goes on over its tombstone."""

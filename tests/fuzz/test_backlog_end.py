@@ -232,3 +232,123 @@ def test_a_deep_queue_of_best_effort_goes_in_slices() -> None:
         left.append(channel.kept)
     assert slowly(left, PER_SLICE)
     assert channel.counters.by_reason[DropReason.UNWANTED] == MANY
+
+
+def goes_on(peer: Hostile) -> int:
+    """Let time pass for a connection without a session; how often it had something to do for what its client left."""
+    count = 0
+    while (deadline_s := peer.port.next_deadline()) is not None:
+        peer.now = max(peer.now, deadline_s)
+        peer.port.handle_timeout(now=peer.now)
+        peer.hub.validate()
+        count += 1
+    return count
+
+
+def comes_back(peer: Hostile, *, boot: int) -> None:
+    """A new process of the client says hello on a new connection."""
+    peer.port = peer.world.relay.port(peer.name)
+    peer.boot, peer.number, peer.control_seq = boot, 0, 0
+    peer.hello(tag=2)
+
+
+def test_who_leaves_much_behind_comes_back_when_that_is_gone() -> None:
+    """Else each session would leave as much as a link may hold."""
+    peer, stream = half_received()
+    hub, link = peer.hub, peer.hub.links[peer.name]
+    peer.control({"t": "retract", "ch": 1})
+    peer.port.receive(wire.encode_handshake(wire.Kind.CLOSE, 1, int(peer.now * 1e6), {"why": "x"}), now=peer.now)
+    peer.port.disconnected(now=peer.now)
+    assert hub._forgotten == {peer.name: link} and stream.holds_any
+    for boot in (78, 79):
+        comes_back(peer, boot=boot)
+        assert peer.name not in hub.links, "not yet"
+    assert goes_on(peer) > 2
+    assert not hub._forgotten and link.reassembly.held_bytes == 0
+    peer.hello(tag=3)
+    assert hub.links[peer.name].established
+
+
+def test_a_new_process_is_not_given_what_the_one_before_confirmed() -> None:
+    backlog = Backlog()
+    reader, channel = backlog.reader, backlog.channel
+    link = backlog.hub.links[reader.name]
+    reader.say(wire.encode_watermark(1, MANY))
+    assert 0 < channel.kept < MANY, "not all of it is through"
+    reader.port.disconnected(now=reader.now)
+    comes_back(reader, boot=78)
+    assert not link.established
+    assert goes_on(reader) and channel.kept == 0
+    reader.hello(tag=3)
+    assert backlog.hub.links[reader.name].established and channel.first_seq == MANY + 1
+    said(backlog.origin, _whole(1, MANY + 1))
+    assert [out.seq for out in channel.queue] == [MANY + 1]
+    backlog.hub.validate()
+
+
+def test_a_client_that_stays_away_is_forgotten_whatever_keeps_coming_for_it() -> None:
+    backlog = Backlog()
+    hub, reader = backlog.hub, backlog.reader
+    reader.port.disconnected(now=reader.now)
+    hub.params = replace(hub.params, resume_s=1.0)
+    seq = MANY
+    for _ in range(MANY // FORGOTTEN_MESSAGES + 1):
+        assert reader.name in hub.links
+        reader.now += 1.0
+        hub.sweep(now=reader.now + 1.0)
+        hub.validate()
+        for first in range(seq + 1, seq + FORGOTTEN_MESSAGES + PER_DATAGRAM, PER_DATAGRAM):
+            said(backlog.origin, *(_whole(1, each) for each in range(first, first + PER_DATAGRAM)))
+            seq = first + PER_DATAGRAM - 1
+    assert reader.name not in hub.links
+    assert backlog.stream.confirmed == seq
+
+
+def test_what_a_revoked_client_had_confirmed_is_not_told_as_dropped() -> None:
+    backlog = Backlog()
+    backlog.reader.say(wire.encode_watermark(1, MANY))
+    assert 0 < backlog.channel.kept < MANY
+    backlog.hub.forget(backlog.reader.name, "its key is revoked", now=backlog.reader.now)
+    assert backlog.told == 0 and backlog.stream.confirmed == MANY
+    assert backlog.channel.counters.delivered == MANY
+
+
+def test_what_is_confirmed_does_not_expire_before_its_turn() -> None:
+    backlog = Backlog()
+    backlog.reader.say(wire.encode_watermark(1, MANY))
+    kept = backlog.channel.kept
+    backlog.hub.links[backlog.reader.name]._sweep(backlog.reader.now + 1e6)
+    assert backlog.channel.kept == kept and backlog.told == 0
+
+
+def test_a_step_that_fails_does_not_keep_the_others_from_their_turn() -> None:
+    peer = Hostile()
+    link = peer.hub.links[peer.name]
+    done: list[bool] = []
+
+    def fail() -> bool:
+        raise RuntimeError("a fault of ours")
+
+    def succeed() -> bool:
+        done.append(True)
+        return True
+
+    link._in_slices(fail, later=True)
+    link._in_slices(succeed, later=True)
+    peer.port.handle_timeout(now=peer.now)
+    assert not link.established and not done
+    peer.port.handle_timeout(now=peer.now)
+    assert done and not link.unfinished
+
+
+def test_a_stream_that_nobody_wants_passes_what_comes_while_the_rest_is_dropped() -> None:
+    backlog = Backlog()
+    off = control(backlog.reader, wire.encode_control({"t": "want", "ch": 1, "on": False}))
+    backlog.reader.say(off)
+    kept, channel = backlog.channel.kept, backlog.channel
+    assert kept
+    said(backlog.origin, *(_whole(1, seq) for seq in range(MANY + 1, MANY + 4)))
+    assert channel.kept == kept and channel.watermark < MANY
+    assert slowly([MANY, *backlog.slices()], MANY)
+    assert channel.watermark == MANY + 3 == backlog.stream.confirmed
+    assert channel.counters.by_reason[DropReason.UNWANTED] == MANY + 3
