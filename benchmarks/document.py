@@ -28,6 +28,8 @@ TITLES: Final = {
     "datagram_us": "CPU a datagram, µs",
     "cost_1": "cost J",
     "plusminus_1": "± (95 %)",
+    "settled_down_plusminus_s": "± s (95 %)",
+    "settled_up_plusminus_s": "± s (95 %)",
     "forward_1": "J, first to last",
     "backward_1": "J, last to first",
     "odom_lost": "odom lost",

@@ -213,6 +213,8 @@ def measure(options: argparse.Namespace, report: Report) -> None:
                     times = [r.settled[policy][rises] for r in mine if rises in r.settled.get(policy, {})]
                     if times:
                         more[metric] = fmean(times)
+                        if len(times) > 1:
+                            more[f"{metric.removesuffix('_s')}_plusminus_s"] = half_width_95(times)
                 terms = Terms(*(fmean(values) for values in zip(*(one.terms for one in runs), strict=True)))
                 report.row(
                     f"{profile_name} {name}",
