@@ -201,14 +201,14 @@ class GoalWatch:
         self._rules = rules
         self._advertise = advertise
         self._actions: dict[str, _Action] = {}
-        self._by_message: dict[tuple[StreamId, int], tuple[_Action, str]] = {}
+        self._by_message: dict[tuple[StreamId, int], tuple[_Action, _Goal]] = {}
         self._due_next: list[tuple[float, int, _Action, _Goal]] = []  # a heap: when to look, and at which goal
         self._entries = count()
         self._timer = Timer(self._due)
 
     @property
     def watched(self) -> int:
-        """Goals that are watched now."""
+        """Goals that are watched now, without those that the link has just refused."""
         return len(self._by_message)
 
     def close(self) -> None:
@@ -248,6 +248,7 @@ class GoalWatch:
             goal = self._given(action, channel, body)
             accepted = sink(body, stamp_ns)
             if not accepted and goal is not None:
+                self._unlist(goal)  # the next goal has its number
                 self._fail_soon(action, goal, "too much waits for the link")
             return accepted
 
@@ -276,7 +277,7 @@ class GoalWatch:
             self._forget(action, next(iter(action.goals)))
         goal = _Goal(ident, channel.stream.id, channel.next_seq, clock.now() + action.accept_s)
         action.goals[ident.text] = goal
-        self._by_message[goal.stream, goal.seq] = action, ident.text
+        self._by_message[goal.stream, goal.seq] = action, goal
         self._queue(action, goal)
         self._arm()
         return goal
@@ -285,8 +286,8 @@ class GoalWatch:
         """A message of ours was dropped, here or on its way."""
         found = self._by_message.get((stream, seq))
         if found is not None:
-            action, text = found
-            self._fail_soon(action, action.goals[text], f"it was dropped on its way: {reason}")
+            action, goal = found
+            self._fail_soon(action, goal, f"it was dropped on its way: {reason}")
 
     # What comes in
 
@@ -347,7 +348,13 @@ class GoalWatch:
     def _forget(self, action: _Action, text: str) -> None:
         goal = action.goals.pop(text)
         goal.watched = False
-        self._by_message.pop((goal.stream, goal.seq), None)
+        self._unlist(goal)
+
+    def _unlist(self, goal: _Goal) -> None:
+        """No message is this goal any more; its number may be another's."""
+        found = self._by_message.get((goal.stream, goal.seq))
+        if found is not None and found[1] is goal:
+            del self._by_message[goal.stream, goal.seq]
 
     def _queue(self, action: _Action, goal: _Goal) -> None:
         goal.queued_s = goal.due_s

@@ -44,7 +44,6 @@ from sern_runtime.zmq_socket import (
     ZERO_COPY_BYTES,
     CurvePair,
     DrainedSocket,
-    FrameSocket,
     apply_common_options,
     bind_all,
     serve_curve,
@@ -191,11 +190,11 @@ class Feed:
             if name in self._outlets:
                 self._outlets[name].role = role
             else:
-                self._outlets[name] = _Outlet(self, role, self._bound(zmq.XPUB, role, role.publish_endpoint))
+                self._outlets[name] = _Outlet(self, role, self._unbound(zmq.XPUB, role))
             if name in self._inlets:
                 self._inlets[name].adopt(role)
             elif role.ingest_endpoint is not None:
-                self._inlets[name] = _Inlet(self, role, self._bound(zmq.XSUB, role, role.ingest_endpoint))
+                self._inlets[name] = _Inlet(self, role, self._unbound(zmq.XSUB, role), role.ingest_endpoint)
         for outlet in self._outlets.values():
             outlet.forget()
 
@@ -253,7 +252,7 @@ class Feed:
         for inlet in self._inlets.values():
             inlet.verdicts.clear()
 
-    def _bound(self, kind: int, role: FeedRole, endpoint: str) -> "zmq.Socket[bytes]":
+    def _unbound(self, kind: int, role: FeedRole) -> "zmq.Socket[bytes]":
         socket = self._ctx.socket(kind)
         try:
             if kind == zmq.XPUB:
@@ -262,7 +261,7 @@ class Feed:
                 # With keys libzmq writes the user before the first message, and that keeps a place for ever: with one
                 # place no subscription would ever come through.
                 limit_bytes, rcvhwm = MAX_SUBSCRIPTION_BYTES, 1 if self._keys is None else 2
-                socket.setsockopt(zmq.XPUB_VERBOSE, 1)  # also the second subscriber of a prefix is told
+                socket.setsockopt(zmq.XPUB_VERBOSER, 1)  # each subscription and unsubscription is told
                 socket.setsockopt(zmq.RCVBUF, SUBSCRIBER_BYTES)  # what has arrived is read also after a cut
             else:
                 limit_bytes, rcvhwm = self.max_message_bytes, HIGH_WATER
@@ -271,7 +270,6 @@ class Feed:
             socket.setsockopt(zmq.TCP_KEEPALIVE, 1)
             socket.setsockopt(zmq.BACKLOG, BACKLOG)
             serve_curve(socket, self._keys, f"feed.{role.name}")
-            bind_all(socket, [endpoint])
         except BaseException:
             socket.close(linger=0)
             raise
@@ -291,18 +289,20 @@ class Feed:
             self.on_interest()
 
 
-class _Outlet(FrameSocket):
-    """The XPUB of a role: takes subscriptions, sends what the role may see."""
+class _Outlet(DrainedSocket):
+    """The XPUB of a role: takes subscriptions, sends what the role may see. Raises ConfigError when its endpoint cannot
+    be had."""
 
     def __init__(self, feed: Feed, role: FeedRole, socket: "zmq.Socket[bytes]") -> None:
-        super().__init__(socket, self._on_subscription)
+        super().__init__(socket)
         self.role = role
-        self.endpoint = socket.getsockopt_string(zmq.LAST_ENDPOINT)
+        self.messages = 0
         self.counters = FeedCounters()
         self._feed = feed
         self.inflow = FeedInflow(role.name, self, socket, self._endless, on_gone=self._gone)
         self.subscriptions = Subscriptions(role.name, self.inflow.connections)
         self._wanted: dict[bytes, bool] = {}
+        self.endpoint = _listening(self, role.publish_endpoint)
 
     def _endless(self) -> None:
         self.counters.endless += 1
@@ -329,25 +329,34 @@ class _Outlet(FrameSocket):
         self.counters.sent += 1
         self.kick()
 
-    def _on_subscription(self, frames: list[zmq.Frame]) -> None:
-        if len(frames) != 1:
-            return
-        message = frames[0].bytes
-        if message[:1] == b"\1":
-            self._subscribed(message[1:], _origin(frames[0]))
-        elif message[:1] == b"\0":
-            self._unsubscribed(message[1:])
+    def _received(self) -> int:
+        return self.messages
+
+    def _take(self, count: int) -> bool:
+        """Frame by frame: libzmq takes every frame that begins as a subscription for one, whatever frames it is
+        among."""
+        recv = self.socket.recv
+        for _ in range(count):
+            frame = recv(_NOBLOCK, copy=False)
+            self.messages += 1
+            message = frame.bytes
+            if message[:1] == b"\1":
+                self._subscribed(message[1:], _origin(frame))
+            elif message[:1] == b"\0":
+                self._unsubscribed(message[1:], _origin(frame))
+        return True
 
     def _subscribed(self, prefix: bytes, fd: int | None) -> None:
         if self.subscriptions.subscribed(prefix, fd):
             self._changed()
 
-    def _unsubscribed(self, prefix: bytes) -> None:
-        if self.subscriptions.unsubscribed(prefix):
+    def _unsubscribed(self, prefix: bytes, fd: int | None) -> None:
+        if self.subscriptions.unsubscribed(prefix, fd):
             self._changed()
 
     def _gone(self, fd: int) -> None:
-        self.subscriptions.gone(fd)
+        if self.subscriptions.gone(fd):
+            self._changed()
 
     def _changed(self) -> None:
         self._wanted.clear()
@@ -368,10 +377,9 @@ class _Inlet(DrainedSocket):
     it, and what malformed ones make together is checked like any other: their senders could have sent just that.
     """
 
-    def __init__(self, feed: Feed, role: FeedRole, socket: "zmq.Socket[bytes]") -> None:
+    def __init__(self, feed: Feed, role: FeedRole, socket: "zmq.Socket[bytes]", endpoint: str) -> None:
         super().__init__(socket)
         self.role = role
-        self.endpoint = socket.getsockopt_string(zmq.LAST_ENDPOINT)
         self.verdicts: dict[bytes, _Verdict] = {}
         self.counters = feed.counters()[role.name]
         self._feed = feed
@@ -379,6 +387,7 @@ class _Inlet(DrainedSocket):
         self.messages = 0
         self.inflow = FeedInflow(role.name, self, socket, self._endless, max_message_bytes=feed.max_message_bytes)
         socket.send(b"\1")  # everything: what the role may publish is decided here, by pattern and not by prefix
+        self.endpoint = _listening(self, endpoint)
 
     def _endless(self) -> None:
         self.counters.endless += 1
@@ -499,6 +508,16 @@ class _Inlet(DrainedSocket):
             self.counters.forbidden += 1
             return b""
         return parsed.pack()
+
+
+def _listening(socket: "_Outlet | _Inlet", endpoint: str) -> str:
+    """Bind, and return the endpoint as bound. The monitor is there by then: a connection that it missed would be taken
+    for one that has ended. Raises ConfigError, with the socket closed."""
+    try:
+        return bind_all(socket.socket, [endpoint])[0]
+    except BaseException:
+        socket.close()
+        raise
 
 
 def _guard_of(role: FeedRole, now: float) -> RateGuard | None:

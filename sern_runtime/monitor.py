@@ -95,8 +95,11 @@ class SocketMonitor:
         self._socket.close()
 
     def drain(self) -> None:
-        """Deliver what has arrived, now."""
-        self._socket.drain()
+        """Deliver all that has arrived, now."""
+        taken = -1
+        while taken != self._socket.messages:  # one drain takes no more than a batch
+            taken = self._socket.messages
+            self._socket.drain()
 
     def _on_frames(self, frames: list[zmq.Frame]) -> None:
         if len(frames) != 2:
@@ -374,11 +377,14 @@ class ConnectionTable:
     def by_fd(self, fd: int) -> Connection | None:
         return self._connections.get(fd)
 
-    def current(self, fd: int) -> Connection | None:
-        """The connection that a frame came over which has just been read: what has happened to connections since
-        is taken in first."""
+    def items(self) -> list[tuple[int, Connection]]:
+        """With their fd."""
+        return list(self._connections.items())
+
+    def take_in(self) -> None:
+        """Take in all that has happened to connections until now, so that `by_fd` knows whose a frame is that has just
+        been read."""
         self._monitor.drain()
-        return self._connections.get(fd)
 
     def bind_user(self, fd: int, user: str) -> None:
         """Remember whose connection this is; `fd` and `user` from a frame that came over it."""

@@ -7,6 +7,7 @@ this process was killed. When the disk refuses, `give_up` cuts the file back to 
 """
 
 import errno
+import logging
 import os
 import shutil
 from abc import ABC, abstractmethod
@@ -46,6 +47,7 @@ MAX_TOPIC_CONNECTIONS: Final = 32
 MAX_CONNECTIONS: Final = 10_000
 MAX_DEFINITION_BYTES: Final = 64 * 2**20
 """Connections in one file, and bytes of their definitions, each counted once. Both are in memory until its end."""
+_LOG = logging.getLogger(__name__)
 _NO_LIMIT: Final = QosTime(MAX_TIME // 10**9, MAX_TIME % 10**9)
 
 
@@ -429,12 +431,19 @@ class McapFile(RecordFile):
 
 @contextmanager
 def _hidden_folder(active: Path) -> Iterator[Path]:
-    """A new folder beside `active`, under a name that nobody looks for; it is gone in the end."""
+    """A new folder beside `active`, under a name that nobody looks for; it is gone in the end.
+
+    Where it cannot be removed, that is logged, and the file is recorded all the same: NFS, for one, keeps another name
+    of an open file in it.
+    """
     folder = Path(mkdtemp(prefix=f".{active.name}.", dir=active.parent))
     try:
         yield folder
     finally:
-        shutil.rmtree(folder)
+        try:
+            shutil.rmtree(folder)
+        except OSError as error:
+            _LOG.warning("%s cannot be removed (%s)", folder, error.strerror)
 
 
 def _move(made: Path, target: Path) -> None:

@@ -8,6 +8,7 @@ from zmq.utils.monitor import parse_monitor_message
 
 from sern_core.types import TopicName
 from sern_runtime.feed import MAX_SUBSCRIPTION_BYTES, MAX_TOPIC_BYTES, Feed, topic_frame
+from sern_runtime.feed_subscriptions import ENTRY_BYTES
 from sern_runtime.keys import SecretKey
 from sern_runtime.zap import ZapHandler
 from sern_runtime.zmq_socket import connect_curve
@@ -103,6 +104,22 @@ async def test_the_longest_topic_can_be_subscribed_to_and_a_longer_prefix_ends_t
     keyed.feed.publish(longest, HEADER, b"body")
     await until(lambda: honest.poll(0), "the other one is served all the same")
     assert honest.recv_multipart()[0] == topic_frame(longest)
+
+
+async def test_each_connection_counts_by_itself(keyed: Keyed) -> None:
+    kept = keyed.feed._outlets["viewer"].subscriptions
+    honest, other = keyed.subscriber(topic_frame(ODOM)), keyed.socket(zmq.XSUB)
+    other.connect(keyed.feed.endpoints()["viewer"][0])
+    other.send(b"\1" + topic_frame(ODOM))
+    await until(lambda: len(kept._prefixes.get(topic_frame(ODOM), ())) == 2, "both subscribe")
+    assert kept.total_bytes == 2 * (len(topic_frame(ODOM)) + ENTRY_BYTES)
+    other.send(b"\0" + topic_frame(ODOM))
+    await until(lambda: kept.total_bytes == len(topic_frame(ODOM)) + ENTRY_BYTES, "one unsubscribes")
+    keyed.feed.publish(ODOM, HEADER, b"body")
+    await until(lambda: honest.poll(0), "a message")
+    honest.close(linger=0)
+    await until(lambda: not keyed.prefixes, "ended")
+    assert kept.total_bytes == 0
 
 
 async def test_a_publisher_is_heard(keyed: Keyed) -> None:

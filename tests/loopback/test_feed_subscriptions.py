@@ -16,6 +16,7 @@ from sern_relay.feed import INTEREST_STREAMS, RelayFeed
 from sern_runtime import feed_inflow, feed_subscriptions
 from sern_runtime.feed import MAX_SUBSCRIPTION_BYTES, MAX_TOPIC_BYTES, Feed, FeedHeader, topic_frame
 from sern_runtime.feed_subscriptions import ENTRY_BYTES, Subscriptions
+from sern_runtime.monitor import Connection
 from tests.loopback.test_inflow import GREETING
 from tests.support import until
 
@@ -161,6 +162,13 @@ def room_for(feed: Feed, *, kept_bytes: int, role_bytes: int, max_connections: i
     return outlet.subscriptions
 
 
+def somebody(feed: Feed) -> int:
+    """The number of a connection of which only the feed's list knows."""
+    fd = 10**6
+    feed._outlets["unity"].inflow.connections._connections[fd] = Connection(None, "", 0.0)
+    return fd
+
+
 async def joined(feed: Feed, prefixes: Iterable[bytes]) -> Raw:
     peer = Raw(port_of(feed))
     await peer.greet()
@@ -247,16 +255,17 @@ async def test_many_subscriptions_are_told_once(zmq_context: Context) -> None:
         on_interest=lambda: changes.append(plain.prefixes()["unity"]),
     )
     outlet = plain._outlets["unity"]
+    fd = somebody(plain)
     for number in range(1000):
-        outlet._subscribed(b"/t%03d" % number, None)
+        outlet._subscribed(b"/t%03d" % number, fd)
     assert changes == []
     await until(lambda: changes, "told")
     assert len(changes[0]) == 1000 and len(outlet.subscriptions._lengths) == 1
     for number in range(1000):
-        outlet._unsubscribed(b"/t%03d" % number)
+        outlet._unsubscribed(b"/t%03d" % number, fd)
     await until(lambda: changes[-1] == (), "told of the end")
     assert len(changes) == 2 and not outlet.subscriptions._lengths
-    outlet._subscribed(b"/late", None)
+    outlet._subscribed(b"/late", fd)
     telling = plain._telling
     assert telling is not None
     plain.close()
@@ -265,15 +274,16 @@ async def test_many_subscriptions_are_told_once(zmq_context: Context) -> None:
 
 async def test_prefixes_match_as_they_do_at_libzmq(feed: Feed) -> None:
     outlet = feed._outlets["unity"]
+    fd = somebody(feed)
     names = [TopicName(name) for name in ("/a", "/ab", "/a/b", "/a/bc", "/b", "/b/" + "c" * 100)]
     prefixes = [b"", b"/", b"/a", b"/a\0", b"/a/b", b"/a/b\0", b"/b/ccc", b"/b\0", b"/a/bcd", b"/b/" + b"c" * 200]
     for prefix in prefixes:
-        outlet._subscribed(prefix, None)
-        outlet._subscribed(b"/zz", None)
+        outlet._subscribed(prefix, fd)
+        outlet._subscribed(b"/zz", fd)
         for name in names:
             assert outlet.wants(topic_frame(name), name) == topic_frame(name).startswith(prefix)
-        outlet._unsubscribed(prefix)
-        outlet._unsubscribed(b"/zz")
+        outlet._unsubscribed(prefix, fd)
+        outlet._unsubscribed(b"/zz", fd)
 
 
 class Streams:

@@ -11,7 +11,7 @@ from sern_runtime.keys import SecretKey
 from sern_runtime.monitor import HANDSHAKE_GRACE_S, ConnectionTable, EventKind, MonitorEvent, TcpHandle, port_of
 from sern_runtime.transport_watch import CUT, ENDED, HALF_WAY, OTHER, SHUT, SILENT, UNFINISHED, TransportWatch
 from sern_runtime.zap import ZapHandler
-from sern_runtime.zmq_socket import HANDSHAKE_IVL_MS, DealerSocket, RouterSocket, make_client, make_server
+from sern_runtime.zmq_socket import BATCH, HANDSHAKE_IVL_MS, DealerSocket, RouterSocket, make_client, make_server
 from sern_tools.ports import free_ports
 from tests.support import until
 
@@ -177,6 +177,21 @@ async def test_connections_are_counted_until_they_end(zmq_context: Context) -> N
         client.close()
     await until(lambda: len(server.table) == 0)
     assert server.table.accepted == 3
+    server.close()
+
+
+async def test_all_that_has_happened_is_taken_in_at_once(zmq_context: Context) -> None:
+    """A message of the last of many connections must not be taken for one of a connection that is not known."""
+    server = Server(zmq_context, max_half_open_per_source=0, max_half_open=0)
+    connections = []
+    for _ in range(BATCH + 10):
+        connections.append(socketlib.create_connection(server.address))
+        assert connections[-1].recv(1) == b"\xff"  # it is accepted
+    assert len(server.table) == 0
+    server.table.take_in()
+    assert len(server.table) == len(server.table.items()) == BATCH + 10
+    for connection in connections:
+        connection.close()
     server.close()
 
 

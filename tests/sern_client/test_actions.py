@@ -349,6 +349,31 @@ async def test_a_goal_that_is_given_again_is_watched_in_place_of_the_one_before(
     assert site.watch.watched == 0 and site.results == []
 
 
+async def test_a_goal_behind_one_that_was_refused_is_watched(site: Site) -> None:
+    """What was refused took no number: the next one has it."""
+    sent: list[bytes] = []
+
+    def send(data: bytes, _stamp_ns: int) -> bool:
+        if not sent:
+            sent.append(data)
+            return False
+        site.channel.next_seq += 1
+        return True
+
+    site.server_appears()
+    give = site.watch.outgoing(GOAL, site.channel, send)
+    seq = site.channel.next_seq
+    later = IDENT._replace(text="/client-2-7.8")
+    assert not give(goal_body(), 1)
+    assert give(goal_body(later), 1)
+    await site.told(REJECTED, "too much waits for the link")
+    assert site.watch.watched == 1
+    site.watch.send_dropped(site.channel.stream.id, seq, DropReason.LIFESPAN)
+    await until(lambda: len(site.results) == 2, "the client is told of the second one")
+    assert "dropped on its way" in result_of(site.results[1]).status.text
+    assert site.cancels == [IDENT.pack(), later.pack()] and site.watch.watched == 0
+
+
 async def test_clients_that_are_gone_are_told_nothing(site: Site) -> None:
     site.server_appears()
     seq = site.channel.next_seq

@@ -1,6 +1,7 @@
 """Recording: what is read back is what was given, byte for byte, and a bad disk does not stop the daemon."""
 
 import asyncio
+import errno
 import resource
 import shutil
 import sys
@@ -18,7 +19,7 @@ from rosbags.rosbag2 import Reader as Reader2
 
 from sern_client.endpoints import bag_files
 from sern_client.endpoints.bag import BagEndpoint, BagOptions
-from sern_client.endpoints.bag_files import active_path
+from sern_client.endpoints.bag_files import BagFile, McapFile, RecordFile, active_path
 from sern_client.endpoints.leftovers import finish
 from sern_client.endpoints.record import RecordEndpoint, RecordOptions
 from sern_client.factory import make_section
@@ -336,6 +337,36 @@ async def test_a_place_that_went_away(tmp_path: Path, events: Any, caplog: pytes
     assert recorder.counters.dropped == 5 and recorder.counters.errors == 1 and recorder.counters.written == 0
     assert recorder.problem is not None and "cannot be written" in recorder.problem
     assert all(record.exc_info is None and "\n" not in record.getMessage() for record in caplog.records)
+
+
+def descriptors() -> int:
+    """How many this process has open."""
+    return len(list(Path("/proc/self/fd").iterdir()))
+
+
+@pytest.mark.parametrize("kind", [BagFile, McapFile])
+def test_a_hidden_folder_that_stays_does_not_end_the_recording(
+    kind: type[RecordFile], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """As where the file system keeps the old name of an open file for as long as it is open."""
+    rmtree = shutil.rmtree
+
+    def refuse(folder: Path) -> None:
+        if folder.name.startswith("."):
+            raise OSError(errno.ENOTEMPTY, "Directory not empty", str(folder))
+        rmtree(folder)
+
+    monkeypatch.setattr(shutil, "rmtree", refuse)
+    before = descriptors()
+    file = kind(tmp_path / "run")
+    assert file.active.exists() and caplog.text.count("cannot be removed") == 1
+    file.finish()
+    assert (tmp_path / "run").is_file() and not file.active.exists()
+    assert descriptors() == before
+    (tmp_path / "again.active").mkdir()
+    with pytest.raises(FileExistsError):  # what went wrong first is what is said
+        kind(tmp_path / "again")
+    assert descriptors() == before
 
 
 @contextmanager
