@@ -7,6 +7,7 @@ import pytest
 
 from sern_core.access import AccessTable
 from sern_core.message import TopicInfo
+from sern_core.patterns import compile_pattern
 from sern_core.rules import Direction
 from sern_core.types import ClientName, Encoding, PriorityClass, TopicName
 from sern_runtime.config.client import ClientFile, load_client
@@ -122,6 +123,24 @@ def test_the_relay_lets_through_what_a_client_needs(name: str) -> None:
     for topic in ("/cmd_vel", "/move_base/goal", "/dock/_call/site1"):
         assert table.may_subscribe(own, TopicName(robot + topic))
     assert not table.may_subscribe(own, TopicName("/other1/cmd_vel"))
+
+
+@pytest.mark.parametrize("name", ["site-noetic.yaml", "site-jazzy.yaml"])
+def test_a_site_takes_what_its_operator_drives_by(name: str) -> None:
+    """Where a robot is and how it leans, of each that there is a file for; what is heavy only in its summaries."""
+    patterns = [compile_pattern(text) for text in client(name).subscribe]
+
+    def takes(topic: str) -> bool:
+        return any(pattern.fullmatch(topic) for pattern in patterns)
+
+    for robot in ("jackal1", "husky1"):
+        for topic in ("odometry/filtered", f"{robot[:-1]}_velocity_controller/odom", "fix", "imu/data", "map"):
+            assert takes(f"/{robot}/{topic}"), topic
+        assert not takes(f"/{robot}/mid/points") and takes(f"/{robot}/mid/points/voxel")
+        assert not takes(f"/{robot}/front/image_raw/compressed")
+    if name == "site-jazzy.yaml":
+        for topic in ("platform/odom/filtered", "platform/odom", "sensors/gps_0/fix", "sensors/imu_0/data", "map"):
+            assert takes(f"/a200_0000/{topic}"), topic
 
 
 def test_no_example_caps_a_command() -> None:
