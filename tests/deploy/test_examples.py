@@ -7,6 +7,8 @@ import pytest
 
 from sern_core.access import AccessTable
 from sern_core.message import TopicInfo
+from sern_core.mmcf.cost import profile
+from sern_core.mmcf.policy import Mmcf
 from sern_core.patterns import compile_pattern
 from sern_core.rules import Direction
 from sern_core.types import ClientName, Encoding, PriorityClass, TopicName
@@ -50,6 +52,22 @@ def test_is_accepted(name: str) -> None:
     model = client(name)
     assert model.relay.endpoint == "tcp://relay.example:5555"
     assert model.http.listen is not None and model.http.listen.startswith("127.0.0.1:")
+
+
+@pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.yaml")), ids=lambda path: path.stem)
+def test_it_adapts_and_never_thins_a_command(path: Path) -> None:
+    """As docs/adaptation.md says of the ready-made files, relay, robots and sites alike."""
+    relay = path.name == "relay.yaml"
+    loaded = load_relay(path, files=False) if relay else load_client(path, files=False)
+    section = loaded.model.adaptation
+    assert section is not None
+    assert (section.policy, section.cost_weights(), section.floor_shares()) == (
+        "mmcf", profile("teleoperation"), (1.0, 1.0, 1.0),
+    )  # fmt: skip
+    assert section.rates.control == (1.0,) and section.limits.min_rates.control == 1.0
+    assert min(section.rates.bulk) < 1.0, "there is something to choose"
+    policy = section.make_policy(encodes=not relay)()
+    assert isinstance(policy, Mmcf) and len(policy.predictor.grid) > 1
 
 
 @pytest.mark.parametrize("name", NOETIC)
