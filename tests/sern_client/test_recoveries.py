@@ -17,6 +17,8 @@ import pytest
 from sern_client import express, guard, relay_name
 from sern_client.checks import CHECK_S, CONFIRM_S, TableCheck
 from sern_client.daemon import SILENT, ClientDaemon
+from sern_client.endpoints.ros1 import services, subscription
+from sern_client.endpoints.ros1.header import encode_header
 from sern_client.express import ClientExpress
 from sern_client.guard import Guard
 from sern_client.link_topics import LinkTopics
@@ -36,7 +38,7 @@ from sern_runtime.datagram_watch import DatagramWatch
 from sern_runtime.sdnotify import Notifier, Watchdog
 from sern_tools.ports import free_ports
 from tests.daemons import Lab
-from tests.sern_client.endpoints.ros1.fakes import FakeMaster, running
+from tests.sern_client.endpoints.ros1.fakes import HOST, FakeMaster, FakePublisher, running
 from tests.sern_client.test_checks import ODOM, Tables
 from tests.sern_client.test_link_state import STAMP_NS, VIEWS, Endpoint, Site, Stream, _close
 from tests.support import Events, until
@@ -101,6 +103,47 @@ async def ros_master(scene: Scene) -> None:
             master.mute = ""
             await scene.until_said("connected to the ROS master", 2)
     finally:
+        await master.stop()
+
+
+async def publisher_of_ros1(scene: Scene) -> None:
+    scene.patch.setattr(subscription, "BACKOFF_S", (0.01, 0.01))
+    master = FakeMaster()
+    await master.start()
+    try:
+        async with FakePublisher(master) as publisher:
+            publisher.greeting = encode_header({"error": "not now"})
+            async with running(master) as (_, events):
+                await scene.until_said("refused: not now")
+                publisher.greeting = None
+                await until(lambda: events.infos, "its topic is there")
+    finally:
+        await master.stop()
+
+
+async def service_of_ros1(scene: Scene) -> None:
+    scene.patch.setattr(services, "PROBE_AGAIN_S", (0.01, 0.01))
+    fields = {"error": "not now"}
+
+    async def probed(_reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        writer.write(encode_header(fields))
+        writer.close()
+
+    master = FakeMaster()
+    await master.start()
+    server = await asyncio.start_server(probed, HOST, 0)
+    try:
+        async with FakePublisher(master) as node:  # a node that lives
+            master.add(2, "/set_mode", node.name, master.nodes[node.name])
+            master.services["/set_mode"] = f"rosrpc://{HOST}:{server.sockets[0].getsockname()[1]}"
+            async with running(master) as (endpoint, events):
+                endpoint.watch_services(events)
+                await scene.until_said("refused: not now")
+                fields = {"type": "std_srvs/SetBool", "md5sum": "09fb03525b03e7ea1fd3992bafd87e16"}
+                await scene.until_said("service of /talker answers again")
+                assert list(events.services) == ["/set_mode"]
+    finally:
+        server.close()
         await master.stop()
 
 
@@ -402,6 +445,8 @@ PAIRS: Final = (
     Pair(peer, logging.WARNING, "jackal1 is gone", "jackal1 is back", "jackal1 is there"),
     Pair(peer_that_was_let_go, logging.WARNING, "jackal1 is gone", "jackal1 is back", "jackal1 is there"),
     Pair(ros_master, logging.WARNING, "like a ROS master", " again, after", "connected to the ROS master"),
+    Pair(publisher_of_ros1, logging.WARNING, "/talker: refused: not now", "publisher /talker answers again"),
+    Pair(service_of_ros1, logging.WARNING, "/talker: refused: not now", "service of /talker answers again"),
     Pair(guard_process, logging.ERROR, "command topics has ended", "runs again as", "command topics runs as"),
     Pair(withdrawn_topics, logging.WARNING, "2 of its topics end here", "jackal1 is there again"),
     Pair(withdrawn_topics_one_by_one, logging.WARNING, "2 of its topics end here", "jackal1 is there again"),
