@@ -26,8 +26,9 @@ class Comparable(Protocol):
 
 @dataclass(slots=True)
 class _Repair:
-    """When a difference is repaired next, and how long it has until it is again."""
+    """Since when a difference is known, when it is repaired next, and how long it has until it is again."""
 
+    since_s: float
     due_s: float
     pause_s: float = REPAIR_S[0]
 
@@ -48,6 +49,9 @@ class TableCheck:
         if now < self._due_s:
             return
         found = self._look()
+        if found is None:  # nobody knows: what differed before is not taken to be right
+            self._due_s = now + (CONFIRM_S if self._suspected else CHECK_S)
+            return
         confirmed = [difference for difference in found if difference in self._suspected]
         new = [difference for difference in confirmed if difference not in self.found]
         self._suspected = found
@@ -56,6 +60,11 @@ class TableCheck:
         for difference in new:
             _log.error("what is here is not what should be: %s", difference)
         self.total += len(new)
+        for difference, repair in self._repairs.items():
+            if difference not in confirmed:
+                _log.error(
+                    "what is here is what should be again: %s, after %.0f s", difference.name, now - repair.since_s
+                )
         due = self._due_repairs(confirmed, now)
         if due:
             try:
@@ -65,7 +74,7 @@ class TableCheck:
 
     def _due_repairs(self, confirmed: list[Difference], now: float) -> list[Difference]:
         """What is to be repaired now, for the first time or again."""
-        self._repairs = {difference: self._repairs.get(difference, _Repair(now)) for difference in confirmed}
+        self._repairs = {difference: self._repairs.get(difference, _Repair(now, now)) for difference in confirmed}
         due = [difference for difference, repair in self._repairs.items() if repair.due_s <= now]
         for difference in due:
             repair = self._repairs[difference]
@@ -73,9 +82,10 @@ class TableCheck:
             repair.pause_s = min(2 * repair.pause_s, REPAIR_S[1])
         return due
 
-    def _look(self) -> list[Difference]:
+    def _look(self) -> list[Difference] | None:
+        """What differs now; None: it cannot be told."""
         try:
             return self._tables.validate()
         except Exception:  # noqa: BLE001  a look must not end the client
             _log.exception("the tables of bridge and endpoint could not be compared")
-            return []
+            return None

@@ -49,6 +49,7 @@ class ClientExpress:
         self._pump: Pump | None = None
         self._open_s = 0.0
         self._failures = 0
+        self._without_s: float | None = None  # since when there is no lane, if that was said
 
     def begin(self) -> None:
         """A session has begun: what is connected must join it."""
@@ -74,7 +75,12 @@ class ClientExpress:
                 self._connections.append(_Connection(self, self._transport))
         except ConfigError as error:
             _log.warning("class control has no connection of its own: %s", error)
+            self._said()
             self._give_up()
+
+    def _said(self) -> None:
+        if self._without_s is None:
+            self._without_s = clock.now()
 
     def _give_up(self) -> None:
         self.close()
@@ -113,6 +119,7 @@ class ClientExpress:
         if self._failures >= ATTEMPTS * CONNECTIONS and link.established and link.express is None:
             self._failures = 0
             _log.warning("the relay takes no connection for class control alone; asking again in %g s", ASK_AGAIN_S)
+            self._said()
             asyncio.get_running_loop().call_soon(self._give_up)
         self._kick()
 
@@ -126,6 +133,9 @@ class ClientExpress:
             _log.warning("the relay sent a bad frame for class control (%s); reconnecting", error)
             connection.dialer.again(f"bad frame: {error}")
             return
+        if self._without_s is not None:
+            without_s, self._without_s = clock.now() - self._without_s, None
+            _log.warning("class control has connections of its own again, after %.0f s", without_s)
         if self.core.link.dirty:
             self._kick()
 

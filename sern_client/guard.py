@@ -20,6 +20,7 @@ from typing import Final, Self
 from sern_client.endpoints.base import GUARD_SUFFIX
 from sern_client.factory import named_sections
 from sern_core.message import TopicInfo
+from sern_runtime import clock
 from sern_runtime.config import endpoints as sections
 from sern_runtime.config.client import ClientFile
 from sern_runtime.config.load import Loaded
@@ -64,6 +65,7 @@ class Guard:
         self._topics: dict[int, _Topic] = {}
         self._next_key = 1
         self._process: Process | None = None
+        self._ended_s: float | None = None  # since when none runs, after one had ended
         self._unanswered = 0  # pings since something was heard
         self._task: asyncio.Task[None] | None = None
         self._spawning: asyncio.Task[Process] | None = None
@@ -128,6 +130,8 @@ class Guard:
             self.ready = False
             self._process = None
             self.restarts += 1
+            if self._ended_s is None:
+                self._ended_s = clock.now()
             _log.error(
                 "the guard of the command topics has ended (%s); started again in %g s; until then a held-up client "
                 "stops nothing",
@@ -174,7 +178,13 @@ class Guard:
     def _answered(self, said: dict[str, object]) -> None:
         if "ready" in said:
             self.ready = True
-            _log.info("the guard of the command topics runs as process %d", self._process.pid if self._process else 0)
+            process = self._process.pid if self._process else 0
+            ended_s, self._ended_s = self._ended_s, None
+            if ended_s is None:
+                _log.info("the guard of the command topics runs as process %d", process)
+            else:
+                after_s = clock.now() - ended_s
+                _log.error("the guard of the command topics runs again as process %d, after %.0f s", process, after_s)
         elif "stopped" in said:
             self.stopped += 1
 

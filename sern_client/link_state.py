@@ -12,7 +12,7 @@ from typing import Final, Protocol
 
 from sern_client.link_topics import LinkTopics, LinkView
 from sern_core.client import ClientCore
-from sern_core.peers import PeerChange, PeerStatus, PeerView
+from sern_core.peers import MAX_PEERS, PeerChange, PeerStatus, PeerView
 from sern_core.types import ClientName, TopicName
 from sern_runtime import clock
 from sern_runtime.loop import Timer
@@ -61,7 +61,7 @@ class LinkState:
         self._own_up = False
         self._own_since_s = clock.now()
         self._there: set[ClientName] = set()  # of whom that was said
-        self._gone_s: dict[ClientName, float] = {}
+        self._gone_s: dict[ClientName, float] = {}  # who was said to be gone, also when the relay has let go of it
         core.peers.on_change = self._changed
 
     def start(self) -> None:
@@ -95,19 +95,20 @@ class LinkState:
             self._own_now(now)
             names = {peer.name for peer in self._core.look_at_peers(now=now)}
             self._there &= names
-            self._gone_s = {name: since_s for name, since_s in self._gone_s.items() if name in names}
 
     def _changed(self, change: PeerChange) -> None:
         """Also said once where our own link was down in between: of that one line speaks for all."""
         self.soon()
         name, now = change.name, clock.now()
         if change.new is PeerStatus.GONE and name not in self._gone_s:
+            while len(self._gone_s) >= MAX_PEERS:
+                del self._gone_s[next(iter(self._gone_s))]
             self._gone_s[name] = now
             _log.warning("%s is gone: the relay does not reach it any more", name)
         elif change.new is PeerStatus.CONNECTED:
             gone_s = self._gone_s.pop(name, None)
             if gone_s is not None:
-                _log.info("%s is back after %.1f s", name, now - gone_s)
+                _log.warning("%s is back after %.1f s", name, now - gone_s)
             elif name not in self._there:
                 _log.info("%s is there", name)
             self._there.add(name)

@@ -15,7 +15,7 @@ from sern_core.errors import ConfigError
 from sern_core.message import TopicInfo
 from sern_core.peers import PeerStatus
 from sern_core.types import Encoding, TopicName
-from sern_runtime import ros_types
+from sern_runtime import clock, ros_types
 
 STATUS_TYPE: Final = "diagnostic_msgs/msg/DiagnosticStatus"
 ARRAY_TYPE: Final = "diagnostic_msgs/msg/DiagnosticArray"
@@ -90,7 +90,7 @@ class LinkTopics:
         self._advertise = advertise
         self._diagnostics = diagnostics
         self._publishers: dict[TopicName, Publisher] = {}
-        self._problems: dict[TopicName, str] = {}
+        self._problems: dict[TopicName, tuple[str, float]] = {}  # what was said of it last, and since when
         self._seq = 0
 
     @property
@@ -139,11 +139,13 @@ class LinkTopics:
         try:
             publisher = self._publishers[name] = self._advertise(info)
         except ConfigError as error:
-            if self._problems.get(name) != str(error):
-                self._problems[name] = str(error)
+            said, since_s = self._problems.get(name, ("", clock.now()))
+            if said != str(error):
+                self._problems[name] = str(error), since_s
                 _log.warning("the state of the link is not published there (link_state in the file): %s", error)
             return None
-        self._problems.pop(name, None)
+        if (problem := self._problems.pop(name, None)) is not None:
+            _log.warning("%s: the state of the link is published now, after %.0f s", name, clock.now() - problem[1])
         return publisher
 
     def repair(self, names: Collection[TopicName]) -> None:

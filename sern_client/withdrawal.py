@@ -13,6 +13,7 @@ from sern_client.endpoints.base import Publisher
 from sern_core.errors import ConfigError
 from sern_core.message import StreamId, StreamInfo, TopicInfo
 from sern_core.types import ClientName
+from sern_runtime import clock
 
 MAX_KEPT: Final = 10
 """Latched messages of one stream that are kept for the time after: what a late joiner gets at most."""
@@ -49,6 +50,7 @@ class Withdrawal:
         self._streams = streams
         self._advertise = advertise
         self._close = close
+        self._since_s: dict[ClientName, float] = {}  # of origins whose topics were said to end here
 
     def kept(self, stream: StreamInfo) -> Kept | None:
         """Where the latched messages of a stream are to be kept; None: nowhere."""
@@ -66,15 +68,32 @@ class Withdrawal:
                 incoming.withdrawn = origin
                 names.append(incoming.info.name)
         if names:
+            self._since_s.setdefault(origin, clock.now())
             _log.warning("%s is not there: %d of its topics end here until it is", origin, len(names))
 
     def restore(self, origin: ClientName) -> None:
         """Publish its topics again, with what is latched in them."""
         for stream, incoming in self._streams.items():
             if stream.origin == origin and incoming.withdrawn is not None:
-                self.restore_one(incoming)
+                self._restore(incoming)
+        self._restored(origin)
 
     def restore_one(self, incoming: Withdrawable) -> None:
+        """Publish one again that was withdrawn: a message of it came."""
+        origin = incoming.withdrawn
+        self._restore(incoming)
+        if origin is not None:
+            self._restored(origin)
+
+    def _restored(self, origin: ClientName) -> None:
+        """Say so once nothing of it is withdrawn any more."""
+        since_s = self._since_s.get(origin)
+        if since_s is None or any(incoming.withdrawn == origin for incoming in self._streams.values()):
+            return
+        del self._since_s[origin]
+        _log.warning("%s is there again: its topics are published here, after %.0f s", origin, clock.now() - since_s)
+
+    def _restore(self, incoming: Withdrawable) -> None:
         try:
             publisher = self._advertise(incoming.info)
         except ConfigError as error:

@@ -99,6 +99,7 @@ class RelayDaemon:
         self.refusals = dict.fromkeys((*sorted(REFUSAL_CODES), OTHER_CODE), 0)
         self.reloads_failed = 0
         self._unreloaded: str | None = None  # what the last reload did not put in force, and why
+        self._unreloaded_s: float | None = None  # since when there is something
         self.hub = Hub(
             name=model.name,
             boot=secrets.randbits(63),
@@ -315,10 +316,10 @@ class RelayDaemon:
         except ConfigError as error:
             self.reloads_failed += 1
             _log.error("reload failed, the old configuration stays: %s", error)
-            self._unreloaded = f"reload failed, the old configuration stays: {error}"
+            self._not_in_force(f"reload failed, the old configuration stays: {error}")
             self.notifier.ready(self._status())
             return
-        failed_before, self._unreloaded = self._unreloaded is not None, None
+        self._unreloaded = None
         log_warnings(_log, loaded.warnings)
         self.directory = directory
         now = clock.now()
@@ -334,9 +335,15 @@ class RelayDaemon:
             self.hub.forget(client, "the name is revoked", now=now)
         self._after()
         self.notifier.ready(self._status())
-        if failed_before and self._unreloaded is None:
-            _log.error("the reload works again: what had failed before is in force")
+        if self._unreloaded is None and self._unreloaded_s is not None:
+            failed_s, self._unreloaded_s = now - self._unreloaded_s, None
+            _log.error("the reload works again: what had failed before is in force, after %.0f s", failed_s)
         _log.info("reloaded keys, access rules and feed roles; other changes need a restart")
+
+    def _not_in_force(self, problem: str) -> None:
+        if self._unreloaded_s is None:
+            self._unreloaded_s = clock.now()
+        self._unreloaded = problem
 
     def _make_http(self, listen: str) -> HttpServer:
         registry = CollectorRegistry()
@@ -420,7 +427,7 @@ class RelayDaemon:
             self.feed.update(model.feed_roles(), now=now)
         except ConfigError as error:
             self.reloads_failed += 1
-            self._unreloaded = f"reload failed in part, not all of feed.roles are in force: {error}"
+            self._not_in_force(f"reload failed in part, not all of feed.roles are in force: {error}")
             _log.error("%s: feed.roles: not all of them are in force: %s", self.loaded.path, error)
 
     def _transforms_refused(self) -> list[tuple[tuple[str, ...], float]]:

@@ -7,6 +7,8 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Final
 
+from sern_runtime import clock
+
 _log = logging.getLogger(__name__)
 _MAX_STATUS_CHARS: Final = 500
 
@@ -86,6 +88,7 @@ class Watchdog:
         self._notifier = notifier
         self._progress = dict(progress)
         self._seen = {name: read() for name, read in self._progress.items()}
+        self._stuck_s = 0.0  # since when some part is
 
     @property
     def interval_s(self) -> float | None:
@@ -97,8 +100,12 @@ class Watchdog:
         now = {name: read() for name, read in self._progress.items()}
         stuck = tuple(name for name, value in now.items() if value == self._seen[name])
         self._seen = now
+        if stuck and not self.stuck:
+            self._stuck_s = clock.now()
         if stuck and stuck != self.stuck:
             _log.error("no progress in %s: the watchdog is not pinged", ", ".join(stuck))
+        elif self.stuck and not stuck:
+            _log.error("progress again everywhere, after %.0f s: the watchdog is pinged", clock.now() - self._stuck_s)
         self.stuck = stuck
         if stuck:
             return False

@@ -38,13 +38,15 @@ UNFINISHED: Final = (
     "is very slow, or what listens there is no relay"
 )
 SHUT: Final = (
-    "the connection was closed before anything was said on it: the relay is full, or what listens there is no relay"
+    "the connection was closed before a relay's greeting came: the relay is full, or what listens there is no relay"
 )
 ENDED: Final = "the relay ended the handshake: its key is not the one in server_key_file, or it is full"
 CUT: Final = (
-    "the connection was closed during the handshake: the relay's key is not the one in server_key_file, it is full, or "
-    "what listens there is no relay"
+    "the connection was closed during the handshake: what listens there is no relay, the relay is full, or its key is "
+    "not the one in server_key_file"
 )
+"""Where it is not known how much came: a port that just closes and a wrong key look the same, so the key is the last
+guess."""
 OTHER: Final = "what listens there is no relay: it does not speak ZeroMQ's protocol"
 
 _ZAP_UNKNOWN_KEY: Final = 400
@@ -172,11 +174,11 @@ class TransportWatch:
 
 def _unfinished(number: int, received: int | None) -> str:
     """Why a handshake has no end: libzmq's errno, and how many bytes came (None: not known)."""
-    silent = received is not None and received <= 1  # one for the end of the stream
     greeted = received is not None and received >= GREETING_BYTES
     if number == errno.EAGAIN:  # its time was over
+        silent = received is not None and received <= 1  # one for the end of the stream
         return SILENT if silent else HALF_WAY if greeted else UNFINISHED
-    return SHUT if silent else ENDED if greeted else CUT
+    return CUT if received is None else ENDED if greeted else SHUT
 
 
 def _protocol_problem(code: int) -> str:

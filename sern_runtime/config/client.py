@@ -11,6 +11,7 @@ from pydantic import Discriminator, Field, Tag, model_validator
 from sern_core.codecs import Compression
 from sern_core.lossy import DEFAULT_LOSSY, LossyParams
 from sern_core.message import DEFAULT_RELIABLE_QUEUE_BYTES
+from sern_core.objects import COMMAND_OBJECT_TYPES
 from sern_core.patterns import MAX_CLIENT_PROGRAM, PatternError, PatternSet, compile_pattern
 from sern_core.rules import (
     AUTO,
@@ -152,6 +153,8 @@ class LossSection(Section):
 
 _COMMAND: Final = re.compile("cmd|command|joy|teleop|twist", re.IGNORECASE)
 """What the names of command topics have in them."""
+_COMMAND_TYPE: Final = re.compile("Twist|AckermannDrive|JointJog|JointTrajectory")
+"""What patterns have in them that are of types of commands, and not of whatever there is."""
 
 
 class TopicSection(Section):
@@ -244,7 +247,7 @@ class TopicSection(Section):
         if self.on_link_loss is not None:
             if self.direction is Direction.SEND:
                 raise fault("acts where commands arrive; direction is send", "on_link_loss")
-            if self.type is not None and not self._takes_commands():
+            if self.type is not None and not self._takes(COMMAND_TYPES):
                 allowed = ", ".join(sorted(COMMAND_TYPES))
                 raise fault(f"is only for {allowed}; type {self.type!r} matches neither", "on_link_loss")
         return self
@@ -257,9 +260,18 @@ class TopicSection(Section):
             return f"lets a command wait for up to {1.0 / (self.max_rate_hz or 1.0):.3g} s; leave it out"
         return None
 
-    def _takes_commands(self) -> bool:
+    @property
+    def commands(self) -> bool:
+        """Whether what it names can move a robot, whatever its class, as far as the file tells."""
+        if self.priority == "control" or self.on_link_loss is not None or _COMMAND.search(self.match):
+            return True
+        named = self.type is not None and _COMMAND_TYPE.search(self.type) is not None
+        return named and self._takes(COMMAND_OBJECT_TYPES)
+
+    def _takes(self, types: frozenset[str]) -> bool:
+        """Whether it is for one of these types, in either spelling."""
         pattern = compile_pattern(self.type or ".*")
-        spellings = [name for plain in COMMAND_TYPES for name in (plain, plain.replace("/", "/msg/"))]
+        spellings = [name for plain in types for name in (plain, plain.replace("/", "/msg/"))]
         return any(pattern.fullmatch(name) for name in spellings)
 
     def rule(self) -> TopicRule:
@@ -492,7 +504,7 @@ class ClientFile(FileModel):
             yield from endpoint.file_problems(base_dir, ("endpoint", index) if several else ("endpoint",))
         yield from self._pattern_problems()
         for index, section in enumerate(self.topics):
-            if section.priority == "control":
+            if section.commands:
                 at, reliable = ("topics", index, "lifespan_s"), section.reliability == "reliable"
                 yield from lifespan_problem(section.lifespan_s, at, reliable=reliable)
             if section.max_rate_hz is not None and (problem := section.rate_problem()) is not None:

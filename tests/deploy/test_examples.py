@@ -7,6 +7,9 @@ import pytest
 
 from sern_core.access import AccessTable
 from sern_core.message import TopicInfo
+from sern_core.mmcf.cost import profile
+from sern_core.mmcf.policy import Mmcf
+from sern_core.patterns import compile_pattern
 from sern_core.rules import Direction
 from sern_core.types import ClientName, Encoding, PriorityClass, TopicName
 from sern_runtime.config.client import ClientFile, load_client
@@ -49,6 +52,22 @@ def test_is_accepted(name: str) -> None:
     model = client(name)
     assert model.relay.endpoint == "tcp://relay.example:5555"
     assert model.http.listen is not None and model.http.listen.startswith("127.0.0.1:")
+
+
+@pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.yaml")), ids=lambda path: path.stem)
+def test_it_adapts_and_never_thins_a_command(path: Path) -> None:
+    """As docs/adaptation.md says of the ready-made files, relay, robots and sites alike."""
+    relay = path.name == "relay.yaml"
+    loaded = load_relay(path, files=False) if relay else load_client(path, files=False)
+    section = loaded.model.adaptation
+    assert section is not None
+    assert (section.policy, section.cost_weights(), section.floor_shares()) == (
+        "mmcf", profile("teleoperation"), (1.0, 1.0, 1.0),
+    )  # fmt: skip
+    assert section.rates.control == (1.0,) and section.limits.min_rates.control == 1.0
+    assert min(section.rates.bulk) < 1.0, "there is something to choose"
+    policy = section.make_policy(encodes=not relay)()
+    assert isinstance(policy, Mmcf) and len(policy.predictor.grid) > 1
 
 
 @pytest.mark.parametrize("name", NOETIC)
@@ -122,6 +141,24 @@ def test_the_relay_lets_through_what_a_client_needs(name: str) -> None:
     for topic in ("/cmd_vel", "/move_base/goal", "/dock/_call/site1"):
         assert table.may_subscribe(own, TopicName(robot + topic))
     assert not table.may_subscribe(own, TopicName("/other1/cmd_vel"))
+
+
+@pytest.mark.parametrize("name", ["site-noetic.yaml", "site-jazzy.yaml"])
+def test_a_site_takes_what_its_operator_drives_by(name: str) -> None:
+    """Where a robot is and how it leans, of each that there is a file for; what is heavy only in its summaries."""
+    patterns = [compile_pattern(text) for text in client(name).subscribe]
+
+    def takes(topic: str) -> bool:
+        return any(pattern.fullmatch(topic) for pattern in patterns)
+
+    for robot in ("jackal1", "husky1"):
+        for topic in ("odometry/filtered", f"{robot[:-1]}_velocity_controller/odom", "fix", "imu/data", "map"):
+            assert takes(f"/{robot}/{topic}"), topic
+        assert not takes(f"/{robot}/mid/points") and takes(f"/{robot}/mid/points/voxel")
+        assert not takes(f"/{robot}/front/image_raw/compressed")
+    if name == "site-jazzy.yaml":
+        for topic in ("platform/odom/filtered", "platform/odom", "sensors/gps_0/fix", "sensors/imu_0/data", "map"):
+            assert takes(f"/a200_0000/{topic}"), topic
 
 
 def test_no_example_caps_a_command() -> None:

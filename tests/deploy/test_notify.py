@@ -98,3 +98,13 @@ async def test_the_client(tmp_path: Path, systemd: Systemd) -> None:
         await until(lambda: systemd.status("link up"), "says that the link is up")
         assert systemd.count("STOPPING=1") == 0
         await ends(client, systemd)
+
+
+async def test_a_client_whose_relay_has_no_address(tmp_path: Path, systemd: Systemd) -> None:
+    async with Lab(tmp_path, "site") as lab:
+        relay = {"endpoint": f"tcp://no..host:{lab.port}"}  # no name server is asked for what is no name
+        client = lab.process(lab.recorder_file("site", "/.*", relay=relay))
+        down = "STATUS=link down: the relay's name no..host does not resolve: "
+        await until(lambda: systemd.status("link down") and systemd.last_status.startswith(down), "says why")
+        assert client.get("/readyz")[1].startswith(down.removeprefix("STATUS=link down: "))
+        await ends(client, systemd)

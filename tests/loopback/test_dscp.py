@@ -2,16 +2,18 @@
 
 import asyncio
 import socket as socketlib
-from collections import Counter
+import struct
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import pytest
 from pydantic import ValidationError
 
+from sern_client.daemon import ClientDaemon
 from sern_core.lanes import LANE_UDP
 from sern_core.message import TopicInfo, TopicSpec
 from sern_core.types import ClientName, Encoding, PriorityClass, TopicName
+from sern_relay.daemon import RelayDaemon
 from sern_runtime import clock
 from sern_runtime.config.shared import DscpSection
 from sern_runtime.dscp import Marks
@@ -27,6 +29,8 @@ from tests.support import until
 
 INSIDE = "127.0.0.2"
 EF, CS0, CS1 = 46 << 2, 0, 8 << 2
+IPV4, ETHERNET_BYTES, UDP_BYTES = 0x0800, 14, 8
+"""EtherType, and the headers before and behind that of IP."""
 
 
 def listening(host: str, port: int = 0) -> socketlib.socket:
@@ -122,76 +126,152 @@ async def test_each_datagram_has_the_mark_it_was_sent_with(host: str) -> None:
         far.close()
 
 
-async def test_the_classes_of_a_session_are_marked_both_ways(tmp_path: Path) -> None:
-    """Bulk fills datagrams of 1200 bytes, class control sends messages of 300 bytes: the sizes tell them apart."""
+class Capture:
+    """Sees every packet of `HOST`:port as it is on the wire of the loopback interface, and notes the IP byte and the
+    size of the datagrams to and from there. Needs root."""
+
+    def __init__(self, port: int) -> None:
+        self.up: list[tuple[int, int]] = []
+        self.down: list[tuple[int, int]] = []
+        self._port = port
+        # Of this protocol only packets that come in are told, so none is seen twice.
+        self._socket = socketlib.socket(socketlib.AF_PACKET, socketlib.SOCK_RAW, socketlib.htons(IPV4))
+        self._socket.setblocking(False)
+        self._socket.bind(("lo", IPV4))
+        asyncio.get_running_loop().add_reader(self._socket, self._readable)
+
+    def _readable(self) -> None:
+        while True:
+            try:
+                packet = memoryview(self._socket.recv(65536))[ETHERNET_BYTES:]
+            except BlockingIOError:
+                return
+            header_bytes = (packet[0] & 0xF) * 4
+            if packet[9] != socketlib.IPPROTO_UDP:
+                continue
+            source, target, nbytes = struct.unpack_from(">HHH", packet, header_bytes)
+            for port, way in ((target, self.up), (source, self.down)):
+                if port == self._port:
+                    way.append((packet[1], nbytes - UDP_BYTES))
+
+    def close(self) -> None:
+        asyncio.get_running_loop().remove_reader(self._socket)
+        self._socket.close()
+
+
+Seen = dict[PriorityClass, tuple[set[int], set[int]]]
+
+
+async def marks_by_class(robot: ClientDaemon, relay: RelayDaemon, tap: Tap | Capture) -> Seen:
+    """The IP bytes of a session's datagrams by class, up and down, as `tap` saw them. Bulk fills datagrams of 1200
+    bytes, class control sends messages of 300 bytes: the sizes tell them apart."""
+    await until(lambda: robot.core.link.lane.id == LANE_UDP, "datagrams are used")
+    hub = relay.hub
+    hub.tap = lambda _stream: True
+    now = clock.now()
+    channels = {}
+    for priority in PriorityClass:
+        info = TopicInfo(TopicName(f"/robot1/{priority.name.lower()}"), "std_msgs/msg/String", Encoding.CDR)
+        channels[priority] = robot.core.publish(info, TopicSpec(priority, depth=1000), now=now)
+    hub.refresh_interest(now=now)
+    robot.core.subscribe(("/feed/.*",), now=now)
+    down = {
+        priority: hub.open_local(
+            TopicInfo(TopicName(f"/feed/{priority.name.lower()}"), "std_msgs/msg/String", Encoding.CDR),
+            TopicSpec(priority, depth=1000),
+            ClientName("feed_x"),
+            now=now,
+        )
+        for priority in PriorityClass
+    }
+    await until(lambda: all(channel.wanted for channel in channels.values()), "all are wanted")
+
+    def clear() -> None:
+        tap.up.clear()
+        tap.down.clear()
+
+    def enough() -> bool:
+        """Sends one message each way; whether 40 datagrams that must hold such came through, each way."""
+        body = b"x" * nbytes
+        robot.core.send(channels[priority], body, 0, now=clock.now())
+        hub.inject(down[priority], body, 0, now=clock.now())
+        robot._kick()
+        relay._after()
+        return all(sum(size > least for _, size in way) >= 40 for way in (tap.up, tap.down))
+
+    def quiet() -> bool:
+        """Whether nothing of the class before is still to come."""
+        links = (robot.core.link, hub.links[ClientName("robot1")])
+        mine = [channel for link in links for channel in link.channels.values()]
+        return not any(channel.queue or channel.flying for channel in mine)
+
+    seen: Seen = {}
+    clear()
+    for priority, nbytes in ((PriorityClass.CONTROL, 300), (PriorityClass.STATE, 500), (PriorityClass.BULK, 20_000)):
+        least = min(nbytes, 1000)
+        await until(enough, f"datagrams of class {priority.name}")
+        up, back = ({tos for tos, size in way if size > least} for way in (tap.up, tap.down))
+        seen[priority] = (up, back)
+        await until(quiet, f"all of class {priority.name} has come")
+        clear()
+    return seen
+
+
+DSCP: Final[dict[str, Any]] = {"control": "cs5", "state": 18, "bulk": "le"}
+
+
+@pytest.mark.parametrize(
+    ("ours", "theirs", "up", "down"),
+    [
+        ({}, {}, (EF, CS0, CS1), (EF, CS0, CS1)),
+        ({"dscp": DSCP}, {"dscp": {"state": "af41"}}, (40 << 2, 18 << 2, 1 << 2), (EF, 34 << 2, CS1)),
+    ],
+    ids=["as they come", "of the file"],
+)
+async def test_the_classes_of_a_session_are_marked_both_ways(
+    tmp_path: Path, ours: dict[str, Any], theirs: dict[str, Any], up: tuple[int, ...], down: tuple[int, ...]
+) -> None:
+    """`ours` is the client's section `link`, `theirs` the relay's: each end marks what it sends."""
     (port,) = free_ports(1)
     async with Lab(tmp_path, "robot1", relay_port=port) as lab:
-        relay = await lab.relay()
+        relay = await lab.relay(lab.relay_file(link=theirs))
         tap = Tap(port)
         forward = await asyncio.start_server(_pipe_to(port), INSIDE, port)
         try:
             there = {"endpoint": f"tcp://{INSIDE}:{port}"}
-            robot = await lab.connected(
-                lab.client_file("robot1", {"kind": "synthetic", "role": "operator"}, relay=there)
-            )
-            await until(lambda: robot.core.link.lane.id == LANE_UDP, "datagrams are used")
-            hub = relay.hub
-            hub.tap = lambda _stream: True
-            now = clock.now()
-            channels = {}
-            for priority in PriorityClass:
-                info = TopicInfo(TopicName(f"/robot1/{priority.name.lower()}"), "std_msgs/msg/String", Encoding.CDR)
-                channels[priority] = robot.core.publish(info, TopicSpec(priority, depth=1000), now=now)
-            hub.refresh_interest(now=now)
-            robot.core.subscribe(("/feed/.*",), now=now)
-            down = {
-                priority: hub.open_local(
-                    TopicInfo(TopicName(f"/feed/{priority.name.lower()}"), "std_msgs/msg/String", Encoding.CDR),
-                    TopicSpec(priority, depth=1000),
-                    ClientName("feed_x"),
-                    now=now,
-                )
-                for priority in PriorityClass
-            }
-            await until(lambda: all(channel.wanted for channel in channels.values()), "all are wanted")
-            tap.up.clear()
-            tap.down.clear()
-            sizes = {PriorityClass.CONTROL: 300, PriorityClass.STATE: 500, PriorityClass.BULK: 20_000}
-
-            def enough() -> bool:
-                """Sends one message each way; whether 40 datagrams that must hold such came through, each way."""
-                body = b"x" * sizes[priority]
-                robot.core.send(channels[priority], body, 0, now=clock.now())
-                hub.inject(down[priority], body, 0, now=clock.now())
-                robot._kick()
-                relay._after()
-                return all(sum(size > least for _, size in way) >= 40 for way in (tap.up, tap.down))
-
-            def quiet() -> bool:
-                """Whether nothing of the class before is still to come."""
-                links = (robot.core.link, hub.links[ClientName("robot1")])
-                mine = [channel for link in links for channel in link.channels.values()]
-                return not any(channel.queue or channel.flying for channel in mine)
-
-            seen: dict[PriorityClass, tuple[Counter[int], Counter[int]]] = {}
-            for priority, nbytes in sizes.items():
-                least = min(nbytes, 1000)
-                await until(enough, f"datagrams of class {priority.name}")
-                seen[priority] = (
-                    Counter(tos for tos, size in tap.up if size > least),
-                    Counter(tos for tos, size in tap.down if size > least),
-                )
-                await until(quiet, f"all of class {priority.name} has come")
-                tap.up.clear()
-                tap.down.clear()
-            for priority, mark in zip(PriorityClass, (EF, CS0, CS1), strict=True):
-                for counts in seen[priority]:
-                    assert set(counts) == {mark}, f"{priority.name}: {counts}"
+            operator = {"kind": "synthetic", "role": "operator"}
+            robot = await lab.connected(lab.client_file("robot1", operator, relay=there, link=ours))
+            seen = await marks_by_class(robot, relay, tap)
+            assert seen == {p: ({up[p]}, {down[p]}) for p in PriorityClass}
             await lab.end(robot)
             await lab.end(relay)
         finally:
             forward.close()
             tap.close()
+
+
+@pytest.mark.root
+@pytest.mark.parametrize("dscp", [{}, DSCP], ids=["as they come", "of the file"])
+async def test_the_classes_are_marked_on_the_wire(tmp_path: Path, dscp: dict[str, Any]) -> None:
+    """What a switch sees: the header of each packet, and not what the kernel tells a socket of it."""
+    marks = DscpSection.model_validate(dscp).marks().tos
+    async with Lab(tmp_path, "robot1") as lab:
+        try:
+            capture = Capture(lab.port)
+        except PermissionError as error:
+            pytest.skip(f"packets are captured by root alone: {error.strerror}")
+        try:
+            relay = await lab.relay(lab.relay_file(link={"dscp": dscp}))
+            operator = {"kind": "synthetic", "role": "operator"}
+            robot = await lab.connected(lab.client_file("robot1", operator, link={"dscp": dscp}))
+            seen = await marks_by_class(robot, relay, capture)
+            assert seen == {p: ({marks[p]}, {marks[p]}) for p in PriorityClass}
+            if not dscp:
+                assert (seen[PriorityClass.CONTROL][0], seen[PriorityClass.BULK][0]) == ({46 << 2}, {8 << 2})
+            await lab.end(robot)
+            await lab.end(relay)
+        finally:
+            capture.close()
 
 
 def _pipe_to(port: int) -> Any:

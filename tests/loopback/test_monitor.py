@@ -137,12 +137,13 @@ async def keep(reader: asyncio.StreamReader, writer: asyncio.StreamWriter, says:
     [
         (b"", False, {SILENT}, False),
         (b"", True, {SHUT}, False),
+        (GREETING[:12], True, {SHUT}, False),
         (GREETING, False, {HALF_WAY}, False),
         (GREETING, True, {ENDED}, False),
         (b"HTTP/1.1 400 Bad Request\r\nConnection: close\r\n\r\n", True, {OTHER}, True),
         (b"SSH-2.0-OpenSSH_9.2\r\n", False, {OTHER}, True),
     ],
-    ids=["silent", "shut", "hangs half way", "another key", "http", "ssh"],
+    ids=["silent", "shut", "shut in its greeting", "hangs half way", "another key", "http", "ssh"],
 )
 async def test_what_listens_in_place_of_a_relay_is_told_apart(
     zmq_context: Context, robot_keys: SecretKey, says: bytes, ends: bool, reasons: set[str], dead: bool

@@ -87,6 +87,27 @@ def test_tables_that_cannot_be_compared_end_nothing(caplog: pytest.LogCaptureFix
     assert "could not be compared" in caplog.text
 
 
+def test_what_differed_is_not_said_to_be_right_when_nobody_can_tell(caplog: pytest.LogCaptureFixture) -> None:
+    class Failing(Tables):
+        broken = False
+
+        def validate(self) -> list[Difference]:
+            if self.broken:
+                raise KeyError("a table")
+            return super().validate()
+
+    tables = Failing()
+    tables.found = [ODOM]
+    check = TableCheck(tables, now=0.0)
+    for turn, tables.broken in enumerate((False, False, True, False)):
+        check.tick(now=CHECK_S + turn * CONFIRM_S)
+        assert check.found == [ODOM] * (turn > 0)
+    assert check.total == 1 and "again" not in caplog.text
+    tables.found = []
+    check.tick(now=CHECK_S + 4 * CONFIRM_S)
+    assert caplog.messages[-1] == "what is here is what should be again: /odom, after 15 s"
+
+
 def test_a_repair_that_cannot_be_done_is_tried_again(caplog: pytest.LogCaptureFixture) -> None:
     class Broken(Tables):
         def repair(self, differences: Sequence[Difference]) -> None:

@@ -7,7 +7,9 @@ import pytest
 from sern_core import wire
 from sern_core.access import AccessRule, AccessTable
 from sern_core.errors import WireError
+from sern_core.flight import STALL_MIN_S, STALL_RTTS
 from sern_core.hub import HubParams
+from sern_core.lanes import PING_INTERVAL_S
 from sern_core.message import TopicInfo
 from sern_core.peers import LET_GO_S, MAX_PEERS, PeerChange, Peers, PeerStatus, PeerView
 from sern_core.presence import MAX_TOLD
@@ -18,6 +20,8 @@ from tests.world import SimClient, World, spec
 CONNECTED, GONE, UNKNOWN = PeerStatus.CONNECTED, PeerStatus.GONE, PeerStatus.UNKNOWN
 THIN_BPS = 0.5e6
 OVERLOAD = 13.0
+SWEEP_S = 1.0
+"""How often the relay looks who is silent, in `World` as in the daemon."""
 
 
 def thin(rate_bps: float = THIN_BPS, delay_s: float = 0.025) -> LinkModel:
@@ -125,6 +129,33 @@ def test_a_client_that_does_not_ask_is_told_nothing() -> None:
 # --- who is gone ------------------------------------------------------------------------------------------------------
 
 
+def gone_within_s(rtt_s: float, site_delay_s: float = 0.0) -> tuple[float, float]:
+    """How soon a robot that falls silent is said to be gone at its site, at the least and at the most: four round
+    trips from the last answer, or from the first question after it, until the relay looks and the site hears."""
+    stall_s = max(STALL_MIN_S, STALL_RTTS * rtt_s)
+    return stall_s - rtt_s, rtt_s / 2 + PING_INTERVAL_S + stall_s + SWEEP_S + site_delay_s
+
+
+@pytest.mark.parametrize("lossless", [True, False])
+@pytest.mark.parametrize("rtt_s", [0.01, 0.05, 0.2, 0.5, 1.5])
+def test_how_soon_a_robot_is_gone_depends_on_its_round_trip(rtt_s: float, lossless: bool) -> None:
+    """README: four round trips, half a second at the least, and up to a second and a half."""
+    world = World(lossless=lossless)
+    model = LinkModel(delay_s=rtt_s / 2, blackouts=(Window(20.0, 60.0),))
+    robot = world.client("robot", model.as_stream() if lossless else model)
+    site = world.client("site", thin(), patterns=["/robot/.*"])
+    odom = robot.publish("/robot/odom", spec())
+    robot.every(0.1, odom, b"o")
+    world.run(20.0)
+    assert statuses(site) == {"robot": CONNECTED}
+    taken_s = world.until(lambda: statuses(site) == {"robot": GONE})
+    measured_s = world.relay.hub.links[robot.name].lane.flight.rtt.srtt_s
+    assert measured_s == pytest.approx(rtt_s, abs=0.02)
+    low_s, high_s = gone_within_s(measured_s, 0.025)
+    assert low_s < taken_s < high_s + 0.01
+    assert high_s <= 1.5 + max(0.5, 4 * rtt_s) + rtt_s / 2 + 0.1
+
+
 @pytest.mark.parametrize("lossless", [True, False])
 def test_a_robot_that_falls_silent_is_gone_and_comes_back(lossless: bool) -> None:
     world = World(lossless=lossless)
@@ -136,7 +167,7 @@ def test_a_robot_that_falls_silent_is_gone_and_comes_back(lossless: bool) -> Non
     world.run(9.9)
     assert statuses(site) == {"robot": CONNECTED}
     start_s = world.network.now
-    assert world.until(lambda: statuses(site) == {"robot": GONE}) <= 2.5
+    assert world.until(lambda: statuses(site) == {"robot": GONE}) <= gone_within_s(0.06, 0.02)[1]
     world.run(5.0)
     view = peers(site)["robot"]
     assert view.age_s == pytest.approx(world.network.now - start_s - 0.1, abs=0.2)

@@ -157,6 +157,7 @@ def test_warnings_go_to_standard_error(deployed: Path) -> None:
         assert err.startswith("warning: ") and "chmod 600" in err
 
 
+WAITS = "topics.0.lifespan_s: lets a command wait for up to 120 s, and then a robot moves by it; leave it out, or "
 HERE = "client: {name: jackal1}\nrelay: {endpoint: 'tcp://127.0.0.1:5555', insecure: true}\n"
 ENDPOINT = "endpoint: {kind: synthetic, role: robot}\n"
 
@@ -174,6 +175,26 @@ ENDPOINT = "endpoint: {kind: synthetic, role: robot}\n"
             "5: topics.0.lifespan_s: lets a command wait for ever, and then a robot moves by it; leave it out, or "
             "write a second or less",
         ),
+        *(
+            (ENDPOINT + f"topics:\n  - {{{rule}, lifespan_s: 120}}\n", f"5: {WAITS}write a second or less")
+            for rule in (
+                "match: /robot/cmd_vel",
+                "match: '.*/joy_teleop', class: state",
+                "match: /drive, on_link_loss: {publish: zero, after_s: 0.5}",
+                "match: /drive, type: geometry_msgs/Twist",
+                "match: /drive, type: 'geometry_msgs/(msg/)?Twist(Stamped)?'",
+                "match: /drive, class: state, type: ackermann_msgs/msg/AckermannDrive",
+                "match: /drive, type: 'ackermann_msgs/AckermannDrive.*'",
+            )
+        ),
+        *(
+            (ENDPOINT + f"topics:\n  - {{{rule}, lifespan_s: 120}}\n", "")
+            for rule in (
+                "match: /map, type: 'nav_msgs/.*'",
+                "match: '.*', type: 'geometry_msgs/.*'",  # whatever there is
+                "match: /velocity, type: geometry_msgs/TwistWithCovarianceStamped",  # where it is, not where it shall
+            )
+        ),
         (ENDPOINT + "topics:\n  - {match: /stop, class: control, reliability: reliable, lifespan_s: null}\n", ""),
         (ENDPOINT + "topics:\n  - {match: /map, class: state, lifespan_s: 600}\n", ""),
         (
@@ -190,6 +211,26 @@ ENDPOINT = "endpoint: {kind: synthetic, role: robot}\n"
             "4: discovery.deny.0: 'rosout' matches no topic: names begin with '/'; /rosout?",
         ),
         (
+            ENDPOINT + "discovery: {allow: ['/odom', odom]}\n",
+            "4: discovery.allow.1: 'odom' matches no topic: names begin with '/'; /odom?",
+        ),
+        *(
+            (
+                ENDPOINT + f"{key}:\n  {word}:\n    - match: move_base\n",
+                f"6: {key}.{word}.0.match: 'move_base' matches no topic: names begin with '/'; /move_base?",
+            )
+            for key in ("services", "actions")
+            for word in ("offer", "use")
+        ),
+        (
+            "endpoint: {kind: bag, path: f.yaml, topics: [odom]}\n",
+            "3: endpoint.topics.0: 'odom' matches no topic: names begin with '/'; /odom?",
+        ),
+        (
+            "endpoint:\n- {kind: synthetic, role: robot}\n- {kind: bag, path: f.yaml, deny: ['/a', 'camera/.*']}\n",
+            "5: endpoint.1.deny.1: 'camera/.*' matches no topic: names begin with '/'; /camera/.*?",
+        ),
+        (
             "endpoint: {kind: zenoh}\n",
             "3: endpoint.kind: needs the Python package zenoh, which is not on this machine: pip install eclipse-zenoh",
         ),
@@ -197,6 +238,11 @@ ENDPOINT = "endpoint: {kind: synthetic, role: robot}\n"
             "endpoint: {kind: dds}\n",
             "3: endpoint.kind: needs the Python package cyclonedds, which is not on this machine: "
             "pip install cyclonedds==11.0.1",
+        ),
+        (
+            "endpoint: {kind: rclpy}\n",
+            "3: endpoint.kind: needs the Python package rclpy, which is not on this machine: "
+            "source the setup file of a ROS 2 installation",
         ),
     ],
 )
@@ -221,6 +267,33 @@ def test_patterns_and_commands_of_a_relay(deployed: Path) -> None:
     assert code == 0
     assert "publish.0: '{self}/.*' matches no topic: names begin with '/'" in err
     assert err.count("warning") == 1
+
+
+ROLE = "{name: scene, publish_endpoint: 'ipc:///tmp/out', ingest_endpoint: 'ipc:///tmp/in', allow_control: true, "
+
+
+@pytest.mark.parametrize(
+    ("role", "said"),
+    [
+        ("subscribe: [odom], publish: [/a]", "subscribe.0: 'odom' matches no topic: names begin with '/'; /odom?"),
+        ("publish: [/a, scene/.*]", "publish.1: 'scene/.*' matches no topic: names begin with '/'; /scene/.*?"),
+        (
+            "publish: [/a], types: [{match: goal, type: geometry_msgs/PoseStamped}]",
+            "types.0.match: 'goal' matches no topic: names begin with '/'; /goal?",
+        ),
+        (
+            "publish: [/a], types: [{match: /a, type: geometry_msgs/Twist, lifespan_s: 120}]",
+            "types.0." + WAITS.partition(".0.")[2] + "write a second or less",
+        ),
+        ("subscribe: [/odom], publish: [/a], types: [{match: /a, type: geometry_msgs/Twist}]", ""),
+    ],
+)
+def test_patterns_and_commands_of_the_roles_of_a_feed(tmp_path: Path, role: str, said: str) -> None:
+    path = tmp_path / "relay.yaml"
+    relay = "relay: {name: hub, listen: ['tcp://127.0.0.1:5555'], insecure: true}\n"
+    path.write_text(f"{relay}feed:\n  roles:\n    - {ROLE}{role}}}\n", encoding="utf-8")
+    code, _, err = ran(path)
+    assert (code, err) == (0, said and f"warning: {path}:4: feed.roles.0.{said}\n")
 
 
 def test_key_files_with_the_name_of_somebody_else(deployed: Path) -> None:

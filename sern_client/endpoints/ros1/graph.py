@@ -22,6 +22,7 @@ from typing import Final, NamedTuple, Protocol
 from sern_client.endpoints.ros1.frames import keep_alive
 from sern_client.endpoints.ros1.master import Master, SystemState
 from sern_client.endpoints.ros1.xmlrpc import CallError, UnreachableError, split_uri
+from sern_runtime import clock
 
 CONNECT_S: Final = 2.0
 LOOK_AGAIN_S: Final = (0.25, 1.0)
@@ -186,7 +187,7 @@ class Graph:
         self._listed: set[Registration] = set()
         self._reconcile_s = 0.0
         self._seen = b""
-        self._problem = ""
+        self._lost_s: float | None = None  # since when there is no master, if that was said
         self._run_id: str | None = None
         self._run_id_s = -RUN_ID_S
         self._now = asyncio.Event()
@@ -262,14 +263,20 @@ class Graph:
                     await asyncio.sleep(GATHER_S)
 
     def _found(self) -> None:
-        if not self.connected:
-            self.connected = True
-            self._problem = ""
+        if self.connected:
+            return
+        self.connected = True
+        lost_s, self._lost_s = self._lost_s, None
+        if lost_s is None:
             _log.info("connected to the ROS master at %s", self._master.uri)
+        else:
+            _log.warning(
+                "connected to the ROS master at %s again, after %.0f s", self._master.uri, clock.now() - lost_s
+            )
 
     def _lost(self, problem: str) -> None:
-        if self.connected or not self._problem:
-            self._problem = problem
+        if self._lost_s is None:
+            self._lost_s = clock.now()
             _log.warning("ROS master: %s; trying again until it works", problem)
         self.connected = False
         self._seen = b""

@@ -18,7 +18,7 @@ from sern_client.endpoints.ros1.server import Inbound
 from sern_client.endpoints.ros1.xmlrpc import CallError, reason, split_uri
 from sern_core.errors import ConfigError, ServiceError, UsageError, WireError
 from sern_core.types import Encoding, TopicName
-from sern_runtime import ros_types
+from sern_runtime import clock, ros_types
 
 PROBE_S: Final = 5.0
 PROBE_AGAIN_S: Final = (0.25, 10.0)
@@ -63,6 +63,7 @@ class Provider:
         self._owner = owner
         self._task: asyncio.Task[None] | None = None
         self._said = ""
+        self._failed_s = 0.0  # since when, if something was said
 
     def up(self, uri: str) -> None:
         del uri  # its own address is looked up, because it is not its node's
@@ -86,16 +87,25 @@ class Provider:
                 if BRIDGE_FIELD not in fields or self._owner.heed_sern:
                     self.info = self._describe(fields)
                     self._owner.announce(self)
+                self._answers()
                 return
             except (CallError, WireError, OSError, asyncio.IncompleteReadError, ConfigError) as error:
                 problem = reason(error)
             except TimeoutError:
                 problem = f"no answer within {PROBE_S:g} s"
             if problem != self._said:
+                if not self._said:
+                    self._failed_s = clock.now()
                 self._said = problem
                 _log.warning("%s: service of %s: %s", self.service, self.node_name, problem)
             await asyncio.sleep(pause_s)
             pause_s = min(pause_s * 2, PROBE_AGAIN_S[1])
+
+    def _answers(self) -> None:
+        if self._said:
+            self._said = ""
+            after_s = clock.now() - self._failed_s
+            _log.warning("%s: service of %s answers again, after %.0f s", self.service, self.node_name, after_s)
 
     async def _probe(self) -> dict[str, str]:
         uri = await self._owner.master.service_uri(self.service)

@@ -22,7 +22,7 @@ from sern_client.tf_latch import TfLatch, is_static_tf
 from sern_core.errors import ConfigError, WireError
 from sern_core.message import TopicInfo
 from sern_core.types import DropReason, Encoding, TopicName
-from sern_runtime import ros_types
+from sern_runtime import clock, ros_types
 
 CONNECT_S: Final = 5.0
 BACKOFF_S: Final = (0.1, 5.0)
@@ -132,6 +132,7 @@ class Source:
         """Its messages are wanted now."""
         self._task: asyncio.Task[None] | None = None
         self._said = ""
+        self._failed_s: float | None = None  # since when no connection is accepted, if that was said
         self._too_large = False
 
     def up(self, uri: str) -> None:
@@ -169,9 +170,9 @@ class Source:
                     await self.wake.wait()
                     continue
             except (CallError, WireError, OSError) as error:
-                self.say(reason(error))
+                self._failed(reason(error))
             except TimeoutError:
-                self.say(f"no connection within {CONNECT_S:g} s")
+                self._failed(f"no connection within {CONNECT_S:g} s")
             await asyncio.sleep(pause_s)
             pause_s = min(pause_s * 2, BACKOFF_S[1])
 
@@ -216,10 +217,18 @@ class Source:
 
     def broke(self, error: WireError) -> None:
         """It broke the protocol after its header came, or with it."""
-        self.say(str(error))
+        if self.link is not None and self.link.open:
+            self.say(str(error))
+        else:
+            self._failed(str(error))
         if self.fields is not None:
             self.fields = self.info = None
             self.topic.source_lost(self)
+
+    def _failed(self, problem: str) -> None:
+        """There is no connection, or none that is of use."""
+        if self.say(problem) and self._failed_s is None:
+            self._failed_s = clock.now()
 
     def greet(self, link: _Link, fields: dict[str, str]) -> None:
         """Its header has come: decide whether to stay connected."""
@@ -231,6 +240,10 @@ class Source:
         self.fields = fields
         ours = BRIDGE_FIELD in fields and not self.topic.owner.heed_sern
         self.info = None if ours else self._describe(fields)
+        if self._failed_s is not None:
+            failed_s, self._failed_s, self._said = self._failed_s, None, ""
+            after_s = clock.now() - failed_s
+            _log.warning("%s: publisher %s answers again, after %.0f s", self.topic.topic, self.node_name, after_s)
         self.topic.sources_changed()
         if not self.topic.connects(self):
             link.close()

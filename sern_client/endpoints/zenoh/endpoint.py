@@ -26,12 +26,15 @@ from sern_client.endpoints.zenoh.session import MAX_WAITING_BYTES, SessionOption
 from sern_core.errors import ConfigError, UsageError, WireError
 from sern_core.message import TopicInfo
 from sern_core.types import DropReason, Encoding, TopicName
-from sern_runtime import ros_types
+from sern_runtime import clock, ros_types
+from sern_runtime.outages import Outages
 from sern_runtime.ros_files import TypeFiles
 
 CDR: Final = "application/cdr"
 ROUTER_WAIT_S: Final = 3.0
 """After so long without a router and without a peer we say so."""
+LOOK_S: Final = 1.0
+"""How often it is looked whether there is one."""
 MAX_COMPLAINTS: Final = 256
 FIRST_MESSAGES: Final = 100
 """Messages of a reliable topic that may wait for its first subscribers."""
@@ -75,7 +78,8 @@ class ZenohEndpoint(Services):
         self._started_s = 0.0
         self._open: list[_Declared] = []
         self._said: set[str] = set()
-        self._miss: asyncio.TimerHandle | None = None
+        self._look_again: asyncio.TimerHandle | None = None
+        self._outages = Outages(_log, logging.WARNING, after_s=ROUTER_WAIT_S)
 
     @property
     def encoding(self) -> Encoding | None:
@@ -105,7 +109,7 @@ class ZenohEndpoint(Services):
         except self.session.zenoh.ZError as error:
             await self.session.close()
             raise ConfigError(f"zenoh: {ros_types.one_line(error)}") from None
-        self._miss = self._loop.call_later(ROUTER_WAIT_S, self._miss_others)
+        self._look_for_others()
 
     def _join(self) -> None:
         session = self.session.opened
@@ -118,17 +122,19 @@ class ZenohEndpoint(Services):
             f"{names.SPACE}/{self.options.domain}/**", self._token, history=True
         )
 
-    def _miss_others(self) -> None:
-        info = self.session.opened.info
-        if not info.routers_zid() and not info.peers_zid():
-            _log.warning(
-                "nobody answers at %s; is the router (rmw_zenohd) running there? Trying again until it works",
-                ", ".join(self.options.session.connect),
-            )
+    def _look_for_others(self) -> None:
+        """Say that nobody is there, and when somebody is again."""
+        info, there = self.session.opened.info, ", ".join(self.options.session.connect)
+        self._outages.look(
+            there, lost=not info.routers_zid() and not info.peers_zid(), now=clock.now(),
+            gone=f"nobody answers at {there}; is the router (rmw_zenohd) running there? Trying again until it works",
+            back=f"somebody answers at {there} now",
+        )  # fmt: skip
+        self._look_again = self._loop.call_later(LOOK_S, self._look_for_others)
 
     async def stop(self) -> None:
-        if self._miss is not None:
-            self._miss.cancel()
+        if self._look_again is not None:
+            self._look_again.cancel()
         for declared in list(self._open):
             declared.close()
             declared.hurry()
