@@ -14,7 +14,7 @@ help:
 	@echo "make test     every test;  make lint, make types: static checks"
 	@echo "make explore  the tests with random input, with new cases and ten times as many; SEED=... repeats a run"
 	@echo "make lab      the whole matrix of bad links, and the longer runs over tc netem, which need root"
-	@echo "make performance   as root: measure docs/performance.md anew, 20 minutes of a machine that does nothing else"
+	@echo "make performance   as root: measure link, fleet and policies of docs/performance.md anew, 26 minutes of an idle machine"
 	@echo "make bench    the quick benchmarks;  make schemas: regenerate schemas/ and the configuration reference"
 
 $(VENV)/.ready: pyproject.toml constraints.txt
@@ -56,7 +56,9 @@ bench: setup
 	$(BIN)/python -m benchmarks.scheduler --quick
 	$(BIN)/python -m benchmarks.relay --quick
 
+# Whatever a step lacks is told before the first begins.
 performance: setup
+	$(BIN)/python -m benchmarks.ready
 	mkdir -p build
 	$(BIN)/python -m benchmarks.link --plots docs/images --json build/link.json
 	$(BIN)/python -m benchmarks.robots --figure docs/images/perf-robots.png --json build/robots.json
