@@ -11,7 +11,7 @@ from ruamel.yaml import YAML
 
 from sern_relay.udp import udp_endpoints
 from sern_runtime.config.base import split_tcp
-from sern_runtime.profiles import load_profiles
+from sern_runtime.profiles import load_profile
 from sern_sim.netem import netem_commands
 from sern_tools.commands import app
 from tests.daemons import Lab
@@ -64,7 +64,7 @@ def test_what_is_installed_is_there() -> None:
 
 
 def test_the_netem_line_is_the_profile() -> None:
-    profile = load_profiles(ROOT / "deploy" / "netem" / "profiles.yaml")["field-wifi"]
+    profile = load_profile("field-wifi")
     expected = netem_commands(profile, "eth0")
     assert [shlex.join(["sudo", *shlex.split(line)]) for line in expected] == [
         shlex.join(words) for words in commands("deploy/README.md") if words[:4] == ["sudo", "tc", "qdisc", "replace"]
