@@ -9,7 +9,6 @@ import argparse
 import sys
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 from time import process_time
 from typing import Final
 
@@ -17,6 +16,7 @@ import numpy as np
 from rosbags.highlevel import AnyReader
 
 from benchmarks.common import Report, main, pin_cpu
+from benchmarks.recordings import DATA, DRIVE, SCANS
 from sern_client.endpoints.clouds import cloud_body, read_ply
 from sern_core import lossy
 from sern_core.codecs import LOSSLESS, LOSSY, Codec, Compression, LossyTopic, decode, encode
@@ -24,9 +24,7 @@ from sern_core.lossy import DEFAULT_LOSSY, IMAGE_TYPE
 from sern_core.types import Encoding
 from sern_runtime import ros_types
 
-DATA: Final = Path(__file__).resolve().parents[2] / "shared" / "data"
-BAGS: Final = {"husky": "husky_gps_imu_odom.bag", "jackal": "jackal_imu_odom.bag"}
-SCANS: Final = ("lidar_scan_a.ply", "lidar_scan_b.ply")
+BAGS: Final = {"husky": DRIVE, "jackal": "jackal_imu_odom.bag"}
 MESSAGES: Final = 400
 CAP_BYTES: Final = 64 << 20
 BUDGET_S: Final = 0.4

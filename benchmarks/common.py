@@ -195,6 +195,26 @@ def positive(text: str) -> int:
     return value
 
 
+def seconds(text: str) -> float:
+    """A time above 0, for arguments."""
+    value = float(text)
+    if not 0 < value < inf:
+        raise argparse.ArgumentTypeError(f"{text} is not a time above 0")
+    return value
+
+
+def repetition_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options for who wants another precision than the usual and that of --quick; see `repetitions`."""
+    parser.add_argument("--rounds", type=positive, metavar="N", help="measure everything so often")
+    parser.add_argument("--seconds", type=seconds, metavar="S", help="measure so long each time")
+
+
+def repetitions(options: argparse.Namespace, usual: tuple[int, float], quick: tuple[int, float]) -> tuple[int, float]:
+    """(rounds, seconds of each) by --quick, --rounds and --seconds."""
+    rounds, duration_s = quick if options.quick else usual
+    return options.rounds or rounds, options.seconds or duration_s
+
+
 T95: Final = (
     12.71,
     4.30,

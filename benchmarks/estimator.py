@@ -9,7 +9,8 @@ goodput as the share of what the link can carry beside the poses, headers and lo
 import argparse
 import sys
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import partial
 from math import inf
 from time import perf_counter
 from typing import Final
@@ -283,8 +284,10 @@ def steady(case: Case, make: Maker, seed: int) -> tuple[float, float, float]:
     return percentile(delays, 0.5) / floor, percentile(delays, 0.99) / floor, goodput
 
 
-def run_steady(report: Report, seeds: range) -> None:
+def run_steady(report: Report, seeds: range, cases: Sequence[str]) -> None:
     for case in STEADY:
+        if case[0] not in cases:
+            continue
         systems = {"fixed 25 kB": FIXED, **SYSTEMS} if "Mbit/s 50" in case[0] or "same" in case[0] else SYSTEMS
         for name, make in systems.items():
             runs = [steady(case, make, seed) for seed in seeds]
@@ -388,43 +391,81 @@ def run_cost(report: Report) -> None:
         report.row("one acknowledgement", name, cost_us=1e6 * (perf_counter() - began_s) / count)
 
 
+PARTS: Final = ("steady", "changes", "company", "cost", "grid")
+
+
 def run(options: argparse.Namespace, report: Report) -> None:
     seeds = range(1, 2) if options.quick else range(1, 4)
-    run_steady(report, seeds)
-    run_changes(report)
-    run_company(report, seeds)
-    run_cost(report)
-    if not options.quick:
+    parts = options.parts or (PARTS[:-1] if options.quick else PARTS)
+    if "steady" in parts:
+        run_steady(report, seeds, options.cases)
+    if "changes" in parts:
+        run_changes(report)
+    if "company" in parts:
+        run_company(report, seeds)
+    if "cost" in parts:
+        run_cost(report)
+    if "grid" in parts:
         run_grid(report)
-        report.reach(
-            "grid: cases within limits",
-            report.value("grid 0.25-50 Mbit/s, 5-1000 ms", "hybrid", "passed_share"),
-            1.0,
-            at_least=True,
-        )
     report.note(f"virtual time, seeds {seeds.start} to {seeds.stop - 1}; p99 and goodput are the worst seed's")
+    if len(parts) < len(PARTS):
+        report.note(f"measured alone: {', '.join(parts)}")
+    for part, reach in (
+        ("steady", partial(_steady_reaches, cases=options.cases)),
+        ("changes", _change_reaches),
+        ("company", _company_reaches),
+        ("cost", _cost_reach),
+        ("grid", _grid_reach),
+    ):
+        if part in parts:
+            reach(report)
+
+
+def _steady_reaches(report: Report, *, cases: Sequence[str]) -> None:
     for case, p50, p99, share in (
         ("4 Mbit/s 50 ms", 1.10, 1.25, 0.97),
         ("same, stream", 1.15, 1.40, 0.97),
         ("same, 2 % loss", inf, 1.35, 0.90),
         ("20 Mbit/s 200 ms", inf, 1.50, 0.95),
     ):
+        if case not in cases:
+            continue
         if p50 < inf:
             report.reach(f"{case}: pose p50 / floor", report.value(case, "hybrid", "p50_x"), p50)
         report.reach(f"{case}: pose p99 / floor", report.value(case, "hybrid", "p99_x"), p99)
         report.reach(f"{case}: goodput", report.value(case, "hybrid", "goodput_share"), share, at_least=True)
+
+
+def _change_reaches(report: Report) -> None:
     report.reach("step down, s", report.value("step 8 to 1 Mbit/s", "hybrid", "settled_s"), 0.5)
     report.reach("step up, s", report.value("step 1 to 4 Mbit/s", "hybrid", "settled_s"), 1.0)
     for gap in ("10", "30"):
         report.reach(f"pose after blackout {gap} s, s", report.value(f"blackout {gap} s", "hybrid", "first_s"), 0.3)
+
+
+def _company_reaches(report: Report) -> None:
     for rate in ("4", "20"):
         fairness = report.value(f"{rate} Mbit/s with itself", "hybrid", "fairness_x")
         report.reach(f"{rate} Mbit/s: fairness of two", fairness, 0.95, at_least=True)
         for rival in ("cubic", "bbr-like"):
             share = report.value(f"{rate} Mbit/s with {rival}", "hybrid", "share_x")
             report.reach(f"{rate} Mbit/s with {rival}: smaller share", min(share, 1 - share), 0.2, at_least=True)
+
+
+def _cost_reach(report: Report) -> None:
     report.reach("cost of an acknowledgement, us", report.value("one acknowledgement", "hybrid", "cost_us"), 3.0)
 
 
+def _grid_reach(report: Report) -> None:
+    passed = report.value("grid 0.25-50 Mbit/s, 5-1000 ms", "hybrid", "passed_share")
+    report.reach("grid: cases within limits", passed, 1.0, at_least=True)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    names = [case[0] for case in STEADY]
+    parser.add_argument("--parts", nargs="+", choices=PARTS, help="these alone (default: all; quick: without grid)")
+    parser.add_argument("--cases", nargs="+", choices=names, default=names, help="of the steady links these alone")
+
+
 if __name__ == "__main__":
-    sys.exit(main("estimator", run, description=__doc__))
+    sys.exit(main("estimator", run, description=__doc__, arguments=add_arguments))

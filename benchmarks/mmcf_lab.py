@@ -3,7 +3,8 @@
 Robot, relay and site are the daemons as their user runs them, robot on one side of the link, relay and site on the
 other; the robot alone adapts. Nothing of what is reported comes from the controller: messages are counted and timed
 by the logs that robot and site write, bytes by netem, processor time of the robot by the kernel. Only what the robot
-left out is its own count, so that a class of which nothing was sent is not taken for a lost one. Needs root.
+left out is its own count, so that a class of which nothing was sent is not taken for a lost one. Without the recordings
+beside the checkout their topics are made up (`benchmarks.recordings`), and a note says so. Needs root.
 """
 
 import argparse
@@ -19,14 +20,12 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-import numpy as np
-
+from benchmarks import recordings
 from benchmarks.common import Report, main, positive, try_realtime
 from benchmarks.link.children import Running
 from benchmarks.link.runs import DRAIN_S, START_S, sleep_until, start_daemon, start_relay
 from benchmarks.link.sern import RELAY_PORT
-from benchmarks.mmcf_replay import CLOUD_HZ, EVERY_NTH_POINT, REAL, recorded, tabulate
-from sern_client.endpoints.clouds import read_ply
+from benchmarks.mmcf_replay import CLOUD_HZ, EVERY_NTH_POINT, recorded, tabulate
 from sern_core.errors import SernError
 from sern_core.message import TopicSpec
 from sern_core.mmcf.adapter import AdapterParams
@@ -144,15 +143,6 @@ def intervals(
     return found
 
 
-def thin_scan(source: Path, into: Path, every: int) -> None:
-    """Every so many points of a `.ply` scan as another one."""
-    points = read_ply(source)[::every]
-    names = ("x", "y", "z", "intensity")[: points.shape[1]]
-    head = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}"]
-    head += [*(f"property float {name}" for name in names), "end_header", ""]
-    into.write_bytes("\n".join(head).encode() + np.ascontiguousarray(points, dtype="<f4").tobytes())
-
-
 def client_file(
     directory: Path, name: str, address: str, endpoint: Sequence[Mapping[str, Any]], **sections: Any
 ) -> Path:
@@ -175,8 +165,23 @@ def client_file(
     return path
 
 
+class Played(NamedTuple):
+    """The files that a robot plays."""
+
+    drive: Path
+    scans: Sequence[Path]
+
+
+def staged(directory: Path, data: Path = recordings.DATA) -> Played:
+    """The drive, and the scans thinned to EVERY_NTH_POINT, in `directory`; made up what `data` does not have."""
+    scans = [directory / name for name in recordings.SCANS]
+    for points, path in zip(recordings.scans(data), scans, strict=True):
+        recordings.write_scan(points[::EVERY_NTH_POINT], path)
+    return Played(recordings.drive_file(directory, data), scans)
+
+
 def robot_file(
-    directory: Path, address: str, specs: Mapping[str, TopicSpec], section: AdaptationSection, scans: Sequence[Path]
+    directory: Path, address: str, specs: Mapping[str, TopicSpec], section: AdaptationSection, played: Played
 ) -> Path:
     """The robot: the recording from its beginning and, beside it, the scans; its topics by `specs`."""
     rules = [
@@ -190,13 +195,13 @@ def robot_file(
         }
         for name, spec in specs.items()
     ]
-    bag = {"kind": "bag", "path": str(REAL[0].resolve()), "loop": True}
+    bag = {"kind": "bag", "path": str(played.drive), "loop": True}
     clouds = {
         "kind": "synthetic",
         "role": "robot",
         "topics": ["/points"],
         "cloud_rate_hz": CLOUD_HZ,
-        "cloud_files": [str(path) for path in scans],
+        "cloud_files": [str(path) for path in played.scans],
     }
     return client_file(
         directory,
@@ -267,12 +272,12 @@ def rates_bps(duration_s: int) -> list[float]:
     return [THIN_BPS if second in thin else LINK.rate_bps for second in range(duration_s)]
 
 
-def run(lab: Lab, directory: Path, section: AdaptationSection, scans: Sequence[Path], duration_s: int) -> list[Terms]:
+def run(lab: Lab, directory: Path, section: AdaptationSection, played: Played, duration_s: int) -> list[Terms]:
     """One run over a link that is thin in its second third; intervals of 1 s. `directory` must be empty."""
     make_keys(directory, "relay", ROBOT, SITE)
     load = recorded(1.0)
     specs = {name: spec for name, (_, spec) in load.specs.items()}
-    robot = robot_file(directory, lab.b.address, specs, section, scans)
+    robot = robot_file(directory, lab.b.address, specs, section, played)
     site = site_file(directory, lab.b.address)
     lab.reset()
     lab.link(LINK, LINK)
@@ -301,21 +306,17 @@ def run(lab: Lab, directory: Path, section: AdaptationSection, scans: Sequence[P
 
 
 def _runner(lab: Lab, directory: Path, duration_s: int) -> Callable[[AdaptationSection, int], list[Terms]]:
-    scans = [directory / path.name for path in REAL[1:]]
-    for source, scan in zip(REAL[1:], scans, strict=True):
-        thin_scan(source, scan, EVERY_NTH_POINT)
+    played = staged(directory)
 
     def intervals_of(section: AdaptationSection, number: int) -> list[Terms]:
         mine = directory / f"{section.profile}-{section.policy}-{number}"
         mine.mkdir()
-        return run(lab, mine, section, scans, duration_s)
+        return run(lab, mine, section, played, duration_s)
 
     return intervals_of
 
 
 def measure(options: argparse.Namespace, report: Report) -> None:
-    if missing := [path.name for path in REAL if not path.exists()]:
-        raise SernError(f"the recordings are not beside the checkout: {', '.join(missing)}; see benchmarks.mmcf_replay")
     note = try_realtime()  # all that is started inherits the priority
     duration_s = QUICK_S if options.quick else RUN_S
     with tempfile.TemporaryDirectory(prefix="sern-mmcf-") as temporary, Lab() as lab:
@@ -324,7 +325,9 @@ def measure(options: argparse.Namespace, report: Report) -> None:
             options.traces.mkdir(parents=True, exist_ok=True)
             directory = Path(tempfile.mkdtemp(prefix="run-", dir=options.traces)).resolve()
         tabulate(report, _runner(lab, directory, duration_s), options.runs)
-        report.note(f"lab: {lab.backend}; {note}; {duration_s} s a run, means over intervals of 1 s")
+        report.note(
+            f"{recordings.note()}; lab: {lab.backend}; {note}; {duration_s} s a run, means over intervals of 1 s"
+        )
 
 
 def _arguments(parser: argparse.ArgumentParser) -> None:

@@ -4,7 +4,8 @@ A recording of a real robot (pose, IMU and GNSS of a Husky) with LiDAR scans bes
 time, once for each policy and mission profile: the paper's tables (mmcf_eval) and (mmcf_breakdown), on our links. What
 is counted is what the adaptation of a client measures: arrivals by acknowledgement, encoding by the clock, bytes on the
 wire. Then the paper's section "Runtime Reconfiguration Evaluation": two robots' streams, a third that appears after
-20 s and leaves at 40 s. Without the recordings beside the checkout the same topics are made up.
+20 s and leaves at 40 s. Without the recordings beside the checkout the same topics are made up
+(`benchmarks.recordings`), and a note says so.
 """
 
 import argparse
@@ -19,8 +20,9 @@ from random import Random
 from statistics import fmean
 from time import perf_counter
 
+from benchmarks import recordings
 from benchmarks.common import Report, half_width_95, main, positive
-from sern_client.endpoints.clouds import CLOUD_TYPE, cloud_body, read_ply
+from sern_client.endpoints.clouds import CLOUD_TYPE, cloud_body
 from sern_core.codecs import Coder
 from sern_core.message import TopicInfo, TopicSpec
 from sern_core.mmcf.adapter import SAMPLES, HopAdapter, Step
@@ -33,15 +35,11 @@ from sern_runtime.profiles import load_profile
 from sern_sim.models import LinkModel
 from sern_sim.profiles import LinkProfile
 from sern_sim.replay import Arrival, ReplayWorld
-from sern_tools.explain_replay import read_bag
 
-DATA = Path(__file__).resolve().parents[1] / "../shared/data"
 SETTLE_S = 1.0
 CLOUD_HZ = 5.0
 EVERY_NTH_POINT = 8
 """8,700 points a scan, about what a 16-beam LiDAR gives in a tenth of a second."""
-REAL = tuple(DATA / name for name in ("husky_gps_imu_odom.bag", "lidar_scan_a.ply", "lidar_scan_b.ply"))
-"""A drive of a Husky, and two scans."""
 POLICIES = ("fixed_throughput", "fixed_reliability", "mmcf")
 PROFILES = ("teleoperation", "mapping")
 LINKS = ("step", "field-wifi", "mesh-radio")
@@ -61,34 +59,14 @@ def _spec(priority: PriorityClass) -> TopicSpec:
     return TopicSpec(priority=priority, weight=(10.0, 3.0, 1.0)[priority], lifespan_s=1.0)
 
 
-def _scans() -> list[bytes]:
-    files = REAL[1:]
-    if all(path.exists() for path in files):
-        return [cloud_body(read_ply(path)[::EVERY_NTH_POINT], 0, "velodyne", Encoding.ROS1) for path in files]
-    random = Random(1)
-    return [bytes(random.randrange(40) for _ in range(140_000)) for _ in range(2)]
-
-
-def recorded(duration_s: float) -> Load:
-    """The Husky's recording with scans beside it, or something like it."""
-    load, bag = Load(), REAL[0]
-    if bag.exists():
-        infos, messages = read_bag(bag, duration_s)
-        load.note = "the Husky's recording with LiDAR scans"
-        for name, info in infos.items():
-            control = "odom" in name or "imu" in name
-            load.specs[name] = (info, _spec(PriorityClass.CONTROL if control else PriorityClass.STATE))
-        load.messages = [(message.at_s, message.topic, message.body) for message in messages]
-    else:
-        load.note = "no recording beside the checkout: made-up bodies"
-        for name, rate_hz, size, priority in (
-            ("/imu/data", 30.0, 320, PriorityClass.CONTROL),
-            ("/odom", 10.0, 713, PriorityClass.CONTROL),
-            ("/fix", 2.5, 120, PriorityClass.STATE),
-        ):
-            load.specs[name] = (TopicInfo(TopicName(name), "std_msgs/msg/String", Encoding.ROS1), _spec(priority))
-            load.messages += [(i / rate_hz, name, bytes(size)) for i in range(int(rate_hz * duration_s))]
-    scans = _scans()
+def recorded(duration_s: float, data: Path = recordings.DATA) -> Load:
+    """The Husky's recording with scans beside it, or something like it where `data` has none."""
+    load = Load(note=recordings.note(data))
+    infos, load.messages = recordings.drive(duration_s, data)
+    for name, info in infos.items():
+        control = "odom" in name or "imu" in name
+        load.specs[name] = (info, _spec(PriorityClass.CONTROL if control else PriorityClass.STATE))
+    scans = [cloud_body(points[::EVERY_NTH_POINT], 0, "velodyne", Encoding.ROS1) for points in recordings.scans(data)]
     load.specs["/points"] = (TopicInfo(TopicName("/points"), CLOUD_TYPE, Encoding.ROS1), _spec(PriorityClass.BULK))
     count = int(CLOUD_HZ * duration_s)
     load.messages += [(0.05 + i / CLOUD_HZ, "/points", scans[i % len(scans)]) for i in range(count)]

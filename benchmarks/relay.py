@@ -444,13 +444,14 @@ def cpu_s(process: psutil.Process) -> float:
 
 
 def bench(options: argparse.Namespace, report: common.Report) -> None:
-    rounds, duration_s = (2, 0.8) if options.quick else (5, 3.0)
+    rounds, duration_s = common.repetitions(options, (5, 3.0), quick=(2, 0.8))
     systems = [s for s in SYSTEMS if s.name != "zenoh" or importlib.util.find_spec("zenoh") is not None]
     if options.systems:
         systems = [s for s in systems if s.name in options.systems]
     if len(systems) < len(SYSTEMS):
         report.note("measured without: " + ", ".join(s.name for s in SYSTEMS if s not in systems))
-    for case, size_bytes in SIZES.items():
+    for case in options.cases:
+        size_bytes = SIZES[case]
         runs = {s.name: partial(measure, s, size_bytes, duration_s) for s in systems}
         samples = common.interleaved(runs, rounds)
         for name, found in samples.items():
@@ -483,6 +484,8 @@ def _reaches(report: common.Report, case: str, samples: dict[str, list[Sample]])
 def _arguments(parser: argparse.ArgumentParser) -> None:
     names = [system.name for system in SYSTEMS]
     parser.add_argument("--systems", nargs="+", choices=names, help="measure these alone")
+    parser.add_argument("--cases", nargs="+", choices=SIZES, default=list(SIZES), help="measure these sizes alone")
+    common.repetition_arguments(parser)
 
 
 def main() -> int:

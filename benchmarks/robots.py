@@ -269,7 +269,7 @@ def measure(robots: int, duration_s: float) -> Sample:
 
 
 def bench(options: argparse.Namespace, report: common.Report) -> None:
-    rounds, duration_s = (1, 3.0) if options.quick else (3, 10.0)
+    rounds, duration_s = common.repetitions(options, (3, 10.0), quick=(1, 3.0))
     samples = common.interleaved({str(n): partial(measure, n, duration_s) for n in options.robots}, rounds)
     median: dict[int, dict[str, float]] = {}
     for found in samples.values():
@@ -324,8 +324,11 @@ def _draw(path: Path, median: dict[int, dict[str, float]]) -> None:
 
 
 def _arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--robots", nargs="+", type=int, default=list(FLEETS), metavar="N", help="measure these fleets")
+    parser.add_argument(
+        "--robots", nargs="+", type=common.positive, default=list(FLEETS), metavar="N", help="measure these fleets"
+    )
     parser.add_argument("--figure", type=Path, metavar="FILE", help="also draw the figures (PNG)")
+    common.repetition_arguments(parser)
 
 
 def main() -> int:

@@ -1,7 +1,8 @@
-"""What each kind of summary makes of real LiDAR scans, what it costs, and what the event loop feels of it.
+"""What each kind of summary makes of LiDAR scans, what it costs, and what the event loop feels of it.
 
-    python -m benchmarks.summaries --scans A.ply B.ply [--plots DIRECTORY]
+    python -m benchmarks.summaries [--scans A.ply B.ply] [--plots DIRECTORY]
 
+Without --scans the two that are beside the checkout (`benchmarks.recordings`), or made-up ones, which a note says.
 Clouds are the scans as sensor_msgs/PointCloud2 with x, y, z and intensity. The map is made of their obstacle masks: a
 robot drives 30 m across a map of 100 x 100 m in cells of 0.1 m and adds what it sees every 0.5 m. Transforms are those
 of a robot with 12 joints and 4 nodes at 50 Hz, merged at 20 Hz. `packed` is a body after Zstandard level 3, as the link
@@ -22,6 +23,7 @@ from statistics import median
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks import recordings
 from benchmarks.common import Report, interleaved, main
 from sern_client.endpoints.clouds import cloud_body, read_ply
 from sern_core.codecs import Compression, encode
@@ -182,7 +184,7 @@ def measure_transforms(report: Report, rounds: int) -> None:
     )
 
 
-def plot(directory: Path, scan_file: Path, cloud: bytes) -> None:
+def plot(directory: Path, scan_name: str, cloud: bytes) -> None:
     """The cloud, a thinned one, its scan and its mask, to look at."""
     import matplotlib
 
@@ -197,7 +199,7 @@ def plot(directory: Path, scan_file: Path, cloud: bytes) -> None:
     mask = read_grid(MaskMaker(MaskParams()).mask(cloud, CDR), CDR)
     figure, axes = pyplot.subplots(1, 4, figsize=(20, 5.4))
     for axis, points, title in (
-        (axes[0], xyz, f"{scan_file.name}: {len(xyz):,} points"),
+        (axes[0], xyz, f"{scan_name}: {len(xyz):,} points"),
         (axes[1], thin, f"voxel 0.2 m: {len(thin):,} points"),
         (axes[2], xyz, "scan (black) on the cloud"),
     ):
@@ -220,13 +222,25 @@ def plot(directory: Path, scan_file: Path, cloud: bytes) -> None:
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--scans", type=Path, nargs="+", required=True, metavar="FILE", help="LiDAR scans, .ply")
+    parser.add_argument(
+        "--scans",
+        type=Path,
+        nargs="+",
+        metavar="FILE",
+        help="LiDAR scans, .ply (default: those beside the checkout, else made-up ones)",
+    )
     parser.add_argument("--plots", type=Path, metavar="DIRECTORY", help="also draw summaries.png there")
 
 
 def run(options: argparse.Namespace, report: Report) -> None:
-    rounds = 5 if options.quick else 25
-    clouds = [cloud_body(read_ply(path), 10**18, "velodyne", CDR) for path in options.scans]
+    rounds = 3 if options.quick else 25
+    if options.scans:
+        names, scans = [path.name for path in options.scans], [read_ply(path) for path in options.scans]
+    else:
+        made = set(recordings.absent()) & set(recordings.SCANS)
+        names, scans = ["made-up scan" if made else name for name in recordings.SCANS], recordings.scans()
+    report.note(f"scans: {', '.join(names)}")
+    clouds = [cloud_body(scan, 10**18, "velodyne", CDR) for scan in scans]
     raw = sum(map(len, clouds)) / len(clouds)
     report.row("cloud", "raw", body_bytes=raw, part_percent=100.0, packed_bytes=sum(map(packed, clouds)) / len(clouds))
     for name, make in cloud_makers().items():
@@ -254,7 +268,7 @@ def run(options: argparse.Namespace, report: Report) -> None:
     worst_ms = max(row.metrics["loop_ms"] for row in report.rows if "loop_ms" in row.metrics)
     report.reach("longest wait of the event loop for a cloud in the thread [ms]", worst_ms, LOOP_LIMIT_MS)
     if options.plots is not None:
-        plot(options.plots, options.scans[0], clouds[0])
+        plot(options.plots, names[0], clouds[0])
 
 
 if __name__ == "__main__":

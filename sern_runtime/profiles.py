@@ -1,13 +1,13 @@
 """Reads named link profiles from YAML into the plain data of `sern_sim.profiles`.
 
-The shipped file is `deploy/netem/profiles.yaml`, whose head explains the keys. Every error is a ConfigError of one
-line with file, line and key.
+The shipped file is `profiles.yaml` beside this module, whose head explains the keys. Every error is a ConfigError of
+one line with file, line and key.
 """
 
 import difflib
 import re
-import sysconfig
 from collections.abc import Iterator
+from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, Self
 
@@ -20,10 +20,8 @@ from sern_runtime.config.yaml import Document, Node, read_document, shown_key
 from sern_sim.models import BurstLoss, Flap, Jitter, LinkModel, RateStep, Window
 from sern_sim.profiles import DEFAULT_DURATION_S, LinkProfile
 
-PROFILES_FILE: Final = Path("deploy/netem/profiles.yaml")
-"""Where the shipped profiles are in a checkout."""
-INSTALLED_FILE: Final = Path("share/sern/netem/profiles.yaml")
-"""Where they are below the prefix of an installation."""
+PROFILES_FILE: Final = "profiles.yaml"
+"""The shipped profiles, a file of this package."""
 
 _NAME: Final = r"[a-z0-9][a-z0-9-]{0,40}"
 _SCRIPT_FIELDS: Final = frozenset({"rate_steps", "blackouts", "flap"})
@@ -176,13 +174,11 @@ class ProfileSection(FileModel):
 
 
 def find_profiles_file() -> Path:
-    """The shipped file: of the checkout that this module is in, else of the installation. ConfigError when absent."""
-    checkout = Path(__file__).resolve().parents[1] / PROFILES_FILE
-    installed = Path(sysconfig.get_path("data")) / INSTALLED_FILE
-    for path in (checkout, installed):
-        if path.is_file():
-            return path
-    raise ConfigError(f"the shipped link profiles are in neither {checkout} nor {installed}: name a file of your own")
+    """The shipped file, of a checkout or an installation. ConfigError when it is absent."""
+    path = Path(str(files("sern_runtime") / PROFILES_FILE))
+    if not path.is_file():
+        raise ConfigError(f"the shipped link profiles are not at {path}: name a file of your own")
+    return path
 
 
 def load_profiles(file: Path | str | None = None) -> dict[str, LinkProfile]:

@@ -1,6 +1,6 @@
 """Named link profiles: the two directions of a hop with a script of what happens to them.
 
-Plain data; `sern_runtime.profiles` reads `deploy/netem/profiles.yaml` into it. Users of a profile are the
+Plain data; `sern_runtime.profiles` reads `sern_runtime/profiles.yaml` into it. Users of a profile are the
 virtual-time network (`Network.join(..., profile.up, profile.down)`), the shaping proxy and the lab.
 """
 

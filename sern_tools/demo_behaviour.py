@@ -96,8 +96,12 @@ class Behaviour:
         return rows
 
     def as_row(self) -> dict[str, float]:
-        """The same as figures."""
-        found: dict[str, float] = {f"lane_{lane}_share": share for lane, share in self.lane_shares().items()}
+        """The same as figures. Where a lane is known at all, the share of the other one is there as well."""
+        if not self.looks:
+            return {}
+        shares = self.lane_shares()
+        found: dict[str, float] = {f"lane_{lane}_share": 0.0 for lane in LANE_WORDS} if shares else {}
+        found |= {f"lane_{lane}_share": share for lane, share in shares.items()}
         found["lane_changes"] = self.lane_changes
         if self.switches is not None:
             found["adaptation_switches"] = self.switches

@@ -219,7 +219,7 @@ def explain(
         Path | None, typer.Argument(help="A recording to replay; without it a running daemon is asked.")
     ] = None,
     link: Annotated[
-        str, typer.Option("--link", help="Link profile for the replay (deploy/netem/profiles.yaml).")
+        str, typer.Option("--link", help="Link profile for the replay (sern_runtime/profiles.yaml).")
     ] = "step",
     config: Annotated[
         Path | None, typer.Option("--config", help="A client's file: its rules, link, scheduler and adaptation.")

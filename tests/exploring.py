@@ -1,8 +1,8 @@
 """Which cases tests with random input draw, and how many.
 
 The same ones in every run: a failure is one of the change at hand, and is there again in the next run. With
-SERN_EXPLORE set to a seed (`make explore`) other ones, and more of them. What is found that way becomes an example of
-its own.
+SERN_EXPLORE set to a seed (`make explore`, which gives hypothesis the same one) other ones, and more of them. What is
+found that way becomes an example of its own.
 """
 
 import os
@@ -15,6 +15,8 @@ from hypothesis.internal.conjecture import providers
 SEED: Final = os.environ.get("SERN_EXPLORE", "")
 TIMES: Final = 10
 """How many times the cases of a usual run are tried."""
+USUAL: Final = 100
+"""Cases of a test that asks for no number."""
 
 
 def cases(count: int) -> int:
@@ -38,6 +40,7 @@ def load_profile() -> None:
         derandomize=not SEED,
         database=None,
         deadline=None,
+        max_examples=cases(USUAL),
         print_blob=bool(SEED),
         suppress_health_check=[HealthCheck.too_slow, HealthCheck.filter_too_much, HealthCheck.data_too_large],
     )

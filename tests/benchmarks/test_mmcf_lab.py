@@ -7,9 +7,10 @@ import pytest
 
 pytest.importorskip("psutil")
 
+from benchmarks import recordings
 from benchmarks.common import Report, half_width_95
-from benchmarks.mmcf_lab import LINK, ROBOT, THIN_BPS, Edge, intervals, rates_bps, robot_file, site_file, thin_scan
-from benchmarks.mmcf_replay import POLICIES, PROFILES, REAL, tabulate
+from benchmarks.mmcf_lab import LINK, ROBOT, THIN_BPS, Edge, intervals, rates_bps, robot_file, site_file, staged
+from benchmarks.mmcf_replay import EVERY_NTH_POINT, POLICIES, PROFILES, recorded, tabulate
 from sern_client.endpoints.clouds import read_ply
 from sern_core.errors import SernError
 from sern_core.message import TopicSpec
@@ -124,24 +125,63 @@ def test_confidence_intervals_are_students() -> None:
 
 
 @pytest.mark.parametrize("columns", [3, 4])
-def test_a_thinned_scan_holds_every_nth_point(tmp_path: Path, columns: int) -> None:
+def test_a_scan_is_written_as_it_is_read(tmp_path: Path, columns: int) -> None:
     points = np.arange(10 * columns, dtype=np.float32).reshape(10, columns)
-    names = ("x", "y", "z", "intensity")[:columns]
-    source, into = tmp_path / "scan.ply", tmp_path / "thin.ply"
-    head = ["ply", "format ascii 1.0", "element vertex 10", *(f"property float {name}" for name in names), "end_header"]
-    source.write_text("\n".join([*head, *(" ".join(map(str, row)) for row in points)]) + "\n")
-    thin_scan(source, into, 4)
-    assert read_ply(into).tolist() == points[::4].tolist()
+    recordings.write_scan(points, tmp_path / "scan.ply")
+    assert read_ply(tmp_path / "scan.ply").tolist() == points.tolist()
 
 
-def test_the_files_are_configurations_of_clients(tmp_path: Path) -> None:
-    recording(REAL[0].name)
+@pytest.fixture(params=["recorded", "made up"])
+def data(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
+    """Where the recordings are; and a folder that has none."""
+    if request.param == "made up":
+        return tmp_path / "nothing"
+    for name in (recordings.DRIVE, *recordings.SCANS):
+        recording(name)
+    return recordings.DATA
+
+
+def test_the_load_is_the_same_with_recordings_and_without(data: Path) -> None:
+    """Three topics of a robot and a LiDAR, as often and as large; what was made up is said."""
+    load = recorded(40.0, data)
+    kinds = {name: spec.priority for name, (_, spec) in load.specs.items()}
+    assert sorted(kinds.values()) == [
+        PriorityClass.CONTROL,
+        PriorityClass.CONTROL,
+        PriorityClass.STATE,
+        PriorityClass.BULK,
+    ]
+    counts = {priority: sum(kinds[topic] is priority for _, topic, _ in load.messages) for priority in PriorityClass}
+    assert counts[PriorityClass.CONTROL] == pytest.approx(1600, abs=10)
+    assert counts[PriorityClass.STATE] == pytest.approx(100, abs=3)
+    assert counts[PriorityClass.BULK] == 200
+    sizes = {kinds[topic]: len(body) for _, topic, body in load.messages}
+    assert sizes[PriorityClass.BULK] == pytest.approx(140_000, rel=0.05)
+    assert [at_s for at_s, _, _ in load.messages] == sorted(at_s for at_s, _, _ in load.messages)
+    assert ("made-up" in load.note) == (data != recordings.DATA)
+
+
+def test_what_is_made_up_is_the_same_every_time(tmp_path: Path) -> None:
+    first, second = recorded(2.0, tmp_path), recorded(2.0, tmp_path)
+    assert first.messages == second.messages
+    assert all(name in first.note for name in (recordings.DRIVE, *recordings.SCANS))
+
+
+def test_a_scan_alone_that_is_missing_is_named(tmp_path: Path) -> None:
+    (tmp_path / recordings.DRIVE).touch()
+    (tmp_path / recordings.SCANS[0]).touch()
+    assert recordings.absent(tmp_path) == [recordings.SCANS[1]]
+    assert recordings.SCANS[1] in recordings.note(tmp_path) and recordings.DRIVE not in recordings.note(tmp_path)
+
+
+def test_the_files_are_configurations_of_clients(tmp_path: Path, data: Path) -> None:
     make_keys(tmp_path, "relay", "robot", "site")
-    scan = tmp_path / "scan.ply"
-    thin_scan(recording(REAL[1].name), scan, 1000)
+    played = staged(tmp_path, data)
+    whole = recordings.scans(data)
+    assert [read_ply(path).tolist() for path in played.scans] == [scan[::EVERY_NTH_POINT].tolist() for scan in whole]
     section = AdaptationSection.model_validate({"policy": "fixed_reliability", "profile": "mapping"})
     specs = {"/odom": TopicSpec(priority=PriorityClass.CONTROL), "/points": TopicSpec(lifespan_s=2.0)}
-    robot = load_client(robot_file(tmp_path, "198.18.1.1", specs, section, [scan])).model
+    robot = load_client(robot_file(tmp_path, "198.18.1.1", specs, section, played)).model
     assert robot.adaptation == section
     assert [(rule.match, rule.priority, rule.lifespan_s) for rule in robot.topics] == [
         ("/odom", "control", specs["/odom"].lifespan_s),

@@ -1,60 +1,190 @@
 """The guides for people: what they name exists, and what they tell to type is right."""
 
+import argparse
 import re
+import runpy
 import shlex
+from collections.abc import Callable
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import pytest
 import typer.main
 from ruamel.yaml import YAML
 
+import sern_client.cli
+import sern_relay.cli
 from sern_relay.udp import udp_endpoints
 from sern_runtime.config.base import split_tcp
-from sern_runtime.profiles import load_profiles
+from sern_runtime.profiles import load_profile
 from sern_sim.netem import netem_commands
 from sern_tools.commands import app
 from tests.daemons import Lab
 
+
+def typer_command(function: Callable[..., Any]) -> Any:
+    """What `typer.run` makes of it."""
+    alone = typer.Typer(add_completion=False)
+    alone.command()(function)
+    return typer.main.get_command(alone)
+
+
 ROOT: Final = Path(__file__).resolve().parents[2]
-GUIDES: Final = ("deploy/README.md", "docs/operations.md", "CONTRIBUTING.md")
-_PATH: Final = re.compile(r"(?<![\w/.~])((?:deploy|docs|schemas|tests|sern_[a-z]+)/[\w/.@-]*\w)(?![\w*])")
+GUIDES: Final = (
+    "README.md",
+    "ARCHITECTURE.md",
+    "CONTRIBUTING.md",
+    "deploy/README.md",
+    *sorted(str(path.relative_to(ROOT)) for path in (ROOT / "docs").glob("*.md")),
+)
+OURS: Final[dict[str, Any]] = {
+    "sern": typer.main.get_command(app),
+    "sern-relay": typer_command(sern_relay.cli.command),
+    "sern-client": typer_command(sern_client.cli.command),
+}
+INSTALLED: Final = "/opt/sern/bin/"
+_PATH: Final = re.compile(r"(?<![\w/.~])((?:deploy|docs|schemas|tests|sern_[a-z]+)/[\w/.@-]*\w)(?![\w*-])")
+_TYPED: Final = re.compile(r"^(?:sudo |make |sern |sern-\w+ |\S*/?python )", re.M)
+
+
+def blocks(guide: str, language: str) -> list[str]:
+    found = re.findall(r"^```(\w*)\n(.*?)^```$", (ROOT / guide).read_text(), flags=re.M | re.S)
+    return [block for marked, block in found if marked == language]
 
 
 def commands(guide: str) -> list[list[str]]:
-    """The words of every command in the `sh` blocks of a guide."""
-    blocks = re.findall(r"^```sh\n(.*?)^```", (ROOT / guide).read_text(), flags=re.MULTILINE | re.DOTALL)
-    return [shlex.split(line) for block in blocks for line in block.splitlines()]
+    """The words of every command in the `sh` blocks of a guide; of a pipe, of all its parts."""
+    lines = [line for block in blocks(guide, "sh") for line in block.splitlines()]
+    return [words for line in lines if (words := shlex.split(line, comments=True))]
+
+
+def program(words: list[str]) -> tuple[str, list[str]]:
+    """What a command starts, and with which arguments, without what it is started by or in."""
+    while True:
+        match words:
+            case ["sudo", "-u", _, *rest] | ["sudo", *rest] | ["ip", "netns", "exec", _, *rest]:
+                words = rest
+            case [first, *rest] if re.match(r"\w+=", first):
+                words = rest
+            case [first, *rest]:
+                return first, rest
+            case _:
+                return "", []
+
+
+def typed() -> list[tuple[str, list[str], str, list[str]]]:
+    """(guide, words, program, its arguments) of everything that people are told to type."""
+    return [(guide, words, *program(words)) for guide in GUIDES for words in commands(guide)]
 
 
 @pytest.mark.parametrize("guide", GUIDES)
 def test_files_that_are_named_exist(guide: str) -> None:
     text = (ROOT / guide).read_text()
     assert [path for path in _PATH.findall(text) if not (ROOT / path).exists()] == []
-    links = re.findall(r"\]\(([^)#]+)\)", text)
+    links = re.findall(r"\]\(([^)#]+)[^)]*\)", text)
     assert [link for link in links if not ((ROOT / guide).parent / link).exists()] == []
 
 
-@pytest.mark.parametrize("guide", GUIDES)
-def test_links_within_a_guide_lead_somewhere(guide: str) -> None:
-    text = (ROOT / guide).read_text()
-    titles = {re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-") for title in re.findall(r"^#+ (.*)$", text, re.M)}
-    assert set(re.findall(r"\]\(#([^)]*)\)", text)) <= titles
+def anchors(path: Path) -> set[str]:
+    return {
+        re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-")
+        for title in re.findall(r"^#+ (.*)$", path.read_text(), re.M)
+    }
 
 
 @pytest.mark.parametrize("guide", GUIDES)
-def test_sern_commands_and_their_options_exist(guide: str) -> None:
-    root = typer.main.get_command(app)
-    for words in commands(guide):
-        if "/opt/sern/bin/sern" not in words:
+def test_links_to_a_title_lead_somewhere(guide: str) -> None:
+    here = ROOT / guide
+    for link, title in re.findall(r"\]\(([^)#]*)#([^)]*)\)", here.read_text()):
+        assert title in anchors(here.parent / link if link else here), f"{guide}: {link}#{title}"
+
+
+@pytest.mark.parametrize("guide", GUIDES)
+def test_what_is_to_be_typed_is_marked_as_such(guide: str) -> None:
+    """So that the tests below read it."""
+    assert [block for block in blocks(guide, "") if _TYPED.search(block)] == []
+
+
+def test_sern_commands_and_their_options_exist() -> None:
+    seen = set()
+    for guide, words, name, rest in typed():
+        command = OURS.get(Path(name).name)
+        if command is None:
             continue
-        rest = words[words.index("/opt/sern/bin/sern") + 1 :]
-        command = root
         while rest and rest[0] in (known := getattr(command, "commands", {})):
             command, rest = known[rest[0]], rest[1:]
         assert not getattr(command, "commands", None), f"{guide}: no such command: {' '.join(words)}"
-        options = {option for parameter in command.params for option in parameter.opts}
+        rest = rest[: rest.index("--")] if "--" in rest else rest
+        rest = rest[: rest.index("|")] if "|" in rest else rest
+        options = {option for parameter in command.params for option in [*parameter.opts, *parameter.secondary_opts]}
         assert {word for word in rest if word.startswith("-")} <= options, f"{guide}: {' '.join(words)}"
+        seen.add(guide)
+    assert seen >= {"README.md", "deploy/README.md", "docs/lab.md", "docs/operations.md"}
+
+
+def test_what_root_starts_is_named_by_its_path() -> None:
+    """Neither an installation nor a checkout is on root's path."""
+    ours = [(guide, words, name) for guide, words, name, _ in typed() if Path(name).name in (*OURS, "python")]
+    assert len(ours) > 20
+    assert [words for _, words, name in ours if words[0] == "sudo" and "/" not in name] == []
+    assert {
+        words[-1] for guide, words, name in ours if guide.startswith("deploy") and not name.startswith(INSTALLED)
+    } == set()
+
+
+def test_verbs_exist() -> None:
+    verbs = set(re.findall(r"^(\w+):(?!=)", (ROOT / "Makefile").read_text(), re.M))
+    named = {word for _, _, name, rest in typed() if name == "make" for word in rest if "=" not in word}
+    named |= {
+        word
+        for guide in GUIDES
+        for part in re.findall(r"`make ([a-z ]+)`", (ROOT / guide).read_text())
+        for word in part.split()
+    }
+    assert {"demo", "test", "performance", "lab"} <= named <= verbs
+
+
+def test_who_installs_is_told_of_the_middleware() -> None:
+    """The dot alone takes away what a host with ROS 2 has, or leaves it at another version."""
+    installing = {guide for guide, words, _, _ in typed() if "install" in words and words[-1] == "."}
+    assert installing == {"deploy/README.md", "docs/operations.md"}
+    for guide in installing:
+        assert {"'.[dds]'", "'.[zenoh]'"} <= set(re.findall(r"'\.\[\w+\]'", (ROOT / guide).read_text())), guide
+
+
+class _StoppedError(Exception):
+    """Before a benchmark begins."""
+
+
+@pytest.mark.usefixtures("default_signals")
+@pytest.mark.filterwarnings("ignore:.* found in sys.modules:RuntimeWarning")  # other tests import them, too
+def test_benchmarks_and_their_options_exist(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("psutil")
+    parsers: list[argparse.ArgumentParser] = []
+
+    def stop(parser: argparse.ArgumentParser) -> None:
+        parsers.append(parser)
+        raise _StoppedError
+
+    monkeypatch.setattr(argparse.ArgumentParser, "parse_args", stop)
+    named: dict[str, set[str]] = {}
+    for guide in GUIDES:
+        text = (ROOT / guide).read_text()
+        for line in re.findall(r"python -m (benchmarks\.[^`\n#]+)", text):
+            module, *rest = line.replace("[", "").replace("]", "").split()
+            if module != "benchmarks.NAME":
+                named.setdefault(module, set()).update(word for word in rest if word.startswith("--"))
+    assert len(named) > 6
+    for module, options in named.items():
+        with pytest.raises(_StoppedError):
+            runpy.run_module(module, run_name="__main__")
+        known = {option for action in parsers[-1]._actions for option in action.option_strings}
+        assert options <= known, f"{module}: {options - known}"
+
+
+def test_a_log_line_that_is_quoted_names_who_is_in_the_guide() -> None:
+    text = (ROOT / "deploy" / "README.md").read_text()
+    assert re.findall(r"`(\w+): no datagram came through \.\.\.", text) == ["jackal1"]
 
 
 def test_what_is_installed_is_there() -> None:
@@ -64,7 +194,7 @@ def test_what_is_installed_is_there() -> None:
 
 
 def test_the_netem_line_is_the_profile() -> None:
-    profile = load_profiles(ROOT / "deploy" / "netem" / "profiles.yaml")["field-wifi"]
+    profile = load_profile("field-wifi")
     expected = netem_commands(profile, "eth0")
     assert [shlex.join(["sudo", *shlex.split(line)]) for line in expected] == [
         shlex.join(words) for words in commands("deploy/README.md") if words[:4] == ["sudo", "tc", "qdisc", "replace"]

@@ -122,6 +122,22 @@ def balanced(text: str) -> Iterator[str]:
     yield from stack
 
 
+def test_prometheus_asks_for_nothing_that_is_not_there() -> None:
+    """Beside a relay as the guide sets it up no client runs: a target that never answers would page for ever."""
+    text = (DEPLOY / "prometheus" / "prometheus.yml").read_text()
+    relay = YAML(typ="safe").load((DEPLOY / "examples" / "relay.yaml").read_text())
+    config = YAML(typ="safe").load(text)
+    assert config["rule_files"] == ["sern.rules.yml"]
+    jobs = {job["job_name"]: job["static_configs"] for job in config["scrape_configs"]}
+    assert jobs == {"sern-relay": [{"targets": [relay["http"]["listen"]]}]}
+    enabled = re.sub(r"^  # ((?:- job_name:|  ).*)$", r"  \1", text, flags=re.M)
+    jobs = {job["job_name"]: job["static_configs"] for job in YAML(typ="safe").load(enabled)["scrape_configs"]}
+    assert jobs.keys() == {"sern-relay", "sern-client"}, "its marks taken off, the other job is whole"
+    ports = {target.rpartition(":")[2] for target in jobs["sern-client"][0]["targets"]}
+    examples = [YAML(typ="safe").load((DEPLOY / "examples" / name).read_text()) for name in ("robot.yaml", "site.yaml")]
+    assert ports == {example["http"]["listen"].rpartition(":")[2] for example in examples}
+
+
 def test_expressions_parse(tmp_path: Path) -> None:
     promtool = shutil.which("promtool")
     if promtool is None:  # the Debian package `prometheus` has it
@@ -176,16 +192,3 @@ def test_alerts_say_what_and_how_bad() -> None:
     for rule in alerts():
         assert rule["labels"]["severity"] in {"page", "warn", "info"}
         assert rule["annotations"]["summary"]
-
-
-def test_the_scrape_targets_are_those_of_the_examples() -> None:
-    config = YAML(typ="safe").load((DEPLOY / "prometheus" / "prometheus.yml").read_text())
-    targets = {
-        target for job in config["scrape_configs"] for group in job["static_configs"] for target in group["targets"]
-    }
-    listens = {
-        YAML(typ="safe").load((DEPLOY / "examples" / name).read_text())["http"]["listen"]
-        for name in ("relay.yaml", "robot.yaml", "site.yaml")
-    }
-    assert targets == listens
-    assert config["rule_files"] == ["sern.rules.yml"]

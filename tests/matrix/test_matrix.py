@@ -3,7 +3,7 @@
 Idle, twice and thirteen times what the link carries; a blackout, a flapping path, bursts of loss, or none of them. No
 times are asserted beyond generous bounds that follow from the link's round trip, rate and queue.
 
-A quarter of the cells is in every run (`Cell.in_every_run`), the others in `make lab`.
+A quarter of the cells is in every run (`Cell.in_every_run`); `make lab` runs all of them.
 """
 
 import pytest

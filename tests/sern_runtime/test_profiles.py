@@ -225,19 +225,9 @@ def test_a_missing_profile_names_those_there_are() -> None:
 def test_a_missing_file_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(ConfigError, match=r"none\.yaml: no such file"):
         load_profiles(tmp_path / "none.yaml")
-    monkeypatch.setattr(module, "PROFILES_FILE", Path("deploy/none.yaml"))
-    monkeypatch.setattr(module, "INSTALLED_FILE", Path("share/none.yaml"))
-    with pytest.raises(ConfigError, match=r"are in neither .*: name a file of your own"):
+    monkeypatch.setattr(module, "PROFILES_FILE", "none.yaml")
+    with pytest.raises(ConfigError, match=r"are not at .*sern_runtime/none\.yaml: name a file of your own"):
         find_profiles_file()
-
-
-def test_an_installation_has_its_own_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    installed = tmp_path / module.INSTALLED_FILE
-    installed.parent.mkdir(parents=True)
-    installed.write_text("profiles: {only: {description: Installed}}")
-    monkeypatch.setattr(module, "PROFILES_FILE", Path("deploy/none.yaml"))
-    monkeypatch.setattr("sysconfig.get_path", lambda name: str(tmp_path))
-    assert list(load_profiles()) == ["only"]
 
 
 def test_the_file_has_a_key_for_every_figure_of_a_model() -> None:

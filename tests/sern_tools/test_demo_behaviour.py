@@ -49,6 +49,10 @@ def test_a_robot_that_did_not_answer_is_not_counted() -> None:
     behaviour = Behaviour([Look.of(0.0, link("udp"), None), Look.of(1.0, None, None), Look.of(4.0, link("udp"), None)])
     assert behaviour.lane_shares() == {"udp": 1.0}
     assert (behaviour.lane_changes, behaviour.switches) == (0, None)
+    assert behaviour.as_row() == {"lane_udp_share": 1.0, "lane_zmq_share": 0.0, "lane_changes": 0}, (
+        "no lane is left out"
+    )
+    assert Behaviour().as_row() == {}
     assert behaviour.rows(1.0) == [
         ("lane", "datagrams (UDP) 100% of the time; changed never"),
         ("clouds", "100% of class bulk delivered"),

@@ -12,11 +12,20 @@ from rich.console import Console
 
 from sern_runtime.profiles import load_profile
 from sern_tools import demo_charts, demo_report
+from sern_tools.demo_behaviour import Behaviour, Look
 from sern_tools.demo_report import Carried, Report
 from sern_tools.demo_scenario import Scenario
 from sern_tools.summary import judge
 from tests.sern_tools.logs import POSE, Run, good_run
 
+BEHAVIOUR = Behaviour(
+    [Look(0.0, "udp", 2), Look(6.0, "zmq", 3, thinned=True), Look(9.0, "udp", 4, summarised=True), Look(10.0, "udp", 4)]
+)
+BEHAVED = {
+    "lane": "datagrams (UDP) 70% of the time, stream (TCP) 30% of the time; changed 2 times",
+    "adaptation": "chose anew 2 times; thinned 30% and summarised 10% of the time",
+    "clouds": "80% of class bulk delivered",
+}
 LIMITS = {"control": 0.01, "state": 0.10}
 
 
@@ -37,6 +46,7 @@ def report_of(run: Run | None = None, *, baseline: bool = True) -> Report:
         carried={"SERN": Carried(0.1, [50_000] * 100)},
         comparison={verdict.name: verdict for verdict in comparison},
         remarks=("a <remark>",),
+        behaviour=BEHAVIOUR,
     )
 
 
@@ -69,6 +79,20 @@ def test_what_does_not_exist_is_null_in_json() -> None:
     assert reach["first_fresh_pose_s"] == {"name": "first_fresh_pose_s", "value": None, "limit": 3.0, "ok": False}
 
 
+def test_the_json_says_how_lane_and_adaptation_behaved() -> None:
+    rows = {(row["case"], row["system"]): row for row in json.loads(demo_report.as_json(report_of()))["rows"]}
+    found = {name: value for name, value in rows["link", "SERN"].items() if name.startswith(("lane_", "adaptation_"))}
+    assert found == {
+        "lane_udp_share": pytest.approx(0.7),
+        "lane_zmq_share": pytest.approx(0.3),
+        "lane_changes": 2,
+        "adaptation_switches": 2,
+        "adaptation_thinned_share": pytest.approx(0.3),
+        "adaptation_summarised_share": pytest.approx(0.1),
+    }
+    assert not any(name.startswith(("lane_", "adaptation_")) for name in rows["link", "plain ZMQ"])
+
+
 def printed(report: Report) -> str:
     console = Console(file=io.StringIO(), width=80, color_system=None)
     demo_report.print_summary(report, console)
@@ -85,6 +109,15 @@ def test_the_summary_fits_the_terminal_and_names_every_drop() -> None:
     assert text.count("kept") == 8
     assert "BROKEN" not in text
     assert "a <remark>" in text
+
+
+def test_the_summary_says_how_lane_and_adaptation_behaved() -> None:
+    words = " ".join(printed(report_of()).split())
+    for name, said in BEHAVED.items():
+        assert f"SERN, {name}: {said}" in words
+    assert "plain ZMQ, lane" not in words
+    unknown = printed(replace(report_of(), behaviour=Behaviour()))
+    assert "SERN, lane" not in unknown and "SERN, adaptation" not in unknown
 
 
 def test_a_broken_promise_is_shown() -> None:
@@ -141,6 +174,13 @@ def test_the_page_is_one_file_with_its_pictures_and_its_honest_notes() -> None:
         "10 never seen again",
     ):
         assert words in text
+
+
+def test_the_page_says_how_lane_and_adaptation_behaved() -> None:
+    page = demo_report.as_html(report_of())
+    table = page.partition("<h2>How SERN behaved</h2>")[2].partition("</table>")[0]
+    assert re.findall(r"<tr><td>(.*?)</td><td>(.*?)</td></tr>", table) == list(BEHAVED.items())
+    assert "How SERN behaved" not in demo_report.as_html(replace(report_of(), behaviour=Behaviour()))
 
 
 def test_the_page_without_a_baseline() -> None:

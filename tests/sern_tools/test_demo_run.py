@@ -127,6 +127,15 @@ async def test_a_whole_run_leaves_its_report_and_nothing_else(tmp_path: Path) ->
     assert {"control_p99_s", "first_fresh_pose_s", "control_overtaken_share"} < reach.keys()
     assert status == (EXIT_OK if all(reach.values()) else EXIT_BROKEN)
     assert {row["system"] for row in figures["rows"]} == {"SERN", "plain ZMQ"}
+    links = {row["system"]: row for row in figures["rows"] if row["case"] == "link"}
+    ours = links["SERN"]
+    assert ours["lane_udp_share"] + ours["lane_zmq_share"] == pytest.approx(1.0)
+    assert ours["lane_changes"] >= 0 and ours["adaptation_switches"] >= 0
+    assert 0.0 <= ours["adaptation_thinned_share"] <= 1.0 and 0.0 <= ours["adaptation_summarised_share"] <= 1.0
+    assert not any(name.startswith(("lane_", "adaptation_")) for name in links["plain ZMQ"])
+    assert "How SERN behaved" in (tmp_path / "result" / "report.html").read_text()
+    for words in ("SERN, lane:", "SERN, adaptation:", "SERN, clouds:"):
+        assert words in demo.output
     for words in ("1/3  measuring", "2/3  SERN, 3 s", "3/3  the same load", "What became of the messages"):
         assert words in demo.output
 

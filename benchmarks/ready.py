@@ -1,0 +1,75 @@
+"""Whether everything is there that the steps of `make performance` need, before the first of them begins.
+
+The steps take half an hour together, and what one of them lacks would be told when the others are over. Each thing that
+is missing is a line of its own; what is only made up (recordings) is said and is no failure.
+"""
+
+import importlib.util
+import os
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Final
+
+from benchmarks import recordings
+from benchmarks.document import DOCUMENT, insert
+from sern_client.endpoints.clouds import read_ply
+from sern_core.errors import SernError
+from sern_tools.explain_replay import read_bag
+from sern_tools.lab.backends import choose
+
+STEPS: Final = ("link", "robots", "mmcf_lab")
+MODULES: Final[Mapping[str, str]] = {"psutil": "bench", "zenoh": "bench", "matplotlib": "report"}
+"""The extra that each is in."""
+FOLDERS: Final = ("build", "docs/images")
+ROOT: Final = DOCUMENT.parents[1]
+
+
+def lacking(document: Path = DOCUMENT, data: Path = recordings.DATA, root: Path = ROOT) -> Iterator[str]:
+    """What is missing or cannot be used, and for what."""
+    try:
+        choose(f"{os.getpid()}")
+    except SernError as error:
+        yield f"link, mmcf_lab: {error}"
+    for module, extra in MODULES.items():
+        if importlib.util.find_spec(module) is None:
+            yield f"link, robots: {module} is not installed: pip install '.[{extra}]'"
+    for name in (recordings.DRIVE, *recordings.SCANS):
+        path = data / name
+        if path.exists():
+            try:
+                if name == recordings.DRIVE:
+                    read_bag(path, 1.0)
+                else:
+                    read_ply(path)
+            except SernError as error:
+                yield f"mmcf_lab: {error}"
+    for folder in FOLDERS:
+        if not _writable(root / folder):
+            yield f"{root / folder}: cannot be written"
+    try:
+        text = document.read_text(encoding="utf-8")
+        for step in STEPS:
+            insert(text, step, "")
+        if not os.access(document, os.W_OK):
+            yield f"document: {document} cannot be written"
+    except (SernError, OSError) as error:
+        yield f"document: {document}: {error}"
+
+
+def _writable(folder: Path) -> bool:
+    """Also of one that is still to be made."""
+    there = next(path for path in (folder, *folder.parents) if path.exists())
+    return there.is_dir() and os.access(there, os.W_OK)
+
+
+def main(problems: Sequence[str] | None = None) -> int:
+    found = list(lacking()) if problems is None else problems
+    for problem in found:
+        print(f"benchmarks.ready: {problem}", file=sys.stderr)
+    print(f"mmcf_lab plays {recordings.note()}")
+    return 1 if found else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
