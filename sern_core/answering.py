@@ -6,13 +6,12 @@ and become runs of messages meanwhile; they survive the session.
 
 from abc import abstractmethod
 from dataclasses import replace
-from functools import partial
 from typing import Final, Unpack
 
 from sern_core import wire
 from sern_core.announce import Want, encode_dropped
 from sern_core.errors import WireError
-from sern_core.fragments import SLICE_US, InStream
+from sern_core.fragments import InStream
 from sern_core.interest import Interest
 from sern_core.queues import GIVEN_UP_US, OutChannel
 from sern_core.session import Session, SessionArguments
@@ -28,8 +27,6 @@ NAMED_PER_US: Final = 16
 ANSWER_US: Final = 6
 OWED_PER_US: Final = 16
 """What naming channels, answers about open ones, and lists of names are charged with (`Reassembly.work_us`)."""
-RETAINED_PER_US: Final = 64
-"""A report of drops is charged with looking for them in what is kept."""
 MAX_REPORTS_UNHEARD: Final = 64
 """Control messages that may wait for the peer's acknowledgement before reports of drops wait as well."""
 
@@ -201,30 +198,9 @@ class Answering(Session):
     def _set_wanted(
         self, channel: OutChannel, wanted: bool, now: float, *, reason: DropReason = DropReason.UNWANTED
     ) -> None:
-        channel.wanted = wanted
-        if not wanted:
-            self._in_slices(partial(self._clear, channel, reason))
-
-    def _at_most(self, each_us: int) -> int:
-        """How many messages, at so many microseconds each, are left of the slice; at least one."""
-        return max(1, (SLICE_US - self.reassembly.work_us) // each_us)
-
-    def _clear(self, channel: OutChannel, reason: DropReason) -> bool:
-        """One step of dropping what is left in a channel. True: nothing is."""
         watermark = channel.watermark
-        self.reassembly.work_us += GIVEN_UP_US * channel.clear(reason, self._at_most(GIVEN_UP_US))
-        if channel.watermark > watermark and self.channels.get(channel.slot) is channel:
+        if not wanted:
+            self.reassembly.work_us += GIVEN_UP_US * channel.kept
+        channel.set_wanted(wanted, reason)
+        if channel.watermark > watermark:
             self._watermark_moved(channel)
-        return not channel.kept
-
-    def _reported(self, channel: OutChannel, seq: int, end: int, reason: DropReason, where: str) -> None:
-        """The peer's side dropped the messages from `seq` up to `end`, for the client `where`."""
-
-        def step() -> bool:
-            nonlocal seq
-            most = self._at_most(GIVEN_UP_US)
-            looked, seq = channel.reported(seq, reason, where, end - seq, most)
-            self.reassembly.work_us += GIVEN_UP_US * looked + len(channel.retained) // RETAINED_PER_US
-            return not seq
-
-        self._in_slices(step)

@@ -7,7 +7,6 @@ State is kept per `StreamId`, across sessions and peers: that is what makes "onc
 new process and everything is sent again.
 """
 
-import sys
 from bisect import bisect_right
 from collections import OrderedDict, deque
 from collections.abc import Callable
@@ -45,8 +44,7 @@ TURN_US: Final = 4
 """A message that waited and has its turn, without what its owner does with it."""
 STALE_US: Final = 1
 LOOKED_AT_PER_US: Final = 16
-"""A half-received message that will not be completed, or a waiting one that is let go of, and how many are looked
-through for those."""
+"""A half-received message that will not be completed, and how many are looked through for those."""
 SEEN_BITS: Final = 64
 SEEN_MASK: Final = (1 << SEEN_BITS) - 1
 
@@ -542,38 +540,21 @@ class InStream:
             if too_old or (seq != newest and now - max(partial.touched_s, up_since_s) > PARTIAL_IDLE_S):
                 self._lose(seq, DropReason.LOST)
 
-    def close(self, most: int = sys.maxsize) -> int:
-        """The stream ends. As `forget`."""
+    def close(self) -> None:
+        """The stream ends."""
+        self.forget(DropReason.DISCONNECTED)
         self._reassembly.reports -= len(self.reports)
         self.reports.clear()
-        return self.forget(DropReason.DISCONNECTED, most)
 
-    def forget(self, reason: DropReason, most: int = sys.maxsize) -> int:
-        """Let go of half-received and waiting messages: the sender has given them up. Returns how many went; after
-        `most` of them the rest waits for another call (`holds_any`)."""
-        reassembly = self._reassembly
-        reassembly.behind.pop(self, None)
-        if self._first:
-            self.delivered, self._first = max(self.delivered, self._first - 1), 0
+    def forget(self, reason: DropReason) -> None:
+        """Let go of half-received and waiting messages: the sender has given them up."""
+        for seq in list(self._partials):
+            self._lose(seq, reason)
+        self._reassembly.held_bytes -= self._waiting_bytes()
+        self._waiting.clear()
+        self._order.clear()
         self._stale = None
-        done = 0
-        while self._partials and done < most:
-            done += 1
-            seq, partial = self._partials.popitem()  # the first ones would be looked for from the start each time
-            reassembly.held_bytes -= partial.held_bytes
-            self._on_drop(self, reason, partial.total, seq, False)
-        if not self._partials:
-            reassembly.gone(self)
-        while self._order and done < most:
-            done += 1
-            message = self._waiting.pop(self._order.pop())
-            reassembly.held_bytes -= len(message.body) + HELD_OVERHEAD_BYTES
-        return done
-
-    @property
-    def holds_any(self) -> bool:
-        """Whether there are half-received or waiting messages."""
-        return bool(self._partials or self._waiting)
+        self._advance()
 
     def _waiting_bytes(self) -> int:
         return sum(len(message.body) + HELD_OVERHEAD_BYTES for message in self._waiting.values())

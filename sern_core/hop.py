@@ -5,15 +5,13 @@
 """
 
 from abc import abstractmethod
-from collections.abc import Callable
-from functools import partial
 from typing import Any, Final
 
 from sern_core import wire
 from sern_core.capacity import AckSample
 from sern_core.codecs import KNOWN_CODECS
 from sern_core.errors import RemoteError, WireError
-from sern_core.fragments import SLICE_US, STALE_US, InStream
+from sern_core.fragments import SLICE_US, InStream
 from sern_core.lanes import (
     LANE_EXPRESS,
     LANE_UDP,
@@ -23,7 +21,6 @@ from sern_core.lanes import (
     PROVEN_ACKS,
     Lane,
 )
-from sern_core.queues import OutChannel
 from sern_core.sending import CONTROL_CHANNEL, RATE_INTERVAL_S, SWEEP_INTERVAL_S, Sender, SentData, SentWatermark
 from sern_core.trace import LINK, TraceEvent
 from sern_core.types import (
@@ -61,15 +58,6 @@ class Hop(Sender):
         position = wire.decode_frames(data, self, position or wire.HEADER_BYTES)
         if position:
             self._pause_reading(lane, number, stamp_us, data, position, now)
-
-    @abstractmethod
-    def _in_slices(self, step: Callable[[], bool], *, later: bool = False) -> None:
-        """Do something in steps, each charged to `Reassembly.work_us`, until one returns True. Beyond a slice the rest
-        comes later, before anything more is read; `later`: all of it does."""
-
-    @property
-    @abstractmethod
-    def unfinished(self) -> bool: ...
 
     @abstractmethod
     def _pause_reading(
@@ -284,17 +272,11 @@ class Hop(Sender):
         # It may lie beyond what was submitted here: the peer had more from an earlier relay (`OutChannel.submit`).
         wide = wire.widen_seq(delivered, out_channel.watermark)
         if wide > out_channel.watermark:
-            self._in_slices(partial(self._delivered, out_channel, wide))
+            done = out_channel.delivered_to(wide)
+            self._refresh(out_channel, self._now)
+            self._watermark_moved(out_channel)
+            self.reassembly.work_us += WATERMARK_US + done // DONE_PER_US
         return self.reassembly.work_us > SLICE_US
-
-    def _delivered(self, channel: OutChannel, watermark: int) -> bool:
-        reassembly = self.reassembly
-        done = channel.delivered_to(watermark, DONE_PER_US * max(1, SLICE_US - reassembly.work_us))
-        if self.channels.get(channel.slot) is channel:  # else closed meanwhile
-            self._refresh(channel, self._now)
-            self._watermark_moved(channel)
-        reassembly.work_us += WATERMARK_US + done // DONE_PER_US
-        return channel.watermark >= watermark
 
     def on_ping(self) -> None:
         """FrameSink: the peer asks for an acknowledgement now."""
@@ -378,15 +360,14 @@ class Hop(Sender):
         self._sweep_due_s = now + SWEEP_INTERVAL_S
         if now >= self._held_back_due_s:
             self._release_held_back(now)
-        for channel in () if self.unfinished else list(self.channels.values()):  # what is confirmed does not expire
+        for channel in list(self.channels.values()):
             watermark = channel.watermark
             channel.sweep(now, up=self.established)
             if channel.offered or channel.active:
                 self._refresh(channel, now)
             if channel.watermark > watermark:
                 self._watermark_moved(channel)
-        most = SLICE_US // STALE_US
         for stream in self.incoming.values():
             stream.heard(self._control.watermark)
-            if 0 < stream.pause_seq <= self._control.watermark and stream not in self.reassembly.behind:
-                most -= stream.forget(DropReason.UNWANTED, most)
+            if 0 < stream.pause_seq <= self._control.watermark:
+                stream.forget(DropReason.UNWANTED)

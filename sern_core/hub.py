@@ -47,8 +47,6 @@ from sern_core.session import DISPLACED
 from sern_core.trace import DecisionTrace
 from sern_core.types import DROP_CODES, ClientName, DropReason, TopicName
 
-FORGOTTEN_MESSAGES: Final = 4000
-"""Messages for clients that stay away that are given up in one sweep; each is told to its origin."""
 STREAM_US: Final = 50
 FORWARD_US: Final = 5
 LANE_US: Final = 300
@@ -129,8 +127,6 @@ class Hub(LocalStreams):
         self._fanout = Fanout(self._offer, self._told, self._let_go)
         self.presence = Presence(self.links, self.local_owners, self._for, self._was_read)
         self._awaited: dict[ClientName, set[TopicName]] = {}
-        self._forgettable = 0  # messages that this sweep may still give up for clients that stay away
-        self._forgotten: dict[ClientName, Link] = {}  # given up; what is left of them goes in slices
         self._heard: set[ClientName] = set()  # said what they want, to this run of the relay
         self._absent_since: dict[ClientName, float] = {}
         self._draining = Draining(self._end_channel)
@@ -147,8 +143,6 @@ class Hub(LocalStreams):
 
     def greet(self, port: HubPort, hello: wire.Envelope, header: wire.Header, *, now: float) -> None:
         """A client says hello on a connection. A newer connection of the same client retires the older one."""
-        if port.client in self._forgotten:
-            return  # it says HELLO again; until then `unfinished` goes on: nobody keeps more than one link holds
         link = self._link(port.client, now)
         older = self.port_of.get(port.client)
         another = older is not port
@@ -192,21 +186,6 @@ class Hub(LocalStreams):
             self._absent_since[client] = now
         return link
 
-    def unfinished(self, client: ClientName) -> Link | None:
-        """The link of a client without a session that has something to finish before it gets one."""
-        link = self._forgotten.get(client)
-        if link is None and client not in self.port_of:
-            link = self.links.get(client)
-        return link if link is not None and link.unfinished else None
-
-    def finish(self, client: ClientName, *, now: float) -> None:
-        """One slice of that."""
-        link = self.unfinished(client)
-        if link is not None:
-            self._for(client, now, partial(link.handle_timeout, now=now))
-        if client in self._forgotten and self._forgotten[client].idle:
-            del self._forgotten[client]
-
     def _was_read(self) -> None:
         self.after()
 
@@ -245,14 +224,13 @@ class Hub(LocalStreams):
 
     def sweep(self, *, now: float) -> None:
         """Let go of clients that stay away, and of ended streams that are fully delivered. Call about once a second."""
-        self._forgettable = FORGOTTEN_MESSAGES
         for client, since_s in list(self._absent_since.items()):
             link = self.links[client]
             if link.established:
                 continue
             link.handle_timeout(now=now)  # retention goes on while a client is away
             if now - since_s > self.params.resume_s:
-                self._for(client, now, partial(self._wind_down, client, now))
+                self._for(client, now, partial(self._forget, client, now))
         for client, link in list(self.links.items()):
             if client not in self.port_of and link.established:  # only its datagram lane is left
                 link.handle_timeout(now=now)
@@ -278,10 +256,6 @@ class Hub(LocalStreams):
                 link.reassembly.work_us = 0
                 self._fanout.go_on(link, now=now)
         self.presence.sweep(now=now)
-        if self._forgotten:
-            client = next(iter(self._forgotten))
-            self._forgotten[client] = self._forgotten.pop(client)  # the others have their turn
-            self.finish(client, now=now)
 
     def left(self, client: ClientName, *, now: float) -> None:
         """A client has said goodbye. One that has streams, or wants reliable ones, may come back to them (a daemon that
@@ -303,29 +277,17 @@ class Hub(LocalStreams):
             self.end_session(client, reason, now=now)
             self._forget(client, now, reason=DropReason.FORBIDDEN)
 
-    def _wind_down(self, client: ClientName, now: float) -> None:
-        """The client stays away: give up what waits for it, as far as this sweep goes, and then its state."""
-        link = self.links[client]
-        self._forgettable -= link.wind_down(DropReason.DISCONNECTED, self._forgettable, now=now)
-        if link.idle:
-            self._forget(client, now)
-
     def _forget(self, client: ClientName, now: float, *, reason: DropReason = DropReason.DISCONNECTED) -> None:
         link = self.links[client]
         self._fanout.forget(client, now=now)
         self._apply(self.routing.drop_client(client), now, reason=reason)
         for channel in list(link.channels.values()):
-            self._end_channel(client, link, channel, reason, now)
+            link.close_channel(channel, reason, now=now)
         self._draining.forget(client)
         if reason is DropReason.FORBIDDEN:
             self._draining.keep(lambda _client, stream: stream.origin != client, reason, now=now)
         self.events.lane_closed(client)
         link.close_streams()
-        link.finish = None
-        if not link.idle:
-            if client in self._forgotten:  # of a link that others had made anew in the meantime
-                self._forgotten[client].finish_steps()
-            self._forgotten[client] = link
         del self.links[client]
         port = self.port_of.pop(client, None)
         if port is not None:
@@ -453,9 +415,7 @@ class Hub(LocalStreams):
             self._unsubscribed = None
 
     def _end_channel(self, client: ClientName, link: Link, channel: OutChannel, reason: DropReason, now: float) -> None:
-        # Nobody is to be told of drops: it is owed nothing any more, or there is no origin.
-        silent = channel is self._unsubscribed or not channel.reliable or channel.stream.id not in self.relayed
-        self._for(client, now, partial(link.close_channel, channel, reason, now=now, silent=silent))
+        self._for(client, now, partial(link.close_channel, channel, reason, now=now))
 
     def _wanted(self, relayed: Relayed) -> bool:
         return bool(relayed.outs or relayed.waiting) or relayed.cache is not None or self.tap(relayed.stream.stream)

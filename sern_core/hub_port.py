@@ -97,8 +97,7 @@ class HubPort:
 
     def next_deadline(self) -> float | None:
         if self.link is None or not self.current:
-            unfinished = self.hub.unfinished(self.client)
-            return None if unfinished is None else unfinished.read_due_s
+            return None
         deadline_s, due_s = self.link.next_deadline(), self.hub.matching.due_s
         if not due_s:
             return deadline_s
@@ -111,13 +110,11 @@ class HubPort:
             if now >= self.hub.matching.due_s.get(self.client, math.inf):
                 self.hub.matching.go_on(self.client, now=now)
                 self.hub.after()
-        else:
-            self.hub.finish(self.client, now=now)
 
     @property
     def dirty(self) -> bool:
         if self._out:
             return True
         if self.link is None or not self.current:
-            return self.hub.unfinished(self.client) is not None
+            return False
         return self.link.dirty or self.client in self.hub.matching.due_s

@@ -30,11 +30,11 @@ from sern_core.answering import Answering
 from sern_core.definitions import DefinitionStore, PeerDefinitions
 from sern_core.errors import RefusedError, RemoteError, UsageError, WireError
 from sern_core.fates import Fates
-from sern_core.fragments import SLICE_US, STALE_US, InStream
+from sern_core.fragments import SLICE_US, InStream
 from sern_core.message import Message, StreamId, StreamInfo
 from sern_core.out_message import OutMessage
 from sern_core.params import LinkParams, SchedulerParams
-from sern_core.queues import OutChannel
+from sern_core.queues import GIVEN_UP_US, OutChannel
 from sern_core.trace import DecisionTrace, TraceEvent
 from sern_core.types import CLASS_LABELS, DROP_REASONS, ClientName, DropReason, PriorityClass
 
@@ -49,11 +49,10 @@ and takes 2 ms to unpack it."""
 CONTROL_US: Final = 30
 CONTROL_BYTES_PER_US: Final = 16
 ATTACHMENT_BYTES_PER_US: Final = 250
-"""What a control message is charged with: itself, its size, what its attachment unpacks to."""
+RETAINED_PER_US: Final = 16
+"""What a control message is charged with: itself, its size, what its attachment unpacks to, what it looks through."""
 ANNOUNCE_US: Final = 12
 """What a session that begins is charged with for each stream that is announced in it."""
-FEW: Final = 64
-"""So many messages of a stream that has ended are dropped at once, more in slices."""
 MAX_UNHEARD: Final = 20_000
 """Control messages that a peer may have answered, beside four for each channel, before it reads an answer."""
 
@@ -153,8 +152,6 @@ class Link(Answering):
         self._attachments_s = 0.0
         self._announcing: deque[tuple[int, OutChannel]] = deque()  # may send once that control message is on its way
         self._gone: deque[InStream] = deque()  # streams that the peer no longer has, to be retracted
-        self._closed: dict[OutChannel, None] = {}  # what is left in them goes in slices
-        self._closing: dict[InStream, None] = {}  # they have ended, and what they hold goes in slices
         self._skipping: dict[InStream, None] = {}  # streams that leave messages out, and go on in a while
         self._missing: dict[StreamId, float] = {}  # not announced by a new peer, and since when
         self.finish: Callable[[Link, float], bool] | None = None
@@ -267,18 +264,15 @@ class Link(Answering):
         fates.dropped(stream, seq, reason, self.peer)
 
     def _dropped(self, channel: OutChannel, out: OutMessage, reason: DropReason) -> None:
-        topic = channel.stream.id.topic
-        self.trace.record(self._now, topic, TraceEvent.DROPPED, seq=out.seq, reason=reason, peer=self.peer)
         if self.channels.get(channel.slot) is channel:
+            topic = channel.stream.id.topic
+            self.trace.record(self._now, topic, TraceEvent.DROPPED, seq=out.seq, reason=reason, peer=self.peer)
             self._tell(self.handler.on_out_drop, self, channel, out, reason)
 
-    def close_channel(self, channel: OutChannel, reason: DropReason, *, now: float, silent: bool = False) -> None:
-        """The stream is gone: tell the peer, drop what is left for `reason`. `silent`: nobody is owed any of it, so the
-        owner is not told of drops, and much goes in slices."""
+    def close_channel(self, channel: OutChannel, reason: DropReason, *, now: float) -> None:
+        """The stream is gone: tell the peer, drop what is left for `reason`."""
         self._now = now
-        if not silent:
-            self.finish_steps()  # what it has confirmed is not dropped
-            channel.clear(reason)
+        channel.clear(reason)
         channel.ready = False
         self._refresh(channel, now)
         self.channels.pop(channel.slot, None)
@@ -288,19 +282,6 @@ class Link(Answering):
         self.texts.use_outgoing(channel.slot, "")
         if self.established:
             self.send_control({"t": "retract", "ch": channel.slot}, now=now)
-        if channel.kept:
-            self._closed[channel] = None
-            # It may be one of many, for something that another client has said.
-            self._in_slices(partial(self._clear_closed, channel, reason), later=channel.kept > FEW)
-
-    def _clear_closed(self, channel: OutChannel, reason: DropReason) -> bool:
-        done = True  # also if it fails
-        try:
-            done = self._clear(channel, reason)
-        finally:
-            if done:
-                del self._closed[channel]
-        return done
 
     def _announce(self, channel: OutChannel, now: float) -> None:
         stream = channel.stream
@@ -362,7 +343,7 @@ class Link(Answering):
             if replaced is not None:  # the origin was configured anew: what was delivered stays delivered
                 stream.delivered, stream.confirmed = replaced.delivered, replaced.confirmed
                 stream.unhandled = replaced.unhandled
-                self._close_stream(replaced)
+                replaced.close()
             self.streams[identity] = stream
         self._missing.pop(identity, None)
         stream.channel_id = slot
@@ -381,7 +362,7 @@ class Link(Answering):
             self.texts.use_incoming(identity, "")
             self._watermarks.pop(slot, None)
             stream.channel_id = None
-            self._close_stream(stream)
+            stream.close()
             self.send_control({"t": "refuse", "ch": slot, "code": refusal.code, "why": str(refusal)[:400]}, now=now)
             return
         self._skip(stream, announcement.first, now)
@@ -556,25 +537,8 @@ class Link(Answering):
         self._forget_answers(stream)
         self._skipping.pop(stream, None)
         self._tell(self.handler.on_retract, self, stream, now=now)
-        self._close_stream(stream)
+        stream.close()
         stream.channel_id = None
-
-    def _close_stream(self, stream: InStream) -> None:
-        """It has ended: let go of what it holds."""
-        stream.close(most=0)
-        if stream.holds_any:
-            self._closing[stream] = None
-            self._in_slices(partial(self._close_some, stream))
-
-    def _close_some(self, stream: InStream) -> bool:
-        done = True  # also if it fails
-        try:
-            self.reassembly.work_us += STALE_US * stream.close(self._at_most(STALE_US))
-            done = not stream.holds_any
-        finally:
-            if done:
-                del self._closing[stream]
-        return done
 
     def _sweep(self, now: float) -> None:
         super()._sweep(now)
@@ -656,9 +620,10 @@ class Link(Answering):
         if kind == "dropped":
             reason = DROP_REASONS.get(wire.take_int(envelope, "code"), DropReason.LOST)
             where = wire.take_str(envelope, "to", max_length=64, default="")
+            self.reassembly.work_us += len(channel.retained) // RETAINED_PER_US
             count = wire.take_int(envelope, "n", low=1, high=wire.MAX_SEQ, default=1)
-            seq = wire.take_int(envelope, "seq")
-            self._reported(channel, seq, seq + count, reason, where)
+            news = channel.reported(wire.take_int(envelope, "seq"), reason, where, count)
+            self.reassembly.work_us += GIVEN_UP_US * news
         else:
             code, why = wire.take_str(envelope, "code", max_length=64), wire.take_str(envelope, "why")
             self._set_wanted(
@@ -678,34 +643,12 @@ class Link(Answering):
     def close_streams(self) -> None:
         """The link is given up: its incoming streams are gone for good."""
         for stream in self.streams.values():
-            self._close_stream(stream)
+            stream.close()
         self.streams.clear()
         self._skipping.clear()
         self.incoming.clear()
         self._missing.clear()
         self.texts.close()
-
-    def wind_down(self, reason: DropReason, most: int, *, now: float) -> int:
-        """The link is about to be given up: drop what waits, at most so many messages, and at once what comes from now
-        on. Returns how many; `idle` says whether that was all."""
-        self._now = now
-        left = most
-        for channel in list(self.channels.values()):
-            if channel.wanted is not False:
-                channel.wanted = False
-                self._refresh(channel, now)
-            if left > 0 and channel.kept:
-                watermark = channel.watermark
-                left -= channel.clear(reason, left)
-                self._refresh(channel, now)
-                if channel.watermark > watermark:
-                    self._watermark_moved(channel)
-        return most - left
-
-    @property
-    def idle(self) -> bool:
-        """Whether nothing waits or is under way, and nothing that has ended is left."""
-        return not self._steps and not any(channel.kept for channel in self.channels.values())
 
     @property
     def now(self) -> float:
@@ -756,11 +699,8 @@ class Link(Answering):
             channel.validate(check)
             waits = bool(channel.ready and channel.wanted and (channel.active or channel.queue))
             check(waits == channel.offered, f"{channel.stream.id.topic}: the scheduler does not know what waits")
-        open_or_not = (*self.channels.values(), *self._closed)
-        self.ledger.validate([(channel.counters, *channel.held()) for channel in open_or_not], check)
-        there_or_not = (*self.streams.values(), *self._closing, self._control_in)
-        held_bytes = sum(stream.held_bytes for stream in there_or_not)
-        check(bool(self._steps) or not (self._closed or self._closing), "what has ended is kept for ever")
+        self.ledger.validate([(channel.counters, *channel.held()) for channel in self.channels.values()], check)
+        held_bytes = sum(stream.held_bytes for stream in self.streams.values()) + self._control_in.held_bytes
         check(self.reassembly.held_bytes == held_bytes, "reassembly bytes do not add up")
         for stream in self.streams.values():
             stream.validate(check)

@@ -10,11 +10,9 @@ A message is in exactly one of four places: queued (nothing sent yet), in flight
 reason. `OutChannel.validate` checks that the counters agree.
 """
 
-import sys
 from bisect import bisect_left, insort
 from collections import deque
 from collections.abc import Callable, Sequence
-from itertools import islice
 from math import inf
 from operator import attrgetter
 from typing import Any, Final
@@ -36,9 +34,6 @@ GIVEN_UP_US: Final = 3
 
 SHARE_HOLD_S: Final = 1.0
 """The longest that the newest message is held back by a `share`."""
-
-MOST: Final = sys.maxsize
-"""As many as there are."""
 
 OnDrop = Callable[["OutChannel", OutMessage, DropReason], None]
 
@@ -124,7 +119,7 @@ class OutChannel:
         self._arrived_s = _NEVER
         self._owed_share = 0.0
         self._cap = _NO_CAP if stream.spec.max_rate_hz is None else RateCap(stream.spec.max_rate_hz)
-        self.wanted: bool | None = None  # does anybody behind the peer want it? None until the peer has answered
+        self.wanted: bool | None = None  # None until the peer has answered
         self.ready = False  # announced in the session
         self.gaps: deque[tuple[int, int]] = _NOTHING  # reliable: after this seq, the next that will come
         self.offered = False  # the scheduler knows of a pending message
@@ -143,17 +138,18 @@ class OutChannel:
         counters = self.counters
         size = len(message.body)
         if self.reliable:
-            unwanted = self.wanted is False and message.seq > self.watermark
-            if not (forced or unwanted or self.has_room(size)):
+            if not forced and not self.has_room(size):
                 counters.refuse(size)
                 return False
             counters.offer(size)
-            if unwanted:
-                self._leave_unwanted(message)
-                return True
             self.next_seq = message.seq + 1
             if message.seq <= self.watermark:
                 counters.deliver(size)  # the peer has it already, from an earlier run of this relay
+                return True
+            if self.wanted is False and not self.retained:
+                reason = DROP_REASONS[message.tombstone] if message.tombstone else DropReason.UNWANTED
+                self._count(message.seq, reason, size)
+                self.watermark = message.seq
                 return True
             out = OutMessage(message)
             if message.tombstone:
@@ -181,15 +177,6 @@ class OutChannel:
             out = OutMessage(message)
         self._keep(out)
         return True
-
-    def _leave_unwanted(self, message: Message) -> None:
-        """Nobody wants a reliable message: it is passed, and behind what is still being dropped in its turn."""
-        reason = DROP_REASONS[message.tombstone] if message.tombstone else DropReason.UNWANTED
-        self._count(message.seq, reason, len(message.body))
-        if self.retained:
-            self.skip_to(message.seq + 1)
-        else:
-            self.next_seq, self.watermark = message.seq + 1, message.seq
 
     def reject(self, message: Message, reason: DropReason) -> None:
         """Drop a message that cannot travel at all; a reliable stream goes on over its tombstone."""
@@ -547,27 +534,25 @@ class OutChannel:
             out.active = False
             del self.active[bisect_left(self.active, out.seq, key=_SEQ)]
 
-    def delivered_to(self, watermark: int, most: int = MOST) -> int:
-        """The peer's delivered watermark moved: reliable messages up to it are done. Returns how many were kept.
+    def _deactivate_all(self) -> None:
+        for out in self.active:
+            out.active = False
+        self.active.clear()
 
-        After `most` of them the rest waits for another call: `watermark` says how far it has got.
-        """
+    def delivered_to(self, watermark: int) -> int:
+        """The peer's delivered watermark moved: reliable messages up to it are done. Returns how many were kept."""
         if watermark <= self.watermark:
             return 0
+        self.watermark = watermark
         retained = self.retained
-        done = 0
+        before = len(retained)
         while retained and retained[0].seq <= watermark:
-            if done >= most:
-                self.watermark = retained[0].seq - 1
-                return done
-            done += 1
             out = retained.popleft()
             self.retained_bytes -= out.size
             if not out.counted:
                 self.counters.deliver(out.offered_bytes)
             self._forget(out)
-        self.watermark = watermark
-        return done
+        return before - len(retained)
 
     def settle(self) -> None:
         """Let go of reliable messages that the peer has whole, in order: for a stream without a watermark."""
@@ -626,27 +611,20 @@ class OutChannel:
                 del self.flying[out.seq]
             self._deactivate(out)
 
-    def reported(
-        self, seq: int, reason: DropReason, where: str = "", count: int = 1, most: int = MOST
-    ) -> tuple[int, int]:
+    def reported(self, seq: int, reason: DropReason, where: str = "", count: int = 1) -> int:
         """A later hop dropped `count` messages from `seq` on, for the client `where`, and said so before its watermark
-        passed them. After `most` of them the rest waits for another call. Returns how many were looked at, and the seq
-        to go on at, 0 if that is all."""
-        retained = self.retained
-        start = bisect_left(retained, seq, key=_SEQ)
-        looked = 0
-        for out in islice(retained, start, None):
+        passed them. Returns how many of them are news."""
+        news = 0
+        for out in self.retained:
             if out.seq >= seq + count:
                 break
-            if looked >= most:
-                return looked, out.seq
-            looked += 1
-            if not out.counted:
+            if out.seq >= seq and not out.counted:
                 self._count(out.seq, reason, out.offered_bytes)
                 out.counted = True
                 out.lost_to = where
+                news += 1
                 self.on_drop(self, out, reason)
-        return looked, 0
+        return news
 
     def sweep(self, now: float, *, up: bool) -> None:
         """Expire what nobody will send: lifespan and retention, also while the link is down."""
@@ -690,6 +668,12 @@ class OutChannel:
         candidates = [out.seq for out in (*self.flying.values(), *self.queue, *filter(None, (self.newest,)))]
         return min(candidates) if candidates else self.next_seq
 
+    def set_wanted(self, wanted: bool, reason: DropReason = DropReason.UNWANTED) -> None:
+        """The peer's answer: does anybody behind it want this stream? What is left is dropped for `reason` if not."""
+        self.wanted = wanted
+        if not wanted:
+            self.clear(reason)
+
     def peer_restarted(self) -> None:
         """A new process at the other end has nothing of what we sent: everything waits to be sent again."""
         again = list(self.retained) if self.reliable else sorted(self.flying.values(), key=lambda out: out.seq)
@@ -709,51 +693,28 @@ class OutChannel:
         self.queue = deque(again) if again else _NOTHING
         self.queued_bytes = sum(out.size for out in again)
         self.flying.clear()
-        for out in self.active:
-            out.active = False
-        self.active.clear()
+        self._deactivate_all()
         self.acked_seq = self.begun_seq = 0
 
-    def clear(self, reason: DropReason, most: int = MOST) -> int:
-        """The stream ends, or nobody wants it: whatever is left is dropped for `reason`, the oldest first. Returns how
-        many went; after `most` of them the rest waits for another call. Of a reliable stream the watermark passes each
-        as it is dropped and told, so that what it passes is never more than that."""
-        return self._clear_reliable(reason, most) if self.reliable else self._clear_best_effort(reason, most)
-
-    def _clear_reliable(self, reason: DropReason, most: int) -> int:
-        retained = self.retained
-        done = 0
-        while retained and done < most:
-            done += 1
-            out = retained.popleft()
-            self.retained_bytes -= out.size
-            self._forget(out)
-            if not out.counted:
-                self._drop(out, reason)
-            self.watermark = out.seq
-            while self.gaps and self.gaps[0][0] <= out.seq:  # who does not want the stream is not told of them
-                self.watermark = max(self.watermark, self.gaps.popleft()[1] - 1)
-        if not retained:
-            self.retained = self.queue = self.gaps = _NOTHING
+    def clear(self, reason: DropReason) -> None:
+        """The stream ends: whatever is left is dropped for `reason`."""
+        if self.reliable:
+            for out in self.retained:
+                out.coding = Coding.DONE
+                if not out.counted:
+                    self._drop(out, reason)
+            self.retained = _NOTHING
+            self.retained_bytes = 0
+            self.gaps = _NOTHING
             self.watermark = max(self.watermark, self.next_seq - 1)
-        return done
-
-    def _clear_best_effort(self, reason: DropReason, most: int) -> int:
-        done = 0
-        for out in list(islice(self.flying.values(), most)):
-            done += 1
-            del self.flying[out.seq]
-            self._deactivate(out)
-            self._drop(out, reason)
-        while self.queue and done < most:
-            done += 1
-            self._drop(self._pop_queue(), reason)
-        if done < most:
-            done += self.newest is not None
+        else:
+            for out in (*self.flying.values(), *self.queue):
+                self._drop(out, reason)
             self._drop_newest(reason)
-        if not self.queue:
-            self.queue = _NOTHING
-        return done
+        self.flying.clear()
+        self._deactivate_all()
+        self.queue = _NOTHING
+        self.queued_bytes = 0
 
     # --- accounting -----------------------------------------------------------------------------------------------
 

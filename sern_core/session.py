@@ -109,7 +109,6 @@ class Session(Hop):
         self.cut_off = False
         """The stream lane ended when the datagram lane was silent already: the path is gone, not the peer's process."""
         self._unread: deque[tuple[int, int, int, bytes, int]] = deque()  # lane, number, stamp, datagram, where to go on
-        self._steps: deque[Callable[[], bool]] = deque()  # what is done in steps, before any of that is read
         self._unread_bytes = 0
         self.read_due_s: float | None = None
         """When to go on reading; None: nothing that has arrived waits to be read."""
@@ -272,8 +271,6 @@ class Session(Hop):
         again = self.established and tag == self.tag and boot == self.peer_boot  # our WELCOME was lost
         if not again and now < self._begun_paid_s - BEGIN_AHEAD_S:
             return False
-        if self._steps and boot != self.peer_boot:
-            return False  # what is not through was of the process before: it must not touch what the new one gets
         self._hello_stamp_us = stamp_us
         self.transport_up = True
         if not again:
@@ -339,7 +336,6 @@ class Session(Hop):
     def _establish(self, peer_boot: int, now: float) -> None:
         resumed = self._resumed = self.peer_boot == peer_boot
         if not resumed:
-            self.finish_steps()
             for channel in self.channels.values():
                 channel.peer_restarted()
             self.clock = ClockSync()
@@ -495,48 +491,12 @@ class Session(Hop):
             raise WireError(f"{self.peer} goes on sending although {len(self._unread)} datagrams wait to be read")
         self._unread.append((lane, number, stamp_us, data, 0))
 
-    def _in_slices(self, step: Callable[[], bool], *, later: bool = False) -> None:
-        self._steps.append(step)
-        if (later or not self._step_on()) and self.read_due_s is None:
-            self.read_due_s = self._now
-            self.dirty = True  # the owner looks at the deadline again
-
-    @property
-    def unfinished(self) -> bool:
-        """Whether something that is done in steps is not through; `handle_timeout` goes on with it."""
-        return bool(self._steps)
-
-    def _step_on(self) -> bool:
-        """One slice of what is done in steps. True: all of it is done."""
-        steps = self._steps
-        while steps:
-            if self.reassembly.work_us > SLICE_US:
-                return False
-            step = steps.popleft()  # one that fails does not come again
-            try:
-                done = step()
-            except BaseException:
-                self.read_due_s = self._now if steps else self.read_due_s  # the others have their turn all the same
-                raise
-            if not done:
-                steps.appendleft(step)
-        return True
-
-    def finish_steps(self) -> None:
-        """Do at once what is left of what is done in steps, and charge it."""
-        spent_us = 0
-        while self._steps:
-            spent_us += self.reassembly.work_us
-            self.reassembly.work_us = 0
-            self._step_on()
-        self.reassembly.work_us += spent_us
-
     def _read_on(self, now: float) -> None:
         self._now = now
         reassembly = self.reassembly
         reassembly.work_us = 0
         self.read_due_s = None
-        done = self._step_on() and self._go_on(now)
+        done = self._go_on(now)
         while done and self._unread and reassembly.work_us <= SLICE_US:
             lane, number, stamp_us, data, position = self._unread.popleft()
             self._unread_bytes -= len(data) + UNREAD_OVERHEAD_BYTES
@@ -547,7 +507,7 @@ class Session(Hop):
             if state is not None:  # else it is closed, and what came over it comes again
                 self._receive_data(state, number, stamp_us, data, now, position)
             done = self.read_due_s is None
-        if not done or self._unread or self._steps:
+        if not done or self._unread:
             self.read_due_s = now + reassembly.work_us * 1e-6
         if self.on_read is not None:
             self.on_read()

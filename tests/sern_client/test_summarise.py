@@ -209,10 +209,10 @@ async def test_what_waits_is_bounded(bench: Bench) -> None:
 async def test_nothing_is_made_that_nobody_wants(bench: Bench) -> None:
     channel = bench.channel()
     summary = bench.summary(VoxelParams(), (channel,))
-    channel.wanted = False
+    channel.set_wanted(False)
     assert summary.offer(b"a", 1, 0.0) and not summary.wanted
     assert bench.begun == 0 and bench.dropped(channel) == {DropReason.UNWANTED: 1}
-    channel.wanted = True
+    channel.set_wanted(True)
     assert summary.offer(b"a", 1, 0.0) and bench.sent == [b"A"] and summary.wanted
 
 

@@ -3,12 +3,12 @@
 import pytest
 from hypothesis import Phase, given, settings
 
-from sern_core import answering, fragments, hop, hub_fanout, link, session
+from sern_core import fragments, hop, hub_fanout, link, session
 from tests.exploring import cases
 from tests.scenarios import Run, Scenario, scenarios
 
 PHASES = (Phase.explicit, Phase.generate)  # a scenario reads well as it is; making it smaller takes minutes
-SLICED = (answering, fragments, hop, hub_fanout, link, session)
+SLICED = (fragments, hop, hub_fanout, link, session)
 """Every module that ends a slice."""
 
 

@@ -12,13 +12,10 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, pr
 from sern_core.ledger import SendLedger
 from sern_core.message import Message, StreamId, StreamInfo, TopicInfo, TopicSpec
 from sern_core.out_message import OutMessage
-from sern_core.queues import MESSAGE_OVERHEAD_BYTES, MOST, OutChannel
+from sern_core.queues import MESSAGE_OVERHEAD_BYTES, OutChannel
 from sern_core.types import ClientName, DropReason, Encoding, TopicName
 from tests.exploring import cases
 from tests.world import spec
-
-MANY = st.sampled_from([1, 2, MOST])
-"""How many messages one call may deal with."""
 
 
 class Sender:
@@ -47,12 +44,6 @@ class Sender:
         if out is None:
             return None
         return (out, out.generation, *self.channel.take(out, room, now))
-
-    def answer(self, wanted: bool, most: int = MOST) -> None:
-        """As the link does it; `most` messages go, if it is not wanted."""
-        self.channel.wanted = wanted
-        if not wanted:
-            self.channel.clear(DropReason.UNWANTED, most)
 
     def check(self) -> None:
         def check(ok: bool, text: str) -> None:
@@ -111,7 +102,7 @@ def test_what_is_held_back_has_a_lifespan_and_an_end() -> None:
         (lambda sender: sender.channel.sweep(0.35, up=True), DropReason.LIFESPAN),
         (lambda sender: sender.channel.release(1.0), DropReason.LIFESPAN),
         (lambda sender: sender.channel.clear(DropReason.SHUTDOWN), DropReason.SHUTDOWN),
-        (lambda sender: sender.answer(False), DropReason.UNWANTED),
+        (lambda sender: sender.channel.set_wanted(False), DropReason.UNWANTED),
         (lambda sender: sender.channel.shed(DropReason.QUEUE_FULL), DropReason.QUEUE_FULL),
     ):
         sender = Sender(spec(depth=1, max_rate_hz=1.0, lifespan_s=0.3))
@@ -446,16 +437,15 @@ class Channel(RuleBasedStateMachine):
             self.sender.channel.fragment_acked(out, generation)
 
     @precondition(lambda self: self.sender.channel.reliable)
-    @rule(ahead=st.integers(0, 3), most=MANY)
-    def confirm(self, ahead: int, most: int) -> None:
+    @rule(ahead=st.integers(0, 3))
+    def confirm(self, ahead: int) -> None:
         channel = self.sender.channel
-        channel.delivered_to(min(channel.watermark + ahead, channel.next_seq - 1), most)
+        channel.delivered_to(min(channel.watermark + ahead, channel.next_seq - 1))
 
     @precondition(lambda self: self.sender.channel.reliable)
-    @rule(seq=st.integers(1, 10), count=st.integers(1, 5), most=MANY)
-    def report(self, seq: int, count: int, most: int) -> None:
-        looked, go_on_at = self.sender.channel.reported(seq, DropReason.RATE_CAP, "", count, most)
-        assert looked <= min(most, count) and (go_on_at == 0 or seq <= go_on_at < seq + count)
+    @rule(seq=st.integers(1, 10))
+    def report(self, seq: int) -> None:
+        self.sender.channel.reported(seq, DropReason.RATE_CAP)
 
     @rule(seconds=st.sampled_from([0.1, 0.6, 3.0]), up=st.booleans())
     def wait(self, seconds: float, up: bool) -> None:
@@ -473,9 +463,9 @@ class Channel(RuleBasedStateMachine):
         self.lose_session()
         self.sender.channel.peer_restarted()
 
-    @rule(wanted=st.booleans(), most=MANY)
-    def answer(self, wanted: bool, most: int) -> None:
-        self.sender.answer(wanted, most)
+    @rule(wanted=st.booleans())
+    def answer(self, wanted: bool) -> None:
+        self.sender.channel.set_wanted(wanted)
 
     @rule()
     def drop_head(self) -> None:
