@@ -13,7 +13,7 @@ from sern_core.announce import Want, encode_dropped
 from sern_core.errors import WireError
 from sern_core.fragments import InStream
 from sern_core.interest import Interest
-from sern_core.queues import GIVEN_UP_US, OutChannel
+from sern_core.queues import OutChannel
 from sern_core.session import Session, SessionArguments
 from sern_core.types import DROP_CODES, DropReason
 
@@ -100,10 +100,12 @@ class Answering(Session):
     def _say_deadline(self) -> float:
         return self._interest.deadline_s
 
-    def report_drop(self, stream: InStream, seq: int, reason: DropReason, where: str, *, now: float) -> None:
-        """Tell the origin's side that a reliable message was dropped here or further on: before the watermark passes
-        it, and again in the next session until it is known there."""
-        stream.report(seq, reason, where)
+    def report_drop(
+        self, stream: InStream, seq: int, reason: DropReason, where: str, *, now: float, count: int = 1
+    ) -> None:
+        """Tell the origin's side that reliable messages, `count` from `seq` on, were dropped here or further on: before
+        the watermark passes them, and again in the next session until it is known there."""
+        stream.report(seq, reason, where, count)
         if stream.channel_id is not None:
             self._reporting[stream] = None
             self._unsaid = self.dirty = True
@@ -199,8 +201,6 @@ class Answering(Session):
         self, channel: OutChannel, wanted: bool, now: float, *, reason: DropReason = DropReason.UNWANTED
     ) -> None:
         watermark = channel.watermark
-        if not wanted:
-            self.reassembly.work_us += GIVEN_UP_US * channel.kept
-        channel.set_wanted(wanted, reason)
+        self.reassembly.work_us += channel.set_wanted(wanted, reason)
         if channel.watermark > watermark:
             self._watermark_moved(channel)

@@ -9,7 +9,7 @@ new process and everything is sent again.
 
 from bisect import bisect_right
 from collections import OrderedDict, deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from heapq import heappop, heappush
 from itertools import islice
 from typing import Final
@@ -197,16 +197,17 @@ class DropReport:
 
     __slots__ = ("control_seq", "count", "reason", "seq", "where")
 
-    def __init__(self, seq: int, reason: DropReason, where: str) -> None:
+    def __init__(self, seq: int, reason: DropReason, where: str, count: int = 1) -> None:
         self.seq = seq
-        self.count = 1
+        self.count = count
         self.reason = reason
         self.where = where
         self.control_seq = 0  # the control message of the session that carries it; 0: none yet
 
 
 Deliver = Callable[["InStream", Message], None]
-OnInDrop = Callable[["InStream", DropReason, int, int, bool], None]
+OnInDrop = Callable[["InStream", DropReason, int, Sequence[int], bool], None]
+"""`on_drop(stream, reason, nbytes, seqs, reported)`, `nbytes` of all of them together."""
 """Stream, reason, bytes, seq, and whether its tombstone follows: a reliable message that was given up here."""
 
 
@@ -283,7 +284,7 @@ class InStream:
         if self._partials and (flags & FLAG_TOMBSTONE or len(body) == total):
             self._discard_partial(seq)
         if self._waiting and seq in self._waiting:
-            self._on_drop(self, DropReason.DUPLICATE, len(body), seq, False)
+            self._on_drop(self, DropReason.DUPLICATE, len(body), (seq,), False)
             return
         if flags & FLAG_TOMBSTONE:
             code = body[0] if body[0] in DROP_REASONS else DROP_CODES[DropReason.LOST]
@@ -337,15 +338,16 @@ class InStream:
                 )
             )
 
-    def report(self, seq: int, reason: DropReason, where: str) -> None:
-        """The peer is to hear that message `seq` was dropped; runs of it are one report until it is on its way."""
+    def report(self, seq: int, reason: DropReason, where: str, count: int = 1) -> None:
+        """The peer is to hear that `count` messages from `seq` on were dropped; runs that meet are one report until it
+        is on its way."""
         for report in islice(reversed(self.reports), MERGED_REPORTS):
             if report.control_seq:
                 break
             if report.seq + report.count == seq and report.reason is reason and report.where == where:
-                report.count += 1
+                report.count += count
                 return
-        self.reports.append(DropReport(seq, reason, where))
+        self.reports.append(DropReport(seq, reason, where, count))
         self._reassembly.reports += 1
 
     def unsaid(self, *, runs: bool) -> DropReport | None:
@@ -394,10 +396,10 @@ class InStream:
         if seq <= self.delivered or seq in self._waiting:
             return
         if not self.reliable:
-            self._on_drop(self, reason, nbytes, seq, False)
+            self._on_drop(self, reason, nbytes, (seq,), False)
             return
         self._check_heard()
-        self._on_drop(self, reason, nbytes, seq, True)
+        self._on_drop(self, reason, nbytes, (seq,), True)
         self._arrived(self.tombstone(seq, reason, 0, now))
 
     def fail(self, seq: int, nbytes: int, now: float) -> None:
@@ -416,7 +418,7 @@ class InStream:
         self._lose(next(iter(self._partials)), DropReason.REASSEMBLY)
 
     def _lose(self, seq: int, reason: DropReason) -> None:
-        self._on_drop(self, reason, self._partials[seq].total, seq, False)
+        self._on_drop(self, reason, self._partials[seq].total, (seq,), False)
         self._discard_partial(seq)
 
     def _discard_partial(self, seq: int) -> None:
@@ -428,15 +430,15 @@ class InStream:
 
     def _late(self, seq: int, size: int) -> None:
         if self.reliable:
-            self._on_drop(self, DropReason.DUPLICATE, size, seq, False)
+            self._on_drop(self, DropReason.DUPLICATE, size, (seq,), False)
             return
         bit = self.delivered - 1 - seq
         if seq == self.delivered or (0 <= bit < SEEN_BITS and self._seen >> bit & 1):
-            self._on_drop(self, DropReason.DUPLICATE, size, seq, False)
+            self._on_drop(self, DropReason.DUPLICATE, size, (seq,), False)
         else:
             if 0 <= bit < SEEN_BITS:
                 self._seen |= 1 << bit
-            self._on_drop(self, DropReason.SUPERSEDED, size, seq, False)
+            self._on_drop(self, DropReason.SUPERSEDED, size, (seq,), False)
 
     def _arrived(self, message: Message) -> None:
         seq = message.seq
@@ -467,7 +469,7 @@ class InStream:
         if not self._reassembly.make_room(size + HELD_OVERHEAD_BYTES):
             # Without the message before it this one cannot be kept; its tombstone can.
             if not message.tombstone:
-                self._on_drop(self, DropReason.REASSEMBLY, size, seq, True)
+                self._on_drop(self, DropReason.REASSEMBLY, size, (seq,), True)
                 message = self.tombstone(seq, DropReason.REASSEMBLY, message.stamp_ns, message.born_s)
             if not self._reassembly.make_room(len(message.body) + HELD_OVERHEAD_BYTES):
                 raise WireError(f"more messages out of order than {self._reassembly.limit_bytes} bytes hold")
@@ -521,9 +523,9 @@ class InStream:
             # Late as far as can be known: where the clocks' offset is uncertain, the worst of it counts.
             size = len(message.body)
             if not self.reliable:
-                self._on_drop(self, DropReason.LIFESPAN, size, message.seq, False)
+                self._on_drop(self, DropReason.LIFESPAN, size, (message.seq,), False)
                 return
-            self._on_drop(self, DropReason.LIFESPAN, size, message.seq, True)
+            self._on_drop(self, DropReason.LIFESPAN, size, (message.seq,), True)
             message = self.tombstone(message.seq, DropReason.LIFESPAN, message.stamp_ns, message.born_s)
         self.known = True
         self._deliver(self, message)
@@ -548,9 +550,12 @@ class InStream:
 
     def forget(self, reason: DropReason) -> None:
         """Let go of half-received and waiting messages: the sender has given them up."""
-        for seq in list(self._partials):
-            self._lose(seq, reason)
-        self._reassembly.held_bytes -= self._waiting_bytes()
+        self._reassembly.held_bytes -= self.held_bytes
+        if self._partials:
+            # At once: a peer may leave a hundred thousand half sent.
+            lost, self._partials = self._partials, {}
+            self._reassembly.gone(self)
+            self._on_drop(self, reason, sum(partial.total for partial in lost.values()), tuple(lost), False)
         self._waiting.clear()
         self._order.clear()
         self._stale = None

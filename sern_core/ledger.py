@@ -79,15 +79,16 @@ class SendCounters(_Drops):
         self.offered += 1
         self.offered_bytes += nbytes
 
-    def deliver(self, nbytes: int) -> None:
-        """The peer has it: acknowledged (best effort) or below its watermark (reliable)."""
-        self.delivered += 1
+    def deliver(self, nbytes: int, count: int = 1) -> None:
+        """The peer has it: acknowledged (best effort) or below its watermark (reliable). `nbytes` of all of them."""
+        self.delivered += count
         self.delivered_bytes += nbytes
 
-    def drop(self, reason: DropReason, nbytes: int) -> None:
-        self.dropped += 1
+    def drop(self, reason: DropReason, nbytes: int, count: int = 1) -> None:
+        """`nbytes` of all of them."""
+        self.dropped += count
         self.dropped_bytes += nbytes
-        self._count(reason)
+        self._count(reason, count)
 
     def refuse(self, nbytes: int) -> None:
         """A reliable queue was full and the caller was told."""
@@ -121,8 +122,8 @@ class ReceiveCounters(_Drops):
         self.age_s = age_s
         self.last_born_s = now - age_s
 
-    def drop_arrived(self, reason: DropReason) -> None:
-        self._count(reason)
+    def drop_arrived(self, reason: DropReason, count: int = 1) -> None:
+        self._count(reason, count)
 
     def age_of_information_s(self, now: float) -> float | None:
         """How old the freshest delivered sample is now; None before the first."""

@@ -34,7 +34,7 @@ from sern_core.fragments import SLICE_US, InStream
 from sern_core.message import Message, StreamId, StreamInfo
 from sern_core.out_message import OutMessage
 from sern_core.params import LinkParams, SchedulerParams
-from sern_core.queues import GIVEN_UP_US, OutChannel
+from sern_core.queues import OutChannel
 from sern_core.trace import DecisionTrace, TraceEvent
 from sern_core.types import CLASS_LABELS, DROP_REASONS, ClientName, DropReason, PriorityClass
 
@@ -53,6 +53,8 @@ RETAINED_PER_US: Final = 16
 """What a control message is charged with: itself, its size, what its attachment unpacks to, what it looks through."""
 ANNOUNCE_US: Final = 12
 """What a session that begins is charged with for each stream that is announced in it."""
+MAX_TRACED: Final = 100
+"""Of many messages that are dropped at once, so many are in the trace of decisions."""
 MAX_UNHEARD: Final = 20_000
 """Control messages that a peer may have answered, beside four for each channel, before it reads an answer."""
 
@@ -90,9 +92,11 @@ class LinkHandler(Protocol):
     def on_message(self, link: "Link", stream: InStream, message: Message, *, now: float) -> None:
         """A message (or tombstone) has its turn."""
 
-    def on_in_drop(self, link: "Link", stream: InStream, reason: DropReason, nbytes: int) -> None: ...
+    def on_in_drop(self, link: "Link", stream: InStream, reason: DropReason, nbytes: int, count: int) -> None: ...
 
-    def on_out_drop(self, link: "Link", channel: OutChannel, out: OutMessage, reason: DropReason) -> None: ...
+    def on_out_drop(
+        self, link: "Link", channel: OutChannel, out: OutMessage, reason: DropReason, count: int
+    ) -> None: ...
 
     def on_delivered(self, link: "Link", channel: OutChannel, *, now: float) -> None:
         """The peer's watermark of a reliable channel moved to `channel.watermark`."""
@@ -263,11 +267,12 @@ class Link(Answering):
     def _counted(self, fates: Fates, stream: StreamInfo, seq: int, reason: DropReason) -> None:
         fates.dropped(stream, seq, reason, self.peer)
 
-    def _dropped(self, channel: OutChannel, out: OutMessage, reason: DropReason) -> None:
+    def _dropped(self, channel: OutChannel, out: OutMessage, reason: DropReason, count: int) -> None:
         if self.channels.get(channel.slot) is channel:
             topic = channel.stream.id.topic
-            self.trace.record(self._now, topic, TraceEvent.DROPPED, seq=out.seq, reason=reason, peer=self.peer)
-            self._tell(self.handler.on_out_drop, self, channel, out, reason)
+            for seq in range(out.seq, out.seq + min(count, MAX_TRACED)):
+                self.trace.record(self._now, topic, TraceEvent.DROPPED, seq=seq, reason=reason, peer=self.peer)
+            self._tell(self.handler.on_out_drop, self, channel, out, reason, count)
 
     def close_channel(self, channel: OutChannel, reason: DropReason, *, now: float) -> None:
         """The stream is gone: tell the peer, drop what is left for `reason`."""
@@ -428,7 +433,7 @@ class Link(Answering):
             lifespan_s = stream.lifespan_s
             aged = lifespan_s is not None and now - message.born_s + message.error_s > lifespan_s  # while it lay here
             if aged or steps != self.clock.steps:
-                self._in_drop(stream, DropReason.LIFESPAN, len(message.body), message.seq, reported=False)
+                self._in_drop(stream, DropReason.LIFESPAN, len(message.body), (message.seq,), reported=False)
                 continue
             try:
                 self.handler.on_message(self, stream, message, now=now)
@@ -441,26 +446,28 @@ class Link(Answering):
         if message.tombstone:
             lost = message
         elif stream.reliable:
-            self._in_drop(stream, DropReason.FAULT, len(message.body), message.seq, reported=True)
+            self._in_drop(stream, DropReason.FAULT, len(message.body), (message.seq,), reported=True)
             lost = stream.tombstone(message.seq, DropReason.FAULT, message.stamp_ns, message.born_s)
         else:
-            self._in_drop(stream, DropReason.FAULT, len(message.body), message.seq, reported=False)
+            self._in_drop(stream, DropReason.FAULT, len(message.body), (message.seq,), reported=False)
             return
         try:
             self.handler.on_message(self, stream, lost, now=self._now)
         except Exception as again:  # noqa: BLE001
             self.fault(again)
 
-    def _in_drop(self, stream: InStream, reason: DropReason, nbytes: int, seq: int, reported: bool) -> None:
+    def _in_drop(self, stream: InStream, reason: DropReason, nbytes: int, seqs: Sequence[int], reported: bool) -> None:
         if stream is self._control_in:
             return
         if reported:
-            self.report_drop(stream, seq, reason, self.name, now=self._now)  # its tombstone tells the handler
-            self._answered(1)
+            for seq in seqs:
+                self.report_drop(stream, seq, reason, self.name, now=self._now)  # its tombstone tells the handler
+                self._answered(1)
         else:
-            self._tell(self.handler.on_in_drop, self, stream, reason, nbytes)
+            self._tell(self.handler.on_in_drop, self, stream, reason, nbytes, len(seqs))
             if self.fates is not None and reason is not DropReason.DUPLICATE:
-                self.fates.discarded(stream.stream, seq, reason, self.peer)
+                for seq in seqs:
+                    self.fates.discarded(stream.stream, seq, reason, self.peer)
 
     def skip(self, channel: OutChannel, first: int, *, now: float, silent: bool = False) -> None:
         """The stream goes on at seq `first`: what lies between will not come, and the peer must not wait for it.
@@ -622,8 +629,7 @@ class Link(Answering):
             where = wire.take_str(envelope, "to", max_length=64, default="")
             self.reassembly.work_us += len(channel.retained) // RETAINED_PER_US
             count = wire.take_int(envelope, "n", low=1, high=wire.MAX_SEQ, default=1)
-            news = channel.reported(wire.take_int(envelope, "seq"), reason, where, count)
-            self.reassembly.work_us += GIVEN_UP_US * news
+            self.reassembly.work_us += channel.reported(wire.take_int(envelope, "seq"), reason, where, count)
         else:
             code, why = wire.take_str(envelope, "code", max_length=64), wire.take_str(envelope, "why")
             self._set_wanted(

@@ -12,7 +12,7 @@ reason. `OutChannel.validate` checks that the counters agree.
 
 from bisect import bisect_left, insort
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from math import inf
 from operator import attrgetter
 from typing import Any, Final
@@ -32,16 +32,31 @@ GIVEN_UP_US: Final = 3
 """What giving up one message, and telling its origin, is charged with to whoever sets it off
 (`Reassembly.work_us`)."""
 
+CLEARED_PER_US: Final = 2
+"""Messages of a run that are given up at once and told of together: what they are charged with beside `GIVEN_UP_US` for
+the run."""
+
 SHARE_HOLD_S: Final = 1.0
 """The longest that the newest message is held back by a `share`."""
 
-OnDrop = Callable[["OutChannel", OutMessage, DropReason], None]
+OnDrop = Callable[["OutChannel", OutMessage, DropReason, int], None]
+"""`on_drop(channel, out, reason, count)`: so many messages that follow each other, of which `out` is the first."""
 
 _NOTHING: Final[Any] = ()
 """Where nothing waits: an empty deque takes 760 bytes, and most channels of most subscribers are quiet."""
 _NO_CAP: Final = RateCap(None)
 _NEVER: Final = -inf
 _SEQ: Final = attrgetter("seq")
+
+
+def _runs(outs: Sequence[OutMessage]) -> Iterator[Sequence[OutMessage]]:
+    """Messages in runs: of seqs that follow each other, and alike in whether they may have arrived."""
+    start = 0
+    for index in range(1, len(outs) + 1):
+        last = outs[index - 1]
+        if index == len(outs) or outs[index].seq != last.seq + 1 or outs[index].exposed is not last.exposed:
+            yield outs[start:index]
+            start = index
 
 
 class OutChannel:
@@ -190,7 +205,7 @@ class OutChannel:
         self._count(message.seq, reason, size)
         out.entomb(reason)
         self._keep(out)
-        self.on_drop(self, out, reason)
+        self.on_drop(self, out, reason, 1)
 
     def prime(self, replays: Sequence[Message], *, now: float) -> None:
         """Put latched messages (oldest first, marked as replays) ahead of everything; nothing has been sent yet."""
@@ -296,13 +311,21 @@ class OutChannel:
         if self.on_count is not None:
             self.on_count(seq, reason)
 
+    def _dropped(self, run: Sequence[OutMessage], reason: DropReason) -> None:
+        """Count messages that follow each other, and tell of them at once: there may be a hundred thousand."""
+        self.counters.drop(reason, sum([out.offered_bytes for out in run]), len(run))
+        if self.on_count is not None:
+            for out in run:
+                self.on_count(out.seq, reason)
+        self.on_drop(self, run[0], reason, len(run))
+
     def _drop(self, out: OutMessage, reason: DropReason) -> None:
         """Whatever the reason to give it up: one that may have arrived must not be counted as if it had not."""
         if out.exposed:
             reason = DropReason.UNCONFIRMED
         out.coding = Coding.DONE  # whatever another thread makes of it
         self._count(out.seq, reason, out.offered_bytes)
-        self.on_drop(self, out, reason)
+        self.on_drop(self, out, reason, 1)
 
     # --- service ------------------------------------------------------------------------------------------------
 
@@ -354,7 +377,7 @@ class OutChannel:
             self._count(out.seq, reason, out.offered_bytes)
         out.entomb(reason)
         if not reported:
-            self.on_drop(self, out, reason)
+            self.on_drop(self, out, reason, 1)
 
     def drop_head(self, reason: DropReason, now: float) -> None:
         """Give up the message that would go next (best effort); a reliable one becomes a tombstone."""
@@ -546,6 +569,9 @@ class OutChannel:
         self.watermark = watermark
         retained = self.retained
         before = len(retained)
+        if retained and retained[-1].seq <= watermark:
+            self._deliver_all()
+            return before
         while retained and retained[0].seq <= watermark:
             out = retained.popleft()
             self.retained_bytes -= out.size
@@ -553,6 +579,25 @@ class OutChannel:
                 self.counters.deliver(out.offered_bytes)
             self._forget(out)
         return before - len(retained)
+
+    def _deliver_all(self) -> None:
+        """What `delivered_to` does, at once for all: a peer may confirm a hundred thousand with one number."""
+        retained = self.retained
+        for out in retained:
+            out.coding = Coding.DONE
+        sizes = [out.offered_bytes for out in retained if not out.counted]
+        self.counters.deliver(sum(sizes), len(sizes))
+        self._let_go()
+
+    def _let_go(self) -> None:
+        """Nothing is left."""
+        if self.reliable:
+            self.retained = _NOTHING
+            self.retained_bytes = 0
+        self.flying.clear()
+        self._deactivate_all()
+        self.queue = _NOTHING
+        self.queued_bytes = 0
 
     def settle(self) -> None:
         """Let go of reliable messages that the peer has whole, in order: for a stream without a watermark."""
@@ -583,7 +628,7 @@ class OutChannel:
             self._count(message.seq, message.drop_reason, size)  # reported where it was dropped
         else:
             self._count(message.seq, reason, size)
-            self.on_drop(self, OutMessage(message), reason)
+            self.on_drop(self, OutMessage(message), reason, 1)
         self.skip_to(message.seq + 1)
 
     def start_at(self, first: int) -> None:
@@ -613,18 +658,20 @@ class OutChannel:
 
     def reported(self, seq: int, reason: DropReason, where: str = "", count: int = 1) -> int:
         """A later hop dropped `count` messages from `seq` on, for the client `where`, and said so before its watermark
-        passed them. Returns how many of them are news."""
-        news = 0
+        passed them. Returns what that costs, in microseconds."""
+        news = []
         for out in self.retained:
             if out.seq >= seq + count:
                 break
             if out.seq >= seq and not out.counted:
-                self._count(out.seq, reason, out.offered_bytes)
                 out.counted = True
                 out.lost_to = where
-                news += 1
-                self.on_drop(self, out, reason)
-        return news
+                news.append(out)
+        work_us = len(news) // CLEARED_PER_US
+        for run in _runs(news):
+            self._dropped(run, reason)
+            work_us += GIVEN_UP_US
+        return work_us
 
     def sweep(self, now: float, *, up: bool) -> None:
         """Expire what nobody will send: lifespan and retention, also while the link is down."""
@@ -668,11 +715,11 @@ class OutChannel:
         candidates = [out.seq for out in (*self.flying.values(), *self.queue, *filter(None, (self.newest,)))]
         return min(candidates) if candidates else self.next_seq
 
-    def set_wanted(self, wanted: bool, reason: DropReason = DropReason.UNWANTED) -> None:
-        """The peer's answer: does anybody behind it want this stream? What is left is dropped for `reason` if not."""
+    def set_wanted(self, wanted: bool, reason: DropReason = DropReason.UNWANTED) -> int:
+        """The peer's answer: does anybody behind it want this stream? What is left is dropped for `reason` if not.
+        Returns what that costs, in microseconds."""
         self.wanted = wanted
-        if not wanted:
-            self.clear(reason)
+        return 0 if wanted else self.clear(reason)
 
     def peer_restarted(self) -> None:
         """A new process at the other end has nothing of what we sent: everything waits to be sent again."""
@@ -696,25 +743,22 @@ class OutChannel:
         self._deactivate_all()
         self.acked_seq = self.begun_seq = 0
 
-    def clear(self, reason: DropReason) -> None:
-        """The stream ends: whatever is left is dropped for `reason`."""
+    def clear(self, reason: DropReason) -> int:
+        """The stream ends: whatever is left is dropped for `reason`. Returns what that costs, in microseconds."""
+        work_us = self.kept // CLEARED_PER_US
+        left = self.retained if self.reliable else (*self.flying.values(), *self.queue)
+        for out in left:
+            out.coding = Coding.DONE  # whatever another thread makes of it
+        for run in _runs([out for out in left if not out.counted]):
+            self._dropped(run, DropReason.UNCONFIRMED if run[0].exposed else reason)
+            work_us += GIVEN_UP_US
         if self.reliable:
-            for out in self.retained:
-                out.coding = Coding.DONE
-                if not out.counted:
-                    self._drop(out, reason)
-            self.retained = _NOTHING
-            self.retained_bytes = 0
             self.gaps = _NOTHING
             self.watermark = max(self.watermark, self.next_seq - 1)
         else:
-            for out in (*self.flying.values(), *self.queue):
-                self._drop(out, reason)
             self._drop_newest(reason)
-        self.flying.clear()
-        self._deactivate_all()
-        self.queue = _NOTHING
-        self.queued_bytes = 0
+        self._let_go()
+        return work_us
 
     # --- accounting -----------------------------------------------------------------------------------------------
 

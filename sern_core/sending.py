@@ -6,7 +6,7 @@ class.
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from math import inf
 from typing import Any, Final, NamedTuple
 
@@ -151,7 +151,9 @@ class Sender(ABC):
     def _control_message(self, stream: InStream, message: Message) -> None: ...
 
     @abstractmethod
-    def _in_drop(self, stream: InStream, reason: DropReason, nbytes: int, seq: int, reported: bool) -> None: ...
+    def _in_drop(
+        self, stream: InStream, reason: DropReason, nbytes: int, seqs: Sequence[int], reported: bool
+    ) -> None: ...
 
     @abstractmethod
     def _control_sent(self, seq: int) -> None:
@@ -192,7 +194,7 @@ class Sender(ABC):
         info = TopicInfo(CONTROL_TOPIC, "", Encoding.RAW)
         stream = StreamInfo(StreamId(self.name, self.boot, CONTROL_TOPIC), info, spec)
         counters = SendCounters(CONTROL_TOPIC, PriorityClass.CONTROL)
-        control = OutChannel(CONTROL_CHANNEL, stream, counters, lambda _channel, _out, _reason: None, first=1)
+        control = OutChannel(CONTROL_CHANNEL, stream, counters, lambda _channel, _out, _reason, _count: None, first=1)
         control.wanted = control.ready = True
         return control, InStream(stream, self.reassembly, self._control_message, self._in_drop, first=1)
 

@@ -8,7 +8,7 @@ from sern_core.control.fixed import FixedWindow
 from sern_core.queues import MESSAGE_OVERHEAD_BYTES
 from sern_core.types import PriorityClass
 from tests.fuzz.price import Input, Make, within_budget
-from tests.fuzz.test_hostile_peer import Hostile, _whole
+from tests.fuzz.test_hostile_peer import Hostile, _piece, _whole
 from tests.fuzz.test_price_datagrams import control, filled, one_more_slice, said
 from tests.world import World
 
@@ -16,6 +16,8 @@ WINDOW_BYTES = 640_000
 IN_FLIGHT = 4_000
 BOUND_BYTES = 5_200_000
 STREAMS = 100
+BACKLOG = 80_000
+HALF_RECEIVED = 120_000
 
 
 def origin_and_reader() -> tuple[Hostile, Hostile]:
@@ -80,7 +82,58 @@ def messages_that_need_room() -> Input:
     return Input(len(frames), lambda: origin.say(frames), rest=rest)
 
 
-EVENTS = (connection_that_ends, messages_that_need_room)
+def backlog_that_ends(name: str, *says: dict[str, object]) -> Make:
+    """A reader says what ends BACKLOG messages that wait for it, or confirms them."""
+
+    def make() -> Input:
+        origin, reader = origin_and_reader()
+        for first in range(1, BACKLOG, 1_600):
+            said(origin, *(_whole(1, seq) for seq in range(first, first + 1_600)))
+        (channel,) = reader.hub.links[reader.name].channels.values()
+        assert channel.kept == BACKLOG
+        frames = b"".join(control(reader, wire.encode_control(envelope)) for envelope in says)
+        frames = frames or wire.encode_watermark(1, BACKLOG)
+
+        def rest() -> bool:
+            more = one_more_slice(reader)
+            assert more or all(out.counted for out in channel.retained)
+            return more
+
+        return Input(len(frames), lambda: reader.say(frames), rest=rest)
+
+    make.__name__ = name
+    return make
+
+
+def stream_that_ends_half_received() -> Input:
+    """A peer retracts a stream of which HALF_RECEIVED messages have begun to arrive."""
+    peer = Hostile()
+    reassembly = peer.hub.links[peer.name].reassembly
+    reassembly.limit_bytes = 64 * 2**20
+    peer.announce(1, "/robot/a", reliable=True)
+    for first in range(1, HALF_RECEIVED, 1_500):
+        said(peer, *(_piece(1, seq, 0, 2) for seq in range(first, first + 1_500)))
+    frame = control(peer, wire.encode_control({"t": "retract", "ch": 1}))
+    assert reassembly.held_bytes > 512 * HALF_RECEIVED
+
+    def rest() -> bool:
+        more = one_more_slice(peer)
+        assert more or reassembly.held_bytes == 0
+        return more
+
+    return Input(len(frame), lambda: peer.say(frame), rest=rest)
+
+
+EVENTS = (
+    connection_that_ends,
+    messages_that_need_room,
+    backlog_that_ends("backlog_not_wanted", {"t": "want", "ch": 1, "on": False}),
+    backlog_that_ends("backlog_refused", {"t": "refuse", "ch": 1, "code": "forbidden", "why": ""}),
+    backlog_that_ends("backlog_dropped", {"t": "dropped", "ch": 1, "seq": 1, "code": 1, "to": "x", "n": 2**61}),
+    backlog_that_ends("backlog_unsubscribed", {"t": "subscribe", "patterns": [], "more": False}),
+    backlog_that_ends("backlog_confirmed"),
+    stream_that_ends_half_received,
+)
 
 
 @pytest.mark.parametrize("make", EVENTS, ids=lambda make: make.__name__)

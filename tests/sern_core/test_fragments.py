@@ -2,6 +2,7 @@
 
 import random
 import tracemalloc
+from collections.abc import Sequence
 from itertools import pairwise
 
 import pytest
@@ -45,9 +46,9 @@ class Receiver:
     def _turn(self, stream: InStream, message: Message) -> None:
         self.turns.append(message)
 
-    def _drop(self, stream: InStream, reason: DropReason, nbytes: int, seq: int, reported: bool) -> None:
-        assert seq > 0
-        self.drops.append((reason, seq if reported else 0))
+    def _drop(self, stream: InStream, reason: DropReason, nbytes: int, seqs: Sequence[int], reported: bool) -> None:
+        assert seqs and min(seqs) > 0
+        self.drops += [(reason, seq if reported else 0) for seq in seqs]
 
     def piece(self, seq: int, start: int, end: int, total: int, *, now: float = 0.0, born_s: float = 0.0) -> None:
         self.stream.fragment(0, seq, start, total, _body(seq, total)[start:end], 7, born_s, 0.0, now)

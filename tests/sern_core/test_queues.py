@@ -27,10 +27,11 @@ class Sender:
         self.ledger = SendLedger()
         self.drops: list[tuple[int, DropReason]] = []
         counters = self.ledger.topic(info.name, topic_spec.priority)
-        self.channel = OutChannel(
-            1, self.stream, counters, lambda _channel, out, reason: self.drops.append((out.seq, reason)), first=first
-        )
+        self.channel = OutChannel(1, self.stream, counters, self._drop, first=first)
         self.channel.wanted = self.channel.ready = True
+
+    def _drop(self, _channel: OutChannel, out: OutMessage, reason: DropReason, count: int) -> None:
+        self.drops += [(seq, reason) for seq in range(out.seq, out.seq + count)]
 
     def message(self, seq: int, size: int = 100, *, now: float = 0.0, replay: bool = False) -> Message:
         return Message(self.stream.id, seq, bytes(size), 0, now, 0, replay)
@@ -521,4 +522,46 @@ def test_at_the_end_what_may_have_arrived_is_told_from_what_was_never_sent(relia
     assert sender.take() is not None and sender.take() is not None
     sender.channel.clear(DropReason.SHUTDOWN)
     assert sender.drops == [(1, DropReason.UNCONFIRMED), (2, DropReason.SHUTDOWN), (3, DropReason.SHUTDOWN)]
+    sender.check()
+
+
+def test_many_that_are_dropped_at_once_are_told_in_runs() -> None:
+    """Of seqs that follow each other, each with the reason it has; what was told before is told no more."""
+    sender = Sender(spec(reliable=True))
+    runs: list[tuple[int, int, DropReason]] = []
+    sender.channel.on_drop = lambda _channel, out, reason, count: runs.append((out.seq, count, reason))
+    sender.submit(10)
+    assert sender.channel.reported(4, DropReason.LIFESPAN, "site", 2) > 0
+    assert sender.channel.reported(3, DropReason.LIFESPAN, "site", 4) > 0
+    assert runs == [(4, 2, DropReason.LIFESPAN), (3, 1, DropReason.LIFESPAN), (6, 1, DropReason.LIFESPAN)]
+    sender.check()
+    runs.clear()
+    sender.channel.set_wanted(False)
+    assert runs == [(1, 2, DropReason.UNWANTED), (7, 4, DropReason.UNWANTED)]
+    assert sender.channel.counters.by_reason[DropReason.UNWANTED] == 6 and sender.channel.watermark == 10
+    sender.check()
+
+
+def test_what_may_have_arrived_is_a_run_of_its_own() -> None:
+    sender = Sender(spec(reliable=False, depth=10))
+    runs: list[tuple[int, int, DropReason]] = []
+    sender.channel.on_drop = lambda _channel, out, reason, count: runs.append((out.seq, count, reason))
+    sender.submit(5)
+    for out in list(sender.channel.queue)[:2]:
+        out.exposed = True
+    sender.channel.clear(DropReason.SHUTDOWN)
+    assert runs == [(1, 2, DropReason.UNCONFIRMED), (3, 3, DropReason.SHUTDOWN)]
+    sender.check()
+
+
+def test_one_number_confirms_all_that_is_kept() -> None:
+    sender = Sender(spec(reliable=True))
+    sender.submit(20)
+    taken = sender.take()
+    assert taken is not None
+    sender.channel.reported(5, DropReason.LIFESPAN, "site")
+    assert sender.channel.delivered_to(20) == 20
+    counters = sender.channel.counters
+    assert counters.delivered == 19 and counters.dropped == 1 and sender.channel.kept == 0
+    assert sender.channel.watermark == 20 and sender.channel.head(0.0) is None
     sender.check()
