@@ -36,6 +36,9 @@ CLEARED_PER_US: Final = 2
 """Messages of a run that are given up at once and told of together: what they are charged with beside `GIVEN_UP_US` for
 the run."""
 
+FEW: Final = 16
+"""Up to so many messages that are confirmed are let go of one by one: that is what happens all the time."""
+
 SHARE_HOLD_S: Final = 1.0
 """The longest that the newest message is held back by a `share`."""
 
@@ -569,7 +572,7 @@ class OutChannel:
         self.watermark = watermark
         retained = self.retained
         before = len(retained)
-        if retained and retained[-1].seq <= watermark:
+        if before > FEW and retained[-1].seq <= watermark:
             self._deliver_all()
             return before
         while retained and retained[0].seq <= watermark:
