@@ -101,7 +101,8 @@ class RelayFeed:
         self.feed.close()
 
     def update(self, roles: tuple[FeedRole, ...], *, now: float) -> None:
-        """Make these the roles, and end what they no longer say. Raises ConfigError (see `Feed.update`)."""
+        """Make these the roles, end what they no longer say, and tell the origins what is wanted now. Raises
+        ConfigError (see `Feed.update`)."""
         for role in roles:
             self.counters.setdefault(role.name, InjectCounters())
         self._hub.local_owners.update(role.owner for role in roles if role.ingest_endpoint is not None)
@@ -110,8 +111,10 @@ class RelayFeed:
             current = known.get(role_name)
             if current is None or current.topic(name) != source.topic:
                 self._hub.close_local(source.handle, now=now)  # with its next message it opens anew, if it may
-        self.feed.update(roles)
-        self._after()
+        try:
+            self.feed.update(roles)
+        finally:
+            self._interest()  # who subscribes is as before, and what that comes to is not
 
     def publish(self, stream: StreamInfo, message: Message, *, now: float) -> None:
         """Send it to the roles' subscribers. They have had what came in through the feed itself."""
