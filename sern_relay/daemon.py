@@ -20,6 +20,7 @@ from sern_core.ledger import MAX_TOPICS
 from sern_core.link import Link
 from sern_core.message import Message, StreamInfo
 from sern_core.queues import OutChannel
+from sern_core.rules import FeedRole
 from sern_core.types import ClientName, DropReason, TopicName
 from sern_relay.feed import RelayFeed
 from sern_relay.objects_view import objects_view
@@ -204,7 +205,7 @@ class RelayDaemon:
             _log.warning("insecure: true: clients are not authenticated and nothing is encrypted")
         if model.feed.roles:
             with blamed_on(self.loaded.path, "feed", "roles"):
-                self.feed = RelayFeed(self._ctx, self.hub, model.feed_roles(), after=self._after, refused=self.refused)
+                self.feed = self._make_feed(self._ctx, model.feed_roles())
         self.tasks.append(asyncio.create_task(self._tick(), name="relay-tick"))
         if self.adaptation is not None:
             kept = self.parts.keep("adaptation", self.adaptation.run, reset=self.adaptation.reset)
@@ -278,6 +279,9 @@ class RelayDaemon:
             if self.feed is not None:
                 with self.parts.survive("feed"):
                     self.feed.sweep(now=now)
+                    if self.feed.over:
+                        feed, self.feed = self.feed, None
+                        feed.close()
             self._flush()
             if self.zap is not None:
                 self.zap.ping()
@@ -324,9 +328,8 @@ class RelayDaemon:
         self.directory = directory
         now = clock.now()
         self.hub.revoke(access, now=now)
-        if self.feed is not None:
-            with self.parts.survive("feed"):
-                self._update_feed(loaded.model, now)
+        with self.parts.survive("feed"):
+            self._update_feed(loaded.model, now)
         if self.server is not None:
             self.server.cut_unbound()  # admitted by the old keys, and silent so far
         self._end_lapsed()
@@ -421,10 +424,18 @@ class RelayDaemon:
         }
         return [((reason,), float(count)) for reason, count in counts.items()]
 
+    def _make_feed(self, ctx: "zmq.Context[zmq.Socket[bytes]]", roles: tuple[FeedRole, ...]) -> RelayFeed:
+        return RelayFeed(ctx, self.hub, roles, after=self._after, refused=self.refused)
+
     def _update_feed(self, model: RelayFile, now: float) -> None:
-        assert self.feed is not None
+        """Make the feed's roles those of `model`. The first one brings the feed; it goes soon after the last one."""
+        roles = model.feed_roles()
+        if self.feed is None:
+            if not roles or self._ctx is None:
+                return
+            self.feed = self._make_feed(self._ctx, ())  # then as any other: what can be had is in force
         try:
-            self.feed.update(model.feed_roles(), now=now)
+            self.feed.update(roles, now=now)
         except ConfigError as error:
             self.reloads_failed += 1
             self._not_in_force(f"reload failed in part, not all of feed.roles are in force: {error}")

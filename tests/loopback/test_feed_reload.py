@@ -59,6 +59,23 @@ async def comes(socket: "zmq.Socket[bytes]", frame: bytes) -> None:
     await until(has_come, f"a message of {frame!r}")
 
 
+async def test_the_first_role_of_a_relay_may_come_and_the_last_may_go(tmp_path: Path, programs: Programs) -> None:
+    async with Lab(tmp_path, "jackal1") as lab:
+        relay = await lab.relay()
+        assert relay.feed is None
+        robot = await lab.connected(lab.client_file("jackal1", ROBOT))
+        await until(lambda: sends(robot) is False, "nobody wants its odometry")
+        subscriber = programs.subscriber(b"")
+        for _ in range(2):
+            reload(lab, relay, programs.role(**VIEWER))
+            await comes(subscriber, FRAME)
+            reload(lab, relay)
+            await until(lambda: sends(robot) is False, "it sends for nobody any more")
+            await until(lambda: relay.feed is None, "the feed is gone")
+        await lab.end(robot)
+        await lab.end(relay)
+
+
 async def test_what_a_role_may_see_is_told_to_the_robots(tmp_path: Path, programs: Programs) -> None:
     async with Lab(tmp_path, "jackal1") as lab:
         relay = await lab.relay(lab.relay_file(feed={"roles": [programs.role(**VIEWER, subscribe=["/hello"])]}))
