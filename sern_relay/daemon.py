@@ -38,7 +38,7 @@ from sern_runtime.draining import Progress
 from sern_runtime.entry import blamed_on, end_tasks, log_warnings, serve
 from sern_runtime.http import Health, HttpServer
 from sern_runtime.internal_errors import InternalErrors
-from sern_runtime.keys import KeyDirectory, KeyStatus, load_secret
+from sern_runtime.keys import KeyDirectory, KeyStatus, load_secret, user_id
 from sern_runtime.link_metrics import AgeHistograms, register_codecs, register_links, register_received
 from sern_runtime.loop import Shutdown
 from sern_runtime.message_log import LoggedFates, MessageLog
@@ -164,6 +164,13 @@ class RelayDaemon:
     def _known(self, client: ClientName) -> bool:
         return self.directory is None or client in self.directory.names
 
+    def _admits(self, client: ClientName, public_key: str) -> bool:
+        """Whether what comes over a connection that was made with this key is taken."""
+        if self.directory is None:
+            return True
+        match = self.directory.lookup(public_key, at_s=time.time())
+        return match.status is KeyStatus.VALID and match.name == client
+
     async def start(self) -> None:
         self.errors.watch(asyncio.get_running_loop())
         self.collector.watch()
@@ -187,7 +194,7 @@ class RelayDaemon:
                 relay.listen,
                 keys,
                 ZAP_DOMAIN,
-                admits=self._known,
+                admits=self._admits,
                 heartbeat_timeout_s=model.link.heartbeat_timeout_s,
                 handshake_interval_s=relay.handshake_interval_s,
                 max_connections=relay.max_connections,
@@ -217,8 +224,8 @@ class RelayDaemon:
     def _lookup(self, public_key: str, address: str) -> str | TemporaryRefusal | None:
         assert self.directory is not None
         match = self.directory.lookup(public_key, at_s=time.time())
-        if match.status is KeyStatus.VALID:
-            return match.name
+        if match.status is KeyStatus.VALID and match.name is not None:
+            return user_id(match.name, public_key)
         if match.status is KeyStatus.NOT_YET:
             return TemporaryRefusal(f"the key of {match.name} is not valid yet")
         if match.name is not None:  # an unknown key is reported by the handler
@@ -236,9 +243,8 @@ class RelayDaemon:
         }
 
     def _end_lapsed(self) -> None:
-        """Cut the connections of every client of which a key was taken away or has expired. Which key a connection
-        was made with is not known here: one with a key that still holds is back at once. Nor is it known whose those
-        are that have not said anything yet, which would be taken for admitted when they do: they go, too."""
+        """Cut the connections of every client of which a key was taken away or has expired; one with a key that still
+        holds is back at once. Whose those are that have not said anything yet is not known: they go, too."""
         before, self._valid = self._valid, self._valid_keys()
         lapsed = [client for client, keys in before.items() if keys - self._valid.get(client, frozenset())]
         if not lapsed or self.server is None:
