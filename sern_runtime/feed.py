@@ -19,7 +19,8 @@ The NUL ends the name: a subscription to `/r/odom` also matches `/r/odom_filtere
 publisher may leave the header frame empty: class bulk, sequence 0, stamped on arrival.
 
 There is one pair of sockets for each role, filtered before sending: on a shared XPUB a grant per topic could not be
-kept apart. A role is what its address gives; publishing is off unless the role has an ingest endpoint.
+kept apart. A role is what its address gives; publishing is off unless the role has an ingest endpoint. There are no
+keys and nothing is encrypted: the feed is for this machine, or for a network where everybody is trusted.
 """
 
 import asyncio
@@ -42,11 +43,9 @@ from sern_runtime.feed_subscriptions import Subscriptions
 from sern_runtime.zmq_socket import (
     BACKLOG,
     ZERO_COPY_BYTES,
-    CurvePair,
     DrainedSocket,
     apply_common_options,
     bind_all,
-    serve_curve,
 )
 
 VERSION: Final = 1
@@ -57,8 +56,7 @@ MAX_MESSAGE_BYTES: Final = 16 * 2**20
 """A publisher's frame above this closes its connection. The local network carries maps and images whole."""
 MAX_SUBSCRIPTION_BYTES: Final = MAX_TOPIC_BYTES + 64
 """A subscriber's frame above this closes its connection: a longer prefix is that of no topic frame, and libzmq keeps
-some hundred bytes for each of its bytes, on our thread. 64: the name of a command (10), and CURVE's box around it
-(33)."""
+some hundred bytes for each of its bytes, on our thread. 64: the name of a command takes 10, the rest is to spare."""
 HIGH_WATER: Final = 1000
 """Messages that may wait for a slow subscriber; libzmq drops what comes after them, for that subscriber alone."""
 INTEREST_S: Final = 0.05
@@ -133,9 +131,8 @@ class Feed:
     """The feed of a relay: one XPUB, and where configured one XSUB, for each role.
 
     `on_publish` None: what comes in goes to the feed's own subscribers only. `on_interest` is called soon after the
-    set of wanted prefixes has changed, once for all that changes within `INTEREST_S`. `keys` makes the sockets CURVE
-    servers in the ZAP domain `feed.NAME`; without keys the role's addresses are the only guard, which the
-    configuration has to allow. Raises ConfigError when an endpoint cannot be had. `close()` once.
+    set of wanted prefixes has changed, once for all that changes within `INTEREST_S`. The roles' addresses are the only
+    guard. Raises ConfigError when an endpoint cannot be had. `close()` once.
 
     A subscriber's frames are bounded by what can name a topic, and its connection by `SUBSCRIBER_BYTES` of them. What
     subscribers keep is bounded for each of them and for all of a role (`feed_subscriptions`).
@@ -149,7 +146,6 @@ class Feed:
         on_publish: OnPublish | None = None,
         on_interest: Callable[[], None] | None = None,
         accept: Accept | None = None,
-        keys: CurvePair | None = None,
         max_message_bytes: int = MAX_MESSAGE_BYTES,
         wall_ns: Callable[[], int] = time.time_ns,
         clock: Callable[[], float] = now,
@@ -160,7 +156,6 @@ class Feed:
         self.accept = accept
         self.wall_ns = wall_ns
         self._ctx = ctx
-        self._keys = keys
         self.max_message_bytes = max_message_bytes
         self._outlets: dict[str, _Outlet] = {}
         self._inlets: dict[str, _Inlet] = {}
@@ -190,11 +185,11 @@ class Feed:
             if name in self._outlets:
                 self._outlets[name].role = role
             else:
-                self._outlets[name] = _Outlet(self, role, self._unbound(zmq.XPUB, role))
+                self._outlets[name] = _Outlet(self, role, self._unbound(zmq.XPUB))
             if name in self._inlets:
                 self._inlets[name].adopt(role)
             elif role.ingest_endpoint is not None:
-                self._inlets[name] = _Inlet(self, role, self._unbound(zmq.XSUB, role), role.ingest_endpoint)
+                self._inlets[name] = _Inlet(self, role, self._unbound(zmq.XSUB), role.ingest_endpoint)
         for outlet in self._outlets.values():
             outlet.forget()
 
@@ -252,15 +247,13 @@ class Feed:
         for inlet in self._inlets.values():
             inlet.verdicts.clear()
 
-    def _unbound(self, kind: int, role: FeedRole) -> "zmq.Socket[bytes]":
+    def _unbound(self, kind: int) -> "zmq.Socket[bytes]":
         socket = self._ctx.socket(kind)
         try:
             if kind == zmq.XPUB:
                 # One at a time: libzmq takes in all that waits before it lets go of our thread, and meanwhile nobody
                 # sees how much a connection brings.
-                # With keys libzmq writes the user before the first message, and that keeps a place for ever: with one
-                # place no subscription would ever come through.
-                limit_bytes, rcvhwm = MAX_SUBSCRIPTION_BYTES, 1 if self._keys is None else 2
+                limit_bytes, rcvhwm = MAX_SUBSCRIPTION_BYTES, 1
                 socket.setsockopt(zmq.XPUB_VERBOSER, 1)  # each subscription and unsubscription is told
                 socket.setsockopt(zmq.RCVBUF, SUBSCRIBER_BYTES)  # what has arrived is read also after a cut
             else:
@@ -269,7 +262,6 @@ class Feed:
             socket.setsockopt(zmq.HEARTBEAT_IVL, 0)  # not every implementation answers ZMTP pings; TCP looks instead
             socket.setsockopt(zmq.TCP_KEEPALIVE, 1)
             socket.setsockopt(zmq.BACKLOG, BACKLOG)
-            serve_curve(socket, self._keys, f"feed.{role.name}")
         except BaseException:
             socket.close(linger=0)
             raise
