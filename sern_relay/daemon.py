@@ -101,6 +101,7 @@ class RelayDaemon:
         self.reloads_failed = 0
         self._unreloaded: str | None = None  # what the last reload did not put in force, and why
         self._unreloaded_s: float | None = None  # since when there is something
+        self._feed_problem = ""  # as far as it is of the feed
         self.hub = Hub(
             name=model.name,
             boot=secrets.randbits(63),
@@ -285,6 +286,7 @@ class RelayDaemon:
             if self.feed is not None:
                 with self.parts.survive("feed"):
                     self.feed.sweep(now=now)
+                    self._retry_feed(now)
                     if self.feed.over:
                         feed, self.feed = self.feed, None
                         feed.close()
@@ -344,10 +346,13 @@ class RelayDaemon:
             self.hub.forget(client, "the name is revoked", now=now)
         self._after()
         self.notifier.ready(self._status())
+        self._in_force(now)
+        _log.info("reloaded keys, access rules and feed roles; other changes need a restart")
+
+    def _in_force(self, now: float) -> None:
         if self._unreloaded is None and self._unreloaded_s is not None:
             failed_s, self._unreloaded_s = now - self._unreloaded_s, None
             _log.error("the reload works again: what had failed before is in force, after %.0f s", failed_s)
-        _log.info("reloaded keys, access rules and feed roles; other changes need a restart")
 
     def _not_in_force(self, problem: str) -> None:
         if self._unreloaded_s is None:
@@ -444,8 +449,16 @@ class RelayDaemon:
             self.feed.update(roles, now=now)
         except ConfigError as error:
             self.reloads_failed += 1
-            self._not_in_force(f"reload failed in part, not all of feed.roles are in force: {error}")
+            self._feed_problem = f"reload failed in part, not all of feed.roles are in force: {error}"
+            self._not_in_force(self._feed_problem)
             _log.error("%s: feed.roles: not all of them are in force: %s", self.loaded.path, error)
+
+    def _retry_feed(self, now: float) -> None:
+        """What was in use at a reload may be free by now; that it was not has been said and counted."""
+        if self.feed is not None and self.feed.feed.missing and self.feed.open_missing():
+            if self._unreloaded == self._feed_problem:  # else a later reload failed
+                self._unreloaded = None
+            self._in_force(now)
 
     def _transforms_refused(self) -> list[tuple[tuple[str, ...], float]]:
         refused = self.transforms.refused if self.transforms is not None else {}

@@ -102,6 +102,10 @@ class RelayFeed:
         self._hub.tap = lambda _stream: False
         self.feed.close()
 
+    def open_missing(self) -> bool:
+        """Try again for endpoints that could not be had; returns whether there are none left."""
+        return self.feed.open_missing() is None
+
     @property
     def over(self) -> bool:
         """Whether it has no role any more, and the origins have been told."""

@@ -101,6 +101,11 @@ class SocketMonitor:
             taken = self._socket.messages
             self._socket.drain()
 
+    def wait(self, timeout_s: float) -> None:
+        """Hold up the loop until an event has come, `timeout_s` at the most, and deliver all that there are."""
+        self._socket.socket.poll(max(1, round(timeout_s * 1000)))
+        self.drain()
+
     def _on_frames(self, frames: list[zmq.Frame]) -> None:
         if len(frames) != 2:
             return
@@ -382,6 +387,8 @@ class ConnectionTable:
         clock: Callable[[], float] = now,
     ) -> None:
         """`on_gone(fd)`: a connection has ended, and its number may be another's next."""
+        self.unbound = False
+        """Whether libzmq has let go of an address that the socket listened on."""
         self.capped = 0
         self.accepted = 0
         self.accept_failed = 0
@@ -400,6 +407,15 @@ class ConnectionTable:
     def close(self) -> None:
         """Before the socket. Idempotent."""
         self._monitor.close()
+
+    def await_unbound(self, until_s: float) -> bool:
+        """After `unbind` wait until libzmq has let go of the address, or until `until_s` on `sern_runtime.clock`.
+
+        False: not by then. It does so on its own thread, within some milliseconds; the loop is held up meanwhile.
+        """
+        while not self.unbound and (left_s := until_s - now()) > 0:
+            self._monitor.wait(left_s)
+        return self.unbound
 
     def __len__(self) -> int:
         return len(self._connections)
@@ -470,7 +486,10 @@ class ConnectionTable:
         match event.kind:
             case EventKind.ACCEPTED:
                 self._accepted(event)
-            case EventKind.DISCONNECTED | EventKind.CLOSED:
+            case EventKind.DISCONNECTED:
+                self._gone(event.value)
+            case EventKind.CLOSED:
+                self.unbound = True
                 self._gone(event.value)
             case EventKind.ACCEPT_FAILED:
                 self.accept_failed += 1

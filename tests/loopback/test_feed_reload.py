@@ -1,5 +1,6 @@
 """SIGHUP and the feed: roles come, change and go while a robot publishes and a plain program listens."""
 
+import socket as socketlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -8,11 +9,15 @@ import pytest
 import zmq
 
 from sern_client.daemon import ClientDaemon
+from sern_core.patterns import compile_pattern
+from sern_core.rules import FeedRole
 from sern_core.types import TopicName
 from sern_relay.daemon import RelayDaemon
+from sern_runtime import clock
+from sern_runtime.feed import Feed
 from sern_tools.ports import free_ports
 from tests.daemons import Lab
-from tests.loopback.test_feed_clients import ROBOT, Programs
+from tests.loopback.test_feed_clients import ROBOT, Programs, send
 from tests.support import until
 
 ODOMETRY = TopicName("/jackal1/odometry/filtered")
@@ -93,5 +98,78 @@ async def test_what_a_role_may_see_is_told_to_the_robots(tmp_path: Path, program
         [elsewhere] = free_ports(1)
         reload(lab, relay, programs.role(**VIEWER, publish_endpoint=f"tcp://127.0.0.1:{elsewhere}"))
         await until(lambda: sends(robot) is False, "its subscriber is gone with the endpoint")
+        await lab.end(robot)
+        await lab.end(relay)
+
+
+def at(name: str, endpoint: str, ingest_endpoint: str | None = None) -> FeedRole:
+    everything = (compile_pattern(".*"),)
+    return FeedRole(name, endpoint, ingest_endpoint, everything, () if ingest_endpoint is None else everything)
+
+
+@pytest.mark.parametrize("transport", ["tcp", "ipc"])
+async def test_endpoints_move_from_role_to_role(tmp_path: Path, programs: Programs, transport: str) -> None:
+    """libzmq lets go of an address on its own thread, and takes the file of an ipc address away then."""
+    first, second = (
+        [f"tcp://127.0.0.1:{port}" for port in free_ports(2)]
+        if transport == "tcp"
+        else [f"ipc://{tmp_path}/{number}" for number in range(2)]
+    )
+    feed = Feed(programs.context, [at("a", first), at("b", second)])
+    try:
+        for number in range(60):
+            here, there = (second, first) if number % 2 == 0 else (first, second)
+            feed.update([at("a", here), at("b", there)])
+            assert {name: endpoint for name, (endpoint, _) in feed.endpoints().items()} == {"a": here, "b": there}
+        feed.update([at("c", first), at("d", second)])
+        for role, endpoint in (("c", first), ("d", second)):
+            socket = programs.context.socket(zmq.SUB)
+            socket.subscribe(b"/r/")
+            socket.connect(endpoint)
+            await until(lambda role=role: feed.prefixes()[role] == (b"/r/",), f"{role} is reached")  # type: ignore[misc]
+            socket.close(linger=0)
+    finally:
+        feed.close()
+
+
+async def test_a_role_counts_on_where_one_of_its_endpoints_moves(programs: Programs) -> None:
+    one, ingest, other = (
+        f"tcp://127.0.0.1:{port}" for port in (programs.publish_port, programs.ingest_port, *free_ports(1))
+    )
+    feed = Feed(programs.context, [at("a", one, ingest)])
+    try:
+        publisher = await programs.publisher()
+        send(publisher, "/hello", b"one")
+        await until(lambda: feed.counters()["a"].received == 1, "one")
+        feed.update([at("a", other, ingest)])
+        send(publisher, "/hello", b"two")
+        await until(lambda: feed.counters()["a"].received == 2, "two")
+    finally:
+        feed.close()
+
+
+async def test_an_endpoint_that_is_in_use_is_taken_when_it_is_free(
+    tmp_path: Path, programs: Programs, caplog: pytest.LogCaptureFixture
+) -> None:
+    async with Lab(tmp_path, "jackal1") as lab:
+        relay = await lab.relay()
+        robot = await lab.connected(lab.client_file("jackal1", ROBOT))
+        [free] = free_ports(1)
+        viewer = programs.role(**VIEWER)
+        other = programs.role(**VIEWER | {"name": "other"}, publish_endpoint=f"tcp://127.0.0.1:{free}")
+        with socketlib.create_server(("127.0.0.1", programs.publish_port)):
+            reload(lab, relay, viewer, other)
+            assert relay.feed is not None
+            assert list(relay.feed.feed.endpoints()) == ["other"], "what can be had is in force"
+            for _ in range(3):
+                relay._retry_feed(clock.now())
+            assert list(relay.feed.feed.endpoints()) == ["other"]
+            assert "not all of feed.roles are in force" in relay._status()
+        await comes(programs.subscriber(b""), FRAME)
+        assert set(relay.feed.feed.endpoints()) == {"viewer", "other"}
+        assert "in force" not in relay._status()
+        assert relay.reloads_failed == 1
+        assert caplog.text.count("not all of them are in force") == 1
+        assert caplog.text.count("what had failed before is in force") == 1
         await lab.end(robot)
         await lab.end(relay)
