@@ -20,6 +20,7 @@ from sern_core.ledger import MAX_TOPICS
 from sern_core.link import Link
 from sern_core.message import Message, StreamInfo
 from sern_core.queues import OutChannel
+from sern_core.rules import FeedRole
 from sern_core.types import ClientName, DropReason, TopicName
 from sern_relay.feed import RelayFeed
 from sern_relay.objects_view import objects_view
@@ -37,7 +38,7 @@ from sern_runtime.draining import Progress
 from sern_runtime.entry import blamed_on, end_tasks, log_warnings, serve
 from sern_runtime.http import Health, HttpServer
 from sern_runtime.internal_errors import InternalErrors
-from sern_runtime.keys import KeyDirectory, KeyStatus, load_secret
+from sern_runtime.keys import KeyDirectory, KeyStatus, load_secret, user_id
 from sern_runtime.link_metrics import AgeHistograms, register_codecs, register_links, register_received
 from sern_runtime.loop import Shutdown
 from sern_runtime.message_log import LoggedFates, MessageLog
@@ -100,6 +101,7 @@ class RelayDaemon:
         self.reloads_failed = 0
         self._unreloaded: str | None = None  # what the last reload did not put in force, and why
         self._unreloaded_s: float | None = None  # since when there is something
+        self._feed_problem = ""  # as far as it is of the feed
         self.hub = Hub(
             name=model.name,
             boot=secrets.randbits(63),
@@ -163,6 +165,13 @@ class RelayDaemon:
     def _known(self, client: ClientName) -> bool:
         return self.directory is None or client in self.directory.names
 
+    def _admits(self, client: ClientName, public_key: str) -> bool:
+        """Whether what comes over a connection that was made with this key is taken."""
+        if self.directory is None:
+            return True
+        match = self.directory.lookup(public_key, at_s=time.time())
+        return match.status is KeyStatus.VALID and match.name == client
+
     async def start(self) -> None:
         self.errors.watch(asyncio.get_running_loop())
         self.collector.watch()
@@ -186,7 +195,7 @@ class RelayDaemon:
                 relay.listen,
                 keys,
                 ZAP_DOMAIN,
-                admits=self._known,
+                admits=self._admits,
                 heartbeat_timeout_s=model.link.heartbeat_timeout_s,
                 handshake_interval_s=relay.handshake_interval_s,
                 max_connections=relay.max_connections,
@@ -204,7 +213,7 @@ class RelayDaemon:
             _log.warning("insecure: true: clients are not authenticated and nothing is encrypted")
         if model.feed.roles:
             with blamed_on(self.loaded.path, "feed", "roles"):
-                self.feed = RelayFeed(self._ctx, self.hub, model.feed_roles(), after=self._after, refused=self.refused)
+                self.feed = self._make_feed(self._ctx, model.feed_roles())
         self.tasks.append(asyncio.create_task(self._tick(), name="relay-tick"))
         if self.adaptation is not None:
             kept = self.parts.keep("adaptation", self.adaptation.run, reset=self.adaptation.reset)
@@ -216,8 +225,8 @@ class RelayDaemon:
     def _lookup(self, public_key: str, address: str) -> str | TemporaryRefusal | None:
         assert self.directory is not None
         match = self.directory.lookup(public_key, at_s=time.time())
-        if match.status is KeyStatus.VALID:
-            return match.name
+        if match.status is KeyStatus.VALID and match.name is not None:
+            return user_id(match.name, public_key)
         if match.status is KeyStatus.NOT_YET:
             return TemporaryRefusal(f"the key of {match.name} is not valid yet")
         if match.name is not None:  # an unknown key is reported by the handler
@@ -235,9 +244,8 @@ class RelayDaemon:
         }
 
     def _end_lapsed(self) -> None:
-        """Cut the connections of every client of which a key was taken away or has expired. Which key a connection
-        was made with is not known here: one with a key that still holds is back at once. Nor is it known whose those
-        are that have not said anything yet, which would be taken for admitted when they do: they go, too."""
+        """Cut the connections of every client of which a key was taken away or has expired; one with a key that still
+        holds is back at once. Whose those are that have not said anything yet is not known: they go, too."""
         before, self._valid = self._valid, self._valid_keys()
         lapsed = [client for client, keys in before.items() if keys - self._valid.get(client, frozenset())]
         if not lapsed or self.server is None:
@@ -278,6 +286,10 @@ class RelayDaemon:
             if self.feed is not None:
                 with self.parts.survive("feed"):
                     self.feed.sweep(now=now)
+                    self._retry_feed(now)
+                    if self.feed.over:
+                        feed, self.feed = self.feed, None
+                        feed.close()
             self._flush()
             if self.zap is not None:
                 self.zap.ping()
@@ -324,9 +336,8 @@ class RelayDaemon:
         self.directory = directory
         now = clock.now()
         self.hub.revoke(access, now=now)
-        if self.feed is not None:
-            with self.parts.survive("feed"):
-                self._update_feed(loaded.model, now)
+        with self.parts.survive("feed"):
+            self._update_feed(loaded.model, now)
         if self.server is not None:
             self.server.cut_unbound()  # admitted by the old keys, and silent so far
         self._end_lapsed()
@@ -335,10 +346,13 @@ class RelayDaemon:
             self.hub.forget(client, "the name is revoked", now=now)
         self._after()
         self.notifier.ready(self._status())
+        self._in_force(now)
+        _log.info("reloaded keys, access rules and feed roles; other changes need a restart")
+
+    def _in_force(self, now: float) -> None:
         if self._unreloaded is None and self._unreloaded_s is not None:
             failed_s, self._unreloaded_s = now - self._unreloaded_s, None
             _log.error("the reload works again: what had failed before is in force, after %.0f s", failed_s)
-        _log.info("reloaded keys, access rules and feed roles; other changes need a restart")
 
     def _not_in_force(self, problem: str) -> None:
         if self._unreloaded_s is None:
@@ -421,14 +435,30 @@ class RelayDaemon:
         }
         return [((reason,), float(count)) for reason, count in counts.items()]
 
+    def _make_feed(self, ctx: "zmq.Context[zmq.Socket[bytes]]", roles: tuple[FeedRole, ...]) -> RelayFeed:
+        return RelayFeed(ctx, self.hub, roles, after=self._after, refused=self.refused)
+
     def _update_feed(self, model: RelayFile, now: float) -> None:
-        assert self.feed is not None
+        """Make the feed's roles those of `model`. The first one brings the feed; it goes soon after the last one."""
+        roles = model.feed_roles()
+        if self.feed is None:
+            if not roles or self._ctx is None:
+                return
+            self.feed = self._make_feed(self._ctx, ())  # then as any other: what can be had is in force
         try:
-            self.feed.update(model.feed_roles(), now=now)
+            self.feed.update(roles, now=now)
         except ConfigError as error:
             self.reloads_failed += 1
-            self._not_in_force(f"reload failed in part, not all of feed.roles are in force: {error}")
+            self._feed_problem = f"reload failed in part, not all of feed.roles are in force: {error}"
+            self._not_in_force(self._feed_problem)
             _log.error("%s: feed.roles: not all of them are in force: %s", self.loaded.path, error)
+
+    def _retry_feed(self, now: float) -> None:
+        """What was in use at a reload may be free by now; that it was not has been said and counted."""
+        if self.feed is not None and self.feed.feed.missing and self.feed.open_missing():
+            if self._unreloaded == self._feed_problem:  # else a later reload failed
+                self._unreloaded = None
+            self._in_force(now)
 
     def _transforms_refused(self) -> list[tuple[tuple[str, ...], float]]:
         refused = self.transforms.refused if self.transforms is not None else {}

@@ -25,9 +25,10 @@ JOIN: Final = bytes((wire.Kind.JOIN,))
 
 @dataclass(slots=True, eq=False)
 class Joined:
-    """A connection that belongs to a client's session; `client` is bound to its key."""
+    """A connection that belongs to a client's session; `user` is its User-Id, `client` the name in it."""
 
     client: ClientName
+    user: str
     fd: int
     connection: Connection | None
     taken: int = 0  # messages that have come in

@@ -85,6 +85,7 @@ class RelayFeed:
         self._clock = clock
         self._wall_ns = wall_ns
         self._sources: dict[tuple[str, TopicName], _Source] = {}
+        self._roles = roles
         self._told: set[tuple[str, TopicName, str]] = set()
         self._untold: list[StreamId] = []  # whose origins have yet to hear of what the feed wants
         self._going_on: asyncio.TimerHandle | None = None
@@ -98,20 +99,34 @@ class RelayFeed:
         if self._going_on is not None:
             self._going_on.cancel()
             self._going_on = None
+        self._hub.tap = lambda _stream: False
         self.feed.close()
 
+    def open_missing(self) -> bool:
+        """Try again for endpoints that could not be had; returns whether there are none left."""
+        return self.feed.open_missing() is None
+
+    @property
+    def over(self) -> bool:
+        """Whether it has no role any more, and the origins have been told."""
+        return not self._roles and self._going_on is None
+
     def update(self, roles: tuple[FeedRole, ...], *, now: float) -> None:
-        """Make these the roles, and end what they no longer say. Raises ConfigError (see `Feed.update`)."""
+        """Make these the roles, end what they no longer say, and tell the origins what is wanted now. Raises
+        ConfigError (see `Feed.update`)."""
         for role in roles:
             self.counters.setdefault(role.name, InjectCounters())
         self._hub.local_owners.update(role.owner for role in roles if role.ingest_endpoint is not None)
+        self._roles = roles
         known = {role.name: role for role in roles}
         for (role_name, name), source in self._sources.items():
             current = known.get(role_name)
             if current is None or current.topic(name) != source.topic:
                 self._hub.close_local(source.handle, now=now)  # with its next message it opens anew, if it may
-        self.feed.update(roles)
-        self._after()
+        try:
+            self.feed.update(roles)
+        finally:
+            self._interest()  # who subscribes is as before, and what that comes to is not
 
     def publish(self, stream: StreamInfo, message: Message, *, now: float) -> None:
         """Send it to the roles' subscribers. They have had what came in through the feed itself."""

@@ -17,6 +17,7 @@ from sern_relay.express import JOIN, Joined, RelayExpress
 from sern_runtime import clock
 from sern_runtime.dscp import Marks
 from sern_runtime.inflow import Inflow
+from sern_runtime.keys import parse_user_id
 from sern_runtime.monitor import ConnectionTable, TcpHandle
 from sern_runtime.pump import LANE_MESSAGE_BYTES, Pump
 from sern_runtime.zmq_socket import CurvePair, RouterSocket, SendResult, make_server
@@ -36,11 +37,12 @@ _log = logging.getLogger(__name__)
 class Session:
     """One connection: its port of the hub and the pump that serves it."""
 
-    __slots__ = ("connection", "fd", "port", "pump", "taken")
+    __slots__ = ("connection", "fd", "port", "pump", "taken", "user")
 
-    def __init__(self, port: HubPort, pump: Pump, fd: int, connection: object) -> None:
+    def __init__(self, port: HubPort, pump: Pump, user: str, fd: int, connection: object) -> None:
         self.port = port
         self.pump = pump
+        self.user = user
         self.fd = fd
         self.connection = connection
         self.taken = 0  # messages that have come in
@@ -49,8 +51,9 @@ class Session:
 class RelayServer:
     """Binds the listeners and joins them to `hub`. Without `keys` clients are who their HELLO says they are.
 
-    `admits` is asked when a connection first speaks: its key may have been revoked since it was let in. `after` is
-    called whenever something came in.
+    `admits(name, key)` is asked when a connection first speaks: its key may have been revoked since it was let in. The
+    key is that of its handshake, which the User-Id carries; empty without `keys`. `after` is called whenever something
+    came in.
     """
 
     def __init__(
@@ -61,7 +64,7 @@ class RelayServer:
         keys: CurvePair | None,
         zap_domain: str,
         *,
-        admits: Callable[[ClientName], bool],
+        admits: Callable[[ClientName, str], bool],
         heartbeat_timeout_s: float,
         handshake_interval_s: float,
         max_connections: int,
@@ -120,7 +123,7 @@ class RelayServer:
             session = self._accept(routing_id, user, bytes(data))
             if session is None:
                 return
-        elif not self._insecure and user != session.port.client:
+        elif user != session.user:
             self._cut(routing_id, session, f"its identity changed to {user!r}")
             return
         session.taken += 1
@@ -150,7 +153,7 @@ class RelayServer:
         _log.warning("connection of %s closed: a message without end", whose)
 
     def _received_express(self, routing_id: bytes, joined: Joined, user: str, data: wire.Datagram) -> None:
-        if not self._insecure and user != joined.client:
+        if user != joined.user:
             problem = f"its identity changed to {user!r}"
         else:
             try:
@@ -169,29 +172,29 @@ class RelayServer:
     def _accept(self, routing_id: bytes, user: str, data: bytes) -> Session | None:
         """A connection speaks for the first time: find out whose it is."""
         details = self.socket.peer_details()
+        if self.connections.ended(details.fd):
+            return None
         try:
-            name = client_name(user or self._claimed(data))
+            name, key = (client_name(self._claimed(data)), "") if self._insecure else parse_user_id(user)
         except (WireError, UsageError) as error:
             self.bad_frames += 1
             _log.warning("connection from %s closed: bad frame: %s", details.address, error)
             self.connections.cut(details.fd)
             return None
-        if not self._admits(name):
+        if not self._admits(name, key):
             self.revoked += 1
             _log.warning("connection from %s closed: the key of %s is revoked", details.address, name)
             self.connections.cut(details.fd)
             return None
         self.connections.bind_user(details.fd, name)
         connection = self.connections.by_fd(details.fd)
-        if connection is not None and connection.ended:
-            return None  # what had arrived before it was cut
         handle = connection.handle if connection is not None else None
         if handle is not None:
             express = data[2:3] == JOIN
             marks = self._marks
             handle.prepare(express=express, tos=marks.express_tos if express else marks.stream_tos)
         if data[2:3] == JOIN:
-            self._join(routing_id, Joined(name, details.fd, connection), data)
+            self._join(routing_id, Joined(name, user, details.fd, connection), data)
             return None
         self._make_room(name)
         port = HubPort(self.hub, name, details.address if handle is None else "{}:{}".format(*handle.peer))
@@ -200,7 +203,7 @@ class RelayServer:
             return self.socket.send_to(routing_id, datagram)
 
         pump = Pump(port, send, on_gone=lambda: self._gone(routing_id))
-        session = self._sessions[routing_id] = Session(port, pump, details.fd, connection)
+        session = self._sessions[routing_id] = Session(port, pump, user, details.fd, connection)
         return session
 
     def _make_room(self, client: ClientName) -> None:

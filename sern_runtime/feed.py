@@ -19,7 +19,8 @@ The NUL ends the name: a subscription to `/r/odom` also matches `/r/odom_filtere
 publisher may leave the header frame empty: class bulk, sequence 0, stamped on arrival.
 
 There is one pair of sockets for each role, filtered before sending: on a shared XPUB a grant per topic could not be
-kept apart. A role is what its address gives; publishing is off unless the role has an ingest endpoint.
+kept apart. A role is what its address gives; publishing is off unless the role has an ingest endpoint. There are no
+keys and nothing is encrypted: the feed is for this machine, or for a network where everybody is trusted.
 """
 
 import asyncio
@@ -27,13 +28,14 @@ import logging
 import struct
 import time
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import zmq
 
 from sern_core.access import RateGuard
+from sern_core.errors import ConfigError
 from sern_core.rules import FeedRole
 from sern_core.types import CLASSES, PriorityClass, TopicName
 from sern_runtime.clock import now
@@ -42,11 +44,9 @@ from sern_runtime.feed_subscriptions import Subscriptions
 from sern_runtime.zmq_socket import (
     BACKLOG,
     ZERO_COPY_BYTES,
-    CurvePair,
     DrainedSocket,
     apply_common_options,
     bind_all,
-    serve_curve,
 )
 
 VERSION: Final = 1
@@ -57,12 +57,13 @@ MAX_MESSAGE_BYTES: Final = 16 * 2**20
 """A publisher's frame above this closes its connection. The local network carries maps and images whole."""
 MAX_SUBSCRIPTION_BYTES: Final = MAX_TOPIC_BYTES + 64
 """A subscriber's frame above this closes its connection: a longer prefix is that of no topic frame, and libzmq keeps
-some hundred bytes for each of its bytes, on our thread. 64: the name of a command (10), and CURVE's box around it
-(33)."""
+some hundred bytes for each of its bytes, on our thread. 64: the name of a command takes 10, the rest is to spare."""
 HIGH_WATER: Final = 1000
 """Messages that may wait for a slow subscriber; libzmq drops what comes after them, for that subscriber alone."""
 INTEREST_S: Final = 0.05
 """Between two calls of `on_interest`: one message of subscriptions is cheap, and what follows from it is not."""
+RELEASE_S: Final = 0.2
+"""So long libzmq is waited for to let go of addresses."""
 _MAX_VERDICTS: Final = 4096
 _NOBLOCK: Final = int(zmq.NOBLOCK)
 _NOBLOCK_MORE: Final = int(zmq.NOBLOCK | zmq.SNDMORE)
@@ -133,9 +134,8 @@ class Feed:
     """The feed of a relay: one XPUB, and where configured one XSUB, for each role.
 
     `on_publish` None: what comes in goes to the feed's own subscribers only. `on_interest` is called soon after the
-    set of wanted prefixes has changed, once for all that changes within `INTEREST_S`. `keys` makes the sockets CURVE
-    servers in the ZAP domain `feed.NAME`; without keys the role's addresses are the only guard, which the
-    configuration has to allow. Raises ConfigError when an endpoint cannot be had. `close()` once.
+    set of wanted prefixes has changed, once for all that changes within `INTEREST_S`. The roles' addresses are the only
+    guard. Raises ConfigError when an endpoint cannot be had. `close()` once.
 
     A subscriber's frames are bounded by what can name a topic, and its connection by `SUBSCRIBER_BYTES` of them. What
     subscribers keep is bounded for each of them and for all of a role (`feed_subscriptions`).
@@ -149,7 +149,6 @@ class Feed:
         on_publish: OnPublish | None = None,
         on_interest: Callable[[], None] | None = None,
         accept: Accept | None = None,
-        keys: CurvePair | None = None,
         max_message_bytes: int = MAX_MESSAGE_BYTES,
         wall_ns: Callable[[], int] = time.time_ns,
         clock: Callable[[], float] = now,
@@ -160,10 +159,13 @@ class Feed:
         self.accept = accept
         self.wall_ns = wall_ns
         self._ctx = ctx
-        self._keys = keys
         self.max_message_bytes = max_message_bytes
         self._outlets: dict[str, _Outlet] = {}
         self._inlets: dict[str, _Inlet] = {}
+        self._roles: dict[str, FeedRole] = {}
+        self._counters: dict[str, FeedCounters] = {}
+        self.missing = False
+        """Whether an endpoint of some role could not be had (`open_missing`)."""
         self._loop = asyncio.get_running_loop()
         self._telling: asyncio.TimerHandle | None = None
         self._told_s = -INTEREST_S
@@ -175,28 +177,47 @@ class Feed:
 
     def update(self, roles: Iterable[FeedRole]) -> None:
         """Make these the roles. Sockets whose address stays are kept with their subscriptions, and filter by the new
-        patterns from now on; others are closed, which cuts their connections. Raises ConfigError when an endpoint
-        cannot be had: the roles before it in order are in force then."""
-        wanted = {role.name: role for role in roles}
+        patterns from now on; others are closed, which cuts their connections. Raises ConfigError for the first endpoint
+        that cannot be had: all others are in force then, and `open_missing` tries it again."""
+        wanted = self._roles = {role.name: role for role in roles}
+        leaving: list[_Outlet | _Inlet] = []
         for name, outlet in list(self._outlets.items()):
             new = wanted.get(name)
             if new is None or new.publish_endpoint != outlet.role.publish_endpoint:
-                self._outlets.pop(name).close()
+                leaving.append(self._outlets.pop(name))
+            else:
+                outlet.role = new
         for name, inlet in list(self._inlets.items()):
             new = wanted.get(name)
             if new is None or new.ingest_endpoint != inlet.role.ingest_endpoint:
-                self._inlets.pop(name).close()
-        for name, role in wanted.items():
-            if name in self._outlets:
-                self._outlets[name].role = role
+                leaving.append(self._inlets.pop(name))
             else:
-                self._outlets[name] = _Outlet(self, role, self._unbound(zmq.XPUB, role))
-            if name in self._inlets:
-                self._inlets[name].adopt(role)
-            elif role.ingest_endpoint is not None:
-                self._inlets[name] = _Inlet(self, role, self._unbound(zmq.XSUB, role), role.ingest_endpoint)
+                inlet.adopt(new)
+        _release(leaving)
         for outlet in self._outlets.values():
             outlet.forget()
+        self.refresh()
+        problem = self.open_missing()
+        if problem is not None:
+            raise problem
+
+    def open_missing(self) -> ConfigError | None:
+        """Open what the roles say and there is not yet; returns why the first endpoint cannot be had that cannot."""
+        problem: ConfigError | None = None
+        for name, role in self._roles.items():
+            try:
+                if name not in self._outlets:
+                    self._outlets[name] = _Outlet(self, role, self._unbound(zmq.XPUB))
+                if name not in self._inlets and role.ingest_endpoint is not None:
+                    self._inlets[name] = _Inlet(self, role, self._unbound(zmq.XSUB), role.ingest_endpoint)
+            except ConfigError as error:
+                problem = problem or error
+        self.missing = problem is not None
+        return problem
+
+    def counters_of(self, role_name: str) -> FeedCounters:
+        """They last as long as the feed, whatever becomes of the role's sockets."""
+        return self._counters.setdefault(role_name, FeedCounters())
 
     def close(self) -> None:
         if self._telling is not None:
@@ -230,11 +251,11 @@ class Feed:
 
     def counters(self) -> dict[str, FeedCounters]:
         """Counters by role name."""
-        for name, outlet in self._outlets.items():
-            inlet = self._inlets.get(name)
-            outlet.counters.crowded = outlet.subscriptions.crowded
-            outlet.counters.capped = outlet.inflow.capped + (inlet.inflow.capped if inlet is not None else 0)
-        return {name: outlet.counters for name, outlet in self._outlets.items()}
+        for outlet in self._outlets.values():
+            outlet.count()
+        for inlet in self._inlets.values():
+            inlet.count()
+        return {name: self.counters_of(name) for name in self._roles}
 
     def endpoints(self) -> dict[str, tuple[str, str | None]]:
         """Where subscribers and publishers connect, as bound, by role name."""
@@ -252,15 +273,13 @@ class Feed:
         for inlet in self._inlets.values():
             inlet.verdicts.clear()
 
-    def _unbound(self, kind: int, role: FeedRole) -> "zmq.Socket[bytes]":
+    def _unbound(self, kind: int) -> "zmq.Socket[bytes]":
         socket = self._ctx.socket(kind)
         try:
             if kind == zmq.XPUB:
                 # One at a time: libzmq takes in all that waits before it lets go of our thread, and meanwhile nobody
                 # sees how much a connection brings.
-                # With keys libzmq writes the user before the first message, and that keeps a place for ever: with one
-                # place no subscription would ever come through.
-                limit_bytes, rcvhwm = MAX_SUBSCRIPTION_BYTES, 1 if self._keys is None else 2
+                limit_bytes, rcvhwm = MAX_SUBSCRIPTION_BYTES, 1
                 socket.setsockopt(zmq.XPUB_VERBOSER, 1)  # each subscription and unsubscription is told
                 socket.setsockopt(zmq.RCVBUF, SUBSCRIBER_BYTES)  # what has arrived is read also after a cut
             else:
@@ -269,7 +288,6 @@ class Feed:
             socket.setsockopt(zmq.HEARTBEAT_IVL, 0)  # not every implementation answers ZMTP pings; TCP looks instead
             socket.setsockopt(zmq.TCP_KEEPALIVE, 1)
             socket.setsockopt(zmq.BACKLOG, BACKLOG)
-            serve_curve(socket, self._keys, f"feed.{role.name}")
         except BaseException:
             socket.close(linger=0)
             raise
@@ -297,7 +315,8 @@ class _Outlet(DrainedSocket):
         super().__init__(socket)
         self.role = role
         self.messages = 0
-        self.counters = FeedCounters()
+        self.counters = feed.counters_of(role.name)
+        self._counted = (0, 0)
         self._feed = feed
         self.inflow = FeedInflow(role.name, self, socket, self._endless, on_gone=self._gone)
         self.subscriptions = Subscriptions(role.name, self.inflow.connections)
@@ -307,7 +326,15 @@ class _Outlet(DrainedSocket):
     def _endless(self) -> None:
         self.counters.endless += 1
 
+    def count(self) -> None:
+        """Book which connections were cut since the last time."""
+        capped, crowded = self._counted
+        self._counted = self.inflow.capped, self.subscriptions.crowded
+        self.counters.capped += self.inflow.capped - capped
+        self.counters.crowded += self.subscriptions.crowded - crowded
+
     def close(self) -> None:
+        self.count()
         self.inflow.close()
         super().close()
 
@@ -365,7 +392,6 @@ class _Outlet(DrainedSocket):
     def forget(self) -> None:
         """Judge every topic anew: the role has changed."""
         self._wanted.clear()
-        self._feed.refresh()
 
 
 class _Inlet(DrainedSocket):
@@ -381,7 +407,8 @@ class _Inlet(DrainedSocket):
         super().__init__(socket)
         self.role = role
         self.verdicts: dict[bytes, _Verdict] = {}
-        self.counters = feed.counters()[role.name]
+        self.counters = feed.counters_of(role.name)
+        self._counted = 0
         self._feed = feed
         self._guard = _guard_of(role, feed.clock())
         self.messages = 0
@@ -392,7 +419,13 @@ class _Inlet(DrainedSocket):
     def _endless(self) -> None:
         self.counters.endless += 1
 
+    def count(self) -> None:
+        """Book which connections were cut since the last time."""
+        before, self._counted = self._counted, self.inflow.capped
+        self.counters.capped += self._counted - before
+
     def close(self) -> None:
+        self.count()
         self.inflow.close()
         super().close()
 
@@ -518,6 +551,18 @@ def _listening(socket: "_Outlet | _Inlet", endpoint: str) -> str:
     except BaseException:
         socket.close()
         raise
+
+
+def _release(sockets: "Sequence[_Outlet | _Inlet]") -> None:
+    """Close sockets whose addresses others may take next. libzmq lets go of an address on its own thread: until then it
+    is in use, and the file of an ipc address would be taken away from whoever has it by then."""
+    for each in sockets:
+        each.socket.unbind(each.endpoint)
+    until_s = now() + RELEASE_S
+    for each in sockets:
+        if not each.endpoint.startswith("inproc://") and not each.inflow.connections.await_unbound(until_s):
+            _log.warning("%s of feed role %s is not given up yet", each.endpoint, each.role.name)
+        each.close()
 
 
 def _guard_of(role: FeedRole, now: float) -> RateGuard | None:

@@ -20,7 +20,8 @@ import zmq
 from pydantic import AfterValidator, Field, model_validator
 from zmq.utils import z85
 
-from sern_core.errors import ConfigError
+from sern_core.errors import ConfigError, UsageError
+from sern_core.rules import client_name
 from sern_core.types import ClientName
 from sern_runtime.config.base import ClientText, FileModel, Section, fault
 from sern_runtime.config.load import Loaded, check_document
@@ -272,6 +273,19 @@ def _write(path: Path, text: str, mode: int, *, replace: bool) -> None:
         raise ConfigError("exists already; --force replaces it", file=str(path)) from error
     except OSError as error:
         raise ConfigError(f"can not be written: {error.strerror or error}", file=str(path)) from error
+
+
+def user_id(name: ClientName, public_key: str) -> str:
+    """What the ZAP handler attaches to every frame of a connection: whose it is, and the key (Z85) it was made with."""
+    return f"{name} {public_key}"
+
+
+def parse_user_id(user: str) -> tuple[ClientName, str]:
+    """Name and key of a User-Id. UsageError when it is none."""
+    name, _, public_key = user.partition(" ")
+    if not _Z85.fullmatch(public_key):
+        raise UsageError("a connection without the name of a key")
+    return client_name(name), public_key
 
 
 class KeyDirectory:

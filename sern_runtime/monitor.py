@@ -101,6 +101,11 @@ class SocketMonitor:
             taken = self._socket.messages
             self._socket.drain()
 
+    def wait(self, timeout_s: float) -> None:
+        """Hold up the loop until an event has come, `timeout_s` at the most, and deliver all that there are."""
+        self._socket.socket.poll(max(1, round(timeout_s * 1000)))
+        self.drain()
+
     def _on_frames(self, frames: list[zmq.Frame]) -> None:
         if len(frames) != 2:
             return
@@ -124,14 +129,71 @@ class TcpInfo:
     delivery_rate_bps: int
 
 
-class TcpHandle:
-    """A TCP socket that belongs to libzmq. Every method answers None or False once the connection is gone."""
+class SocketHandle:
+    """A connected socket that belongs to libzmq, over TCP or on this machine. Every method answers None or False once
+    the connection is gone."""
 
-    __slots__ = ("fd", "inode", "local", "peer")
+    __slots__ = ("fd", "inode")
 
-    def __init__(self, fd: int, inode: int, local: tuple[str, int], peer: tuple[str, int]) -> None:
+    def __init__(self, fd: int, inode: int) -> None:
         self.fd = fd
         self.inode = inode
+
+    @classmethod
+    def at_path(cls, fd: int, endpoint: str) -> "SocketHandle | None":
+        """A handle on `fd`, or None when it is no connection that was accepted at this ipc endpoint (any more)."""
+        path = os.fsencode(endpoint.removeprefix("ipc://"))
+        try:
+            duplicate = os.dup(fd)
+        except OSError:
+            return None
+        try:
+            status = os.fstat(duplicate)
+            if not stat.S_ISSOCK(status.st_mode):
+                return None
+            with socketlib.socket(fileno=os.dup(duplicate)) as connection:
+                if connection.family != socketlib.AF_UNIX:
+                    return None
+                name = connection.getsockname()
+        except OSError:
+            return None
+        finally:
+            os.close(duplicate)
+        bound = name if isinstance(name, bytes) else os.fsencode(name)
+        return cls(fd, status.st_ino) if bound.replace(b"\0", b"@", 1) == path else None  # @: it has no file
+
+    def cut(self) -> bool:
+        """End the connection now, both ways; libzmq notices and cleans up. False when it is gone already."""
+        with self._connection() as connection:
+            if connection is None:
+                return False
+            with suppress(OSError):
+                connection.shutdown(socketlib.SHUT_RDWR)
+            return True
+
+    @contextmanager
+    def _connection(self) -> Iterator[socketlib.socket | None]:
+        """The connection through a duplicate that lives as long as the block; None when it is gone."""
+        try:
+            duplicate = os.dup(self.fd)
+        except OSError:
+            yield None
+            return
+        if os.fstat(duplicate).st_ino != self.inode:
+            os.close(duplicate)
+            yield None
+            return
+        with socketlib.socket(fileno=duplicate) as connection:
+            yield connection
+
+
+class TcpHandle(SocketHandle):
+    """A TCP socket that belongs to libzmq."""
+
+    __slots__ = ("local", "peer")
+
+    def __init__(self, fd: int, inode: int, local: tuple[str, int], peer: tuple[str, int]) -> None:
+        super().__init__(fd, inode)
         self.local = local
         self.peer = peer
 
@@ -231,15 +293,6 @@ class TcpHandle:
         `rate_bps`. Without it a window that a loss held back leaves as one burst, and fills the path's queue."""
         return self._set(SO_MAX_PACING_RATE, int(rate_bps / 8), level=socketlib.SOL_SOCKET)
 
-    def cut(self) -> bool:
-        """End the connection now, both ways; libzmq notices and cleans up. False when it is gone already."""
-        with self._connection() as connection:
-            if connection is None:
-                return False
-            with suppress(OSError):
-                connection.shutdown(socketlib.SHUT_RDWR)
-            return True
-
     def _set(self, option: int, value: int | bytes, *, level: int = socketlib.IPPROTO_TCP) -> bool:
         with self._connection() as connection:
             if connection is None:
@@ -251,21 +304,6 @@ class TcpHandle:
                     raise
                 return False
             return True
-
-    @contextmanager
-    def _connection(self) -> Iterator[socketlib.socket | None]:
-        """The connection through a duplicate that lives as long as the block; None when it is gone."""
-        try:
-            duplicate = os.dup(self.fd)
-        except OSError:
-            yield None
-            return
-        if os.fstat(duplicate).st_ino != self.inode:
-            os.close(duplicate)
-            yield None
-            return
-        with socketlib.socket(fileno=duplicate) as connection:
-            yield connection
 
 
 def _parse_tcp_info(raw: bytes) -> TcpInfo:
@@ -305,8 +343,8 @@ def port_of(endpoint: str) -> int | None:
 
 @dataclass(slots=True)
 class Connection:
-    """One accepted connection. `user` is empty until `ConnectionTable.bind_user`; `ended`: it was cut, and may still be
-    listed, and heard, until libzmq has noticed."""
+    """One accepted connection. `handle` over TCP, `local` over ipc. `user` is empty until `ConnectionTable.bind_user`;
+    `ended`: it was cut, and may still be listed, and heard, until libzmq has noticed."""
 
     handle: TcpHandle | None
     source: str
@@ -315,13 +353,15 @@ class Connection:
     ended: bool = False
     number: int = 0
     """Rises with every connection of the table."""
+    local: SocketHandle | None = None
 
     def cut(self) -> bool:
         """End it now. False when it is gone already, or was cut before."""
-        if self.ended or self.handle is None:
+        if self.ended:
             return False
         self.ended = True
-        return self.handle.cut()
+        handle = self.handle or self.local
+        return handle is not None and handle.cut()
 
 
 class ConnectionTable:
@@ -347,6 +387,8 @@ class ConnectionTable:
         clock: Callable[[], float] = now,
     ) -> None:
         """`on_gone(fd)`: a connection has ended, and its number may be another's next."""
+        self.unbound = False
+        """Whether libzmq has let go of an address that the socket listened on."""
         self.capped = 0
         self.accepted = 0
         self.accept_failed = 0
@@ -365,6 +407,15 @@ class ConnectionTable:
     def close(self) -> None:
         """Before the socket. Idempotent."""
         self._monitor.close()
+
+    def await_unbound(self, until_s: float) -> bool:
+        """After `unbind` wait until libzmq has let go of the address, or until `until_s` on `sern_runtime.clock`.
+
+        False: not by then. It does so on its own thread, within some milliseconds; the loop is held up meanwhile.
+        """
+        while not self.unbound and (left_s := until_s - now()) > 0:
+            self._monitor.wait(left_s)
+        return self.unbound
 
     def __len__(self) -> int:
         return len(self._connections)
@@ -396,6 +447,15 @@ class ConnectionTable:
             connection.user = user
             self._not_half_open(fd, connection)
 
+    def ended(self, fd: int) -> bool:
+        """Whether the connection that a frame has come over was cut, or is gone already: what had arrived is read all
+        the same. libzmq tells that a connection was accepted before its first message."""
+        connection = self._connections.get(fd)
+        if connection is None or connection.ended:  # its event may wait, or the number be another's by now
+            self._monitor.drain()
+            connection = self._connections.get(fd)
+        return connection is None or connection.ended
+
     def handles(self) -> list[TcpHandle]:
         return [c.handle for c in self._connections.values() if c.handle is not None]
 
@@ -412,7 +472,9 @@ class ConnectionTable:
         return [c.handle for c in self._connections.values() if c.user == user and c.handle is not None]
 
     def cut_user(self, user: str) -> int:
-        """End every connection of a user; returns how many."""
+        """End every connection of a user; returns how many. Those count whose handshake is over, whether or not their
+        event has been read."""
+        self._monitor.drain()
         return sum(connection.cut() for connection in self._connections.values() if connection.user == user)
 
     def cut_silent(self, after_s: float) -> int:
@@ -424,7 +486,10 @@ class ConnectionTable:
         match event.kind:
             case EventKind.ACCEPTED:
                 self._accepted(event)
-            case EventKind.DISCONNECTED | EventKind.CLOSED:
+            case EventKind.DISCONNECTED:
+                self._gone(event.value)
+            case EventKind.CLOSED:
+                self.unbound = True
                 self._gone(event.value)
             case EventKind.ACCEPT_FAILED:
                 self.accept_failed += 1
@@ -442,7 +507,9 @@ class ConnectionTable:
         self.accepted += 1
         handle = TcpHandle.of(fd, local_port=port_of(event.endpoint))
         source = handle.peer[0] if handle is not None else ""
-        connection = self._connections[fd] = Connection(handle, source, self._clock(), number=self.accepted)
+        local = SocketHandle.at_path(fd, event.endpoint) if handle is None else None
+        connection = Connection(handle, source, self._clock(), number=self.accepted, local=local)
+        self._connections[fd] = connection
         self._expire()
         self._half_open_until_s[fd] = self._clock() + HANDSHAKE_IVL_MS / 1000
         self._half_open_by_source[source] += 1

@@ -3,7 +3,7 @@
 libzmq asks one handler per context, at inproc://zeromq.zap.01, about every connection of a socket that has a ZAP
 domain. The answer's status decides what the client sees:
 
-    200   admitted; the User-Id (the client's name) is attached to every frame of the connection
+    200   admitted; the User-Id (the client's name and key) is attached to every frame of the connection
     400   unknown key: libzmq never retries by itself, the client must rebuild its socket
     300   not now (a cap, a reload, a fault of ours): the client is told nothing, and libzmq ends the handshake after
           HANDSHAKE_IVL; then it tries again by itself
@@ -41,7 +41,7 @@ class TemporaryRefusal:
 
 
 Lookup = Callable[[str, str], "str | TemporaryRefusal | None"]
-"""`lookup(public_key_z85, address) -> client name`, None for an unknown key, or a TemporaryRefusal."""
+"""`lookup(public_key_z85, address) -> User-Id`, None for an unknown key, or a TemporaryRefusal."""
 
 Admit = Callable[[str], bool]
 """`admit(address) -> bool`: the connection cap, asked before the lookup. False is answered 300."""

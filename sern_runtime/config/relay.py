@@ -243,7 +243,9 @@ class FeedRoleSection(Section):
 
 
 class FeedSection(Section):
-    """Plain ZMQ for programs on the local network, in any language. Off unless a role is given."""
+    """Plain ZMQ for programs on the local network, in any language. Off unless a role is given. It has no keys and
+    encrypts nothing: whoever reaches an address has its role. Use it on this machine, or in a network where everybody
+    is trusted."""
 
     roles: tuple[FeedRoleSection, ...] = ()
     """The roles; each has sockets of its own."""

@@ -3,12 +3,21 @@
 import asyncio
 import os
 import socket as socketlib
+from pathlib import Path
 
 import pytest
 import zmq
 
 from sern_runtime.keys import SecretKey
-from sern_runtime.monitor import HANDSHAKE_GRACE_S, ConnectionTable, EventKind, MonitorEvent, TcpHandle, port_of
+from sern_runtime.monitor import (
+    HANDSHAKE_GRACE_S,
+    ConnectionTable,
+    EventKind,
+    MonitorEvent,
+    SocketHandle,
+    TcpHandle,
+    port_of,
+)
 from sern_runtime.transport_watch import CUT, ENDED, HALF_WAY, OTHER, SHUT, SILENT, UNFINISHED, TransportWatch
 from sern_runtime.zap import ZapHandler
 from sern_runtime.zmq_socket import BATCH, HANDSHAKE_IVL_MS, DealerSocket, RouterSocket, make_client, make_server
@@ -397,6 +406,30 @@ def test_what_is_no_tcp_connection_gives_no_handle() -> None:
             assert TcpHandle.of(connection.fileno(), peer_port=port) is not None
             assert TcpHandle.of(connection.fileno(), peer_port=port + 1) is None
             assert TcpHandle.of(connection.fileno(), local_port=port) is None
+
+
+def test_a_handle_at_a_path_is_of_what_was_accepted_there_alone(tmp_path: Path) -> None:
+    left, right = socketlib.socketpair()
+    places: list[tuple[str | bytes, str]] = [
+        (f"{tmp_path}/one", f"ipc://{tmp_path}/one"),
+        (b"\0sern-test-one", "ipc://@sern-test-one"),
+    ]
+    for address, endpoint in places:
+        with socketlib.socket(socketlib.AF_UNIX) as listener, socketlib.socket(socketlib.AF_UNIX) as peer:
+            listener.bind(address)
+            listener.listen()
+            peer.connect(address)
+            accepted = listener.accept()[0]
+            assert SocketHandle.at_path(left.fileno(), endpoint) is None
+            assert SocketHandle.at_path(accepted.fileno(), endpoint + "x") is None
+            handle = SocketHandle.at_path(accepted.fileno(), endpoint)
+            assert handle is not None and handle.cut()
+            assert peer.recv(1) == b"", "it has ended"
+            accepted.close()
+            assert not handle.cut()
+    with left, right:
+        left.sendall(b"alive")
+        assert right.recv(5) == b"alive"
 
 
 async def test_a_revoked_user_loses_the_connection_and_is_refused(

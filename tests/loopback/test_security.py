@@ -453,8 +453,13 @@ async def test_a_rotated_key_ends_the_connections_of_the_old_one(
         await lab.end(relay)
 
 
-async def test_a_silent_connection_does_not_outlive_its_key(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("transport", ["tcp", "ipc"])
+async def test_a_silent_connection_does_not_outlive_its_key(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, transport: str
+) -> None:
     async with Lab(tmp_path, *CLIENTS) as lab:
+        if transport == "ipc":
+            lab.endpoint = f"ipc://{tmp_path}/relay.ipc"
         old, new = load_secret(tmp_path / "robot2.key"), generate(ClientName("robot2"))
         end_s = int(time.time()) + 3600
         keys = (PublicKey(old.public_key, None, end_s), PublicKey(new.public_key))

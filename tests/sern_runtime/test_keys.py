@@ -7,7 +7,7 @@ import pytest
 import zmq
 from zmq.utils import z85
 
-from sern_core.errors import ConfigError
+from sern_core.errors import ConfigError, UsageError
 from sern_core.types import ClientName
 from sern_runtime import keys
 from sern_runtime.keys import KeyDirectory, KeyMatch, KeyStatus, PublicKey, PublicKeys
@@ -197,3 +197,11 @@ def test_directory_that_is_none(tmp_path: Path) -> None:
 def test_keys_are_what_libzmq_uses() -> None:
     pair = keys.generate(NAME)
     assert zmq.curve_public(pair.secret_key.encode()) == pair.public_key.encode()
+
+
+def test_a_user_id_says_name_and_key() -> None:
+    pair = keys.generate(ClientName("robot1"))
+    assert keys.parse_user_id(keys.user_id(pair.name, pair.public_key)) == (pair.name, pair.public_key)
+    for text in ("", "robot1", f"Robot1 {pair.public_key}", f"robot1 {pair.public_key[1:]}", f" {pair.public_key}"):
+        with pytest.raises(UsageError):
+            keys.parse_user_id(text)

@@ -1,0 +1,75 @@
+"""A key that no longer holds opens no session: over ipc:// as over TCP, and also where a connection lives on."""
+
+from pathlib import Path
+
+import pytest
+import zmq
+
+from sern_runtime.keys import load_secret
+from sern_runtime.monitor import ConnectionTable
+from tests.daemons import Lab
+from tests.loopback.test_security import DEAD_ENDS, Stranger, hello
+from tests.support import until
+
+
+def local(lab: Lab) -> None:
+    """Relay and clients meet at a path of this machine."""
+    lab.endpoint = f"ipc://{lab.directory}/relay.ipc"
+
+
+async def test_a_replaced_key_is_cut_off_over_ipc_and_comes_back_when_it_is_put_back(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    async with Lab(tmp_path, "robot1") as lab:
+        local(lab)
+        relay = await lab.relay()
+        assert relay.server is not None and relay.zap is not None
+        robot = await lab.connected(lab.client_file("robot1", DEAD_ENDS))
+        public = lab.clients_dir / "robot1.pub"
+        old = public.read_text()
+        lab.make_keys("robot1")  # the new pair is at the relay; the client runs with the old one
+        relay.reload()
+        assert relay.server._sessions == {}
+        await until(lambda: "refused our key" in robot.reason)
+        refused = relay.zap.counters.unknown_key
+        await until(lambda: relay.zap is not None and relay.zap.counters.unknown_key > refused, "it tries again")
+        assert relay.server._sessions == {} and not robot.core.link.established
+        assert caplog.text.count("robot1 lost a key; 1 connections cut") == 1
+        public.write_text(old)
+        relay.reload()
+        await until(lambda: robot.core.link.established, "it is back by itself")
+        await lab.end(robot)
+        await lab.end(relay)
+
+
+@pytest.mark.parametrize("ipc", [True, False], ids=["ipc", "tcp"])
+@pytest.mark.parametrize("removed", [True, False], ids=["removed", "replaced"])
+async def test_a_connection_that_outlives_its_key_is_not_heard(
+    tmp_path: Path, ipc: bool, removed: bool, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """As where nothing can end it: what it says is refused by its key, and said once."""
+    async with Lab(tmp_path, "robot2") as lab:
+        if ipc:
+            local(lab)
+        relay = await lab.relay()
+        assert relay.server is not None
+        server = relay.server
+        async with Stranger(lab, load_secret(tmp_path / "robot2.key")) as silent:
+            await until(lambda: zmq.Event.HANDSHAKE_SUCCEEDED in silent.events, "admitted by its key, that holds")
+            with monkeypatch.context() as patch:
+                patch.setattr(ConnectionTable, "cut_user", lambda _table, _user: 0)
+                if removed:
+                    (lab.clients_dir / "robot2.pub").unlink()
+                else:
+                    lab.make_keys("robot2")
+                relay.reload()
+            assert zmq.Event.DISCONNECTED not in silent.events
+            messages = server.socket.messages
+            for _ in range(20):
+                await silent.send(hello("robot2"))
+            await silent.cut()
+            assert server.socket.messages > messages
+            assert server._sessions == {} and silent.received == []
+            assert server.revoked == 1
+            assert caplog.text.count("the key of robot2 is revoked") == 1
+        await lab.end(relay)
