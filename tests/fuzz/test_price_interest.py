@@ -4,10 +4,8 @@ A peer says so of all topics as often as it likes. So each time must cost as muc
 there are: what is counted are the steps of Python's own interpreter, which are the same in every run.
 """
 
-import sys
 from collections.abc import Callable
 from dataclasses import replace
-from types import FrameType
 from typing import Any
 
 import pytest
@@ -25,6 +23,7 @@ from sern_core.summaries.patches import PatchParams
 from sern_core.summaries.spec import SummarySpec, VoxelParams
 from sern_core.types import ClientName, DropReason, Encoding, TopicName
 from sern_runtime import ros_types
+from tests.steps import steps
 
 FEW, MANY = 20, 1_000
 CLOUD, GRID = TopicName("/robot/cloud"), TopicName("/robot/grid")
@@ -32,26 +31,6 @@ RULES = (
     TopicRule(compile_pattern(CLOUD), summaries=(SummarySpec(VoxelParams()),)),
     TopicRule(compile_pattern(GRID), summaries=(SummarySpec(PatchParams()),)),
 )
-
-
-def steps(call: Callable[[], object]) -> int:
-    """How many instructions of the interpreter a call takes."""
-    count = 0
-
-    def trace(frame: FrameType, event: str, _argument: Any) -> Any:
-        nonlocal count
-        frame.f_trace_opcodes = True
-        count += event == "opcode"
-        return trace
-
-    before = sys.gettrace()
-    sys.settrace(trace)
-    try:
-        call()
-    finally:
-        sys.settrace(before)
-    assert count > 0
-    return count
 
 
 class Robot:

@@ -1,9 +1,8 @@
 """Goals that nobody will answer: what their clients are told."""
 
 import struct
-import sys
 from collections.abc import AsyncIterator, Callable
-from types import FrameType
+from functools import partial
 from typing import Any
 
 import pytest
@@ -30,6 +29,7 @@ from sern_core.patterns import compile_pattern
 from sern_core.queues import OutChannel
 from sern_core.types import ClientName, DropReason, Encoding, PriorityClass, TopicName
 from sern_runtime import clock, ros_types
+from tests.steps import steps
 from tests.support import until
 
 HEADER = "Header header\n"
@@ -224,27 +224,6 @@ async def test_a_status_of_too_many_goals_is_not_read(caplog: pytest.LogCaptureF
     site.watch.close()
 
 
-def steps(work: Callable[[], None]) -> int:
-    """Bytecode that `work` runs in sern_client.actions."""
-    count = 0
-
-    def trace(frame: FrameType, event: str, _arg: object) -> Any:
-        nonlocal count
-        if frame.f_code.co_filename != actions.__file__:
-            return None
-        frame.f_trace_opcodes = True
-        count += event == "opcode"
-        return trace
-
-    before = sys.gettrace()
-    sys.settrace(trace)
-    try:
-        work()
-    finally:
-        sys.settrace(before)
-    return count
-
-
 async def test_what_a_status_costs_does_not_grow_with_the_goals_it_does_not_mention() -> None:
     costs = []
     for goals in (10, MAX_GOALS - 1):
@@ -253,8 +232,9 @@ async def test_what_a_status_costs_does_not_grow_with_the_goals_it_does_not_ment
         for number in range(goals):
             site.give(goal_body(GoalId(1, 2, f"goal {number}")), 1)
         one = status_body("goal 5")
-        costs.append(steps(lambda watch=site.watch, one=one: watch.message(STATUS.name, Encoding.ROS1, one)))  # type: ignore[misc]
-        costs.append(steps(lambda site=site: site.give(goal_body(), 1)))  # type: ignore[misc]
+        look = partial(site.watch.message, STATUS.name, Encoding.ROS1, one)
+        costs.append(steps(look, within=actions.__file__))
+        costs.append(steps(partial(site.give, goal_body(), 1), within=actions.__file__))
         site.watch.close()
     assert costs[0] > 100 and costs[2:] == costs[:2]
 
