@@ -12,6 +12,7 @@ from sern_core.lanes import LANE_UDP
 from sern_core.link import Link
 from sern_core.types import ClientName
 from sern_runtime import clock
+from sern_runtime.addresses import plain_host
 from sern_runtime.config.base import split_tcp
 from sern_runtime.dscp import Marks
 from sern_runtime.pump import Pump
@@ -149,7 +150,7 @@ class RelayLanes:
                 f"{port} in this host's firewall and in its cloud security group, or allow outgoing UDP at the client"
             )
         return (
-            f"datagrams come through from it ({session.address[0]}), and it has confirmed none of ours for "
+            f"datagrams come through from it ({plain_host(session.address[0])}), and it has confirmed none of ours for "
             f"{within_s:g} s; using TCP; allow this host's UDP port {port} to answer, and datagrams of 1200 bytes"
         )
 
@@ -188,7 +189,7 @@ class RelayLanes:
 
     def _path(self, session: UdpSession, address: Address, validated: bool) -> None:
         if validated:
-            _log.info("%s is reached over UDP at %s", session.client, address[0])
+            _log.info("%s is reached over UDP at %s", session.client, plain_host(address[0]))
         else:
             self.moved += 1
         self._writable(session)

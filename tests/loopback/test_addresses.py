@@ -12,6 +12,7 @@ from sern_relay.daemon import RelayDaemon
 from sern_runtime.seal import offered_ciphers
 from sern_tools.ports import free_ports
 from tests.daemons import Lab
+from tests.loopback.test_udp_client import SIX
 from tests.support import until
 
 DEAD_ENDS = {"kind": "synthetic", "role": "robot", "topics": 1}
@@ -42,21 +43,40 @@ def refused(robot: ClientDaemon) -> bool:
             ["tcp://127.0.0.1:{1}", "tcp://127.0.0.1:{0}"],
             id="two ports",
         ),
+        pytest.param(
+            ["tcp://[::]:{0}"],
+            ["tcp://127.0.0.1:{0}", "tcp://[::1]:{0}"],
+            id="both families",
+            marks=SIX,
+        ),
+        pytest.param(["tcp://*:{0}"], ["tcp://127.0.0.1:{0}"], id="every address"),
+        pytest.param(
+            ["tcp://*:{0}"],
+            ["tcp://[::1]:{0}"],
+            id="every address, over IPv6",
+            marks=SIX,
+        ),
     ],
 )
 async def test_a_client_has_its_lanes_where_it_reaches_the_relay(
-    tmp_path: Path, listen: list[str], reached: list[str]
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, listen: list[str], reached: list[str]
 ) -> None:
     """`listen` is the relay's; a client comes to each address of `reached`."""
+    caplog.set_level("INFO")
     ports = free_ports(2)
     endpoints = {f"robot{index}": address.format(*ports) for index, address in enumerate(reached)}
     async with Lab(tmp_path, *endpoints) as lab:
         relay = await lab.relay(lab.relay_file(relay={"listen": [address.format(*ports) for address in listen]}))
+        assert relay.server is not None
         robots = []
         for name, endpoint in endpoints.items():
             robot = await lab.connected(lab.client_file(name, DEAD_ENDS, relay={"endpoint": endpoint}))
             await datagrams_at(int(endpoint.rpartition(":")[2]), robot, relay)
             robots.append(robot)
+            home = "::1" if "[::1]" in endpoint else "127.0.0.1"
+            assert f"{name} is reached over UDP at {home}" in caplog.messages
+            connected = relay.server.connections.handles_of(name)
+            assert {(handle.local[0], handle.peer[0]) for handle in connected} == {(home, home)}
         assert relay.hub.links.keys() == endpoints.keys()
         for name in endpoints:
             (lab.clients_dir / f"{name}.pub").unlink()
@@ -64,6 +84,7 @@ async def test_a_client_has_its_lanes_where_it_reaches_the_relay(
         assert not relay.hub.links and relay.lanes is not None and not relay.lanes._lanes
         for robot in robots:
             await until(partial(refused, robot), "it has no session, and knows why")
+        assert "::ffff:" not in caplog.text, "an IPv4 client is one in the logs"
         for daemon in (*robots, relay):
             await lab.end(daemon)
 
