@@ -50,6 +50,12 @@ def refused(robot: ClientDaemon) -> bool:
             marks=SIX,
         ),
         pytest.param(["tcp://*:{0}"], ["tcp://127.0.0.1:{0}"], id="every address"),
+        pytest.param(["tcp://127.0.0.1:{0}"], ["tcp://localhost:{0}"], id="a name"),
+        pytest.param(
+            ["ipc://{path}/relay", "tcp://127.0.0.1:{0}"],
+            ["ipc://{path}/relay", "tcp://127.0.0.1:{0}"],
+            id="beside ipc",
+        ),
         pytest.param(
             ["tcp://*:{0}"],
             ["tcp://[::1]:{0}"],
@@ -61,32 +67,40 @@ def refused(robot: ClientDaemon) -> bool:
 async def test_a_client_has_its_lanes_where_it_reaches_the_relay(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, listen: list[str], reached: list[str]
 ) -> None:
-    """`listen` is the relay's; a client comes to each address of `reached`."""
+    """`listen` is the relay's; a client comes to each address of `reached`. Who comes by TCP is revoked."""
     caplog.set_level("INFO")
     ports = free_ports(2)
-    endpoints = {f"robot{index}": address.format(*ports) for index, address in enumerate(reached)}
+    endpoints = {f"robot{index}": address.format(*ports, path=tmp_path) for index, address in enumerate(reached)}
     async with Lab(tmp_path, *endpoints) as lab:
-        relay = await lab.relay(lab.relay_file(relay={"listen": [address.format(*ports) for address in listen]}))
-        assert relay.server is not None
-        robots = []
+        there = [address.format(*ports, path=tmp_path) for address in listen]
+        relay = await lab.relay(lab.relay_file(relay={"listen": there}))
+        assert relay.server is not None and relay.lanes is not None
+        revoked, stay = {}, {}
         for name, endpoint in endpoints.items():
             robot = await lab.connected(lab.client_file(name, DEAD_ENDS, relay={"endpoint": endpoint}))
+            if endpoint.startswith("ipc://"):
+                stay[name] = robot
+                continue
             await datagrams_at(int(endpoint.rpartition(":")[2]), robot, relay)
-            robots.append(robot)
+            revoked[name] = robot
             home = "::1" if "[::1]" in endpoint else "127.0.0.1"
             assert f"{name} is reached over UDP at {home}" in caplog.messages
             connected = relay.server.connections.handles_of(name)
             assert {(handle.local[0], handle.peer[0]) for handle in connected} == {(home, home)}
         assert relay.hub.links.keys() == endpoints.keys()
-        for name in endpoints:
+        assert relay.lanes._lanes.keys() == revoked.keys()
+        for name in revoked:
             (lab.clients_dir / f"{name}.pub").unlink()
         relay.reload()
-        assert not relay.hub.links and relay.lanes is not None and not relay.lanes._lanes
-        for robot in robots:
-            await until(partial(refused, robot), "it has no session, and knows why")
+        assert relay.hub.links.keys() == stay.keys() and not relay.lanes._lanes
+        for name, robot in revoked.items():
+            await until(partial(refused, robot), f"{name} has no session, and knows why")
+        for robot in stay.values():
+            assert robot.core.link.established and LANE_UDP not in robot.core.link.lanes
         assert "::ffff:" not in caplog.text, "an IPv4 client is one in the logs"
-        for daemon in (*robots, relay):
-            await lab.end(daemon)
+        for robot in (*revoked.values(), *stay.values()):
+            await lab.end(robot)
+        await lab.end(relay)
 
 
 async def test_a_lane_that_is_renewed_while_tcp_is_lost_keeps_its_port(tmp_path: Path) -> None:
