@@ -205,7 +205,13 @@ class RelayDaemon:
             )
         if keys is not None and relay.udp:
             with blamed_on(self.loaded.path, "relay", "listen"):
-                self.lanes = RelayLanes(self.hub, relay.listen, after=self._after, marks=model.link.dscp.marks())
+                self.lanes = RelayLanes(
+                    self.hub,
+                    relay.listen,
+                    port_of=self.server.local_port,
+                    after=self._after,
+                    marks=model.link.dscp.marks(),
+                )
         if keys is not None and self.zap is not None:
             await self_test(self._ctx, self.zap, relay.listen, keys.public_key)
             _log.info("self-test passed: a stranger's key is refused on %s", ", ".join(relay.listen))

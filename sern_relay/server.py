@@ -18,7 +18,7 @@ from sern_runtime import clock
 from sern_runtime.dscp import Marks
 from sern_runtime.inflow import Inflow
 from sern_runtime.keys import parse_user_id
-from sern_runtime.monitor import ConnectionTable, TcpHandle
+from sern_runtime.monitor import Connection, ConnectionTable, TcpHandle
 from sern_runtime.pump import LANE_MESSAGE_BYTES, Pump
 from sern_runtime.zmq_socket import CurvePair, RouterSocket, SendResult, make_server
 
@@ -39,7 +39,7 @@ class Session:
 
     __slots__ = ("connection", "fd", "port", "pump", "taken", "user")
 
-    def __init__(self, port: HubPort, pump: Pump, user: str, fd: int, connection: object) -> None:
+    def __init__(self, port: HubPort, pump: Pump, user: str, fd: int, connection: Connection | None) -> None:
         self.port = port
         self.pump = pump
         self.user = user
@@ -261,6 +261,15 @@ class RelayServer:
         for session in self._sessions.values():
             session.pump.kick()
         self.express.kick()
+
+    def local_port(self, client: ClientName) -> int | None:
+        """The number of our port to which the client's session came by TCP; None while it has no such connection, as
+        over ipc."""
+        for session in self._sessions.values():
+            if session.port.client == client and session.port.current:
+                handle = session.connection.handle if session.connection is not None else None
+                return None if handle is None else handle.local[1]
+        return None
 
     def cut_client(self, client: str) -> int:
         """End every connection of a client at once; returns how many there were."""

@@ -12,6 +12,7 @@ from sern_core.lanes import LANE_UDP
 from sern_core.link import Link
 from sern_core.types import ClientName
 from sern_runtime import clock
+from sern_runtime.addresses import plain_host
 from sern_runtime.config.base import split_tcp
 from sern_runtime.dscp import Marks
 from sern_runtime.pump import Pump
@@ -33,13 +34,22 @@ def udp_endpoints(listen: Sequence[str]) -> tuple[str, ...]:
 class RelayLanes:
     """Opens a session for a client that asks, and joins it to the client's link until the core closes the lane.
 
-    Raises ConfigError when an address cannot be had. `after` is called whenever something came in.
+    Raises ConfigError when an address cannot be had. `port_of(client)` is the number of the port over which the client
+    reached the relay by TCP, None while it has no such connection: its datagrams go to the UDP port of that number, as
+    firewalls and routes to another may be closed. `after` is called whenever something came in.
     """
 
     def __init__(
-        self, hub: Hub, listen: Sequence[str], *, after: Callable[[], None], marks: Marks | None = None
+        self,
+        hub: Hub,
+        listen: Sequence[str],
+        *,
+        port_of: Callable[[ClientName], int | None],
+        after: Callable[[], None],
+        marks: Marks | None = None,
     ) -> None:
         self.hub = hub
+        self._port_of = port_of
         marks = marks or Marks()
         self._tos = marks.tos
         self._after = after
@@ -89,11 +99,18 @@ class RelayLanes:
             self._after()
 
     def _open(self, client: ClientName, ciphers: Sequence[str]) -> None:
+        before = self._lanes.get(client)
+        port_number = self._port_of(client)
+        if port_number is None and before is not None:  # it asks over the lane itself, while TCP is lost
+            port_number = before[0].parameters.port
         self.closed(client)
         link = self.hub.links[client]
         link.close_lane(now=clock.now())
+        if port_number is None:
+            _log.warning("%s gets no datagram lane: it has no TCP connection to this relay", client)
+            return
         try:
-            session = self.server.open_session(client, ciphers)
+            session = self.server.open_session(client, ciphers, port=port_number)
         except RefusedError as refusal:
             _log.warning("%s gets no datagram lane: %s", client, refusal)
             return
@@ -133,7 +150,7 @@ class RelayLanes:
                 f"{port} in this host's firewall and in its cloud security group, or allow outgoing UDP at the client"
             )
         return (
-            f"datagrams come through from it ({session.address[0]}), and it has confirmed none of ours for "
+            f"datagrams come through from it ({plain_host(session.address[0])}), and it has confirmed none of ours for "
             f"{within_s:g} s; using TCP; allow this host's UDP port {port} to answer, and datagrams of 1200 bytes"
         )
 
@@ -172,7 +189,7 @@ class RelayLanes:
 
     def _path(self, session: UdpSession, address: Address, validated: bool) -> None:
         if validated:
-            _log.info("%s is reached over UDP at %s", session.client, address[0])
+            _log.info("%s is reached over UDP at %s", session.client, plain_host(address[0]))
         else:
             self.moved += 1
         self._writable(session)

@@ -24,6 +24,7 @@ from typing import Final, NamedTuple
 
 import zmq
 
+from sern_runtime.addresses import plain_host
 from sern_runtime.clock import now
 from sern_runtime.zmq_socket import HANDSHAKE_IVL_MS, FrameSocket
 
@@ -222,7 +223,7 @@ class TcpHandle(SocketHandle):
             os.close(duplicate)
         if local_port not in (None, local[1]) or peer_port not in (None, peer[1]):
             return None
-        return cls(fd, status.st_ino, local, peer)
+        return cls(fd, status.st_ino, (plain_host(local[0]), local[1]), (plain_host(peer[0]), peer[1]))
 
     def info(self) -> TcpInfo | None:
         """The kernel's view of the connection (TCP_INFO)."""

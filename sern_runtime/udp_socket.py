@@ -104,11 +104,9 @@ class DatagramSocket:
         self._paused: asyncio.Handle | None = None
         self._blocked = False
         self._tos = -1  # of the datagram before
-        self._level, self._tos_option = (
-            (socketlib.IPPROTO_IPV6, socketlib.IPV6_TCLASS)
-            if socket.family == socketlib.AF_INET6
-            else (socketlib.IPPROTO_IP, socketlib.IP_TOS)
-        )
+        self._tos_options = [(socketlib.IPPROTO_IP, socketlib.IP_TOS)]  # IPv4 through a socket of IPv6 has its own
+        if socket.family == socketlib.AF_INET6:
+            self._tos_options.append((socketlib.IPPROTO_IPV6, socketlib.IPV6_TCLASS))
         self._filtered = False
         self._closed = False
         self._loop.add_reader(self._fd, self._readable)
@@ -138,7 +136,8 @@ class DatagramSocket:
         counted, and told to `on_error`."""
         try:
             if tos != self._tos:
-                self.socket.setsockopt(self._level, self._tos_option, tos)
+                for level, option in self._tos_options:
+                    self.socket.setsockopt(level, option, tos)
                 self._tos = tos
             if address is None:
                 self.socket.send(datagram)
@@ -271,7 +270,10 @@ def _filter_program(ids: Collection[int]) -> bytes:
 
 
 def bound_socket(endpoint: str) -> socketlib.socket:
-    """A socket on `udp://address:port`; `*` is every IPv4 address, or a free port. Raises ConfigError of one line.
+    """A socket on `udp://address:port`; `*` is every address, or a free port. Raises ConfigError of one line.
+
+    It takes datagrams wherever libzmq takes connections for the same address: at `[::]` and `*` of both families, with
+    those of IPv4 as `::ffff:` addresses, and at `*` of IPv4 alone where the kernel has no IPv6.
 
     On a host with several addresses name the one that clients connect to: from a wildcard the kernel chooses the source
     of each answer by its routes, and a connected client takes datagrams of the address it knows only. The path is then
@@ -280,24 +282,32 @@ def bound_socket(endpoint: str) -> socketlib.socket:
     host, port = split_udp(endpoint)
     try:
         found = socketlib.getaddrinfo(
-            None if host == "*" else host,
-            port,
-            family=socketlib.AF_INET if host == "*" else socketlib.AF_UNSPEC,
-            type=socketlib.SOCK_DGRAM,
-            flags=socketlib.AI_PASSIVE,
+            "::" if host == "*" else host, port, type=socketlib.SOCK_DGRAM, flags=socketlib.AI_PASSIVE
         )
     except (OSError, UnicodeError):  # UnicodeError: no name that DNS could hold
         raise ConfigError(f"{endpoint}: cannot find the address; write one of this host's") from None
     family, _, _, _, address = found[0]
+    try:
+        try:
+            return _bound(family, address)
+        except OSError as error:
+            if host != "*" or error.errno != errno.EAFNOSUPPORT:
+                raise
+            return _bound(socketlib.AF_INET, ("0.0.0.0", port))
+    except OSError as error:
+        raise ConfigError(f"cannot listen on {endpoint}: {(error.strerror or str(error)).lower()}") from error
+
+
+def _bound(family: int, address: Address | tuple[int, bytes]) -> socketlib.socket:
     socket = socketlib.socket(family, socketlib.SOCK_DGRAM)
     try:
         if family == socketlib.AF_INET6:
-            socket.setsockopt(socketlib.IPPROTO_IPV6, socketlib.IPV6_V6ONLY, 1)  # each family has its own socket
+            socket.setsockopt(socketlib.IPPROTO_IPV6, socketlib.IPV6_V6ONLY, 0)  # whatever bindv6only says
         prepare(socket)
         socket.bind(address)
-    except OSError as error:
+    except OSError:
         socket.close()
-        raise ConfigError(f"cannot listen on {endpoint}: {(error.strerror or str(error)).lower()}") from error
+        raise
     return socket
 
 
@@ -323,10 +333,9 @@ def prepare(socket: socketlib.socket) -> None:
     socket.setblocking(False)
     socket.setsockopt(socketlib.SOL_SOCKET, socketlib.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
     socket.setsockopt(socketlib.SOL_SOCKET, socketlib.SO_SNDBUF, SEND_BUFFER_BYTES)
-    if socket.family == socketlib.AF_INET6:
+    socket.setsockopt(socketlib.IPPROTO_IP, _IP_MTU_DISCOVER, _PMTUDISC_PROBE)
+    if socket.family == socketlib.AF_INET6:  # IPv4 may pass through it, too
         socket.setsockopt(socketlib.IPPROTO_IPV6, _IPV6_MTU_DISCOVER, _PMTUDISC_PROBE)
-    else:
-        socket.setsockopt(socketlib.IPPROTO_IP, _IP_MTU_DISCOVER, _PMTUDISC_PROBE)
 
 
 def split_udp(endpoint: str) -> tuple[str, int]:

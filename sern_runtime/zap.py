@@ -22,6 +22,7 @@ import zmq
 from zmq.utils import z85
 
 from sern_core.errors import ConfigError, SernError, UsageError
+from sern_runtime.addresses import plain_host
 from sern_runtime.monitor import EventKind, MonitorEvent, SocketMonitor
 from sern_runtime.zmq_socket import DealerSocket, FrameSocket, connect_curve
 
@@ -123,7 +124,7 @@ class ZapHandler:
         if len(request) != _REQUEST_FRAMES or request[0] != _VERSION or request[5] != b"CURVE":
             counters.malformed += 1
             return b"400", b"only CURVE is accepted", b""
-        domain, address = request[2], request[3].decode("ascii", "replace")
+        domain, address = request[2], plain_host(request[3].decode("ascii", "replace"))
         try:
             public_key = z85.encode(request[6]).decode("ascii")
             probe = public_key in self._expected

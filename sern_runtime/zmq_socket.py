@@ -31,6 +31,7 @@ from typing import Final, NamedTuple, Protocol, cast
 import zmq
 
 from sern_core.errors import ConfigError, UsageError
+from sern_runtime.addresses import plain_host
 from sern_runtime.inflow import trim_memory
 
 HEARTBEAT_IVL_MS: Final = 500
@@ -302,7 +303,7 @@ class RouterSocket(DrainedSocket):
         """Address and file descriptor of the sender; only inside `on_message` and `on_refused`."""
         if self._frame is None:
             raise UsageError("peer_details() is for use inside on_message and on_refused")
-        return PeerDetails(_text(self._frame, "Peer-Address"), int(self._frame.get(zmq.SRCFD)))
+        return PeerDetails(plain_host(_text(self._frame, "Peer-Address")), int(self._frame.get(zmq.SRCFD)))
 
     def send_to(self, routing_id: bytes, body: bytes) -> SendResult:
         """Send to one peer without waiting. GONE when its connection is over (ROUTER_MANDATORY)."""

@@ -56,7 +56,7 @@ class RelaySection(Section):
     name: ClientText
     """Its name, as in its key file."""
     listen: Annotated[tuple[BindEndpoint, ...], Field(min_length=1, max_length=16)]
-    """Where clients connect: tcp://address:port, tcp://*:port (every address), ipc://path; one or more."""
+    """Where clients connect: tcp://address:port, tcp://*:port (every one of IPv4 and IPv6), ipc://path; 1 or more."""
     secret_key_file: PathText | None = None
     """The relay's secret key file (.key)."""
     clients_dir: PathText | None = None

@@ -23,7 +23,7 @@ from sern_runtime.udp_client import UdpClient
 from sern_runtime.zmq_socket import SendResult
 from sern_tools.ports import free_ports
 from tests.daemons import HOST, Lab
-from tests.loopback.test_udp_client import NO_IPV6, has_ipv6
+from tests.loopback.test_udp_client import SIX
 from tests.loopback.udp_support import OFFERED, ROBOT
 from tests.support import until
 
@@ -90,10 +90,16 @@ class Tap:
 
 
 @pytest.mark.parametrize(
-    "host", ["127.0.0.1", pytest.param("::1", marks=pytest.mark.skipif(not has_ipv6(), reason=NO_IPV6))]
+    ("url", "host"),
+    [
+        ("udp://127.0.0.1:*", "127.0.0.1"),
+        pytest.param("udp://[::1]:*", "::1", marks=SIX),
+        pytest.param("udp://[::]:*", "127.0.0.1", marks=SIX),
+        pytest.param("udp://[::]:*", "::1", marks=SIX),
+    ],
+    ids=["IPv4", "IPv6", "both, over IPv4", "both, over IPv6"],
 )
-async def test_each_datagram_has_the_mark_it_was_sent_with(host: str) -> None:
-    url = f"udp://[{host}]:*" if ":" in host else f"udp://{host}:*"
+async def test_each_datagram_has_the_mark_it_was_sent_with(url: str, host: str) -> None:
     marks = [EF, EF, CS1, CS0, EF, CS1, CS1, None]
     server = UdpServer([url], lambda _session, _data, _now: None, tos=0xBB)
     session = server.open_session(ROBOT, OFFERED)
@@ -118,8 +124,15 @@ async def test_each_datagram_has_the_mark_it_was_sent_with(host: str) -> None:
         await until(lambda: len(came()) == len(marks), "all are there")
         assert came() == [CS1 if tos is None else tos for tos in marks]
         assert set(challenges()) == {CS1}, "ECN's two bits are not ours"
-        server.listeners[0].send(b"from the relay", far.getsockname()[:2], server.tos)
-        await until(lambda: (seen := take(far)) is not None and seen[0] == 0xB8, "the server's own")
+        seen.clear()
+        listener = server.listeners[0]
+        there = far.getsockname()[:2]
+        if listener.socket.family == socketlib.AF_INET6 and ":" not in host:
+            there = ("::ffff:" + host, there[1])  # as a socket of both families knows it
+        for tos in (server.tos, CS1, EF):
+            assert listener.send(b"from the relay", there, tos) is SendResult.OK
+        await until(lambda: len(came()) == 3, "the server's own")
+        assert came() == [0xB8, CS1, EF]
     finally:
         client.close()
         server.close()

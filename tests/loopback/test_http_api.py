@@ -1,5 +1,6 @@
 """The daemons over HTTP: metrics with proper names and every counter at 0, health, readiness, and JSON without NaN."""
 
+import asyncio
 import json
 from pathlib import Path
 from typing import Any
@@ -8,13 +9,17 @@ import aiohttp
 import pytest
 from prometheus_client import CollectorRegistry
 from prometheus_client.parser import text_string_to_metric_families
+from typer.testing import CliRunner
 
 from sern_client.daemon import ClientDaemon
 from sern_core.types import CLASS_LABELS, ClientName
 from sern_relay.daemon import RelayDaemon
 from sern_runtime.link_metrics import LOSSES, RECEIVED_LOSSES
 from sern_runtime.metrics import check_names
+from sern_tools.commands import app
+from sern_tools.ports import free_ports
 from tests.daemons import Lab, write_bag
+from tests.loopback.test_udp_client import SIX
 from tests.support import until
 
 
@@ -125,6 +130,29 @@ async def test_metrics_and_json_of_a_running_system(tmp_path: Path) -> None:
         trace = await read(robot, "/api/trace")
         assert "/robot1/chat" in json.dumps(trace)
         for daemon in (robot, site, relay):
+            await lab.end(daemon)
+
+
+@SIX
+async def test_over_ipv6_everything_answers(tmp_path: Path) -> None:
+    addresses = [f"[::1]:{port}" for port in free_ports(2)]
+    async with Lab(tmp_path, "robot1") as lab:
+        relay = await lab.relay(lab.relay_file(http={"listen": addresses[0]}))
+        endpoint = {"kind": "synthetic", "role": "robot", "topics": 1}
+        robot = await lab.connected(lab.client_file("robot1", endpoint, http={"listen": addresses[1]}))
+        await until(lambda: len(list(relay.hub.announced())) == 1, "the relay knows the robot's topic")
+        daemons: tuple[RelayDaemon | ClientDaemon, ...] = (relay, robot)
+        for daemon, address in zip(daemons, addresses, strict=True):
+            assert await get(daemon, "/healthz") == (200, "running\n")
+            assert (await samples(daemon))["sern_bad_frames_total"][()] == 0.0
+            command = ["topics", "--json", "--api", f"http://{address}"]
+            listed = await asyncio.to_thread(CliRunner().invoke, app, command)
+            assert listed.exit_code == 0, listed.output
+            assert {row["owner"] for row in json.loads(listed.stdout)} == {"robot1"}
+            port = address.rpartition(":")[2]
+            elsewhere = await asyncio.to_thread(CliRunner().invoke, app, [*command[:-1], f"http://127.0.0.1:{port}"])
+            assert elsewhere.exit_code == 1 and "no answer (connection refused)" in elsewhere.output
+        for daemon in (robot, relay):
             await lab.end(daemon)
 
 

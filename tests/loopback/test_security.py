@@ -275,9 +275,9 @@ async def test_a_client_is_given_a_lane_now_and_then(tmp_path: Path, monkeypatch
         opened: list[Sequence[str]] = []
         open_session = lanes.server.open_session
 
-        def counted(client: ClientName, offered: Sequence[str]) -> UdpSession:
+        def counted(client: ClientName, offered: Sequence[str], *, port: int) -> UdpSession:
             opened.append(offered)
-            return open_session(client, offered)
+            return open_session(client, offered, port=port)
 
         monkeypatch.setattr(lanes.server, "open_session", counted)
         ciphers = list(lanes._ciphers[name])

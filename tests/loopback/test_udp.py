@@ -7,11 +7,12 @@ import struct
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
+from typing import Any
 
 import pytest
 
 from sern_core.errors import ConfigError, RefusedError, UsageError
-from sern_runtime import udp
+from sern_runtime import udp, udp_socket
 from sern_runtime.seal import UDP_PAYLOAD_BYTES, Cipher, SessionParameters, Side
 from sern_runtime.udp import (
     AMPLIFICATION,
@@ -23,6 +24,7 @@ from sern_runtime.udp import (
     UdpServer,
 )
 from sern_runtime.zmq_socket import SendResult
+from tests.loopback.test_udp_client import SIX
 from tests.loopback.udp_support import OFFERED, ROBOT, SITE, RawClient, Relay
 from tests.support import until
 
@@ -515,17 +517,43 @@ async def test_a_bad_endpoint_is_one_line(endpoint: str, problem: str) -> None:
     assert problem in str(error.value) and endpoint in str(error.value) and "\n" not in str(error.value)
 
 
+async def test_every_address_is_ipv4_where_the_kernel_has_nothing_else(monkeypatch: pytest.MonkeyPatch) -> None:
+    class FourOnly(socketlib.socket):
+        def __init__(self, family: int = -1, *rest: Any, **kwargs: Any) -> None:
+            if family == socketlib.AF_INET6:
+                raise OSError(errno.EAFNOSUPPORT, "Address family not supported by protocol")
+            super().__init__(family, *rest, **kwargs)
+
+    monkeypatch.setattr(socketlib, "socket", FourOnly)
+    with udp_socket.bound_socket("udp://*:*") as socket:
+        assert socket.getsockname()[0] == "0.0.0.0"
+    with pytest.raises(ConfigError, match=r"cannot listen on udp://\[::\]:1: address family not supported"):
+        udp_socket.bound_socket("udp://[::]:1")
+
+
 async def test_a_port_in_use_is_named(relay: Relay) -> None:
     endpoint = f"udp://127.0.0.1:{relay.server.ports[0]}"
     with pytest.raises(ConfigError, match=f"cannot listen on {endpoint}: address already in use"):
         UdpServer([endpoint], lambda _session, _data, _now: None)
 
 
-async def test_the_socket_is_set_up() -> None:
-    server = UdpServer(["udp://*:*"], lambda _session, _data, _now: None)
+@pytest.mark.parametrize(
+    ("endpoint", "host"),
+    [
+        ("udp://0.0.0.0:*", "0.0.0.0"),
+        pytest.param("udp://[::]:*", "::", marks=SIX),
+        pytest.param("udp://*:*", "::", marks=SIX),
+        pytest.param("udp://[::ffff:127.0.0.1]:*", "::ffff:127.0.0.1", marks=SIX),
+    ],
+)
+async def test_the_socket_is_set_up(endpoint: str, host: str) -> None:
+    server = UdpServer([endpoint], lambda _session, _data, _now: None)
     socket = server.listeners[0].socket
-    assert socket.getsockname()[0] == "0.0.0.0"
+    assert socket.getsockname()[0] == host
     assert socket.getsockopt(socketlib.IPPROTO_IP, 10) == 3, "Don't Fragment, and no ICMP believed"
+    if socket.family == socketlib.AF_INET6:
+        assert socket.getsockopt(socketlib.IPPROTO_IPV6, 23) == 3, "the same for IPv6"
+        assert not socket.getsockopt(socketlib.IPPROTO_IPV6, socketlib.IPV6_V6ONLY)
     assert not socket.getblocking()
     server.close()
     server.close()

@@ -64,7 +64,10 @@ async def test_round_trip(relay: Relay) -> None:
     client.close()
 
 
-@pytest.mark.skipif(not has_ipv6(), reason=NO_IPV6)
+SIX = pytest.mark.skipif(not has_ipv6(), reason=NO_IPV6)
+
+
+@SIX
 async def test_ipv6() -> None:
     relay = Relay(["udp://127.0.0.1:*", "udp://[::1]:*"], echo=True)
     ports = relay.server.ports
