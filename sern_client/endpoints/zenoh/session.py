@@ -7,6 +7,8 @@ block (opening, closing, putting into a full transmission queue) is done off the
 import asyncio
 import json
 import logging
+import re
+import secrets
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -23,6 +25,11 @@ DEFAULT_CONNECT: Final = ("tcp/localhost:7447",)
 MAX_WAITING_BYTES: Final = 64 * 2**20
 """Messages that may wait for zenoh's transmission queue; beyond, the oldest are dropped and counted."""
 
+_WITH_PORT: Final = re.compile(r"((?:tcp|udp|tls|quic|ws)/)([^?#]*):([0-9]+)((?:[?#].*)?)")
+_ON_THIS_HOST: Final = re.compile(r"(?:unixsock-stream|unixpipe)/.*")
+_EVERYWHERE: Final = {"0.0.0.0": "127.0.0.1", "[::]": "[::1]"}
+"""Addresses to listen on that are none to connect to, and what leads there on this host."""
+
 _log = logging.getLogger(__name__)
 
 
@@ -38,11 +45,15 @@ def load_zenoh() -> ModuleType:
 
 @dataclass(frozen=True, slots=True)
 class SessionOptions:
-    """`config_file` (zenoh's own JSON5) replaces the defaults of rmw_zenoh; `connect` and `listen` go on top."""
+    """`config_file` (zenoh's own JSON5) replaces the defaults of rmw_zenoh; `connect` and `listen` go on top.
+
+    `second`: another process has a session of the same options already, and this one is to reach whom that one reaches.
+    """
 
     connect: tuple[str, ...] = DEFAULT_CONNECT
     listen: tuple[str, ...] = ()
     config_file: Path | None = None
+    second: bool = False
 
 
 def make_config(zenoh: ModuleType, options: SessionOptions) -> Any:
@@ -66,9 +77,43 @@ def make_config(zenoh: ModuleType, options: SessionOptions) -> Any:
                 config.insert_json5(key, json.dumps(value))
         config.insert_json5("connect/endpoints", json.dumps(list(options.connect)))
         config.insert_json5("listen/endpoints", json.dumps(list(options.listen or ("tcp/localhost:0",))))
+        if options.second:
+            _step_aside(config)
     except zenoh.ZError as error:
         raise ConfigError(f"zenoh does not accept this: {one_line(error)}") from None
     return config
+
+
+def _step_aside(config: Any) -> None:
+    """Make of the configuration of a session that of a second one beside it.
+
+    Peers do not pass on what others publish, so the second session needs links of its own to whoever is linked to the
+    first. Those that come to a locator of the first learn there of the second one, which therefore comes there as well,
+    and listens at the same addresses, at ports that are free.
+    """
+    mode = json.loads(config.get_json("mode")) or "peer"
+    connect, listen = _locators(config, "connect/endpoints", mode), _locators(config, "listen/endpoints", mode)
+    if mode != "client":  # which has one link, to its router
+        connect += [there for locator in listen if (there := _reached_at(locator)) is not None]
+    config.insert_json5("connect/endpoints", json.dumps(list(dict.fromkeys(connect))))
+    matches = [match for locator in listen if (match := _WITH_PORT.fullmatch(locator))]
+    free = (f"{match[1]}{match[2]}:0{match[4]}" for match in matches)
+    config.insert_json5("listen/endpoints", json.dumps(list(dict.fromkeys(free))))
+    if json.loads(config.get_json("id")) is not None:  # no two sessions have one
+        config.insert_json5("id", json.dumps(f"{1 << 127 | secrets.randbits(127):x}"))
+
+
+def _locators(config: Any, key: str, mode: str) -> list[str]:
+    """What the configuration has at `key`: locators, or locators for each mode."""
+    found = json.loads(config.get_json(key))
+    return list(found.get(mode, ()) if isinstance(found, dict) else found)
+
+
+def _reached_at(locator: str) -> str | None:
+    """Where a process of this host reaches one that listens there; None: nobody can tell, or only one can."""
+    if match := _WITH_PORT.fullmatch(locator):
+        return f"{match[1]}{_EVERYWHERE.get(match[2], match[2])}:{match[3]}{match[4]}" if int(match[3]) else None
+    return locator if _ON_THIS_HOST.fullmatch(locator) else None
 
 
 class ZenohSession:

@@ -1,6 +1,9 @@
-"""What zenoh does not take in time, without a network."""
+"""The configuration of a session, and what zenoh does not take in time. Without a network."""
 
 import asyncio
+import json
+from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -8,7 +11,7 @@ pytest.importorskip("zenoh", reason="the library eclipse-zenoh is missing: pip i
 
 from sern_client.endpoints.zenoh import session as module
 from sern_client.endpoints.zenoh.endpoint import ZenohEndpoint, ZenohOptions
-from sern_client.endpoints.zenoh.session import SessionOptions
+from sern_client.endpoints.zenoh.session import SessionOptions, load_zenoh, make_config
 from sern_core.types import DropReason
 from tests.support import Events, until
 
@@ -48,3 +51,39 @@ async def test_a_loop_that_is_behind_counts_what_it_drops(monkeypatch: pytest.Mo
         assert endpoint.drops == {DropReason.QUEUE_FULL: 2}
     finally:
         await endpoint.stop()
+
+
+def configured(options: SessionOptions) -> dict[str, Any]:
+    """The keys of zenoh's configuration that these tests are about."""
+    config = make_config(load_zenoh(), options)
+    return {key: json.loads(config.get_json(key)) for key in ("mode", "id", "connect/endpoints", "listen/endpoints")}
+
+
+@pytest.mark.parametrize(
+    ("listen", "comes_to", "listens"),
+    [
+        ("tcp/0.0.0.0:7450", ["tcp/127.0.0.1:7450"], ["tcp/0.0.0.0:0"]),
+        ("tcp/[::]:7450#iface=eth0", ["tcp/[::1]:7450#iface=eth0"], ["tcp/[::]:0#iface=eth0"]),
+        ("udp/10.0.0.7:7450", ["udp/10.0.0.7:7450"], ["udp/10.0.0.7:0"]),
+        ("tcp/127.0.0.1:0", [], ["tcp/127.0.0.1:0"]),
+        ("unixsock-stream//run/zenoh", ["unixsock-stream//run/zenoh"], []),
+        ("serial//dev/ttyS0#baudrate=9600", [], []),
+    ],
+)
+def test_a_second_session_takes_no_locator_of_the_first(listen: str, comes_to: list[str], listens: list[str]) -> None:
+    there = "tcp/router.example:7447"
+    found = configured(SessionOptions(connect=(there,), listen=(listen,), second=True))
+    assert found["connect/endpoints"] == [there, *comes_to]
+    assert found["listen/endpoints"] == listens
+
+
+def test_a_second_session_of_a_file_is_another_one_in_the_mode_of_the_file(tmp_path: Path) -> None:
+    file = tmp_path / "session.json5"
+    file.write_text('{id: "abc1", mode: "client"}')
+    found = configured(
+        SessionOptions(connect=("tcp/a:1",), listen=("tcp/127.0.0.1:7450",), config_file=file, second=True)
+    )
+    assert found["mode"] == "client"
+    assert found["id"] not in (None, "abc1")
+    assert found["connect/endpoints"] == ["tcp/a:1"], "a client has one way, and it leads to the router"
+    assert found["listen/endpoints"] == ["tcp/127.0.0.1:0"]
