@@ -22,6 +22,7 @@ from sern_core.errors import ConfigError
 from sern_runtime.ros_types import one_line
 
 DEFAULT_CONNECT: Final = ("tcp/localhost:7447",)
+DEFAULT_LISTEN: Final = ("tcp/localhost:0",)
 MAX_WAITING_BYTES: Final = 64 * 2**20
 """Messages that may wait for zenoh's transmission queue; beyond, the oldest are dropped and counted."""
 
@@ -45,19 +46,23 @@ def load_zenoh() -> ModuleType:
 
 @dataclass(frozen=True, slots=True)
 class SessionOptions:
-    """`config_file` (zenoh's own JSON5) replaces the defaults of rmw_zenoh; `connect` and `listen` go on top.
+    """`config_file` (zenoh's own JSON5) replaces the defaults of rmw_zenoh; `connect` and `listen` go on top, None: as
+    the file has it, else as rmw_zenoh has it. `listen` empty: a free port of loopback.
 
     `second`: another process has a session of the same options already, and this one is to reach whom that one reaches.
     """
 
-    connect: tuple[str, ...] = DEFAULT_CONNECT
-    listen: tuple[str, ...] = ()
+    connect: tuple[str, ...] | None = None
+    listen: tuple[str, ...] | None = None
     config_file: Path | None = None
     second: bool = False
 
 
 def make_config(zenoh: ModuleType, options: SessionOptions) -> Any:
     """ConfigError for a file or locator that zenoh does not accept."""
+    connect, listen = options.connect, options.listen
+    if options.config_file is None:
+        connect, listen = DEFAULT_CONNECT if connect is None else connect, listen or DEFAULT_LISTEN
     try:
         if options.config_file is not None:
             config = zenoh.Config.from_file(str(options.config_file))
@@ -75,8 +80,10 @@ def make_config(zenoh: ModuleType, options: SessionOptions) -> Any:
             }
             for key, value in settings.items():
                 config.insert_json5(key, json.dumps(value))
-        config.insert_json5("connect/endpoints", json.dumps(list(options.connect)))
-        config.insert_json5("listen/endpoints", json.dumps(list(options.listen or ("tcp/localhost:0",))))
+        if connect is not None:
+            config.insert_json5("connect/endpoints", json.dumps(list(connect)))
+        if listen is not None:
+            config.insert_json5("listen/endpoints", json.dumps(list(listen or DEFAULT_LISTEN)))
         if options.second:
             _step_aside(config)
     except zenoh.ZError as error:
@@ -91,9 +98,8 @@ def _step_aside(config: Any) -> None:
     first. Those that come to a locator of the first learn there of the second one, which therefore comes there as well,
     and listens at the same addresses, at ports that are free.
     """
-    mode = json.loads(config.get_json("mode")) or "peer"
-    connect, listen = _locators(config, "connect/endpoints", mode), _locators(config, "listen/endpoints", mode)
-    if mode != "client":  # which has one link, to its router
+    connect, listen = _locators(config, "connect/endpoints"), _locators(config, "listen/endpoints")
+    if json.loads(config.get_json("mode")) != "client":  # which has one link, to its router
         connect += [there for locator in listen if (there := _reached_at(locator)) is not None]
     config.insert_json5("connect/endpoints", json.dumps(list(dict.fromkeys(connect))))
     matches = [match for locator in listen if (match := _WITH_PORT.fullmatch(locator))]
@@ -103,9 +109,9 @@ def _step_aside(config: Any) -> None:
         config.insert_json5("id", json.dumps(f"{1 << 127 | secrets.randbits(127):x}"))
 
 
-def _locators(config: Any, key: str, mode: str) -> list[str]:
-    """What the configuration has at `key`: locators, or locators for each mode."""
-    found = json.loads(config.get_json(key))
+def _locators(config: Any, key: str) -> list[str]:
+    """What the configuration has at `key`, where there are locators, or locators for each mode."""
+    found, mode = json.loads(config.get_json(key)), json.loads(config.get_json("mode")) or "peer"
     return list(found.get(mode, ()) if isinstance(found, dict) else found)
 
 
@@ -126,6 +132,8 @@ class ZenohSession:
         self.put_failed = 0
         """Messages that zenoh refused: its session has ended."""
         self._config = make_config(self.zenoh, options)
+        self.connect = tuple(_locators(self._config, "connect/endpoints"))
+        """Where it looks for others."""
         self._session: Any = None
         self._handover: Handover | None = None
         self._waiting: deque[tuple[Callable[[], None], int]] = deque()
