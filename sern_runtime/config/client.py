@@ -502,6 +502,7 @@ class ClientFile(FileModel):
         several = isinstance(self.endpoint, tuple)
         for index, endpoint in enumerate(self.endpoints):
             yield from endpoint.file_problems(base_dir, ("endpoint", index) if several else ("endpoint",))
+        yield from self._action_problems()
         yield from self._pattern_problems()
         for index, section in enumerate(self.topics):
             if section.commands:
@@ -511,6 +512,16 @@ class ClientFile(FileModel):
                 yield FileProblem(("topics", index, "max_rate_hz"), problem, warning=True)
         yield from output_problems(base_dir, self.message_log, ("message_log",))
         yield from output_problems(base_dir, self.summary, ("summary",))
+
+    def _action_problems(self) -> Iterator[FileProblem]:
+        """A warning of actions where no endpoint has their goals."""
+        kinds = {endpoint.kind for endpoint in self.endpoints}
+        if self.actions != ActionsSection() and "rclpy" in kinds and not kinds & {"ros1", "dds", "zenoh"}:
+            problem = (
+                "an endpoint of kind rclpy has topics only, and goals of ROS 2 are services: none gets through; use "
+                "kind dds or zenoh"
+            )
+            yield FileProblem(("actions",), problem, warning=True)
 
     def _pattern_problems(self) -> Iterator[FileProblem]:
         """Warnings of patterns that match no name."""
