@@ -234,6 +234,7 @@ class ClientDaemon:
                 keys,
                 server_keys,
                 heartbeat_timeout_s=model.link.heartbeat_timeout_s,
+                handshake_interval_s=relay.handshake_interval_s,
                 random=Random(secrets.randbits(64)),
                 on_reason=self._link_down,
                 after=self._kick,
