@@ -103,8 +103,8 @@ class RelayConnection(Section):
     insecure: bool = False
     """No keys and no encryption; only for ipc and loopback, for trials on one machine."""
     handshake_interval_s: Annotated[float, Field(ge=1, le=120)] = 10.0
-    """Time to prove the keys on a new connection, before another is tried. It takes 4 round trips, and some kB of a very
-    slow link. The relay waits as long as its own file says: to wait longer, set both."""
+    """Time to prove the keys on a new connection, before another is tried. It takes 4 round trips, and some kB of a
+    very slow link. The relay waits as long as its own file says: to wait longer, set both."""
 
     @model_validator(mode="after")
     def _keys(self) -> "RelayConnection":
