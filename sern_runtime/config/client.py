@@ -4,7 +4,7 @@ import re
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Final, Literal
+from typing import Annotated, Final, Literal, Self
 
 from pydantic import Discriminator, Field, Tag, model_validator
 
@@ -50,6 +50,8 @@ from sern_runtime.config.base import (
     lifespan_problem,
     pattern_problem,
     pattern_problems,
+    place,
+    socket_problems,
 )
 from sern_runtime.config.endpoints import EndpointSection
 from sern_runtime.config.link_state import LinkStateSection
@@ -89,7 +91,7 @@ class RelayConnection(Section):
     """The relay this client connects to, and the keys for it."""
 
     endpoint: ConnectEndpoint
-    """tcp://host:port, or ipc://path on the same machine."""
+    """tcp://host:port, or ipc://path on the same machine; a relative path starts at this file."""
     server_key_file: PathText | None = None
     """The relay's public key file (.pub): the client talks to nobody else."""
     secret_key_file: PathText | None = None
@@ -495,7 +497,12 @@ class ClientFile(FileModel):
         services = subscriptions(self.name, self.namespace, offer=self.offered_services(), use=self.used_services())
         return tuple(dict.fromkeys((*self.subscribe, *received, *services, *self.actions.patterns())))
 
+    def placed(self, base_dir: Path) -> Self:
+        relay = self.relay.model_copy(update={"endpoint": place(base_dir, self.relay.endpoint)})
+        return self.model_copy(update={"relay": relay})
+
     def file_problems(self, base_dir: Path) -> Iterator[FileProblem]:
+        yield from socket_problems(base_dir, self.relay.endpoint, ("relay", "endpoint"))
         if self.relay.server_key_file is not None:
             loc = ("relay", "server_key_file")
             yield from public_key_problems(base_dir, self.relay.server_key_file, loc, client=self.name)
