@@ -8,12 +8,13 @@ from typing import Any
 import pytest
 import zmq
 
-from sern_client import relay_name, transport
+from sern_client import relay_name
 from sern_client.daemon import SILENT
 from sern_core.lanes import LANE_UDP
 from sern_core.message import TopicInfo
 from sern_core.types import Encoding, TopicName
 from sern_runtime.transport_watch import WAITING
+from sern_runtime.zmq_socket import make_client
 from tests.daemons import Lab, write_bag
 from tests.support import until
 
@@ -163,13 +164,12 @@ async def test_a_client_waits_for_the_handshake_as_long_as_its_file_says(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made: list[zmq.Socket[bytes]] = []
-    make = transport.make_client
 
     def making(*args: Any, **options: Any) -> "zmq.Socket[bytes]":
-        made.append(make(*args, **options))
+        made.append(make_client(*args, **options))
         return made[-1]
 
-    monkeypatch.setattr(transport, "make_client", making)
+    monkeypatch.setattr("sern_client.transport.make_client", making)
     async with Lab(tmp_path, "robot1") as lab:
         await lab.relay()
         await lab.connected(lab.client_file("robot1", ROBOT, relay={"handshake_interval_s": 60}))
