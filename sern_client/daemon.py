@@ -16,7 +16,8 @@ from prometheus_client import CollectorRegistry
 from sern_client.actions import GoalWatch
 from sern_client.bridge import Bridge
 from sern_client.checks import TableCheck
-from sern_client.endpoints.base import CountingEndpoint, Endpoint, ServiceEndpoint
+from sern_client.endpoints.base import CountingEndpoint, Endpoint
+from sern_client.endpoints.composite import with_services
 from sern_client.express import ClientExpress
 from sern_client.factory import make_endpoint, make_link_topics
 from sern_client.guard import Guard
@@ -187,14 +188,15 @@ class ClientDaemon:
         offer, use = model.offered_services(), model.used_services()
         if not offer and not use:
             return
-        if not isinstance(endpoint, ServiceEndpoint) and model.services == ServicesSection():
+        known = with_services(endpoint)
+        if known is None and model.services == ServicesSection():
             return  # actions of ROS 1 are topics
         with blamed_on(self.loaded.path, "services"):
-            if not isinstance(endpoint, ServiceEndpoint):
-                kind = model.endpoints[0].kind
-                raise ConfigError(f"an endpoint of kind {kind} has no services; leave the section out")
+            if known is None:
+                kinds = " and ".join(dict.fromkeys(section.kind for section in model.endpoints))
+                raise ConfigError(f"an endpoint of kind {kinds} has no services; leave the section out")
             self.bridge.services = ServiceBridge(
-                self.core, endpoint, offer=offer, use=use, namespace=model.namespace, kick=self._kick
+                self.core, known, offer=offer, use=use, namespace=model.namespace, kick=self._kick
             )
 
     async def start(self) -> None:
@@ -232,6 +234,7 @@ class ClientDaemon:
                 keys,
                 server_keys,
                 heartbeat_timeout_s=model.link.heartbeat_timeout_s,
+                handshake_interval_s=relay.handshake_interval_s,
                 random=Random(secrets.randbits(64)),
                 on_reason=self._link_down,
                 after=self._kick,

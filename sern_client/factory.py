@@ -70,8 +70,8 @@ def named_sections(model: ClientFile) -> list[sections.EndpointSection]:
     return named
 
 
-def make_section(section: sections.EndpointSection, resolve: Resolve) -> Endpoint:
-    """One of them."""
+def make_section(section: sections.EndpointSection, resolve: Resolve, *, second: bool = False) -> Endpoint:
+    """One of them. `second`: another process has an endpoint of this section already, whose ports are taken."""
     match section:
         case sections.BagEndpoint():
             return BagEndpoint(
@@ -115,6 +115,7 @@ def make_section(section: sections.EndpointSection, resolve: Resolve) -> Endpoin
                         connect=section.connect,
                         listen=section.listen,
                         config_file=None if section.config_file is None else resolve(section.config_file),
+                        second=second,
                     ),
                     domain=section.domain,
                     node_name=section.node_name,

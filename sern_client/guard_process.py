@@ -182,7 +182,7 @@ def _info(said: dict[str, Any]) -> TopicInfo:
 def _make_endpoint(said: dict[str, Any]) -> Endpoint:
     folder = Path(said["folder"])
     sections = TypeAdapter(list[EndpointSection]).validate_json(json.dumps(said["endpoints"]))
-    made = [make_section(section, lambda text: resolve(folder, text)) for section in sections]
+    made = [make_section(section, lambda text: resolve(folder, text), second=True) for section in sections]
     for endpoint in made:
         if isinstance(endpoint, Ros1Endpoint):
             endpoint.publishes_only = True

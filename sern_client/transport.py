@@ -17,7 +17,7 @@ from sern_runtime.inflow import Inflow
 from sern_runtime.monitor import TcpHandle
 from sern_runtime.pump import LANE_MESSAGE_BYTES, Pump
 from sern_runtime.transport_watch import TransportWatch
-from sern_runtime.zmq_socket import CurvePair, DealerSocket, SendResult, make_client
+from sern_runtime.zmq_socket import HANDSHAKE_IVL_MS, CurvePair, DealerSocket, SendResult, make_client
 
 REBUILD_MIN_S: Final = 1.0
 REBUILD_MAX_S: Final = 30.0
@@ -56,6 +56,7 @@ class Dialer:
         events: DialerEvents,
         *,
         heartbeat_timeout_s: float,
+        handshake_interval_s: float,
         random: Random,
         tos: int = 0,
         express: bool = False,
@@ -70,6 +71,7 @@ class Dialer:
         self._server_keys = tuple(server_keys)
         self._events = events
         self._was_up = False
+        self._handshake_ivl_ms = int(handshake_interval_s * 1000)
         self._heartbeat_timeout_ms = int(heartbeat_timeout_s * 1000)
         self._random = random
         self._express = express
@@ -99,6 +101,7 @@ class Dialer:
             self._server_keys[self.attempt % len(self._server_keys)] if self._server_keys else None,
             heartbeat_timeout_ms=self._heartbeat_timeout_ms,
             max_message_bytes=LANE_MESSAGE_BYTES,
+            handshake_ivl_ms=self._handshake_ivl_ms,
             tos=self._tos,
             before_connect=attach,
         )
@@ -196,6 +199,7 @@ class RelayTransport:
         server_keys: Sequence[str],
         *,
         heartbeat_timeout_s: float,
+        handshake_interval_s: float = HANDSHAKE_IVL_MS / 1000,
         random: Random,
         on_reason: Callable[[str], None],
         after: Callable[[], None] = lambda: None,
@@ -216,6 +220,7 @@ class RelayTransport:
                 server_keys,
                 events,
                 heartbeat_timeout_s=heartbeat_timeout_s,
+                handshake_interval_s=handshake_interval_s,
                 random=random,
                 tos=marks.express_tos if express else marks.stream_tos,
                 express=express,

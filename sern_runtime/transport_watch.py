@@ -14,7 +14,6 @@ from typing import Final
 import zmq
 
 from sern_runtime.monitor import EventKind, MonitorEvent, SocketMonitor, TcpHandle, port_of, received_bytes
-from sern_runtime.zmq_socket import HANDSHAKE_IVL_MS
 
 GREETING_BYTES: Final = 64
 """What a ZMTP peer says first (RFC 23)."""
@@ -26,15 +25,14 @@ WAITING: Final = "connected, and nothing has come back yet"
 LOST: Final = "the connection to the relay was lost"
 NOBODY: Final = "the relay does not answer: connecting failed"
 SILENT: Final = (
-    f"connected, and nothing came back for {HANDSHAKE_IVL_MS // 1000} s: the relay hangs, nothing gets through, or "
+    "connected, and nothing came back in the time for a handshake: the relay hangs, nothing gets through, or "
     "what listens there is no relay"
 )
 HALF_WAY: Final = (
-    f"the relay began the handshake and did not end it within {HANDSHAKE_IVL_MS // 1000} s: it hangs, refuses us for "
-    "now, or the link is very slow"
+    "the relay began the handshake and did not end it in time: it hangs, refuses us for now, or the link is very slow"
 )
 UNFINISHED: Final = (
-    f"connected, and no handshake within {HANDSHAKE_IVL_MS // 1000} s: the relay hangs or refuses us for now, the link "
+    "connected, and no handshake in time: the relay hangs or refuses us for now, the link "
     "is very slow, or what listens there is no relay"
 )
 SHUT: Final = (

@@ -592,6 +592,7 @@ def make_client(
     heartbeat_timeout_ms: int = HEARTBEAT_TIMEOUT_MS,
     max_message_bytes: int = MAX_MESSAGE_BYTES,
     sndhwm: int = SNDHWM,
+    handshake_ivl_ms: int = HANDSHAKE_IVL_MS,
     tos: int = 0,
     before_connect: "Callable[[zmq.Socket[bytes]], None] | None" = None,
 ) -> "zmq.Socket[bytes]":
@@ -609,6 +610,7 @@ def make_client(
             heartbeat_timeout_ms=heartbeat_timeout_ms,
             max_message_bytes=max_message_bytes,
             sndhwm=sndhwm,
+            handshake_ivl_ms=handshake_ivl_ms,
             tos=tos,
         )
         if "[" in endpoint:

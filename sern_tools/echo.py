@@ -159,6 +159,7 @@ class Identity:
     link: LinkParams
     scheduler: SchedulerParams
     http: str | None = None  # where the daemon of the same name would answer
+    handshake_interval_s: float = HANDSHAKE_IVL_MS / 1000
 
 
 def identity_from_file(path: Path) -> Identity:
@@ -174,6 +175,7 @@ def identity_from_file(path: Path) -> Identity:
         model.link.params(),
         model.scheduler.params(),
         model.http.listen,
+        relay.handshake_interval_s,
     )
 
 
@@ -344,6 +346,7 @@ async def listen(
             identity.keys,
             identity.server_keys,
             heartbeat_timeout_s=identity.link.heartbeat_timeout_s,
+            handshake_interval_s=identity.handshake_interval_s,
             random=Random(secrets.randbits(64)),
             on_reason=note,
         )
@@ -390,7 +393,7 @@ def _check_patience(
         raise SernError(f"{identity.endpoint}: {reason}")
     limit_s = timeout_s
     if up_s is None and reason == UNHEARD:  # a relay that is far away, or a busy machine: nothing says that it is gone
-        limit_s = max(timeout_s, HANDSHAKE_IVL_MS / 1000)
+        limit_s = max(timeout_s, identity.handshake_interval_s)
     if not timeout_s or clock.now() - (began_s if up_s is None else up_s) < limit_s:
         return
     if not core.link.established:

@@ -298,6 +298,11 @@ class CompositeEndpoint:
             raise ConfigError("; ".join(dict.fromkeys(refusals)) or f"no endpoint serves {info.name}")
         return _Servers(servers)
 
+    @property
+    def has_services(self) -> bool:
+        """Whether any member knows services. Without one `watch_services` is an error."""
+        return bool(self._service_members())
+
     def _service_members(self) -> list[ServiceEndpoint]:
         return [member for member in self._members if isinstance(member, ServiceEndpoint)]
 
@@ -362,3 +367,10 @@ class CompositeEndpoint:
     def forget(self, joined: _Joined) -> None:
         if joined in self._joined:
             self._joined.remove(joined)
+
+
+def with_services(endpoint: Endpoint) -> ServiceEndpoint | None:
+    """The endpoint, if it knows services itself or has a member that does."""
+    if isinstance(endpoint, CompositeEndpoint) and not endpoint.has_services:
+        return None
+    return endpoint if isinstance(endpoint, ServiceEndpoint) else None

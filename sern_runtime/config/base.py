@@ -9,7 +9,7 @@ import re
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import Annotated, Any, Final, Self
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, WrapValidator
 from pydantic_core import PydanticCustomError
@@ -23,6 +23,7 @@ from sern_runtime.config.yaml import Loc
 _HOST: Final = re.compile(r"[A-Za-z0-9_](?:[A-Za-z0-9_.-]{0,251}[A-Za-z0-9_])?")
 _TCP: Final = re.compile(r"tcp://(\[[0-9A-Fa-f:.%a-z]+\]|[^:/\[\]]+):([0-9]{1,5})")
 _IPC_MAX_CHARS: Final = 100  # a Unix socket path holds 107 bytes on Linux
+_SOCKET_MAX_BYTES: Final = 107
 LONG_COMMAND_S: Final = 60.0
 """A command that is older moves nobody's robot on purpose."""
 _LOOPBACK_NAMES: Final = frozenset({"localhost", "ip6-localhost"})
@@ -52,6 +53,11 @@ class FileProblem:
 
 class FileModel(Section):
     """A whole file. `file_problems` is the second step of checking: it looks at the other files that this one names."""
+
+    def placed(self, base_dir: Path) -> Self:
+        """The same with its sockets (ipc://) where they are, relative paths starting at `base_dir`."""
+        del base_dir
+        return self
 
     def file_problems(self, base_dir: Path) -> Iterator[FileProblem]:
         """Problems with the files this one names; relative paths start at `base_dir`. By default it names none."""
@@ -231,3 +237,18 @@ Count = Annotated[int, Field(ge=1, le=1_000_000)]
 def resolve(base_dir: Path, text: str) -> Path:
     """A path from a configuration file: `~` is the home directory, relative ones start at the file's directory."""
     return base_dir / Path(text).expanduser()
+
+
+def place(base_dir: Path, endpoint: str) -> str:
+    """An endpoint with the path of an ipc:// one as `resolve` has it; abstract names (@) and ipc://* are no paths."""
+    path = endpoint.removeprefix("ipc://")
+    if path == endpoint or path.startswith(("/", "@")) or path == "*":
+        return endpoint
+    return f"ipc://{resolve(base_dir, path)}"
+
+
+def socket_problems(base_dir: Path, endpoint: str | None, loc: Loc) -> Iterator[FileProblem]:
+    """The problem of an ipc:// endpoint whose whole path is too long for a socket."""
+    placed = "" if endpoint is None else place(base_dir, endpoint)
+    if len(placed.removeprefix("ipc://").encode()) > _SOCKET_MAX_BYTES and placed.startswith("ipc://"):
+        yield FileProblem(loc, f"{placed}: a path of 1 to {_SOCKET_MAX_BYTES} bytes is needed")

@@ -4,7 +4,7 @@ import re
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Final, Literal
+from typing import Annotated, Final, Literal, Self
 
 from pydantic import Discriminator, Field, Tag, model_validator
 
@@ -50,6 +50,8 @@ from sern_runtime.config.base import (
     lifespan_problem,
     pattern_problem,
     pattern_problems,
+    place,
+    socket_problems,
 )
 from sern_runtime.config.endpoints import EndpointSection
 from sern_runtime.config.link_state import LinkStateSection
@@ -89,7 +91,7 @@ class RelayConnection(Section):
     """The relay this client connects to, and the keys for it."""
 
     endpoint: ConnectEndpoint
-    """tcp://host:port, or ipc://path on the same machine."""
+    """tcp://host:port, or ipc://path on the same machine; a relative path starts at this file."""
     server_key_file: PathText | None = None
     """The relay's public key file (.pub): the client talks to nobody else."""
     secret_key_file: PathText | None = None
@@ -102,6 +104,9 @@ class RelayConnection(Section):
     `link.redundancy`)."""
     insecure: bool = False
     """No keys and no encryption; only for ipc and loopback, for trials on one machine."""
+    handshake_interval_s: Annotated[float, Field(ge=1, le=120)] = 10.0
+    """Time to prove the keys on a new connection, before another is tried. It takes 4 round trips, and some kB of a
+    very slow link. The relay waits as long as its own file says: to wait longer, set both."""
 
     @model_validator(mode="after")
     def _keys(self) -> "RelayConnection":
@@ -492,7 +497,12 @@ class ClientFile(FileModel):
         services = subscriptions(self.name, self.namespace, offer=self.offered_services(), use=self.used_services())
         return tuple(dict.fromkeys((*self.subscribe, *received, *services, *self.actions.patterns())))
 
+    def placed(self, base_dir: Path) -> Self:
+        relay = self.relay.model_copy(update={"endpoint": place(base_dir, self.relay.endpoint)})
+        return self.model_copy(update={"relay": relay})
+
     def file_problems(self, base_dir: Path) -> Iterator[FileProblem]:
+        yield from socket_problems(base_dir, self.relay.endpoint, ("relay", "endpoint"))
         if self.relay.server_key_file is not None:
             loc = ("relay", "server_key_file")
             yield from public_key_problems(base_dir, self.relay.server_key_file, loc, client=self.name)
@@ -502,6 +512,7 @@ class ClientFile(FileModel):
         several = isinstance(self.endpoint, tuple)
         for index, endpoint in enumerate(self.endpoints):
             yield from endpoint.file_problems(base_dir, ("endpoint", index) if several else ("endpoint",))
+        yield from self._action_problems()
         yield from self._pattern_problems()
         for index, section in enumerate(self.topics):
             if section.commands:
@@ -511,6 +522,16 @@ class ClientFile(FileModel):
                 yield FileProblem(("topics", index, "max_rate_hz"), problem, warning=True)
         yield from output_problems(base_dir, self.message_log, ("message_log",))
         yield from output_problems(base_dir, self.summary, ("summary",))
+
+    def _action_problems(self) -> Iterator[FileProblem]:
+        """A warning of actions where no endpoint has their goals."""
+        kinds = {endpoint.kind for endpoint in self.endpoints}
+        if self.actions != ActionsSection() and "rclpy" in kinds and not kinds & {"ros1", "dds", "zenoh"}:
+            problem = (
+                "an endpoint of kind rclpy has topics only, and goals of ROS 2 are services: none gets through; use "
+                "kind dds or zenoh"
+            )
+            yield FileProblem(("actions",), problem, warning=True)
 
     def _pattern_problems(self) -> Iterator[FileProblem]:
         """Warnings of patterns that match no name."""

@@ -244,10 +244,12 @@ class ZenohEndpoint(EndpointBase):
 
     kind: Literal["zenoh"]
     """ROS 2 over zenoh (rmw_zenoh)."""
-    connect: Annotated[tuple[str, ...], Field(min_length=1)] = ("tcp/localhost:7447",)
-    """Zenoh locators of the router (rmw_zenohd) or of peers; it may start later than this."""
-    listen: tuple[str, ...] = ()
-    """Zenoh locators to listen on; empty: a free port of loopback."""
+    connect: Annotated[tuple[str, ...], Field(min_length=1)] | None = None
+    """Zenoh locators of the router (rmw_zenohd) or of peers; it may start later than this. null: as `config_file` has
+    it, without one `[tcp/localhost:7447]`."""
+    listen: tuple[str, ...] | None = None
+    """Zenoh locators to listen on; empty: a free port of loopback. null: as `config_file` has it (zenoh itself listens
+    on every interface where that says nothing), without one a free port of loopback."""
     config_file: PathText | None = None
     """A session configuration of zenoh (JSON5) in place of rmw_zenoh's defaults; null: those."""
     domain: Annotated[int, Field(ge=0, le=232)] = 0

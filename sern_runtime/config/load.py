@@ -77,14 +77,15 @@ def check_document(document: Document, path: Path, model: type[M], *, files: boo
     except ValidationError as error:
         details = _without_echoes(error.errors(include_url=False, include_input=False))
         return Checked(None, _in_order(_render(document, model, item) for item in details))
+    placed = value.placed(path.parent)
     if not files:
-        return Checked(Loaded(value, path))
+        return Checked(Loaded(placed, path))
     problems = list(value.file_problems(path.parent))
     errors = [document.error(item.loc, item.problem) for item in problems if not item.warning]
     if errors:
         return Checked(None, _in_order(errors))
     warnings = [document.error(item.loc, item.problem) for item in problems if item.warning]
-    return Checked(Loaded(value, path, tuple(str(warning) for warning in warnings)))
+    return Checked(Loaded(placed, path, tuple(str(warning) for warning in warnings)))
 
 
 def _without_echoes(details: list[ErrorDetails]) -> list[ErrorDetails]:

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -34,7 +34,9 @@ from sern_runtime.config.base import (
     lifespan_problem,
     pattern_problem,
     pattern_problems,
+    place,
     resolve,
+    socket_problems,
 )
 from sern_runtime.config.load import Loaded, load
 from sern_runtime.config.shared import (
@@ -48,6 +50,7 @@ from sern_runtime.config.shared import (
 from sern_runtime.keys import KeyDirectory
 
 DEFAULT_HTTP_LISTEN = "127.0.0.1:5580"
+_SOCKETS = ("publish_endpoint", "ingest_endpoint")
 
 
 class RelaySection(Section):
@@ -56,7 +59,8 @@ class RelaySection(Section):
     name: ClientText
     """Its name, as in its key file."""
     listen: Annotated[tuple[BindEndpoint, ...], Field(min_length=1, max_length=16)]
-    """Where clients connect: tcp://address:port, tcp://*:port (every one of IPv4 and IPv6), ipc://path; 1 or more."""
+    """Where clients connect: tcp://address:port, tcp://*:port (every one of IPv4 and IPv6), ipc://path (a relative one
+    starts at this file); one or more."""
     secret_key_file: PathText | None = None
     """The relay's secret key file (.key)."""
     clients_dir: PathText | None = None
@@ -210,7 +214,7 @@ class FeedRoleSection(Section):
 
     @model_validator(mode="after")
     def _consistent(self) -> "FeedRoleSection":
-        for key in ("publish_endpoint", "ingest_endpoint"):
+        for key in _SOCKETS:
             endpoint = getattr(self, key)
             if endpoint is not None and not is_local(endpoint) and not self.insecure:
                 raise fault("is open to the network and the feed has no keys; insecure: true accepts that", key)
@@ -227,6 +231,11 @@ class FeedRoleSection(Section):
             if entry.commands and not self.allow_control:
                 raise fault(f"{entry.type} commands a robot, which needs allow_control: true", "types", index)
         return self
+
+    def placed(self, base_dir: Path) -> Self:
+        """The same with its sockets where they are, as `FileModel.placed`."""
+        found = {key: endpoint for key in _SOCKETS if (endpoint := getattr(self, key)) is not None}
+        return self.model_copy(update={key: place(base_dir, endpoint) for key, endpoint in found.items()})
 
     def role(self) -> FeedRole:
         return FeedRole(
@@ -301,7 +310,7 @@ class RelayFile(FileModel):
                 raise fault(
                     f"{role.name} and {other} are too much alike ('-' counts as '_')", "feed", "roles", index, "name"
                 )
-            for key in ("publish_endpoint", "ingest_endpoint"):
+            for key in _SOCKETS:
                 endpoint = getattr(role, key)
                 if endpoint in taken:
                     raise fault(f"{endpoint} is already used by {taken[endpoint]}", "feed", "roles", index, key)
@@ -324,7 +333,22 @@ class RelayFile(FileModel):
     def feed_roles(self) -> tuple[FeedRole, ...]:
         return tuple(section.role() for section in self.feed.roles)
 
+    def placed(self, base_dir: Path) -> Self:
+        listen = tuple(place(base_dir, endpoint) for endpoint in self.relay.listen)
+        roles = tuple(role.placed(base_dir) for role in self.feed.roles)
+        return self.model_copy(
+            update={
+                "relay": self.relay.model_copy(update={"listen": listen}),
+                "feed": self.feed.model_copy(update={"roles": roles}),
+            }
+        )
+
     def file_problems(self, base_dir: Path) -> Iterator[FileProblem]:
+        for index, endpoint in enumerate(self.relay.listen):
+            yield from socket_problems(base_dir, endpoint, ("relay", "listen", index))
+        for index, section in enumerate(self.feed.roles):
+            for key in _SOCKETS:
+                yield from socket_problems(base_dir, getattr(section, key), ("feed", "roles", index, key))
         yield from self._rule_problems()
         yield from output_problems(base_dir, self.message_log, ("message_log",))
         yield from output_problems(base_dir, self.summary, ("summary",))

@@ -5,6 +5,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, Discriminator, Field, Tag, model_validator
 
 from sern_core.errors import UsageError
+from sern_core.replay import MAX_REPLAY_MESSAGES
 from sern_core.rules import topic_name
 from sern_core.summaries.mask import MAX_CELLS, MaskParams
 from sern_core.summaries.obstacles import Band
@@ -29,6 +30,13 @@ def _check_name(text: str) -> str:
     except UsageError as error:
         raise fault(f"must be a name to put behind the topic's, such as thin, or a topic name: {error}") from error
     return text
+
+
+def _check_kept(count: int) -> int:
+    if count > MAX_REPLAY_MESSAGES:
+        kept = "the messages of a topic that a relay keeps for late joiners"
+        raise fault(f"must be <= {MAX_REPLAY_MESSAGES}, {kept}, not {count}")
+    return count
 
 
 SummaryName = Annotated[str, AfterValidator(_check_name)]
@@ -160,8 +168,11 @@ class PatchesSummary(SummaryBase):
 
     kind: Literal["patches"]
     """The changed cells of an occupancy grid."""
-    keyframe_updates: Annotated[int, Field(ge=2, le=1024)] = _PATCH.keyframe_updates
-    """A whole grid after so many updates at the latest; also what a late joiner gets at most."""
+    keyframe_updates: Annotated[
+        int, Field(ge=2, json_schema_extra={"maximum": MAX_REPLAY_MESSAGES}), AfterValidator(_check_kept)
+    ] = _PATCH.keyframe_updates
+    """A whole grid after so many updates at the latest; also what a late joiner gets at most, and so no more than a
+    relay keeps."""
     keyframe_part: Annotated[float, Field(gt=0, le=1)] = _PATCH.keyframe_part
     """A whole grid when the changes are more than this part of it."""
     keyframe_s: Seconds | None = None

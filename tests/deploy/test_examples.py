@@ -143,6 +143,25 @@ def test_the_relay_lets_through_what_a_client_needs(name: str) -> None:
     assert not table.may_subscribe(own, TopicName("/other1/cmd_vel"))
 
 
+@pytest.mark.parametrize("name", [name for name in CLIENTS if not name.startswith("site")])
+def test_the_feed_shows_where_each_robot_is_and_what_is_around_it(name: str) -> None:
+    """Of each robot that there is a file for, by topics that its file sends."""
+    (role,) = load_relay(EXAMPLES / "relay.yaml", files=False).model.feed_roles()
+    model = client(name)
+    robot = model.name
+    shown = [f"/{robot}/platform/odom/filtered", f"/{robot}/map", f"/{robot}/sensors/lidar2d_0/scan"]  # of jazzy
+    if name == "robot.yaml":
+        shown = ["/odometry/filtered", "/map", "/map_updates", "/scan"]
+    elif name in NOETIC:
+        shown = ["/odometry/filtered", "/map", "/front/scan"]
+    for topic in shown:
+        found = treated(model, topic, "nav_msgs/msg/Odometry", Encoding.CDR)
+        assert found is not None and found.direction is Direction.SEND, topic
+        assert any(pattern.fullmatch(model.namespace.rstrip("/") + topic) for pattern in role.subscribe), topic
+    for topic in ("/cmd_vel", "/points", "/front/image_raw/compressed"):
+        assert not any(pattern.fullmatch(f"/{robot}{topic}") for pattern in role.subscribe), topic
+
+
 @pytest.mark.parametrize("name", ["site-noetic.yaml", "site-jazzy.yaml"])
 def test_a_site_takes_what_its_operator_drives_by(name: str) -> None:
     """Where a robot is and how it leans, of each that there is a file for; what is heavy only in its summaries."""

@@ -3,8 +3,10 @@
 import signal
 import socket
 from pathlib import Path
+from typing import Any
 
 import pytest
+import zmq
 
 from sern_client import relay_name
 from sern_client.daemon import SILENT
@@ -12,6 +14,7 @@ from sern_core.lanes import LANE_UDP
 from sern_core.message import TopicInfo
 from sern_core.types import Encoding, TopicName
 from sern_runtime.transport_watch import WAITING
+from sern_runtime.zmq_socket import make_client
 from tests.daemons import Lab, write_bag
 from tests.support import until
 
@@ -155,3 +158,19 @@ async def test_before_anything_has_come_back_nothing_else_is_said(
             await until(lambda: robot._ready().reason == WAITING, "has a connection")
             assert not [record for record in caplog.records if record.levelname == "WARNING"]
             await lab.drop(robot)
+
+
+async def test_a_client_waits_for_the_handshake_as_long_as_its_file_says(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made: list[zmq.Socket[bytes]] = []
+
+    def making(*args: Any, **options: Any) -> "zmq.Socket[bytes]":
+        made.append(make_client(*args, **options))
+        return made[-1]
+
+    monkeypatch.setattr("sern_client.transport.make_client", making)
+    async with Lab(tmp_path, "robot1") as lab:
+        await lab.relay()
+        await lab.connected(lab.client_file("robot1", ROBOT, relay={"handshake_interval_s": 60}))
+        assert [socket.getsockopt(zmq.HANDSHAKE_IVL) for socket in made] == [60_000] * len(made) != []

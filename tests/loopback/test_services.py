@@ -575,3 +575,20 @@ async def test_an_endpoint_without_services_is_named(tmp_path: Path) -> None:
     )
     with pytest.raises(ConfigError, match=r"services: an endpoint of kind record has no services"):
         ClientDaemon(load_client(path))
+
+
+RECORDS = [{"kind": "record", "path": "one.bag"}, {"kind": "record", "path": "two.bag"}]
+
+
+async def test_several_endpoints_without_services_take_actions_of_ros_1(tmp_path: Path) -> None:
+    actions = {"use": [{"match": "/robot1/move_base"}]}
+    client = ClientDaemon(load_client(Lab(tmp_path, "site").client_file("site", RECORDS, actions=actions)))
+    assert client.bridge.services is None
+    assert "(?:/robot1/move_base)/result" in client.loaded.model.subscribe_patterns()
+
+
+async def test_several_endpoints_without_services_are_named(tmp_path: Path) -> None:
+    services = {"use": [{"match": "/robot1/set_mode"}]}
+    path = Lab(tmp_path, "site").client_file("site", RECORDS, services=services)
+    with pytest.raises(ConfigError, match=r"services: an endpoint of kind record has no services"):
+        ClientDaemon(load_client(path))

@@ -151,4 +151,4 @@ async def test_an_action_of_ros_2_across_the_link(tmp_path: Path, monkeypatch: p
 
 
 def _section(router: Router) -> dict[str, Any]:
-    return {"kind": "zenoh", "connect": list(router.options.connect), "listen": ["tcp/127.0.0.1:0"], "domain": DOMAIN}
+    return {"kind": "zenoh", "connect": [router.locator], "listen": ["tcp/127.0.0.1:0"], "domain": DOMAIN}

@@ -40,6 +40,16 @@ def zenoh() -> tuple[sections.ZenohEndpoint, sections.ZenohEndpoint]:
     return sections.ZenohEndpoint(**there), sections.ZenohEndpoint(**here, node_name="driver")
 
 
+def zenoh_listening() -> tuple[sections.ZenohEndpoint, sections.ZenohEndpoint]:
+    """The client listens at a port of its own choice, which no other process can take, and the node comes there."""
+    pytest.importorskip("zenoh", reason="the library eclipse-zenoh is missing: pip install eclipse-zenoh")
+    port, nobody = free_ports(2)
+    fixed, free = f"tcp/0.0.0.0:{port}", "tcp/127.0.0.1:0"
+    nowhere, here = f"tcp/127.0.0.1:{nobody}", f"tcp/127.0.0.1:{port}"
+    own = sections.ZenohEndpoint(kind="zenoh", connect=(nowhere,), listen=(fixed,))
+    return own, sections.ZenohEndpoint(kind="zenoh", connect=(here,), listen=(free,), node_name="driver")
+
+
 @asynccontextmanager
 async def started(section: Any) -> AsyncIterator[tuple[Endpoint, Events]]:
     endpoint, events = make_section(section, Path), Events()
@@ -50,7 +60,7 @@ async def started(section: Any) -> AsyncIterator[tuple[Endpoint, Events]]:
         await endpoint.stop()
 
 
-@pytest.mark.parametrize("kind", [dds, zenoh])
+@pytest.mark.parametrize("kind", [dds, zenoh, zenoh_listening])
 async def test_a_node_of_ros2_is_told_to_stand_by_the_guard(kind: Any, tmp_path: Path) -> None:
     own, other = kind()
     got: list[bytes] = []

@@ -28,7 +28,7 @@ async def test_ros_1_and_ros_2_call_each_other(tmp_path: Path, router: Router, p
     need("/usr/bin/rosservice", "/usr/lib/python3/dist-packages/std_srvs")
     type_hash = ros_services.resolve("std_srvs/srv/SetBool", "", Encoding.CDR).text.type_hash
     zenoh = {
-        "kind": "zenoh", "connect": list(router.options.connect), "listen": ["tcp/127.0.0.1:0"], "domain": DOMAIN,
+        "kind": "zenoh", "connect": [router.locator], "listen": ["tcp/127.0.0.1:0"], "domain": DOMAIN,
     }  # fmt: skip
     manual = {"mode": "manual"}
     async with RosLab(tmp_path) as ros, Lab(tmp_path, "one", "two") as lab:

@@ -60,8 +60,12 @@ class Router:
             self.session = None
 
     @property
+    def locator(self) -> str:
+        return f"tcp/127.0.0.1:{self.port}"
+
+    @property
     def options(self) -> SessionOptions:
-        return SessionOptions(connect=(f"tcp/127.0.0.1:{self.port}",), listen=("tcp/127.0.0.1:0",))
+        return SessionOptions(connect=(self.locator,), listen=("tcp/127.0.0.1:0",))
 
 
 class Peer:
@@ -394,7 +398,7 @@ async def test_from_a_ros_1_recording_to_a_ros_2_node(tmp_path: Path, router: Ro
     async with Lab(tmp_path, "robot1", "site") as lab:
         await lab.relay()
         section = {
-            "kind": "zenoh", "connect": list(router.options.connect), "listen": ["tcp/127.0.0.1:0"], "domain": DOMAIN,
+            "kind": "zenoh", "connect": [router.locator], "listen": ["tcp/127.0.0.1:0"], "domain": DOMAIN,
         }  # fmt: skip
         await lab.connected(lab.client_file("site", section, client={"namespace": "/"}, subscribe=["/robot1/.*"]))
         await peer.do("subscriber", name="/robot1/chatter", latched=True, depth=100)

@@ -256,6 +256,32 @@ def test_what_is_accepted_and_does_not_do_what_it_seems(
     assert (code, err) == (0, said and f"warning: {path}:{said}\n")
 
 
+@pytest.mark.parametrize(
+    ("endpoint", "key", "said"),
+    [
+        ("{kind: rclpy}", "actions", True),
+        ("[{kind: rclpy}, {kind: record, path: made/}]", "actions", True),
+        ("[{kind: rclpy}, {kind: ros1}]", "actions", False),
+        ("[{kind: rclpy}, {kind: dds}]", "actions", False),
+        ("{kind: record, path: made/}", "actions", False),
+        ("{kind: rclpy}", "subscribe", False),
+    ],
+)
+def test_goals_that_reach_no_action_of_ros_2_are_a_warning(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, endpoint: str, key: str, said: bool
+) -> None:
+    monkeypatch.setattr(endpoints, "installed", lambda _package: True)
+    path = tmp_path / "f.yaml"
+    more = {"actions": "actions: {use: [{match: /r/go}]}\n", "subscribe": "subscribe: [/r/go]\n"}[key]
+    path.write_text(f"{HERE}endpoint: {endpoint}\n{more}", encoding="utf-8")
+    code, _, err = ran(path)
+    problem = (
+        f"warning: {path}:4: actions: an endpoint of kind rclpy has topics only, and goals of ROS 2 are services: none "
+        "gets through; use kind dds or zenoh\n"
+    )
+    assert (code, err) == (0, problem if said else "")
+
+
 def test_a_package_that_is_there_is_found() -> None:
     assert endpoints.installed("zmq") and not endpoints.installed("no_such_package")
 

@@ -124,7 +124,7 @@ class ZenohEndpoint(Services):
 
     def _look_for_others(self) -> None:
         """Say that nobody is there, and when somebody is again."""
-        info, there = self.session.opened.info, ", ".join(self.options.session.connect)
+        info, there = self.session.opened.info, ", ".join(self.session.connect) or "the locators we listen on"
         self._outages.look(
             there, lost=not info.routers_zid() and not info.peers_zid(), now=clock.now(),
             gone=f"nobody answers at {there}; is the router (rmw_zenohd) running there? Trying again until it works",

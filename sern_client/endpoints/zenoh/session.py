@@ -7,6 +7,8 @@ block (opening, closing, putting into a full transmission queue) is done off the
 import asyncio
 import json
 import logging
+import re
+import secrets
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -20,8 +22,14 @@ from sern_core.errors import ConfigError
 from sern_runtime.ros_types import one_line
 
 DEFAULT_CONNECT: Final = ("tcp/localhost:7447",)
+DEFAULT_LISTEN: Final = ("tcp/localhost:0",)
 MAX_WAITING_BYTES: Final = 64 * 2**20
 """Messages that may wait for zenoh's transmission queue; beyond, the oldest are dropped and counted."""
+
+_WITH_PORT: Final = re.compile(r"((?:tcp|udp|tls|quic|ws)/)([^?#]*):([0-9]+)((?:[?#].*)?)")
+_ON_THIS_HOST: Final = re.compile(r"(?:unixsock-stream|unixpipe)/.*")
+_EVERYWHERE: Final = {"0.0.0.0": "127.0.0.1", "[::]": "[::1]"}
+"""Addresses to listen on that are none to connect to, and what leads there on this host."""
 
 _log = logging.getLogger(__name__)
 
@@ -38,15 +46,23 @@ def load_zenoh() -> ModuleType:
 
 @dataclass(frozen=True, slots=True)
 class SessionOptions:
-    """`config_file` (zenoh's own JSON5) replaces the defaults of rmw_zenoh; `connect` and `listen` go on top."""
+    """`config_file` (zenoh's own JSON5) replaces the defaults of rmw_zenoh; `connect` and `listen` go on top, None: as
+    the file has it, else as rmw_zenoh has it. `listen` empty: a free port of loopback.
 
-    connect: tuple[str, ...] = DEFAULT_CONNECT
-    listen: tuple[str, ...] = ()
+    `second`: another process has a session of the same options already, and this one is to reach whom that one reaches.
+    """
+
+    connect: tuple[str, ...] | None = None
+    listen: tuple[str, ...] | None = None
     config_file: Path | None = None
+    second: bool = False
 
 
 def make_config(zenoh: ModuleType, options: SessionOptions) -> Any:
     """ConfigError for a file or locator that zenoh does not accept."""
+    connect, listen = options.connect, options.listen
+    if options.config_file is None:
+        connect, listen = DEFAULT_CONNECT if connect is None else connect, listen or DEFAULT_LISTEN
     try:
         if options.config_file is not None:
             config = zenoh.Config.from_file(str(options.config_file))
@@ -64,11 +80,46 @@ def make_config(zenoh: ModuleType, options: SessionOptions) -> Any:
             }
             for key, value in settings.items():
                 config.insert_json5(key, json.dumps(value))
-        config.insert_json5("connect/endpoints", json.dumps(list(options.connect)))
-        config.insert_json5("listen/endpoints", json.dumps(list(options.listen or ("tcp/localhost:0",))))
+        if connect is not None:
+            config.insert_json5("connect/endpoints", json.dumps(list(connect)))
+        if listen is not None:
+            config.insert_json5("listen/endpoints", json.dumps(list(listen or DEFAULT_LISTEN)))
+        if options.second:
+            _step_aside(config)
     except zenoh.ZError as error:
         raise ConfigError(f"zenoh does not accept this: {one_line(error)}") from None
     return config
+
+
+def _step_aside(config: Any) -> None:
+    """Make of the configuration of a session that of a second one beside it.
+
+    Peers do not pass on what others publish, so the second session needs links of its own to whoever is linked to the
+    first. Those that come to a locator of the first learn there of the second one, which therefore comes there as well,
+    and listens at the same addresses, at ports that are free.
+    """
+    connect, listen = _locators(config, "connect/endpoints"), _locators(config, "listen/endpoints")
+    if json.loads(config.get_json("mode")) != "client":  # which has one link, to its router
+        connect += [there for locator in listen if (there := _reached_at(locator)) is not None]
+    config.insert_json5("connect/endpoints", json.dumps(list(dict.fromkeys(connect))))
+    matches = [match for locator in listen if (match := _WITH_PORT.fullmatch(locator))]
+    free = (f"{match[1]}{match[2]}:0{match[4]}" for match in matches)
+    config.insert_json5("listen/endpoints", json.dumps(list(dict.fromkeys(free))))
+    if json.loads(config.get_json("id")) is not None:  # no two sessions have one
+        config.insert_json5("id", json.dumps(f"{1 << 127 | secrets.randbits(127):x}"))
+
+
+def _locators(config: Any, key: str) -> list[str]:
+    """What the configuration has at `key`, where there are locators, or locators for each mode."""
+    found, mode = json.loads(config.get_json(key)), json.loads(config.get_json("mode")) or "peer"
+    return list(found.get(mode, ()) if isinstance(found, dict) else found)
+
+
+def _reached_at(locator: str) -> str | None:
+    """Where a process of this host reaches one that listens there; None: nobody can tell, or only one can."""
+    if match := _WITH_PORT.fullmatch(locator):
+        return f"{match[1]}{_EVERYWHERE.get(match[2], match[2])}:{match[3]}{match[4]}" if int(match[3]) else None
+    return locator if _ON_THIS_HOST.fullmatch(locator) else None
 
 
 class ZenohSession:
@@ -81,6 +132,8 @@ class ZenohSession:
         self.put_failed = 0
         """Messages that zenoh refused: its session has ended."""
         self._config = make_config(self.zenoh, options)
+        self.connect = tuple(_locators(self._config, "connect/endpoints"))
+        """Where it looks for others."""
         self._session: Any = None
         self._handover: Handover | None = None
         self._waiting: deque[tuple[Callable[[], None], int]] = deque()

@@ -1,6 +1,9 @@
-"""What zenoh does not take in time, without a network."""
+"""The configuration of a session, and what zenoh does not take in time. Without a network."""
 
 import asyncio
+import json
+from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -8,8 +11,11 @@ pytest.importorskip("zenoh", reason="the library eclipse-zenoh is missing: pip i
 
 from sern_client.endpoints.zenoh import session as module
 from sern_client.endpoints.zenoh.endpoint import ZenohEndpoint, ZenohOptions
-from sern_client.endpoints.zenoh.session import SessionOptions
+from sern_client.endpoints.zenoh.session import SessionOptions, load_zenoh, make_config
+from sern_client.factory import make_section
 from sern_core.types import DropReason
+from sern_runtime.config import endpoints as sections
+from sern_tools.ports import free_ports
 from tests.support import Events, until
 
 
@@ -46,5 +52,94 @@ async def test_a_loop_that_is_behind_counts_what_it_drops(monkeypatch: pytest.Mo
             endpoint.session.handover.put(lambda: None, 10)
         await asyncio.sleep(0)
         assert endpoint.drops == {DropReason.QUEUE_FULL: 2}
+    finally:
+        await endpoint.stop()
+
+
+def configured(options: SessionOptions) -> dict[str, Any]:
+    """The keys of zenoh's configuration that these tests are about."""
+    config = make_config(load_zenoh(), options)
+    return {key: json.loads(config.get_json(key)) for key in ("mode", "id", "connect/endpoints", "listen/endpoints")}
+
+
+@pytest.mark.parametrize(
+    ("listen", "comes_to", "listens"),
+    [
+        ("tcp/0.0.0.0:7450", ["tcp/127.0.0.1:7450"], ["tcp/0.0.0.0:0"]),
+        ("tcp/[::]:7450#iface=eth0", ["tcp/[::1]:7450#iface=eth0"], ["tcp/[::]:0#iface=eth0"]),
+        ("udp/10.0.0.7:7450", ["udp/10.0.0.7:7450"], ["udp/10.0.0.7:0"]),
+        ("tcp/127.0.0.1:0", [], ["tcp/127.0.0.1:0"]),
+        ("unixsock-stream//run/zenoh", ["unixsock-stream//run/zenoh"], []),
+        ("serial//dev/ttyS0#baudrate=9600", [], []),
+    ],
+)
+def test_a_second_session_takes_no_locator_of_the_first(listen: str, comes_to: list[str], listens: list[str]) -> None:
+    there = "tcp/router.example:7447"
+    found = configured(SessionOptions(connect=(there,), listen=(listen,), second=True))
+    assert found["connect/endpoints"] == [there, *comes_to]
+    assert found["listen/endpoints"] == listens
+
+
+def test_a_second_session_of_a_file_is_another_one_in_the_mode_of_the_file(tmp_path: Path) -> None:
+    file = tmp_path / "session.json5"
+    file.write_text('{id: "abc1", mode: "client"}')
+    found = configured(
+        SessionOptions(connect=("tcp/a:1",), listen=("tcp/127.0.0.1:7450",), config_file=file, second=True)
+    )
+    assert found["mode"] == "client"
+    assert found["id"] not in (None, "abc1")
+    assert found["connect/endpoints"] == ["tcp/a:1"], "a client has one way, and it leads to the router"
+    assert found["listen/endpoints"] == ["tcp/127.0.0.1:0"]
+
+
+FILE = '{mode: "peer", connect: {endpoints: ["tcp/of.the.file:1"]}, listen: {endpoints: ["tcp/127.0.0.1:7451"]}}'
+
+
+def of_section(tmp_path: Path, **said: Any) -> dict[str, Any]:
+    """What a section of the client's file makes of the session."""
+    section = sections.ZenohEndpoint.model_validate_json(json.dumps({"kind": "zenoh", **said}))
+    endpoint = make_section(section, tmp_path.joinpath)
+    assert isinstance(endpoint, ZenohEndpoint)
+    return configured(endpoint.options.session)
+
+
+@pytest.mark.parametrize(
+    ("said", "connect", "listen"),
+    [
+        ({}, ["tcp/of.the.file:1"], ["tcp/127.0.0.1:7451"]),
+        ({"connect": ["tcp/a:2"]}, ["tcp/a:2"], ["tcp/127.0.0.1:7451"]),
+        ({"listen": ["tcp/127.0.0.1:7452"]}, ["tcp/of.the.file:1"], ["tcp/127.0.0.1:7452"]),
+        ({"listen": []}, ["tcp/of.the.file:1"], ["tcp/localhost:0"]),
+    ],
+)
+def test_locators_of_the_file_hold_unless_the_section_has_others(
+    tmp_path: Path, said: dict[str, Any], connect: list[str], listen: list[str]
+) -> None:
+    (tmp_path / "session.json5").write_text(FILE)
+    found = of_section(tmp_path, config_file="session.json5", **said)
+    assert found["connect/endpoints"] == connect
+    assert found["listen/endpoints"] == listen
+
+
+def test_without_a_file_and_locators_a_session_is_one_of_rmw_zenoh(tmp_path: Path) -> None:
+    found = of_section(tmp_path)
+    assert found["connect/endpoints"] == ["tcp/localhost:7447"]
+    assert found["listen/endpoints"] == ["tcp/localhost:0"]
+
+
+async def test_the_router_of_the_file_is_the_one_that_is_said_to_be_missing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr("sern_client.endpoints.zenoh.endpoint.ROUTER_WAIT_S", 0.0)
+    file = tmp_path / "session.json5"
+    (nobody,) = free_ports(1)
+    file.write_text(
+        f'{{mode: "peer", connect: {{endpoints: ["tcp/127.0.0.1:{nobody}"], exit_on_failure: false, timeout_ms: -1}}, '
+        'listen: {endpoints: ["tcp/127.0.0.1:0"]}, scouting: {multicast: {enabled: false}}}'
+    )
+    endpoint = ZenohEndpoint(ZenohOptions(SessionOptions(config_file=file)))
+    await endpoint.start(Events())
+    try:
+        await until(lambda: f"nobody answers at tcp/127.0.0.1:{nobody}; is the router" in caplog.text, "said")
     finally:
         await endpoint.stop()

@@ -254,3 +254,58 @@ def test_warnings_do_not_stop(keyed: Path) -> None:
         f"/relay.yaml:5: relay.clients_dir: {base}/clients/README: is not read, its name does not end in .pub",
         "/relay.yaml:1: access: no rule matches client jackal1: it may connect and do nothing",
     ]
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("ipc://sern.sock", "ipc://{here}/sern.sock"),
+        ("ipc://run/sern.sock", "ipc://{here}/run/sern.sock"),
+        ("ipc://~/sern.sock", "ipc:///home/robot/sern.sock"),
+        ("ipc:///run/sern.sock", "ipc:///run/sern.sock"),
+        ("ipc://@sern", "ipc://@sern"),  # a name in Linux's abstract namespace is no path
+        ("tcp://127.0.0.1:5555", "tcp://127.0.0.1:5555"),
+    ],
+)
+def test_sockets_of_this_machine_are_where_the_file_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str, expected: str
+) -> None:
+    monkeypatch.setenv("HOME", "/home/robot")
+    found = expected.format(here=tmp_path)
+    client, hub, other = tmp_path / "client.yaml", tmp_path / "hub.yaml", tmp_path / "other.yaml"
+    client.write_text(
+        f"client: {{name: jackal1}}\nrelay: {{endpoint: '{text}', insecure: true}}\n"
+        "endpoint: {kind: synthetic, role: robot}\n"
+    )
+    hub.write_text(f"relay: {{name: hub, listen: ['{text}'], insecure: true}}\n")
+    other.write_text(
+        "relay: {name: hub, listen: ['tcp://127.0.0.1:1'], insecure: true}\nfeed: {roles: [{name: one, "
+        f"publish_endpoint: '{text}', ingest_endpoint: 'tcp://127.0.0.1:3', publish: ['/a']}}, "
+        f"{{name: two, publish_endpoint: 'tcp://127.0.0.1:2', ingest_endpoint: '{text}2', publish: ['/a']}}]}}\n"
+    )
+    assert load_client(client).model.relay.endpoint == found
+    assert load_relay(hub).model.relay.listen == (found,)
+    one, two = load_relay(other).model.feed_roles()
+    assert (one.publish_endpoint, one.ingest_endpoint) == (found, "tcp://127.0.0.1:3")
+    assert (two.publish_endpoint, two.ingest_endpoint) == ("tcp://127.0.0.1:2", found + "2")
+
+
+@pytest.mark.parametrize("key", ["relay.endpoint", "relay.listen.0", "feed.roles.0.publish_endpoint"])
+def test_a_socket_too_deep_in_the_file_system_is_an_error(tmp_path: Path, key: str) -> None:
+    file = tmp_path / ("deep" * 30) / "f.yaml"
+    file.parent.mkdir()
+    socket = "ipc://sern.sock"
+    if key == "relay.endpoint":
+        file.write_text(
+            f"client: {{name: jackal1}}\nrelay: {{endpoint: '{socket}', insecure: true}}\n"
+            "endpoint: {kind: synthetic, role: robot}\n"
+        )
+    else:
+        listen, feed = (socket, "tcp://127.0.0.1:2") if key == "relay.listen.0" else ("tcp://127.0.0.1:2", socket)
+        file.write_text(
+            f"relay: {{name: hub, listen: ['{listen}'], insecure: true}}\n"
+            f"feed: {{roles: [{{name: one, publish_endpoint: '{feed}'}}]}}\n"
+        )
+    model: type[FileModel] = ClientFile if key == "relay.endpoint" else RelayFile
+    (error,) = check(file, model).errors
+    assert f"{key}: ipc://{file.parent}/sern.sock: a path of 1 to 107 bytes is needed" in str(error)
