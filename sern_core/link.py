@@ -54,7 +54,7 @@ RETAINED_PER_US: Final = 16
 ANNOUNCE_US: Final = 12
 """What a session that begins is charged with for each stream that is announced in it."""
 MAX_TRACED: Final = 100
-"""Of many messages that are dropped at once, so many are in the trace of decisions."""
+"""The most of one run of dropped messages that the trace of decisions has."""
 MAX_UNHEARD: Final = 20_000
 """Control messages that a peer may have answered, beside four for each channel, before it reads an answer."""
 

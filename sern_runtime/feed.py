@@ -63,7 +63,7 @@ HIGH_WATER: Final = 1000
 INTEREST_S: Final = 0.05
 """Between two calls of `on_interest`: one message of subscriptions is cheap, and what follows from it is not."""
 RELEASE_S: Final = 0.2
-"""So long libzmq is waited for to let go of addresses."""
+"""The longest wait for libzmq to let go of addresses."""
 _MAX_VERDICTS: Final = 4096
 _NOBLOCK: Final = int(zmq.NOBLOCK)
 _NOBLOCK_MORE: Final = int(zmq.NOBLOCK | zmq.SNDMORE)

@@ -23,9 +23,9 @@ from sern_runtime.monitor import Connection, ConnectionTable
 ENTRY_BYTES: Final = 16
 """What a subscription counts beside its prefix: short ones cost more than their bytes."""
 KEPT_BYTES: Final = 2 * SUBSCRIBER_BYTES
-"""Of one connection. In the long run it may bring more than `SUBSCRIBER_BYTES`, and keep so much of that."""
+"""What one connection may keep. In the long run it may bring more than `SUBSCRIBER_BYTES`."""
 ROLE_BYTES: Final = 2**20
-"""Of all connections of a role together: about 120 MB in libzmq's table."""
+"""What all connections of a role may keep together: about 120 MB in libzmq's table."""
 
 _NAMELESS: Final = -1
 """Stands for all connections without a name, where others have their fd."""
@@ -68,7 +68,7 @@ class Subscriptions:
 
     @property
     def prefixes(self) -> tuple[bytes, ...]:
-        """In order."""
+        """What is subscribed to, in order."""
         return tuple(sorted(self._prefixes))
 
     def match(self, frame: bytes) -> bool:

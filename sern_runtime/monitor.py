@@ -52,8 +52,8 @@ SO_MAX_PACING_RATE: Final = 47
 PACING_BPS: Final = 10e9
 """No bound of its own: any value makes the kernel pace."""
 HANDSHAKE_GRACE_S: Final = 3.0
-"""So long a half-open connection keeps its place whatever comes: the four round trips of a handshake over 600 ms, and
-more."""
+"""A half-open connection keeps its place for this time, whatever comes: the four round trips of a handshake over 600 ms
+fit into it."""
 RTO_MAX_MS: Final = 1000
 """Bounds the kernel's backoff in a blackout: a fresh pose 0.65 s after 30 s without a link, instead of 7.1 s."""
 
@@ -130,6 +130,22 @@ class TcpInfo:
     delivery_rate_bps: int
 
 
+@contextmanager
+def _peek(fd: int) -> Iterator[tuple[int, socketlib.socket | None]]:
+    """The inode of what `fd` is, and that socket through a duplicate that lives as long as the block; None where it is
+    none. OSError where nothing is open."""
+    duplicate = os.dup(fd)
+    try:
+        status = os.fstat(duplicate)
+        if not stat.S_ISSOCK(status.st_mode):
+            yield status.st_ino, None
+            return
+        with socketlib.socket(fileno=os.dup(duplicate)) as connection:
+            yield status.st_ino, connection
+    finally:
+        os.close(duplicate)
+
+
 class SocketHandle:
     """A connected socket that belongs to libzmq, over TCP or on this machine. Every method answers None or False once
     the connection is gone."""
@@ -145,23 +161,14 @@ class SocketHandle:
         """A handle on `fd`, or None when it is no connection that was accepted at this ipc endpoint (any more)."""
         path = os.fsencode(endpoint.removeprefix("ipc://"))
         try:
-            duplicate = os.dup(fd)
-        except OSError:
-            return None
-        try:
-            status = os.fstat(duplicate)
-            if not stat.S_ISSOCK(status.st_mode):
-                return None
-            with socketlib.socket(fileno=os.dup(duplicate)) as connection:
-                if connection.family != socketlib.AF_UNIX:
+            with _peek(fd) as (inode, connection):
+                if connection is None or connection.family != socketlib.AF_UNIX:
                     return None
                 name = connection.getsockname()
         except OSError:
             return None
-        finally:
-            os.close(duplicate)
         bound = name if isinstance(name, bytes) else os.fsencode(name)
-        return cls(fd, status.st_ino) if bound.replace(b"\0", b"@", 1) == path else None  # @: it has no file
+        return cls(fd, inode) if bound.replace(b"\0", b"@", 1) == path else None  # @: it has no file
 
     def cut(self) -> bool:
         """End the connection now, both ways; libzmq notices and cleans up. False when it is gone already."""
@@ -206,24 +213,15 @@ class TcpHandle(SocketHandle):
         number reused meanwhile.
         """
         try:
-            duplicate = os.dup(fd)
-        except OSError:
-            return None
-        try:
-            status = os.fstat(duplicate)
-            if not stat.S_ISSOCK(status.st_mode):
-                return None
-            with socketlib.socket(fileno=os.dup(duplicate)) as connection:
-                if connection.family not in (socketlib.AF_INET, socketlib.AF_INET6):
+            with _peek(fd) as (inode, connection):
+                if connection is None or connection.family not in (socketlib.AF_INET, socketlib.AF_INET6):
                     return None
                 local, peer = connection.getsockname()[:2], connection.getpeername()[:2]
         except OSError:
             return None
-        finally:
-            os.close(duplicate)
         if local_port not in (None, local[1]) or peer_port not in (None, peer[1]):
             return None
-        return cls(fd, status.st_ino, (plain_host(local[0]), local[1]), (plain_host(peer[0]), peer[1]))
+        return cls(fd, inode, (plain_host(local[0]), local[1]), (plain_host(peer[0]), peer[1]))
 
     def info(self) -> TcpInfo | None:
         """The kernel's view of the connection (TCP_INFO)."""
@@ -430,7 +428,7 @@ class ConnectionTable:
         return self._connections.get(fd)
 
     def items(self) -> list[tuple[int, Connection]]:
-        """With their fd."""
+        """Those that are open, with their fd."""
         return list(self._connections.items())
 
     def take_in(self) -> None:

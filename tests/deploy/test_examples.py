@@ -56,7 +56,7 @@ def test_is_accepted(name: str) -> None:
 
 @pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.yaml")), ids=lambda path: path.stem)
 def test_it_adapts_and_never_thins_a_command(path: Path) -> None:
-    """As docs/adaptation.md says of the ready-made files, relay, robots and sites alike."""
+    """The ready-made files of relay, robots and sites are as docs/adaptation.md says."""
     relay = path.name == "relay.yaml"
     loaded = load_relay(path, files=False) if relay else load_client(path, files=False)
     section = loaded.model.adaptation
@@ -145,7 +145,7 @@ def test_the_relay_lets_through_what_a_client_needs(name: str) -> None:
 
 @pytest.mark.parametrize("name", [name for name in CLIENTS if not name.startswith("site")])
 def test_the_feed_shows_where_each_robot_is_and_what_is_around_it(name: str) -> None:
-    """Of each robot that there is a file for, by topics that its file sends."""
+    """Cover each robot that there is a file for, by topics that its file sends."""
     (role,) = load_relay(EXAMPLES / "relay.yaml", files=False).model.feed_roles()
     model = client(name)
     robot = model.name

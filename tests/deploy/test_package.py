@@ -40,7 +40,7 @@ def test_every_file_of_a_package_is_packaged() -> None:
 
 
 def test_what_is_built_finds_its_profiles_without_the_checkout(tmp_path: Path) -> None:
-    """As `sern lab` and `sern demo` of an installation do."""
+    """Read them as `sern lab` and `sern demo` of an installation do."""
     pytest.importorskip("setuptools")
     source, built, elsewhere = tmp_path / "source", tmp_path / "built", tmp_path / "elsewhere"
     elsewhere.mkdir()

@@ -39,7 +39,7 @@ def programs() -> Iterator[Programs]:
 
 
 def reload(lab: Lab, relay: RelayDaemon, *roles: dict[str, Any]) -> None:
-    """As SIGHUP does, with these roles in the file."""
+    """Reload as SIGHUP does, with these roles in the file."""
     lab.relay_file(feed={"roles": list(roles)})
     relay.reload()
 

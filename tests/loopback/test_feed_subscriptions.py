@@ -46,7 +46,7 @@ class Raw:
         self.ended = False
 
     async def greet(self) -> None:
-        """As a SUB: it says nothing more before it has heard that it may."""
+        """Greet as a SUB: it says nothing more before it has heard that it may."""
         await self.send(GREETING)
         await asyncio.to_thread(self._read, 64)
         await self.send(b"\x04" + bytes([len(READY)]) + READY)
@@ -179,7 +179,7 @@ async def joined(feed: Feed, prefixes: Iterable[bytes]) -> Raw:
 
 
 def names(tag: str, count: int) -> list[bytes]:
-    """So many prefixes, each of 100 bytes with what it counts."""
+    """Make so many prefixes, each of 100 bytes with what it counts."""
     return [(b"/%s/%d/" % (tag.encode(), number)).ljust(100 - ENTRY_BYTES, b"z") for number in range(count)]
 
 

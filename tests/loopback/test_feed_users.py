@@ -23,7 +23,7 @@ HEADER = FeedHeader(PriorityClass.STATE, 7, 1)
 ODOM = TopicName("/r/odom")
 FRAME = topic_frame(ODOM)
 GREETING_2 = b"\xff" + bytes(8) + b"\x7f" + b"\x01" + b"\x02" + b"\0\0"
-"""Of a SUB that speaks ZMTP 2.0, with its empty identity."""
+"""The greeting of a SUB that speaks ZMTP 2.0, with its empty identity."""
 
 
 @pytest.fixture

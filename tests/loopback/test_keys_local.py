@@ -47,7 +47,7 @@ async def test_a_replaced_key_is_cut_off_over_ipc_and_comes_back_when_it_is_put_
 async def test_a_connection_that_outlives_its_key_is_not_heard(
     tmp_path: Path, ipc: bool, removed: bool, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """As where nothing can end it: what it says is refused by its key, and said once."""
+    """Nothing can end it here: what it says is refused by its key, and said once."""
     async with Lab(tmp_path, "robot2") as lab:
         if ipc:
             local(lab)

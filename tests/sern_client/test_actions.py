@@ -318,7 +318,7 @@ async def test_a_goal_with_a_result_is_done_and_what_is_no_goal_is_let_through(s
 
 
 async def test_a_goal_that_is_given_again_is_watched_in_place_of_the_one_before(site: Site) -> None:
-    """As a client does that does not see its server; what becomes of the first makes no difference any more."""
+    """A client that does not see its server does so; what becomes of the first makes no difference any more."""
     site.server_appears()
     seq = site.channel.next_seq
     for _ in range(3):

@@ -233,13 +233,18 @@ async def test_an_update_is_owed_until_its_grid_has_been_published() -> None:
     site.rebuilds.close()
 
 
-async def test_a_whole_grid_that_comes_late_or_broken_leaves_what_is_due() -> None:
-    """Copies of a keyframe are as old as what they repeat: what was taken since waits for its turn all the same."""
+def site_with_a_grid_due() -> tuple[Site, int]:
+    """A site that has shown a change, and waits to show the next one, of stamp 7; the seq of the update after that."""
     site = Site()
     site.open("/map")
     site.keyframe("/map", 5)
     site.now += 10.0
-    seq = site.change("/map", site.change("/map", 2, 6, 1), 7, 2)
+    return site, site.change("/map", site.change("/map", 2, 6, 1), 7, 2)
+
+
+async def test_a_whole_grid_that_comes_late_or_broken_leaves_what_is_due() -> None:
+    """Copies of a keyframe are as old as what they repeat: what was taken since waits for its turn all the same."""
+    site, seq = site_with_a_grid_due()
     updates, whole = stream("/map_updates", UPDATE_TYPE, "/map"), stream("/map", GRID_TYPE, "/map")
     assert len(site.shown) == 2 and site.rebuilds.owes(updates, seq - 1), "the loop rests"
     assert site.rebuilds.message(whole, message("/map", 2, grid_body(0), 5)), "late: a newer one is shown"
@@ -255,11 +260,7 @@ async def test_a_whole_grid_that_comes_late_or_broken_leaves_what_is_due() -> No
 
 async def test_a_grid_that_is_due_keeps_its_stamp() -> None:
     """An update that waits for another one has no part in it."""
-    site = Site()
-    site.open("/map")
-    site.keyframe("/map", 5)
-    site.now += 10.0
-    seq = site.change("/map", site.change("/map", 2, 6, 1), 7, 2)
+    site, seq = site_with_a_grid_due()
     site.update("/map", seq + 1, 99, np.empty((0, 0), np.int8))  # one is missing before it
     site.now += REST * COST_S
     await until(lambda: len(site.shown) == 3, "the change has its turn")

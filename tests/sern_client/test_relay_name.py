@@ -43,7 +43,7 @@ def world(monkeypatch: pytest.MonkeyPatch) -> World:
 
 
 def said_s(caplog: pytest.LogCaptureFixture) -> list[str]:
-    """For how long the name had not resolved, as each line has it; the first line has no time."""
+    """How long the name had not resolved, as each line has it; the first line has no time."""
     told = [message.partition("known")[2] for message in caplog.messages if "does not resolve" in message]
     return [text.removeprefix(", for ").removesuffix(" s now") for text in told]
 

@@ -526,7 +526,7 @@ def test_at_the_end_what_may_have_arrived_is_told_from_what_was_never_sent(relia
 
 
 def test_many_that_are_dropped_at_once_are_told_in_runs() -> None:
-    """Of seqs that follow each other, each with the reason it has; what was told before is told no more."""
+    """A run has seqs that follow each other, with one reason; what was told before is told no more."""
     sender = Sender(spec(reliable=True))
     runs: list[tuple[int, int, DropReason]] = []
     sender.channel.on_drop = lambda _channel, out, reason, count: runs.append((out.seq, count, reason))

@@ -295,7 +295,7 @@ def test_patterns_and_commands_of_a_relay(deployed: Path) -> None:
     assert err.count("warning") == 1
 
 
-ROLE = "{name: scene, publish_endpoint: 'ipc:///tmp/out', ingest_endpoint: 'ipc:///tmp/in', allow_control: true, "
+ROLE = "{name: scene, publish_endpoint: 'ipc://@scene/out', ingest_endpoint: 'ipc://@scene/in', allow_control: true, "
 
 
 @pytest.mark.parametrize(

@@ -348,7 +348,7 @@ def descriptors() -> int:
 def test_a_hidden_folder_that_stays_does_not_end_the_recording(
     kind: type[RecordFile], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """As where the file system keeps the old name of an open file for as long as it is open."""
+    """Some file systems keep the old name of an open file for as long as it is open."""
     rmtree = shutil.rmtree
 
     def refuse(folder: Path) -> None:
