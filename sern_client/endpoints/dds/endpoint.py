@@ -38,13 +38,13 @@ from sern_client.endpoints.dds.graph import MAX_COMPLAINTS, Graph, Local, Partic
 from sern_client.endpoints.dds.idl import TypeMaker
 from sern_client.endpoints.dds.names import DISCOVERY_TOPIC, SERN_KEY, RosName, user_data
 from sern_client.endpoints.dds.qos import (
-    INFINITE_NS,
     EndpointQos,
     mismatches,
     reader_for,
     to_policies,
     writer_for,
 )
+from sern_client.endpoints.dds.raw import INFINITE_NS
 from sern_client.endpoints.dds.services import DdsServices
 from sern_client.endpoints.dds.stream import Stream
 from sern_client.endpoints.dds.worker import Inbox, Sample, Worker

@@ -10,9 +10,9 @@ from typing import Any, Final
 from cyclonedds.core import Policy, Qos
 
 from sern_client.endpoints.dds.names import read_user_data, user_data
+from sern_client.endpoints.dds.raw import INFINITE_NS, Announced
 from sern_core.message import TopicInfo
 
-INFINITE_NS: Final = 2**63 - 1
 _DURABILITY: Final = ("volatile", "transient_local", "transient", "persistent")
 _LIVELINESS: Final = ("automatic", "manual_by_participant", "manual_by_topic")
 
@@ -41,38 +41,21 @@ class EndpointQos:
         return self.durability > 0
 
 
-def read_qos(qos: Qos) -> EndpointQos:
+def read_qos(announced: Announced) -> EndpointQos:
     """The policies of a discovered endpoint, as far as they matter here."""
-    liveliness = qos[Policy.Liveliness]
-    user = qos[Policy.Userdata]
-    said = read_user_data(bytes(user.data)) if user is not None else {}
-    partition = qos[Policy.Partition]
+    said = read_user_data(announced.user_data)
     return EndpointQos(
-        reliable=isinstance(qos[Policy.Reliability], Policy.Reliability.Reliable),
-        durability=_rank(qos[Policy.Durability], ("Volatile", "TransientLocal", "Transient", "Persistent")),
-        deadline_ns=_ns(qos[Policy.Deadline], "deadline"),
-        lifespan_ns=_ns(qos[Policy.Lifespan], "lifespan"),
-        liveliness=_rank(liveliness, ("Automatic", "ManualByParticipant", "ManualByTopic")),
-        lease_ns=_ns(liveliness, "lease_duration"),
-        exclusive=qos[Policy.Ownership] == Policy.Ownership.Exclusive,
-        partitions=tuple(partition.partitions) if partition is not None else (),
+        reliable=announced.reliable,
+        durability=announced.durability,
+        deadline_ns=announced.deadline_ns,
+        lifespan_ns=announced.lifespan_ns,
+        liveliness=announced.liveliness,
+        lease_ns=announced.lease_ns,
+        exclusive=announced.exclusive,
+        partitions=announced.partitions,
         type_hash=said.get("typehash", ""),
         service_id=said.get("serviceid") or said.get("clientid", ""),
     )
-
-
-def _rank(policy: Any, names: tuple[str, ...]) -> int:
-    """Where a policy's kind stands among the kinds of its sort; the first for one that was not said."""
-    words = type(policy).__qualname__, repr(policy)
-    return max((rank for rank, name in enumerate(names) if any(_ends(word, name) for word in words)), default=0)
-
-
-def _ends(text: str, name: str) -> bool:
-    return text.partition("(")[0].rpartition(".")[2] == name
-
-
-def _ns(policy: Any, field: str) -> int:
-    return INFINITE_NS if policy is None else int(getattr(policy, field))
 
 
 def mismatches(offered: EndpointQos, asked: EndpointQos) -> list[str]:

@@ -2,18 +2,23 @@
 
 The binding (de)serialises every sample in Python; here bytes go through as they are. `ddspy_take` and `ddspy_write` are
 the C functions below its `take` and `write`; the version of the binding is pinned for their sake. The wait set is used
-below its Python class too, because that does not tell what woke it.
+below its Python class too, because that does not tell what woke it. And the binding reads policies into variables that
+all threads share, and frees what it finds there: with two endpoints in a process, one got the other's policies, or the
+process broke. Here every reading has its own.
 """
 
 import ctypes
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, Final
 
 from cyclonedds import _clayer
-from cyclonedds.core import Entity, InstanceState, ReadCondition, SampleState, ViewState, WaitSet
+from cyclonedds.builtin import BuiltinDataReader
+from cyclonedds.core import DDSException, Entity, InstanceState, ReadCondition, SampleState, ViewState, WaitSet
 from cyclonedds.domain import DomainParticipant
 from cyclonedds.internal import dds_c_t
 from cyclonedds.pub import DataWriter
+from cyclonedds.qos import _CQos
 from cyclonedds.sub import DataReader
 
 ANY: Final = SampleState.Any | ViewState.Any | InstanceState.Any
@@ -39,6 +44,102 @@ def write(writer: DataWriter[Any], body: bytes, stamp_ns: int | None) -> int:
     if stamp_ns is None:
         return int(_clayer.ddspy_write(writer._ref, body))
     return int(_clayer.ddspy_write_ts(writer._ref, body, stamp_ns))
+
+
+@dataclass(frozen=True, slots=True)
+class Announced:
+    """What a participant, reader or writer announces of itself. Kinds count upwards, as DDS numbers them."""
+
+    name: str
+    user_data: bytes
+    reliable: bool
+    durability: int
+    deadline_ns: int
+    lifespan_ns: int
+    liveliness: int
+    lease_ns: int
+    exclusive: bool
+    partitions: tuple[str, ...]
+
+
+def announced(address: int) -> Announced:
+    """The policies at an address of Cyclone DDS. What was not announced is the least; text that is none, made one."""
+    qos = ctypes.cast(address, dds_c_t.qos_p)
+    reliability, blocking_ns = dds_c_t.reliability(), dds_c_t.duration()
+    _CQos._get_reliability(qos, ctypes.byref(reliability), ctypes.byref(blocking_ns))
+    durability = dds_c_t.durability()
+    _CQos._get_durability(qos, ctypes.byref(durability))
+    deadline_ns = dds_c_t.duration(INFINITE_NS)
+    _CQos._get_deadline(qos, ctypes.byref(deadline_ns))
+    lifespan_ns = dds_c_t.duration(INFINITE_NS)
+    _CQos._get_lifespan(qos, ctypes.byref(lifespan_ns))
+    liveliness, lease_ns = dds_c_t.liveliness(), dds_c_t.duration(INFINITE_NS)
+    _CQos._get_liveliness(qos, ctypes.byref(liveliness), ctypes.byref(lease_ns))
+    ownership = dds_c_t.ownership()
+    _CQos._get_ownership(qos, ctypes.byref(ownership))
+    return Announced(
+        _name(qos),
+        _user_data(qos),
+        reliability.value != 0,
+        durability.value,
+        deadline_ns.value,
+        lifespan_ns.value,
+        liveliness.value,
+        lease_ns.value,
+        ownership.value != 0,
+        _partitions(qos),
+    )
+
+
+def _name(qos: Any) -> str:
+    text = ctypes.c_char_p()
+    _CQos._get_entity_name(qos, ctypes.byref(text))
+    try:
+        return (text.value or b"").decode("utf-8", "replace")
+    finally:
+        _CQos.free(text)
+
+
+def _user_data(qos: Any) -> bytes:
+    data, size = ctypes.c_void_p(), ctypes.c_size_t()
+    _CQos._get_userdata(qos, ctypes.byref(data), ctypes.byref(size))
+    try:
+        return ctypes.string_at(data, size.value) if data else b""
+    finally:
+        _CQos.free(data)
+
+
+def _partitions(qos: Any) -> tuple[str, ...]:
+    count, texts = ctypes.c_uint32(), ctypes.POINTER(ctypes.c_char_p)()
+    _CQos._get_partition(qos, ctypes.byref(count), ctypes.byref(texts))
+    addresses = ctypes.cast(texts, ctypes.POINTER(ctypes.c_void_p))
+    try:
+        return tuple((texts[k] or b"").decode("utf-8", "replace") for k in range(count.value))
+    finally:
+        for k in range(count.value):
+            _CQos.free(addresses[k])
+        _CQos.free(addresses)
+
+
+class DiscoveryReader:
+    """What participants, writers or readers come and go in a domain, each with what it announces."""
+
+    def __init__(self, participant: DomainParticipant, topic: Any) -> None:
+        self.reader = BuiltinDataReader(participant, topic)
+        self.reader._cqos_conv = announced
+
+    def take(self) -> Any | None:
+        """The next change: `key`, `sample_info`, and `qos`, which is `Announced`. None when there is no more.
+
+        ValueError for one that cannot be read, such as a topic whose name is no text: it is taken, the others follow.
+        """
+        try:
+            taken = self.reader.take(1)  # with more at once, one that cannot be read takes the others with it
+        except DDSException:
+            raise
+        except Exception as error:  # noqa: BLE001 - the binding raises no other class
+            raise ValueError(f"a peer announces what cannot be read ({error})") from None
+        return taken[0] if taken else None
 
 
 def matched_readers(writer: DataWriter[Any]) -> list[int]:

@@ -10,12 +10,11 @@ from typing import Any, Final, NamedTuple, Protocol
 from uuid import UUID
 
 from cyclonedds.builtin import (
-    BuiltinDataReader,
     BuiltinTopicDcpsParticipant,
     BuiltinTopicDcpsPublication,
     BuiltinTopicDcpsSubscription,
 )
-from cyclonedds.core import DDSException, GuardCondition, InstanceState, Policy
+from cyclonedds.core import DDSException, GuardCondition, InstanceState
 from cyclonedds.domain import DomainParticipant
 from cyclonedds.sub import DataReader
 
@@ -75,12 +74,13 @@ class Worker:
         self._guard = GuardCondition(participant)
         self._waiter = raw.Waiter(participant)
         self._waiter.attach(self._guard, _WAKE)
-        self._participants = BuiltinDataReader(participant, BuiltinTopicDcpsParticipant)
-        self._writers = BuiltinDataReader(participant, BuiltinTopicDcpsPublication)
-        self._readers = BuiltinDataReader(participant, BuiltinTopicDcpsSubscription)
-        self._waiter.attach_reader(self._participants, _PARTICIPANTS)
-        self._waiter.attach_reader(self._writers, _WRITERS)
-        self._waiter.attach_reader(self._readers, _READERS)
+        self._discovery = {
+            _PARTICIPANTS: raw.DiscoveryReader(participant, BuiltinTopicDcpsParticipant),
+            _WRITERS: raw.DiscoveryReader(participant, BuiltinTopicDcpsPublication),
+            _READERS: raw.DiscoveryReader(participant, BuiltinTopicDcpsSubscription),
+        }
+        for number, discovered in self._discovery.items():
+            self._waiter.attach_reader(discovered.reader, number)
         self._inboxes: dict[int, tuple[DataReader[Any], Inbox]] = {}
         self._next = _FIRST
         self._jobs: deque[Callable[[], None]] = deque()
@@ -186,28 +186,34 @@ class Worker:
         try:
             step()
         except (DDSException, OSError, ValueError, TypeError, AttributeError) as error:
-            self.faults += 1
-            if self.faults <= MAX_FAULTS_SAID:
-                _log.exception("a fault in reading from DDS: %s", one_line(error))
+            self._fault(error)
+
+    def _fault(self, error: Exception) -> None:
+        self.faults += 1
+        if self.faults <= MAX_FAULTS_SAID:
+            _log.error("a fault in reading from DDS: %s", one_line(error), exc_info=error)
 
     def _discover(self, number: int) -> None:
-        reader = {_PARTICIPANTS: self._participants, _WRITERS: self._writers, _READERS: self._readers}[number]
-        while taken := reader.take(TAKE_AT_ONCE):
-            for found in taken:
-                alive = found.sample_info.instance_state == InstanceState.Alive
-                if number == _PARTICIPANTS:
-                    self._participant(found, alive)
-                else:
-                    self._endpoint(found, alive, writer=number == _WRITERS)
+        while True:
+            try:
+                found = self._discovery[number].take()
+            except ValueError as error:
+                self._fault(error)  # the others are still to be taken
+                continue
+            if found is None:
+                return
+            alive = found.sample_info.instance_state == InstanceState.Alive
+            if number == _PARTICIPANTS:
+                self._participant(found, alive)
+            else:
+                self._endpoint(found, alive, writer=number == _WRITERS)
 
     def _participant(self, found: Any, alive: bool) -> None:
         if not alive:
             self._hand_over(partial(self._events.participant_removed, found.key))
             return
-        name, user = found.qos[Policy.EntityName], found.qos[Policy.Userdata]
-        pairs = read_user_data(bytes(user.data)) if user is not None else {}
-        participant = Participant(found.key, name.name if name is not None else "", pairs.get(SERN_KEY, ""))
-        self._hand_over(partial(self._events.participant_added, participant))
+        sern = read_user_data(found.qos.user_data).get(SERN_KEY, "")
+        self._hand_over(partial(self._events.participant_added, Participant(found.key, found.qos.name, sern)))
 
     def _endpoint(self, found: Any, alive: bool, *, writer: bool) -> None:
         handle = int(found.sample_info.instance_handle)

@@ -150,7 +150,7 @@ class Peer:
 
     def send(self, command: str) -> None:
         assert self._process is not None and self._process.stdin is not None
-        self._process.stdin.write(command.encode() + b"\n")
+        self._process.stdin.write(command.encode(errors="surrogateescape") + b"\n")
 
     async def crash(self) -> None:
         """It goes without a word to anybody."""
@@ -159,14 +159,17 @@ class Peer:
         await asyncio.wait_for(self._process.wait(), self._deadline_s)
 
     async def until(self, condition: Callable[[], bool]) -> None:
-        async with asyncio.timeout(self._deadline_s):
-            while not condition():
-                if failed := self.lines("failed "):
-                    raise PeerError(f"the peer: {' '.join(failed[-1])}")
-                if self._reading is None or self._reading.done():
-                    raise PeerError("the peer has ended")
-                self._news.clear()
-                await self._news.wait()
+        try:
+            async with asyncio.timeout(self._deadline_s):
+                while not condition():
+                    if failed := self.lines("failed "):
+                        raise PeerError(f"the peer: {' '.join(failed[-1])}")
+                    if self._reading is None or self._reading.done():
+                        raise PeerError("the peer has ended")
+                    self._news.clear()
+                    await self._news.wait()
+        except TimeoutError:
+            raise PeerError(f"the peer said nothing else in {self._deadline_s:.0f} s: {self.said[-20:]}") from None
 
     def lines(self, beginning: str) -> list[list[str]]:
         """The words of each line that begins so."""

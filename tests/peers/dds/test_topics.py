@@ -254,6 +254,27 @@ async def test_two_sern_endpoints_beside_each_other_make_no_loop(
     only_ours.close()
 
 
+async def test_a_topic_whose_name_is_no_text_hides_no_other(
+    domain: int, make_peer: MakePeer, make_endpoint: MakeEndpoint, caplog: pytest.LogCaptureFixture
+) -> None:
+    """It is said once and left out, whether it was there before us or comes later."""
+    before = await make_peer(domain)
+    await before.do(f"pub bad rt/a\udcff {STRING}")
+    await before.do(f"pub good rt/good {STRING}")
+    endpoint, heard = await make_endpoint(domain)
+    await until(lambda: TopicName("/good") in heard.infos)
+    await before.do(f"pub worse rt/b\udcff {STRING}")
+    await before.do(f"pub later rt/later {STRING}")
+    await until(lambda: TopicName("/later") in heard.infos)
+    subscription = endpoint.subscribe(TopicName("/later"), heard.sink)
+    await before.line("matched later 1")
+    await until(lambda: subscription.matched == 1)
+    await before.do(f"write later {body_of(STRING, 7).hex()}")
+    await until(lambda: len(heard.got) == 1)
+    assert set(heard.infos) == {TopicName("/good"), TopicName("/later")}
+    assert len([text for text in caplog.messages if "announces what cannot be read" in text]) == 2
+
+
 async def test_several_domains_in_one_process(make_peer: MakePeer, make_endpoint: MakeEndpoint) -> None:
     from tests.peers.dds.peer import free_domain
 

@@ -1,7 +1,9 @@
 """The parts of the dds endpoint that need no peer: names, policies, the graph, settings, and its queues."""
 
+import ctypes
 import logging
 import threading
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,6 +17,7 @@ pytest.importorskip("cyclonedds", reason="the dds endpoint needs cyclonedds: pip
 
 from cyclonedds.core import DDSException, Policy, Qos
 from cyclonedds.pub import DataWriter
+from cyclonedds.qos import _CQos
 
 from sern_client.endpoints.dds import names, node_info, raw
 from sern_client.endpoints.dds.definitions import Definitions
@@ -22,7 +25,6 @@ from sern_client.endpoints.dds.domain import DomainOptions, close_domain, enviro
 from sern_client.endpoints.dds.graph import Graph, Local, Participant, Remote, puts_header
 from sern_client.endpoints.dds.names import Role, RosName
 from sern_client.endpoints.dds.qos import (
-    INFINITE_NS,
     EndpointQos,
     mismatches,
     read_qos,
@@ -30,6 +32,7 @@ from sern_client.endpoints.dds.qos import (
     to_policies,
     writer_for,
 )
+from sern_client.endpoints.dds.raw import INFINITE_NS
 from sern_client.endpoints.dds.services import new_service_id
 from sern_core.errors import ConfigError
 from sern_core.message import TopicInfo
@@ -100,11 +103,61 @@ def test_what_is_asked_for_because_of_writers_matches_them(offered: EndpointQos,
     assert mismatches(offered, offered) == []
 
 
+def through_dds(policies: Qos) -> raw.Announced:
+    """What a peer would read of these policies."""
+    there = _CQos.qos_to_cqos(policies)
+    try:
+        return raw.announced(ctypes.cast(there, ctypes.c_void_p).value or 0)
+    finally:
+        _CQos.delete_cqos(there)
+
+
+def test_threads_read_policies_beside_each_other() -> None:
+    """The binding's own way mixes them up, and frees what another thread has."""
+
+    def read(number: int) -> set[tuple[str, bytes, int, tuple[str, ...]]]:
+        policies = Qos(
+            Policy.EntityName(f"peer{number}"),
+            Policy.Userdata(f"typehash={number};".encode()),
+            Policy.Deadline(number + 1),
+            Policy.Partition([f"first{number}", f"second{number}"]),
+        )
+        there = _CQos.qos_to_cqos(policies)
+        try:
+            address = ctypes.cast(there, ctypes.c_void_p).value or 0
+            found = [raw.announced(address) for _ in range(2000)]
+        finally:
+            _CQos.delete_cqos(there)
+        return {(one.name, one.user_data, one.deadline_ns, one.partitions) for one in found}
+
+    with ThreadPoolExecutor(4) as threads:
+        for number, found in enumerate(threads.map(read, range(4))):
+            partitions = (f"first{number}", f"second{number}")
+            assert found == {(f"peer{number}", f"typehash={number};".encode(), number + 1, partitions)}
+
+
+def test_what_is_read_of_policies_is_freed(monkeypatch: pytest.MonkeyPatch) -> None:
+    freed: list[Any] = []
+    free = _CQos.free
+
+    def counted(what: Any) -> None:
+        freed.append(bool(what))
+        free(what)
+
+    monkeypatch.setattr(_CQos, "free", counted)
+    through_dds(Qos(Policy.EntityName("a"), Policy.Userdata(b"b"), Policy.Partition(["c", "d"])))
+    assert freed == [True] * 5  # the name, the data, the partitions and their list
+
+
+def test_policies_that_are_not_announced() -> None:
+    assert through_dds(Qos()) == raw.Announced("", b"", False, 0, INFINITE_NS, INFINITE_NS, 0, INFINITE_NS, False, ())
+
+
 @given(QOS)
 @STEADY
 def test_policies_are_read_as_they_are_written(qos: EndpointQos) -> None:
     wanted = replace(qos, durability=min(qos.durability, 1), liveliness=0, lease_ns=INFINITE_NS, type_hash="RIHS01_1")
-    assert read_qos(to_policies(wanted, depth=3, writer=True)) == wanted
+    assert read_qos(through_dds(to_policies(wanted, depth=3, writer=True))) == wanted
 
 
 def test_policies_of_others() -> None:
@@ -116,7 +169,7 @@ def test_policies_of_others() -> None:
         Policy.Partition(["a", "b"]),
         Policy.Userdata(b"serviceid=1.2;"),
     )
-    qos = read_qos(policies)
+    qos = read_qos(through_dds(policies))
     assert (qos.reliable, qos.durability, qos.liveliness, qos.lease_ns, qos.deadline_ns) == (False, 3, 2, 10**9, 5)
     assert qos.partitions == ("a", "b") and qos.service_id == "1.2"
     assert mismatches(qos, EndpointQos()) == ["partition"]
