@@ -1,8 +1,10 @@
 """DDS types made at run time from message definitions, so that peers which compare types find the real ones."""
 
+from collections import OrderedDict
 from collections.abc import Callable
 from types import new_class
 from typing import Any, Final
+from weakref import WeakValueDictionary
 
 from cyclonedds.idl import IdlStruct
 from cyclonedds.idl import types as idl
@@ -21,6 +23,7 @@ MAX_BOUND: Final = 0xFFFF
 _STRING: Final[Any] = idl.bounded_str
 _ARRAY: Final[Any] = idl.array
 _SEQUENCE: Final[Any] = idl.sequence
+_Key = tuple[int, str, bool]  # id of the store, type, with a request's header or not
 _BASE: Final[dict[str, Any]] = {
     "bool": bool,
     "byte": idl.byte,
@@ -44,36 +47,51 @@ REQUEST_HEADER: Final[Fielddefs] = [
 """What rmw_cyclonedds puts before the fields of a request or response."""
 
 
+KEPT_TYPES: Final = 64
+"""The types made last, which are kept when nobody uses them: 1 MB for the largest definition. The others go."""
+
+
 class TypeMaker:
-    """Makes and keeps the DDS types of one endpoint."""
+    """Makes the DDS types of one endpoint. While one is in use, its definition has no other."""
 
     def __init__(self) -> None:
-        self._made: dict[tuple[int, str, bool], Any] = {}
+        self._made: WeakValueDictionary[_Key, Any] = WeakValueDictionary()
+        self._newest: OrderedDict[_Key, Any] = OrderedDict()
+
+    def __len__(self) -> int:
+        """How many there are, with the types in them."""
+        return len(self._made)
 
     def make(self, resolved: ResolvedType, *, header: bool = False) -> Any:
         """The class of a ROS type; with `header`, of a request or response of rmw_cyclonedds.
 
         ConfigError for a type that DDS cannot have.
         """
-        if header:
-            fields = [*REQUEST_HEADER, *resolved.store.fielddefs[resolved.name][1]]
-            return self._struct(resolved.store, resolved.name, fields, header=True)
-        return self._of(resolved.store, resolved.name)
+        fields = resolved.store.fielddefs[resolved.name][1]
+        made = self._struct(
+            resolved.store, resolved.name, [*REQUEST_HEADER, *fields] if header else fields, header=header
+        )
+        key = id(resolved.store), resolved.name, header
+        self._newest[key] = made
+        self._newest.move_to_end(key)
+        if len(self._newest) > KEPT_TYPES:
+            self._newest.popitem(last=False)
+        return made
 
     def _of(self, store: Typestore, name: str) -> Any:
         return self._struct(store, name, store.fielddefs[name][1], header=False)
 
     def _struct(self, store: Typestore, name: str, fields: Fielddefs, *, header: bool) -> Any:
         key = id(store), name, header
-        if key not in self._made:
+        made: Any = self._made.get(key)
+        if made is None:
             hints = {field: self._field(store, name, desc) for field, desc in fields}
             fill: Callable[[dict[str, Any]], None] = lambda namespace: namespace.update(__annotations__=hints)  # noqa: E731
             kwds = {"typename": type_to_dds(name)}
-            # The store is kept with its types: a later one must not get its id.
             made = new_class(name.rpartition("/")[2] + "_", (IdlStruct,), kwds, fill)
+            made._sern_store = store  # lasts as long as its types: a later one must not get its id
             self._made[key] = made
-            self._made[id(store), "", False] = store
-        return self._made[key]
+        return made
 
     def _field(self, store: Typestore, owner: str, desc: FieldDesc) -> Any:
         if desc[0] == Nodetype.NAME:
