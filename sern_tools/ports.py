@@ -34,27 +34,30 @@ PORTS: Final[Sequence[int]] = own_ports()
 CLAIMS: Final = 128
 """How many of the last claims of a process hold; by then the owners of those before listen, or have ended."""
 
-_claims: Final[deque[socket.socket]] = deque()
+_claims: Final[dict[int, deque[socket.socket]]] = {}
 
 
-def claim(name: str) -> bool:
-    """Whether `name` is this process's now: no other process, and no earlier call here, holds a claim to it."""
+def claim(name: str, last: int = CLAIMS) -> bool:
+    """Whether `name` is this process's now: no other process, and no earlier call here, holds a claim to it. Of names
+    that are claimed with the same `last`, so many of the last claims hold."""
     held = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
     try:
         held.bind(f"\0sern-claim-{name}")
     except OSError:
         held.close()
         return False
-    _claims.append(held)
-    if len(_claims) > CLAIMS:
-        _claims.popleft().close()
+    claims = _claims.setdefault(last, deque())
+    claims.append(held)
+    if len(claims) > last:
+        claims.popleft().close()
     return True
 
 
 def release_claims() -> None:
     """Let others have everything that this process claimed."""
-    while _claims:
-        _claims.popleft().close()
+    for claims in _claims.values():
+        while claims:
+            claims.popleft().close()
 
 
 def free_ports(count: int) -> list[int]:

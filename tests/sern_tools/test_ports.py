@@ -4,7 +4,6 @@ import os
 import socket
 import subprocess
 import sys
-from collections import deque
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -18,7 +17,7 @@ NAME = f"tests-{os.getpid()}"
 
 @pytest.fixture(autouse=True)
 def own_claims(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    monkeypatch.setattr(ports, "_claims", deque())
+    monkeypatch.setattr(ports, "_claims", {})
     yield
     ports.release_claims()
 
@@ -33,10 +32,10 @@ def test_a_claim_holds_in_this_process_and_in_others_until_it_is_released() -> N
     assert ports.claim(f"{NAME}-one") and ports.claim(f"{NAME}-two"), "claims end with their process"
 
 
-def test_the_oldest_claims_end_first(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ports, "CLAIMS", 2)
-    assert all(ports.claim(f"{NAME}-{number}") for number in range(3))
-    assert ports.claim(f"{NAME}-0") and not ports.claim(f"{NAME}-2")
+def test_the_oldest_claims_end_first() -> None:
+    assert all(ports.claim(f"{NAME}-{number}", 2) for number in range(3))
+    assert ports.claim(f"{NAME}-other"), "claims of another number are others"
+    assert ports.claim(f"{NAME}-0", 2) and not ports.claim(f"{NAME}-2", 2)
 
 
 @pytest.mark.parametrize(
