@@ -58,8 +58,8 @@ class Unheard:
         self._last_s = now
         if self._unread_s > UNREAD_S:
             raise WireError(
-                f"the peer went on sending for {UNREAD_S:g} s and read none of the {self.said} reports of drops that it "
-                f"was told, of {self.reports} in all"
+                f"the peer went on sending for {UNREAD_S:g} s and read none of the {self.said} reports of drops that "
+                f"it was told, of {self.reports} in all"
             )
 
 
