@@ -139,6 +139,33 @@ def test_what_others_report_does_not_end_the_session_of_an_origin(monkeypatch: p
     world.relay.hub.validate()
 
 
+def test_what_makes_room_newest_first_is_one_run() -> None:
+    reader = Hostile(World(), "reader")
+    robot, urgent = Hostile(reader.world, "robot"), Hostile(reader.world, "urgent")
+    robot.announce(1, "/robot/log", reliable=True, priority=PriorityClass.BULK)
+    urgent.announce(1, "/urgent/state", reliable=True)
+    reader.control({"t": "subscribe", "patterns": [".*"], "more": False})
+    reader.port.disconnected(now=reader.now)
+    hub = reader.hub
+    rule = AccessRule(client=".*", publish=(".*",), subscribe=(".*",), max_queue_bytes=300 * 257)
+    hub.revoke(AccessTable([rule]), now=robot.now)
+    for seq in range(1, 301):
+        robot.say(_whole(1, seq))
+    robot.port.disconnected(now=robot.now)
+    urgent.now = robot.now
+    for seq in range(1, 201):
+        urgent.say(_whole(1, seq))
+        urgent.now += 0.02
+    (log,) = (each for each in hub.links[reader.name].channels.values() if each.stream.id.topic == "/robot/log")
+    assert log.kept == 100
+    (stream,) = hub.links[robot.name].streams.values()
+    assert len(stream.reports) == 1
+    report = stream.reports.first(runs=True)
+    assert report is not None
+    assert (report.seq, report.count, report.reason) == (101, 200, DropReason.QUEUE_FULL)
+    hub.validate()
+
+
 def test_what_several_will_not_get_is_reported_once_above_the_limit(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(drop_reports, "MAX_REPORTS", 10)
     world = World()
