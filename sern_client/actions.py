@@ -282,11 +282,15 @@ class GoalWatch:
         self._arm()
         return goal
 
-    def send_dropped(self, stream: StreamId, seq: int, reason: DropReason) -> None:
-        """A message of ours was dropped, here or on its way."""
-        found = self._by_message.get((stream, seq))
-        if found is not None:
-            action, goal = found
+    def send_dropped(self, stream: StreamId, first: int, count: int, reason: DropReason) -> None:
+        """Messages of ours, `count` from seq `first` on, were dropped, here or on their way."""
+        watched = self._by_message
+        if count <= len(watched):
+            keys = [key for seq in range(first, first + count) if (key := (stream, seq)) in watched]
+        else:
+            keys = [key for key in watched if key[0] == stream and first <= key[1] < first + count]
+        for key in keys:
+            action, goal = watched[key]
             self._fail_soon(action, goal, f"it was dropped on its way: {reason}")
 
     # What comes in

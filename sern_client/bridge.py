@@ -585,22 +585,24 @@ class Bridge:
             source.audience_changed()
         self.endpoint.interest(local, source.wanted)
 
-    def send_dropped(self, stream: StreamInfo, seq: int, reason: DropReason, where: str) -> None:
+    def send_dropped(self, stream: StreamInfo, first: int, count: int, reason: DropReason, where: str) -> None:
         found = self._by_stream.get(stream.id)
         if found is not None and found[1].source is not None:
             found[1].source.lost(stream.id)
         if self.services is not None:
-            self.services.send_dropped(stream, seq, reason)
+            self.services.send_dropped(stream, first, count, reason)
         if self.goals is not None:
-            self.goals.send_dropped(stream.id, seq, reason)
+            self.goals.send_dropped(stream.id, first, count, reason)
         if not stream.spec.reliable or self._closed:  # what is left at the end was said in one line
             return
+        one = count == 1
+        which = f"message {first}" if one else f"messages {first} to {first + count - 1}"
         if reason is DropReason.UNWANTED:  # who wanted it has left or unsubscribed: counted, and no loss to anybody
-            _log.debug("%s: nobody wants our reliable message %d any more", stream.id.topic, seq)
-        elif where:
-            _log.warning("%s: our reliable message %d was dropped for %s: %s", stream.id.topic, seq, where, reason)
+            _log.debug("%s: nobody wants our reliable %s any more", stream.id.topic, which)
         else:
-            _log.warning("%s: our reliable message %d was dropped here: %s", stream.id.topic, seq, reason)
+            place = f"for {where}" if where else "here"
+            verb = "was" if one else "were"
+            _log.warning("%s: our reliable %s %s dropped %s: %s", stream.id.topic, which, verb, place, reason)
 
     def publication_refused(self, stream: StreamInfo, code: str, text: str) -> None:
         self.refusals += 1

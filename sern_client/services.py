@@ -200,15 +200,24 @@ class ServiceBridge:
         if used is not None and used.offer.id.origin == stream.id.origin:  # nobody else answers for it
             self._replied(used, message.body)
 
-    def send_dropped(self, stream: StreamInfo, seq: int, reason: DropReason) -> None:
-        """A message of ours was dropped, here or on its way: if it was a call, nobody will answer it."""
+    def send_dropped(self, stream: StreamInfo, first: int, count: int, reason: DropReason) -> None:
+        """Messages of ours, `count` from seq `first` on, were dropped, here or on their way: what was a call, nobody
+        will answer."""
         used = self._calling.get(stream.id)
-        number = None if used is None else used.numbers.pop(seq, None)
-        if used is None or number is None or reason is DropReason.UNWANTED:
-            return  # unwanted by another site of the same name than the one that offers it, which will answer
-        future = used.waiting.get(number)
-        if future is not None and not future.done():
-            future.set_exception(ServiceError(f"the call of {used.name} was dropped on its way: {reason}"))
+        if used is None:
+            return
+        numbers = used.numbers
+        if count <= len(numbers):
+            dropped = [seq for seq in range(first, first + count) if seq in numbers]
+        else:
+            dropped = [seq for seq in numbers if first <= seq < first + count]
+        for seq in dropped:
+            number = numbers.pop(seq)
+            future = used.waiting.get(number)
+            if reason is DropReason.UNWANTED:
+                continue  # by another site of the same name than the one that offers it, which will answer
+            if future is not None and not future.done():
+                future.set_exception(ServiceError(f"the call of {used.name} was dropped on its way: {reason}"))
 
     async def stop(self) -> None:
         """Withdraw what is served here, end the calls that others have under way."""

@@ -242,7 +242,7 @@ def decode_want(envelope: wire.Envelope) -> Want:
 
 def encode_dropped(channel: int, seq: int, code: int, where: str, count: int = 1) -> wire.Envelope:
     """The envelope that says that `count` messages from `seq` on were dropped; more than one only to a peer that
-    understands runs."""
+    understands runs. `where`: the client that will not get them, empty: several."""
     envelope: wire.Envelope = {"t": "dropped", "ch": channel, "seq": seq, "code": code, "to": where, "n": count}
     if count == 1:
         del envelope["n"]

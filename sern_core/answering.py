@@ -52,6 +52,7 @@ class Answering(Session):
     def _begin_answers(self) -> None:
         """A session has begun: nothing was said in it."""
         self._interest.begin()
+        self.reassembly.unheard.begin()
         self._reporting.clear()
         self._owed_parts.clear()
         self._owed_unfinished = 0
@@ -66,8 +67,7 @@ class Answering(Session):
     def _expect_answer(self, stream: InStream, slot: int) -> None:
         """The peer has announced a stream: it waits for an answer, whatever it was told before, and for reports."""
         self._interest.forget(slot)
-        for report in stream.reports:
-            report.control_seq = 0
+        stream.reports.unsay()
         if stream.reports:
             self._reporting[stream] = None
             self._unsaid = True
@@ -105,7 +105,7 @@ class Answering(Session):
     ) -> None:
         """Tell the origin's side that reliable messages, `count` from `seq` on, were dropped here or further on: before
         the watermark passes them, and again in the next session until it is known there."""
-        stream.report(seq, reason, where, count)
+        stream.reports.add(seq, reason, where, count)
         if stream.channel_id is not None:
             self._reporting[stream] = None
             self._unsaid = self.dirty = True
@@ -115,12 +115,13 @@ class Answering(Session):
         retained = self._control.retained
         for stream in list(self._reporting):
             slot = stream.channel_id
-            while slot is not None and (report := stream.unsaid(runs=self._interest.batches)) is not None:
+            reports, runs = stream.reports, self._interest.batches
+            while slot is not None and (report := reports.first(runs=runs)) is not None:
                 if len(retained) >= MAX_REPORTS_UNHEARD:
                     return
                 code = DROP_CODES[report.reason]
                 envelope = encode_dropped(slot, report.seq, code, report.where, report.count)
-                report.control_seq = self.send_control(envelope, now=now)
+                reports.say(report, self.send_control(envelope, now=now))
             del self._reporting[stream]
 
     # --- from the peer ------------------------------------------------------------------------------------------------

@@ -63,8 +63,9 @@ class ClientEvents(Protocol):
     def skipped(self, stream: StreamInfo, count: int) -> None:
         """`count` messages of a reliable stream were given up before this site was told of it again."""
 
-    def send_dropped(self, stream: StreamInfo, seq: int, reason: DropReason, where: str) -> None:
-        """A message of ours was dropped: here (`where` is empty), or further on for the client `where`."""
+    def send_dropped(self, stream: StreamInfo, first: int, count: int, reason: DropReason, where: str) -> None:
+        """Messages of ours, `count` from seq `first` on, were dropped: here (`where` is empty), or further on for the
+        client `where`. There may be 100,000 of them: nothing is to be done for each."""
 
     def wanted(self, stream: StreamInfo, wanted: bool) -> None:
         """Whether anybody at the far side wants a stream of ours; said again after every change."""
@@ -471,8 +472,7 @@ class ClientCore:
         self.trace.record(link.now, stream.stream.id.topic, TraceEvent.DROPPED, reason=reason, peer=link.peer)
 
     def on_out_drop(self, link: Link, channel: OutChannel, out: OutMessage, reason: DropReason, count: int) -> None:
-        for seq in range(out.seq, out.seq + count):
-            self._tell(self.events.send_dropped, channel.stream, seq, reason, out.lost_to)
+        self._tell(self.events.send_dropped, channel.stream, out.seq, count, reason, out.lost_to)
 
     def on_delivered(self, link: Link, channel: OutChannel, *, now: float) -> None:
         """The ledger has counted it."""

@@ -8,12 +8,12 @@ new process and everything is sent again.
 """
 
 from bisect import bisect_right
-from collections import OrderedDict, deque
+from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from heapq import heappop, heappush
-from itertools import islice
 from typing import Final
 
+from sern_core.drop_reports import DropReports, Unheard
 from sern_core.errors import WireError
 from sern_core.message import Message, StreamInfo
 from sern_core.types import DROP_CODES, DROP_REASONS, DropReason, PriorityClass
@@ -33,11 +33,6 @@ PIECES_PAID: Final = 16
 """Pieces are charged for so many at a time."""
 HELD_OVERHEAD_BYTES: Final = 512
 """What a half-received or waiting message costs beside its body: without it, small ones could fill the memory."""
-MAX_REPORTS: Final = 16_384
-"""Reports of drops that one peer has not heard of; one that goes on sending reliable messages then is not read. What is
-behind it is kept at its end."""
-MERGED_REPORTS: Final = 8
-"""Latest reports of a stream that one more drop may belong to: of so many subscribers the runs are found."""
 SLICE_US: Final = 6000
 """What reading may cost before others get their turn, in microseconds as they are charged here and by the owner."""
 TURN_US: Final = 4
@@ -156,10 +151,10 @@ class Partial:
 class Reassembly:
     """Memory that half-received and waiting messages of one link may hold in all, and how much is to be reported."""
 
-    __slots__ = ("behind", "held_bytes", "holders", "latest", "limit_bytes", "reports", "work_us")
+    __slots__ = ("behind", "held_bytes", "holders", "latest", "limit_bytes", "unheard", "work_us")
 
     def __init__(self, limit_bytes: int) -> None:
-        self.reports = 0  # drop reports that the peer has not heard, of all streams
+        self.unheard = Unheard()
         self.limit_bytes = limit_bytes
         self.held_bytes = 0
         self.holders: OrderedDict[InStream, None] = OrderedDict()
@@ -189,20 +184,6 @@ class Reassembly:
         self.holders.pop(stream, None)
         if self.latest is stream:
             self.latest = None
-
-
-class DropReport:
-    """Reliable messages, `count` from `seq` on, dropped here or further on, of which the peer must know before its
-    watermark passes them."""
-
-    __slots__ = ("control_seq", "count", "reason", "seq", "where")
-
-    def __init__(self, seq: int, reason: DropReason, where: str, count: int = 1) -> None:
-        self.seq = seq
-        self.count = count
-        self.reason = reason
-        self.where = where
-        self.control_seq = 0  # the control message of the session that carries it; 0: none yet
 
 
 Deliver = Callable[["InStream", Message], None]
@@ -237,7 +218,7 @@ class InStream:
         self.paused = False  # it was not wanted, and the peer has not said yet where it goes on
         self.pause_seq = 0  # the control message of the session that said so
         self.known = False  # something has had its turn, or an earlier session announced it: a gap is then a gap
-        self.reports: deque[DropReport] = deque()  # drops that the peer may not know of yet
+        self.reports = DropReports(reassembly.unheard)  # drops that the peer may not know of yet
         self._seen = 0  # best effort: bit i set when seq delivered-1-i arrived
         self._partials: dict[int, Partial] = {}  # best effort: untouched for longest first
         self._lowest = 0  # no half-received message has a seq below it
@@ -338,43 +319,9 @@ class InStream:
                 )
             )
 
-    def report(self, seq: int, reason: DropReason, where: str, count: int = 1) -> None:
-        """The peer is to hear that `count` messages from `seq` on were dropped; runs that meet are one report until it
-        is on its way."""
-        for report in islice(reversed(self.reports), MERGED_REPORTS):
-            if report.control_seq:
-                break
-            if report.seq + report.count == seq and report.reason is reason and report.where == where:
-                report.count += count
-                return
-        self.reports.append(DropReport(seq, reason, where, count))
-        self._reassembly.reports += 1
-
-    def unsaid(self, *, runs: bool) -> DropReport | None:
-        """The first report that is not on its way yet; without `runs`, of one message."""
-        for index, report in enumerate(self.reports):
-            if report.control_seq == 0:
-                if report.count > 1 and not runs:
-                    first = DropReport(report.seq, report.reason, report.where)
-                    report.seq += 1
-                    report.count -= 1
-                    self.reports.insert(index, first)
-                    self._reassembly.reports += 1
-                    return first
-                return report
-        return None
-
-    def heard(self, control_seq: int) -> bool:
-        """The peer has the control messages up to this one. Returns whether it knows of all drops."""
-        reports = self.reports
-        while reports and 0 < reports[0].control_seq <= control_seq:
-            reports.popleft()
-            self._reassembly.reports -= 1
-        return not reports
-
     def _check_heard(self) -> None:
-        if self._reassembly.reports > MAX_REPORTS and self.channel_id is not None:  # not of the control stream
-            raise WireError(f"the peer goes on sending and does not read {self._reassembly.reports} reports of drops")
+        if self.channel_id is not None:  # not of the control stream
+            self._reassembly.unheard.check(self._now)
 
     def _pay(self, seq: int, partial: Partial) -> bool:
         """Take the pieces of a message into account. False: there was no room for them, and it is lost."""
@@ -398,7 +345,8 @@ class InStream:
         if not self.reliable:
             self._on_drop(self, reason, nbytes, (seq,), False)
             return
-        self._check_heard()
+        if self._reassembly.unheard.crowded:
+            self._check_heard()
         self._on_drop(self, reason, nbytes, (seq,), True)
         self._arrived(self.tombstone(seq, reason, 0, now))
 
@@ -457,7 +405,7 @@ class InStream:
                 self._lowest = min(self._partials, default=0)
             self._turn(message)
             return
-        if self._reassembly.reports > MAX_REPORTS:
+        if self._reassembly.unheard.crowded:
             self._check_heard()
         if seq == self.delivered + 1:
             self.delivered = seq
@@ -545,7 +493,6 @@ class InStream:
     def close(self) -> None:
         """The stream ends."""
         self.forget(DropReason.DISCONNECTED)
-        self._reassembly.reports -= len(self.reports)
         self.reports.clear()
 
     def forget(self, reason: DropReason) -> None:
@@ -583,4 +530,5 @@ class InStream:
         check(behind or self.delivered + 1 not in self._waiting, f"{name}: a message waits for nothing")
         check(behind or not (self._stale or self._first), f"{name}: it was to go on at {self._first}")
         check(not self._partials.keys() & self._waiting.keys(), f"{name}: a whole message is half-received as well")
+        self.reports.validate(check, name)
         check(self.confirmed <= self.delivered, f"{name}: more was confirmed than had its turn")

@@ -368,6 +368,6 @@ class Hop(Sender):
             if channel.watermark > watermark:
                 self._watermark_moved(channel)
         for stream in self.incoming.values():
-            stream.heard(self._control.watermark)
+            stream.reports.heard(self._control.watermark)
             if 0 < stream.pause_seq <= self._control.watermark:
                 stream.forget(DropReason.UNWANTED)

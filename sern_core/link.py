@@ -57,6 +57,8 @@ MAX_TRACED: Final = 100
 """The most of one run of dropped messages that the trace of decisions has."""
 MAX_UNHEARD: Final = 20_000
 """Control messages that a peer may have answered, beside four for each channel, before it reads an answer."""
+SEVERAL: Final = "several clients"
+"""Who will not get a message when the report of its drop names nobody; it is no client's name."""
 
 
 P = ParamSpec("P")
@@ -626,7 +628,7 @@ class Link(Answering):
     def _about_channel(self, kind: str, channel: OutChannel, envelope: wire.Envelope, now: float) -> None:
         if kind == "dropped":
             reason = DROP_REASONS.get(wire.take_int(envelope, "code"), DropReason.LOST)
-            where = wire.take_str(envelope, "to", max_length=64, default="")
+            where = wire.take_str(envelope, "to", max_length=64, default="") or SEVERAL
             self.reassembly.work_us += len(channel.retained) // RETAINED_PER_US
             count = wire.take_int(envelope, "n", low=1, high=wire.MAX_SEQ, default=1)
             self.reassembly.work_us += channel.reported(wire.take_int(envelope, "seq"), reason, where, count)
@@ -710,6 +712,9 @@ class Link(Answering):
         check(self.reassembly.held_bytes == held_bytes, "reassembly bytes do not add up")
         for stream in self.streams.values():
             stream.validate(check)
+        unheard, reports = self.reassembly.unheard, [stream.reports for stream in self.streams.values()]
+        check(unheard.reports == sum(map(len, reports)), "reports of drops do not add up")
+        check(unheard.said == sum(each.said for each in reports), "reports of drops that were said do not add up")
         for lane in self.lanes.values():
             lane.flight.validate(check)
         self.scheduler.validate()

@@ -537,7 +537,7 @@ class Sender(ABC):
 
     def _put_watermarks(self, frames: list[bytes], items: list[SentData | SentWatermark | SentPing], size: int) -> int:
         for slot in list(self._watermarks)[:MAX_WATERMARKS]:
-            if not self.incoming[slot].heard(self._control.watermark):
+            if not self.incoming[slot].reports.heard(self._control.watermark):
                 continue  # of drops first: behind the watermark it would take them for delivered
             frames.append(wire.encode_watermark(slot, self._watermarks.pop(slot)))
             items.append(SentWatermark(slot))

@@ -368,6 +368,7 @@ class Session(Hop):
             stream.channel_id = None
             stream.known = True
             stream.pause_seq = 0
+            stream.reports.unsay()
         self.incoming.clear()
         self._watermarks.clear()
         self._unread.clear()

@@ -165,12 +165,12 @@ class RelayDaemon:
     def _known(self, client: ClientName) -> bool:
         return self.directory is None or client in self.directory.names
 
-    def _admits(self, client: ClientName, public_key: str) -> bool:
-        """Whether what comes over a connection that was made with this key is taken."""
+    def _key_status(self, client: ClientName, public_key: str) -> KeyStatus:
+        """Whether what comes over a connection that was made with this key is taken: if it is VALID."""
         if self.directory is None:
-            return True
+            return KeyStatus.VALID
         match = self.directory.lookup(public_key, at_s=time.time())
-        return match.status is KeyStatus.VALID and match.name == client
+        return match.status if match.name == client else KeyStatus.UNKNOWN
 
     async def start(self) -> None:
         self.errors.watch(asyncio.get_running_loop())
@@ -195,7 +195,7 @@ class RelayDaemon:
                 relay.listen,
                 keys,
                 ZAP_DOMAIN,
-                admits=self._admits,
+                key_status=self._key_status,
                 heartbeat_timeout_s=model.link.heartbeat_timeout_s,
                 handshake_interval_s=relay.handshake_interval_s,
                 max_connections=relay.max_connections,

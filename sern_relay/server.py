@@ -17,7 +17,7 @@ from sern_relay.express import JOIN, Joined, RelayExpress
 from sern_runtime import clock
 from sern_runtime.dscp import Marks
 from sern_runtime.inflow import Inflow
-from sern_runtime.keys import parse_user_id
+from sern_runtime.keys import KeyStatus, parse_user_id
 from sern_runtime.monitor import Connection, ConnectionTable, TcpHandle
 from sern_runtime.pump import LANE_MESSAGE_BYTES, Pump
 from sern_runtime.zmq_socket import CurvePair, RouterSocket, SendResult, make_server
@@ -30,6 +30,12 @@ SILENT_INTERVALS: Final = 2.0
 right after it."""
 MAX_TOLD: Final = 1024
 """Clients of which is logged, once each, that they have too many connections."""
+REFUSED_KEY: Final = {
+    KeyStatus.UNKNOWN: "is revoked",
+    KeyStatus.EXPIRED: "has expired",
+    KeyStatus.NOT_YET: "is not valid yet",
+}
+"""What the log says of a key that was let in and does not hold any more."""
 
 _log = logging.getLogger(__name__)
 
@@ -51,9 +57,9 @@ class Session:
 class RelayServer:
     """Binds the listeners and joins them to `hub`. Without `keys` clients are who their HELLO says they are.
 
-    `admits(name, key)` is asked when a connection first speaks: its key may have been revoked since it was let in. The
-    key is that of its handshake, which the User-Id carries; empty without `keys`. `after` is called whenever something
-    came in.
+    `key_status(name, key)` is asked when a connection first speaks: its key may not hold any more since it was let in.
+    The key is that of its handshake, which the User-Id carries; empty without `keys`. `after` is called whenever
+    something came in.
     """
 
     def __init__(
@@ -64,7 +70,7 @@ class RelayServer:
         keys: CurvePair | None,
         zap_domain: str,
         *,
-        admits: Callable[[ClientName, str], bool],
+        key_status: Callable[[ClientName, str], KeyStatus],
         heartbeat_timeout_s: float,
         handshake_interval_s: float,
         max_connections: int,
@@ -82,7 +88,7 @@ class RelayServer:
         """Connections that were cut because nothing was said on them."""
         self._silent_s = SILENT_INTERVALS * handshake_interval_s
         self._told: set[ClientName] = set()
-        self._admits = admits
+        self._key_status = key_status
         self._marks = marks or Marks()
         self._insecure = keys is None
         self._after = after
@@ -181,9 +187,10 @@ class RelayServer:
             _log.warning("connection from %s closed: bad frame: %s", details.address, error)
             self.connections.cut(details.fd)
             return None
-        if not self._admits(name, key):
+        status = self._key_status(name, key)
+        if status is not KeyStatus.VALID:
             self.revoked += 1
-            _log.warning("connection from %s closed: the key of %s is revoked", details.address, name)
+            _log.warning("connection from %s closed: the key of %s %s", details.address, name, REFUSED_KEY[status])
             self.connections.cut(details.fd)
             return None
         self.connections.bind_user(details.fd, name)

@@ -286,7 +286,7 @@ class Listener:
     def skipped(self, stream: StreamInfo, count: int) -> None:
         self._printer.lost(stream, count, "given up before we were told of them")
 
-    def send_dropped(self, stream: StreamInfo, seq: int, reason: DropReason, where: str) -> None:
+    def send_dropped(self, stream: StreamInfo, first: int, count: int, reason: DropReason, where: str) -> None:
         """We send nothing."""
 
     def wanted(self, stream: StreamInfo, wanted: bool) -> None:

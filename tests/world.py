@@ -265,8 +265,8 @@ class SimClient:
         self.turns[stream.id].append(-count)
         self.skipped_count[stream.id.topic] += count
 
-    def send_dropped(self, stream: StreamInfo, seq: int, reason: DropReason, where: str) -> None:
-        self.dropped_out.append(Dropped(stream.id.topic, seq, reason, where))
+    def send_dropped(self, stream: StreamInfo, first: int, count: int, reason: DropReason, where: str) -> None:
+        self.dropped_out += [Dropped(stream.id.topic, seq, reason, where) for seq in range(first, first + count)]
 
     def wanted(self, stream: StreamInfo, wanted: bool) -> None:
         self.wants[stream.id.topic].append(wanted)

@@ -158,7 +158,7 @@ class End:
 
     def skipped(self, stream: StreamInfo, count: int) -> None: ...
 
-    def send_dropped(self, stream: StreamInfo, seq: int, reason: DropReason, where: str) -> None:
+    def send_dropped(self, stream: StreamInfo, first: int, count: int, reason: DropReason, where: str) -> None:
         """The link's counters have it."""
 
     def wanted(self, stream: StreamInfo, wanted: bool) -> None:

@@ -88,7 +88,7 @@ async def wants_what_is_no_topic(topics: int) -> Callable[[], None]:
 async def drops_one(topics: int) -> Callable[[], None]:
     robot = Robot(topics)
     last = robot.stream(f"/robot/t{topics - 1}")
-    return lambda: robot.bridge.send_dropped(last, 1, DropReason.UNWANTED, "")
+    return lambda: robot.bridge.send_dropped(last, 1, 1, DropReason.UNWANTED, "")
 
 
 async def asks_the_endpoint(topics: int) -> Callable[[], None]:
@@ -160,7 +160,7 @@ async def test_a_topic_that_has_ended_is_not_wanted_and_begins_anew() -> None:
     before = robot.interested()
     robot.bridge.wanted(stream, False)
     robot.bridge.wanted(summary.channel.stream, False)
-    robot.bridge.send_dropped(summary.channel.stream, 1, DropReason.UNWANTED, "")
+    robot.bridge.send_dropped(summary.channel.stream, 1, 1, DropReason.UNWANTED, "")
     assert robot.interested() == before and robot.bridge._by_stream.keys() == {
         channel.stream.id for channel in robot.core.link.channels.values()
     }

@@ -5,7 +5,8 @@ from pathlib import Path
 import pytest
 import zmq
 
-from sern_runtime.keys import load_secret
+from sern_core.types import ClientName
+from sern_runtime.keys import PublicKey, PublicKeys, load_public, load_secret, write_public
 from sern_runtime.monitor import ConnectionTable
 from tests.daemons import Lab
 from tests.loopback.test_security import DEAD_ENDS, Stranger, hello
@@ -15,6 +16,22 @@ from tests.support import until
 def local(lab: Lab) -> None:
     """Relay and clients meet at a path of this machine."""
     lab.endpoint = f"ipc://{lab.directory}/relay.ipc"
+
+
+def changed(lab: Lab, change: str) -> None:
+    """The key of robot2 is removed, replaced, given to another, ended or put off."""
+    file = lab.clients_dir / "robot2.pub"
+    (known,) = load_public(file).keys
+    if change == "removed":
+        file.unlink()
+    elif change == "replaced":
+        lab.make_keys("robot2")
+    elif change == "given to another":
+        file.unlink()
+        write_public(lab.clients_dir / "robot3.pub", PublicKeys(ClientName("robot3"), (known,)))
+    else:
+        window = PublicKey(known.key, not_after_s=1e9) if change == "ended" else PublicKey(known.key, not_before_s=4e9)
+        write_public(file, PublicKeys(ClientName("robot2"), (window,)), replace=True)
 
 
 async def test_a_replaced_key_is_cut_off_over_ipc_and_comes_back_when_it_is_put_back(
@@ -43,9 +60,15 @@ async def test_a_replaced_key_is_cut_off_over_ipc_and_comes_back_when_it_is_put_
 
 
 @pytest.mark.parametrize("ipc", [True, False], ids=["ipc", "tcp"])
-@pytest.mark.parametrize("removed", [True, False], ids=["removed", "replaced"])
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ("removed", "is revoked"), ("replaced", "is revoked"), ("given to another", "is revoked"),
+        ("ended", "has expired"), ("put off", "is not valid yet"),
+    ],
+)  # fmt: skip
 async def test_a_connection_that_outlives_its_key_is_not_heard(
-    tmp_path: Path, ipc: bool, removed: bool, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    tmp_path: Path, ipc: bool, change: str, said: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Nothing can end it here: what it says is refused by its key, and said once."""
     async with Lab(tmp_path, "robot2") as lab:
@@ -58,10 +81,7 @@ async def test_a_connection_that_outlives_its_key_is_not_heard(
             await until(lambda: zmq.Event.HANDSHAKE_SUCCEEDED in silent.events, "admitted by its key, that holds")
             with monkeypatch.context() as patch:
                 patch.setattr(ConnectionTable, "cut_user", lambda _table, _user: 0)
-                if removed:
-                    (lab.clients_dir / "robot2.pub").unlink()
-                else:
-                    lab.make_keys("robot2")
+                changed(lab, change)
                 relay.reload()
             assert zmq.Event.DISCONNECTED not in silent.events
             messages = server.socket.messages
@@ -71,5 +91,5 @@ async def test_a_connection_that_outlives_its_key_is_not_heard(
             assert server.socket.messages > messages
             assert server._sessions == {} and silent.received == []
             assert server.revoked == 1
-            assert caplog.text.count("the key of robot2 is revoked") == 1
+            assert caplog.text.count(f"the key of robot2 {said}") == 1
         await lab.end(relay)

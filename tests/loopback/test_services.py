@@ -141,9 +141,35 @@ async def test_a_call_that_another_site_does_not_want_is_still_answered(
         await until(called.is_set, "the robot has the call")
         calls = services.used[GLOBAL].calls
         assert calls is not None
-        services.send_dropped(calls.stream, calls.next_seq - 1, DropReason.UNWANTED)
+        services.send_dropped(calls.stream, calls.next_seq - 1, 1, DropReason.UNWANTED)
         go.set()
         assert await call == b"re: mine"
+
+
+@pytest.mark.parametrize("count", [1, 2, 2**61])
+async def test_a_call_in_a_run_of_messages_that_is_dropped_has_failed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, count: int
+) -> None:
+    called, never = asyncio.Event(), asyncio.Event()
+
+    async def wait(request: bytes) -> bytes:
+        called.set()
+        await never.wait()
+        return request
+
+    async with offered(tmp_path, monkeypatch) as (sites, handler):
+        sites.robot.answer = wait
+        services = bridge(sites.site_daemon)
+        call = asyncio.ensure_future(handler(b"mine"))
+        await until(called.is_set, "the robot has the call")
+        calls = services.used[GLOBAL].calls
+        assert calls is not None
+        services.send_dropped(calls.stream, calls.next_seq, count, DropReason.RETENTION)
+        assert services.used[GLOBAL].numbers
+        services.send_dropped(calls.stream, calls.next_seq - 1, count, DropReason.RETENTION)
+        with pytest.raises(ServiceError, match="dropped on its way: retention"):
+            await call
+        assert not services.used[GLOBAL].numbers
 
 
 async def test_a_service_that_does_not_answer_is_an_error_in_time(

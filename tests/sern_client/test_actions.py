@@ -1,5 +1,6 @@
 """Goals that nobody will answer: what their clients are told."""
 
+import asyncio
 import struct
 from collections.abc import AsyncIterator, Callable
 from functools import partial
@@ -177,9 +178,23 @@ async def test_a_goal_that_is_dropped_on_its_way(site: Site) -> None:
     site.server_appears()
     seq = site.channel.next_seq
     assert site.give(goal_body(), 1)
-    site.watch.send_dropped(site.channel.stream.id, seq + 1, DropReason.LIFESPAN)
-    site.watch.send_dropped(site.channel.stream.id, seq, DropReason.LIFESPAN)
-    site.watch.send_dropped(site.channel.stream.id, seq, DropReason.LIFESPAN)
+    site.watch.send_dropped(site.channel.stream.id, seq + 1, 1, DropReason.LIFESPAN)
+    site.watch.send_dropped(site.channel.stream.id, seq, 1, DropReason.LIFESPAN)
+    site.watch.send_dropped(site.channel.stream.id, seq, 1, DropReason.LIFESPAN)
+    await site.told(REJECTED, "dropped on its way: lifespan")
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 2**61])
+async def test_a_run_of_messages_that_is_dropped_takes_its_goals(site: Site, count: int) -> None:
+    site.server_appears()
+    other = site.channel.stream.id._replace(topic=TopicName("/other/goal"))
+    first = site.channel.next_seq
+    assert site.give(goal_body(), 1)
+    site.watch.send_dropped(other, first, count, DropReason.LIFESPAN)
+    site.watch.send_dropped(site.channel.stream.id, first + 1, count, DropReason.LIFESPAN)
+    await asyncio.sleep(0)
+    assert site.watch.watched == 1 and not site.results
+    site.watch.send_dropped(site.channel.stream.id, max(1, first - count + 1), count, DropReason.LIFESPAN)
     await site.told(REJECTED, "dropped on its way: lifespan")
 
 
@@ -310,7 +325,7 @@ async def test_a_goal_with_a_result_is_done_and_what_is_no_goal_is_let_through(s
     site.watch.message(RESULT.name, Encoding.ROS1, b"\0")
     site.watch.message(STATUS.name, Encoding.ROS1, b"\0")
     site.watch.message(RESULT.name, Encoding.ROS1, result_for(IDENT.text))
-    site.watch.send_dropped(site.channel.stream.id, seq, DropReason.LIFESPAN)
+    site.watch.send_dropped(site.channel.stream.id, seq, 1, DropReason.LIFESPAN)
     site.accepts = False
     site.give(goal_body(GoalId(0, 0, "another")), 1)
     await until(lambda: site.results, "the next is told of")
@@ -325,7 +340,7 @@ async def test_a_goal_that_is_given_again_is_watched_in_place_of_the_one_before(
         site.give(goal_body(), 1)
     assert site.watch.watched == 1
     site.watch.message(RESULT.name, Encoding.ROS1, result_for(IDENT.text))
-    site.watch.send_dropped(site.channel.stream.id, seq, DropReason.LIFESPAN)
+    site.watch.send_dropped(site.channel.stream.id, seq, 1, DropReason.LIFESPAN)
     assert site.watch.watched == 0 and site.results == []
 
 
@@ -348,7 +363,7 @@ async def test_a_goal_behind_one_that_was_refused_is_watched(site: Site) -> None
     assert give(goal_body(later), 1)
     await site.told(REJECTED, "too much waits for the link")
     assert site.watch.watched == 1
-    site.watch.send_dropped(site.channel.stream.id, seq, DropReason.LIFESPAN)
+    site.watch.send_dropped(site.channel.stream.id, seq, 1, DropReason.LIFESPAN)
     await until(lambda: len(site.results) == 2, "the client is told of the second one")
     assert "dropped on its way" in result_of(site.results[1]).status.text
     assert site.cancels == [IDENT.pack(), later.pack()] and site.watch.watched == 0
@@ -359,7 +374,7 @@ async def test_clients_that_are_gone_are_told_nothing(site: Site) -> None:
     seq = site.channel.next_seq
     site.give(goal_body(), 1)
     site.watch.withdrawn(GOAL.name)
-    site.watch.send_dropped(site.channel.stream.id, seq, DropReason.LIFESPAN)
+    site.watch.send_dropped(site.channel.stream.id, seq, 1, DropReason.LIFESPAN)
     site.accepts = False
     site.give(goal_body(GoalId(0, 0, "another")), 1)
     await until(lambda: site.results, "the next is told of")
