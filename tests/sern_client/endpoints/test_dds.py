@@ -420,7 +420,7 @@ def test_a_writer_that_is_gone_has_no_readers_to_name() -> None:
 
 def test_a_writer_is_deleted_on_the_thread_that_may_wait() -> None:
     """However quick that thread is: deleting waits for slow readers, and the event loop must not."""
-    from sern_client.endpoints.dds.endpoint import _Writer
+    from sern_client.endpoints.dds.entities import Writer
 
     deleted_on: list[str] = []
 
@@ -429,14 +429,14 @@ def test_a_writer_is_deleted_on_the_thread_that_may_wait() -> None:
             deleted_on.append(threading.current_thread().name)
 
     class Endpoint:
-        def close_writer(self, writer: _Writer, kept: list[Any]) -> None:
+        def close_writer(self, writer: Writer, kept: list[Any]) -> None:
             worker = threading.Thread(target=kept.clear, name="worker")
             worker.start()
             worker.join()
 
     endpoint: Any = Endpoint()
     entity: Any = Entity()
-    writer = _Writer(endpoint, entity, UUID(int=1), stamped=False)
+    writer = Writer(endpoint, entity, UUID(int=1), stamped=False)
     del entity
     writer.close()
     assert deleted_on == ["worker"]
