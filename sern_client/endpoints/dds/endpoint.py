@@ -10,6 +10,7 @@ import logging
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Final, TypeVar
 from uuid import UUID
@@ -43,6 +44,7 @@ from sern_client.endpoints.dds.qos import (
     mismatches,
     reader_for,
     to_policies,
+    within_reach,
     writer_for,
 )
 from sern_client.endpoints.dds.raw import INFINITE_NS
@@ -129,6 +131,8 @@ class DdsEndpoint:
         self._announced: dict[TopicName, TopicInfo] = {}
         self._subscriptions: dict[TopicName, list[Subscription]] = {}
         self._readers: dict[UUID, Reader] = {}
+        self._leaving: dict[UUID, Reader] = {}
+        """Readers that are closed and have not ended."""
         self._writers: dict[UUID, Writer] = {}
         self._streams: list[Stream] = []
         self._ending: list[FirstMessages] = []  # of streams that are closed
@@ -182,6 +186,8 @@ class DdsEndpoint:
             writer.close()
         self._events = None
         await self._joined.worker.stop()
+        for guid in list(self._leaving):
+            self._reader_ended(guid)
         self._info_writer = None
         self._topics.clear()
         # Leaving tells everybody, which may take a moment.
@@ -377,10 +383,14 @@ class DdsEndpoint:
     def close_reader(self, reader: Reader, number: int) -> None:
         if self._readers.pop(reader.guid, None) is None:
             return
-        self.counters.overrun += reader.dropped
+        self._leaving[reader.guid] = reader
         self.graph.local_removed(reader.guid)
-        self._alive().worker.unwatch(number)
+        self._alive().worker.unwatch(number, partial(self._reader_ended, reader.guid))
         self._info_changed()
+
+    def _reader_ended(self, guid: UUID) -> None:
+        """All that it received is delivered or dropped."""
+        self.counters.overrun += self._leaving.pop(guid).dropped
 
     def close_writer(self, writer: Writer, kept: list[DataWriter[Any]]) -> None:
         """`kept` holds its entity, which is deleted on the worker's thread."""
@@ -438,7 +448,9 @@ class DdsEndpoint:
 
     def overruns(self) -> int:
         """Messages dropped because the event loop was too slow, of all readers there are and were."""
-        return self.counters.overrun + sum(reader.dropped for reader in self._readers.values())
+        return self.counters.overrun + sum(
+            reader.dropped for readers in (self._readers, self._leaving) for reader in readers.values()
+        )
 
     def say_once(self, line: str) -> None:
         """What a person has to know and do something about; each line once."""
@@ -495,7 +507,8 @@ class DdsEndpoint:
             except ConfigError as error:
                 self.say_once(f"{name} of {self.graph.owner(writer)} is left alone: {error}")
                 continue
-            offered = [other.qos for other in writers if other.type_name == writer.type_name]
+            every = [other.qos for other in writers if other.type_name == writer.type_name]
+            offered = within_reach(every) or every
             common = reader_for(offered)
             lifespan_ns = max(offer.lifespan_ns for offer in offered)
             deadline_ns = max(offer.deadline_ns for offer in offered)

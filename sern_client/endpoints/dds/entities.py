@@ -8,8 +8,8 @@ from cyclonedds.pub import DataWriter
 from cyclonedds.sub import DataReader
 
 from sern_client.endpoints.base import Sink
-from sern_client.endpoints.dds import raw
-from sern_client.endpoints.dds.qos import EndpointQos, mismatches, reader_for
+from sern_client.endpoints.dds import names, raw
+from sern_client.endpoints.dds.qos import EndpointQos, mismatches, reader_for, within_reach
 from sern_client.endpoints.dds.worker import Inbox, Sample
 from sern_client.endpoints.first import Readers
 from sern_core.message import TopicInfo
@@ -33,16 +33,23 @@ class Subscription:
         self.wanted = True
 
     def refresh(self) -> None:
-        """Have a reader that matches all writers there are now, or none while nobody wants the topic."""
+        """Have a reader that matches all writers there are now that it can, or none while nobody wants the topic.
+
+        What the reader before it has received is delivered.
+        """
         if self.closed:
             return
         if not self.wanted and not self.info.latched:
-            self._drop()
+            self._drop(rest=True)
             return
-        writers = [writer.qos for writer in self._endpoint.graph.writers(self.dds_topic)]
+        type_name = names.type_to_dds(self.info.type_name)
+        offers = [
+            writer.qos for writer in self._endpoint.graph.writers(self.dds_topic) if writer.type_name == type_name
+        ]
+        writers = within_reach(offers, exclusive=self._reader is not None and self._reader.qos.exclusive)
         if self._reader is not None and not any(mismatches(offer, self._reader.qos) for offer in writers):
             return
-        self._drop()
+        self._drop(rest=True)
         asked = replace(reader_for(writers), type_hash=self.info.type_hash)
         resolved = ros_types.resolve(self.info.type_name, self.info.definition, Encoding.CDR)
         self._reader = self._endpoint.open_reader(self.dds_topic, resolved, asked, self._deliver)
@@ -62,15 +69,15 @@ class Subscription:
         if not self._sink(sample.body, sample.stamp_ns):
             self._endpoint.counters.refused += 1
 
-    def _drop(self) -> None:
+    def _drop(self, *, rest: bool) -> None:
         if self._reader is not None:
-            self._reader.close()
+            self._reader.close(rest=rest)
             self._reader = None
 
     def close(self) -> None:
         if not self.closed:
             self.closed = True
-            self._drop()
+            self._drop(rest=False)
             self._endpoint.forget(self)
 
 
@@ -96,8 +103,9 @@ class Reader:
     def dropped(self) -> int:
         return self._inbox.dropped
 
-    def close(self) -> None:
-        self._inbox.closed = True
+    def close(self, *, rest: bool = False) -> None:
+        """With `rest`, what it has received is still delivered."""
+        self._inbox.closed = not rest
         self._entity = None  # the worker is the last to hold it, and lets go on its own thread
         self._endpoint.close_reader(self, self._number)
 

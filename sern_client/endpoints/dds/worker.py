@@ -26,6 +26,8 @@ from sern_runtime.ros_types import one_line
 
 TAKE_AT_ONCE: Final = 64
 """Samples taken from one reader before the next has its turn."""
+LAST_TAKES: Final = 16
+"""How often a reader is taken from before it is let go: all that it holds, but not for as long as its writers go on."""
 MAX_FAULTS_SAID: Final = 10
 _WAKE, _PARTICIPANTS, _WRITERS, _READERS, _FIRST = 1, 2, 3, 4, 5
 
@@ -110,12 +112,22 @@ class Worker:
         self._do(begin)
         return number
 
-    def unwatch(self, number: int) -> None:
-        """Let go of a reader, which is deleted on this worker's thread unless somebody else holds it."""
+    def unwatch(self, number: int, ended: Callable[[], None]) -> None:
+        """Let go of a reader, which is deleted on this worker's thread unless somebody else holds it.
+
+        What it has received is taken first, unless its inbox is closed. `ended` is called on the event loop when no
+        more comes, but not after `stop`.
+        """
 
         def end() -> None:
             self._waiter.detach(number)
-            self._inboxes.pop(number, None)
+            try:
+                for _ in range(LAST_TAKES):
+                    if self._take(number) < TAKE_AT_ONCE:
+                        break
+            finally:
+                del self._inboxes[number]
+                self._hand_over(ended)
 
         self._do(end)
 
@@ -181,7 +193,7 @@ class Worker:
         self._inboxes.clear()
         self._jobs.clear()
 
-    def _try(self, step: Callable[[], None]) -> None:
+    def _try(self, step: Callable[[], object]) -> None:
         """What one peer says or one reader does must not end the thread for all."""
         try:
             step()
@@ -227,13 +239,15 @@ class Worker:
             partial(self._events.remote_added, Remote(found.key, participant, writer, topic, type_name, qos, handle))
         )
 
-    def _take(self, number: int) -> None:
+    def _take(self, number: int) -> int:
+        """Take from a reader what its inbox is open for. How many samples there were."""
         entry = self._inboxes.get(number)
-        if entry is None:
-            return
+        if entry is None or entry[1].closed:
+            return 0
         reader, inbox = entry
         added = False
-        for body, info in raw.take(reader, TAKE_AT_ONCE):
+        taken = raw.take(reader, TAKE_AT_ONCE)
+        for body, info in taken:
             if not info.valid_data:
                 continue
             if info.publication_handle not in self._known_writers:
@@ -254,6 +268,7 @@ class Worker:
             inbox.dropped += 1
         if added:
             self._hand_over(inbox)
+        return len(taken)
 
     def _hand_over(self, item: Inbox | Callable[[], None]) -> None:
         self._ready.append(item)
