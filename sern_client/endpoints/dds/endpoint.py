@@ -92,7 +92,8 @@ class DdsOptions:
 class DdsCounters:
     """Messages by fate. Dropped: the event loop was too slow (`overrun`), slow reliable readers left a writer no room
     (`blocked`), too many calls of a service were under way (`calls`), or what came was no call (`unreadable`). What the
-    link did not take (`refused`), the link counts. `closed`: given to a writer that is no more."""
+    link did not take (`refused`), the link counts. `closed`: given to a writer that is no more. `faults` of the thread
+    that waits for DDS are of those that were; `DdsEndpoint.faults` has all."""
 
     received: int = 0
     overrun: int = 0
@@ -102,6 +103,7 @@ class DdsCounters:
     calls: int = 0
     unreadable: int = 0
     closed: int = 0
+    faults: int = 0
 
 
 @dataclass(slots=True)
@@ -191,6 +193,7 @@ class DdsEndpoint:
         self._info_writer = None
         self._topics.clear()
         # Leaving tells everybody, which may take a moment.
+        self.counters.faults += self._joined.worker.faults
         left = [self._joined]
         self._joined = None
         await asyncio.get_running_loop().run_in_executor(None, left.clear)
@@ -441,10 +444,15 @@ class DdsEndpoint:
         """Messages dropped between this domain's nodes and us, by reason."""
         counted = {
             DropReason.QUEUE_FULL: self.overruns() + self.counters.blocked + self.counters.calls,
-            DropReason.UNDECODABLE: self.counters.unreadable,
+            DropReason.UNDECODABLE: self.counters.unreadable + self.faults,
             DropReason.DISCONNECTED: self.counters.closed,
         }
         return {reason: count for reason, count in (Counter(counted) + self._first_dropped).items() if count}
+
+    @property
+    def faults(self) -> int:
+        """What others announced and nobody could read, and readers that DDS would not give."""
+        return self.counters.faults + (0 if self._joined is None else self._joined.worker.faults)
 
     def overruns(self) -> int:
         """Messages dropped because the event loop was too slow, of all readers there are and were."""
@@ -540,7 +548,7 @@ class DdsEndpoint:
 
     def _tell_nodes(self) -> None:
         self._info_due = False
-        if self._info_writer is None or self._joined is None:
+        if self._info_writer is None or self._events is None:
             return
         hidden = {self._info_writer.guid}
         writers = [guid for guid in self._writers if guid not in hidden]

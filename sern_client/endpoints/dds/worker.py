@@ -6,30 +6,26 @@ import threading
 from collections import deque
 from collections.abc import Callable
 from functools import partial
-from typing import Any, Final, NamedTuple, Protocol
-from uuid import UUID
+from typing import Any, Final, NamedTuple
 
 from cyclonedds.builtin import (
     BuiltinTopicDcpsParticipant,
     BuiltinTopicDcpsPublication,
     BuiltinTopicDcpsSubscription,
 )
-from cyclonedds.core import DDSException, GuardCondition, InstanceState
+from cyclonedds.core import DDSException, GuardCondition
 from cyclonedds.domain import DomainParticipant
 from cyclonedds.sub import DataReader
 
 from sern_client.endpoints.dds import raw
-from sern_client.endpoints.dds.graph import Participant, Remote
-from sern_client.endpoints.dds.names import SERN_KEY, read_user_data
-from sern_client.endpoints.dds.qos import read_qos
+from sern_client.endpoints.dds.discovery import PARTICIPANTS, READERS, WRITERS, Discovery, DiscoveryEvents
 from sern_runtime.ros_types import one_line
 
 TAKE_AT_ONCE: Final = 64
 """Samples taken from one reader before the next has its turn."""
 LAST_TAKES: Final = 16
 """How often a reader is taken from before it is let go: all that it holds, but not for as long as its writers go on."""
-MAX_FAULTS_SAID: Final = 10
-_WAKE, _PARTICIPANTS, _WRITERS, _READERS, _FIRST = 1, 2, 3, 4, 5
+_WAKE, _FIRST = 4, 5
 
 _log = logging.getLogger(__name__)
 
@@ -54,34 +50,22 @@ class Inbox:
         self.closed = False
 
 
-class DiscoveryEvents(Protocol):
-    """Told on the event loop, in the order in which DDS said it."""
-
-    def participant_added(self, participant: Participant) -> None: ...
-
-    def participant_removed(self, guid: UUID) -> None: ...
-
-    def remote_added(self, remote: Remote) -> None: ...
-
-    def remote_removed(self, guid: UUID) -> None: ...
-
-
 class Worker:
     """One thread for all readers of a participant. `stop` ends it."""
 
     def __init__(self, participant: DomainParticipant, events: DiscoveryEvents, *, max_buffer_bytes: int) -> None:
         self._loop = asyncio.get_running_loop()
-        self._events = events
         self._max_buffer_bytes = max_buffer_bytes
         self._guard = GuardCondition(participant)
         self._waiter = raw.Waiter(participant)
         self._waiter.attach(self._guard, _WAKE)
-        self._discovery = {
-            _PARTICIPANTS: raw.DiscoveryReader(participant, BuiltinTopicDcpsParticipant),
-            _WRITERS: raw.DiscoveryReader(participant, BuiltinTopicDcpsPublication),
-            _READERS: raw.DiscoveryReader(participant, BuiltinTopicDcpsSubscription),
+        readers = {
+            PARTICIPANTS: raw.DiscoveryReader(participant, BuiltinTopicDcpsParticipant),
+            WRITERS: raw.DiscoveryReader(participant, BuiltinTopicDcpsPublication),
+            READERS: raw.DiscoveryReader(participant, BuiltinTopicDcpsSubscription),
         }
-        for number, discovered in self._discovery.items():
+        self._discovery = Discovery(readers, events)
+        for number, discovered in readers.items():
             self._waiter.attach_reader(discovered.reader, number)
         self._inboxes: dict[int, tuple[DataReader[Any], Inbox]] = {}
         self._next = _FIRST
@@ -91,8 +75,7 @@ class Worker:
         # Each counter has one writer (thread, event loop), so what is buffered needs no lock.
         self._taken_bytes = 0
         self._done_bytes = 0
-        self._known_writers: set[int] = set()
-        self.faults = 0
+        self._faults = 0
         self._stopping = False
         self._thread = threading.Thread(target=self._run, name="sern-dds", daemon=True)
         self._thread.start()
@@ -140,6 +123,11 @@ class Worker:
         self._guard.set(True)
 
     @property
+    def faults(self) -> int:
+        """How many announcements could not be read, and how many readers could not be read from."""
+        return self._faults + self._discovery.unreadable
+
+    @property
     def alive(self) -> bool:
         """Whether the thread runs."""
         return self._thread.is_alive()
@@ -185,6 +173,8 @@ class Worker:
             while self._jobs:
                 self._try(self._jobs.popleft())
             for number in sorted(numbers):
+                if self._stopping:
+                    break
                 if number >= _FIRST:
                     self._try(partial(self._take, number))
                 elif number != _WAKE:
@@ -198,46 +188,19 @@ class Worker:
         try:
             step()
         except (DDSException, OSError, ValueError, TypeError, AttributeError) as error:
-            self._fault(error)
-
-    def _fault(self, error: Exception) -> None:
-        self.faults += 1
-        if self.faults <= MAX_FAULTS_SAID:
+            self._faults += 1
             _log.error("a fault in reading from DDS: %s", one_line(error), exc_info=error)
 
     def _discover(self, number: int) -> None:
-        while True:
-            try:
-                found = self._discovery[number].take()
-            except ValueError as error:
-                self._fault(error)  # the others are still to be taken
-                continue
-            if found is None:
-                return
-            alive = found.sample_info.instance_state == InstanceState.Alive
-            if number == _PARTICIPANTS:
-                self._participant(found, alive)
-            else:
-                self._endpoint(found, alive, writer=number == _WRITERS)
+        """What is left after one look makes the next wait a short one."""
+        try:
+            self._discovery.look(number)
+        finally:
+            self._tell_found()
 
-    def _participant(self, found: Any, alive: bool) -> None:
-        if not alive:
-            self._hand_over(partial(self._events.participant_removed, found.key))
-            return
-        sern = read_user_data(found.qos.user_data).get(SERN_KEY, "")
-        self._hand_over(partial(self._events.participant_added, Participant(found.key, found.qos.name, sern)))
-
-    def _endpoint(self, found: Any, alive: bool, *, writer: bool) -> None:
-        handle = int(found.sample_info.instance_handle)
-        if not alive:
-            self._known_writers.discard(handle)
-            self._hand_over(partial(self._events.remote_removed, found.key))
-            return
-        qos = read_qos(found.qos)
-        participant, topic, type_name = found.participant_key, found.topic_name, found.type_name
-        self._hand_over(
-            partial(self._events.remote_added, Remote(found.key, participant, writer, topic, type_name, qos, handle))
-        )
+    def _tell_found(self) -> None:
+        while self._discovery.found:
+            self._hand_over(self._discovery.found.popleft())
 
     def _take(self, number: int) -> int:
         """Take from a reader what its inbox is open for. How many samples there were."""
@@ -250,11 +213,8 @@ class Worker:
         for body, info in taken:
             if not info.valid_data:
                 continue
-            if info.publication_handle not in self._known_writers:
-                # A sample can be here before its writer was looked at: who speaks is to be known before what is said.
-                self._discover(_PARTICIPANTS)
-                self._discover(_WRITERS)
-                self._known_writers.add(info.publication_handle)
+            self._discovery.find_writer(info.publication_handle)
+            self._tell_found()
             inbox.samples.append(Sample(body, info.source_timestamp, info.publication_handle))
             self._taken_bytes += len(body)
             added = True
