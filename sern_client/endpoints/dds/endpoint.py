@@ -91,9 +91,9 @@ class DdsOptions:
 @dataclass(slots=True)
 class DdsCounters:
     """Messages by fate. Dropped: the event loop was too slow (`overrun`), slow reliable readers left a writer no room
-    (`blocked`), too many calls of a service were under way (`calls`), or what came was no call (`unreadable`). What the
-    link did not take (`refused`), the link counts. `closed`: given to a writer that is no more. `faults` of the thread
-    that waits for DDS are of those that were; `DdsEndpoint.faults` has all."""
+    (`blocked`), too many calls of a service were under way (`calls`), or what came was no call, or too long to be about
+    nodes (`unreadable`). What the link did not take (`refused`), the link counts. `closed`: given to a writer that is
+    no more. `faults` of the thread that waits for DDS are of those that were; `DdsEndpoint.faults` has all."""
 
     received: int = 0
     overrun: int = 0
@@ -508,12 +508,14 @@ class DdsEndpoint:
         for writer in writers:
             type_name = names.type_from_dds(writer.type_name)
             if type_name is None:
-                self.say_once(f"{name} has the type {writer.type_name}, which is not of ROS 2; it is left alone")
+                self.say_once(
+                    f"{name} has the type {names.cut(writer.type_name)}, which is not of ROS 2; it is left alone"
+                )
                 continue
             try:
                 text = self.types.message(type_name, writer.qos.type_hash)
             except ConfigError as error:
-                self.say_once(f"{name} of {self.graph.owner(writer)} is left alone: {error}")
+                self.say_once(f"{name} of {self.graph.owner(writer)} is left alone: {names.cut(str(error), 600)}")
                 continue
             every = [other.qos for other in writers if other.type_name == writer.type_name]
             offered = within_reach(every) or every
@@ -536,6 +538,9 @@ class DdsEndpoint:
     # Nodes
 
     def _heed_nodes(self, sample: Sample) -> None:
+        if len(sample.body) > node_info.MAX_BODY_BYTES:
+            self.counters.unreadable += 1
+            return
         found = node_info.decode(sample.body)
         if found is not None and found[0] != self.graph.own:
             self.graph.nodes_of(*found)

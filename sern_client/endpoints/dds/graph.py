@@ -12,12 +12,15 @@ from uuid import UUID
 
 from sern_client.endpoints.dds import names, qos
 from sern_client.endpoints.dds.names import Role, RosName
+from sern_client.endpoints.dds.node_info import Node
 from sern_client.endpoints.dds.qos import EndpointQos
 from sern_core.types import TopicName
 
 FAST_DDS: Final = b"\x01\x0f"
 """How the GUIDs of eProsima's DDS begin: their vendor id."""
 MAX_COMPLAINTS: Final = 1000
+MAX_EARLY_NODES: Final = 64
+"""Participants that are not known, and of whose nodes is kept what was said."""
 
 _log = logging.getLogger(__name__)
 
@@ -91,7 +94,10 @@ class Graph:
     """Handles of the writers whose samples are not to be taken."""
     complaints: dict[tuple[UUID, UUID], str] = field(default_factory=dict)
     """Who does not get, or give, what: by the two endpoints, in one line each."""
-    _nodes: dict[UUID, dict[UUID, str]] = field(default_factory=dict)
+    _nodes: dict[UUID, list[Node]] = field(default_factory=dict)
+    """Of each participant, as it was last said."""
+    _early_nodes: dict[UUID, list[Node]] = field(default_factory=dict)
+    """The same for participants that are not known yet, or never will be."""
     _of_participant: dict[UUID, dict[UUID, None]] = field(default_factory=dict)
     """Readers and writers, in the order in which they came."""
     _told: set[UUID] = field(default_factory=set)
@@ -106,6 +112,9 @@ class Graph:
     def participant_added(self, participant: Participant) -> None:
         """It came, or says something else of itself than before, which may change whose its readers and writers are."""
         self.participants[participant.guid] = participant
+        early = self._early_nodes.pop(participant.guid, None)
+        if early is not None:
+            self._nodes[participant.guid] = early
         mine = [self.remotes[guid] for guid in self._of_participant.get(participant.guid, ())]
         moved = [remote for remote in mine if self.foreign(remote) is not self._is_foreign(remote)]
         for remote in moved:
@@ -157,9 +166,15 @@ class Graph:
             del self._locals_on[local.topic]
         self._forget(guid)
 
-    def nodes_of(self, participant: UUID, nodes: Iterable[tuple[str, list[UUID]]]) -> None:
-        """What a participant says of its nodes: full names, and the readers and writers of each."""
-        self._nodes[participant] = {guid: name for name, guids in nodes for guid in guids}
+    def nodes_of(self, participant: UUID, nodes: list[Node]) -> None:
+        """What is said of a participant's nodes. Anybody can say it of any participant, known or invented."""
+        if participant in self.participants:
+            self._nodes[participant] = nodes
+            return
+        self._early_nodes.pop(participant, None)
+        self._early_nodes[participant] = nodes
+        if len(self._early_nodes) > MAX_EARLY_NODES:
+            del self._early_nodes[next(iter(self._early_nodes))]
 
     # What it amounts to
 
@@ -176,12 +191,12 @@ class Graph:
 
     def owner(self, remote: Remote) -> str:
         """Whose it is, in words: the node where that is known, else the participant."""
-        node = self._nodes.get(remote.participant, {}).get(remote.guid)
-        if node is not None:
-            return f"node {node}"
+        for node in self._nodes.get(remote.participant, ()):
+            if node.has(remote.guid):
+                return f"node {names.cut(node.name)}"
         participant = self.participants.get(remote.participant)
         name = participant.name if participant is not None and participant.name else "without a name"
-        return f"participant {name} ({remote.participant.hex[:24]})"
+        return f"participant {names.cut(name)} ({remote.participant.hex[:24]})"
 
     # In here
 
@@ -251,9 +266,9 @@ class Graph:
         mine, theirs = local.qos, remote.qos
         found = qos.mismatches(mine, theirs) if local.writer else qos.mismatches(theirs, mine)
         if remote.type_name != local.type_name:
-            found.insert(0, f"type ({remote.type_name} there, {local.type_name} here)")
+            found.insert(0, f"type ({names.cut(remote.type_name)} there, {local.type_name} here)")
         elif mine.type_hash and theirs.type_hash and mine.type_hash != theirs.type_hash:
-            found.insert(0, f"version of the type ({theirs.type_hash} there, {mine.type_hash} here)")
+            found.insert(0, f"version of the type ({names.cut(theirs.type_hash)} there, {mine.type_hash} here)")
         if not found or len(self.complaints) >= MAX_COMPLAINTS:
             return
         ros = names.from_dds(remote.topic)

@@ -19,10 +19,13 @@ from cyclonedds.sub import DataReader
 
 from sern_client.endpoints.dds import raw
 from sern_client.endpoints.dds.discovery import PARTICIPANTS, READERS, WRITERS, Discovery, DiscoveryEvents
+from sern_runtime.clock import now
 from sern_runtime.ros_types import one_line
 
 TAKE_AT_ONCE: Final = 64
 """Samples taken from one reader before the next has its turn."""
+SERVE_S: Final = 0.005
+"""How long the event loop is held by what the thread hands over before others have their turn."""
 LAST_TAKES: Final = 16
 """How often a reader is taken from before it is let go: all that it holds, but not for as long as its writers go on."""
 _WAKE, _FIRST = 4, 5
@@ -39,15 +42,25 @@ class Sample(NamedTuple):
 class Inbox:
     """What one reader has received and the event loop has not yet seen: bounded, the oldest go first.
 
-    The worker appends, the event loop drains; a deque needs no lock for that.
+    The worker appends, the event loop drains; a deque needs no lock for that. Samples are numbered; `came` is the last
+    number.
     """
 
     def __init__(self, depth: int, deliver: Callable[[Sample], None]) -> None:
         self.depth = depth
         self.deliver = deliver
-        self.samples: deque[Sample] = deque()
+        self.samples: deque[tuple[int, Sample]] = deque()
+        self.came = 0
         self.dropped = 0
         self.closed = False
+
+
+class Arrived(NamedTuple):
+    """An inbox, and the number of the last sample in it when this was handed over: what came later may be of a writer
+    that the event loop has not been told of."""
+
+    inbox: Inbox
+    last: int
 
 
 class Worker:
@@ -70,7 +83,7 @@ class Worker:
         self._inboxes: dict[int, tuple[DataReader[Any], Inbox]] = {}
         self._next = _FIRST
         self._jobs: deque[Callable[[], None]] = deque()
-        self._ready: deque[Inbox | Callable[[], None]] = deque()
+        self._ready: deque[Arrived | Callable[[], None]] = deque()
         self._drain_due = False
         # Each counter has one writer (thread, event loop), so what is buffered needs no lock.
         self._taken_bytes = 0
@@ -137,32 +150,45 @@ class Worker:
         self._stopping = True
         self._guard.set(True)
         await self._loop.run_in_executor(None, self._thread.join)
-        self._drain()
+        while self._ready:
+            self._drain()
 
     def _drain(self) -> None:
+        """Serve what is ready, for a few milliseconds; the rest after what else the event loop has to do."""
         self._drain_due = False
+        end_s = now() + SERVE_S
         try:
             for _ in range(len(self._ready)):  # what comes meanwhile has its own turn
-                item = self._ready.popleft()
-                if isinstance(item, Inbox):
-                    self._empty(item)
-                else:
+                item = self._ready[0]
+                if not isinstance(item, Arrived):
+                    self._ready.popleft()
                     item()
+                elif self._empty(*item, end_s):
+                    self._ready.popleft()
+                if now() >= end_s:
+                    break
         finally:
             # A fault in one of them is reported by the loop; the others must not wait for the next event.
             if self._ready and not self._drain_due and not self._stopping:
                 self._drain_due = True
                 self._loop.call_soon(self._drain)
 
-    def _empty(self, inbox: Inbox) -> None:
-        for _ in range(len(inbox.samples)):
+    def _empty(self, inbox: Inbox, last: int, end_s: float) -> bool:
+        """Deliver the samples up to number `last`, or until `end_s`. Whether none of them is left."""
+        while inbox.samples:
             try:
-                sample = inbox.samples.popleft()
+                number, sample = inbox.samples.popleft()
             except IndexError:
-                return  # the thread dropped it for a newer one
+                return True  # the thread dropped it for a newer one
+            if number > last:
+                inbox.samples.appendleft((number, sample))
+                return True
             self._done_bytes += len(sample.body)
             if not inbox.closed:
                 inbox.deliver(sample)
+            if number < last and now() >= end_s:
+                return False
+        return True
 
     # On the thread
 
@@ -215,22 +241,23 @@ class Worker:
                 continue
             self._discovery.find_writer(info.publication_handle)
             self._tell_found()
-            inbox.samples.append(Sample(body, info.source_timestamp, info.publication_handle))
+            inbox.came += 1
+            inbox.samples.append((inbox.came, Sample(body, info.source_timestamp, info.publication_handle)))
             self._taken_bytes += len(body)
             added = True
         while inbox.samples and (
             len(inbox.samples) > inbox.depth or self._taken_bytes - self._done_bytes > self._max_buffer_bytes
         ):
             try:
-                self._taken_bytes -= len(inbox.samples.popleft().body)
+                self._taken_bytes -= len(inbox.samples.popleft()[1].body)
             except IndexError:
                 break  # the event loop took the last one meanwhile
             inbox.dropped += 1
         if added:
-            self._hand_over(inbox)
+            self._hand_over(Arrived(inbox, inbox.came))
         return len(taken)
 
-    def _hand_over(self, item: Inbox | Callable[[], None]) -> None:
+    def _hand_over(self, item: Arrived | Callable[[], None]) -> None:
         self._ready.append(item)
         if not self._drain_due:
             self._drain_due = True

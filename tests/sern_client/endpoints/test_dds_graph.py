@@ -5,6 +5,7 @@ from dataclasses import replace
 from typing import Any
 from uuid import UUID
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -12,10 +13,12 @@ from hypothesis import strategies as st
 pytest.importorskip("cyclonedds", reason="the dds endpoint needs cyclonedds: pip install cyclonedds==11.0.1")
 
 from sern_client.endpoints.dds import node_info
-from sern_client.endpoints.dds.graph import Graph, Local, Participant, Remote
+from sern_client.endpoints.dds.graph import MAX_EARLY_NODES, Graph, Local, Participant, Remote
 from sern_client.endpoints.dds.names import RosName
+from sern_client.endpoints.dds.node_info import Node
 from sern_client.endpoints.dds.qos import EndpointQos
-from sern_core.types import TopicName
+from sern_core.types import Encoding, TopicName
+from sern_runtime import ros_types
 from tests.exploring import cases
 
 STEADY = settings(max_examples=cases(100))
@@ -65,7 +68,7 @@ def test_the_graph_counts_what_is_of_this_site(heed_sern: bool) -> None:
 def test_mismatches_are_said_once_and_forgotten_with_their_cause(caplog: pytest.LogCaptureFixture) -> None:
     graph = Graph(OWN, Heard())
     graph.participant_added(Participant(OTHER, "robot"))
-    graph.nodes_of(OTHER, [("/ns/talker", [UUID(int=11)])])
+    graph.nodes_of(OTHER, [Node("/ns/talker", UUID(int=11).bytes)])
     with caplog.at_level(logging.WARNING):
         graph.remote_added(remote(11))
         graph.local_added(Local(UUID(int=20), False, "rt/chat", STRING, EndpointQos(reliable=True)))
@@ -88,9 +91,126 @@ def test_mismatches_are_said_once_and_forgotten_with_their_cause(caplog: pytest.
 
 def test_node_information() -> None:
     body = node_info.encode(OWN, "sern", [UUID(int=5)], [UUID(int=6)])
-    assert node_info.decode(body) == (OWN, [("/sern", [UUID(int=5), UUID(int=6)])])
-    for length in range(len(body) - 4):
+    assert node_info.decode(body) == (OWN, [Node("/sern", UUID(int=5).bytes + UUID(int=6).bytes)])
+    for length in range(len(body)):
         assert node_info.decode(body[:length]) is None
+    assert node_info.decode(body + bytes(3)) is not None  # DDS pads
+    assert node_info.decode(body + bytes(4)) is None
+
+
+GUIDS = st.lists(st.uuids(), max_size=4)
+NAMES = st.text(st.characters(exclude_characters="\0", exclude_categories=["Cs"]), max_size=9)
+
+
+@given(participant=st.uuids(), nodes=st.lists(st.tuples(NAMES, NAMES, GUIDS, GUIDS), max_size=4))
+@STEADY
+def test_what_others_say_of_their_nodes(
+    participant: UUID, nodes: list[tuple[str, str, list[UUID], list[UUID]]]
+) -> None:
+    """As the serialiser writes it."""
+
+    def new(name: str, **fields: Any) -> Any:
+        return ros_types.new(f"rmw_dds_common/msg/{name}", Encoding.CDR, **fields)
+
+    def gid(guid: UUID) -> Any:
+        return new("Gid", data=np.frombuffer(guid.bytes, dtype="uint8"))
+
+    entities = [
+        new(
+            "NodeEntitiesInfo",
+            node_namespace=namespace,
+            node_name=name,
+            reader_gid_seq=[gid(guid) for guid in readers],
+            writer_gid_seq=[gid(guid) for guid in writers],
+        )
+        for namespace, name, readers, writers in nodes
+    ]
+    info = new("ParticipantEntitiesInfo", gid=gid(participant), node_entities_info_seq=entities)
+    found = node_info.decode(ros_types.serialise(info, node_info.TYPE, Encoding.CDR))
+    assert found is not None and found[0] == participant
+    assert [(node.name, node.gids) for node in found[1]] == [
+        (f"{namespace.rstrip('/')}/{name}", b"".join(guid.bytes for guid in (*readers, *writers)))
+        for namespace, name, readers, writers in nodes
+    ]
+    for node, (_, _, readers, writers) in zip(found[1], nodes, strict=True):
+        assert all(node.has(guid) for guid in readers + writers)
+
+
+def test_a_guid_is_found_at_its_place_only() -> None:
+    there = UUID(bytes=b"\1" * 16)
+    assert not Node("/n", b"\0" + b"\1" * 16 + b"\0" * 15).has(there)
+    assert Node("/n", b"\0" + b"\1" * 31 + b"\0" * 16).has(there)
+    assert not Node("/n", b"").has(there)
+
+
+def test_bodies_in_the_other_byte_order() -> None:
+    body = b"\0\0\0\0" + OTHER.bytes + (1).to_bytes(4, "big") + (3).to_bytes(4, "big") + b"/a\0" + b"\0"
+    body += (2).to_bytes(4, "big") + b"b\0" + bytes(2) + (1).to_bytes(4, "big") + SERN.bytes + bytes(4)
+    assert node_info.decode(body) == (OTHER, [Node("/a/b", SERN.bytes)])
+    assert node_info.decode(b"\0\1" + body[2:]) is None
+
+
+@given(st.binary(max_size=200))
+@STEADY
+def test_node_information_that_is_none(rest: bytes) -> None:
+    found = node_info.decode(b"\0\1\0\0" + OTHER.bytes + rest)
+    assert found is None or found[0] == OTHER
+
+
+def test_node_information_has_a_limit() -> None:
+    body = node_info.encode(OWN, "sern", [], [UUID(int=number) for number in range(4090)])
+    assert len(body) <= node_info.MAX_BODY_BYTES and node_info.decode(body) is not None
+    body = node_info.encode(OWN, "sern", [], [UUID(int=number) for number in range(4100)])
+    assert len(body) > node_info.MAX_BODY_BYTES and node_info.decode(body) is None
+
+
+def test_nodes_of_invented_participants_do_not_pile_up() -> None:
+    """Bodies may be earlier than their participants, so some are kept."""
+    graph = Graph(OWN, Heard())
+    graph.participant_added(Participant(OTHER, "robot"))
+    graph.nodes_of(OTHER, [Node("/known", UUID(int=11).bytes)])
+    graph.nodes_of(SERN, [Node("/early", UUID(int=12).bytes)])
+    graph.participant_added(Participant(SERN, "other"))
+    late = UUID(int=10_000)
+    for number in range(10_001 - 3 * MAX_EARLY_NODES, 10_001):
+        graph.nodes_of(UUID(int=number), [Node("/invented", UUID(int=13).bytes)])
+    assert len(graph._early_nodes) == MAX_EARLY_NODES and len(graph._nodes) == 2
+    graph.participant_added(Participant(late))
+    owners = [remote(11, OTHER), remote(12, SERN), remote(13, late), remote(13, UUID(int=9999))]
+    assert [graph.owner(one) for one in owners[:3]] == ["node /known", "node /early", "node /invented"]
+    assert graph.owner(owners[3]).startswith("participant without a name")
+    graph.participant_removed(OTHER)
+    assert graph.owner(remote(11, OTHER)).startswith("participant without a name")
+
+
+def test_what_is_said_of_peers_is_short(caplog: pytest.LogCaptureFixture) -> None:
+    long = "x" * 60_000
+    graph = Graph(OWN, Heard())
+    graph.participant_added(Participant(OTHER, long))
+    graph.local_added(Local(UUID(int=20), False, "rt/chat", STRING, EndpointQos(type_hash="a")))
+    graph.remote_added(remote(11, type_name=long))
+    graph.remote_added(remote(12, qos=EndpointQos(type_hash=long)))
+    graph.nodes_of(OTHER, [Node("/" + long, UUID(int=13).bytes)])
+    graph.remote_added(remote(13, type_name="T"))
+    assert len(graph.complaints) == 3 and max(map(len, graph.complaints.values())) < 700
+    assert max(map(len, caplog.messages)) < 700
+
+
+def test_a_participant_that_goes_tells_each_topic_once() -> None:
+    heard = Heard()
+    graph = Graph(OWN, heard)
+    graph.participant_added(Participant(OTHER, "robot"))
+    graph.participant_added(Participant(SERN, "other"))
+    for number in range(200):
+        graph.remote_added(remote(1000 + number, topic=f"rt/t{number % 2}"))
+    graph.remote_added(remote(5000, SERN, "rt/t0"))
+    for number, topic in enumerate(("rq/aRequest", "rr/aReply", "rr/bReply")):
+        graph.remote_added(remote(2000 + number, topic=topic, writer=topic.startswith("rr")))
+    heard.topics.clear()
+    heard.services.clear()
+    graph.participant_removed(OTHER)
+    assert heard.topics == ["/t0", "/t1"] and heard.services == ["/a", "/b"]
+    assert [one.guid for one in graph.writers("rt/t0")] == [UUID(int=5000)] and graph.writers("rt/t1") == []
 
 
 def test_a_participant_that_says_later_that_it_is_of_sern_is_believed() -> None:
