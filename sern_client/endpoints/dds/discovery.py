@@ -19,7 +19,7 @@ AT_ONCE: Final = 64
 """How many changes are taken from DDS in one call; each may have 64 kB of user data."""
 CALLS: Final = 4
 """How many calls are made before others have their turn."""
-MOST_ROUNDS: Final = 16
+MOST_ROUNDS: Final = 4
 """How often others wait until what they ask for is found: a flood of announcements must not hold them for ever."""
 
 
@@ -65,22 +65,23 @@ class Discovery:
                     self._participant(change)
             elif changes:
                 # Whose they are is to be known before they are: a SERN endpoint's writer is none of this site.
-                self._look_while(PARTICIPANTS, lambda: True)
+                self._look_until(PARTICIPANTS, lambda: False)
                 for change in changes:
                     self._endpoint(change, writer=number == WRITERS)
             if len(changes) + unreadable < AT_ONCE:
                 return False
         return True
 
-    def find_writer(self, handle: int) -> None:
-        """Find the writer with this handle, if it is new: who speaks is to be known before what is said."""
-        if handle not in self._writers:
-            self._look_while(WRITERS, lambda: handle not in self._writers)
+    def find_writer(self, handle: int) -> bool:
+        """Find the writer with this handle, if it is new: who speaks is to be known before what is said.
 
-    def _look_while(self, number: int, wanted: Callable[[], bool]) -> None:
-        for _ in range(MOST_ROUNDS):
-            if not self.look(number) or not wanted():
-                return
+        False when there are so many others that it was given up.
+        """
+        return handle in self._writers or self._look_until(WRITERS, lambda: handle in self._writers)
+
+    def _look_until(self, number: int, found: Callable[[], bool]) -> bool:
+        """Look until it is found or nothing is left; False when there was still more after `MOST_ROUNDS`."""
+        return any(not self.look(number) or found() for _ in range(MOST_ROUNDS))
 
     def _participant(self, change: Change) -> None:
         said = change.announced

@@ -203,7 +203,7 @@ class DiscoveryReader:
 
     def _change(self, address: int | None, info: Any) -> Change:
         """UnicodeDecodeError for a topic or type whose name is no text."""
-        sample = ctypes.cast(address, ctypes.POINTER(self._sample)).contents
+        sample = ctypes.cast(ctypes.c_void_p(address), ctypes.POINTER(self._sample)).contents
         guid = UUID(bytes=bytes(sample.key))
         if not info.valid_data or info.instance_state != InstanceState.Alive:
             return Change(guid, info.instance_handle, None, guid)  # of one that went only the key is there

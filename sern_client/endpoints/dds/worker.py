@@ -89,7 +89,7 @@ class Worker:
         self._taken_bytes = 0
         self._done_bytes = 0
         self._faults = 0
-        self._stopping = False
+        self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name="sern-dds", daemon=True)
         self._thread.start()
 
@@ -147,7 +147,7 @@ class Worker:
 
     async def stop(self) -> None:
         """Ends the thread; it has let go of all readers then."""
-        self._stopping = True
+        self._stopping.set()
         self._guard.set(True)
         await self._loop.run_in_executor(None, self._thread.join)
         while self._ready:
@@ -169,7 +169,7 @@ class Worker:
                     break
         finally:
             # A fault in one of them is reported by the loop; the others must not wait for the next event.
-            if self._ready and not self._drain_due and not self._stopping:
+            if self._ready and not self._drain_due and not self._stopping.is_set():
                 self._drain_due = True
                 self._loop.call_soon(self._drain)
 
@@ -193,13 +193,13 @@ class Worker:
     # On the thread
 
     def _run(self) -> None:
-        while not self._stopping:
+        while not self._stopping.is_set():
             numbers = self._waiter.wait()
             self._guard.take()
             while self._jobs:
                 self._try(self._jobs.popleft())
             for number in sorted(numbers):
-                if self._stopping:
+                if self._stopping.is_set():
                     break
                 if number >= _FIRST:
                     self._try(partial(self._take, number))
@@ -234,13 +234,14 @@ class Worker:
         if entry is None or entry[1].closed:
             return 0
         reader, inbox = entry
-        added = False
+        added, caught_up = False, True
         taken = raw.take(reader, TAKE_AT_ONCE)
         for body, info in taken:
             if not info.valid_data:
                 continue
-            self._discovery.find_writer(info.publication_handle)
-            self._tell_found()
+            if caught_up:
+                caught_up = self._discovery.find_writer(info.publication_handle)
+                self._tell_found()
             inbox.came += 1
             inbox.samples.append((inbox.came, Sample(body, info.source_timestamp, info.publication_handle)))
             self._taken_bytes += len(body)
@@ -264,4 +265,4 @@ class Worker:
             try:
                 self._loop.call_soon_threadsafe(self._drain)
             except RuntimeError:
-                self._stopping = True  # the loop is closed: nobody is left to hear it
+                self._stopping.set()  # the loop is closed: nobody is left to hear it

@@ -131,13 +131,13 @@ def test_one_look_has_an_end(discovery: Discovery, scripts: dict[int, Script], t
 
 def test_who_speaks_is_found_before_what_is_said(discovery: Discovery, scripts: dict[int, Script], told: Told) -> None:
     scripts[WRITERS].changes.extend(change(number) for number in range(AT_ONCE * CALLS + 5))
-    discovery.find_writer(AT_ONCE * CALLS + 2)
+    assert discovery.find_writer(AT_ONCE * CALLS + 2)
     tell(discovery)
     assert ("writer", UUID(int=AT_ONCE * CALLS + 2)) in told.what
     asked = scripts[WRITERS].asked
     discovery.find_writer(4)
     assert scripts[WRITERS].asked == asked  # known
-    discovery.find_writer(9999)
+    assert discovery.find_writer(9999)  # there is none, as far as DDS knows
     assert scripts[WRITERS].asked == asked + 1
     scripts[WRITERS].changes.append(change(4, here=False))
     discovery.look(WRITERS)
@@ -148,7 +148,7 @@ def test_who_speaks_is_found_before_what_is_said(discovery: Discovery, scripts: 
 def test_nobody_is_looked_for_without_end(discovery: Discovery, scripts: dict[int, Script]) -> None:
     endless = scripts[WRITERS]
     endless.unreadable = 10**9
-    discovery.find_writer(1)
+    assert not discovery.find_writer(1)
     assert endless.asked == CALLS * MOST_ROUNDS
 
 
@@ -174,7 +174,7 @@ def test_changes_are_read_as_the_binding_reads_them(participant: DomainParticipa
     topics = [Topic(participant, f"rt/t{number}", string_type()) for number in range(3)]
     policies = Qos(Policy.Reliability.Reliable(0), Policy.Deadline(10**9), Policy.Userdata(b"typehash=RIHS01_1;"))
     publisher = Publisher(participant, Qos(Policy.Partition(["a", "b"])))
-    used = [DataWriter(publisher, topic, policies) for topic in topics]
+    used: list[Any] = [DataWriter(publisher, topic, policies) for topic in topics]
     used += [DataReader(Subscriber(participant), topic, policies) for topic in topics[:2]]
     expected = {BUILTIN[0]: 1, BUILTIN[1]: 3, BUILTIN[2]: 2}
     for topic in BUILTIN:

@@ -9,12 +9,12 @@ import pytest
 
 pytest.importorskip("cyclonedds", reason="the dds endpoint needs cyclonedds: pip install cyclonedds==11.0.1")
 
-from sern_client.endpoints.base import AgingPublisher
 from sern_client.endpoints.dds import endpoint as module
 from sern_client.endpoints.dds.domain import DomainOptions
 from sern_client.endpoints.dds.endpoint import DdsEndpoint, DdsOptions
 from sern_client.endpoints.dds.graph import Remote
 from sern_client.endpoints.dds.qos import EndpointQos, mismatches, reader_for, within_reach
+from sern_client.endpoints.dds.stream import Stream
 from sern_core.types import Encoding, TopicName
 from sern_runtime.ros_types import topic_info
 from tests.peers.dds.peer import free_domain
@@ -72,7 +72,7 @@ class Pair:
         self.got.append(body)
         return True
 
-    async def connect(self) -> AgingPublisher:
+    async def connect(self) -> Stream:
         """Take /chat of `one` at `two`."""
         info = topic_info("/chat", "std_msgs/msg/String", Encoding.CDR, reliable=True)
         publisher = self.one.advertise(replace(info, depth=500))
