@@ -345,10 +345,10 @@ class DdsEndpoint:
         depth = depth or self.options.queue_depth
         policies = to_policies(qos, depth=max(depth, READER_HISTORY), writer=False, id_key=id_key)
         joined = self._alive()
-        ignored = self.graph.ignored
+        ignores = self.graph.ignores
 
         def checked(sample: Sample) -> None:
-            if header or sample.handle not in ignored:
+            if header or not ignores(sample.handle):
                 deliver(sample)
 
         entity = self._make(

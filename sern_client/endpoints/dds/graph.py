@@ -19,6 +19,7 @@ from sern_core.types import TopicName
 FAST_DDS: Final = b"\x01\x0f"
 """How the GUIDs of eProsima's DDS begin: their vendor id."""
 MAX_COMPLAINTS: Final = 1000
+MAX_IGNORED_BEFORE: Final = 1000
 MAX_EARLY_NODES: Final = 64
 """Participants that are not known, and of whose nodes is kept what was said."""
 
@@ -92,6 +93,8 @@ class Graph:
     locals: dict[UUID, Local] = field(default_factory=dict)
     ignored: set[int] = field(default_factory=set)
     """Handles of the writers whose samples are not to be taken."""
+    _ignored_before: dict[int, None] = field(default_factory=dict)
+    """Those that went last: what they wrote may still be on its way."""
     complaints: dict[tuple[UUID, UUID], str] = field(default_factory=dict)
     """Who does not get, or give, what: by the two endpoints, in one line each."""
     _nodes: dict[UUID, list[Node]] = field(default_factory=dict)
@@ -178,6 +181,10 @@ class Graph:
 
     # What it amounts to
 
+    def ignores(self, handle: int) -> bool:
+        """Whether samples of the writer with this handle are not to be taken, of one that has just gone too."""
+        return handle in self.ignored or handle in self._ignored_before
+
     def foreign(self, remote: Remote) -> bool:
         """Whether it counts as of this site, and not of a SERN endpoint that brings it from elsewhere."""
         return remote.guid in self._told
@@ -214,6 +221,7 @@ class Graph:
             if remote.writer:
                 self.ignored.add(remote.handle)
             return
+        self._ignored_before.pop(remote.handle, None)
         self._told.add(remote.guid)
         insort(self._on_topic.setdefault((remote.topic, remote.writer), []), remote, key=_by_guid)
         for local in self._locals_on.get(remote.topic, {}).values():
@@ -225,8 +233,11 @@ class Graph:
         del mine[guid]
         if not mine:
             del self._of_participant[remote.participant]
-        if remote.writer:
+        if remote.handle in self.ignored and remote.writer:
             self.ignored.discard(remote.handle)
+            self._ignored_before[remote.handle] = None
+            if len(self._ignored_before) > MAX_IGNORED_BEFORE:
+                del self._ignored_before[next(iter(self._ignored_before))]
         if guid not in self._told:
             return
         self._told.discard(guid)

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 pytest.importorskip("cyclonedds", reason="the dds endpoint needs cyclonedds: pip install cyclonedds==11.0.1")
 
 from sern_client.endpoints.dds import node_info
-from sern_client.endpoints.dds.graph import MAX_EARLY_NODES, Graph, Local, Participant, Remote
+from sern_client.endpoints.dds.graph import MAX_EARLY_NODES, MAX_IGNORED_BEFORE, Graph, Local, Participant, Remote
 from sern_client.endpoints.dds.names import RosName
 from sern_client.endpoints.dds.node_info import Node
 from sern_client.endpoints.dds.qos import EndpointQos
@@ -268,6 +268,26 @@ def test_a_writer_that_changes_its_policies_goes_and_comes_again() -> None:
     assert graph.complaints == {}
     graph.remote_added(remote(11, qos=EndpointQos(reliable=True)))
     assert seen == [[False], [], [True]]
+
+
+def test_the_last_words_of_a_writer_of_sern_are_not_taken_for_a_robots() -> None:
+    """DDS may tell that it went before it gives its last sample."""
+    graph = Graph(OWN, Heard())
+    graph.participant_added(Participant(SERN, "bridge", "sern_two"))
+    graph.remote_added(remote(12, SERN))
+    graph.remote_added(remote(11))
+    graph.remote_removed(UUID(int=12))
+    graph.remote_removed(UUID(int=11))
+    assert graph.ignores(12) and not graph.ignores(11) and graph.ignored == set()
+    graph.participant_added(Participant(SERN, "robot after all"))
+    graph.remote_added(remote(12, SERN))
+    assert not graph.ignores(12)
+    graph.participant_added(Participant(SERN, "bridge", "sern_two"))
+    for number in range(100, 101 + MAX_IGNORED_BEFORE):
+        graph.remote_added(remote(number, SERN))
+        graph.remote_removed(UUID(int=number))
+    assert graph.ignores(12) and not graph.ignores(100) and graph.ignores(101)
+    assert len(graph._ignored_before) == MAX_IGNORED_BEFORE
 
 
 class Network:
