@@ -103,6 +103,8 @@ class Graph:
     """The same for participants that are not known yet, or never will be."""
     _of_participant: dict[UUID, dict[UUID, None]] = field(default_factory=dict)
     """Readers and writers, in the order in which they came."""
+    _writers: dict[int, Remote] = field(default_factory=dict)
+    """By their handles."""
     _told: set[UUID] = field(default_factory=set)
     """Readers and writers that count as of this site: as such they are told when they go, whatever is true by then."""
     _on_topic: dict[tuple[str, bool], list[Remote]] = field(default_factory=dict)
@@ -196,6 +198,10 @@ class Graph:
     def readers(self, topic: str) -> list[Remote]:
         return list(self._on_topic.get((topic, False), ()))
 
+    def writer(self, handle: int) -> Remote | None:
+        """Whose samples are marked with this handle; None when it has gone."""
+        return self._writers.get(handle)
+
     def owner(self, remote: Remote) -> str:
         """Whose it is, in words: the node where that is known, else the participant."""
         for node in self._nodes.get(remote.participant, ()):
@@ -217,6 +223,8 @@ class Graph:
     def _put_in(self, remote: Remote) -> None:
         self.remotes[remote.guid] = remote
         self._of_participant.setdefault(remote.participant, {})[remote.guid] = None
+        if remote.writer:
+            self._writers[remote.handle] = remote
         if not self._is_foreign(remote):
             if remote.writer:
                 self.ignored.add(remote.handle)
@@ -233,6 +241,8 @@ class Graph:
         del mine[guid]
         if not mine:
             del self._of_participant[remote.participant]
+        if remote.writer:
+            self._writers.pop(remote.handle, None)
         if remote.handle in self.ignored and remote.writer:
             self.ignored.discard(remote.handle)
             self._ignored_before[remote.handle] = None

@@ -315,9 +315,7 @@ class DdsServices:
         return server
 
     def _asked(self, server: _Server, sample: Sample) -> None:
-        caller = next(
-            (r for r in self._endpoint.graph.remotes.values() if r.handle == sample.handle and r.writer), None
-        )
+        caller = self._endpoint.graph.writer(sample.handle)
         if caller is not None and not self._understood(server.info.name, caller):
             return
         try:

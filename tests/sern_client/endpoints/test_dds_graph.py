@@ -357,6 +357,8 @@ def test_in_whatever_order_discovery_tells_it(heed_sern: bool, acts: list[tuple[
         for topic in ("rt/t0", "rt/t1"):
             assert graph.writers(topic) == network.heard.get(topic, []) == network.expected(topic)
             shown += graph.writers(topic)
+        for one in network.remotes.values():
+            assert graph.writer(one.handle) == one
         assert graph.ignored == {one.handle for one in graph.remotes.values() if one not in shown}
         unreliable = {one.guid for one in shown if one.topic == "rt/t0" and not one.qos.reliable}
         assert {theirs for _, theirs in graph.complaints} == unreliable
@@ -364,5 +366,5 @@ def test_in_whatever_order_discovery_tells_it(heed_sern: bool, acts: list[tuple[
         network.act("no participant", participant, 0, 0)
     for number in (1, 2):
         graph.local_removed(UUID(int=number))
-    empty = ("_of_participant", "_told", "_on_topic", "_locals_on", "_complained", "complaints", "ignored")
+    empty = ("_writers", "_of_participant", "_told", "_on_topic", "_locals_on", "_complained", "complaints", "ignored")
     assert [name for name in empty if getattr(graph, name)] == []
