@@ -4,7 +4,7 @@ import asyncio
 import logging
 import threading
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import partial
 from typing import Any, Final, NamedTuple
 
@@ -224,6 +224,14 @@ class Worker:
         finally:
             self._tell_found()
 
+    def _find_writers(self, handles: Iterable[int]) -> None:
+        try:
+            for handle in handles:
+                if not self._discovery.find_writer(handle):
+                    break
+        finally:
+            self._tell_found()
+
     def _tell_found(self) -> None:
         while self._discovery.found:
             self._hand_over(self._discovery.found.popleft())
@@ -234,14 +242,12 @@ class Worker:
         if entry is None or entry[1].closed:
             return 0
         reader, inbox = entry
-        added, caught_up = False, True
+        added = False
         taken = raw.take(reader, TAKE_AT_ONCE)
+        self._try(partial(self._find_writers, {info.publication_handle: None for _, info in taken}))
         for body, info in taken:
             if not info.valid_data:
                 continue
-            if caught_up:
-                caught_up = self._discovery.find_writer(info.publication_handle)
-                self._tell_found()
             inbox.came += 1
             inbox.samples.append((inbox.came, Sample(body, info.source_timestamp, info.publication_handle)))
             self._taken_bytes += len(body)

@@ -15,7 +15,7 @@ from sern_client.endpoints.dds.endpoint import DdsEndpoint, DdsOptions
 from sern_client.endpoints.dds.graph import Remote
 from sern_client.endpoints.dds.qos import EndpointQos, mismatches, reader_for, within_reach
 from sern_client.endpoints.dds.stream import Stream
-from sern_core.types import Encoding, TopicName
+from sern_core.types import DropReason, Encoding, TopicName
 from sern_runtime.ros_types import topic_info
 from tests.peers.dds.peer import free_domain
 from tests.support import Events, until
@@ -124,6 +124,20 @@ async def test_a_writer_that_never_matches_leaves_the_reader_alone(pair: Pair, c
     publisher.publish(body(1), 1)
     await until(lambda: pair.got == [body(1)])
     assert len(pair.two.graph.complaints) == 1  # it is said whom it does not match
+
+
+async def test_messages_survive_a_fault_in_discovery(pair: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They are taken already when it is asked whose they are."""
+    publisher = await pair.connect()
+
+    def fail(handle: int) -> bool:
+        raise OSError("Cyclone DDS does not say")
+
+    assert pair.two._joined is not None
+    monkeypatch.setattr(pair.two._joined.worker._discovery, "find_writer", fail)
+    publisher.publish(body(1), 1)
+    await until(lambda: pair.got == [body(1)])
+    assert pair.two.drops == {DropReason.UNDECODABLE: pair.two.faults} and pair.two.faults >= 1
 
 
 async def test_what_a_reader_has_received_outlives_it(pair: Pair) -> None:
