@@ -10,6 +10,7 @@ import logging
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Final, TypeVar
 from uuid import UUID
@@ -31,9 +32,10 @@ from sern_client.endpoints.base import (
     Sink,
     TopicEvents,
 )
-from sern_client.endpoints.dds import names, node_info, raw
+from sern_client.endpoints.dds import names, node_info
 from sern_client.endpoints.dds.definitions import Definitions
 from sern_client.endpoints.dds.domain import DomainOptions, close_domain, open_domain
+from sern_client.endpoints.dds.entities import Reader, Subscription, Writer
 from sern_client.endpoints.dds.graph import MAX_COMPLAINTS, Graph, Local, Participant, Remote
 from sern_client.endpoints.dds.idl import TypeMaker
 from sern_client.endpoints.dds.names import DISCOVERY_TOPIC, SERN_KEY, RosName, user_data
@@ -42,13 +44,14 @@ from sern_client.endpoints.dds.qos import (
     mismatches,
     reader_for,
     to_policies,
+    within_reach,
     writer_for,
 )
 from sern_client.endpoints.dds.raw import INFINITE_NS
 from sern_client.endpoints.dds.services import DdsServices
 from sern_client.endpoints.dds.stream import Stream
 from sern_client.endpoints.dds.worker import Inbox, Sample, Worker
-from sern_client.endpoints.first import LEARN_S, FirstMessages, Readers
+from sern_client.endpoints.first import LEARN_S, FirstMessages
 from sern_core.errors import ConfigError, UsageError
 from sern_core.message import TopicInfo
 from sern_core.types import DropReason, Encoding, TopicName
@@ -88,8 +91,9 @@ class DdsOptions:
 @dataclass(slots=True)
 class DdsCounters:
     """Messages by fate. Dropped: the event loop was too slow (`overrun`), slow reliable readers left a writer no room
-    (`blocked`), too many calls of a service were under way (`calls`), or what came was no call (`unreadable`). What the
-    link did not take (`refused`), the link counts. `closed`: given to a writer that is no more."""
+    (`blocked`), too many calls of a service were under way (`calls`), or what came was no call, or too long to be about
+    nodes (`unreadable`). What the link did not take (`refused`), the link counts. `closed`: given to a writer that is
+    no more. `faults` of the thread that waits for DDS are of those that were; `DdsEndpoint.faults` has all."""
 
     received: int = 0
     overrun: int = 0
@@ -99,127 +103,7 @@ class DdsCounters:
     calls: int = 0
     unreadable: int = 0
     closed: int = 0
-
-
-class _Subscription:
-    """One topic on its way to the link. The reader is made anew when writers appear that it would not match."""
-
-    def __init__(self, endpoint: "DdsEndpoint", info: TopicInfo, dds_topic: str, sink: Sink) -> None:
-        self._endpoint = endpoint
-        self.info = info
-        self.dds_topic = dds_topic
-        self._sink = sink
-        self._reader: _Reader | None = None
-        self.closed = False
-        self.wanted = True
-
-    def refresh(self) -> None:
-        """Have a reader that matches all writers there are now, or none while nobody wants the topic."""
-        if self.closed:
-            return
-        if not self.wanted and not self.info.latched:
-            self._drop()
-            return
-        writers = [writer.qos for writer in self._endpoint.graph.writers(self.dds_topic)]
-        if self._reader is not None and not any(mismatches(offer, self._reader.qos) for offer in writers):
-            return
-        self._drop()
-        asked = replace(reader_for(writers), type_hash=self.info.type_hash)
-        resolved = ros_types.resolve(self.info.type_name, self.info.definition, Encoding.CDR)
-        self._reader = self._endpoint.open_reader(self.dds_topic, resolved, asked, self._deliver)
-
-    @property
-    def lacks_reader(self) -> bool:
-        """It is to have one and has none."""
-        return self._reader is None and (self.wanted or self.info.latched)
-
-    @property
-    def matched(self) -> int:
-        """How many writers it is connected with."""
-        return 0 if self._reader is None else self._reader.matched
-
-    def _deliver(self, sample: Sample) -> None:
-        self._endpoint.counters.received += 1
-        if not self._sink(sample.body, sample.stamp_ns):
-            self._endpoint.counters.refused += 1
-
-    def _drop(self) -> None:
-        if self._reader is not None:
-            self._reader.close()
-            self._reader = None
-
-    def close(self) -> None:
-        if not self.closed:
-            self.closed = True
-            self._drop()
-            self._endpoint.forget(self)
-
-
-class _Reader:
-    """A reader in use: its samples come to `deliver` on the event loop until it is closed."""
-
-    def __init__(
-        self, endpoint: "DdsEndpoint", entity: DataReader[Any], qos: EndpointQos, inbox: Inbox, number: int
-    ) -> None:
-        self._endpoint = endpoint
-        self._entity: DataReader[Any] | None = entity
-        self.guid: UUID = entity.guid
-        self.qos = qos
-        self._inbox = inbox
-        self._number = number
-
-    @property
-    def matched(self) -> int:
-        """How many writers it has."""
-        return 0 if self._entity is None else len(raw.matched_writers(self._entity))
-
-    @property
-    def dropped(self) -> int:
-        return self._inbox.dropped
-
-    def close(self) -> None:
-        self._inbox.closed = True
-        self._entity = None  # the worker is the last to hold it, and lets go on its own thread
-        self._endpoint.close_reader(self, self._number)
-
-
-class _Writer:
-    """A writer in use."""
-
-    def __init__(self, endpoint: "DdsEndpoint", writer: DataWriter[Any], guid: UUID, *, stamped: bool) -> None:
-        self._endpoint = endpoint
-        self._writer: DataWriter[Any] | None = writer
-        self.guid = guid
-        self._stamped = stamped
-
-    @property
-    def matched(self) -> int:
-        """How many readers it has."""
-        return 0 if self._writer is None else len(raw.matched_readers(self._writer))
-
-    def readers(self, known: set[int]) -> Readers:
-        """How many of the `known` readers, by their handles, it has."""
-        mine = () if self._writer is None else raw.matched_readers(self._writer)
-        return Readers(len(known), len(known.intersection(mine)))
-
-    def publish(self, body: bytes, stamp_ns: int) -> None:
-        if self._writer is None:
-            self._endpoint.counters.closed += 1
-            return
-        # A lifespan is judged by the time stamp: only one of this host says how old a sample is here.
-        result = raw.write(self._writer, body, stamp_ns if self._stamped else None)
-        if result == raw.RETCODE_TIMEOUT:
-            self._endpoint.counters.blocked += 1
-        elif result < 0:
-            raise OSError(f"Cyclone DDS did not take a message of {len(body)} bytes (return code {result})")
-        else:
-            self._endpoint.counters.written += 1
-
-    def close(self) -> None:
-        if self._writer is not None:
-            kept = [self._writer]  # no name for it: whoever is the last to hold it deletes it
-            self._writer = None
-            self._endpoint.close_writer(self, kept)
+    faults: int = 0
 
 
 @dataclass(slots=True)
@@ -247,14 +131,16 @@ class DdsEndpoint:
         self._joined: _Joined | None = None
         self._topics: WeakValueDictionary[str, Topic[Any]] = WeakValueDictionary()
         self._announced: dict[TopicName, TopicInfo] = {}
-        self._subscriptions: dict[TopicName, list[_Subscription]] = {}
-        self._readers: dict[UUID, _Reader] = {}
-        self._writers: dict[UUID, _Writer] = {}
+        self._subscriptions: dict[TopicName, list[Subscription]] = {}
+        self._readers: dict[UUID, Reader] = {}
+        self._leaving: dict[UUID, Reader] = {}
+        """Readers that are closed and have not ended."""
+        self._writers: dict[UUID, Writer] = {}
         self._streams: list[Stream] = []
         self._ending: list[FirstMessages] = []  # of streams that are closed
         self._first_dropped: Counter[DropReason] = Counter()
         self._started_s = 0.0
-        self._info_writer: _Writer | None = None
+        self._info_writer: Writer | None = None
         self._info_due = False
         self._said: set[str] = set()
 
@@ -302,9 +188,12 @@ class DdsEndpoint:
             writer.close()
         self._events = None
         await self._joined.worker.stop()
+        for guid in list(self._leaving):
+            self._reader_ended(guid)
         self._info_writer = None
         self._topics.clear()
         # Leaving tells everybody, which may take a moment.
+        self.counters.faults += self._joined.worker.faults
         left = [self._joined]
         self._joined = None
         await asyncio.get_running_loop().run_in_executor(None, left.clear)
@@ -321,11 +210,11 @@ class DdsEndpoint:
 
     # Topics
 
-    def subscribe(self, name: TopicName, sink: Sink) -> _Subscription:
+    def subscribe(self, name: TopicName, sink: Sink) -> Subscription:
         info = self._announced.get(name)
         if info is None:
             raise UsageError(f"{name}: no such topic was announced")
-        subscription = _Subscription(self, info, names.to_dds(name), sink)
+        subscription = Subscription(self, info, names.to_dds(name), sink)
         self._subscriptions.setdefault(name, []).append(subscription)
         self._refresh(subscription)
         return subscription
@@ -404,7 +293,7 @@ class DdsEndpoint:
             subscription.wanted = wanted
             self._refresh(subscription)
 
-    def _refresh(self, subscription: _Subscription) -> None:
+    def _refresh(self, subscription: Subscription) -> None:
         try:
             subscription.refresh()
         except ConfigError as error:
@@ -412,11 +301,11 @@ class DdsEndpoint:
             # Some of what DDS refuses it accepts a moment later: a reader right after the one before it was closed.
             asyncio.get_running_loop().call_later(RETRY_S, self._refresh_again, subscription)
 
-    def _refresh_again(self, subscription: _Subscription) -> None:
+    def _refresh_again(self, subscription: Subscription) -> None:
         if self._joined is not None and subscription in self._subscriptions.get(subscription.info.name, ()):
             self._refresh(subscription)
 
-    def forget(self, subscription: _Subscription) -> None:
+    def forget(self, subscription: Subscription) -> None:
         found = self._subscriptions.get(subscription.info.name, [])
         if subscription in found:
             found.remove(subscription)
@@ -448,7 +337,7 @@ class DdsEndpoint:
         depth: int | None = None,
         header: bool = False,
         id_key: str = "clientid",
-    ) -> _Reader:
+    ) -> Reader:
         """Open a reader; with `header`, of requests or replies, which other SERN endpoints send as well.
 
         ConfigError when the topic is in use here with another type, or DDS cannot have the type.
@@ -456,17 +345,17 @@ class DdsEndpoint:
         depth = depth or self.options.queue_depth
         policies = to_policies(qos, depth=max(depth, READER_HISTORY), writer=False, id_key=id_key)
         joined = self._alive()
-        ignored = self.graph.ignored
+        ignores = self.graph.ignores
 
         def checked(sample: Sample) -> None:
-            if header or sample.handle not in ignored:
+            if header or not ignores(sample.handle):
                 deliver(sample)
 
         entity = self._make(
             lambda of: DataReader(joined.subscriber, of, policies), "reader", topic, resolved, header=header
         )
         inbox = Inbox(depth, checked)
-        reader = _Reader(self, entity, qos, inbox, joined.worker.watch(entity, inbox))
+        reader = Reader(self, entity, qos, inbox, joined.worker.watch(entity, inbox))
         self._readers[reader.guid] = reader
         self.graph.local_added(Local(reader.guid, False, topic, names.type_to_dds(resolved.name), qos))
         self._info_changed()
@@ -481,28 +370,32 @@ class DdsEndpoint:
         depth: int,
         header: bool = False,
         id_key: str = "clientid",
-    ) -> _Writer:
+    ) -> Writer:
         """ConfigError as `open_reader`."""
         policies = to_policies(qos, depth=depth, writer=True, id_key=id_key)
         joined = self._alive()
         entity = self._make(
             lambda of: DataWriter(joined.publisher, of, policies), "writer", topic, resolved, header=header
         )
-        writer = _Writer(self, entity, entity.guid, stamped=qos.lifespan_ns >= INFINITE_NS)
+        writer = Writer(self, entity, entity.guid, stamped=qos.lifespan_ns >= INFINITE_NS)
         self._writers[writer.guid] = writer
         self.graph.local_added(Local(writer.guid, True, topic, names.type_to_dds(resolved.name), qos))
         self._info_changed()
         return writer
 
-    def close_reader(self, reader: _Reader, number: int) -> None:
+    def close_reader(self, reader: Reader, number: int) -> None:
         if self._readers.pop(reader.guid, None) is None:
             return
-        self.counters.overrun += reader.dropped
+        self._leaving[reader.guid] = reader
         self.graph.local_removed(reader.guid)
-        self._alive().worker.unwatch(number)
+        self._alive().worker.unwatch(number, partial(self._reader_ended, reader.guid))
         self._info_changed()
 
-    def close_writer(self, writer: _Writer, kept: list[DataWriter[Any]]) -> None:
+    def _reader_ended(self, guid: UUID) -> None:
+        """All that it received is delivered or dropped."""
+        self.counters.overrun += self._leaving.pop(guid).dropped
+
+    def close_writer(self, writer: Writer, kept: list[DataWriter[Any]]) -> None:
         """`kept` holds its entity, which is deleted on the worker's thread."""
         if self._writers.pop(writer.guid, None) is None:
             return
@@ -551,14 +444,21 @@ class DdsEndpoint:
         """Messages dropped between this domain's nodes and us, by reason."""
         counted = {
             DropReason.QUEUE_FULL: self.overruns() + self.counters.blocked + self.counters.calls,
-            DropReason.UNDECODABLE: self.counters.unreadable,
+            DropReason.UNDECODABLE: self.counters.unreadable + self.faults,
             DropReason.DISCONNECTED: self.counters.closed,
         }
         return {reason: count for reason, count in (Counter(counted) + self._first_dropped).items() if count}
 
+    @property
+    def faults(self) -> int:
+        """What others announced and nobody could read, and readers that DDS would not give."""
+        return self.counters.faults + (0 if self._joined is None else self._joined.worker.faults)
+
     def overruns(self) -> int:
         """Messages dropped because the event loop was too slow, of all readers there are and were."""
-        return self.counters.overrun + sum(reader.dropped for reader in self._readers.values())
+        return self.counters.overrun + sum(
+            reader.dropped for readers in (self._readers, self._leaving) for reader in readers.values()
+        )
 
     def say_once(self, line: str) -> None:
         """What a person has to know and do something about; each line once."""
@@ -608,14 +508,17 @@ class DdsEndpoint:
         for writer in writers:
             type_name = names.type_from_dds(writer.type_name)
             if type_name is None:
-                self.say_once(f"{name} has the type {writer.type_name}, which is not of ROS 2; it is left alone")
+                self.say_once(
+                    f"{name} has the type {names.cut(writer.type_name)}, which is not of ROS 2; it is left alone"
+                )
                 continue
             try:
                 text = self.types.message(type_name, writer.qos.type_hash)
             except ConfigError as error:
-                self.say_once(f"{name} of {self.graph.owner(writer)} is left alone: {error}")
+                self.say_once(f"{name} of {self.graph.owner(writer)} is left alone: {names.cut(str(error), 600)}")
                 continue
-            offered = [other.qos for other in writers if other.type_name == writer.type_name]
+            every = [other.qos for other in writers if other.type_name == writer.type_name]
+            offered = within_reach(every) or every
             common = reader_for(offered)
             lifespan_ns = max(offer.lifespan_ns for offer in offered)
             deadline_ns = max(offer.deadline_ns for offer in offered)
@@ -635,6 +538,9 @@ class DdsEndpoint:
     # Nodes
 
     def _heed_nodes(self, sample: Sample) -> None:
+        if len(sample.body) > node_info.MAX_BODY_BYTES:
+            self.counters.unreadable += 1
+            return
         found = node_info.decode(sample.body)
         if found is not None and found[0] != self.graph.own:
             self.graph.nodes_of(*found)
@@ -647,7 +553,7 @@ class DdsEndpoint:
 
     def _tell_nodes(self) -> None:
         self._info_due = False
-        if self._info_writer is None or self._joined is None:
+        if self._info_writer is None or self._events is None:
             return
         hidden = {self._info_writer.guid}
         writers = [guid for guid in self._writers if guid not in hidden]

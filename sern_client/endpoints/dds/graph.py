@@ -4,6 +4,7 @@ No DDS in here: it is told what came and went, and answers with topics, services
 """
 
 import logging
+from bisect import bisect_left, insort
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Final, Protocol
@@ -11,12 +12,16 @@ from uuid import UUID
 
 from sern_client.endpoints.dds import names, qos
 from sern_client.endpoints.dds.names import Role, RosName
+from sern_client.endpoints.dds.node_info import Node
 from sern_client.endpoints.dds.qos import EndpointQos
 from sern_core.types import TopicName
 
 FAST_DDS: Final = b"\x01\x0f"
 """How the GUIDs of eProsima's DDS begin: their vendor id."""
 MAX_COMPLAINTS: Final = 1000
+MAX_IGNORED_BEFORE: Final = 1000
+MAX_EARLY_NODES: Final = 64
+"""Participants that are not known, and of whose nodes is kept what was said."""
 
 _log = logging.getLogger(__name__)
 
@@ -63,6 +68,10 @@ def puts_header(remote: Remote) -> bool:
     return bool(remote.qos.service_id) or remote.guid.bytes[:2] != FAST_DDS
 
 
+def _by_guid(remote: Remote) -> bytes:
+    return remote.guid.bytes
+
+
 class GraphEvents(Protocol):
     def writers_changed(self, name: RosName, topic: str) -> None:
         """Somebody else's writers on a topic are others than before."""
@@ -84,114 +93,203 @@ class Graph:
     locals: dict[UUID, Local] = field(default_factory=dict)
     ignored: set[int] = field(default_factory=set)
     """Handles of the writers whose samples are not to be taken."""
+    _ignored_before: dict[int, None] = field(default_factory=dict)
+    """Those that went last: what they wrote may still be on its way."""
     complaints: dict[tuple[UUID, UUID], str] = field(default_factory=dict)
     """Who does not get, or give, what: by the two endpoints, in one line each."""
-    _nodes: dict[UUID, dict[UUID, str]] = field(default_factory=dict)
-    _by_topic: dict[str, set[UUID]] = field(default_factory=dict)
+    _nodes: dict[UUID, list[Node]] = field(default_factory=dict)
+    """Of each participant, as it was last said."""
+    _early_nodes: dict[UUID, list[Node]] = field(default_factory=dict)
+    """The same for participants that are not known yet, or never will be."""
+    _of_participant: dict[UUID, dict[UUID, None]] = field(default_factory=dict)
+    """Readers and writers, in the order in which they came."""
+    _writers: dict[int, Remote] = field(default_factory=dict)
+    """By their handles."""
+    _told: set[UUID] = field(default_factory=set)
+    """Readers and writers that count as of this site: as such they are told when they go, whatever is true by then."""
+    _on_topic: dict[tuple[str, bool], list[Remote]] = field(default_factory=dict)
+    """Of this site, in the order of their GUIDs; by topic, and whether they write."""
+    _locals_on: dict[str, dict[UUID, Local]] = field(default_factory=dict)
+    _complained: dict[UUID, set[tuple[UUID, UUID]]] = field(default_factory=dict)
 
     # What happens
 
     def participant_added(self, participant: Participant) -> None:
+        """It came, or says something else of itself than before, which may change whose its readers and writers are."""
         self.participants[participant.guid] = participant
+        early = self._early_nodes.pop(participant.guid, None)
+        if early is not None:
+            self._nodes[participant.guid] = early
+        mine = [self.remotes[guid] for guid in self._of_participant.get(participant.guid, ())]
+        moved = [remote for remote in mine if self.foreign(remote) is not self._is_foreign(remote)]
+        for remote in moved:
+            self._take_out(remote.guid)
+            self._put_in(remote)
+        self._tell(moved)
 
     def participant_removed(self, guid: UUID) -> None:
-        """Its readers and writers go with it."""
+        """Its readers and writers go with it; of each topic and service that is told once."""
+        mine = [self.remotes[one] for one in self._of_participant.get(guid, ())]
+        told = [remote for remote in mine if self.foreign(remote)]
+        for remote in mine:
+            self._take_out(remote.guid)
         self.participants.pop(guid, None)
         self._nodes.pop(guid, None)
-        for remote in [remote for remote in self.remotes.values() if remote.participant == guid]:
-            self.remote_removed(remote.guid)
+        self._tell(told)
 
     def remote_added(self, remote: Remote) -> None:
-        if remote.participant == self.own or remote.guid in self.remotes:
+        """One that is known already and is not the same any more went and came again."""
+        if remote.participant == self.own or self.remotes.get(remote.guid) == remote:
             return
-        self.remotes[remote.guid] = remote
-        if remote.writer and not self.foreign(remote):
-            self.ignored.add(remote.handle)
-        self._by_topic.setdefault(remote.topic, set()).add(remote.guid)
-        for local in self.locals.values():
-            self._compare(local, remote)
-        self._tell(remote)
+        self.remote_removed(remote.guid)
+        self._put_in(remote)
+        if self.foreign(remote):
+            self._tell([remote])
 
     def remote_removed(self, guid: UUID) -> None:
-        remote = self.remotes.pop(guid, None)
+        remote = self.remotes.get(guid)
         if remote is None:
             return
-        self.ignored.discard(remote.handle)
-        found = self._by_topic[remote.topic]
-        found.discard(guid)
-        if not found:
-            del self._by_topic[remote.topic]
-        self._forget(guid)
-        self._tell(remote)
+        told = self.foreign(remote)
+        self._take_out(guid)
+        if told:
+            self._tell([remote])
 
     def local_added(self, local: Local) -> None:
         self.locals[local.guid] = local
-        for guid in list(self._by_topic.get(local.topic, ())):
-            self._compare(local, self.remotes[guid])
+        self._locals_on.setdefault(local.topic, {})[local.guid] = local
+        for remote in self._on_topic.get((local.topic, not local.writer), ()):
+            self._compare(local, remote)
 
     def local_removed(self, guid: UUID) -> None:
-        self.locals.pop(guid, None)
+        local = self.locals.pop(guid, None)
+        if local is None:
+            return
+        here = self._locals_on[local.topic]
+        del here[guid]
+        if not here:
+            del self._locals_on[local.topic]
         self._forget(guid)
 
-    def nodes_of(self, participant: UUID, nodes: Iterable[tuple[str, list[UUID]]]) -> None:
-        """What a participant says of its nodes: full names, and the readers and writers of each."""
-        self._nodes[participant] = {guid: name for name, guids in nodes for guid in guids}
+    def nodes_of(self, participant: UUID, nodes: list[Node]) -> None:
+        """What is said of a participant's nodes. Anybody can say it of any participant, known or invented."""
+        if participant in self.participants:
+            self._nodes[participant] = nodes
+            return
+        self._early_nodes.pop(participant, None)
+        self._early_nodes[participant] = nodes
+        if len(self._early_nodes) > MAX_EARLY_NODES:
+            del self._early_nodes[next(iter(self._early_nodes))]
 
     # What it amounts to
 
+    def ignores(self, handle: int) -> bool:
+        """Whether samples of the writer with this handle are not to be taken, of one that has just gone too."""
+        return handle in self.ignored or handle in self._ignored_before
+
     def foreign(self, remote: Remote) -> bool:
-        """Whether it is of this site, and not of a SERN endpoint that brings it from elsewhere."""
+        """Whether it counts as of this site, and not of a SERN endpoint that brings it from elsewhere."""
+        return remote.guid in self._told
+
+    def writers(self, topic: str) -> list[Remote]:
+        """The writers of this site on a DDS topic, in the order of their GUIDs."""
+        return list(self._on_topic.get((topic, True), ()))
+
+    def readers(self, topic: str) -> list[Remote]:
+        return list(self._on_topic.get((topic, False), ()))
+
+    def writer(self, handle: int) -> Remote | None:
+        """Whose samples are marked with this handle; None when it has gone."""
+        return self._writers.get(handle)
+
+    def owner(self, remote: Remote) -> str:
+        """Whose it is, in words: the node where that is known, else the participant."""
+        for node in self._nodes.get(remote.participant, ()):
+            if node.has(remote.guid):
+                return f"node {names.cut(node.name)}"
+        participant = self.participants.get(remote.participant)
+        name = participant.name if participant is not None and participant.name else "without a name"
+        return f"participant {names.cut(name)} ({remote.participant.hex[:24]})"
+
+    # In here
+
+    def _is_foreign(self, remote: Remote) -> bool:
+        """As its participant has it now."""
         participant = self.participants.get(remote.participant)
         if participant is None or not participant.sern:
             return True
         return self.heed_sern and participant.sern != self.own_guard
 
-    def writers(self, topic: str) -> list[Remote]:
-        """The writers of this site on a DDS topic, in the order of their GUIDs."""
-        return self._of(topic, writers=True)
-
-    def readers(self, topic: str) -> list[Remote]:
-        return self._of(topic, writers=False)
-
-    def _of(self, topic: str, *, writers: bool) -> list[Remote]:
-        found = (self.remotes[guid] for guid in sorted(self._by_topic.get(topic, ()), key=lambda guid: guid.bytes))
-        return [remote for remote in found if remote.writer is writers and self.foreign(remote)]
-
-    def owner(self, remote: Remote) -> str:
-        """Whose it is, in words: the node where that is known, else the participant."""
-        node = self._nodes.get(remote.participant, {}).get(remote.guid)
-        if node is not None:
-            return f"node {node}"
-        participant = self.participants.get(remote.participant)
-        name = participant.name if participant is not None and participant.name else "without a name"
-        return f"participant {name} ({remote.participant.hex[:24]})"
-
-    # In here
-
-    def _tell(self, remote: Remote) -> None:
-        if not self.foreign(remote):
+    def _put_in(self, remote: Remote) -> None:
+        self.remotes[remote.guid] = remote
+        self._of_participant.setdefault(remote.participant, {})[remote.guid] = None
+        if remote.writer:
+            self._writers[remote.handle] = remote
+        if not self._is_foreign(remote):
+            if remote.writer:
+                self.ignored.add(remote.handle)
             return
-        name = names.from_dds(remote.topic)
-        if name is None:
+        self._ignored_before.pop(remote.handle, None)
+        self._told.add(remote.guid)
+        insort(self._on_topic.setdefault((remote.topic, remote.writer), []), remote, key=_by_guid)
+        for local in self._locals_on.get(remote.topic, {}).values():
+            self._compare(local, remote)
+
+    def _take_out(self, guid: UUID) -> None:
+        remote = self.remotes.pop(guid)
+        mine = self._of_participant[remote.participant]
+        del mine[guid]
+        if not mine:
+            del self._of_participant[remote.participant]
+        if remote.writer:
+            self._writers.pop(remote.handle, None)
+        if remote.handle in self.ignored and remote.writer:
+            self.ignored.discard(remote.handle)
+            self._ignored_before[remote.handle] = None
+            if len(self._ignored_before) > MAX_IGNORED_BEFORE:
+                del self._ignored_before[next(iter(self._ignored_before))]
+        if guid not in self._told:
             return
-        if name.role is not Role.TOPIC:
-            self.events.services_changed(name.name)
-        elif remote.writer:
-            self.events.writers_changed(name, remote.topic)
+        self._told.discard(guid)
+        found = self._on_topic[remote.topic, remote.writer]
+        del found[bisect_left(found, guid.bytes, key=_by_guid)]
+        if not found:
+            del self._on_topic[remote.topic, remote.writer]
+        self._forget(guid)
+
+    def _tell(self, changed: Iterable[Remote]) -> None:
+        """Each topic with other writers than before, and each service, once."""
+        topics = {(remote.topic, remote.writer): None for remote in changed}
+        services: dict[TopicName, None] = {}
+        for topic, writer in topics:
+            name = names.from_dds(topic)
+            if name is None:
+                continue
+            if name.role is not Role.TOPIC:
+                services[name.name] = None
+            elif writer:
+                self.events.writers_changed(name, topic)
+        for service in services:
+            self.events.services_changed(service)
 
     def _forget(self, guid: UUID) -> None:
-        for pair in [pair for pair in self.complaints if guid in pair]:
+        for pair in self._complained.pop(guid, ()):
             del self.complaints[pair]
+            for other in pair:
+                if other != guid:
+                    self._complained[other].discard(pair)
+                    if not self._complained[other]:
+                        del self._complained[other]
 
     def _compare(self, local: Local, remote: Remote) -> None:
-        if remote.topic != local.topic or remote.writer is local.writer or not self.foreign(remote):
+        if remote.writer is local.writer:
             return
         mine, theirs = local.qos, remote.qos
         found = qos.mismatches(mine, theirs) if local.writer else qos.mismatches(theirs, mine)
         if remote.type_name != local.type_name:
-            found.insert(0, f"type ({remote.type_name} there, {local.type_name} here)")
+            found.insert(0, f"type ({names.cut(remote.type_name)} there, {local.type_name} here)")
         elif mine.type_hash and theirs.type_hash and mine.type_hash != theirs.type_hash:
-            found.insert(0, f"version of the type ({theirs.type_hash} there, {mine.type_hash} here)")
+            found.insert(0, f"version of the type ({names.cut(theirs.type_hash)} there, {mine.type_hash} here)")
         if not found or len(self.complaints) >= MAX_COMPLAINTS:
             return
         ros = names.from_dds(remote.topic)
@@ -201,4 +299,6 @@ class Graph:
             + "; ".join(found)
         )
         self.complaints[local.guid, remote.guid] = line
+        for one in (local.guid, remote.guid):
+            self._complained.setdefault(one, set()).add((local.guid, remote.guid))
         _log.warning("%s", line)

@@ -15,8 +15,8 @@ from sern_core.errors import WireError
 from sern_core.rules import name_problem
 from sern_core.types import TopicName
 
-__all__ = ["DISCOVERY_TOPIC", "SERN_KEY", "Role", "RosName", "from_dds", "read_user_data", "to_dds", "type_from_dds"]
-__all__ += ["type_to_dds", "user_data"]
+__all__ = ["DISCOVERY_TOPIC", "SERN_KEY", "Role", "RosName", "cut", "from_dds", "read_user_data", "to_dds"]
+__all__ += ["type_from_dds", "type_to_dds", "user_data"]
 
 DISCOVERY_TOPIC: Final = "ros_discovery_info"
 """Which nodes a participant has: rmw_dds_common/msg/ParticipantEntitiesInfo."""
@@ -66,6 +66,14 @@ def type_from_dds(type_name: str) -> str | None:
         return ros_type(type_name)
     except WireError:
         return None
+
+
+def cut(text: str, most_chars: int = 200) -> str:
+    """A peer's text as it is said and kept: of one that is longer than `most_chars`, beginning and end."""
+    if len(text) <= most_chars:
+        return text
+    end = most_chars // 3
+    return f"{text[: most_chars - end - 3]}...{text[-end:]}"
 
 
 def user_data(**values: str) -> bytes:

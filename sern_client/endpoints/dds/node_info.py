@@ -1,16 +1,23 @@
 """`ros_discovery_info`: which nodes a participant has, and which readers and writers are whose (since ROS 2 Iron)."""
 
+import struct
 from collections.abc import Iterable
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 from uuid import UUID
 
 import numpy as np
 
-from sern_core.errors import ConfigError
 from sern_core.types import Encoding
 from sern_runtime import ros_types
 
 TYPE: Final = "rmw_dds_common/msg/ParticipantEntitiesInfo"
+MAX_BODY_BYTES: Final = 2**16
+"""The largest body that is looked at: some 4000 readers and writers of one process."""
+GID_BYTES: Final = 16
+_HEADER_BYTES: Final = 4
+_ALIGNMENT: Final = 4
+_LITTLE: Final = struct.Struct("<I").unpack_from
+_BIG: Final = struct.Struct(">I").unpack_from
 
 
 def encode(participant: UUID, node_name: str, readers: Iterable[UUID], writers: Iterable[UUID]) -> bytes:
@@ -26,21 +33,51 @@ def encode(participant: UUID, node_name: str, readers: Iterable[UUID], writers: 
     return ros_types.serialise(info, TYPE, Encoding.CDR)
 
 
-def decode(body: bytes) -> tuple[UUID, list[tuple[str, list[UUID]]]] | None:
-    """Participant, and of each of its nodes the full name and its readers and writers. None if it does not decode:
-    before Iron, GUIDs were longer."""
-    try:
-        info = ros_types.deserialise(body, TYPE, Encoding.CDR)
-    except ConfigError:
+class Node(NamedTuple):
+    """A node by its full name. `gids`: its readers and writers, 16 bytes each."""
+
+    name: str
+    gids: bytes
+
+    def has(self, guid: UUID) -> bool:
+        at = self.gids.find(guid.bytes)
+        while at % GID_BYTES and at >= 0:
+            at = self.gids.find(guid.bytes, at + 1)
+        return at >= 0
+
+
+def decode(body: bytes) -> tuple[UUID, list[Node]] | None:
+    """Participant, and its nodes. None for what is larger than `MAX_BODY_BYTES` or does not decode: before Iron, GUIDs
+    were longer. What others send costs no more than its bytes: GUIDs are not looked at one by one."""
+    if not _HEADER_BYTES <= len(body) <= MAX_BODY_BYTES:
         return None
-    nodes = [
-        (
-            f"{node.node_namespace.rstrip('/')}/{node.node_name}",
-            [_guid(gid) for gid in (*node.reader_gid_seq, *node.writer_gid_seq)],
-        )
-        for node in info.node_entities_info_seq
-    ]
-    return _guid(info.gid), nodes
+    number = _LITTLE if body[1] & 1 else _BIG
+    at = _HEADER_BYTES + GID_BYTES
+    participant = body[_HEADER_BYTES:at]
+
+    def part(element_bytes: int) -> bytes:
+        """The next sequence: the number of its elements, which is aligned, and they."""
+        nonlocal at
+        at += -at % _ALIGNMENT  # the header has the size of the alignment
+        start = at + _ALIGNMENT
+        at = start + number(body, at)[0] * element_bytes
+        if at > len(body):
+            raise ValueError("a sequence with no end")
+        return body[start:at]
+
+    try:
+        nodes = []
+        count = number(body, at)[0]
+        at += _ALIGNMENT
+        for _ in range(count):
+            namespace, name = part(1), part(1)
+            if namespace[-1:] != b"\0" or name[-1:] != b"\0":
+                return None
+            full = f"{namespace[:-1].decode().rstrip('/')}/{name[:-1].decode()}"
+            nodes.append(Node(full, part(GID_BYTES) + part(GID_BYTES)))
+    except (ValueError, struct.error):
+        return None
+    return (UUID(bytes=participant), nodes) if len(body) - at < _ALIGNMENT else None
 
 
 def _new(name: str, **fields: Any) -> Any:
@@ -49,7 +86,3 @@ def _new(name: str, **fields: Any) -> Any:
 
 def _gid(guid: UUID) -> Any:
     return _new("Gid", data=np.frombuffer(guid.bytes, dtype="uint8"))
-
-
-def _guid(gid: Any) -> UUID:
-    return UUID(bytes=gid.data.tobytes())

@@ -77,9 +77,25 @@ def mismatches(offered: EndpointQos, asked: EndpointQos) -> list[str]:
         found.append(f"liveliness lease (offered {_seconds(offered.lease_ns)}, asked for {_seconds(asked.lease_ns)})")
     if asked.exclusive != offered.exclusive:
         found.append("ownership (one shared, one exclusive)")
-    if set(asked.partitions or ("",)).isdisjoint(offered.partitions or ("",)):
+    if not _meet(offered.partitions, asked.partitions):
         found.append("partition")
     return found
+
+
+def _meet(some: tuple[str, ...], others: tuple[str, ...]) -> bool:
+    """Whether a writer's and a reader's partitions have one in common. None named is the one without a name."""
+    if not some or not others:
+        return any(not name.strip("*") for name in (some or others or ("",)))  # "*" stands for each, that one too
+    return not set(some).isdisjoint(others)
+
+
+def within_reach(writers: list[EndpointQos], *, exclusive: bool = False) -> list[EndpointQos]:
+    """Those of a topic's writers that one reader of ours can match all: in the partition without a name, and with the
+    ownership that most of these have; where both have as many, `exclusive` or not."""
+    here = [writer for writer in writers if _meet(writer.partitions, ())]
+    balance = sum(1 if writer.exclusive else -1 for writer in here)
+    most = balance > 0 or (balance == 0 and exclusive)
+    return [writer for writer in here if writer.exclusive is most]
 
 
 def _seconds(duration_ns: int) -> str:

@@ -8,15 +8,17 @@ process broke. Here every reading has its own.
 """
 
 import ctypes
+import logging
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, ClassVar, Final
+from uuid import UUID
 
 from cyclonedds import _clayer
-from cyclonedds.builtin import BuiltinDataReader
-from cyclonedds.core import DDSException, Entity, InstanceState, ReadCondition, SampleState, ViewState, WaitSet
+from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsParticipant
+from cyclonedds.core import Entity, InstanceState, ReadCondition, SampleState, ViewState, WaitSet
 from cyclonedds.domain import DomainParticipant
-from cyclonedds.internal import dds_c_t
+from cyclonedds.internal import DDS, dds_c_t
 from cyclonedds.pub import DataWriter
 from cyclonedds.qos import _CQos
 from cyclonedds.sub import DataReader
@@ -28,6 +30,8 @@ RETCODE_TIMEOUT: Final = -10
 """What a write returns when slow reliable readers leave it no room."""
 _WAKES: Final = 64
 """How many of the entities that are ready one wait names; the others come with the next."""
+
+_log = logging.getLogger(__name__)
 
 
 def take(reader: DataReader[Any], count: int) -> list[tuple[bytes, Any]]:
@@ -121,25 +125,93 @@ def _partitions(qos: Any) -> tuple[str, ...]:
         _CQos.free(addresses)
 
 
+@dataclass(frozen=True, slots=True)
+class Change:
+    """A participant, writer or reader that came, changed or went. `announced`: None when it went.
+
+    Of a participant, `participant` is its own GUID, and it has no topic and no type.
+    """
+
+    guid: UUID
+    handle: int
+    announced: Announced | None
+    participant: UUID
+    topic: str = ""
+    type_name: str = ""
+
+
+class _ParticipantSample(ctypes.Structure):
+    """`dds_builtintopic_participant_t` of Cyclone DDS."""
+
+    _fields_: ClassVar = [("key", ctypes.c_uint8 * 16), ("qos", ctypes.c_void_p)]
+
+
+class _EndpointSample(ctypes.Structure):
+    """`dds_builtintopic_endpoint_t` of Cyclone DDS."""
+
+    _fields_: ClassVar = [
+        ("key", ctypes.c_uint8 * 16),
+        ("participant_key", ctypes.c_uint8 * 16),
+        ("participant_instance_handle", ctypes.c_uint64),
+        ("topic_name", ctypes.c_char_p),
+        ("type_name", ctypes.c_char_p),
+        ("qos", ctypes.c_void_p),
+    ]
+
+
+_SAMPLES: Final = ctypes.POINTER(ctypes.c_void_p)
+# Functions of our own: the types of arguments that the binding gives to its own are for all who use those.
+_dds_take: Final = ctypes.CFUNCTYPE(
+    ctypes.c_int32, dds_c_t.entity, _SAMPLES, ctypes.POINTER(dds_c_t.sample_info), ctypes.c_size_t, ctypes.c_uint32
+)(("dds_take", DDS._dll_handle))
+_dds_return_loan: Final = ctypes.CFUNCTYPE(ctypes.c_int32, dds_c_t.entity, _SAMPLES, ctypes.c_int32)(
+    ("dds_return_loan", DDS._dll_handle)
+)
+
+
 class DiscoveryReader:
-    """What participants, writers or readers come and go in a domain, each with what it announces."""
+    """What participants, writers or readers come and go in a domain, each with what it announces.
+
+    The binding's own way of taking them gives up at a name that is no text, and leaves all that it took in memory.
+    """
 
     def __init__(self, participant: DomainParticipant, topic: Any) -> None:
         self.reader = BuiltinDataReader(participant, topic)
-        self.reader._cqos_conv = announced
+        self._sample = _ParticipantSample if topic is BuiltinTopicDcpsParticipant else _EndpointSample
 
-    def take(self) -> Any | None:
-        """The next change: `key`, `sample_info`, and `qos`, which is `Announced`. None when there is no more.
+    def take(self, count: int) -> tuple[list[Change], int]:
+        """Up to `count` changes, and how many more could not be read, which is logged. Fewer in all: there is no more.
 
-        ValueError for one that cannot be read, such as a topic whose name is no text: it is taken, the others follow.
+        OSError when Cyclone DDS does not give them.
         """
+        samples, infos = (ctypes.c_void_p * count)(), (dds_c_t.sample_info * count)()
+        taken = _dds_take(self.reader._ref, samples, infos, count, count)
+        if taken < 0:
+            raise OSError(f"Cyclone DDS does not say who came and went (return code {taken})")
+        changes, unreadable = [], 0
         try:
-            taken = self.reader.take(1)  # with more at once, one that cannot be read takes the others with it
-        except DDSException:
-            raise
-        except Exception as error:  # noqa: BLE001 - the binding raises no other class
-            raise ValueError(f"a peer announces what cannot be read ({error})") from None
-        return taken[0] if taken else None
+            for address, info in zip(samples[:taken], infos, strict=False):
+                try:
+                    changes.append(self._change(address, info))
+                except UnicodeDecodeError as error:
+                    unreadable += 1
+                    _log.error("a peer announces what cannot be read: the name %.100r", error.object)
+        finally:
+            if taken:
+                _dds_return_loan(self.reader._ref, samples, taken)
+        return changes, unreadable
+
+    def _change(self, address: int | None, info: Any) -> Change:
+        """UnicodeDecodeError for a topic or type whose name is no text."""
+        sample = ctypes.cast(ctypes.c_void_p(address), ctypes.POINTER(self._sample)).contents
+        guid = UUID(bytes=bytes(sample.key))
+        if not info.valid_data or info.instance_state != InstanceState.Alive:
+            return Change(guid, info.instance_handle, None, guid)  # of one that went only the key is there
+        said = announced(sample.qos)
+        if self._sample is _ParticipantSample:
+            return Change(guid, info.instance_handle, said, guid)
+        topic, type_name = (sample.topic_name or b"").decode(), (sample.type_name or b"").decode()
+        return Change(guid, info.instance_handle, said, UUID(bytes=bytes(sample.participant_key)), topic, type_name)
 
 
 def matched_readers(writer: DataWriter[Any]) -> list[int]:

@@ -200,7 +200,9 @@ class DdsServices:
             try:
                 text = self._endpoint.types.service(type_name, reader.qos.type_hash)
             except ConfigError as error:
-                self._endpoint.say_once(f"service {name} of {graph.owner(reader)} is left alone: {error}")
+                self._endpoint.say_once(
+                    f"service {name} of {graph.owner(reader)} is left alone: {names.cut(str(error), 600)}"
+                )
                 continue
             return ServiceInfo(name, type_name, Encoding.CDR, text.type_hash, text.definition)
         return None
@@ -313,9 +315,7 @@ class DdsServices:
         return server
 
     def _asked(self, server: _Server, sample: Sample) -> None:
-        caller = next(
-            (r for r in self._endpoint.graph.remotes.values() if r.handle == sample.handle and r.writer), None
-        )
+        caller = self._endpoint.graph.writer(sample.handle)
         if caller is not None and not self._understood(server.info.name, caller):
             return
         try:

@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 from sern_client.endpoints.dds import node_info
+from sern_client.endpoints.dds.node_info import Node
 from sern_core.errors import ConfigError
 from sern_core.types import Encoding, TopicName
 from sern_runtime.ros_types import topic_info
@@ -24,15 +25,15 @@ async def test_we_are_a_node(domain: int, make_peer: MakePeer, make_endpoint: Ma
     await peer.line("got info ")
     publisher = endpoint.advertise(topic_info("/chat", "std_msgs/msg/String", Encoding.CDR))
 
-    def nodes() -> list[tuple[str, list[object]]]:
+    def nodes() -> list[Node]:
         found = node_info.decode(peer.got("info")[-1])
         assert found is not None and found[0] == endpoint.graph.own
-        return [(name, list(guids)) for name, guids in found[1]]
+        return found[1]
 
-    await peer.until(lambda: any(publisher.guid in guids for _, guids in nodes()))
-    assert [name for name, _ in nodes()] == ["/sern_jackal"]
+    await peer.until(lambda: any(node.has(publisher.guid) for node in nodes()))
+    assert [node.name for node in nodes()] == ["/sern_jackal"]
     publisher.close()
-    await peer.until(lambda: not any(publisher.guid in guids for _, guids in nodes()))
+    await peer.until(lambda: not any(node.has(publisher.guid) for node in nodes()))
 
 
 async def test_nodes_of_others_are_named(domain: int, make_peer: MakePeer, make_endpoint: MakeEndpoint) -> None:

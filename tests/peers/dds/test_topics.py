@@ -11,7 +11,7 @@ import pytest
 
 from sern_core.errors import ConfigError, UsageError
 from sern_core.message import TopicInfo
-from sern_core.types import Encoding, TopicName
+from sern_core.types import DropReason, Encoding, TopicName
 from sern_runtime import ros_types
 from sern_runtime.ros_types import topic_info
 from tests.peers.dds.conftest import MakeEndpoint, MakePeer, Recorder
@@ -273,6 +273,9 @@ async def test_a_topic_whose_name_is_no_text_hides_no_other(
     await until(lambda: len(heard.got) == 1)
     assert set(heard.infos) == {TopicName("/good"), TopicName("/later")}
     assert len([text for text in caplog.messages if "announces what cannot be read" in text]) == 2
+    assert endpoint.drops == {DropReason.UNDECODABLE: 2}
+    await endpoint.stop()
+    assert endpoint.drops == {DropReason.UNDECODABLE: 2}
 
 
 async def test_several_domains_in_one_process(make_peer: MakePeer, make_endpoint: MakeEndpoint) -> None:

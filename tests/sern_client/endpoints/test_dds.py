@@ -1,7 +1,6 @@
 """The parts of the dds endpoint that need no peer: names, policies, the graph, settings, and its queues."""
 
 import ctypes
-import logging
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -19,10 +18,10 @@ from cyclonedds.core import DDSException, Policy, Qos
 from cyclonedds.pub import DataWriter
 from cyclonedds.qos import _CQos
 
-from sern_client.endpoints.dds import names, node_info, raw
+from sern_client.endpoints.dds import names, raw
 from sern_client.endpoints.dds.definitions import Definitions
 from sern_client.endpoints.dds.domain import DomainOptions, close_domain, environment_domain, open_domain
-from sern_client.endpoints.dds.graph import Graph, Local, Participant, Remote, puts_header
+from sern_client.endpoints.dds.graph import Remote, puts_header
 from sern_client.endpoints.dds.names import Role, RosName
 from sern_client.endpoints.dds.qos import (
     EndpointQos,
@@ -190,84 +189,13 @@ def test_what_a_stream_is_offered_with(reliable: bool | None, latched: bool, off
     assert writer_for(info, lifespan=True).lifespan_ns == 10**9
 
 
-class Heard:
-    def __init__(self) -> None:
-        self.topics: list[str] = []
-        self.services: list[str] = []
-
-    def writers_changed(self, name: RosName, topic: str) -> None:
-        self.topics.append(name.name)
-
-    def services_changed(self, name: TopicName) -> None:
-        self.services.append(name)
-
-
-OWN, OTHER, SERN = (UUID(int=number) for number in (1, 2, 3))
-STRING = "std_msgs::msg::dds_::String_"
-
-
-def remote(number: int, participant: UUID = OTHER, topic: str = "rt/chat", **changed: Any) -> Remote:
-    return replace(Remote(UUID(int=number), participant, True, topic, STRING, EndpointQos(), number), **changed)
-
-
-@pytest.mark.parametrize("heed_sern", [False, True])
-def test_the_graph_counts_what_is_of_this_site(heed_sern: bool) -> None:
-    heard = Heard()
-    graph = Graph(OWN, heard, heed_sern=heed_sern)
-    graph.participant_added(Participant(OTHER, "robot"))
-    graph.participant_added(Participant(SERN, "bridge", "sern_two"))
-    for number, participant in ((10, OWN), (11, OTHER), (12, SERN)):
-        graph.remote_added(remote(number, participant))
-        graph.remote_added(remote(number, participant))
-    graph.remote_added(remote(13, topic="not_ros"))
-    graph.remote_added(remote(14, topic="rq/set_boolRequest", writer=False))
-    found = [writer.handle for writer in graph.writers("rt/chat")]
-    assert found == ([11, 12] if heed_sern else [11])
-    assert graph.ignored == (set() if heed_sern else {12})
-    assert heard.topics == ["/chat"] * len(found) and heard.services == ["/set_bool"]
-    graph.participant_removed(SERN)
-    graph.participant_removed(OTHER)
-    assert graph.writers("rt/chat") == [] and graph.ignored == set() and graph.remotes == {}
-    graph.remote_removed(UUID(int=99))
-
-
-def test_mismatches_are_said_once_and_forgotten_with_their_cause(caplog: pytest.LogCaptureFixture) -> None:
-    graph = Graph(OWN, Heard())
-    graph.participant_added(Participant(OTHER, "robot"))
-    graph.nodes_of(OTHER, [("/ns/talker", [UUID(int=11)])])
-    with caplog.at_level(logging.WARNING):
-        graph.remote_added(remote(11))
-        graph.local_added(Local(UUID(int=20), False, "rt/chat", STRING, EndpointQos(reliable=True)))
-        graph.remote_added(remote(12, type_name="std_msgs::msg::dds_::Int32_", qos=EndpointQos(reliable=True)))
-        hashed = EndpointQos(reliable=True, type_hash="RIHS01_b")
-        graph.local_added(Local(UUID(int=21), True, "rt/back", STRING, replace(hashed, type_hash="RIHS01_a")))
-        graph.remote_added(remote(13, topic="rt/back", writer=False, qos=hashed))
-    assert [record.message for record in caplog.records] == [
-        "/chat: the publisher of node /ns/talker and we do not match: "
-        "reliability (offered best_effort, asked for reliable)",
-        f"/chat: the publisher of participant robot ({OTHER.hex[:24]}) and we do not match: "
-        f"type (std_msgs::msg::dds_::Int32_ there, {STRING} here)",
-        f"/back: the subscriber of participant robot ({OTHER.hex[:24]}) and we do not match: "
-        "version of the type (RIHS01_b there, RIHS01_a here)",
-    ]
-    graph.remote_removed(UUID(int=11))
-    graph.local_removed(UUID(int=21))
-    assert len(graph.complaints) == 1
-
-
 def test_who_puts_the_number_of_a_call_into_its_messages() -> None:
-    fast = UUID(bytes=b"\x01\x0f" + bytes(14))
-    assert puts_header(remote(5))
-    assert not puts_header(remote(5, guid=fast))
-    assert puts_header(remote(5, guid=fast, qos=EndpointQos(service_id="1.2")))
+    other = Remote(UUID(int=5), UUID(int=3), True, "rt/chat", "T", EndpointQos())
+    fast = replace(other, guid=UUID(bytes=b"\x01\x0f" + bytes(14)))
+    assert puts_header(other)
+    assert not puts_header(fast)
+    assert puts_header(replace(fast, qos=EndpointQos(service_id="1.2")))
     assert len(new_service_id().split(".")) == 16
-
-
-def test_node_information() -> None:
-    body = node_info.encode(OWN, "sern", [UUID(int=5)], [UUID(int=6)])
-    assert node_info.decode(body) == (OWN, [("/sern", [UUID(int=5), UUID(int=6)])])
-    for length in range(len(body) - 4):
-        assert node_info.decode(body[:length]) is None
 
 
 def test_settings_become_xml() -> None:
@@ -420,7 +348,7 @@ def test_a_writer_that_is_gone_has_no_readers_to_name() -> None:
 
 def test_a_writer_is_deleted_on_the_thread_that_may_wait() -> None:
     """However quick that thread is: deleting waits for slow readers, and the event loop must not."""
-    from sern_client.endpoints.dds.endpoint import _Writer
+    from sern_client.endpoints.dds.entities import Writer
 
     deleted_on: list[str] = []
 
@@ -429,14 +357,14 @@ def test_a_writer_is_deleted_on_the_thread_that_may_wait() -> None:
             deleted_on.append(threading.current_thread().name)
 
     class Endpoint:
-        def close_writer(self, writer: _Writer, kept: list[Any]) -> None:
+        def close_writer(self, writer: Writer, kept: list[Any]) -> None:
             worker = threading.Thread(target=kept.clear, name="worker")
             worker.start()
             worker.join()
 
     endpoint: Any = Endpoint()
     entity: Any = Entity()
-    writer = _Writer(endpoint, entity, UUID(int=1), stamped=False)
+    writer = Writer(endpoint, entity, UUID(int=1), stamped=False)
     del entity
     writer.close()
     assert deleted_on == ["worker"]
