@@ -81,6 +81,7 @@ class Provider:
     async def _run(self) -> None:
         pause_s = PROBE_AGAIN_S[0]
         while True:
+            unexpected: Exception | None = None
             try:
                 async with asyncio.timeout(PROBE_S):
                     fields = await self._probe()
@@ -93,11 +94,14 @@ class Provider:
                 problem = reason(error)
             except TimeoutError:
                 problem = f"no answer within {PROBE_S:g} s"
+            except Exception as error:  # noqa: BLE001  an error of ours must not be the end of a service
+                problem, unexpected = f"internal error: {reason(error)}", error
             if problem != self._said:
                 if not self._said:
                     self._failed_s = clock.now()
                 self._said = problem
-                _log.warning("%s: service of %s: %s", self.service, self.node_name, problem)
+                level = logging.WARNING if unexpected is None else logging.ERROR
+                _log.log(level, "%s: service of %s: %s", self.service, self.node_name, problem, exc_info=unexpected)
             await asyncio.sleep(pause_s)
             pause_s = min(pause_s * 2, PROBE_AGAIN_S[1])
 

@@ -35,6 +35,15 @@ class UnreachableError(CallError):
     """Nobody answers there."""
 
 
+def check_host(host: str) -> None:
+    """CallError for a host that no resolver can be asked for. An event loop would raise UnicodeError, of another kind
+    than all else that ends a connection: for an empty label (`.local`), one of more than 63 characters and the like."""
+    try:
+        host.encode("idna")
+    except UnicodeError:
+        raise CallError(f"{host[:200]!r} is no name of a host") from None
+
+
 def split_uri(uri: str, scheme: str = "http") -> tuple[str, int]:
     """Host and port of `http://host:port/` or `rosrpc://host:port`. CallError for anything else."""
     try:
@@ -44,6 +53,7 @@ def split_uri(uri: str, scheme: str = "http") -> tuple[str, int]:
         host = port = None
     if host is None or port is None or parts.scheme != scheme:
         raise CallError(f"{uri[:200]!r} is not {scheme}://host:port")
+    check_host(host)
     return host, port
 
 
