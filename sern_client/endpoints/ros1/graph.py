@@ -32,6 +32,8 @@ SHORT_WATCH_S: Final = 1.0
 MASTER_AGAIN_S: Final = 0.5
 GATHER_S: Final = 0.02
 """The master tells of one change several times (once a topic); one poll answers all."""
+THREAD_BYTES: Final = 100_000
+"""A longer state of the master is read in a thread: a thousand topics take 20 ms."""
 RUN_ID_S: Final = 1.0
 RECONCILE_S: Final = 60.0
 """How often a state that has not changed is read all the same, and what was refused is tried again."""
@@ -352,7 +354,10 @@ class Graph:
         answer = await self._master.state()
         if answer == self._seen:
             return
-        state = self._master.read_state(answer)
+        if len(answer) > THREAD_BYTES:
+            state = await asyncio.to_thread(self._master.read_state, answer)
+        else:
+            state = self._master.read_state(answer)
         kinds = {"publisher": state.publishers, "subscriber": state.subscribers, "service": state.services}
         self._listed = {
             Registration(kind, name)

@@ -12,7 +12,14 @@ from typing import Final, NamedTuple
 from sern_client.endpoints.base import ServiceEvents, ServiceHandler, ServiceInfo
 from sern_client.endpoints.ros1.frames import LENGTH
 from sern_client.endpoints.ros1.graph import Graph
-from sern_client.endpoints.ros1.header import BRIDGE_FIELD, MAX_HEADER_BYTES, decode_header, encode_header
+from sern_client.endpoints.ros1.header import (
+    BRIDGE_FIELD,
+    MAX_HEADER_BYTES,
+    check_lengths,
+    decode_header,
+    encode_header,
+    shown,
+)
 from sern_client.endpoints.ros1.master import ANY, Master, Table
 from sern_client.endpoints.ros1.server import Inbound
 from sern_client.endpoints.ros1.xmlrpc import CallError, reason, split_uri
@@ -120,6 +127,7 @@ class Provider:
         return connection.fields
 
     def _describe(self, fields: dict[str, str]) -> ServiceInfo:
+        check_lengths(fields, "type", "request_type", "md5sum")
         name = fields.get("type", "")
         if not name:
             name = fields.get("request_type", "").removesuffix("Request")
@@ -341,8 +349,8 @@ class ServiceHost:
         md5, own = fields.get("md5sum", ""), served.info.type_hash or ANY
         if ANY not in (md5, own) and md5 != own:
             return (
-                f"{name}: {fields.get('callerid', 'a caller')} expects {fields.get('type', 'a type')} with md5sum "
-                f"{md5}, what is served here is {served.info.type_name} with {own}"
+                f"{name}: {shown(fields, 'callerid', 'a caller')} expects {shown(fields, 'type', 'a type')} "
+                f"with md5sum {shown(fields, 'md5sum')}, what is served here is {served.info.type_name} with {own}"
             )
         link.answer(served.answer)
         if fields.get("probe") == "1" and link.transport is not None:

@@ -15,9 +15,9 @@ from typing import Final, Protocol
 
 from sern_client.endpoints.base import Sink
 from sern_client.endpoints.ros1.frames import Frames
-from sern_client.endpoints.ros1.header import BRIDGE_FIELD, encode_header
+from sern_client.endpoints.ros1.header import BRIDGE_FIELD, check_lengths, encode_header
 from sern_client.endpoints.ros1.master import ANY
-from sern_client.endpoints.ros1.xmlrpc import CallError, XmlRpcClient, check_host, reason
+from sern_client.endpoints.ros1.xmlrpc import MAX_REQUEST_BYTES, CallError, XmlRpcClient, check_host, reason
 from sern_client.tf_latch import TfLatch, is_static_tf
 from sern_core.errors import ConfigError, WireError
 from sern_core.message import TopicInfo
@@ -197,7 +197,7 @@ class Source:
             self._hang_up()
 
     async def _ask(self) -> tuple[str, int]:
-        client = XmlRpcClient(self.uri, timeout_s=CONNECT_S)
+        client = XmlRpcClient(self.uri, timeout_s=CONNECT_S, max_answer_bytes=MAX_REQUEST_BYTES)
         try:
             value = await client.call("requestTopic", self.topic.owner.caller, self.topic.topic, [["TCPROS"]])
         finally:
@@ -254,6 +254,7 @@ class Source:
 
     def _describe(self, fields: dict[str, str]) -> TopicInfo | None:
         """What to announce; None for a publisher that does not say what it publishes."""
+        check_lengths(fields, "type", "md5sum")
         type_name, md5 = fields.get("type", ANY), fields.get("md5sum", ANY)
         if type_name == ANY or md5 == ANY:
             return None
