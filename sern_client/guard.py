@@ -35,6 +35,10 @@ AGAIN_S: Final = (1.0, 30.0)
 """First and longest pause before it is started again."""
 END_S: Final = 3.0
 """How long it may take to leave its masters and domains."""
+ANSWERS: Final = frozenset(("ready", "stopped", "pong"))
+READ_BYTES: Final = 64 * 1024
+SHOWN_CHARS: Final = 100
+"""How much of a line that is no answer is shown."""
 
 DrivesRobots = sections.Ros1Endpoint | sections.DdsEndpoint | sections.ZenohEndpoint | sections.RclpyEndpoint
 
@@ -67,6 +71,7 @@ class Guard:
         self._process: Process | None = None
         self._ended_s: float | None = None  # since when none runs, after one had ended
         self._unanswered = 0  # pings since something was heard
+        self._noticed = False  # a line that was no answer
         self._task: asyncio.Task[None] | None = None
         self._spawning: asyncio.Task[Process] | None = None
 
@@ -124,7 +129,12 @@ class Guard:
     async def _keep(self) -> None:
         pause_s = AGAIN_S[0]
         while True:
-            code = await self._run()
+            try:
+                code = await self._run()
+            except Exception as error:  # noqa: BLE001  an error of ours must not leave the leases without a guard
+                _log.exception("the guard of the command topics is killed, because what it says could not be heard")
+                code = type(error).__name__
+                await self._kill()
             if self.ready:
                 pause_s = AGAIN_S[0]
             self.ready = False
@@ -158,12 +168,45 @@ class Guard:
         silence = asyncio.create_task(self._listen_for_silence(process), name="guard-silence")
         try:
             assert process.stdout is not None
-            while line := await process.stdout.readline():
-                self._unanswered = 0
-                self._answered(json.loads(line))
+            await self._listen(process.stdout)
             return f"exit code {await process.wait()}"
         finally:
             await end_tasks([silence])
+
+    async def _listen(self, answers: asyncio.StreamReader) -> None:
+        """Hear its answers until their end. Other text among them is the word of some library, before the guard has
+        taken standard output away from it."""
+        while True:
+            try:
+                line = await answers.readline()
+            except ValueError as error:  # longer than the reader keeps: what it has of it is gone
+                self._notice(str(error))
+                continue
+            if not line:
+                return
+            said = _answer(line)
+            if said is None:
+                self._notice(line.decode(errors="replace"))
+            else:
+                self._unanswered = 0
+                self._answered(said)
+
+    def _notice(self, text: str) -> None:
+        if not self._noticed:
+            self._noticed = True
+            shown = " ".join(text.split())[:SHOWN_CHARS]
+            _log.warning("the guard of the command topics says what is no answer, here and from now on: %s", shown)
+
+    async def _kill(self) -> None:
+        """The one that runs shall not live on beside the next one."""
+        process = self._process
+        if process is None or process.returncode is not None:
+            return
+        with suppress(ProcessLookupError):
+            process.kill()
+        with suppress(TimeoutError):
+            async with asyncio.timeout(END_S):
+                await process.wait()
 
     async def _listen_for_silence(self, process: Process) -> None:
         number = 0
@@ -189,6 +232,15 @@ class Guard:
             self.stopped += 1
 
 
+def _answer(line: bytes) -> dict[str, object] | None:
+    """What a line of its standard output says; None for what is no answer of a guard."""
+    try:
+        said = json.loads(line)
+    except (ValueError, RecursionError):
+        return None
+    return said if isinstance(said, dict) and not ANSWERS.isdisjoint(said) else None
+
+
 def _opening(key: int, topic: _Topic) -> dict[str, object]:
     return {"open": key, "info": asdict(topic.info), "stop": base64.b64encode(topic.stop).decode()}
 
@@ -203,8 +255,16 @@ async def _end(process: Process) -> None:
         process.stdin.close()
     try:
         async with asyncio.timeout(END_S):
-            await process.wait()
+            await _over(process)
     except TimeoutError:
         _log.error("the guard of the command topics does not end; it is killed")
-        process.kill()
-        await process.wait()
+        with suppress(ProcessLookupError):
+            process.kill()
+        await _over(process)
+
+
+async def _over(process: Process) -> None:
+    """Wait for its end. What it still says is read: a pipe that nobody reads holds back the news of the end."""
+    while process.stdout is not None and await process.stdout.read(READ_BYTES):
+        pass
+    await process.wait()

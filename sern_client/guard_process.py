@@ -12,9 +12,10 @@ What the client says, a line of JSON each, on standard input:
     {"close": 1}                                                     the client has said what there was to say
     {"ping": 7}
 
-What it answers: {"ready": true}, {"stopped": 1} for each lease that ran out here, {"pong": 7}. When standard input
-ends, or its parent does, whatever is armed is due at once; then it ends. Signals do not end it: those to a whole group
-come while the client still has to say its own stop commands.
+What it answers, on what was standard output when it began: {"ready": true}, {"stopped": 1} for each lease that ran out
+here, {"pong": 7}. Libraries that write to standard output (a trace of DDS, the log of rclpy) are given standard error.
+When standard input ends, or its parent does, whatever is armed is due at once; then it ends. Signals do not end it:
+those to a whole group come while the client still has to say its own stop commands.
 """
 
 import asyncio
@@ -48,6 +49,8 @@ from sern_runtime.config.endpoints import EndpointSection
 from sern_runtime.fine_timer import fine_timer
 
 READ_BYTES: Final = 64 * 1024
+STDOUT: Final = 1
+STDERR: Final = 2
 
 _log = logging.getLogger("sern_client.guard_process")
 
@@ -197,9 +200,10 @@ def _watch(parent: int) -> int | None:
         return None
 
 
-async def guard(parent: int) -> None:
-    """Runs until the client is gone. Raises ConfigError when an endpoint cannot be started."""
-    source, answers = sys.stdin.fileno(), sys.stdout.fileno()
+async def guard(parent: int, answers: int) -> None:
+    """Runs until the client is gone. `answers`: the descriptor to answer at. Raises ConfigError when an endpoint cannot
+    be started."""
+    source = sys.stdin.fileno()
     head = b""
     while not head.endswith(b"\n"):  # byte by byte: what follows is for the reader
         byte = os.read(source, 1)
@@ -231,12 +235,14 @@ async def guard(parent: int) -> None:
 
 
 def main() -> int:
+    answers = os.dup(STDOUT)
+    os.dup2(STDERR, STDOUT)
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
     parent = int(sys.argv[1])
     try:
         with asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:
-            runner.run(guard(parent))
+            runner.run(guard(parent, answers))
     except ConfigError as error:
         print(f"sern-client guard: {error}", file=sys.stderr)
         return 2

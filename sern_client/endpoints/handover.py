@@ -4,70 +4,119 @@ import asyncio
 from collections import deque
 from collections.abc import Callable
 from threading import Lock
-from typing import Final
+from typing import Final, NamedTuple
+
+from sern_runtime import clock
 
 DEFAULT_MAX_BYTES: Final = 64 * 2**20
+ITEM_BYTES: Final = 100
+"""What a message counts for beside its bytes: an empty one is kept in memory, too."""
+TURN_S: Final = 0.005
+"""How long the loop serves items before it looks at its sockets and timers again."""
+
+
+class _News(NamedTuple):
+    number: int
+    deliver: Callable[[], None]
+
+
+class _Message(NamedTuple):
+    number: int
+    deliver: Callable[[], None]
+    nbytes: int
+    shed: Callable[[], None] | None
 
 
 class Handover:
-    """`put` from any thread; `deliver` items run on the loop in the order they were put.
+    """`put` and `news` from any thread; `deliver` items run on the loop in the order they came.
 
-    At most `max_bytes` wait; beyond, the oldest that may be dropped are, and counted in `dropped`: a loop that is
-    behind serves what is fresh.
+    At most `max_bytes` of messages wait; beyond, the oldest are dropped, and counted in `dropped`: a loop that is
+    behind serves what is fresh. The newest message is never dropped.
     """
 
     def __init__(self, loop: asyncio.AbstractEventLoop, *, max_bytes: int = DEFAULT_MAX_BYTES) -> None:
         self.dropped = 0
+        """Messages, because more than `max_bytes` waited (queue_full)."""
         self._loop = loop
         self._max_bytes = max_bytes
         self._lock = Lock()
-        self._items: deque[tuple[Callable[[], None], int]] = deque()
+        self._count = 0
+        self._news: deque[_News] = deque()
+        self._messages: deque[_Message] = deque()
         self._nbytes = 0
         self._scheduled = False
         self._closed = False
 
-    def put(self, deliver: Callable[[], None], nbytes: int = 0) -> None:
-        """`nbytes` 0: never dropped (news of the graph)."""
+    def news(self, deliver: Callable[[], None]) -> None:
+        """What is said once and must arrive, and only then: changes of the graph, the end of a call."""
         with self._lock:
             if self._closed:
                 return
-            self._items.append((deliver, nbytes))
-            self._nbytes += nbytes
-            if self._nbytes > self._max_bytes:
-                self._shed()
-            if self._scheduled:
+            self._count += 1
+            self._news.append(_News(self._count, deliver))
+            wake = self._wakes()
+        if wake:
+            self._loop.call_soon_threadsafe(self._run)
+
+    def put(self, deliver: Callable[[], None], nbytes: int, shed: Callable[[], None] | None = None) -> None:
+        """A message that keeps `nbytes` in memory. `shed` is called in its place when it is dropped, in whatever thread
+        put the message that took its place."""
+        with self._lock:
+            if self._closed:
                 return
-            self._scheduled = True
-        self._loop.call_soon_threadsafe(self._run)
+            self._count += 1
+            self._messages.append(_Message(self._count, deliver, nbytes + ITEM_BYTES, shed))
+            self._nbytes += nbytes + ITEM_BYTES
+            dropped = self._shed()
+            wake = self._wakes()
+        if wake:
+            self._loop.call_soon_threadsafe(self._run)
+        for message in dropped:
+            if message.shed is not None:
+                message.shed()
 
     def close(self) -> None:
         """Nothing more is delivered."""
         with self._lock:
             self._closed = True
-            self._items.clear()
+            self._news.clear()
+            self._messages.clear()
             self._nbytes = 0
 
-    def _shed(self) -> None:
-        kept: deque[tuple[Callable[[], None], int]] = deque()
-        while self._nbytes > self._max_bytes and len(self._items) > 1:
-            item = self._items.popleft()
-            if item[1]:
-                self._nbytes -= item[1]
-                self.dropped += 1
-            else:
-                kept.append(item)
-        self._items.extendleft(reversed(kept))
+    def _wakes(self) -> bool:
+        """Whether the loop is to be woken: it is not while it has items to serve."""
+        wake, self._scheduled = not self._scheduled, True
+        return wake
+
+    def _shed(self) -> list[_Message]:
+        dropped: list[_Message] = []
+        while self._nbytes > self._max_bytes and len(self._messages) > 1:
+            message = self._messages.popleft()
+            self._nbytes -= message.nbytes
+            dropped.append(message)
+        self.dropped += len(dropped)
+        return dropped
+
+    def _next(self) -> Callable[[], None] | None:
+        """The oldest item; None where there is no more, and the next one wakes the loop."""
+        with self._lock:
+            if self._messages and not (self._news and self._news[0].number < self._messages[0].number):
+                message = self._messages.popleft()
+                self._nbytes -= message.nbytes
+                return message.deliver
+            if self._news:
+                return self._news.popleft().deliver
+            self._scheduled = False
+            return None
 
     def _run(self) -> None:
-        with self._lock:
-            items, self._items = self._items, deque()
-            self._nbytes = 0
-            self._scheduled = False
-        for deliver, _ in items:
-            if self._closed:
-                return
+        until_s = clock.now() + TURN_S
+        while (deliver := self._next()) is not None:
             try:
                 deliver()
             except Exception as error:  # noqa: BLE001  (of one item: those behind it are not lost with it)
                 message = "an item from another thread could not be delivered"
                 self._loop.call_exception_handler({"message": message, "exception": error})
+            if clock.now() >= until_s:
+                self._loop.call_soon(self._run)
+                return

@@ -92,3 +92,22 @@ async def test_a_node_of_ros2_is_told_to_stand_by_the_guard(kind: Any, tmp_path:
         finally:
             await guard.stop()
         await until(lambda: COMMANDS not in seen.infos, "it has left")
+
+
+async def test_a_trace_on_standard_output_does_not_disturb_the_guard(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    tracing = "<Tracing><Verbosity>config</Verbosity><OutputFile>stdout</OutputFile></Tracing>"
+    monkeypatch.setenv("CYCLONEDDS_URI", f"<CycloneDDS><Domain>{tracing}</Domain></CycloneDDS>")
+    own, _ = dds()
+    guard = Guard([own], tmp_path, LogSection())
+    guard.start()
+    try:
+        key = guard.opened(ros_types.topic_info(COMMANDS, TWIST, Encoding.CDR), STOP)
+        await until(lambda: guard.ready)
+        guard.lease(key, clock.now() - 1.0)
+        await until(lambda: guard.stopped == 1)
+        assert guard.ready and guard.restarts == 0
+    finally:
+        await guard.stop()
+    assert "what is no answer" not in caplog.text, "it goes to standard error"

@@ -11,8 +11,11 @@ import uvloop
 
 from sern_client import guard
 from sern_client.guard import Guard
+from sern_core.types import Encoding
+from sern_runtime import clock, ros_types
+from sern_runtime.config.endpoints import Ros1Endpoint
 from sern_runtime.config.shared import LogSection
-from tests.support import until
+from tests.support import ended, until
 
 ANSWERS = """
 import json, sys
@@ -22,6 +25,25 @@ for line in sys.stdin:
         print(json.dumps({"pong": said["ping"]}), json.dumps({"stopped": 1}), sep="\\n", flush=True)
 """
 """What it says has stopped counts its answers."""
+NOISY = (
+    """
+import sys
+noises = b"1790000.123 [0] tev: a trace", b"x" * 200_000, b"5", b"[1]", b'{"pang": 1}', b"\\xff\\xfe", b"[" * 60_000
+sys.stdout.buffer.write(b"\\n".join(noises) + b"\\n")
+"""
+    + ANSWERS
+)
+CHATTER = """
+import os, threading, time
+os.write(1, b"chatter at the start\\n")
+
+def chatter():
+    while True:
+        os.write(1, b"chatter of a library\\n")
+        time.sleep(0.01)
+
+threading.Thread(target=chatter, daemon=True).start()
+"""
 SILENT = "import sys; sys.stdin.read()"
 
 
@@ -79,3 +101,91 @@ async def test_a_guard_that_answers_no_ping_is_started_again(
     await watched.stop()
     assert "has not answered for 0.05 s; it is killed" in caplog.text
     assert "has ended (exit code -9)" in caplog.text
+
+
+async def test_text_among_its_answers_is_said_once_and_skipped(
+    runs: Callable[[str], Guard], caplog: pytest.LogCaptureFixture
+) -> None:
+    watched = runs(NOISY)
+    watched.start()
+    try:
+        await until(lambda: watched.stopped >= 3)
+        assert watched.restarts == 0
+    finally:
+        await watched.stop()
+    (said,) = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
+    assert said.endswith("says what is no answer, here and from now on: 1790000.123 [0] tev: a trace")
+
+
+async def test_text_is_no_sign_of_life(runs: Callable[[str], Guard], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(guard, "SILENT_S", 0.05)
+    watched = runs("import sys\nfor line in sys.stdin: print('I am not well', flush=True)")
+    watched.start()
+    await until(lambda: watched.restarts == 1)
+    await watched.stop()
+
+
+async def test_an_error_of_ours_ends_the_guard_and_starts_another(
+    runs: Callable[[str], Guard], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(guard, "AGAIN_S", (0.01, 0.01))
+    watched = runs(ANSWERS)
+    original, pids = Guard._answered, list[int]()
+
+    def failing(self: Guard, said: dict[str, object]) -> None:
+        if not pids:
+            assert self._process is not None
+            pids.append(self._process.pid)
+            raise KeyError("nobody expected this")
+        original(self, said)
+
+    monkeypatch.setattr(Guard, "_answered", failing)
+    watched.start()
+    try:
+        await until(lambda: watched.stopped >= 3)
+        assert watched.restarts == 1
+        assert ended(pids[0]), "it does not live on beside the new one"
+    finally:
+        await watched.stop()
+    assert "nobody expected this" in caplog.text and "has ended (KeyError); started again" in caplog.text
+
+
+async def test_a_library_that_writes_to_standard_output_does_not_disturb_the_guard(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, caplog: pytest.LogCaptureFixture, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """The real process, in which something writes to descriptor 1 from its first moment to its last."""
+    (tmp_path / "sitecustomize.py").write_text(CHATTER)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    section = Ros1Endpoint(kind="ros1", master_uri="http://127.0.0.1:1", host="127.0.0.1")
+    watched = Guard([section], tmp_path, LogSection())
+    watched.start()
+    try:
+        key = watched.opened(ros_types.topic_info("/cmd_vel", "geometry_msgs/msg/Twist", Encoding.ROS1), b"")
+        await until(lambda: watched.ready)
+        chattered: list[str] = []
+
+        def heard() -> bool:
+            chattered.append(capfd.readouterr().err)
+            return "chatter of a library" in "".join(chattered)
+
+        await until(heard)
+        watched.lease(key, clock.now() - 1.0)
+        await until(lambda: watched.stopped == 1)
+        assert watched.restarts == 0 and watched.ready
+    finally:
+        await watched.stop()
+    assert caplog.text.count("what is no answer, here and from now on: chatter at the start") == 1
+
+
+async def test_a_guard_that_writes_without_end_is_ended_with_its_client(
+    runs: Callable[[str], Guard], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What nobody reads any more holds back the news of its end."""
+    monkeypatch.setattr(guard, "END_S", 0.05)
+    watched = runs("while True: print('I am not well')")
+    watched.start()
+    await until(lambda: watched._process is not None)
+    process = watched._process
+    assert process is not None
+    await watched.stop()
+    assert process.returncode == -9

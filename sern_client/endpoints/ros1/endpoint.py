@@ -42,7 +42,7 @@ from sern_client.endpoints.ros1.server import TcprosServer
 from sern_client.endpoints.ros1.services import Served, ServiceHost, ServiceWatch
 from sern_client.endpoints.ros1.slave import BusLink, SlaveApi
 from sern_client.endpoints.ros1.subscription import ReceiveCounters, Source, Subscription, Topic
-from sern_client.endpoints.ros1.xmlrpc import CallError, XmlRpcServer, split_uri
+from sern_client.endpoints.ros1.xmlrpc import CallError, XmlRpcServer, check_host, split_uri
 from sern_core.errors import ConfigError, UsageError
 from sern_core.message import TopicInfo
 from sern_core.rules import name_problem
@@ -81,7 +81,7 @@ class Ros1Endpoint:
     """An `Endpoint` and `ServiceEndpoint` that is a node of one ROS 1 master. Several can be in one process."""
 
     def __init__(self, options: Ros1Options, *, environ: Mapping[str, str] | None = None) -> None:
-        """ConfigError for a master URI or a node name that cannot be one."""
+        """ConfigError for a master URI, a host or a node name that cannot be one."""
         environ = os.environ if environ is None else environ
         name = options.node_name or DEFAULT_NODE_NAME
         if not _NODE.fullmatch(name):
@@ -95,6 +95,11 @@ class Ros1Endpoint:
         except CallError as error:
             raise ConfigError(f"master_uri: {error}; write it like {DEFAULT_MASTER_URI}") from None
         self.host = options.host or environ.get("ROS_HOSTNAME") or environ.get("ROS_IP") or ""
+        if self.host:
+            try:
+                check_host(self.host)
+            except CallError as error:
+                raise ConfigError(f"host: {error}; check it, or ROS_HOSTNAME where it is not set") from None
         self.counters = ReceiveCounters()
         self.max_message_bytes = options.max_message_bytes
         self.tcp_nodelay = options.tcp_nodelay
@@ -221,7 +226,8 @@ class Ros1Endpoint:
             topic.interest(wanted)
 
     def validate(self, held: Held) -> list[Difference]:
-        """Publishers that the master does not list differ too, unless there is no master."""
+        """Publishers that the master does not list differ too, unless there is no master; and nodes that nobody watches
+        any more, so that nothing of theirs would come or go."""
         here = Held()
         for name, publication in self._publications.items():
             if not publication.closed:
@@ -233,6 +239,11 @@ class Ros1Endpoint:
             Difference(TopicName(self._local(name)), f"{self.caller} is not listed as its {kind} at {self.master_uri}")
             for kind, name in self._graph.unlisted
             if kind != "service"
+        ]
+        found += [
+            Difference(TopicName(""), f"{node.name} at {self.master_uri} is not watched any more")
+            for node in self._graph.nodes.values()
+            if node.ended
         ]
         return found if self.problem is None else [Difference(TopicName(""), self.problem), *found]
 

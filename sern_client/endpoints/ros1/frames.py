@@ -1,8 +1,9 @@
 """TCPROS framing: every header and every message is a little-endian u32 length and so many bytes.
 
 `Frames` is the receiving half of a connection. Small frames are cut out of one buffer that all connections share
-(a read and its handling are one step of the event loop); a frame that is still incomplete then gets a buffer of its
-own size, which the socket fills directly.
+(a read and its handling are one step of the event loop). A frame that is still incomplete then gets a buffer of its
+own, which the socket fills directly: as long as the frame where one so long has come before, else `SCRATCH_BYTES`, and
+each time that is full another one as long as all that came. A length alone makes nobody take memory.
 """
 
 import asyncio
@@ -27,10 +28,12 @@ class Frames(asyncio.BufferedProtocol, ABC):
     """One connection's receiving half. A subclass says what to do with the header and with each message.
 
     `max_frame_bytes` bounds messages: one that is longer is read and thrown away, and `too_large` is told once it is
-    announced. A header that is too long, or none in time, ends the connection.
+    announced. A header that is too long, or none in time, ends the connection, and so does a message that is not
+    complete `frame_s` after its beginning; None: it may take its time.
     """
 
     max_frame_bytes: int
+    frame_s: float | None = None
 
     def __init__(self, max_frame_bytes: int) -> None:
         self.max_frame_bytes = max_frame_bytes
@@ -39,9 +42,12 @@ class Frames(asyncio.BufferedProtocol, ABC):
         self.received_bytes = 0
         self.received_messages = 0
         self._partial = b""  # less than a length
-        self._frame: bytearray | None = None
+        self._frame: bytearray | None = None  # what is being filled of an incomplete frame
         self._view = memoryview(b"")
         self._have = 0
+        self._filled: list[bytearray] = []  # the full buffers before it
+        self._missing = 0  # bytes of the frame that no buffer is there for
+        self._longest = SCRATCH_BYTES  # what has come in one frame
         self._skip = 0  # bytes of a frame that is too long
         self._headed = False
         self._patience: asyncio.TimerHandle | None = None
@@ -71,14 +77,13 @@ class Frames(asyncio.BufferedProtocol, ABC):
         address = transport.get_extra_info("peername")
         self.peer = f"{address[0]}:{address[1]}" if isinstance(address, tuple) and len(address) >= 2 else "?"
         keep_alive(transport)
-        self._patience = asyncio.get_running_loop().call_later(HANDSHAKE_S, self._impatient)
+        self._wait(HANDSHAKE_S)
 
     def connection_lost(self, exc: Exception | None) -> None:
         del exc
         self.transport = None
         self._settle()
-        self._frame = None
-        self._view = memoryview(b"")
+        self._forget_frame()
 
     def get_buffer(self, sizehint: int) -> memoryview:
         del sizehint
@@ -92,7 +97,10 @@ class Frames(asyncio.BufferedProtocol, ABC):
             if self._frame is not None:
                 self._have += nbytes
                 if self._have == len(self._frame):
-                    self._whole()
+                    if self._missing:
+                        self._grow(self._frame)
+                    else:
+                        self._whole(self._frame)
             elif self._skip:
                 self._skip -= nbytes
             elif self._partial:
@@ -112,11 +120,35 @@ class Frames(asyncio.BufferedProtocol, ABC):
 
     # Inside
 
-    def _whole(self) -> None:
-        assert self._frame is not None
-        body = bytes(self._frame)
-        self._frame, self._view, self._have = None, memoryview(b""), 0
+    def _begin(self, size: int, data: memoryview) -> None:
+        """A frame of which this has come."""
+        self._frame = bytearray(min(size, self._longest))
+        self._missing = size - len(self._frame)
+        self._view = memoryview(self._frame)
+        self._have = len(data)
+        self._view[: self._have] = data
+        if self._headed and self.frame_s is not None:
+            self._wait(self.frame_s)
+
+    def _grow(self, full: bytearray) -> None:
+        self._filled.append(full)
+        came = sum(map(len, self._filled))
+        self._frame = bytearray(min(self._missing, came))
+        self._missing -= len(self._frame)
+        self._view, self._have = memoryview(self._frame), 0
+
+    def _whole(self, last: bytearray) -> None:
+        body = b"".join((*self._filled, last)) if self._filled else bytes(last)
+        self._longest = max(self._longest, len(body))
+        self._forget_frame()
+        if self._headed:
+            self._settle()
         self._take(body)
+
+    def _forget_frame(self) -> None:
+        self._frame, self._view, self._have = None, memoryview(b""), 0
+        self._filled.clear()
+        self._missing = 0
 
     def _cut(self, data: memoryview) -> None:
         self._partial = b""
@@ -138,10 +170,7 @@ class Frames(asyncio.BufferedProtocol, ABC):
                 self._skip = size - (end - at)
                 self.too_large(size)
                 return
-            self._frame = bytearray(size)
-            self._view = memoryview(self._frame)
-            self._have = end - at
-            self._view[: self._have] = data[at:]
+            self._begin(size, data[at:])
             return
         self._partial = bytes(data[at:])
 
@@ -156,13 +185,18 @@ class Frames(asyncio.BufferedProtocol, ABC):
         self._settle()
         self.header(decode_header(body))
 
+    def _wait(self, patience_s: float) -> None:
+        self._settle()
+        self._patience = asyncio.get_running_loop().call_later(patience_s, self._impatient, patience_s)
+
     def _settle(self) -> None:
         if self._patience is not None:
             self._patience.cancel()
             self._patience = None
 
-    def _impatient(self) -> None:
-        self.failed(WireError(f"no connection header within {HANDSHAKE_S:g} s"))
+    def _impatient(self, patience_s: float) -> None:
+        what = "a message that is not complete" if self._headed else "no connection header"
+        self.failed(WireError(f"{what} within {patience_s:g} s"))
         self.close()
 
 

@@ -32,6 +32,8 @@ SHORT_WATCH_S: Final = 1.0
 MASTER_AGAIN_S: Final = 0.5
 GATHER_S: Final = 0.02
 """The master tells of one change several times (once a topic); one poll answers all."""
+THREAD_BYTES: Final = 100_000
+"""A longer state of the master is read in a thread: a thousand topics take 20 ms."""
 RUN_ID_S: Final = 1.0
 RECONCILE_S: Final = 60.0
 """How often a state that has not changed is read all the same, and what was refused is tried again."""
@@ -95,6 +97,7 @@ class Node:
         self.alive = False
         self.members: list[Member] = []
         self._master = master
+        self._said = ""
         self._look = asyncio.Event()
         self._transport: asyncio.BaseTransport | None = None
         self._task = asyncio.create_task(self._run(), name=f"ros1 node {name}")
@@ -114,6 +117,11 @@ class Node:
         if self._transport is not None:
             self._transport.close()
 
+    @property
+    def ended(self) -> bool:
+        """Whether nobody watches it any more, though it was not closed: an error of ours."""
+        return self._task.done()
+
     def close(self) -> None:
         self._task.cancel()
         if self._transport is not None:
@@ -123,22 +131,48 @@ class Node:
         loop = asyncio.get_running_loop()
         pause_s = LOOK_AGAIN_S[0]
         while True:
-            with suppress(CallError):  # no master, or one that has not heard of it: where it was last is the best guess
-                self.uri = await self._master.node_uri(self.name)
             began_s = loop.time()
             try:
+                # No master, or one that has not heard of it: where it was last is the best guess.
+                with suppress(CallError):
+                    self.uri = await self._master.node_uri(self.name)
+                began_s = loop.time()
                 await self._watch()
             except (CallError, OSError, TimeoutError):
                 self._dead()
-                await self._pause(pause_s)
-                pause_s = min(pause_s * 2, LOOK_AGAIN_S[1])
+            except Exception as error:  # noqa: BLE001  an error of ours must not end the watching of a node
+                self._failed(error)
+            else:
+                pause_s = LOOK_AGAIN_S[0]
+                if loop.time() - began_s < SHORT_WATCH_S:
+                    await self._pause(pause_s)
+                else:
+                    self._said = ""
                 continue
-            pause_s = LOOK_AGAIN_S[0]
-            if loop.time() - began_s < SHORT_WATCH_S:
-                await self._pause(pause_s)
+            await self._pause(pause_s)
+            pause_s = min(pause_s * 2, LOOK_AGAIN_S[1])
+
+    def _failed(self, error: Exception) -> None:
+        """Log an error that nobody expected, once until it is another one; the node counts as dead."""
+        try:
+            self._dead()
+        except Exception:  # noqa: BLE001  what a member does must not end the watching either
+            _log.exception("%s: what it offers could not be withdrawn", self.name)
+        if self._says(f"{type(error).__name__}: {error}"):
+            _log.error("%s: the watching of this node failed; it is tried again", self.name, exc_info=error)
+
+    def _says(self, problem: str) -> bool:
+        """Whether a problem is to be logged: once until it is another one."""
+        new, self._said = problem != self._said, problem
+        return new
 
     async def _watch(self) -> None:
-        host, port = split_uri(self.uri)
+        try:
+            host, port = split_uri(self.uri)
+        except CallError as error:
+            if self.uri and self._says(str(error)):
+                _log.warning("%s: the master has %s; its ROS_HOSTNAME is to be another one", self.name, error)
+            raise
         loop = asyncio.get_running_loop()
         async with asyncio.timeout(CONNECT_S):
             _, watch = await loop.create_connection(_Watch, host, port)
@@ -320,7 +354,10 @@ class Graph:
         answer = await self._master.state()
         if answer == self._seen:
             return
-        state = self._master.read_state(answer)
+        if len(answer) > THREAD_BYTES:
+            state = await asyncio.to_thread(self._master.read_state, answer)
+        else:
+            state = self._master.read_state(answer)
         kinds = {"publisher": state.publishers, "subscriber": state.subscribers, "service": state.services}
         self._listed = {
             Registration(kind, name)

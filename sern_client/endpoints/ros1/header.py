@@ -18,6 +18,8 @@ from sern_core.errors import WireError
 MAX_HEADER_BYTES: Final = 1_200_000
 """The longest accepted definition text (1 MiB) and the other fields; what a stranger may make us hold."""
 MAX_FIELDS: Final = 64
+SHOWN_CHARS: Final = 200
+"""How much of a field is shown in a log, an error or a list: any text can be in it."""
 
 BRIDGE_FIELD: Final = "sern_bridge"
 """This field stands in our headers, with the node's name as its value. What comes from such a publisher or server came
@@ -56,3 +58,15 @@ def decode_header(body: bytes) -> dict[str, str]:
         if len(fields) > MAX_FIELDS:
             raise WireError(f"connection header: more than {MAX_FIELDS} fields")
     return fields
+
+
+def shown(fields: Mapping[str, str], name: str, default: str = "") -> str:
+    """A field as it is shown: no more than its first `SHOWN_CHARS` characters."""
+    return fields.get(name, default)[:SHOWN_CHARS]
+
+
+def check_lengths(fields: Mapping[str, str], *names: str) -> None:
+    """WireError where one of these fields is longer than any type or hash of ROS."""
+    for name in names:
+        if (length := len(fields.get(name, ""))) > SHOWN_CHARS:
+            raise WireError(f"its {name} has {length} characters")

@@ -14,7 +14,7 @@ from math import inf
 from typing import TYPE_CHECKING, Final
 
 from sern_client.endpoints.ros1.frames import LENGTH
-from sern_client.endpoints.ros1.header import BRIDGE_FIELD
+from sern_client.endpoints.ros1.header import BRIDGE_FIELD, shown
 from sern_client.endpoints.ros1.hold import Hold
 from sern_client.tf_latch import TfLatch, is_static_tf
 from sern_core.errors import ConfigError
@@ -166,10 +166,10 @@ class Publication:
 
     def refusal(self, fields: dict[str, str]) -> str | None:
         """Why a subscriber with this header cannot be served; None when it can."""
-        md5, type_name = fields.get("md5sum", ""), fields.get("type", "*")
-        if md5 not in ("*", self.info.type_hash):
+        if fields.get("md5sum", "") not in ("*", self.info.type_hash):
             return (
-                f"{self.topic}: {fields.get('callerid', 'a subscriber')} expects {type_name} with md5sum {md5}, "
+                f"{self.topic}: {shown(fields, 'callerid', 'a subscriber')} expects {shown(fields, 'type', '*')} "
+                f"with md5sum {shown(fields, 'md5sum')}, "
                 f"what arrives here is {self.type_name} with {self.info.type_hash}"
             )
         return None

@@ -7,7 +7,7 @@ from itertools import count
 from typing import Final, Protocol
 
 from sern_client.endpoints.ros1.frames import Frames
-from sern_client.endpoints.ros1.header import encode_header
+from sern_client.endpoints.ros1.header import encode_header, shown
 from sern_client.endpoints.ros1.listener import Listener
 from sern_client.endpoints.ros1.publication import Feed, Publication
 from sern_core.errors import WireError
@@ -15,6 +15,8 @@ from sern_core.errors import WireError
 MAX_CONNECTIONS: Final = 2048
 FLUSH_S: Final = 0.5
 """How long `stop` waits for what was written before."""
+REQUEST_S: Final = 60.0
+"""How long a begun request to a service may take to arrive."""
 MAX_REFUSALS: Final = 256
 """Refusals that are remembered, so that each is logged once."""
 
@@ -42,6 +44,7 @@ class Inbound(Frames):
 
     def __init__(self, server: "TcprosServer") -> None:
         super().__init__(server.max_frame_bytes)
+        self.frame_s = REQUEST_S
         self.server = server
         self._feed: Feed | None = None
         self._caller: Caller | None = None
@@ -87,7 +90,8 @@ class Inbound(Frames):
         if (problem := publication.refusal(fields)) is not None:
             self.refuse(problem)
             return
-        caller = fields.get("callerid", self.peer)
+        self.max_frame_bytes = 0
+        caller = shown(fields, "callerid", self.peer)
         self.answer(publication.answer)
         self._feed = Feed(self, publication, caller, next(self.server.numbers))
         publication.join(self._feed)
@@ -108,9 +112,15 @@ class Inbound(Frames):
     def message(self, body: bytes) -> None:
         if self._caller is not None:
             self._caller.request(body)
-        # a subscriber has nothing to say
+        elif self._feed is not None:
+            self.too_large(len(body))
 
     def too_large(self, size_bytes: int) -> None:
+        if self._feed is not None:
+            name = self._feed.caller
+            self.server.complain(f"{name}: a message of {size_bytes} bytes; a subscriber has nothing to say")
+            self.close()
+            return
         self.server.complain(f"{self.peer} sends {size_bytes} bytes, the limit is {self.max_frame_bytes}")
         self.close()
 

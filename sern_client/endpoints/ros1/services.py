@@ -12,7 +12,14 @@ from typing import Final, NamedTuple
 from sern_client.endpoints.base import ServiceEvents, ServiceHandler, ServiceInfo
 from sern_client.endpoints.ros1.frames import LENGTH
 from sern_client.endpoints.ros1.graph import Graph
-from sern_client.endpoints.ros1.header import BRIDGE_FIELD, MAX_HEADER_BYTES, decode_header, encode_header
+from sern_client.endpoints.ros1.header import (
+    BRIDGE_FIELD,
+    MAX_HEADER_BYTES,
+    check_lengths,
+    decode_header,
+    encode_header,
+    shown,
+)
 from sern_client.endpoints.ros1.master import ANY, Master, Table
 from sern_client.endpoints.ros1.server import Inbound
 from sern_client.endpoints.ros1.xmlrpc import CallError, reason, split_uri
@@ -81,6 +88,7 @@ class Provider:
     async def _run(self) -> None:
         pause_s = PROBE_AGAIN_S[0]
         while True:
+            unexpected: Exception | None = None
             try:
                 async with asyncio.timeout(PROBE_S):
                     fields = await self._probe()
@@ -93,11 +101,14 @@ class Provider:
                 problem = reason(error)
             except TimeoutError:
                 problem = f"no answer within {PROBE_S:g} s"
+            except Exception as error:  # noqa: BLE001  an error of ours must not be the end of a service
+                problem, unexpected = f"internal error: {reason(error)}", error
             if problem != self._said:
                 if not self._said:
                     self._failed_s = clock.now()
                 self._said = problem
-                _log.warning("%s: service of %s: %s", self.service, self.node_name, problem)
+                level = logging.WARNING if unexpected is None else logging.ERROR
+                _log.log(level, "%s: service of %s: %s", self.service, self.node_name, problem, exc_info=unexpected)
             await asyncio.sleep(pause_s)
             pause_s = min(pause_s * 2, PROBE_AGAIN_S[1])
 
@@ -116,6 +127,7 @@ class Provider:
         return connection.fields
 
     def _describe(self, fields: dict[str, str]) -> ServiceInfo:
+        check_lengths(fields, "type", "request_type", "md5sum")
         name = fields.get("type", "")
         if not name:
             name = fields.get("request_type", "").removesuffix("Request")
@@ -337,8 +349,8 @@ class ServiceHost:
         md5, own = fields.get("md5sum", ""), served.info.type_hash or ANY
         if ANY not in (md5, own) and md5 != own:
             return (
-                f"{name}: {fields.get('callerid', 'a caller')} expects {fields.get('type', 'a type')} with md5sum "
-                f"{md5}, what is served here is {served.info.type_name} with {own}"
+                f"{name}: {shown(fields, 'callerid', 'a caller')} expects {shown(fields, 'type', 'a type')} "
+                f"with md5sum {shown(fields, 'md5sum')}, what is served here is {served.info.type_name} with {own}"
             )
         link.answer(served.answer)
         if fields.get("probe") == "1" and link.transport is not None:

@@ -15,9 +15,9 @@ from typing import Final, Protocol
 
 from sern_client.endpoints.base import Sink
 from sern_client.endpoints.ros1.frames import Frames
-from sern_client.endpoints.ros1.header import BRIDGE_FIELD, encode_header
+from sern_client.endpoints.ros1.header import BRIDGE_FIELD, check_lengths, encode_header
 from sern_client.endpoints.ros1.master import ANY
-from sern_client.endpoints.ros1.xmlrpc import CallError, XmlRpcClient, reason
+from sern_client.endpoints.ros1.xmlrpc import MAX_REQUEST_BYTES, CallError, XmlRpcClient, check_host, reason
 from sern_client.tf_latch import TfLatch, is_static_tf
 from sern_core.errors import ConfigError, WireError
 from sern_core.message import TopicInfo
@@ -137,7 +137,7 @@ class Source:
 
     def up(self, uri: str) -> None:
         """Its node lives, at this URI."""
-        if self._task is not None and uri == self.uri:
+        if self._task is not None and not self._task.done() and uri == self.uri:
             return
         self.down()
         self.uri = uri
@@ -173,6 +173,8 @@ class Source:
                 self._failed(reason(error))
             except TimeoutError:
                 self._failed(f"no connection within {CONNECT_S:g} s")
+            except Exception as error:  # noqa: BLE001  an error of ours must not be the end of a publisher
+                self._failed(f"internal error: {reason(error)}", error)
             await asyncio.sleep(pause_s)
             pause_s = min(pause_s * 2, BACKOFF_S[1])
 
@@ -186,8 +188,8 @@ class Source:
                 limit = self.topic.owner.max_message_bytes
                 _, link = await loop.create_connection(lambda: _Link(self, limit), host, port)
                 self.link = link
-                assert link.transport is not None
-                link.transport.write(encode_header(self._request()))
+                if link.transport is not None:  # else it has ended already, and `greeted` says so
+                    link.transport.write(encode_header(self._request()))
                 await link.greeted
             await link.closed
             return self.fields is not None
@@ -195,13 +197,14 @@ class Source:
             self._hang_up()
 
     async def _ask(self) -> tuple[str, int]:
-        client = XmlRpcClient(self.uri, timeout_s=CONNECT_S)
+        client = XmlRpcClient(self.uri, timeout_s=CONNECT_S, max_answer_bytes=MAX_REQUEST_BYTES)
         try:
             value = await client.call("requestTopic", self.topic.owner.caller, self.topic.topic, [["TCPROS"]])
         finally:
             client.close()
         match value:
             case ["TCPROS", str(host), int(port)]:
+                check_host(host)
                 return host, port
         raise CallError(f"{self.uri}: requestTopic: the answer is not [TCPROS, host, port]")
 
@@ -225,9 +228,10 @@ class Source:
             self.fields = self.info = None
             self.topic.source_lost(self)
 
-    def _failed(self, problem: str) -> None:
-        """There is no connection, or none that is of use."""
-        if self.say(problem) and self._failed_s is None:
+    def _failed(self, problem: str, error: Exception | None = None) -> None:
+        """There is no connection, or none that is of use. `error`: what nobody expected."""
+        level = logging.WARNING if error is None else logging.ERROR
+        if self.say(problem, level, error) and self._failed_s is None:
             self._failed_s = clock.now()
 
     def greet(self, link: _Link, fields: dict[str, str]) -> None:
@@ -250,6 +254,7 @@ class Source:
 
     def _describe(self, fields: dict[str, str]) -> TopicInfo | None:
         """What to announce; None for a publisher that does not say what it publishes."""
+        check_lengths(fields, "type", "md5sum")
         type_name, md5 = fields.get("type", ANY), fields.get("md5sum", ANY)
         if type_name == ANY or md5 == ANY:
             return None
@@ -293,12 +298,12 @@ class Source:
             self._too_large = True
             self.say(f"a message of {size_bytes} bytes is dropped, max_message_bytes is {limit_bytes}")
 
-    def say(self, problem: str, level: int = logging.WARNING) -> bool:
-        """Log a problem, once until it is another one."""
+    def say(self, problem: str, level: int = logging.WARNING, error: Exception | None = None) -> bool:
+        """Log a problem, once until it is another one. `error`: with where it came from."""
         if problem == self._said:
             return False
         self._said = problem
-        _log.log(level, "%s: publisher %s: %s", self.topic.topic, self.node_name, problem)
+        _log.log(level, "%s: publisher %s: %s", self.topic.topic, self.node_name, problem, exc_info=error)
         return True
 
 

@@ -16,7 +16,8 @@ from sern_runtime.ros_types import one_line
 CALL_TIMEOUT_S: Final = 5.0
 MAX_ANSWER_BYTES: Final = 32 * 2**20
 """The state of a master with ten thousand topics is about 5 MB."""
-MAX_REQUEST_BYTES: Final = 2**20
+MAX_REQUEST_BYTES: Final = 64 * 2**10
+"""What a node is asked and answers: the longest is a list of some hundred publishers. It is decoded on the loop."""
 MAX_CONNECTIONS: Final = 256
 IDLE_S: Final = 20.0
 """How long a begun request may take to arrive."""
@@ -35,6 +36,15 @@ class UnreachableError(CallError):
     """Nobody answers there."""
 
 
+def check_host(host: str) -> None:
+    """CallError for a host that no resolver can be asked for. An event loop would raise UnicodeError, of another kind
+    than all else that ends a connection: for an empty label (`.local`), one of more than 63 characters and the like."""
+    try:
+        host.encode("idna")
+    except UnicodeError:
+        raise CallError(f"{host[:200]!r} is no name of a host") from None
+
+
 def split_uri(uri: str, scheme: str = "http") -> tuple[str, int]:
     """Host and port of `http://host:port/` or `rosrpc://host:port`. CallError for anything else."""
     try:
@@ -44,6 +54,7 @@ def split_uri(uri: str, scheme: str = "http") -> tuple[str, int]:
         host = port = None
     if host is None or port is None or parts.scheme != scheme:
         raise CallError(f"{uri[:200]!r} is not {scheme}://host:port")
+    check_host(host)
     return host, port
 
 
@@ -62,10 +73,10 @@ def decode_call(body: bytes) -> tuple[tuple[Any, ...], str | None]:
 class _Exchange(asyncio.Protocol):
     """The client's end of one connection: one request at a time."""
 
-    def __init__(self) -> None:
+    def __init__(self, max_answer_bytes: int) -> None:
         self.transport: asyncio.Transport | None = None
         self.reusable = False
-        self._reader = HttpReader(max_body_bytes=MAX_ANSWER_BYTES, answers=True)
+        self._reader = HttpReader(max_body_bytes=max_answer_bytes, answers=True)
         self._answer: asyncio.Future[HttpMessage] | None = None
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
@@ -117,10 +128,13 @@ class _Exchange(asyncio.Protocol):
 class XmlRpcClient:
     """Calls one server over one connection, which is kept. Calls wait for each other."""
 
-    def __init__(self, uri: str, *, timeout_s: float = CALL_TIMEOUT_S) -> None:
+    def __init__(
+        self, uri: str, *, timeout_s: float = CALL_TIMEOUT_S, max_answer_bytes: int = MAX_ANSWER_BYTES
+    ) -> None:
         """CallError for a URI that is not http://host:port."""
         self.uri = uri
         self.timeout_s = timeout_s
+        self._max_answer_bytes = max_answer_bytes
         self._host, self._port = split_uri(uri)
         self._exchange: _Exchange | None = None
         self._lock = asyncio.Lock()
@@ -155,7 +169,9 @@ class XmlRpcClient:
                 return await self._exchange.ask(request)
             self.close()
         loop = asyncio.get_running_loop()
-        _, self._exchange = await loop.create_connection(_Exchange, self._host, self._port)
+        _, self._exchange = await loop.create_connection(
+            lambda: _Exchange(self._max_answer_bytes), self._host, self._port
+        )
         return await self._exchange.ask(request)
 
     async def call(self, method: str, *params: Any) -> Any:

@@ -157,7 +157,7 @@ class ZenohEndpoint(Services):
         def arrived(sample: Any) -> None:
             body = sample.payload.to_bytes()
             attachment = None if sample.attachment is None else sample.attachment.to_bytes()
-            session.handover.put(lambda: deliver(body, attachment), len(body))
+            session.handover.put(lambda: deliver(body, attachment), len(body) + len(attachment or b""))
 
         def deliver(body: bytes, attachment: bytes | None) -> None:
             if declared.closed:
@@ -248,7 +248,7 @@ class ZenohEndpoint(Services):
     def _token(self, sample: Any) -> None:
         """Runs in a thread of zenoh's."""
         key, alive = str(sample.key_expr), sample.kind == self.session.zenoh.SampleKind.PUT
-        self.session.handover.put(lambda: self._token_changed(key, alive))
+        self.session.handover.news(lambda: self._token_changed(key, alive))
 
     def _token_changed(self, key: str, alive: bool) -> None:
         try:

@@ -20,7 +20,7 @@ class Presence:
         self._querier: Any = session.opened.declare_querier(key, target=zenoh.QueryTarget.BEST_MATCHING)
 
         def changed(_status: Any) -> None:  # in a thread of zenoh's
-            handover.put(self._look)
+            handover.news(self._look)
 
         self._listener: Any = self._querier.declare_matching_listener(zenoh.handlers.Callback(changed))
         self._look()

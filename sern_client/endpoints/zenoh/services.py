@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from sern_runtime.ros_files import TypeFiles
 
 CDR: Final = "application/cdr"
+BEHIND: Final = "the bridge is behind with what has arrived"
 MAX_REQUESTS: Final = 256
 """Requests of one service that may be under way; more are refused."""
 
@@ -89,6 +90,7 @@ class Services(ABC):
         key = self._data_key(info)
         zenoh, handover = self.session.zenoh, self.session.handover
         answer: asyncio.Future[bytes] = asyncio.get_running_loop().create_future()
+        heard = False
 
         def settle(body: bytes | None, problem: str) -> None:
             if answer.done():
@@ -99,15 +101,19 @@ class Services(ABC):
                 answer.set_result(body)
 
         def replied(reply: Any) -> None:
+            nonlocal heard
+            if heard:  # one answer is what a call has: a server that says more keeps nothing here
+                return
+            heard = True
             if reply.ok is not None:
                 body = reply.ok.payload.to_bytes()
-                handover.put(lambda: settle(body, ""))
+                handover.news(lambda: settle(body, ""))
             else:
                 text = reply.err.payload.to_bytes()[:512].decode(errors="replace")
-                handover.put(lambda: settle(None, f"{name}: {text or 'refused'}"))
+                handover.news(lambda: settle(None, f"{name}: {text or 'refused'}"))
 
         def ended() -> None:
-            handover.put(lambda: settle(None, f"{name} did not answer"))
+            handover.news(lambda: settle(None, f"{name} did not answer"))
 
         if key not in self._present:
             self._present[key] = Presence(self.session, key)
@@ -194,7 +200,18 @@ class _Server:
         """Runs in a thread of zenoh's."""
         payload = b"" if query.payload is None else query.payload.to_bytes()
         attachment = b"" if query.attachment is None else query.attachment.to_bytes()
-        self._owner.session.handover.put(lambda: self._begin(query, payload, attachment))
+        self._owner.session.handover.put(
+            lambda: self._begin(query, payload, attachment), len(payload) + len(attachment), lambda: self._shed(query)
+        )
+
+    def _shed(self, query: Any) -> None:
+        """More wait than the loop serves. Runs in a thread of zenoh's."""
+        try:
+            query.reply_err(BEHIND)
+        except self._owner.session.zenoh.ZError as error:  # its session has ended, or ours
+            _log.debug("%s: a request could not be refused: %s", self._key, error)
+        finally:
+            query.drop()
 
     def _begin(self, query: Any, request: bytes, attachment: bytes) -> None:
         if self._closed:

@@ -1,7 +1,8 @@
-"""The configuration of a session, and what zenoh does not take in time. Without a network."""
+"""The configuration of a session, and what is dropped on the way to zenoh and from it. Without a network."""
 
 import asyncio
 import json
+from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
 
@@ -9,14 +10,19 @@ import pytest
 
 pytest.importorskip("zenoh", reason="the library eclipse-zenoh is missing: pip install 'sern[zenoh]'")
 
+from sern_client.endpoints.base import ServiceInfo
+from sern_client.endpoints.handover import ITEM_BYTES
+from sern_client.endpoints.zenoh import names
 from sern_client.endpoints.zenoh import session as module
 from sern_client.endpoints.zenoh.endpoint import ZenohEndpoint, ZenohOptions
 from sern_client.endpoints.zenoh.session import SessionOptions, load_zenoh, make_config
 from sern_client.factory import make_section
-from sern_core.types import DropReason
+from sern_core.errors import ServiceError
+from sern_core.types import DropReason, Encoding, TopicName
+from sern_runtime import ros_types
 from sern_runtime.config import endpoints as sections
 from sern_tools.ports import free_ports
-from tests.support import Events, until
+from tests.support import DEADLINE_S, Events, until
 
 
 async def test_a_writer_that_is_behind_drops_the_oldest_messages_and_no_news(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -47,7 +53,7 @@ async def test_a_loop_that_is_behind_counts_what_it_drops(monkeypatch: pytest.Mo
     endpoint = ZenohEndpoint(ZenohOptions(SessionOptions(connect=(), listen=("tcp/127.0.0.1:0",))))
     await endpoint.start(Events())
     try:
-        monkeypatch.setattr(endpoint.session.handover, "_max_bytes", 15)
+        monkeypatch.setattr(endpoint.session.handover, "_max_bytes", 115)
         for _ in range(3):
             endpoint.session.handover.put(lambda: None, 10)
         await asyncio.sleep(0)
@@ -143,3 +149,73 @@ async def test_the_router_of_the_file_is_the_one_that_is_said_to_be_missing(
         await until(lambda: f"nobody answers at tcp/127.0.0.1:{nobody}; is the router" in caplog.text, "said")
     finally:
         await endpoint.stop()
+
+
+@pytest.fixture
+async def two() -> AsyncIterator[tuple[ZenohEndpoint, ZenohEndpoint]]:
+    """One that listens, and one that comes to it."""
+    (port,) = free_ports(1)
+    here, there = f"tcp/127.0.0.1:{port}", "tcp/127.0.0.1:0"
+    one = ZenohEndpoint(ZenohOptions(SessionOptions(connect=(), listen=(here,))))
+    other = ZenohEndpoint(ZenohOptions(SessionOptions(connect=(here,), listen=(there,))))
+    await one.start(Events())
+    await other.start(Events())
+    yield one, other
+    await other.stop()
+    await one.stop()
+
+
+async def test_an_attachment_counts_for_what_waits(
+    two: tuple[ZenohEndpoint, ZenohEndpoint], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    here, there = two
+    info = ros_types.topic_info("/chat", "std_msgs/msg/String", Encoding.CDR)
+    there.advertise(info)
+    await until(lambda: info.name in here._topics)
+    got: list[bytes] = []
+
+    def sink(body: bytes, _stamp_ns: int) -> bool:
+        got.append(body)
+        return True
+
+    here.subscribe(info.name, sink)
+    handover = here.session.handover
+    monkeypatch.setattr(handover, "_wakes", lambda: False)  # the loop is busy
+    key = names.data_key(0, info.name, names.dds_type(info.type_name), info.type_hash)
+
+    def arrived() -> bool:
+        """Until the two have met, what is published is for nobody: again and again."""
+        there.session.opened.put(key, b"", attachment=bytes(60_000))
+        return bool(handover._messages)
+
+    await until(arrived)
+    assert handover._nbytes >= 60_000 and handover._messages[0].nbytes == 60_000 + ITEM_BYTES
+    handover._run()
+    assert b"" in got
+
+
+async def test_a_request_that_is_dropped_is_refused(
+    two: tuple[ZenohEndpoint, ZenohEndpoint], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """More have arrived than the loop serves: the oldest is told at once, and does not wait for its timeout."""
+    server, caller = two
+    lamp = ServiceInfo(TopicName("/lamp"), "std_srvs/srv/SetBool", Encoding.CDR, "RIHS01_" + "5" * 64)
+
+    async def echo(request: bytes) -> bytes:
+        return request
+
+    server.serve(lamp, echo)
+    await until(lambda: lamp.name in caller._servers)
+    assert await caller.call(lamp.name, b"first", timeout_s=DEADLINE_S) == b"first"
+    handover = server.session.handover
+    monkeypatch.setattr(handover, "_max_bytes", 1)
+    monkeypatch.setattr(handover, "_wakes", lambda: False)  # the loop is busy
+    calls = list[asyncio.Task[bytes]]()
+    for word in (b"one", b"two"):
+        calls.append(asyncio.create_task(caller.call(lamp.name, word, timeout_s=DEADLINE_S)))
+        await until(lambda: handover._messages and handover.dropped == len(calls) - 1)
+    with pytest.raises(ServiceError, match="/lamp: the bridge is behind"):
+        await calls[0]
+    assert not calls[1].done() and server.drops == {DropReason.QUEUE_FULL: 1}
+    handover._run()
+    assert await calls[1] == b"two"

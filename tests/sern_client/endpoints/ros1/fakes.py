@@ -131,6 +131,7 @@ class FakePublisher:
             "message_definition": STRING.definition, "latching": "0", **fields,
         }  # fmt: skip
         self.greeting: bytes | None = None  # in place of the header
+        self.host = HOST  # where it says that it is
         self.requests: list[dict[str, str]] = []
         self.writers: list[asyncio.StreamWriter] = []
         self._master = master
@@ -156,7 +157,7 @@ class FakePublisher:
     def _dispatch(self, method: str, params: tuple[Any, ...]) -> Any:
         if method != "requestTopic":
             raise LookupError(method)
-        return 1, "", ["TCPROS", HOST, self._port]
+        return 1, "", ["TCPROS", self.host, self._port]
 
     async def _connected(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         with suppress(asyncio.IncompleteReadError, OSError):

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sern_client.endpoints.ros1.frames import Frames
+from sern_client.endpoints.ros1.frames import SCRATCH_BYTES, Frames
 from sern_client.endpoints.ros1.header import MAX_HEADER_BYTES, decode_header, encode_header
 from sern_client.endpoints.ros1.http import HttpMessage, HttpReader
 from sern_client.endpoints.ros1.xmlrpc import CallError, decode_call, split_uri, value_of
@@ -199,6 +199,27 @@ def test_a_large_frame_is_filled_in_place() -> None:
     body = bytes(range(256)) * 8000
     taken.receive(encode_header({"a": "b"}) + framed(body, b"next"), [100_000])
     assert taken.messages == [body, b"next"]
+
+
+def test_a_frame_takes_the_memory_of_what_has_arrived() -> None:
+    taken = Taken(limit=64 * 2**20)
+    body = bytes(range(251)) * (20 * 2**20 // 251)
+    data = encode_header({"a": "b"}) + framed(body)
+    begun = len(data) - len(body)
+    taken.receive(data[: begun + 1], [100_000])
+    assert held(taken) <= SCRATCH_BYTES, "a length is no reason to take memory"
+    for at in range(begun + 1, len(data), 500_000):
+        taken.receive(data[at : at + 500_000], [100_000])
+        assert held(taken) <= max(SCRATCH_BYTES, 2 * (at + 500_000 - begun))
+    assert taken.messages == [body] and held(taken) == 0
+    taken.receive(framed(body)[:5], [100_000])
+    assert held(taken) == len(body), "the next of that size is filled in place"
+    taken.receive(framed(body)[5:], [100_000])
+    assert taken.messages == [body, body] and held(taken) == 0
+
+
+def held(taken: Taken) -> int:
+    return sum(map(len, taken._filled)) + len(taken._frame or b"")
 
 
 @pytest.mark.parametrize(
