@@ -17,7 +17,11 @@ help:
 	@echo "make performance   as root: measure link, fleet and policies of docs/performance.md anew, 26 minutes of an idle machine"
 	@echo "make bench    the quick benchmarks;  make schemas: regenerate schemas/ and the configuration reference"
 
+PYTHON_NEEDED := SERN needs 3.11 to 3.13: make PYTHON=python3.11, or see deploy/README.md, 1
+PYTHON_HAS := import sys; print("%d.%d" % sys.version_info[:2]); sys.exit(sys.version_info < (3, 11))
+
 $(VENV)/.ready: pyproject.toml constraints.txt
+	@has=$$($(PYTHON) -c '$(PYTHON_HAS)') || { echo "$(PYTHON) is Python $$has, $(PYTHON_NEEDED)" >&2; exit 1; }
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev,bench,report,lossy,dds,zenoh]'
 	@touch $@
