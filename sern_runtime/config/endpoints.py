@@ -29,6 +29,7 @@ from sern_runtime.config.base import (
     pattern_problems,
     resolve,
     unexpected,
+    unit_problems,
 )
 from sern_runtime.config.yaml import Loc
 
@@ -194,6 +195,8 @@ class RecordEndpoint(EndpointBase):
             yield FileProblem((*loc, "path"), f"{path} exists; set overwrite: true or name another file")
         elif not path.is_dir() and not path.parent.is_dir():
             yield FileProblem((*loc, "path"), f"{path.parent}: no such directory; create it first")
+        else:
+            yield from unit_problems(path, (*loc, "path"))
 
 
 def _check_uri(text: str) -> str:
