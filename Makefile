@@ -14,7 +14,7 @@ help:
 	@echo "make test     every test;  make lint, make types: static checks"
 	@echo "make explore  the tests with random input, with new cases and ten times as many; SEED=... repeats a run"
 	@echo "make lab      the whole matrix of bad links, and the longer runs over tc netem, which need root"
-	@echo "make performance   as root: measure link, fleet and policies of docs/performance.md anew, 26 minutes of an idle machine"
+	@echo "make performance   as root: measure link, fleet and policies of docs/performance.md anew, two hours of an idle machine"
 	@echo "make bench    the quick benchmarks;  make schemas: regenerate schemas/ and the configuration reference"
 
 PYTHON_NEEDED := SERN needs 3.11 to 3.13: make PYTHON=python3.11, or see deploy/README.md, 1
@@ -66,7 +66,7 @@ performance: setup
 	mkdir -p build
 	$(BIN)/python -m benchmarks.link --plots docs/images --json build/link.json
 	$(BIN)/python -m benchmarks.robots --figure docs/images/perf-robots.png --json build/robots.json
-	$(BIN)/python -m benchmarks.mmcf_lab --json build/mmcf_lab.json
+	$(BIN)/python -m benchmarks.mmcf_lab --runs 20 --json build/mmcf_lab.json
 	$(BIN)/python -m benchmarks.document build/link.json build/robots.json build/mmcf_lab.json
 
 demo: setup
