@@ -14,10 +14,14 @@ help:
 	@echo "make test     every test;  make lint, make types: static checks"
 	@echo "make explore  the tests with random input, with new cases and ten times as many; SEED=... repeats a run"
 	@echo "make lab      the whole matrix of bad links, and the longer runs over tc netem, which need root"
-	@echo "make performance   as root: measure link, fleet and policies of docs/performance.md anew, 26 minutes of an idle machine"
+	@echo "make performance   as root: measure link, fleet and policies of docs/performance.md anew, two hours of an idle machine"
 	@echo "make bench    the quick benchmarks;  make schemas: regenerate schemas/ and the configuration reference"
 
+PYTHON_NEEDED := SERN needs 3.11 to 3.13: make PYTHON=python3.11, or see deploy/README.md, 1
+PYTHON_HAS := import sys; print("%d.%d" % sys.version_info[:2]); sys.exit(sys.version_info < (3, 11))
+
 $(VENV)/.ready: pyproject.toml constraints.txt
+	@has=$$($(PYTHON) -c '$(PYTHON_HAS)') || { echo "$(PYTHON) is Python $$has, $(PYTHON_NEEDED)" >&2; exit 1; }
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev,bench,report,lossy,dds,zenoh]'
 	@touch $@
@@ -62,7 +66,7 @@ performance: setup
 	mkdir -p build
 	$(BIN)/python -m benchmarks.link --plots docs/images --json build/link.json
 	$(BIN)/python -m benchmarks.robots --figure docs/images/perf-robots.png --json build/robots.json
-	$(BIN)/python -m benchmarks.mmcf_lab --json build/mmcf_lab.json
+	$(BIN)/python -m benchmarks.mmcf_lab --runs 20 --json build/mmcf_lab.json
 	$(BIN)/python -m benchmarks.document build/link.json build/robots.json build/mmcf_lab.json
 
 demo: setup

@@ -136,7 +136,9 @@ def _dds(section: sections.DdsEndpoint, resolve: Resolve) -> Endpoint:
         from sern_client.endpoints.dds.domain import DomainOptions, environment_domain
         from sern_client.endpoints.dds.endpoint import DdsEndpoint, DdsOptions
     except ImportError as error:
-        raise ConfigError(f"endpoint kind dds needs Cyclone DDS: pip install cyclonedds==11.0.1 ({error})") from None
+        raise ConfigError(
+            f"endpoint kind dds needs Cyclone DDS: {sections.installing('cyclonedds==11.0.1')} ({error})"
+        ) from None
     return DdsEndpoint(
         DdsOptions(
             DomainOptions(

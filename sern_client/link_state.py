@@ -61,7 +61,7 @@ class LinkState:
         self._own_up = False
         self._own_since_s = clock.now()
         self._there: set[ClientName] = set()  # of whom that was said
-        self._gone_s: dict[ClientName, float] = {}  # who was said to be gone, also when the relay has let go of it
+        self._gone_s: dict[ClientName, float] = {}  # who was said to be gone, also when nothing else knows it any more
         core.peers.on_change = self._changed
 
     def start(self) -> None:
@@ -100,7 +100,12 @@ class LinkState:
         """Also said once where our own link was down in between: of that one line speaks for all."""
         self.soon()
         name, now = change.name, clock.now()
-        if change.new is PeerStatus.GONE and name not in self._gone_s:
+        if change.given_up:
+            _log.warning(
+                "%s is given up by the relay after %.0f s: its topics end, and it is gone until it is back",
+                name, change.lasted_s,
+            )  # fmt: skip
+        elif change.new is PeerStatus.GONE and name not in self._gone_s:
             while len(self._gone_s) >= MAX_PEERS:
                 del self._gone_s[next(iter(self._gone_s))]
             self._gone_s[name] = now
@@ -170,7 +175,7 @@ class LinkState:
         whole = own_s is not None and peer.rtt_s is not None
         why = {
             PeerStatus.CONNECTED: "",
-            PeerStatus.GONE: "the relay does not reach it",
+            PeerStatus.GONE: "given up by the relay" if peer.given_up else "the relay does not reach it",
             PeerStatus.UNKNOWN: "the relay has not told of it" if self._own_up else "our own link is down",
         }[peer.status]
         return LinkView(

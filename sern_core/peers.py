@@ -2,7 +2,8 @@
 
 The relay tells of each peer whether it can be reached (`sern_core/presence.py`), the streams tell when something of it
 came last, and the client's own link says whether any of that is still to be believed: while it is down nobody knows,
-and ages grow.
+and ages grow. A peer that is gone for longer than the relay waits is given up there, with its streams. Here it stays as
+one that is gone, until it is back: nobody else would still say that it is missing.
 """
 
 from collections import Counter
@@ -15,9 +16,10 @@ from sern_core.errors import WireError
 from sern_core.types import ClientName
 
 LET_GO_S: Final = 60.0
-"""A peer of which the relay of a new session says nothing for so long, and that has no stream here, is forgotten."""
+"""A peer of which the relay of a new session says nothing for so long, and that has no stream here, is forgotten; one
+that was gone before is given up."""
 MAX_PEERS: Final = 4096
-"""Peers that a relay may tell of; no honest one has as many."""
+"""Peers that a relay may tell of; no honest one has as many. The one given up longest ago makes way for another."""
 MAX_FOR_S: Final = 1e9
 MAX_RTT_S: Final = 1e6
 
@@ -33,7 +35,8 @@ class PeerStatus(StrEnum):
 
 class PeerView(NamedTuple):
     """A peer at one time. `age_s`: since the last message of it came here; None: none has. `since_s`: for how long its
-    status has been so. `rtt_s`: round trip between it and the relay, and `lane` its lane there, as far as known."""
+    status has been so. `rtt_s`: round trip between it and the relay, and `lane` its lane there, as far as known.
+    `given_up`: it was gone when the relay spoke of it last, and the relay waits for it no longer."""
 
     name: ClientName
     status: PeerStatus
@@ -41,19 +44,22 @@ class PeerView(NamedTuple):
     age_s: float | None
     rtt_s: float | None
     lane: str
+    given_up: bool = False
 
 
 class PeerChange(NamedTuple):
-    """A peer's status is another one, after `lasted_s` of the one before. `old` None: it is a new peer."""
+    """A peer's status is another one, after `lasted_s` of the one before; or, `given_up`, it is what it was, and the
+    relay has given the peer up. `old` None: it is a new peer."""
 
     name: ClientName
     old: PeerStatus | None
     new: PeerStatus
     lasted_s: float
+    given_up: bool = False
 
 
 class _Peer:
-    __slots__ = ("lane", "rtt_s", "since_s", "status", "up", "up_since_s")
+    __slots__ = ("given_up", "lane", "lost", "rtt_s", "since_s", "status", "up", "up_since_s")
 
     def __init__(self, since_s: float) -> None:
         self.status = PeerStatus.UNKNOWN
@@ -62,10 +68,12 @@ class _Peer:
         self.up_since_s = since_s
         self.lane = ""
         self.rtt_s: float | None = None
+        self.lost = False  # what any relay said last is that it does not reach it
+        self.given_up = False
 
 
 class Peers:
-    """`on_change` is told of every peer whose status changes, and that comes."""
+    """`on_change` is told of every peer whose status changes, that comes, and that is given up."""
 
     def __init__(self) -> None:
         self.on_change: Callable[[PeerChange], None] = lambda _change: None
@@ -85,7 +93,8 @@ class Peers:
         """Nobody knows of any peer any more."""
         self._session = False
         for peer in self._peers.values():
-            peer.up = None
+            if not peer.given_up:  # no relay speaks of it until it is back
+                peer.up = None
         self.reached(False, now=now)
 
     def reached(self, answers: bool, *, now: float) -> None:
@@ -120,18 +129,18 @@ class Peers:
         name = ClientName(wire.take_str(item, "name", max_length=64))
         if "up" not in item:  # we take nothing of it any more
             if name in self._peers:
-                self._peers[name].up = None
-                self._let_go(name)
+                self._let_go(name, self._peers[name], now)
             return
         up = wire.take_bool(item, "up")
         for_s = wire.take_float(item, "for", low=0.0, high=MAX_FOR_S) or 0.0
         rtt_s = wire.take_float(item, "rtt", low=0.0, high=MAX_RTT_S)
         lane = wire.take_str(item, "lane", max_length=16, default="")
-        if name not in self._peers and len(self._peers) >= MAX_PEERS:
+        if name not in self._peers and len(self._peers) >= MAX_PEERS and not self._make_way():
             raise WireError(f"the relay tells of more than {MAX_PEERS} peers")
         peer = self._known(name, now)
         if peer.up is not up:
             peer.up, peer.up_since_s = up, now - for_s
+        peer.lost, peer.given_up = not up, False
         peer.rtt_s, peer.lane = rtt_s, lane
         self._settle(name, peer, now)
 
@@ -153,19 +162,44 @@ class Peers:
             peer.status, peer.since_s = status, since_s
             self.on_change(PeerChange(name, old, status, lasted_s))
 
-    def _let_go(self, name: ClientName) -> None:
+    def _let_go(self, name: ClientName, peer: _Peer, now: float) -> None:
+        """The relay speaks of it no more."""
+        if peer.lost:
+            self._give_up(name, peer, now)
+            return
+        peer.up = None
         if name not in self._streams:
-            del self._peers[name]
-            self._heard_s.pop(name, None)
+            self._forget(name)
+
+    def _give_up(self, name: ClientName, peer: _Peer, now: float) -> None:
+        if peer.given_up:
+            return
+        peer.up, peer.given_up = False, True
+        self._peers[name] = self._peers.pop(name)  # last: the one given up longest ago is the first of them
+        self._settle(name, peer, now)
+        self.on_change(PeerChange(name, peer.status, peer.status, now - peer.up_since_s, given_up=True))
+
+    def _make_way(self) -> bool:
+        """Forget the peer that was given up longest ago; whether there was one."""
+        for name, peer in self._peers.items():
+            if peer.given_up and name not in self._streams:
+                self._forget(name)
+                return True
+        return False
+
+    def _forget(self, name: ClientName) -> None:
+        del self._peers[name]
+        self._heard_s.pop(name, None)
 
     def look(self, *, now: float) -> list[PeerView]:
         """All peers by name. Lets go of those that nothing speaks of any more."""
         if self._session and now - self._session_s > LET_GO_S:
-            for name in [name for name, peer in self._peers.items() if peer.up is None]:
-                self._let_go(name)
+            for name, peer in list(self._peers.items()):
+                if peer.up is None and name not in self._streams:
+                    self._let_go(name, peer, now)
         return [self._view(name, peer, now) for name, peer in sorted(self._peers.items())]
 
     def _view(self, name: ClientName, peer: _Peer, now: float) -> PeerView:
         heard_s = self._heard_s.get(name)
         age_s = None if heard_s is None else max(0.0, now - heard_s)
-        return PeerView(name, peer.status, max(0.0, now - peer.since_s), age_s, peer.rtt_s, peer.lane)
+        return PeerView(name, peer.status, max(0.0, now - peer.since_s), age_s, peer.rtt_s, peer.lane, peer.given_up)

@@ -24,6 +24,8 @@ OVERTAKING_MARGIN_S: Final = 0.010
 """Overtaking by less is the grain of two connections and of a busy machine, not an order."""
 LATE_LOG_S: Final = 0.020
 """What may pass between the last check of a command's age and the line in the log."""
+DATAGRAM_SHARE: Final = 0.5
+"""The lane falls back to TCP for a while after a blackout, and never for most of a run."""
 
 Floats = NDArray[np.float64]
 
@@ -311,8 +313,12 @@ def judge(
     baseline_factor: float = 10.0,
     fresh_limit_s: float = 3.0,
     late_log_s: float = LATE_LOG_S,
+    datagram_share: float | None = None,
 ) -> list[Verdict]:
-    """The promises of a run. A promise that the run could not put to the test is not in the list."""
+    """The promises of a run. A promise that the run could not put to the test is not in the list.
+
+    `datagram_share`: share of the time that the datagram lane was in use on a link that lets datagrams through.
+    """
     verdicts = [_reliable(sern), _intact(sern), *_order(sern, overtaken_share_limits), *_commands(sern, late_log_s)]
     if sern.accounting_gap is not None:
         notes = [*sern.accounting_notes[:4], *_sum_words(sern)]
@@ -325,6 +331,16 @@ def judge(
                 sern.accounting_gap == 0,
                 "; ".join(notes),
                 noun="uncounted",
+            )
+        )
+    if datagram_share is not None:
+        verdicts.append(
+            Verdict(
+                "datagram_share",
+                f"datagrams carry it, where they get through, more than {DATAGRAM_SHARE:.0%} of the time",
+                datagram_share,
+                DATAGRAM_SHARE,
+                datagram_share > DATAGRAM_SHARE,
             )
         )
     if baseline is not None:

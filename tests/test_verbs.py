@@ -49,6 +49,38 @@ def pytest_commands(*arguments: str) -> list[list[str]]:
     ]
 
 
+@pytest.mark.parametrize(("version", "status"), [((3, 8), 2), ((3, 10), 2), ((3, 11), 0), ((3, 13), 0)])
+def test_a_python_that_is_too_old_makes_nothing(tmp_path: Path, version: tuple[int, int], status: int) -> None:
+    """It stands in for one that has another version, and notes what else it is asked to do."""
+    python = tmp_path / "python"
+    body = f"""#!{sys.executable}
+import sys
+if sys.argv[1] == "-c":
+    sys.version_info = {(*version, 0, "final", 0)}
+    exec(sys.argv[2])
+else:
+    open({str(tmp_path / "asked")!r}, "a").write(" ".join(sys.argv[1:]))
+    pip = {str(tmp_path / "venv/bin/python")!r}
+    import os
+    os.makedirs(os.path.dirname(pip))
+    os.symlink("/bin/true", pip)
+"""
+    python.write_text(body)
+    python.chmod(0o755)
+    done = subprocess.run(
+        ["make", "setup", f"PYTHON={python}", f"VENV={tmp_path / 'venv'}"],
+        cwd=ROOT, capture_output=True, text=True, timeout=DEADLINE_S, check=False,
+    )  # fmt: skip
+    assert done.returncode == status, done.stdout + done.stderr
+    said = [line for line in done.stderr.splitlines() if "SERN needs" in line]
+    if status:
+        (line,) = said
+        assert f"is Python {version[0]}.{version[1]}, SERN needs 3.11 to 3.13" in line and "deploy/README.md" in line
+        assert not (tmp_path / "asked").exists() and not (tmp_path / "venv").exists()
+    else:
+        assert said == [] and (tmp_path / "asked").read_text() == f"-m venv {tmp_path / 'venv'}"
+
+
 def imports(path: Path) -> set[str]:
     found = set()
     for node in ast.walk(ast.parse(path.read_text())):

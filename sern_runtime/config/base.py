@@ -26,6 +26,8 @@ _IPC_MAX_CHARS: Final = 100  # a Unix socket path holds 107 bytes on Linux
 _SOCKET_MAX_BYTES: Final = 107
 LONG_COMMAND_S: Final = 60.0
 """A command that is older moves nobody's robot on purpose."""
+UNITS_READ_ONLY: Final = Path("/etc")
+"""What the systemd units show to the daemons read-only, and where their configuration is (`deploy/systemd`)."""
 _LOOPBACK_NAMES: Final = frozenset({"localhost", "ip6-localhost"})
 
 
@@ -237,6 +239,15 @@ Count = Annotated[int, Field(ge=1, le=1_000_000)]
 def resolve(base_dir: Path, text: str) -> Path:
     """A path from a configuration file: `~` is the home directory, relative ones start at the file's directory."""
     return base_dir / Path(text).expanduser()
+
+
+def unit_problems(path: Path, loc: Loc) -> Iterator[FileProblem]:
+    """A warning of a file that the daemon is to write where the units of `deploy` let it write nothing."""
+    if path.resolve().is_relative_to(UNITS_READ_ONLY):
+        problem = (
+            f"{path}: under the systemd units nothing can be written below {UNITS_READ_ONLY}; name /var/lib/sern/..."
+        )
+        yield FileProblem(loc, problem, warning=True)
 
 
 def place(base_dir: Path, endpoint: str) -> str:

@@ -29,6 +29,7 @@ from sern_runtime.config.base import (
     pattern_problems,
     resolve,
     unexpected,
+    unit_problems,
 )
 from sern_runtime.config.yaml import Loc
 
@@ -38,6 +39,11 @@ MAX_SYNTHETIC_TOPICS = 20
 def installed(package: str) -> bool:
     """Whether Python could import it here; nothing is imported."""
     return package in sys.modules or importlib.util.find_spec(package) is not None
+
+
+def installing(package: str) -> str:
+    """The command that installs a package where SERN is: another pip would put it beside."""
+    return f"{sys.executable} -m pip install {package}"
 
 
 def missing_package(package: str, remedy: str, loc: Loc) -> Iterator[FileProblem]:
@@ -189,6 +195,8 @@ class RecordEndpoint(EndpointBase):
             yield FileProblem((*loc, "path"), f"{path} exists; set overwrite: true or name another file")
         elif not path.is_dir() and not path.parent.is_dir():
             yield FileProblem((*loc, "path"), f"{path.parent}: no such directory; create it first")
+        else:
+            yield from unit_problems(path, (*loc, "path"))
 
 
 def _check_uri(text: str) -> str:
@@ -240,7 +248,8 @@ class Ros1Endpoint(EndpointBase):
 
 
 class ZenohEndpoint(EndpointBase):
-    """ROS 2 over zenoh, among nodes that run with rmw_zenoh. Needs `pip install eclipse-zenoh`, no ROS installation."""
+    """ROS 2 over zenoh, among nodes that run with rmw_zenoh. Needs the extra `zenoh` (`'.[zenoh]'` where SERN is
+    installed), no ROS installation."""
 
     kind: Literal["zenoh"]
     """ROS 2 over zenoh (rmw_zenoh)."""
@@ -260,15 +269,15 @@ class ZenohEndpoint(EndpointBase):
     """Directories with .msg and .srv files of types beyond those of a ROS 2 install (searched at any depth)."""
 
     def file_problems(self, base_dir: Path, loc: Loc) -> Iterator[FileProblem]:
-        yield from missing_package("zenoh", "pip install eclipse-zenoh", loc)
+        yield from missing_package("zenoh", installing("eclipse-zenoh"), loc)
         if self.config_file is not None and not resolve(base_dir, self.config_file).is_file():
             yield FileProblem((*loc, "config_file"), f"{resolve(base_dir, self.config_file)}: no such file")
         yield from missing_directories(base_dir, self.type_paths, (*loc, "type_paths"))
 
 
 class DdsEndpoint(EndpointBase):
-    """ROS 2 over DDS, among nodes of rmw_fastrtps, rmw_cyclonedds and others. Needs `pip install cyclonedds==11.0.1`,
-    no ROS installation. Services work with nodes of rmw_cyclonedds only."""
+    """ROS 2 over DDS, among nodes of rmw_fastrtps, rmw_cyclonedds and others. Needs the extra `dds` (`'.[dds]'` where
+    SERN is installed), no ROS installation. Services work with nodes of rmw_cyclonedds only."""
 
     kind: Literal["dds"]
     """ROS 2 over DDS."""
@@ -304,7 +313,7 @@ class DdsEndpoint(EndpointBase):
     domain in the middle; with two of them side by side it makes a loop."""
 
     def file_problems(self, base_dir: Path, loc: Loc) -> Iterator[FileProblem]:
-        yield from missing_package("cyclonedds", "pip install cyclonedds==11.0.1", loc)
+        yield from missing_package("cyclonedds", installing("cyclonedds==11.0.1"), loc)
         yield from missing_directories(base_dir, self.type_paths, (*loc, "type_paths"))
 
 

@@ -21,6 +21,7 @@ from sern_runtime.config.base import (
     Section,
     described,
     resolve,
+    unit_problems,
 )
 from sern_runtime.config.yaml import Loc
 from sern_runtime.dscp import DSCP_NAMES, Marks
@@ -225,3 +226,5 @@ def output_problems(base_dir: Path, text: PathText | None, loc: Loc) -> Iterator
         yield FileProblem(loc, f"{path.parent}: no such directory; create it first")
     elif not os.access(path.parent, os.W_OK):
         yield FileProblem(loc, f"{path.parent}: may not be written")
+    else:
+        yield from unit_problems(path, loc)

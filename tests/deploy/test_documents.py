@@ -1,6 +1,7 @@
 """The guides for people: what they name exists, and what they tell to type is right."""
 
 import argparse
+import ast
 import re
 import runpy
 import shlex
@@ -44,6 +45,9 @@ OURS: Final[dict[str, Any]] = {
 }
 INSTALLED: Final = "/opt/sern/bin/"
 _PATH: Final = re.compile(r"(?<![\w/.~])((?:deploy|docs|schemas|tests|sern_[a-z]+)/[\w/.@-]*\w)(?![\w*-])")
+QUOTING: Final = ("deploy/README.md", "docs/adaptation.md", "docs/adaptation-theory.md", "docs/operations.md")
+"""Guides that quote what the programs say."""
+PROGRAMS: Final = frozenset({"sern", "sudo", "systemctl", "journalctl", "getent", "ip", "nc", "ros2", "scp", "ss"})
 _TYPED: Final = re.compile(r"^(?:sudo |make |sern |sern-\w+ |\S*/?python )", re.M)
 
 
@@ -185,6 +189,48 @@ def test_benchmarks_and_their_options_exist(monkeypatch: pytest.MonkeyPatch) -> 
 def test_a_log_line_that_is_quoted_names_who_is_in_the_guide() -> None:
     text = (ROOT / "deploy" / "README.md").read_text()
     assert re.findall(r"`(\w+): no datagram came through \.\.\.", text) == ["jackal1"]
+
+
+def said() -> str:
+    """Every text of the programs, a line each: what they log, answer and show. Values that are put in are `{}`."""
+    found = []
+    for path in sorted(file for package in ROOT.glob("sern_*") for file in package.rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.JoinedStr):
+                found.append("".join(str(v.value) if isinstance(v, ast.Constant) else "{}" for v in node.values))
+            elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+                found.append(node.value)
+    found += [path.read_text() for path in sorted((ROOT / "deploy" / "grafana").glob("*.json"))]
+    found += [title for guide in GUIDES for title in re.findall(r"^#+ (.*)$", (ROOT / guide).read_text(), re.M)]
+    return "\n".join(" ".join(text.split()) for text in found)
+
+
+def pattern(quoted: str) -> str:
+    """What a quoted line looks like in the source: names in capitals and words with a digit in them stand for values,
+    and three dots for anything."""
+    words = re.sub(r"\b[A-Z]+\b|[\w.]*\d[\w.]*", "\0", quoted)
+    return re.escape(words).replace(r"\.\.\.", ".*").replace("…", ".*").replace("\0", r"\S*").replace(r"\ ", " ")
+
+
+def test_lines_that_are_quoted_are_said() -> None:
+    """Read all quotations of three words and more that are no commands and no parts of files. A line that ends in
+    another one's text, after a colon, is looked for in its parts."""
+    source = said()
+    quotations = set()
+    for guide in QUOTING:
+        text = re.sub(r"^```.*?^```$", "", (ROOT / guide).read_text(), flags=re.M | re.S)
+        text = " ".join(text.split())
+        for quoted in re.findall(r"`([^`]+)`", text) + re.findall(r'"([^"`]+)"', text):
+            first, *others = quoted.split()
+            if len(others) >= 2 and first not in PROGRAMS and not re.search(r"[/={}<>|*\[\]]|--", quoted):
+                quotations.add((guide, quoted))
+    assert len(quotations) > 40
+    missing = [
+        (guide, quoted)
+        for guide, quoted in sorted(quotations)
+        if not all(re.search(pattern(part), source) for part in re.split(": ", quoted))
+    ]
+    assert missing == []
 
 
 def test_what_is_installed_is_there() -> None:

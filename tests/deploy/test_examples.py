@@ -162,22 +162,43 @@ def test_the_feed_shows_where_each_robot_is_and_what_is_around_it(name: str) -> 
         assert not any(pattern.fullmatch(f"/{robot}{topic}") for pattern in role.subscribe), topic
 
 
-@pytest.mark.parametrize("name", ["site-noetic.yaml", "site-jazzy.yaml"])
-def test_a_site_takes_what_its_operator_drives_by(name: str) -> None:
-    """Where a robot is and how it leans, of each that there is a file for; what is heavy only in its summaries."""
-    patterns = [compile_pattern(text) for text in client(name).subscribe]
+FRAMES: Final = ("tf", "tf_static", "map")
+TAKEN_OF_NOETIC: Final = (
+    *FRAMES, "odometry/filtered", "fix", "navsat/fix", "imu/data", "joint_states", "diagnostics_agg",
+    "move_base/NavfnROS/plan", "move_base/local_costmap/costmap", "front/scan", "mid/points/scan", "mid/points/voxel",
+)  # fmt: skip
+TAKEN_OF_JAZZY: Final = (
+    *FRAMES, "platform/odom/filtered", "platform/odom", "platform/joint_states", "platform/emergency_stop",
+    "sensors/gps_0/fix", "sensors/imu_0/data", "plan", "local_costmap/costmap", "global_costmap/costmap",
+    "sensors/lidar2d_0/scan", "sensors/lidar3d_0/points/scan", "sensors/lidar3d_0/points/voxel",
+)  # fmt: skip
+LEFT_THERE: Final = (
+    "mid/points",
+    "sensors/lidar3d_0/points",
+    "front/image_raw/compressed",
+    "sensors/camera_0/color/compressed",
+)
+
+
+@pytest.mark.parametrize("robot", [*NOETIC, "jackal-jazzy.yaml", "husky-jazzy.yaml"])
+@pytest.mark.parametrize("site", ["site-noetic.yaml", "site-jazzy.yaml"])
+def test_each_site_takes_what_its_operator_drives_by_of_each_robot(site: str, robot: str) -> None:
+    """Where a robot is, how it leans, what it plans and what is near; what is heavy only in its summaries."""
+    patterns = [compile_pattern(text) for text in client(site).subscribe]
+    model = client(robot)
+    noetic = robot in NOETIC
+    drives_by = [*TAKEN_OF_NOETIC, f"{robot.partition('-')[0]}_velocity_controller/odom"] if noetic else TAKEN_OF_JAZZY
 
     def takes(topic: str) -> bool:
-        return any(pattern.fullmatch(topic) for pattern in patterns)
+        return any(pattern.fullmatch(f"/{model.name}/{topic}") for pattern in patterns)
 
-    for robot in ("jackal1", "husky1"):
-        for topic in ("odometry/filtered", f"{robot[:-1]}_velocity_controller/odom", "fix", "imu/data", "map"):
-            assert takes(f"/{robot}/{topic}"), topic
-        assert not takes(f"/{robot}/mid/points") and takes(f"/{robot}/mid/points/voxel")
-        assert not takes(f"/{robot}/front/image_raw/compressed")
-    if name == "site-jazzy.yaml":
-        for topic in ("platform/odom/filtered", "platform/odom", "sensors/gps_0/fix", "sensors/imu_0/data", "map"):
-            assert takes(f"/a200_0000/{topic}"), topic
+    assert [topic for topic in drives_by if not takes(topic)] == []
+    assert [topic for topic in LEFT_THERE if takes(topic)] == []
+    for topic in drives_by:  # and the robot's file sends it, or what it is a summary of
+        whole = "/" + topic.removesuffix("/voxel").replace("points/scan", "points")
+        local = whole if noetic else f"/{model.name}{whole}"
+        found = treated(model, local, "nav_msgs/msg/Odometry", Encoding.ROS1 if noetic else Encoding.CDR)
+        assert found is not None and found.direction is Direction.SEND, topic
 
 
 def test_no_example_caps_a_command() -> None:

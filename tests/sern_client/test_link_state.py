@@ -280,6 +280,25 @@ async def test_rows_and_detail_name_who_is_away() -> None:
     site.state.close()
 
 
+async def test_who_is_given_up_is_said_and_stays_away(caplog: pytest.LogCaptureFixture) -> None:
+    site = Site()
+    site.state.start()
+    site.told("jackal1", up=False, for_s=600.0)
+    site.core.peers.told({"t": "peers", "peers": [{"name": "jackal1"}]}, now=clock.now())
+    (line,) = [record for record in caplog.records if "given up" in record.message]
+    assert line.levelname == "WARNING"
+    assert line.message.startswith("jackal1 is given up by the relay after 600 s")
+    assert site.state.detail() == "1 of 1 peers away: jackal1 is gone for 600 s (given up by the relay)"
+    assert [(row["peer"], row["status"]) for row in site.state.to_json()] == [("jackal1", "gone")]
+    await until(lambda: "/jackal1/sern/link" in site.endpoint.open, "its state stays published")
+    opened = site.endpoint.open["/jackal1/sern/link"]
+    assert decoded(opened).level == 2 and "given up by the relay" in decoded(opened).message
+    site.told("jackal1", up=True)
+    await until(lambda: decoded(opened).level == 0, "it is back")
+    assert [record.message for record in caplog.records][-1].startswith("jackal1 is back after")
+    site.state.close()
+
+
 async def test_topics_are_withdrawn_when_nothing_was_heard_for_so_long_and_come_back() -> None:
     site = Site(withdraw_after_s=5.0)
     site.state.start()

@@ -176,19 +176,60 @@ def test_a_robot_that_falls_silent_is_gone_and_comes_back(lossless: bool) -> Non
     assert world.until(lambda: statuses(site) == {"robot": CONNECTED}) <= 1.5
 
 
-def test_a_robot_whose_connection_ends_is_gone_at_once_and_is_let_go_with_its_streams() -> None:
+def test_a_robot_that_the_relay_gives_up_stays_gone_until_it_is_back() -> None:
     world = World(hub_params=HubParams(resume_s=20.0)).watch()
     model = LinkModel(blackouts=(Window(5.0, 100.0),), disconnect_after_s=0.2).as_stream()
     robot = world.client("robot", model)
     site = world.client("site", patterns=["/robot/.*"])
     robot.publish("/robot/odom", spec())
+    changes: list[PeerChange] = []
+    site.core.peers.on_change = changes.append
     world.run(4.9)
     assert statuses(site) == {"robot": CONNECTED}
     assert world.until(lambda: statuses(site) == {"robot": GONE}) <= 2.0
+    gone_s = world.network.now
     world.run(10.0)
-    assert statuses(site) == {"robot": GONE}
+    assert statuses(site) == {"robot": GONE} and not peers(site)["robot"].given_up
     world.until(lambda: site.closed, what="the relay lets go of the robot's streams")
-    world.until(lambda: statuses(site) == {}, within_s=2.0)
+    world.until(lambda: peers(site)["robot"].given_up, within_s=2.0)
+    assert [change.given_up for change in changes] == [False, False, False, True]
+    assert changes[-1].new is GONE and changes[-1].lasted_s == pytest.approx(world.network.now - gone_s, abs=0.1)
+    world.run(30.0)
+    assert statuses(site) == {"robot": GONE}
+    assert peers(site)["robot"].since_s == pytest.approx(world.network.now - gone_s, abs=0.1)
+    world.hops["site"].break_connection(reconnect_s=5.0)
+    world.until(lambda: statuses(site) == {"robot": UNKNOWN})
+    world.until(lambda: statuses(site) == {"robot": GONE})
+    assert len(changes) == 6 and peers(site)["robot"].given_up  # said once
+    world.until(lambda: statuses(site) == {"robot": CONNECTED}, within_s=100.0)
+    assert not peers(site)["robot"].given_up
+
+
+def test_a_robot_that_is_given_up_while_our_own_link_is_down_stays_gone() -> None:
+    world = World(hub_params=HubParams(resume_s=20.0)).watch()
+    robot = world.client("robot", LinkModel(blackouts=(Window(5.0, 1e6),), disconnect_after_s=0.2).as_stream())
+    site = world.client("site", patterns=["/robot/.*"])
+    robot.publish("/robot/odom", spec())
+    world.run(4.9)
+    world.until(lambda: statuses(site) == {"robot": GONE})
+    world.hops["site"].break_connection(reconnect_s=50.0)
+    world.until(lambda: statuses(site) == {"robot": UNKNOWN})
+    world.until(lambda: site.closed, within_s=1000.0, what="its streams end here")
+    world.until(lambda: statuses(site) == {"robot": GONE}, within_s=2 * LET_GO_S)
+    assert peers(site)["robot"].given_up
+
+
+def test_a_robot_that_ends_its_streams_while_it_is_there_is_let_go() -> None:
+    world = World().watch()
+    robot = world.client("robot")
+    site = world.client("site", patterns=["/robot/.*"])
+    channel = robot.publish("/robot/odom", spec())
+    world.until(lambda: statuses(site) == {"robot": CONNECTED})
+    robot.core.unpublish(channel, now=robot.now)
+    world.run(1.0)
+    robot.core.link.close("bye", now=robot.now)
+    world.run(2 * LET_GO_S)
+    assert statuses(site) == {}
 
 
 @pytest.mark.parametrize("disconnect_after_s", [0.2, 30.0])
@@ -223,17 +264,24 @@ def test_a_relay_that_begins_anew_tells_of_who_is_there() -> None:
     assert {change.name for change in changes} == {"robot"}
 
 
-def test_a_robot_that_a_new_relay_never_hears_of_is_let_go_once_its_streams_are() -> None:
+@pytest.mark.parametrize("said_gone", [True, False])
+def test_a_robot_that_a_new_relay_never_hears_of_is_gone_if_it_was_once_its_streams_end(said_gone: bool) -> None:
+    """Of one that was there before, nobody can say that it is gone: it may have nothing for us any more."""
     world = World().watch()
     robot = world.client("robot", LinkModel(blackouts=(Window(5.0, 1e6),), disconnect_after_s=0.2).as_stream())
     site = world.client("site", patterns=["/robot/.*"])
     robot.publish("/robot/odom", spec())
-    world.run(6.0)
+    world.run(4.9)
+    assert statuses(site) == {"robot": CONNECTED}
+    if said_gone:
+        world.until(lambda: statuses(site) == {"robot": GONE})
+    else:
+        world.run(0.11)
     world.restart_relay()
     world.run(2 * LET_GO_S)
     assert statuses(site) == {"robot": UNKNOWN}
     world.until(lambda: site.closed, within_s=1000.0, what="the site's retention is over")
-    assert statuses(site) == {}
+    assert statuses(site) == ({"robot": GONE} if said_gone else {})
 
 
 # --- under load -------------------------------------------------------------------------------------------------------
@@ -350,3 +398,25 @@ def test_there_is_an_end_to_the_peers_that_a_relay_may_tell_of() -> None:
     with pytest.raises(WireError, match="more than"):
         known.told({"t": "peers", "peers": [{"name": "one_more", "up": True, "for": 0.0}]}, now=0.0)
     assert Counter(view.status for view in known.look(now=1.0)) == {CONNECTED: MAX_PEERS}
+
+
+def test_who_was_given_up_longest_ago_makes_way() -> None:
+    known = Peers()
+    known.session_began(now=0.0)
+
+    def tell(name: str, **said: object) -> None:
+        known.told({"t": "peers", "peers": [{"name": name, **said}]}, now=0.0)
+
+    for number in range(MAX_PEERS):
+        tell(f"c{number}", up=False, **{"for": 0.0})
+    for name in ("c7", "c5"):
+        tell(name)
+    known.arrived(ClientName("c7"), now=0.0)
+    tell("new1", up=True, **{"for": 0.0})
+    names = {view.name for view in known.look(now=1.0)}
+    assert "c7" not in names and {"c5", "new1"} <= names
+    tell("new2", up=True, **{"for": 0.0})
+    assert {view.name for view in known.look(now=1.0)} & {"c5", "c7"} == set()
+    assert known._heard_s == {}
+    with pytest.raises(WireError, match="more than"):
+        tell("new3", up=True, **{"for": 0.0})

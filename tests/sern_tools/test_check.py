@@ -2,6 +2,7 @@
 
 import asyncio
 import shutil
+import sys
 from io import StringIO
 from pathlib import Path
 
@@ -232,12 +233,13 @@ ENDPOINT = "endpoint: {kind: synthetic, role: robot}\n"
         ),
         (
             "endpoint: {kind: zenoh}\n",
-            "3: endpoint.kind: needs the Python package zenoh, which is not on this machine: pip install eclipse-zenoh",
+            "3: endpoint.kind: needs the Python package zenoh, which is not on this machine: "
+            f"{sys.executable} -m pip install eclipse-zenoh",
         ),
         (
             "endpoint: {kind: dds}\n",
             "3: endpoint.kind: needs the Python package cyclonedds, which is not on this machine: "
-            "pip install cyclonedds==11.0.1",
+            f"{sys.executable} -m pip install cyclonedds==11.0.1",
         ),
         (
             "endpoint: {kind: rclpy}\n",

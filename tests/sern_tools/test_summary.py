@@ -39,6 +39,12 @@ def test_a_good_run_keeps_every_promise() -> None:
     assert [v for v in judged.values() if not v.ok] == []
 
 
+@pytest.mark.parametrize(("share", "kept"), [(None, None), (0.0, False), (0.5, False), (0.51, True)])
+def test_a_run_without_datagrams_breaks_a_promise(share: float | None, kept: bool | None) -> None:
+    judged = judge(good_run().analyse(), None, overtaken_share_limits=LIMITS, datagram_share=share)
+    assert {v.name: v.ok for v in judged}.get("datagram_share") is kept
+
+
 def test_statistics_of_a_good_run() -> None:
     result = good_run().analyse()
     control, state, bulk = (result.classes[label] for label in ("control", "state", "bulk"))

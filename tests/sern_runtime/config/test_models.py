@@ -11,6 +11,7 @@ from sern_core.params import LinkParams, SchedulerParams, WindowAlgorithm
 from sern_core.rules import Direction, DiscoveryMode, Lease, LossAction
 from sern_core.types import ClientName, Encoding, Ordering, PriorityClass, Reliability, TopicName
 from sern_runtime import keys
+from sern_runtime.config import base as config_base
 from sern_runtime.config.base import FileModel, is_local
 from sern_runtime.config.client import ClientFile, load_client
 from sern_runtime.config.endpoints import BagEndpoint, RecordEndpoint, SyntheticEndpoint
@@ -217,6 +218,23 @@ def test_files_that_are_there(keyed: Path) -> None:
     path = keyed / "relay.yaml"
     path.write_text(RELAY_KEYED + "access: [{client: '.*', publish: ['/{self}/.*']}]\n", encoding="utf-8")
     assert load_relay(path).warnings == ()
+
+
+@pytest.mark.parametrize("named", ["message_log: log.csv", "summary: s.json"])
+def test_what_the_units_cannot_write_is_warned_of(keyed: Path, monkeypatch: pytest.MonkeyPatch, named: str) -> None:
+    path = keyed / "client.yaml"
+    path.write_text(CLIENT_KEYED + f"endpoint: {{kind: record, path: .}}\n{named}\n", encoding="utf-8")
+    assert load_client(path).warnings == ()
+    monkeypatch.setattr(config_base, "UNITS_READ_ONLY", keyed)
+    loaded = load_client(path)
+    key, _, name = named.partition(": ")
+    assert [warning.removeprefix(str(path)).split(";")[0] for warning in loaded.warnings] == [
+        f":6: endpoint.path: {keyed}: under the systemd units nothing can be written below {keyed}",
+        f":7: {key}: {keyed / name}: under the systemd units nothing can be written below {keyed}",
+    ]
+    path = keyed / "relay.yaml"
+    path.write_text(RELAY_KEYED + f"{named}\n", encoding="utf-8")
+    assert sum(f"{key}: {keyed / name}: under the systemd units" in said for said in load_relay(path).warnings) == 1
 
 
 def test_files_that_are_not_there(keyed: Path) -> None:
