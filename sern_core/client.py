@@ -470,9 +470,9 @@ class ClientCore:
         self.received.of(stream.stream).drop_arrived(reason, count)
         self.trace.record(link.now, stream.stream.id.topic, TraceEvent.DROPPED, reason=reason, peer=link.peer)
 
-    def on_out_drop(self, link: Link, channel: OutChannel, out: OutMessage, reason: DropReason, count: int) -> None:
-        for seq in range(out.seq, out.seq + count):
-            self._tell(self.events.send_dropped, channel.stream, seq, reason, out.lost_to)
+    def on_out_drop(self, link: Link, channel: OutChannel, outs: Sequence[OutMessage], reason: DropReason) -> None:
+        for out in outs:
+            self._tell(self.events.send_dropped, channel.stream, out.seq, reason, out.lost_to)
 
     def on_delivered(self, link: Link, channel: OutChannel, *, now: float) -> None:
         """The ledger has counted it."""

@@ -10,9 +10,10 @@ A message is in exactly one of four places: queued (nothing sent yet), in flight
 reason. `OutChannel.validate` checks that the counters agree.
 """
 
-from bisect import bisect_left, insort
+from bisect import bisect_left, bisect_right, insort
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from itertools import islice, pairwise
 from math import inf
 from operator import attrgetter
 from typing import Any, Final
@@ -20,7 +21,7 @@ from typing import Any, Final
 from sern_core.encoding import ChannelCodec, Coding
 from sern_core.ledger import SendCounters
 from sern_core.message import Message, StreamInfo
-from sern_core.out_message import OutMessage
+from sern_core.out_message import OutMessage, in_sequence
 from sern_core.rate_cap import RateCap
 from sern_core.types import DROP_REASONS, DropReason
 
@@ -42,8 +43,12 @@ FEW: Final = 16
 SHARE_HOLD_S: Final = 1.0
 """The longest that the newest message is held back by a `share`."""
 
-OnDrop = Callable[["OutChannel", OutMessage, DropReason, int], None]
-"""`on_drop(channel, out, reason, count)`: so many messages that follow each other, of which `out` is the first."""
+LAPSED_A_SWEEP: Final = 1_000
+"""Messages of a link that become tombstones in one sweep, or runs that are given up in it: some milliseconds."""
+
+OnDrop = Callable[["OutChannel", Sequence[OutMessage], DropReason], None]
+"""`on_drop(channel, outs, reason)`: these messages, in their order, are counted as dropped now. Of a reliable stream
+what lies between two of them was dropped before, or never comes: the whole span may be told onwards."""
 
 _NOTHING: Final[Any] = ()
 """Where nothing waits: an empty deque takes 760 bytes, and most channels of most subscribers are quiet."""
@@ -52,21 +57,12 @@ _NEVER: Final = -inf
 _SEQ: Final = attrgetter("seq")
 
 
-def _runs(outs: Sequence[OutMessage]) -> Iterator[Sequence[OutMessage]]:
-    """Messages in runs: of seqs that follow each other, and alike in whether they may have arrived."""
-    start = 0
-    for index in range(1, len(outs) + 1):
-        last = outs[index - 1]
-        if index == len(outs) or outs[index].seq != last.seq + 1 or outs[index].exposed is not last.exposed:
-            yield outs[start:index]
-            start = index
-
-
 class OutChannel:
     """One stream towards one peer. The link serves it through `head` and `sent`; `slot` is its scheduler slot."""
 
     __slots__ = (
         "_arrived_s",
+        "_buried_to",
         "_cap",
         "_owed_share",
         "acked_seq",
@@ -80,6 +76,7 @@ class OutChannel:
         "gaps",
         "last_sent_s",
         "left_out",
+        "live_from",
         "newest",
         "newest_due_s",
         "newest_thinned",
@@ -121,6 +118,8 @@ class OutChannel:
         self.acked_seq = 0  # best effort: the newest message that the peer has whole
         self.begun_seq = 0
         self.next_seq = first  # the next seq expected from `submit`
+        self.live_from = 0  # what is kept below it are replays, and between them lies what the peer is not owed
+        self._buried_to = 0  # every message that is kept up to this seq is a tombstone
         self.last_sent_s: float | None = None
         self.share = 1.0
         """Share of the messages that are let in (`adapt`)."""
@@ -208,7 +207,7 @@ class OutChannel:
         self._count(message.seq, reason, size)
         out.entomb(reason)
         self._keep(out)
-        self.on_drop(self, out, reason, 1)
+        self.on_drop(self, (out,), reason)
 
     def prime(self, replays: Sequence[Message], *, now: float) -> None:
         """Put latched messages (oldest first, marked as replays) ahead of everything; nothing has been sent yet."""
@@ -230,6 +229,7 @@ class OutChannel:
             self.retained = deque((*fresh, *self.retained))
             self.retained_bytes += sum(out.size for out in fresh)
             self.watermark = fresh[0].seq - 1
+            self.live_from = limit
             after = [*(out.seq for out in fresh[1:]), limit]
             gaps = [(out.seq, seq) for out, seq in zip(fresh, after, strict=True) if seq > out.seq + 1]
             if gaps:
@@ -315,12 +315,41 @@ class OutChannel:
             self.on_count(seq, reason)
 
     def _dropped(self, run: Sequence[OutMessage], reason: DropReason) -> None:
-        """Count messages that follow each other, and tell of them at once: there may be a hundred thousand."""
+        """Count messages that are dropped together, and tell of them at once: there may be a hundred thousand."""
         self.counters.drop(reason, sum([out.offered_bytes for out in run]), len(run))
         if self.on_count is not None:
             for out in run:
                 self.on_count(out.seq, reason)
-        self.on_drop(self, run[0], reason, len(run))
+        self.on_drop(self, run, reason)
+
+    def _spans(self, lost: list[OutMessage]) -> Iterator[Sequence[OutMessage]]:
+        """Messages of a reliable stream, in their order, in runs whose spans may be told onwards."""
+        replays = bisect_left(lost, self.live_from, key=_SEQ) if self.live_from else 0
+        if replays:
+            yield from in_sequence(lost[:replays])
+            lost = lost[replays:]
+        if lost:
+            yield lost
+
+    def _runs(self, lost: list[OutMessage]) -> Iterator[Sequence[OutMessage]]:
+        """What is left, in runs that are alike in whether they may have arrived."""
+        for span in self._spans(lost):
+            exposed = [out.exposed for out in span]
+            if exposed.count(exposed[0]) == len(span):
+                yield span
+                continue
+            start = 0
+            for index, (one, other) in enumerate(pairwise(exposed), 1):
+                if one is not other:
+                    yield span[start:index]
+                    start = index
+            yield span[start:]
+
+    def _uncode(self, outs: Iterable[OutMessage]) -> None:
+        """Whatever another thread makes of these bodies, nobody needs it any more."""
+        if self.codec is not None:
+            for out in outs:
+                out.coding = Coding.DONE
 
     def _drop(self, out: OutMessage, reason: DropReason) -> None:
         """Whatever the reason to give it up: one that may have arrived must not be counted as if it had not."""
@@ -328,7 +357,7 @@ class OutChannel:
             reason = DropReason.UNCONFIRMED
         out.coding = Coding.DONE  # whatever another thread makes of it
         self._count(out.seq, reason, out.offered_bytes)
-        self.on_drop(self, out, reason, 1)
+        self.on_drop(self, (out,), reason)
 
     # --- service ------------------------------------------------------------------------------------------------
 
@@ -380,7 +409,7 @@ class OutChannel:
             self._count(out.seq, reason, out.offered_bytes)
         out.entomb(reason)
         if not reported:
-            self.on_drop(self, out, reason, 1)
+            self.on_drop(self, (out,), reason)
 
     def drop_head(self, reason: DropReason, now: float) -> None:
         """Give up the message that would go next (best effort); a reliable one becomes a tombstone."""
@@ -423,7 +452,7 @@ class OutChannel:
         self.queued_bytes -= out.size
         self.retained_bytes -= out.size
         last_seq = self.retained[-1].seq if self.retained else self.watermark
-        while self.gaps and self.gaps[-1][0] >= last_seq:
+        while self.gaps and self.gaps[-1][1] > last_seq:
             self.gaps.pop()
         self._add_gap(last_seq, self.next_seq)
         out.coding = Coding.DONE
@@ -572,9 +601,11 @@ class OutChannel:
         self.watermark = watermark
         retained = self.retained
         before = len(retained)
-        if before > FEW and retained[-1].seq <= watermark:
-            self._deliver_all()
-            return before
+        if before > FEW and retained[FEW].seq <= watermark:
+            done = self._take_out()
+            sizes = [out.offered_bytes for out in done if not out.counted]
+            self.counters.deliver(sum(sizes), len(sizes))
+            return len(done)
         while retained and retained[0].seq <= watermark:
             out = retained.popleft()
             self.retained_bytes -= out.size
@@ -583,14 +614,28 @@ class OutChannel:
             self._forget(out)
         return before - len(retained)
 
-    def _deliver_all(self) -> None:
-        """What `delivered_to` does, at once for all: a peer may confirm a hundred thousand with one number."""
-        retained = self.retained
-        for out in retained:
-            out.coding = Coding.DONE
-        sizes = [out.offered_bytes for out in retained if not out.counted]
-        self.counters.deliver(sum(sizes), len(sizes))
-        self._let_go()
+    def _take_out(self) -> Sequence[OutMessage]:
+        """Take the reliable messages up to the watermark out of wherever they are, at once: a peer may confirm a
+        hundred thousand with one number."""
+        watermark, retained = self.watermark, self.retained
+        if retained[-1].seq <= watermark:
+            self._uncode(retained)
+            self._let_go()
+            return retained
+        done = [retained.popleft() for _ in range(bisect_right(retained, watermark, key=_SEQ))]
+        self._uncode(done)
+        self.retained_bytes -= sum([out.size for out in done])
+        for seq in [seq for seq in self.flying if seq <= watermark]:
+            del self.flying[seq]
+        begun = bisect_right(self.active, watermark, key=_SEQ)
+        for out in self.active[:begun]:
+            out.active = False
+        del self.active[:begun]
+        queue = self.queue
+        if queue and queue[0].seq <= watermark:
+            waited = [queue.popleft() for _ in range(bisect_right(queue, watermark, key=_SEQ))]
+            self.queued_bytes -= sum([out.size for out in waited])
+        return done
 
     def _let_go(self) -> None:
         """Nothing is left."""
@@ -631,7 +676,7 @@ class OutChannel:
             self._count(message.seq, message.drop_reason, size)  # reported where it was dropped
         else:
             self._count(message.seq, reason, size)
-            self.on_drop(self, OutMessage(message), reason, 1)
+            self.on_drop(self, (OutMessage(message),), reason)
         self.skip_to(message.seq + 1)
 
     def start_at(self, first: int) -> None:
@@ -662,16 +707,14 @@ class OutChannel:
     def reported(self, seq: int, reason: DropReason, where: str = "", count: int = 1) -> int:
         """A later hop dropped `count` messages from `seq` on, for the client `where`, and said so before its watermark
         passed them. Returns what that costs, in microseconds."""
-        news = []
-        for out in self.retained:
-            if out.seq >= seq + count:
-                break
-            if out.seq >= seq and not out.counted:
-                out.counted = True
-                out.lost_to = where
-                news.append(out)
+        retained = self.retained
+        start, end = bisect_left(retained, seq, key=_SEQ), bisect_left(retained, seq + count, key=_SEQ)
+        news = [out for out in islice(retained, start, end) if not out.counted]
+        for out in news:
+            out.counted = True
+            out.lost_to = where
         work_us = len(news) // CLEARED_PER_US
-        for run in _runs(news):
+        for run in self._spans(news):
             self._dropped(run, reason)
             work_us += GIVEN_UP_US
         return work_us
@@ -749,10 +792,9 @@ class OutChannel:
     def clear(self, reason: DropReason) -> int:
         """The stream ends: whatever is left is dropped for `reason`. Returns what that costs, in microseconds."""
         work_us = self.kept // CLEARED_PER_US
-        left = self.retained if self.reliable else (*self.flying.values(), *self.queue)
-        for out in left:
-            out.coding = Coding.DONE  # whatever another thread makes of it
-        for run in _runs([out for out in left if not out.counted]):
+        left = self.retained if self.reliable else [*self.flying.values(), *self.queue]
+        self._uncode(left)
+        for run in self._runs([out for out in left if not out.counted]):
             self._dropped(run, DropReason.UNCONFIRMED if run[0].exposed else reason)
             work_us += GIVEN_UP_US
         if self.reliable:

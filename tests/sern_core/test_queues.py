@@ -1,5 +1,6 @@
 """The sending side of one stream: what is kept, dropped, resent and reported, and that the counters always add up."""
 
+from collections.abc import Sequence
 from itertools import pairwise
 from math import inf
 from random import Random
@@ -26,15 +27,20 @@ class Sender:
         self.stream = StreamInfo(StreamId(ClientName("a"), 1, info.name), info, topic_spec)
         self.ledger = SendLedger()
         self.drops: list[tuple[int, DropReason]] = []
+        self.told: list[tuple[int, int, DropReason]] = []  # the spans: first, last, why
         counters = self.ledger.topic(info.name, topic_spec.priority)
         self.channel = OutChannel(1, self.stream, counters, self._drop, first=first)
         self.channel.wanted = self.channel.ready = True
 
-    def _drop(self, _channel: OutChannel, out: OutMessage, reason: DropReason, count: int) -> None:
-        self.drops += [(seq, reason) for seq in range(out.seq, out.seq + count)]
+    def _drop(self, _channel: OutChannel, outs: Sequence[OutMessage], reason: DropReason) -> None:
+        self.drops += [(out.seq, reason) for out in outs]
+        self.told.append((outs[0].seq, outs[-1].seq, reason))
 
     def message(self, seq: int, size: int = 100, *, now: float = 0.0, replay: bool = False) -> Message:
         return Message(self.stream.id, seq, bytes(size), 0, now, 0, replay)
+
+    def tombstone(self, seq: int) -> Message:
+        return Message(self.stream.id, seq, b"\x01", 0, 0.0, 1)
 
     def submit(self, count: int = 1, size: int = 100, *, now: float = 0.0) -> list[bool]:
         channel = self.channel
@@ -417,10 +423,25 @@ class Channel(RuleBasedStateMachine):
         self.now = 0.0
         self.sender = Sender(spec(reliable=reliable, depth=depth, lifespan_s=lifespan_s, retention_s=retention_s))
         self.flying: list[tuple[OutMessage, int, int, int]] = []
+        self.lost_before: set[int] = set()
 
     @rule(size=st.sampled_from([0, 1, 100, 3000]))
     def submit(self, size: int) -> None:
         self.sender.submit(1, size, now=self.now)
+
+    @precondition(lambda self: self.sender.channel.reliable)
+    @rule()
+    def submit_a_tombstone(self) -> None:
+        channel = self.sender.channel
+        self.lost_before.add(channel.next_seq)
+        channel.submit(self.sender.tombstone(channel.next_seq), now=self.now, forced=True)
+
+    @precondition(lambda self: self.sender.channel.reliable)
+    @rule(ahead=st.integers(1, 3))
+    def skip(self, ahead: int) -> None:
+        channel = self.sender.channel
+        self.lost_before.update(range(channel.next_seq, channel.next_seq + ahead))
+        channel.skip_to(channel.next_seq + ahead)
 
     @rule(room=st.sampled_from([64, 1000]))
     def take(self, room: int) -> None:
@@ -444,9 +465,9 @@ class Channel(RuleBasedStateMachine):
         channel.delivered_to(min(channel.watermark + ahead, channel.next_seq - 1))
 
     @precondition(lambda self: self.sender.channel.reliable)
-    @rule(seq=st.integers(1, 10))
-    def report(self, seq: int) -> None:
-        self.sender.channel.reported(seq, DropReason.RATE_CAP)
+    @rule(seq=st.integers(1, 10), count=st.integers(1, 10))
+    def report(self, seq: int, count: int) -> None:
+        self.sender.channel.reported(seq, DropReason.RATE_CAP, "", count)
 
     @rule(seconds=st.sampled_from([0.1, 0.6, 3.0]), up=st.booleans())
     def wait(self, seconds: float, up: bool) -> None:
@@ -497,6 +518,15 @@ class Channel(RuleBasedStateMachine):
             assert len(dropped) == len(set(dropped)), "reported twice"
 
     @invariant()
+    def who_is_told_of_spans_may_believe_them(self) -> None:
+        """Nothing lies in them that is still to come, or has come."""
+        if hasattr(self, "sender") and self.sender.channel.reliable:
+            dropped = {seq for seq, _ in self.sender.drops} | self.lost_before
+            for first, last, _ in self.sender.told:
+                assert dropped.issuperset(range(first, last + 1)), "told of what was not dropped"
+            self.sender.told.clear()
+
+    @invariant()
     def the_peer_waits_for_nothing(self) -> None:
         if hasattr(self, "sender") and self.sender.channel.reliable:
             channel = self.sender.channel
@@ -525,32 +555,61 @@ def test_at_the_end_what_may_have_arrived_is_told_from_what_was_never_sent(relia
     sender.check()
 
 
-def test_many_that_are_dropped_at_once_are_told_in_runs() -> None:
-    """A run has seqs that follow each other, with one reason; what was told before is told no more."""
+def test_many_that_are_dropped_at_once_are_told_as_one_span() -> None:
+    """The span goes over what was dropped and told of before; that is counted no more."""
     sender = Sender(spec(reliable=True))
-    runs: list[tuple[int, int, DropReason]] = []
-    sender.channel.on_drop = lambda _channel, out, reason, count: runs.append((out.seq, count, reason))
     sender.submit(10)
     assert sender.channel.reported(4, DropReason.LIFESPAN, "site", 2) > 0
     assert sender.channel.reported(3, DropReason.LIFESPAN, "site", 4) > 0
-    assert runs == [(4, 2, DropReason.LIFESPAN), (3, 1, DropReason.LIFESPAN), (6, 1, DropReason.LIFESPAN)]
+    assert sender.told == [(4, 5, DropReason.LIFESPAN), (3, 6, DropReason.LIFESPAN)]
+    assert sorted(seq for seq, _ in sender.drops) == [3, 4, 5, 6]
     sender.check()
-    runs.clear()
+    sender.told.clear()
     sender.channel.set_wanted(False)
-    assert runs == [(1, 2, DropReason.UNWANTED), (7, 4, DropReason.UNWANTED)]
+    assert sender.told == [(1, 10, DropReason.UNWANTED)]
+    assert sorted(seq for seq, _ in sender.drops) == list(range(1, 11))
     assert sender.channel.counters.by_reason[DropReason.UNWANTED] == 6 and sender.channel.watermark == 10
+    sender.check()
+
+
+def test_a_backlog_of_tombstones_and_gaps_ends_as_one_span() -> None:
+    sender = Sender(spec(reliable=True))
+    channel = sender.channel
+    for _ in range(100):
+        sender.submit()
+        channel.submit(sender.tombstone(channel.next_seq), now=0.0, forced=True)
+        channel.skip_to(channel.next_seq + 3)
+    assert channel.kept == 200 and channel.counters.dropped == 100
+    channel.clear(DropReason.DISCONNECTED)
+    assert sender.told == [(1, 496, DropReason.DISCONNECTED)] and len(sender.drops) == 100
+    assert channel.counters.offered == channel.counters.dropped == 200 and channel.watermark == channel.next_seq - 1
+    sender.check()
+
+
+def test_what_lies_between_replays_is_not_told_of() -> None:
+    """It was never owed to who joined late, and others may have it yet."""
+    sender = Sender(spec(reliable=True, latched=True, depth=3), first=12)
+    sender.channel.prime([sender.message(seq, replay=True) for seq in (2, 3, 6, 9)], now=0.0)
+    sender.submit()
+    sender.channel.skip_to(20)
+    sender.submit()
+    assert sender.take() is not None
+    sender.channel.reported(1, DropReason.LIFESPAN, "site", 2**61)
+    assert sender.told == [
+        (2, 3, DropReason.LIFESPAN),
+        *((seq, seq, DropReason.LIFESPAN) for seq in (6, 9)),
+        (12, 20, DropReason.LIFESPAN),
+    ]
     sender.check()
 
 
 def test_what_may_have_arrived_is_a_run_of_its_own() -> None:
     sender = Sender(spec(reliable=False, depth=10))
-    runs: list[tuple[int, int, DropReason]] = []
-    sender.channel.on_drop = lambda _channel, out, reason, count: runs.append((out.seq, count, reason))
     sender.submit(5)
     for out in list(sender.channel.queue)[:2]:
         out.exposed = True
     sender.channel.clear(DropReason.SHUTDOWN)
-    assert runs == [(1, 2, DropReason.UNCONFIRMED), (3, 3, DropReason.SHUTDOWN)]
+    assert sender.told == [(1, 2, DropReason.UNCONFIRMED), (3, 5, DropReason.SHUTDOWN)]
     sender.check()
 
 
@@ -564,4 +623,23 @@ def test_one_number_confirms_all_that_is_kept() -> None:
     counters = sender.channel.counters
     assert counters.delivered == 19 and counters.dropped == 1 and sender.channel.kept == 0
     assert sender.channel.watermark == 20 and sender.channel.head(0.0) is None
+    sender.check()
+
+
+@pytest.mark.parametrize("watermark", [1, 19, 39, 40])
+def test_a_number_confirms_what_is_kept_up_to_it(watermark: int) -> None:
+    """At once or one by one, begun or waiting: the same is left."""
+    sender = Sender(spec(reliable=True))
+    channel = sender.channel
+    sender.submit(40)
+    parts = [part for part in (sender.take() for _ in range(30)) if part is not None]
+    for part in parts[5:25]:
+        channel.fragment_lost(*part, now=0.0)
+    channel.reported(15, DropReason.LIFESPAN, "site", 10)
+    assert channel.delivered_to(watermark) == watermark
+    assert [out.seq for out in channel.retained] == list(range(watermark + 1, 41))
+    assert [out.seq for out in channel.active] == list(range(max(watermark + 1, 6), 26))
+    assert sorted(channel.flying) == list(range(watermark + 1, 31))
+    lost = len(range(15, min(watermark, 24) + 1))
+    assert channel.counters.delivered == watermark - lost and channel.counters.dropped == 10
     sender.check()
