@@ -398,6 +398,10 @@ class Link(Answering):
         else:
             self._skipped(stream, now)
 
+    def _forget_paused(self, stream: InStream) -> None:
+        super()._forget_paused(stream)
+        self._skipping.pop(stream, None)  # it is where it was to go on, and nobody is to hear of it later
+
     def _skipped(self, stream: InStream, now: float) -> None:
         if stream.left_out:
             self._tell(self.handler.on_skipped, self, stream, stream.left_out, now=now)

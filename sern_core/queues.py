@@ -365,22 +365,43 @@ class OutChannel:
         """The message to serve next: begun ones first, then the queue; what has expired is dropped on the way."""
         while self.active:
             out = self.active[0]
-            if self._expired(out, now):
-                self._give_up_begun(out, DropReason.LIFESPAN)
+            reason = self._overdue(out, now)
+            if reason is not None:
+                self._give_up_begun(out, reason)
             elif out.seq < self.acked_seq:
                 self._give_up_begun(out, DropReason.SUPERSEDED)
             else:
                 return out
-        while self.queue:
-            out = self.queue[0]
-            if self._expired(out, now):
-                if self.reliable:
-                    self._entomb(out, DropReason.LIFESPAN)
-                    return out
-                self._drop(self._pop_queue(), DropReason.LIFESPAN)
-            else:
-                return out
-        return None
+        if not self.queue:
+            return None
+        out = self.queue[0]
+        reason = self._overdue(out, now)
+        if reason is None:
+            return out
+        if self.reliable:
+            self._entomb(out, reason)
+            return out
+        self._drop_overdue(now)
+        return self.queue[0] if self.queue else None
+
+    def _drop_overdue(self, now: float) -> None:
+        """Best effort: the oldest that have waited too long, together."""
+        gone: list[OutMessage] = []
+        while self.queue and self._expired(self.queue[0], now):
+            gone.append(self._pop_queue())
+        self._uncode(gone)
+        for run in self._runs(gone):
+            self._dropped(run, DropReason.UNCONFIRMED if run[0].exposed else DropReason.LIFESPAN)
+
+    def _overdue(self, out: OutMessage, now: float) -> DropReason | None:
+        """Why a message is not to be sent any more, by time; None if it is."""
+        message, spec = out.message, self.spec
+        if message.tombstone:
+            return None
+        if self.reliable and now - out.retain_from_s > spec.retention_s:
+            return DropReason.RETENTION
+        late = spec.lifespan_s is not None and now - message.born_s + message.error_s > spec.lifespan_s
+        return DropReason.LIFESPAN if late else None
 
     def _expired(self, out: OutMessage, now: float) -> bool:
         lifespan_s = self.spec.lifespan_s
@@ -550,20 +571,31 @@ class OutChannel:
 
     def fragment_lost(self, out: OutMessage, generation: int, start: int, end: int, *, now: float) -> bool:
         """A fragment did not arrive. True: it will be sent again; False: the message is no longer wanted."""
-        if out.generation != generation:
-            return False
-        out.fragments_inflight -= 1
-        if self.flying.get(out.seq) is not out:
-            return False  # finished or dropped meanwhile
-        reason = None if self.reliable else self._unwanted_again(out, now)
-        if reason is not None:
-            self._give_up_begun(out, reason)
-            return False
-        if out.ranges is None:
-            out.ranges = []
-        insort(out.ranges, (start, end))
-        self._activate(out)
-        return True
+        return bool(self.fragments_lost([(out, generation, start, end)], now=now))
+
+    def fragments_lost(self, fragments: Iterable[tuple[OutMessage, int, int, int]], *, now: float) -> list[OutMessage]:
+        """Fragments (message, its generation, start, end) did not arrive: a connection may end with twenty thousand of
+        them. Returns the message of each that will be sent again."""
+        again: list[OutMessage] = []
+        waiting: dict[int, OutMessage] = {}  # have bytes to send again, and are not in `active` yet
+        for out, generation, start, end in fragments:
+            if out.generation != generation:
+                continue
+            out.fragments_inflight -= 1
+            if self.flying.get(out.seq) is not out:
+                continue  # finished or dropped meanwhile
+            reason = None if self.reliable else self._unwanted_again(out, now)
+            if reason is not None:
+                waiting.pop(out.seq, None)
+                self._give_up_begun(out, reason)
+                continue
+            if out.ranges is None:
+                out.ranges = []
+            insort(out.ranges, (start, end))
+            waiting[out.seq] = out
+            again.append(out)
+        self._activate_all(waiting.values())
+        return again
 
     def _unwanted_again(self, out: OutMessage, now: float) -> DropReason | None:
         """Why a best-effort message that lost a fragment is not sent again; None if it is."""
@@ -582,6 +614,20 @@ class OutChannel:
         if not out.active:
             out.active = True
             insort(self.active, out, key=_SEQ)
+
+    def _activate_all(self, outs: Iterable[OutMessage]) -> None:
+        """The same of many, each once."""
+        fresh = []
+        for out in outs:
+            self.flying[out.seq] = out
+            if not out.active:
+                out.active = True
+                fresh.append(out)
+        if len(fresh) == 1:
+            insort(self.active, fresh[0], key=_SEQ)
+        elif fresh:
+            self.active += fresh
+            self.active.sort(key=_SEQ)  # two runs in order, most often, which is merged in one go
 
     def _deactivate(self, out: OutMessage) -> None:
         """It has no more bytes to send, or is given up."""
@@ -719,39 +765,113 @@ class OutChannel:
             work_us += GIVEN_UP_US
         return work_us
 
-    def sweep(self, now: float, *, up: bool) -> None:
-        """Expire what nobody will send: lifespan and retention, also while the link is down."""
+    def sweep(self, now: float, *, up: bool, room: int = LAPSED_A_SWEEP) -> int:
+        """Expire what nobody will send: lifespan and retention, also while the link is down.
+
+        Of a reliable stream at most `room` messages are given up one by one; returns how many were. As many as there
+        was room for: sweep again soon, there may be more. Nothing of that is sent meanwhile (`head`).
+        """
         if not self.reliable:
             if self.newest is not None and self._expired(self.newest, now):
                 self._drop_newest(DropReason.LIFESPAN)
             if self.spec.lifespan_s is not None:
-                while self.queue and self._expired(self.queue[0], now):
-                    self._drop(self._pop_queue(), DropReason.LIFESPAN)
+                self._drop_overdue(now)
                 while self.active and self._expired(self.active[0], now):
                     self._give_up_begun(self.active[0], DropReason.LIFESPAN)
-            return
-        retention_s = self.spec.retention_s
-        patience_s = retention_s if self.spec.lifespan_s is None else min(retention_s, self.spec.lifespan_s)
-        for out in self.retained:
-            if out.message.tombstone:
-                continue
-            lapsed = now - out.retain_from_s > retention_s
-            if now - out.message.born_s + out.message.error_s <= patience_s:
-                break  # they are in the order of their birth
-            # Lifespan stops a message from being sent; once the peer has it whole, the peer watches it.
-            if lapsed or (self._expired(out, now) and (out.has_unsent or out.fragments_inflight > 0)):
-                reason = DropReason.RETENTION if lapsed else DropReason.LIFESPAN
-                if out.started:
-                    self._give_up_begun(out, reason)
-                else:
-                    self._entomb(out, reason)
+            return 0
+        spent = 0
         if not up:
-            # Nobody to tell in the session: the announcement of the next one starts behind them.
-            while self.retained and self.retained[0].message.tombstone:
-                out = self.retained.popleft()
-                self.retained_bytes -= out.size
-                self._forget(out)
-                self.watermark = out.seq
+            spent = self._leave_behind(now, room)
+        return spent + self._bury(now, room - spent)
+
+    def _lapsed(self, out: OutMessage, now: float) -> DropReason | None:
+        """Why a reliable message that is no tombstone is to be given up now; None if it is not."""
+        if now - out.retain_from_s > self.spec.retention_s:
+            return DropReason.RETENTION
+        # Lifespan stops a message from being sent; once the peer has it whole, the peer watches it.
+        if self._expired(out, now) and (out.has_unsent or out.fragments_inflight > 0):
+            return DropReason.LIFESPAN
+        return None
+
+    @property
+    def _patience_s(self) -> float:
+        """No message that is younger has lapsed. They are in the order of their birth."""
+        lifespan_s, retention_s = self.spec.lifespan_s, self.spec.retention_s
+        return retention_s if lifespan_s is None else min(retention_s, lifespan_s)
+
+    def _bury(self, now: float, room: int) -> int:
+        """Put tombstones in the places of reliable messages that have lapsed, of at most `room`; returns how many."""
+        patience_s = self._patience_s
+        retained = self.retained
+        runs: list[tuple[DropReason | None, list[OutMessage]]] = []
+        known: DropReason | None = None
+        count = 0
+        all_buried = True
+        start = bisect_right(retained, self._buried_to, key=_SEQ) if self._buried_to else 0
+        for out in islice(retained, start, None) if start else retained:
+            if out.message.tombstone:
+                if all_buried:
+                    self._buried_to = out.seq
+                continue
+            if now - out.message.born_s + out.message.error_s <= patience_s or count >= room:
+                break
+            reason = self._lapsed(out, now)
+            if reason is None:
+                all_buried = False
+            else:
+                if reason is not known:
+                    runs.append((reason, []))
+                runs[-1][1].append(out)
+                count += 1
+            known = reason  # a span has none in it that goes on
+        for why, run in runs:
+            assert why is not None
+            self._entomb_all(run, why)
+        return count
+
+    def _entomb_all(self, outs: list[OutMessage], reason: DropReason) -> None:
+        """Tombstones take the places of reliable messages. Those that were not counted are told of together."""
+        lost = [out for out in outs if not out.counted]
+        for out in outs:
+            freed_bytes = out.size - 1
+            self.retained_bytes -= freed_bytes
+            if not out.started:
+                self.queued_bytes -= freed_bytes
+            out.entomb(reason)
+        self._activate_all([out for out in outs if out.started])
+        for span in self._spans(lost):
+            self._dropped(span, reason)
+
+    def _leave_behind(self, now: float, room: int) -> int:
+        """Without a session the oldest that have lapsed leave nothing behind: there is nobody to tell, and the
+        announcement of the next session starts behind them. In at most `room` runs; returns in how many."""
+        patience_s = self._patience_s
+        runs: list[tuple[DropReason, list[OutMessage]]] = []
+        known: DropReason | None = None
+        last_seq = 0
+        for out in self.retained:
+            if not out.message.tombstone:
+                if now - out.message.born_s + out.message.error_s <= patience_s:
+                    break
+                reason = self._lapsed(out, now)
+                if reason is None:
+                    break
+                if not out.counted:
+                    if reason is not known:
+                        if len(runs) >= room:
+                            break
+                        run: list[OutMessage] = []
+                        runs.append((reason, run))
+                        known = reason
+                    run.append(out)
+            last_seq = out.seq
+        if last_seq:
+            self.watermark = last_seq
+            self._take_out()
+        for why, run in runs:
+            for span in self._spans(run):
+                self._dropped(span, why)
+        return len(runs)
 
     @property
     def first_seq(self) -> int:

@@ -172,7 +172,7 @@ class Sender(ABC):
 
     @abstractmethod
     def _give_back(self, lane: Lane, items: list[Any], now: float) -> None:
-        """What a packet carried did not arrive: send again what is still wanted."""
+        """What packets carried did not arrive: send again what is still wanted."""
 
     @abstractmethod
     def fault(self, error: Exception) -> None:

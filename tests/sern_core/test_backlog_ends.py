@@ -1,13 +1,17 @@
 """The end of what waits for a subscriber: tombstones and gaps in it, and exactly the messages in between are lost."""
 
+import pytest
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
+from sern_core import hop
 from sern_core.access import AccessRule, AccessTable
 from sern_core.hub import HubParams
+from sern_core.out_message import OutMessage
 from sern_core.params import LinkParams
-from sern_core.queues import MESSAGE_OVERHEAD_BYTES
+from sern_core.queues import MESSAGE_OVERHEAD_BYTES, OutChannel
 from sern_core.types import DropReason
+from sern_sim.models import LinkModel
 from tests.exploring import cases
 from tests.world import World, spec
 
@@ -93,3 +97,34 @@ def test_what_ends_is_what_waited_and_nothing_else(actions: list[str], end: str,
     if back is not None and end == "comes back":
         taken = back.seqs("/robot/log")
         assert waiting - set(lost_before) <= set(taken) and taken == sorted(set(taken))
+
+
+def test_what_lapses_in_many_sweeps_is_reported_once_and_never_sent(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where 500 messages lapse at a time and a sweep is for 3: the next one is due at once, and what lies between two
+    sweeps sends none of them."""
+    monkeypatch.setattr(hop, "LAPSED_A_SWEEP", 3)
+    sent: list[bool] = []
+    take = OutChannel.take
+
+    def taken(channel: OutChannel, out: OutMessage, room: int, now: float) -> tuple[int, int]:
+        sent.append(not out.message.tombstone and now - out.retain_from_s > channel.spec.retention_s)
+        return take(channel, out, room, now)
+
+    monkeypatch.setattr(OutChannel, "take", taken)
+    world = World().watch()
+    robot = world.client("robot")
+    thin = LinkModel(rate_bps=40e3, delay_s=0.05).as_stream()
+    site = world.client("site", thin, thin, patterns=["/robot/.*"])
+    log = robot.publish("/robot/log", spec(reliable=True, retention_s=4.0))
+    world.run(1.0)
+    for _ in range(500):
+        assert robot.send(log, bytes(100))
+    world.until(lambda: not log.retained, within_s=60.0)
+    lost = [drop.seq for drop in robot.dropped_out]
+    got = site.seqs("/robot/log")
+    assert got == list(range(1, len(got) + 1)) and 20 < len(got) < 400
+    assert len(lost) == len(set(lost)) and set(lost) >= set(range(len(got) + 1, 501))
+    assert sent and not any(sent), "what has lapsed is sent"
+    (channel,) = world.relay.hub.links[site.name].channels.values()
+    assert channel.counters.by_reason[DropReason.RETENTION] >= 500 - len(got)
+    assert log.counters.offered == log.counters.delivered + log.counters.dropped == 500

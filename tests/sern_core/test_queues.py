@@ -15,7 +15,7 @@ from sern_core.message import Message, StreamId, StreamInfo, TopicInfo, TopicSpe
 from sern_core.out_message import OutMessage
 from sern_core.queues import MESSAGE_OVERHEAD_BYTES, OutChannel
 from sern_core.types import ClientName, DropReason, Encoding, TopicName
-from tests.exploring import cases
+from tests.exploring import cases, seeds
 from tests.world import spec
 
 
@@ -403,11 +403,14 @@ def test_what_a_lost_connection_held_is_taken_back_without_a_walk_for_each(order
     parts = [part for part in (sender.take() for _ in range(2000)) if part is not None]
     assert len(parts) == len(channel.flying) == 2000
     CountedSeq.compared = 0
-    for out, generation, start, end in parts[::order]:
-        assert channel.fragment_lost(out, generation, start, end, now=0.1)
-    assert CountedSeq.compared <= 2000 * 12
+    assert len(channel.fragments_lost(parts[::order], now=0.1)) == 2000
+    assert CountedSeq.compared <= 2000 * 2
     assert [out.seq for out in channel.active] == list(range(1, 2001))
     sender.check()
+
+
+def retention_s_of(sender: Sender) -> float:
+    return sender.stream.spec.retention_s
 
 
 class Channel(RuleBasedStateMachine):
@@ -448,6 +451,9 @@ class Channel(RuleBasedStateMachine):
         part = self.sender.take(room, now=self.now)
         if part is not None:
             self.flying.append(part)
+            out = part[0]
+            lapsed = self.sender.channel.reliable and self.now - out.retain_from_s > retention_s_of(self.sender)
+            assert not lapsed or out.message.tombstone, "what has lapsed is sent"
 
     @precondition(lambda self: bool(self.flying))
     @rule(data=st.data(), lost=st.booleans())
@@ -469,15 +475,14 @@ class Channel(RuleBasedStateMachine):
     def report(self, seq: int, count: int) -> None:
         self.sender.channel.reported(seq, DropReason.RATE_CAP, "", count)
 
-    @rule(seconds=st.sampled_from([0.1, 0.6, 3.0]), up=st.booleans())
-    def wait(self, seconds: float, up: bool) -> None:
+    @rule(seconds=st.sampled_from([0.1, 0.6, 3.0]), up=st.booleans(), room=st.sampled_from([0, 1, 2, 1000]))
+    def wait(self, seconds: float, up: bool, room: int) -> None:
         self.now += seconds
-        self.sender.channel.sweep(self.now, up=up)
+        assert self.sender.channel.sweep(self.now, up=up, room=room) <= room
 
     @rule()
     def lose_session(self) -> None:
-        for out, generation, start, end in self.flying:
-            self.sender.channel.fragment_lost(out, generation, start, end, now=self.now)
+        self.sender.channel.fragments_lost(self.flying, now=self.now)
         self.flying.clear()
 
     @rule()
@@ -643,3 +648,90 @@ def test_a_number_confirms_what_is_kept_up_to_it(watermark: int) -> None:
     lost = len(range(15, min(watermark, 24) + 1))
     assert channel.counters.delivered == watermark - lost and channel.counters.dropped == 10
     sender.check()
+
+
+def test_what_lapses_in_a_sweep_is_bounded_and_the_rest_is_not_sent_meanwhile() -> None:
+    sender = Sender(spec(reliable=True, retention_s=1.0))
+    channel = sender.channel
+    sender.submit(30)
+    begun = sender.take()
+    assert begun is not None
+    assert channel.sweep(2.0, up=True, room=10) == 10
+    assert sender.told == [(1, 10, DropReason.RETENTION)], "begun or not, in one span"
+    sender.check()
+    for _ in range(15):
+        part = sender.take(now=2.0)
+        assert part is not None and part[0].message.tombstone
+    assert [channel.sweep(2.0, up=True, room=10) for _ in range(3)] == [10, 5, 0]
+    assert [span[:2] for span in sender.told] == [(1, 10), *((seq, seq) for seq in range(11, 16)), (16, 25), (26, 30)]
+    assert {reason for _, reason in sender.drops} == {DropReason.RETENTION} and channel.kept == 30
+    sender.check()
+
+
+def test_what_lapses_around_a_message_that_goes_on_is_told_around_it() -> None:
+    sender = Sender(spec(reliable=True, lifespan_s=1.0))
+    sender.submit(5)
+    parts = [sender.take() for _ in range(3)]
+    assert parts[2] is not None
+    sender.channel.fragment_acked(parts[2][0], parts[2][1])
+    assert sender.channel.sweep(2.0, up=True) == 4
+    assert sender.told == [(1, 2, DropReason.LIFESPAN), (4, 5, DropReason.LIFESPAN)], "the peer has 3 and watches it"
+    sender.check()
+
+
+def test_without_a_link_what_has_lapsed_goes_together_and_becomes_no_tombstone_first() -> None:
+    sender = Sender(spec(reliable=True, retention_s=10.0, lifespan_s=100.0))
+    channel = sender.channel
+    sender.submit(8)
+    channel.submit(sender.tombstone(9), now=0.0, forced=True)
+    sender.submit(8)
+    sender.submit(3, now=9.0)
+    part = sender.take()
+    assert part is not None
+    assert channel.sweep(11.0, up=False) == 1
+    assert sender.told == [(1, 17, DropReason.RETENTION)] and sender.waiting == [18, 19, 20] == [
+        out.seq for out in channel.retained
+    ]
+    assert channel.watermark == 17 and channel.first_seq == 18 and not channel.flying and not channel.active
+    assert channel.counters.dropped == 17 and not part[0].message.tombstone
+    sender.check()
+
+
+def test_what_waited_too_long_on_a_best_effort_stream_goes_together() -> None:
+    sender = Sender(spec(depth=100, lifespan_s=1.0))
+    sender.submit(50)
+    sender.submit(50, now=1.5)
+    head = sender.channel.head(2.0)
+    assert head is not None and head.seq == 51 and sender.told == [(1, 50, DropReason.LIFESPAN)]
+    sender.channel.sweep(3.0, up=False)
+    assert sender.told[1:] == [(51, 100, DropReason.LIFESPAN)] and sender.channel.counters.dropped == 100
+    sender.check()
+
+
+@pytest.mark.parametrize("seed", seeds(20))
+@pytest.mark.parametrize(("reliable", "depth"), [(True, 1), (False, 1), (False, 30)])
+def test_many_fragments_that_are_lost_together_are_lost_as_one_by_one(seed: int, reliable: bool, depth: int) -> None:
+    random = Random(seed)
+    left: list[tuple[list[int], list[int], list[tuple[int, DropReason]], list[int]]] = []
+    draw = [(random.choice((1, 100, 2500)), random.random() < 0.3) for _ in range(30)]
+    order = [random.random() for _ in range(200)]
+    for together in (True, False):
+        sender = Sender(spec(reliable=reliable, depth=depth, lifespan_s=5.0))
+        parts = []
+        for index, (size, acked) in enumerate(draw):
+            sender.submit(1, size, now=0.3 * index)
+            while (part := sender.take(now=0.3 * index)) is not None:
+                if acked:
+                    sender.channel.fragment_acked(part[0], part[1])
+                else:
+                    parts.append(part)
+        sender.submit(1, now=9.0)
+        parts = [part for _, part in sorted(zip(order, parts, strict=False), key=lambda pair: pair[0])]
+        if together:
+            again = [out.seq for out in sender.channel.fragments_lost(parts, now=9.0)]
+        else:
+            again = [part[0].seq for part in parts if sender.channel.fragment_lost(*part, now=9.0)]
+        sender.check()
+        channel = sender.channel
+        left.append(([out.seq for out in channel.active], sorted(channel.flying), sender.drops, again))
+    assert left[0] == left[1] and (left[0][0] or not reliable)
