@@ -10,7 +10,7 @@ from sern_core.hub import HubParams
 from sern_core.out_message import OutMessage
 from sern_core.params import LinkParams
 from sern_core.queues import MESSAGE_OVERHEAD_BYTES, OutChannel
-from sern_core.types import DropReason
+from sern_core.types import ClientName, DropReason
 from sern_sim.models import LinkModel
 from tests.exploring import cases
 from tests.world import World, spec
@@ -70,7 +70,7 @@ def test_what_ends_is_what_waited_and_nothing_else(actions: list[str], end: str,
     if here:
         world.network.crash_node(world.clients["away"])
     world.run(0.5)
-    channels = hub.links["away"].channels.values() if joined else ()
+    channels = hub.links[ClientName("away")].channels.values() if joined else ()
     waiting = {out.seq for channel in channels for out in channel.retained if not out.counted}
     open_at_origin = {out.seq for out in log.retained if not out.counted}
     lost_before = [drop.seq for drop in robot.dropped_out]
