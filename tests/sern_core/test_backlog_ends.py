@@ -46,7 +46,7 @@ def test_what_ends_is_what_waited_and_nothing_else(actions: list[str], end: str,
     ).watch(0.5)
     robot = world.client("robot")
     near = world.client("near", patterns=["/robot/.*"])
-    log = robot.publish("/robot/log", spec(reliable=True, retention_s=80.0, latched=latched, depth=5))
+    log = robot.publish("/robot/log", spec(reliable=True, retention_s=600.0, latched=latched, depth=5))
     world.run(1.0)
     joined = here = False
     for action in actions:
@@ -69,6 +69,7 @@ def test_what_ends_is_what_waited_and_nothing_else(actions: list[str], end: str,
     hub = world.relay.hub
     if here:
         world.network.crash_node(world.clients["away"])
+    world.until(lambda: not log.queue and not log.flying, what="the relay has all of it")
     world.run(0.5)
     channels = hub.links[ClientName("away")].channels.values() if joined else ()
     waiting = {out.seq for channel in channels for out in channel.retained if not out.counted}
