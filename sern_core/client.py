@@ -65,7 +65,7 @@ class ClientEvents(Protocol):
 
     def send_dropped(self, stream: StreamInfo, first: int, count: int, reason: DropReason, where: str) -> None:
         """Messages of ours, `count` from seq `first` on, were dropped: here (`where` is empty), or further on for the
-        client `where`. There may be 100,000 of them: nothing is to be done for each."""
+        client `where`. There may be 100,000 of them: nothing is to be done for each. Some may have been told before."""
 
     def wanted(self, stream: StreamInfo, wanted: bool) -> None:
         """Whether anybody at the far side wants a stream of ours; said again after every change."""
@@ -471,8 +471,9 @@ class ClientCore:
         self.received.of(stream.stream).drop_arrived(reason, count)
         self.trace.record(link.now, stream.stream.id.topic, TraceEvent.DROPPED, reason=reason, peer=link.peer)
 
-    def on_out_drop(self, link: Link, channel: OutChannel, out: OutMessage, reason: DropReason, count: int) -> None:
-        self._tell(self.events.send_dropped, channel.stream, out.seq, count, reason, out.lost_to)
+    def on_out_drop(self, link: Link, channel: OutChannel, outs: Sequence[OutMessage], reason: DropReason) -> None:
+        first, last = outs[0], outs[-1].seq  # what lies between was told before
+        self._tell(self.events.send_dropped, channel.stream, first.seq, last - first.seq + 1, reason, first.lost_to)
 
     def on_delivered(self, link: Link, channel: OutChannel, *, now: float) -> None:
         """The ledger has counted it."""

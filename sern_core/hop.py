@@ -21,6 +21,8 @@ from sern_core.lanes import (
     PROVEN_ACKS,
     Lane,
 )
+from sern_core.out_message import OutMessage
+from sern_core.queues import LAPSED_A_SWEEP, OutChannel
 from sern_core.sending import CONTROL_CHANNEL, RATE_INTERVAL_S, SWEEP_INTERVAL_S, Sender, SentData, SentWatermark
 from sern_core.trace import LINK, TraceEvent
 from sern_core.types import (
@@ -229,8 +231,7 @@ class Hop(Sender):
 
     def _recall(self, lane: Lane, now: float) -> None:
         """What is in flight on this lane goes another way; what arrives twice is dropped there."""
-        for packet in lane.flight.abandon():
-            self._give_back(lane, packet.items, now)
+        self._give_back(lane, [item for packet in lane.flight.abandon() for item in packet.items], now)
 
     def _rate_known(self, now: float) -> None:
         self._rate_due_s = now + RATE_INTERVAL_S
@@ -243,26 +244,33 @@ class Hop(Sender):
             lane.resolved(lost=len(gone))
         for packet in gone:
             lane.estimator.on_loss(now=now, nbytes=packet.nbytes)
-            self._give_back(lane, packet.items, now)
             self.dirty = True
+        if gone:
+            self._give_back(lane, [item for packet in gone for item in packet.items], now)
 
     def _give_back(self, lane: Lane, items: list[Any], now: float) -> None:
-        """What a packet carried did not arrive: send again what is still wanted."""
+        """What packets carried did not arrive: send again what is still wanted."""
+        lost: dict[OutChannel, list[tuple[OutMessage, int, int, int]]] = {}
         for item in items:
             if type(item) is SentData:
-                channel = item.channel
-                again = channel.fragment_lost(item.out, item.generation, item.start, item.end, now=now)
-                if again and self.trace.enabled:
-                    self.trace.record(
-                        now, item.out.message.stream.topic, TraceEvent.LOST, seq=item.out.seq, peer=self.peer
-                    )
-                if self.channels.get(channel.slot) is channel:
-                    self._refresh(channel, now)
+                lost.setdefault(item.channel, []).append((item.out, item.generation, item.start, item.end))
             elif type(item) is SentWatermark:
                 if item.channel in self.incoming:
                     self._watermarks[item.channel] = self.incoming[item.channel].confirmed
             else:
                 lane.ping = True
+        for channel, fragments in lost.items():
+            again = channel.fragments_lost(fragments, now=now)
+            if self.trace.enabled:
+                topic = channel.stream.id.topic
+                for out in again:
+                    self.trace.record(now, topic, TraceEvent.LOST, seq=out.seq, peer=self.peer)
+            if self.channels.get(channel.slot) is channel:
+                self._refresh(channel, now)
+
+    def _forget_paused(self, stream: InStream) -> None:
+        """The peer knows that nobody wants this stream: it has given up what is half received or waits here."""
+        stream.forget(DropReason.UNWANTED)
 
     def on_watermark(self, channel: int, delivered: int) -> bool | None:
         """FrameSink: everything of a reliable channel up to `delivered` has had its turn at the far side."""
@@ -360,14 +368,17 @@ class Hop(Sender):
         self._sweep_due_s = now + SWEEP_INTERVAL_S
         if now >= self._held_back_due_s:
             self._release_held_back(now)
+        room = LAPSED_A_SWEEP
         for channel in list(self.channels.values()):
             watermark = channel.watermark
-            channel.sweep(now, up=self.established)
+            room -= channel.sweep(now, up=self.established, room=room)
             if channel.offered or channel.active:
                 self._refresh(channel, now)
             if channel.watermark > watermark:
                 self._watermark_moved(channel)
+        if room <= 0:
+            self._sweep_due_s = now  # the rest in another turn of the loop
         for stream in self.incoming.values():
             stream.reports.heard(self._control.watermark)
             if 0 < stream.pause_seq <= self._control.watermark:
-                stream.forget(DropReason.UNWANTED)
+                self._forget_paused(stream)

@@ -787,7 +787,7 @@ class Hub(LocalStreams):
     def on_in_drop(self, link: Link, stream: InStream, reason: DropReason, nbytes: int, count: int) -> None:
         self.received.of(stream.stream).drop_arrived(reason, count)
 
-    def on_out_drop(self, link: Link, channel: OutChannel, out: OutMessage, reason: DropReason, count: int) -> None:
+    def on_out_drop(self, link: Link, channel: OutChannel, outs: Sequence[OutMessage], reason: DropReason) -> None:
         if not channel.reliable:
             return
         relayed = self.relayed.get(channel.stream.id)
@@ -796,7 +796,8 @@ class Hub(LocalStreams):
         if channel is self._unsubscribed or (reason is DropReason.UNWANTED and link.peer not in relayed.outs):
             return  # it is owed nothing any more, also of what was sent whole, and others may have the message
         now, source = link.now, relayed.source
-        report = partial(source.report_drop, relayed.stream, out.seq, reason, link.peer, now=now, count=count)
+        first, last = outs[0].seq, outs[-1].seq  # the origin counts what it has not counted of them
+        report = partial(source.report_drop, relayed.stream, first, reason, link.peer, now=now, count=last - first + 1)
         self._for(source.peer, now, report)
 
     def on_delivered(self, link: Link, channel: OutChannel, *, now: float) -> None:

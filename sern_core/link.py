@@ -96,9 +96,9 @@ class LinkHandler(Protocol):
 
     def on_in_drop(self, link: "Link", stream: InStream, reason: DropReason, nbytes: int, count: int) -> None: ...
 
-    def on_out_drop(
-        self, link: "Link", channel: OutChannel, out: OutMessage, reason: DropReason, count: int
-    ) -> None: ...
+    def on_out_drop(self, link: "Link", channel: OutChannel, outs: Sequence[OutMessage], reason: DropReason) -> None:
+        """These messages are dropped, in the order of their seqs. Of a reliable stream what lies between two of them
+        was dropped before, or never comes."""
 
     def on_delivered(self, link: "Link", channel: OutChannel, *, now: float) -> None:
         """The peer's watermark of a reliable channel moved to `channel.watermark`."""
@@ -269,12 +269,12 @@ class Link(Answering):
     def _counted(self, fates: Fates, stream: StreamInfo, seq: int, reason: DropReason) -> None:
         fates.dropped(stream, seq, reason, self.peer)
 
-    def _dropped(self, channel: OutChannel, out: OutMessage, reason: DropReason, count: int) -> None:
+    def _dropped(self, channel: OutChannel, outs: Sequence[OutMessage], reason: DropReason) -> None:
         if self.channels.get(channel.slot) is channel:
             topic = channel.stream.id.topic
-            for seq in range(out.seq, out.seq + min(count, MAX_TRACED)):
-                self.trace.record(self._now, topic, TraceEvent.DROPPED, seq=seq, reason=reason, peer=self.peer)
-            self._tell(self.handler.on_out_drop, self, channel, out, reason, count)
+            for out in outs[:MAX_TRACED]:
+                self.trace.record(self._now, topic, TraceEvent.DROPPED, seq=out.seq, reason=reason, peer=self.peer)
+            self._tell(self.handler.on_out_drop, self, channel, outs, reason)
 
     def close_channel(self, channel: OutChannel, reason: DropReason, *, now: float) -> None:
         """The stream is gone: tell the peer, drop what is left for `reason`."""
@@ -399,6 +399,10 @@ class Link(Answering):
             self._skipping[stream] = None
         else:
             self._skipped(stream, now)
+
+    def _forget_paused(self, stream: InStream) -> None:
+        super()._forget_paused(stream)
+        self._skipping.pop(stream, None)  # it is where it was to go on, and nobody is to hear of it later
 
     def _skipped(self, stream: InStream, now: float) -> None:
         if stream.left_out:

@@ -1,5 +1,7 @@
 """One message on its way over one hop: what of its body is still to be sent, and what became of the rest."""
 
+from collections.abc import Iterator, Sequence
+
 from sern_core.encoding import Coding
 from sern_core.message import Message
 from sern_core.types import DROP_CODES, DropReason
@@ -78,3 +80,12 @@ class OutMessage:
         self.restart()
         self.exposed = False
         self.counted = True
+
+
+def in_sequence(outs: Sequence[OutMessage]) -> Iterator[Sequence[OutMessage]]:
+    """Messages in runs of seqs that follow each other."""
+    start = 0
+    for index in range(1, len(outs) + 1):
+        if index == len(outs) or outs[index].seq != outs[index - 1].seq + 1:
+            yield outs[start:index]
+            start = index

@@ -172,7 +172,7 @@ class Sender(ABC):
 
     @abstractmethod
     def _give_back(self, lane: Lane, items: list[Any], now: float) -> None:
-        """What a packet carried did not arrive: send again what is still wanted."""
+        """What packets carried did not arrive: send again what is still wanted."""
 
     @abstractmethod
     def fault(self, error: Exception) -> None:
@@ -194,7 +194,7 @@ class Sender(ABC):
         info = TopicInfo(CONTROL_TOPIC, "", Encoding.RAW)
         stream = StreamInfo(StreamId(self.name, self.boot, CONTROL_TOPIC), info, spec)
         counters = SendCounters(CONTROL_TOPIC, PriorityClass.CONTROL)
-        control = OutChannel(CONTROL_CHANNEL, stream, counters, lambda _channel, _out, _reason, _count: None, first=1)
+        control = OutChannel(CONTROL_CHANNEL, stream, counters, lambda _channel, _outs, _reason: None, first=1)
         control.wanted = control.ready = True
         return control, InStream(stream, self.reassembly, self._control_message, self._in_drop, first=1)
 

@@ -200,7 +200,7 @@ class TopicSection(Section):
     retention_s: Seconds | None = None
     """How long an undelivered reliable message is kept; null: `link.retention_s`."""
     max_queue_bytes: Bytes = DEFAULT_RELIABLE_QUEUE_BYTES
-    """Undelivered reliable messages kept at most, each counted with 256 bytes beside its own; beyond, new ones are
+    """Undelivered reliable messages kept at most, each counted with 768 bytes beside its own; beyond, new ones are
     refused to their publisher."""
     compression: Literal["auto", "none", "lz4", "zstd", "zstd_strong", "voxel_draco", "jpeg"] = "auto"
     """How bodies from here are compressed; `auto`: whichever gets a message there soonest, by what each makes of the

@@ -1,22 +1,31 @@
 """What one event costs the relay while a lot is under way or waits: `price.py` says how it is measured."""
 
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from typing import Final
+
 import pytest
 
 from sern_core import wire
-from sern_core.access import AccessRule, AccessTable
+from sern_core.access import DEFAULT_QUEUE_BYTES, AccessRule, AccessTable
 from sern_core.control.fixed import FixedWindow
-from sern_core.queues import MESSAGE_OVERHEAD_BYTES
-from sern_core.types import PriorityClass
+from sern_core.queues import MESSAGE_OVERHEAD_BYTES, OutChannel
+from sern_core.types import DropReason, PriorityClass
 from tests.fuzz.price import Input, Make, within_budget
 from tests.fuzz.test_hostile_peer import Hostile, _piece, _whole
 from tests.fuzz.test_price_datagrams import control, filled, one_more_slice, said
 from tests.world import World
 
 WINDOW_BYTES = 640_000
-IN_FLIGHT = 4_000
+IN_FLIGHT = 16_000
+"""One-byte messages: forty share a datagram."""
 BOUND_BYTES = 5_200_000
 STREAMS = 100
 BACKLOG = 80_000
+AT_BOUND = DEFAULT_QUEUE_BYTES // (MESSAGE_OVERHEAD_BYTES + 1) // 1_600 * 1_600
+"""One-byte messages that may wait for a client by default."""
+GAPS = 20_000
 HALF_RECEIVED = 120_000
 
 
@@ -40,8 +49,8 @@ def connection_that_ends() -> Input:
         wire.encode_ack(0, link.lane.flight.next_number - 1, 0, 0, int(reader.now * 1e6), 100),
         control(reader, wire.encode_control({"t": "want", "ch": 1, "on": True})),
     )
-    for first in range(1, 6_000, 400):
-        said(origin, *(_whole(1, seq, b"x" * 100) for seq in range(first, first + 400)))
+    for first in range(1, 24_000, 1_600):
+        said(origin, *(_whole(1, seq) for seq in range(first, first + 1_600)))
     reader.now += 0.001
     while reader.port.next_datagram(now=reader.now) is not None:
         pass
@@ -82,27 +91,112 @@ def messages_that_need_room() -> Input:
     return Input(len(frames), lambda: origin.say(frames), rest=rest)
 
 
-def backlog_that_ends(name: str, *says: dict[str, object]) -> Make:
-    """A reader says what ends BACKLOG messages that wait for it, or confirms them."""
+def plain(seq: int) -> bytes:
+    return _whole(1, seq)
+
+
+def buried(seq: int) -> bytes:
+    """Every second one is a tombstone."""
+    return _whole(1, seq, b"\x01", flags=wire.FLAG_TOMBSTONE) if seq % 2 == 0 else _whole(1, seq)
+
+
+def filled_backlog(count: int, frame: Callable[[int], bytes] = plain) -> tuple[Hostile, Hostile, OutChannel]:
+    """Origin and reader, with so many messages that wait for the reader."""
+    origin, reader = origin_and_reader()
+    for first in range(1, count, 1_600):
+        said(origin, *(frame(seq) for seq in range(first, first + 1_600)))
+    (channel,) = reader.hub.links[reader.name].channels.values()
+    assert channel.kept == count
+    return origin, reader, channel
+
+
+def backlog_with_gaps(count: int) -> tuple[Hostile, Hostile, OutChannel]:
+    """The origin leaves a message out behind each."""
+    origin, reader = origin_and_reader()
+    for start in range(0, count, 400):
+        frames = []
+        for index in range(start, start + 400):
+            first = wire.encode_control({"t": "first", "ch": 1, "seq": 3 + 2 * index})
+            frames += [_whole(1, 1 + 2 * index), control(origin, first)]
+        said(origin, *frames)
+    (channel,) = reader.hub.links[reader.name].channels.values()
+    assert channel.kept == count and len(channel.gaps) >= count - 1
+    return origin, reader, channel
+
+
+def in_order() -> tuple[Hostile, Hostile, OutChannel]:
+    return filled_backlog(BACKLOG)
+
+
+Fill = Callable[[], tuple[Hostile, Hostile, OutChannel]]
+UNWANTED: Final[dict[str, object]] = {"t": "want", "ch": 1, "on": False}
+
+
+def backlog_that_ends(name: str, *says: dict[str, object], fill: Fill = in_order, confirmed: int = BACKLOG) -> Make:
+    """A reader says what ends the messages that wait for it, or confirms them."""
 
     def make() -> Input:
-        origin, reader = origin_and_reader()
-        for first in range(1, BACKLOG, 1_600):
-            said(origin, *(_whole(1, seq) for seq in range(first, first + 1_600)))
-        (channel,) = reader.hub.links[reader.name].channels.values()
-        assert channel.kept == BACKLOG
+        _origin, reader, channel = fill()
+        last_seq = channel.next_seq - 1
         frames = b"".join(control(reader, wire.encode_control(envelope)) for envelope in says)
-        frames = frames or wire.encode_watermark(1, BACKLOG)
+        frames = frames or wire.encode_watermark(1, confirmed)
 
         def rest() -> bool:
             more = one_more_slice(reader)
-            assert more or all(out.counted for out in channel.retained)
+            if says:
+                assert more or all(out.counted for out in channel.retained)
+            else:
+                assert more or (channel.watermark, channel.kept) == (confirmed, last_seq - confirmed)
             return more
 
         return Input(len(frames), lambda: reader.say(frames), rest=rest)
 
     make.__name__ = name
     return make
+
+
+def backlog_that_lapses() -> Input:
+    """The retention of all that waits for a connected client is over at once, as after a suspend."""
+    _origin, reader, channel = filled_backlog(BACKLOG)
+    link = reader.hub.links[reader.name]
+    reader.now += channel.spec.retention_s + 1
+
+    def sweep() -> None:
+        reader.port.handle_timeout(now=reader.now)
+
+    def rest() -> bool:
+        more = link._sweep_due_s <= reader.now
+        if more:
+            sweep()
+        else:
+            assert channel.kept == BACKLOG and all(out.message.tombstone for out in channel.retained)
+        return more
+
+    return Input(0, sweep, rest=rest)
+
+
+def backlog_that_lapses_while_its_reader_is_away() -> Input:
+    _origin, reader, channel = filled_backlog(AT_BOUND)
+    reader.port.disconnected(now=reader.now)
+    reader.hub.params = replace(reader.hub.params, resume_s=1e9)
+
+    def take() -> None:
+        reader.hub.sweep(now=reader.now + channel.spec.retention_s + 1)
+        assert not channel.kept and channel.counters.by_reason[DropReason.RETENTION] == AT_BOUND
+
+    return Input(0, take)
+
+
+def client_that_is_forgotten() -> Input:
+    """A client is revoked for which an origin has filled all there is room for, every second message a tombstone."""
+    _origin, reader, channel = filled_backlog(AT_BOUND, buried)
+    reader.port.disconnected(now=reader.now)
+
+    def take() -> None:
+        reader.hub.forget(reader.name, "it is revoked", now=reader.now)
+        assert not channel.kept
+
+    return Input(0, take)
 
 
 def stream_that_ends_half_received() -> Input:
@@ -127,11 +221,17 @@ def stream_that_ends_half_received() -> Input:
 EVENTS = (
     connection_that_ends,
     messages_that_need_room,
-    backlog_that_ends("backlog_not_wanted", {"t": "want", "ch": 1, "on": False}),
+    backlog_that_ends("backlog_not_wanted", UNWANTED),
     backlog_that_ends("backlog_refused", {"t": "refuse", "ch": 1, "code": "forbidden", "why": ""}),
     backlog_that_ends("backlog_dropped", {"t": "dropped", "ch": 1, "seq": 1, "code": 1, "to": "x", "n": 2**61}),
     backlog_that_ends("backlog_unsubscribed", {"t": "subscribe", "patterns": [], "more": False}),
     backlog_that_ends("backlog_confirmed"),
+    backlog_that_ends("all_but_one_confirmed", fill=partial(filled_backlog, AT_BOUND), confirmed=AT_BOUND - 1),
+    backlog_that_ends("backlog_of_tombstones", UNWANTED, fill=partial(filled_backlog, AT_BOUND, buried)),
+    backlog_that_ends("backlog_with_gaps", UNWANTED, fill=partial(backlog_with_gaps, GAPS)),
+    backlog_that_lapses,
+    backlog_that_lapses_while_its_reader_is_away,
+    client_that_is_forgotten,
     stream_that_ends_half_received,
 )
 

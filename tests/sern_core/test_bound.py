@@ -1,5 +1,6 @@
 """access.max_queue_bytes: what may wait for one client at the relay, and who gives way."""
 
+import tracemalloc
 from random import Random
 from typing import Any
 
@@ -8,16 +9,18 @@ import pytest
 from sern_core import wire
 from sern_core.access import DEFAULT_QUEUE_BYTES, AccessRule, AccessTable
 from sern_core.bound import TOMBSTONE_BYTES
+from sern_core.control.fixed import FixedWindow
 from sern_core.link import Link
+from sern_core.message import TopicSpec
 from sern_core.queues import MESSAGE_OVERHEAD_BYTES, OutChannel
-from sern_core.types import ClientName, DropReason, PriorityClass
+from sern_core.types import ClientName, DropReason, PriorityClass, Reliability
 from sern_sim.models import LinkModel
 from tests.exploring import seeds
 from tests.fuzz.test_hostile_peer import Hostile, _whole
 from tests.world import World, spec
 
 LARGE_BYTES = 10_000 + MESSAGE_OVERHEAD_BYTES
-LIMIT_BYTES = 5 * LARGE_BYTES + 20 * TOMBSTONE_BYTES
+LIMIT_BYTES = 5 * LARGE_BYTES + 7 * TOMBSTONE_BYTES
 BOUNDED = AccessTable(
     [
         AccessRule(client="site", subscribe=(".*",), max_queue_bytes=LIMIT_BYTES),
@@ -294,3 +297,43 @@ def test_a_full_queue_is_not_added_up_for_each_message() -> None:
         peer.say(*(_whole(channel + 1, seq, b"x" * 30) for channel in range(200)))
         peer.now -= 1e-4  # all in one instant
     assert looked < 20
+
+
+def test_a_message_counts_for_what_it_takes() -> None:
+    """Also while it is in flight, and its objects are its own: of all that came, none is shared."""
+    count = 5_000
+    world = World()
+    site, robot = Hostile(world, "site"), Hostile(world)
+    robot.announce(1, "/robot/log", reliable=True)
+    site.control({"t": "subscribe", "patterns": [".*"], "more": False})
+    link = to_site(world)
+    link.lane.estimator = link.lane.path.estimator = FixedWindow(64_000_000)
+    while site.port.next_datagram(now=site.now) is not None:
+        pass
+    site.say(wire.encode_ack(0, link.lane.flight.next_number - 1, 0, 0, int(site.now * 1e6), 100))
+    site.control({"t": "want", "ch": 1, "on": True})
+    (channel,) = link.channels.values()
+    tracemalloc.start()
+    try:
+        before_bytes = tracemalloc.get_traced_memory()[0]
+        for first in range(1, count, 500):
+            robot.say(*(_whole(1, seq, bytes((seq & 255, seq >> 8))) for seq in range(first, first + 500)))
+            while (due_s := robot.hub.links[robot.name].read_due_s) is not None:
+                robot.now = max(robot.now, due_s)
+                robot.port.handle_timeout(now=robot.now)
+        site.now = robot.now
+        while site.port.next_datagram(now=site.now) is not None:
+            site.now += 1e-4
+        taken_bytes = tracemalloc.get_traced_memory()[0] - before_bytes
+    finally:
+        tracemalloc.stop()
+    assert channel.kept == len(channel.flying) == count
+    assert 0.5 * channel.kept_bytes < taken_bytes < channel.kept_bytes
+
+
+def test_what_a_robot_keeps_over_its_retention_fits_into_the_defaults() -> None:
+    """Twenty topics at 10 Hz with 100 bytes, of which nothing is confirmed for as long as they are kept."""
+    spec_of_all = TopicSpec(reliability=Reliability.RELIABLE)
+    each_bytes = int(10 * spec_of_all.retention_s) * (100 + MESSAGE_OVERHEAD_BYTES)
+    assert each_bytes <= spec_of_all.max_queue_bytes
+    assert 20 * each_bytes <= DEFAULT_QUEUE_BYTES

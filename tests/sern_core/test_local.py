@@ -131,7 +131,7 @@ def test_reliable_is_in_order_and_its_bound_is_a_refusal() -> None:
     world = World(access=ACCESS).watch()
     robot = world.client("jackal1", LinkModel(rate_bps=400_000, delay_s=0.02).as_stream(), patterns=[".*"])
     world.run(1.0)
-    handle = opened(world, spec(PriorityClass.STATE, reliable=True, max_queue_bytes=32_000), name="/jackal1/path")
+    handle = opened(world, spec(PriorityClass.STATE, reliable=True, max_queue_bytes=35_000), name="/jackal1/path")
     world.run(1.0)
     accepted = [inject(world, handle, b"%05d" % number * 1_000) for number in range(10)]
     assert accepted == [True] * 6 + [False] * 4

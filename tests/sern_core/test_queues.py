@@ -1,5 +1,6 @@
 """The sending side of one stream: what is kept, dropped, resent and reported, and that the counters always add up."""
 
+from collections.abc import Sequence
 from itertools import pairwise
 from math import inf
 from random import Random
@@ -14,7 +15,7 @@ from sern_core.message import Message, StreamId, StreamInfo, TopicInfo, TopicSpe
 from sern_core.out_message import OutMessage
 from sern_core.queues import MESSAGE_OVERHEAD_BYTES, OutChannel
 from sern_core.types import ClientName, DropReason, Encoding, TopicName
-from tests.exploring import cases
+from tests.exploring import cases, seeds
 from tests.world import spec
 
 
@@ -26,15 +27,20 @@ class Sender:
         self.stream = StreamInfo(StreamId(ClientName("a"), 1, info.name), info, topic_spec)
         self.ledger = SendLedger()
         self.drops: list[tuple[int, DropReason]] = []
+        self.told: list[tuple[int, int, DropReason]] = []  # the spans: first, last, why
         counters = self.ledger.topic(info.name, topic_spec.priority)
         self.channel = OutChannel(1, self.stream, counters, self._drop, first=first)
         self.channel.wanted = self.channel.ready = True
 
-    def _drop(self, _channel: OutChannel, out: OutMessage, reason: DropReason, count: int) -> None:
-        self.drops += [(seq, reason) for seq in range(out.seq, out.seq + count)]
+    def _drop(self, _channel: OutChannel, outs: Sequence[OutMessage], reason: DropReason) -> None:
+        self.drops += [(out.seq, reason) for out in outs]
+        self.told.append((outs[0].seq, outs[-1].seq, reason))
 
     def message(self, seq: int, size: int = 100, *, now: float = 0.0, replay: bool = False) -> Message:
         return Message(self.stream.id, seq, bytes(size), 0, now, 0, replay)
+
+    def tombstone(self, seq: int) -> Message:
+        return Message(self.stream.id, seq, b"\x01", 0, 0.0, 1)
 
     def submit(self, count: int = 1, size: int = 100, *, now: float = 0.0) -> list[bool]:
         channel = self.channel
@@ -397,11 +403,14 @@ def test_what_a_lost_connection_held_is_taken_back_without_a_walk_for_each(order
     parts = [part for part in (sender.take() for _ in range(2000)) if part is not None]
     assert len(parts) == len(channel.flying) == 2000
     CountedSeq.compared = 0
-    for out, generation, start, end in parts[::order]:
-        assert channel.fragment_lost(out, generation, start, end, now=0.1)
-    assert CountedSeq.compared <= 2000 * 12
+    assert len(channel.fragments_lost(parts[::order], now=0.1)) == 2000
+    assert CountedSeq.compared <= 2000 * 2
     assert [out.seq for out in channel.active] == list(range(1, 2001))
     sender.check()
+
+
+def retention_s_of(sender: Sender) -> float:
+    return sender.stream.spec.retention_s
 
 
 class Channel(RuleBasedStateMachine):
@@ -417,16 +426,34 @@ class Channel(RuleBasedStateMachine):
         self.now = 0.0
         self.sender = Sender(spec(reliable=reliable, depth=depth, lifespan_s=lifespan_s, retention_s=retention_s))
         self.flying: list[tuple[OutMessage, int, int, int]] = []
+        self.lost_before: set[int] = set()
 
     @rule(size=st.sampled_from([0, 1, 100, 3000]))
     def submit(self, size: int) -> None:
         self.sender.submit(1, size, now=self.now)
+
+    @precondition(lambda self: self.sender.channel.reliable)
+    @rule()
+    def submit_a_tombstone(self) -> None:
+        channel = self.sender.channel
+        self.lost_before.add(channel.next_seq)
+        channel.submit(self.sender.tombstone(channel.next_seq), now=self.now, forced=True)
+
+    @precondition(lambda self: self.sender.channel.reliable)
+    @rule(ahead=st.integers(1, 3))
+    def skip(self, ahead: int) -> None:
+        channel = self.sender.channel
+        self.lost_before.update(range(channel.next_seq, channel.next_seq + ahead))
+        channel.skip_to(channel.next_seq + ahead)
 
     @rule(room=st.sampled_from([64, 1000]))
     def take(self, room: int) -> None:
         part = self.sender.take(room, now=self.now)
         if part is not None:
             self.flying.append(part)
+            out = part[0]
+            lapsed = self.sender.channel.reliable and self.now - out.retain_from_s > retention_s_of(self.sender)
+            assert not lapsed or out.message.tombstone, "what has lapsed is sent"
 
     @precondition(lambda self: bool(self.flying))
     @rule(data=st.data(), lost=st.booleans())
@@ -444,19 +471,18 @@ class Channel(RuleBasedStateMachine):
         channel.delivered_to(min(channel.watermark + ahead, channel.next_seq - 1))
 
     @precondition(lambda self: self.sender.channel.reliable)
-    @rule(seq=st.integers(1, 10))
-    def report(self, seq: int) -> None:
-        self.sender.channel.reported(seq, DropReason.RATE_CAP)
+    @rule(seq=st.integers(1, 10), count=st.integers(1, 10))
+    def report(self, seq: int, count: int) -> None:
+        self.sender.channel.reported(seq, DropReason.RATE_CAP, "", count)
 
-    @rule(seconds=st.sampled_from([0.1, 0.6, 3.0]), up=st.booleans())
-    def wait(self, seconds: float, up: bool) -> None:
+    @rule(seconds=st.sampled_from([0.1, 0.6, 3.0]), up=st.booleans(), room=st.sampled_from([0, 1, 2, 1000]))
+    def wait(self, seconds: float, up: bool, room: int) -> None:
         self.now += seconds
-        self.sender.channel.sweep(self.now, up=up)
+        assert self.sender.channel.sweep(self.now, up=up, room=room) <= room
 
     @rule()
     def lose_session(self) -> None:
-        for out, generation, start, end in self.flying:
-            self.sender.channel.fragment_lost(out, generation, start, end, now=self.now)
+        self.sender.channel.fragments_lost(self.flying, now=self.now)
         self.flying.clear()
 
     @rule()
@@ -497,6 +523,15 @@ class Channel(RuleBasedStateMachine):
             assert len(dropped) == len(set(dropped)), "reported twice"
 
     @invariant()
+    def who_is_told_of_spans_may_believe_them(self) -> None:
+        """Nothing lies in them that is still to come, or has come."""
+        if hasattr(self, "sender") and self.sender.channel.reliable:
+            dropped = {seq for seq, _ in self.sender.drops} | self.lost_before
+            for first, last, _ in self.sender.told:
+                assert dropped.issuperset(range(first, last + 1)), "told of what was not dropped"
+            self.sender.told.clear()
+
+    @invariant()
     def the_peer_waits_for_nothing(self) -> None:
         if hasattr(self, "sender") and self.sender.channel.reliable:
             channel = self.sender.channel
@@ -525,32 +560,61 @@ def test_at_the_end_what_may_have_arrived_is_told_from_what_was_never_sent(relia
     sender.check()
 
 
-def test_many_that_are_dropped_at_once_are_told_in_runs() -> None:
-    """A run has seqs that follow each other, with one reason; what was told before is told no more."""
+def test_many_that_are_dropped_at_once_are_told_as_one_span() -> None:
+    """The span goes over what was dropped and told of before; that is counted no more."""
     sender = Sender(spec(reliable=True))
-    runs: list[tuple[int, int, DropReason]] = []
-    sender.channel.on_drop = lambda _channel, out, reason, count: runs.append((out.seq, count, reason))
     sender.submit(10)
     assert sender.channel.reported(4, DropReason.LIFESPAN, "site", 2) > 0
     assert sender.channel.reported(3, DropReason.LIFESPAN, "site", 4) > 0
-    assert runs == [(4, 2, DropReason.LIFESPAN), (3, 1, DropReason.LIFESPAN), (6, 1, DropReason.LIFESPAN)]
+    assert sender.told == [(4, 5, DropReason.LIFESPAN), (3, 6, DropReason.LIFESPAN)]
+    assert sorted(seq for seq, _ in sender.drops) == [3, 4, 5, 6]
     sender.check()
-    runs.clear()
+    sender.told.clear()
     sender.channel.set_wanted(False)
-    assert runs == [(1, 2, DropReason.UNWANTED), (7, 4, DropReason.UNWANTED)]
+    assert sender.told == [(1, 10, DropReason.UNWANTED)]
+    assert sorted(seq for seq, _ in sender.drops) == list(range(1, 11))
     assert sender.channel.counters.by_reason[DropReason.UNWANTED] == 6 and sender.channel.watermark == 10
+    sender.check()
+
+
+def test_a_backlog_of_tombstones_and_gaps_ends_as_one_span() -> None:
+    sender = Sender(spec(reliable=True))
+    channel = sender.channel
+    for _ in range(100):
+        sender.submit()
+        channel.submit(sender.tombstone(channel.next_seq), now=0.0, forced=True)
+        channel.skip_to(channel.next_seq + 3)
+    assert channel.kept == 200 and channel.counters.dropped == 100
+    channel.clear(DropReason.DISCONNECTED)
+    assert sender.told == [(1, 496, DropReason.DISCONNECTED)] and len(sender.drops) == 100
+    assert channel.counters.offered == channel.counters.dropped == 200 and channel.watermark == channel.next_seq - 1
+    sender.check()
+
+
+def test_what_lies_between_replays_is_not_told_of() -> None:
+    """It was never owed to who joined late, and others may have it yet."""
+    sender = Sender(spec(reliable=True, latched=True, depth=3), first=12)
+    sender.channel.prime([sender.message(seq, replay=True) for seq in (2, 3, 6, 9)], now=0.0)
+    sender.submit()
+    sender.channel.skip_to(20)
+    sender.submit()
+    assert sender.take() is not None
+    sender.channel.reported(1, DropReason.LIFESPAN, "site", 2**61)
+    assert sender.told == [
+        (2, 3, DropReason.LIFESPAN),
+        *((seq, seq, DropReason.LIFESPAN) for seq in (6, 9)),
+        (12, 20, DropReason.LIFESPAN),
+    ]
     sender.check()
 
 
 def test_what_may_have_arrived_is_a_run_of_its_own() -> None:
     sender = Sender(spec(reliable=False, depth=10))
-    runs: list[tuple[int, int, DropReason]] = []
-    sender.channel.on_drop = lambda _channel, out, reason, count: runs.append((out.seq, count, reason))
     sender.submit(5)
     for out in list(sender.channel.queue)[:2]:
         out.exposed = True
     sender.channel.clear(DropReason.SHUTDOWN)
-    assert runs == [(1, 2, DropReason.UNCONFIRMED), (3, 3, DropReason.SHUTDOWN)]
+    assert sender.told == [(1, 2, DropReason.UNCONFIRMED), (3, 5, DropReason.SHUTDOWN)]
     sender.check()
 
 
@@ -565,3 +629,109 @@ def test_one_number_confirms_all_that_is_kept() -> None:
     assert counters.delivered == 19 and counters.dropped == 1 and sender.channel.kept == 0
     assert sender.channel.watermark == 20 and sender.channel.head(0.0) is None
     sender.check()
+
+
+@pytest.mark.parametrize("watermark", [1, 19, 39, 40])
+def test_a_number_confirms_what_is_kept_up_to_it(watermark: int) -> None:
+    """At once or one by one, begun or waiting: the same is left."""
+    sender = Sender(spec(reliable=True))
+    channel = sender.channel
+    sender.submit(40)
+    parts = [part for part in (sender.take() for _ in range(30)) if part is not None]
+    for part in parts[5:25]:
+        channel.fragment_lost(*part, now=0.0)
+    channel.reported(15, DropReason.LIFESPAN, "site", 10)
+    assert channel.delivered_to(watermark) == watermark
+    assert [out.seq for out in channel.retained] == list(range(watermark + 1, 41))
+    assert [out.seq for out in channel.active] == list(range(max(watermark + 1, 6), 26))
+    assert sorted(channel.flying) == list(range(watermark + 1, 31))
+    lost = len(range(15, min(watermark, 24) + 1))
+    assert channel.counters.delivered == watermark - lost and channel.counters.dropped == 10
+    sender.check()
+
+
+def test_what_lapses_in_a_sweep_is_bounded_and_the_rest_is_not_sent_meanwhile() -> None:
+    sender = Sender(spec(reliable=True, retention_s=1.0))
+    channel = sender.channel
+    sender.submit(30)
+    begun = sender.take()
+    assert begun is not None
+    assert channel.sweep(2.0, up=True, room=10) == 10
+    assert sender.told == [(1, 10, DropReason.RETENTION)], "begun or not, in one span"
+    sender.check()
+    for _ in range(15):
+        part = sender.take(now=2.0)
+        assert part is not None and part[0].message.tombstone
+    assert [channel.sweep(2.0, up=True, room=10) for _ in range(3)] == [10, 5, 0]
+    assert [span[:2] for span in sender.told] == [(1, 10), *((seq, seq) for seq in range(11, 16)), (16, 25), (26, 30)]
+    assert {reason for _, reason in sender.drops} == {DropReason.RETENTION} and channel.kept == 30
+    sender.check()
+
+
+def test_what_lapses_around_a_message_that_goes_on_is_told_around_it() -> None:
+    sender = Sender(spec(reliable=True, lifespan_s=1.0))
+    sender.submit(5)
+    parts = [sender.take() for _ in range(3)]
+    assert parts[2] is not None
+    sender.channel.fragment_acked(parts[2][0], parts[2][1])
+    assert sender.channel.sweep(2.0, up=True) == 4
+    assert sender.told == [(1, 2, DropReason.LIFESPAN), (4, 5, DropReason.LIFESPAN)], "the peer has 3 and watches it"
+    sender.check()
+
+
+def test_without_a_link_what_has_lapsed_goes_together_and_becomes_no_tombstone_first() -> None:
+    sender = Sender(spec(reliable=True, retention_s=10.0, lifespan_s=100.0))
+    channel = sender.channel
+    sender.submit(8)
+    channel.submit(sender.tombstone(9), now=0.0, forced=True)
+    sender.submit(8)
+    sender.submit(3, now=9.0)
+    part = sender.take()
+    assert part is not None
+    assert channel.sweep(11.0, up=False) == 1
+    assert sender.told == [(1, 17, DropReason.RETENTION)] and sender.waiting == [18, 19, 20] == [
+        out.seq for out in channel.retained
+    ]
+    assert channel.watermark == 17 and channel.first_seq == 18 and not channel.flying and not channel.active
+    assert channel.counters.dropped == 17 and not part[0].message.tombstone
+    sender.check()
+
+
+def test_what_waited_too_long_on_a_best_effort_stream_goes_together() -> None:
+    sender = Sender(spec(depth=100, lifespan_s=1.0))
+    sender.submit(50)
+    sender.submit(50, now=1.5)
+    head = sender.channel.head(2.0)
+    assert head is not None and head.seq == 51 and sender.told == [(1, 50, DropReason.LIFESPAN)]
+    sender.channel.sweep(3.0, up=False)
+    assert sender.told[1:] == [(51, 100, DropReason.LIFESPAN)] and sender.channel.counters.dropped == 100
+    sender.check()
+
+
+@pytest.mark.parametrize("seed", seeds(20))
+@pytest.mark.parametrize(("reliable", "depth"), [(True, 1), (False, 1), (False, 30)])
+def test_many_fragments_that_are_lost_together_are_lost_as_one_by_one(seed: int, reliable: bool, depth: int) -> None:
+    random = Random(seed)
+    left: list[tuple[list[int], list[int], list[tuple[int, DropReason]], list[int]]] = []
+    draw = [(random.choice((1, 100, 2500)), random.random() < 0.3) for _ in range(30)]
+    order = [random.random() for _ in range(200)]
+    for together in (True, False):
+        sender = Sender(spec(reliable=reliable, depth=depth, lifespan_s=5.0))
+        parts = []
+        for index, (size, acked) in enumerate(draw):
+            sender.submit(1, size, now=0.3 * index)
+            while (part := sender.take(now=0.3 * index)) is not None:
+                if acked:
+                    sender.channel.fragment_acked(part[0], part[1])
+                else:
+                    parts.append(part)
+        sender.submit(1, now=9.0)
+        parts = [part for _, part in sorted(zip(order, parts, strict=False), key=lambda pair: pair[0])]
+        if together:
+            again = [out.seq for out in sender.channel.fragments_lost(parts, now=9.0)]
+        else:
+            again = [part[0].seq for part in parts if sender.channel.fragment_lost(*part, now=9.0)]
+        sender.check()
+        channel = sender.channel
+        left.append(([out.seq for out in channel.active], sorted(channel.flying), sender.drops, again))
+    assert left[0] == left[1] and (left[0][0] or not reliable)

@@ -83,7 +83,9 @@ def test_never_more_than_the_bound_and_always_the_newest(steps: list[tuple[int, 
             store.below(caches[0], seq)
 
 
-@pytest.mark.parametrize(("cache_bytes", "expected"), [(2_600, {"/b", "/c"}), (10_000, {"/a", "/b", "/c"}), (0, set())])
+@pytest.mark.parametrize(
+    ("cache_bytes", "expected"), [(2 * (1_000 + UNIT), {"/b", "/c"}), (10_000, {"/a", "/b", "/c"}), (0, set())]
+)
 def test_the_relay_keeps_no_more_than_it_may(cache_bytes: int, expected: set[str]) -> None:
     world = World(hub_params=HubParams(cache_bytes=cache_bytes))
     robot = world.client("robot")
