@@ -7,7 +7,7 @@ appear and which messages have their turn. Everything about bandwidth, order, re
 from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from typing import ParamSpec, Protocol
+from typing import Final, ParamSpec, Protocol
 
 from sern_core import wire
 from sern_core.announce import MAX_STRINGS, Announcement, check_stream
@@ -20,7 +20,7 @@ from sern_core.ledger import MAX_TOPICS, ReceiveLedger
 from sern_core.link import Link
 from sern_core.message import Message, StreamId, StreamInfo, TopicInfo, TopicSpec
 from sern_core.numbering import Numbering
-from sern_core.out_message import OutMessage
+from sern_core.out_message import OutMessage, in_sequence
 from sern_core.params import LinkParams, SchedulerParams
 from sern_core.peers import Peers, PeerView
 from sern_core.queues import OutChannel
@@ -32,6 +32,9 @@ P = ParamSpec("P")
 
 RELAY_NAME = ClientName("relay")
 """What the relay is called until its WELCOME says its own name."""
+
+MAX_RUNS_TOLD: Final = 1_000
+"""Runs of messages that are told of one by one: each is a line in a log."""
 
 
 class ClientEvents(Protocol):
@@ -65,7 +68,8 @@ class ClientEvents(Protocol):
 
     def send_dropped(self, stream: StreamInfo, first: int, count: int, reason: DropReason, where: str) -> None:
         """Messages of ours, `count` from seq `first` on, were dropped: here (`where` is empty), or further on for the
-        client `where`. There may be 100,000 of them: nothing is to be done for each. Some may have been told before."""
+        client `where`. There may be 100,000 of them: nothing is to be done for each. Where they lie in very
+        many runs, one run has them all, and what lies between them, which was told before."""
 
     def wanted(self, stream: StreamInfo, wanted: bool) -> None:
         """Whether anybody at the far side wants a stream of ours; said again after every change."""
@@ -472,8 +476,12 @@ class ClientCore:
         self.trace.record(link.now, stream.stream.id.topic, TraceEvent.DROPPED, reason=reason, peer=link.peer)
 
     def on_out_drop(self, link: Link, channel: OutChannel, outs: Sequence[OutMessage], reason: DropReason) -> None:
-        first, last = outs[0], outs[-1].seq  # what lies between was told before
-        self._tell(self.events.send_dropped, channel.stream, first.seq, last - first.seq + 1, reason, first.lost_to)
+        runs = list(in_sequence(outs))
+        if channel.reliable and len(runs) > MAX_RUNS_TOLD:
+            runs = [outs]  # what lies between was told before
+        for run in runs:
+            first, count = run[0], run[-1].seq - run[0].seq + 1
+            self._tell(self.events.send_dropped, channel.stream, first.seq, count, reason, first.lost_to)
 
     def on_delivered(self, link: Link, channel: OutChannel, *, now: float) -> None:
         """The ledger has counted it."""

@@ -11,8 +11,10 @@ from sern_client.bridge import Bridge
 from sern_client.endpoints.ros1.endpoint import Ros1Endpoint, Ros1Options
 from sern_client.endpoints.ros1.subscription import Topic
 from sern_core.client import ClientCore
+from sern_core.message import DEFAULT_RELIABLE_QUEUE_BYTES
 from sern_core.params import LinkParams, SchedulerParams
 from sern_core.patterns import compile_pattern
+from sern_core.queues import MESSAGE_OVERHEAD_BYTES
 from sern_core.rules import Discovery, DiscoveryMode, RuleSet, TopicRule
 from sern_core.types import DROP_CODES, ClientName, DropReason, Encoding, Reliability, TopicName
 from sern_runtime import clock, ros_types
@@ -22,7 +24,7 @@ from tests.world import World
 
 LOST = DROP_CODES[DropReason.LOST]
 LOG = TopicName("/robot/log")
-BACKLOG = 130_000
+BACKLOG = DEFAULT_RELIABLE_QUEUE_BYTES // (MESSAGE_OVERHEAD_BYTES + 1)
 """As many one-byte messages as a reliable stream keeps by default."""
 
 

@@ -4,9 +4,10 @@ import pytest
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
-from sern_core import hop
+from sern_core import client, hop
 from sern_core.access import AccessRule, AccessTable
 from sern_core.hub import HubParams
+from sern_core.message import Message
 from sern_core.out_message import OutMessage
 from sern_core.params import LinkParams
 from sern_core.queues import MESSAGE_OVERHEAD_BYTES, OutChannel
@@ -129,3 +130,17 @@ def test_what_lapses_in_many_sweeps_is_reported_once_and_never_sent(monkeypatch:
     (channel,) = world.relay.hub.links[site.name].channels.values()
     assert channel.counters.by_reason[DropReason.RETENTION] >= 500 - len(got)
     assert log.counters.offered == log.counters.delivered + log.counters.dropped == 500
+
+
+@pytest.mark.parametrize(("reliable", "most", "told"), [(True, 9, 3), (True, 2, 5), (False, 2, 3)])
+def test_an_origin_is_told_of_exactly_what_is_dropped_unless_that_is_in_too_many_runs(
+    reliable: bool, most: int, told: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Between two reliable messages lies what was told before, between two others perhaps one that arrived."""
+    monkeypatch.setattr(client, "MAX_RUNS_TOLD", most)
+    world = World()
+    robot = world.client("robot")
+    channel = robot.publish("/robot/a", spec(reliable=reliable))
+    outs = [OutMessage(Message(channel.stream.id, seq, b"x", 0, robot.now)) for seq in (1, 3, 5)]
+    robot.core.on_out_drop(robot.core.link, channel, outs, DropReason.LIFESPAN)
+    assert [drop.seq for drop in robot.dropped_out] == ([1, 3, 5] if told == 3 else [1, 2, 3, 4, 5])
