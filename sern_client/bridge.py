@@ -595,14 +595,15 @@ class Bridge:
             self.goals.send_dropped(stream.id, first, count, reason)
         if not stream.spec.reliable or self._closed:  # what is left at the end was said in one line
             return
-        one = count == 1
-        which = f"message {first}" if one else f"messages {first} to {first + count - 1}"
+        which = f"message {first}" if count == 1 else f"messages {first} to {first + count - 1}"
         if reason is DropReason.UNWANTED:  # who wanted it has left or unsubscribed: counted, and no loss to anybody
             _log.debug("%s: nobody wants our reliable %s any more", stream.id.topic, which)
+            return
+        which += " was" if count == 1 else " were"
+        if where:
+            _log.warning("%s: our reliable %s dropped for %s: %s", stream.id.topic, which, where, reason)
         else:
-            place = f"for {where}" if where else "here"
-            verb = "was" if one else "were"
-            _log.warning("%s: our reliable %s %s dropped %s: %s", stream.id.topic, which, verb, place, reason)
+            _log.warning("%s: our reliable %s dropped here: %s", stream.id.topic, which, reason)
 
     def publication_refused(self, stream: StreamInfo, code: str, text: str) -> None:
         self.refusals += 1

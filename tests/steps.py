@@ -1,5 +1,6 @@
 """What a call costs in steps of Python's own interpreter, which are the same in every run."""
 
+import gc
 import sys
 from collections.abc import Callable
 from types import FrameType
@@ -18,7 +19,8 @@ def steps(call: Callable[[], object], *, within: str | None = None) -> int:
         count += event == "opcode"
         return trace
 
-    before = sys.gettrace()
+    before, collects = sys.gettrace(), gc.isenabled()
+    gc.disable()  # what is collected meanwhile may have finalizers of its own
     sys._getframe().f_trace_opcodes = (
         True  # else Python 3.12 tells of none while a process does this for the first time
     )
@@ -27,5 +29,7 @@ def steps(call: Callable[[], object], *, within: str | None = None) -> int:
         call()
     finally:
         sys.settrace(before)
+        if collects:
+            gc.enable()
     assert count > 0
     return count
