@@ -595,15 +595,17 @@ class Bridge:
             self.goals.send_dropped(stream.id, first, count, reason)
         if not stream.spec.reliable or self._closed:  # what is left at the end was said in one line
             return
-        which = f"message {first}" if count == 1 else f"messages {first} to {first + count - 1}"
+        name, last = stream.id.topic, first + count - 1
         if reason is DropReason.UNWANTED:  # who wanted it has left or unsubscribed: counted, and no loss to anybody
-            _log.debug("%s: nobody wants our reliable %s any more", stream.id.topic, which)
-            return
-        which += " was" if count == 1 else " were"
-        if where:
-            _log.warning("%s: our reliable %s dropped for %s: %s", stream.id.topic, which, where, reason)
+            _log.debug("%s: nobody wants our reliable messages %d to %d any more", name, first, last)
+        elif count == 1 and where:
+            _log.warning("%s: our reliable message %d was dropped for %s: %s", name, first, where, reason)
+        elif count == 1:
+            _log.warning("%s: our reliable message %d was dropped here: %s", name, first, reason)
+        elif where:
+            _log.warning("%s: our reliable messages %d to %d were dropped for %s: %s", name, first, last, where, reason)
         else:
-            _log.warning("%s: our reliable %s dropped here: %s", stream.id.topic, which, reason)
+            _log.warning("%s: our reliable messages %d to %d were dropped here: %s", name, first, last, reason)
 
     def publication_refused(self, stream: StreamInfo, code: str, text: str) -> None:
         self.refusals += 1

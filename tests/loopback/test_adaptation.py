@@ -106,6 +106,8 @@ async def test_a_cloud_goes_to_its_summary_when_the_link_gets_thin_and_comes_bac
             adaptation.register(Metrics(registry, process=False))
             peer = {"peer": robot.core.link.peer, "class": "bulk"}
             assert registry.get_sample_value("sern_mmcf_summarised", peer) == 1.0
+            before = site.core.received.topics[topic].delivered
+            await until(lambda: site.core.received.topics[topic].delivered > before + 5, "and arrive")
             proxy._directions["up"].shaper.schedule = RateSchedule.of(good)
             # A raw message is sent every 5 to 30 intervals to see whether the link got better.
             await until(lambda: chosen() == RAW, "raw clouds go again", deadline_s=90)
