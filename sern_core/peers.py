@@ -19,6 +19,8 @@ LET_GO_S: Final = 60.0
 """A peer of which the relay of a new session says nothing for so long, and that has no stream here, is forgotten; one
 that was gone before is given up."""
 MAX_PEERS: Final = 4096
+MAX_GIVEN_UP: Final = 64
+"""Peers that are gone for good, as far as anybody knows, and are still shown. Each costs something every second."""
 """Peers that a relay may tell of; no honest one has as many. The one given up longest ago makes way for another."""
 MAX_FOR_S: Final = 1e9
 MAX_RTT_S: Final = 1e6
@@ -176,6 +178,8 @@ class Peers:
             return
         peer.up, peer.given_up = False, True
         self._peers[name] = self._peers.pop(name)  # last: the one given up longest ago is the first of them
+        if sum(other.given_up for other in self._peers.values()) > MAX_GIVEN_UP:
+            self._make_way()
         self._settle(name, peer, now)
         self.on_change(PeerChange(name, peer.status, peer.status, now - peer.up_since_s, given_up=True))
 

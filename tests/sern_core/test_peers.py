@@ -11,7 +11,7 @@ from sern_core.flight import STALL_MIN_S, STALL_RTTS
 from sern_core.hub import HubParams
 from sern_core.lanes import PING_INTERVAL_S
 from sern_core.message import TopicInfo
-from sern_core.peers import LET_GO_S, MAX_PEERS, PeerChange, Peers, PeerStatus, PeerView
+from sern_core.peers import LET_GO_S, MAX_GIVEN_UP, MAX_PEERS, PeerChange, Peers, PeerStatus, PeerView
 from sern_core.presence import MAX_TOLD
 from sern_core.types import ClientName, Encoding, PriorityClass, TopicName
 from sern_sim.models import LinkModel, Window
@@ -420,3 +420,13 @@ def test_who_was_given_up_longest_ago_makes_way() -> None:
     assert known._heard_s == {}
     with pytest.raises(WireError, match="more than"):
         tell("new3", up=True, **{"for": 0.0})
+
+
+def test_of_many_that_were_given_up_the_last_are_shown() -> None:
+    known = Peers()
+    known.session_began(now=0.0)
+    for number in range(MAX_GIVEN_UP + 3):
+        known.told({"t": "peers", "peers": [{"name": f"c{number}", "up": False, "for": 0.0}]}, now=0.0)
+    for number in range(MAX_GIVEN_UP + 3):
+        known.told({"t": "peers", "peers": [{"name": f"c{number}"}]}, now=0.0)
+    assert {view.name for view in known.look(now=1.0)} == {f"c{number}" for number in range(3, MAX_GIVEN_UP + 3)}

@@ -46,7 +46,7 @@ class Subscription:
         offers = [
             writer.qos for writer in self._endpoint.graph.writers(self.dds_topic) if writer.type_name == type_name
         ]
-        writers = within_reach(offers, exclusive=self._reader is not None and self._reader.qos.exclusive)
+        writers = within_reach(offers)
         if self._reader is not None and not any(mismatches(offer, self._reader.qos) for offer in writers):
             return
         self._drop(rest=True)

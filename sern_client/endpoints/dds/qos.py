@@ -89,13 +89,12 @@ def _meet(some: tuple[str, ...], others: tuple[str, ...]) -> bool:
     return not set(some).isdisjoint(others)
 
 
-def within_reach(writers: list[EndpointQos], *, exclusive: bool = False) -> list[EndpointQos]:
-    """Those of a topic's writers that one reader of ours can match all: in the partition without a name, and with the
-    ownership that most of these have; where both have as many, `exclusive` or not."""
+def within_reach(writers: list[EndpointQos]) -> list[EndpointQos]:
+    """Those of a topic's writers that one reader of ours can match all: in the partition without a name, and of shared
+    ownership, unless all of these are exclusive. No number of others takes our reader from a shared one."""
     here = [writer for writer in writers if _meet(writer.partitions, ())]
-    balance = sum(1 if writer.exclusive else -1 for writer in here)
-    most = balance > 0 or (balance == 0 and exclusive)
-    return [writer for writer in here if writer.exclusive is most]
+    exclusive = all(writer.exclusive for writer in here)
+    return [writer for writer in here if writer.exclusive is exclusive]
 
 
 def _seconds(duration_ns: int) -> str:

@@ -36,10 +36,17 @@ class UnreachableError(CallError):
     """Nobody answers there."""
 
 
+MAX_HOST: Final = 253
+"""Characters of the longest name that DNS has (RFC 1035)."""
+MAX_URI: Final = 2_000
+
+
 def check_host(host: str) -> None:
     """CallError for a host that no resolver can be asked for. An event loop would raise UnicodeError, of another kind
     than all else that ends a connection: for an empty label (`.local`), one of more than 63 characters and the like."""
     try:
+        if len(host) > MAX_HOST:
+            raise UnicodeError  # and its encoding would take seconds
         host.encode("idna")
     except UnicodeError:
         raise CallError(f"{host[:200]!r} is no name of a host") from None
@@ -48,6 +55,8 @@ def check_host(host: str) -> None:
 def split_uri(uri: str, scheme: str = "http") -> tuple[str, int]:
     """Host and port of `http://host:port/` or `rosrpc://host:port`. CallError for anything else."""
     try:
+        if len(uri) > MAX_URI:
+            raise ValueError
         parts = urlsplit(uri)
         host, port = parts.hostname, parts.port
     except ValueError:

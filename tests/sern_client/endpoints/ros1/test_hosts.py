@@ -17,10 +17,11 @@ from sern_client.endpoints.ros1.xmlrpc import CallError, split_uri
 from sern_core.errors import ConfigError, ServiceError
 from sern_core.types import TopicName
 from tests.sern_client.endpoints.ros1.fakes import HOST, FakeMaster, FakePublisher, collect, frame, running, text
+from tests.steps import steps
 from tests.support import until
 
 CHAT = TopicName("/chat")
-HOSTS = (".local", "robot..local", "x" * 64)
+HOSTS = (".local", "robot..local", "x" * 64, ".".join(["ä" * 40] * 20))
 """What ROS_HOSTNAME=$HOST.local gives where HOST is not set, and the like."""
 
 
@@ -33,6 +34,15 @@ def test_a_host_that_no_resolver_takes_is_a_call_error(host: str) -> None:
         Ros1Endpoint(Ros1Options(host=host), environ={})
     with pytest.raises(ConfigError, match="ROS_HOSTNAME"):
         Ros1Endpoint(Ros1Options(), environ={"ROS_HOSTNAME": host})
+
+
+@pytest.mark.parametrize("uri", ["http://" + ".".join(["ä" * 40] * 700) + ":80/", "http://host:1/" + "x" * 1_000_000])
+def test_a_long_address_is_not_looked_into(uri: str) -> None:
+    def refused() -> None:
+        with pytest.raises(CallError, match="is not http://host:port"):
+            split_uri(uri)
+
+    assert steps(refused) < 20_000
 
 
 @pytest.mark.parametrize("host", HOSTS)
