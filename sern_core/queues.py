@@ -230,7 +230,8 @@ class OutChannel:
             self.retained = deque((*fresh, *self.retained))
             self.retained_bytes += sum(out.size for out in fresh)
             self.watermark = fresh[0].seq - 1
-            self.live_from = limit
+            self.live_from = max(self.live_from, limit)  # also replays of an earlier time may have others between them
+            self._buried_to = 0
             after = [*(out.seq for out in fresh[1:]), limit]
             gaps = [(out.seq, seq) for out, seq in zip(fresh, after, strict=True) if seq > out.seq + 1]
             if gaps:
@@ -672,8 +673,8 @@ class OutChannel:
         done = [retained.popleft() for _ in range(bisect_right(retained, watermark, key=_SEQ))]
         self._uncode(done)
         self.retained_bytes -= sum([out.size for out in done])
-        for seq in [seq for seq in self.flying if seq <= watermark]:
-            del self.flying[seq]
+        for out in done:
+            self.flying.pop(out.seq, None)  # not by a look at all: a peer may confirm them by twenty
         begun = bisect_right(self.active, watermark, key=_SEQ)
         for out in self.active[:begun]:
             out.active = False

@@ -16,6 +16,7 @@ from sern_core.out_message import OutMessage
 from sern_core.queues import MESSAGE_OVERHEAD_BYTES, OutChannel
 from sern_core.types import ClientName, DropReason, Encoding, TopicName
 from tests.exploring import cases, seeds
+from tests.steps import steps
 from tests.world import spec
 
 
@@ -51,6 +52,12 @@ class Sender:
         if out is None:
             return None
         return (out, out.generation, *self.channel.take(out, room, now))
+
+    def send_all(self, *, now: float = 0.0) -> None:
+        """The peer has each whole and confirms none."""
+        while (sent := self.take(now=now)) is not None:
+            out, generation, _start, _end = sent
+            self.channel.fragment_acked(out, generation)
 
     def check(self) -> None:
         def check(ok: bool, text: str) -> None:
@@ -735,3 +742,31 @@ def test_many_fragments_that_are_lost_together_are_lost_as_one_by_one(seed: int,
         channel = sender.channel
         left.append(([out.seq for out in channel.active], sorted(channel.flying), sender.drops, again))
     assert left[0] == left[1] and (left[0][0] or not reliable)
+
+
+def test_a_replay_lapses_where_others_had_lapsed_before_it() -> None:
+    sender = Sender(spec(reliable=True, retention_s=10.0, latched=True, depth=20))
+    channel = sender.channel
+    sender.submit(10, now=0.0)
+    sender.send_all()
+    channel.sweep(10.5, up=True)
+    channel.sweep(10.8, up=True)
+    channel.delivered_to(10)
+    channel.peer_restarted()
+    channel.prime([sender.message(seq, now=0.0, replay=True) for seq in range(3, 11)], now=11.0)
+    sender.send_all(now=11.0)
+    assert [out.message.tombstone for out in channel.retained] == [0] * 8
+    channel.sweep(22.0, up=True)
+    assert len(channel.retained) == 8 and all(out.message.tombstone for out in channel.retained)
+
+
+def test_confirming_twenty_costs_the_same_however_many_are_in_flight() -> None:
+    def cost(flying: int) -> int:
+        sender = Sender(spec(reliable=True))
+        sender.submit(flying, now=0.0)
+        while sender.take() is not None:
+            pass
+        assert len(sender.channel.flying) == flying
+        return steps(lambda: sender.channel.delivered_to(20))
+
+    assert cost(2000) <= 1.2 * cost(100)
