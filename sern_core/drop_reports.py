@@ -18,9 +18,9 @@ MAX_REPORTS: Final = 16_384
 """Reports that one peer has not heard of. Above it, neighbours are one run whichever clients they name, and a peer that
 goes on sending without reading any is cut."""
 MAX_KEPT_REPORTS: Final = 8 * MAX_REPORTS
-"""As many as a stream holds messages by default. What would be one more is counted here like any drop, and not told."""
+"""The most reports that are kept for one peer. What would be one more is counted here like any drop, and not told."""
 UNREAD_S: Final = 10.0
-"""So long a peer may go on sending while it reads none of the reports that were said in the session."""
+"""How long a peer may go on sending while it reads none of the reports that were said in the session."""
 STEP_S: Final = 1.0
 """What the pause between two of its messages counts for that at most: if we were held up, its words wait as well."""
 

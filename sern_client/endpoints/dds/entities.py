@@ -65,6 +65,8 @@ class Subscription:
         return 0 if self._reader is None else self._reader.matched
 
     def _deliver(self, sample: Sample) -> None:
+        if self.closed:
+            return  # the rest of a reader before the last one: nobody is there to take it
         self._endpoint.counters.received += 1
         if not self._sink(sample.body, sample.stamp_ns):
             self._endpoint.counters.refused += 1

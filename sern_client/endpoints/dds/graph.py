@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from typing import Final, Protocol
 from uuid import UUID
 
-from sern_client.endpoints.dds import names, qos
+from sern_client.endpoints.dds import names, node_info, qos
 from sern_client.endpoints.dds.names import Role, RosName
 from sern_client.endpoints.dds.node_info import Node
 from sern_client.endpoints.dds.qos import EndpointQos
@@ -98,17 +98,19 @@ class Graph:
     complaints: dict[tuple[UUID, UUID], str] = field(default_factory=dict)
     """Who does not get, or give, what: by the two endpoints, in one line each."""
     _nodes: dict[UUID, list[Node]] = field(default_factory=dict)
-    """Of each participant, as it was last said."""
+    """Nodes of each participant, as they were last said."""
+    _node_names: dict[UUID, dict[bytes, str]] = field(default_factory=dict)
+    """Nodes by their readers and writers, for participants that were asked about: a body may have 3000 nodes."""
     _early_nodes: dict[UUID, list[Node]] = field(default_factory=dict)
     """The same for participants that are not known yet, or never will be."""
     _of_participant: dict[UUID, dict[UUID, None]] = field(default_factory=dict)
     """Readers and writers, in the order in which they came."""
     _writers: dict[int, Remote] = field(default_factory=dict)
-    """By their handles."""
+    """Writers by their handles."""
     _told: set[UUID] = field(default_factory=set)
     """Readers and writers that count as of this site: as such they are told when they go, whatever is true by then."""
     _on_topic: dict[tuple[str, bool], list[Remote]] = field(default_factory=dict)
-    """Of this site, in the order of their GUIDs; by topic, and whether they write."""
+    """Readers and writers of this site, in the order of their GUIDs; by topic, and whether they write."""
     _locals_on: dict[str, dict[UUID, Local]] = field(default_factory=dict)
     _complained: dict[UUID, set[tuple[UUID, UUID]]] = field(default_factory=dict)
 
@@ -135,6 +137,7 @@ class Graph:
             self._take_out(remote.guid)
         self.participants.pop(guid, None)
         self._nodes.pop(guid, None)
+        self._node_names.pop(guid, None)
         self._tell(told)
 
     def remote_added(self, remote: Remote) -> None:
@@ -175,6 +178,7 @@ class Graph:
         """What is said of a participant's nodes. Anybody can say it of any participant, known or invented."""
         if participant in self.participants:
             self._nodes[participant] = nodes
+            self._node_names.pop(participant, None)
             return
         self._early_nodes.pop(participant, None)
         self._early_nodes[participant] = nodes
@@ -204,9 +208,11 @@ class Graph:
 
     def owner(self, remote: Remote) -> str:
         """Whose it is, in words: the node where that is known, else the participant."""
-        for node in self._nodes.get(remote.participant, ()):
-            if node.has(remote.guid):
-                return f"node {names.cut(node.name)}"
+        known = self._node_names.get(remote.participant)
+        if known is None and (nodes := self._nodes.get(remote.participant)) is not None:
+            known = self._node_names[remote.participant] = node_info.by_entity(nodes)
+        if known and (node := known.get(remote.guid.bytes)) is not None:
+            return f"node {names.cut(node)}"
         participant = self.participants.get(remote.participant)
         name = participant.name if participant is not None and participant.name else "without a name"
         return f"participant {names.cut(name)} ({remote.participant.hex[:24]})"
@@ -214,7 +220,7 @@ class Graph:
     # In here
 
     def _is_foreign(self, remote: Remote) -> bool:
-        """As its participant has it now."""
+        """Whether it would count as of this site by what its participant says now."""
         participant = self.participants.get(remote.participant)
         if participant is None or not participant.sern:
             return True

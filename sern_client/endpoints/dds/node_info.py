@@ -39,11 +39,14 @@ class Node(NamedTuple):
     name: str
     gids: bytes
 
-    def has(self, guid: UUID) -> bool:
-        at = self.gids.find(guid.bytes)
-        while at % GID_BYTES and at >= 0:
-            at = self.gids.find(guid.bytes, at + 1)
-        return at >= 0
+
+def by_entity(nodes: Iterable[Node]) -> dict[bytes, str]:
+    """Names of nodes by the GUIDs of their readers and writers; the first node that names one has it."""
+    found: dict[bytes, str] = {}
+    for node in nodes:
+        for at in range(0, len(node.gids), GID_BYTES):
+            found.setdefault(node.gids[at : at + GID_BYTES], node.name)
+    return found
 
 
 def decode(body: bytes) -> tuple[UUID, list[Node]] | None:

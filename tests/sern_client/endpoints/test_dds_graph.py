@@ -20,6 +20,7 @@ from sern_client.endpoints.dds.qos import EndpointQos
 from sern_core.types import Encoding, TopicName
 from sern_runtime import ros_types
 from tests.exploring import cases
+from tests.steps import steps
 
 STEADY = settings(max_examples=cases(100))
 
@@ -132,15 +133,37 @@ def test_what_others_say_of_their_nodes(
         (f"{namespace.rstrip('/')}/{name}", b"".join(guid.bytes for guid in (*readers, *writers)))
         for namespace, name, readers, writers in nodes
     ]
-    for node, (_, _, readers, writers) in zip(found[1], nodes, strict=True):
-        assert all(node.has(guid) for guid in readers + writers)
+    assert set(node_info.by_entity(found[1])) == {
+        guid.bytes for *_, readers, writers in nodes for guid in (*readers, *writers)
+    }
 
 
-def test_a_guid_is_found_at_its_place_only() -> None:
-    there = UUID(bytes=b"\1" * 16)
-    assert not Node("/n", b"\0" + b"\1" * 16 + b"\0" * 15).has(there)
-    assert Node("/n", b"\0" + b"\1" * 31 + b"\0" * 16).has(there)
-    assert not Node("/n", b"").has(there)
+def test_the_first_node_that_names_a_reader_or_writer_has_it() -> None:
+    there, other = UUID(int=1), UUID(int=2)
+    nodes = [Node("/empty", b""), Node("/one", there.bytes), Node("/two", other.bytes + there.bytes)]
+    assert node_info.by_entity(nodes) == {there.bytes: "/one", other.bytes: "/two"}
+
+
+def test_whose_it_is_costs_the_same_however_many_nodes_were_said() -> None:
+    def cost(nodes: int) -> int:
+        graph = Graph(OWN, Heard())
+        graph.participant_added(Participant(OTHER))
+        graph.nodes_of(OTHER, [Node(f"/n{number}", UUID(int=number).bytes) for number in range(nodes)])
+        last = remote(nodes - 1)
+        assert graph.owner(last) == f"node /n{nodes - 1}"
+        return steps(lambda: graph.owner(last))
+
+    assert cost(2000) == cost(10)
+
+
+def test_what_is_said_anew_of_nodes_holds() -> None:
+    graph = Graph(OWN, Heard())
+    graph.participant_added(Participant(OTHER))
+    for name in ("/before", "/after"):
+        graph.nodes_of(OTHER, [Node(name, UUID(int=11).bytes)])
+        assert graph.owner(remote(11)) == f"node {name}"
+    graph.participant_removed(OTHER)
+    assert graph.owner(remote(11)).startswith("participant without a name")
 
 
 def test_bodies_in_the_other_byte_order() -> None:
