@@ -92,6 +92,18 @@ async def offered(
         yield sites, await sites.served()
 
 
+def hold() -> tuple[Callable[[bytes], Awaitable[bytes]], asyncio.Event, asyncio.Event]:
+    """A service that tells when it begins and ends when it is let."""
+    started, release = asyncio.Event(), asyncio.Event()
+
+    async def answer(request: bytes) -> bytes:
+        started.set()
+        await release.wait()
+        return request
+
+    return answer, started, release
+
+
 def outcomes(daemon: ClientDaemon) -> dict[tuple[TopicName, str], int]:
     return dict(bridge(daemon).outcomes)
 
@@ -150,15 +162,8 @@ async def test_a_call_that_another_site_does_not_want_is_still_answered(
 async def test_a_call_in_a_run_of_messages_that_is_dropped_has_failed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, count: int
 ) -> None:
-    called, never = asyncio.Event(), asyncio.Event()
-
-    async def wait(request: bytes) -> bytes:
-        called.set()
-        await never.wait()
-        return request
-
     async with offered(tmp_path, monkeypatch) as (sites, handler):
-        sites.robot.answer = wait
+        sites.robot.answer, called, _ = hold()
         services = bridge(sites.site_daemon)
         call = asyncio.ensure_future(handler(b"mine"))
         await until(called.is_set, "the robot has the call")
@@ -177,13 +182,7 @@ async def test_a_service_that_does_not_answer_is_an_error_in_time(
 ) -> None:
     async with offered(tmp_path, monkeypatch, timeout_s=0.3) as (sites, handler):
         site = sites.site_daemon
-        never = asyncio.Event()
-
-        async def wait(request: bytes) -> bytes:
-            await never.wait()
-            return request
-
-        sites.robot.answer = wait
+        sites.robot.answer, _, _ = hold()
         with pytest.raises(ServiceError, match=r"did not answer within 0.3 s|took too long"):
             await handler(b"")
         assert sum(outcomes(site).values()) == 1
@@ -217,14 +216,7 @@ async def test_a_lost_relay_is_an_error_and_the_call_is_not_executed_later(
 
 async def test_a_service_that_goes_is_withdrawn_and_comes_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     async with offered(tmp_path, monkeypatch) as (sites, handler):
-        started = asyncio.Event()
-
-        async def wait(request: bytes) -> bytes:
-            started.set()
-            await asyncio.Event().wait()
-            return request
-
-        sites.robot.answer = wait
+        sites.robot.answer, started, _ = hold()
         pending = asyncio.ensure_future(handler(b"one"))
         await started.wait()
         assert sites.robot.events is not None
@@ -342,18 +334,6 @@ async def test_nobody_else_answers_for_a_service(tmp_path: Path, monkeypatch: py
         services.message(forged, Message(forged.id, 1, REPLY.pack(number, False) + b"forged", 0, clock.now()))
         release.set()
         assert await pending == b"one"
-
-
-def hold() -> tuple[Callable[[bytes], Awaitable[bytes]], asyncio.Event, asyncio.Event]:
-    """A service that tells when it begins and ends when it is let."""
-    started, release = asyncio.Event(), asyncio.Event()
-
-    async def answer(request: bytes) -> bytes:
-        started.set()
-        await release.wait()
-        return request
-
-    return answer, started, release
 
 
 async def test_a_call_whose_caller_leaves_is_not_made_later(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

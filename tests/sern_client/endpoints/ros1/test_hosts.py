@@ -61,6 +61,21 @@ async def test_a_node_that_registers_with_a_good_address_is_found_again(
             await until(lambda: CHAT in events.infos)
 
 
+def fail_at_first(monkeypatch: pytest.MonkeyPatch, owner: type, name: str) -> None:
+    """Has the method ``name`` of ``owner`` raise in its first three calls what nobody expects."""
+    original = getattr(owner, name)
+    failures = 3
+
+    async def failing(self: object) -> Any:
+        nonlocal failures
+        if failures:
+            failures -= 1
+            raise KeyError("nobody expected this")
+        return await original(self)
+
+    monkeypatch.setattr(owner, name, failing)
+
+
 async def test_a_publisher_that_names_a_bad_host_is_asked_again(
     master: FakeMaster, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -75,17 +90,7 @@ async def test_a_publisher_that_names_a_bad_host_is_asked_again(
 async def test_an_error_of_ours_does_not_end_a_publisher(
     master: FakeMaster, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    original = Source._session
-    failures = 3
-
-    async def failing(self: Source) -> bool:
-        nonlocal failures
-        if failures:
-            failures -= 1
-            raise KeyError("nobody expected this")
-        return await original(self)
-
-    monkeypatch.setattr(Source, "_session", failing)
+    fail_at_first(monkeypatch, Source, "_session")
     async with running(master) as (endpoint, events), FakePublisher(master) as talker:
         await until(lambda: CHAT in events.infos)
         got = collect(endpoint)
@@ -117,17 +122,7 @@ async def test_a_source_whose_task_has_ended_starts_anew(master: FakeMaster) -> 
 async def test_an_error_of_ours_does_not_end_the_watching_of_a_node(
     master: FakeMaster, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    original = Node._watch
-    failures = 3
-
-    async def failing(self: Node) -> None:
-        nonlocal failures
-        if failures:
-            failures -= 1
-            raise KeyError("nobody expected this")
-        await original(self)
-
-    monkeypatch.setattr(Node, "_watch", failing)
+    fail_at_first(monkeypatch, Node, "_watch")
     async with running(master) as (_, events), FakePublisher(master):
         await until(lambda: CHAT in events.infos)
     assert caplog.text.count("/talker: the watching of this node failed") == 1
