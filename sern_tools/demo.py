@@ -21,6 +21,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any, Final
 
@@ -30,7 +31,7 @@ from rich.console import Console
 
 from sern_core.errors import ConfigError, SernError
 from sern_runtime.profiles import load_profile
-from sern_tools import demo_report
+from sern_tools import demo_charts, demo_report
 from sern_tools.counters import Counters, read_counters
 from sern_tools.demo_behaviour import Behaviour, Look
 from sern_tools.demo_link import LinkProcess
@@ -78,6 +79,7 @@ class Options:
     out: Path
     json_file: Path
     html_file: Path
+    picture_file: Path | None
     baseline: bool = True
     keep: bool = False
     profiles: Path | None = None
@@ -451,6 +453,10 @@ async def run(options: Options, console: Console) -> int:
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_text(text, encoding="utf-8")
             console.print(f"wrote {path}", highlight=False, soft_wrap=True)
+        if options.picture_file is not None:
+            options.picture_file.parent.mkdir(parents=True, exist_ok=True)
+            options.picture_file.write_bytes(demo_charts.pose_age(report.results))
+            console.print(f"wrote {options.picture_file}", highlight=False, soft_wrap=True)
         if options.keep:
             console.print(f"kept {directory}", highlight=False, soft_wrap=True)
     return EXIT_OK if report.ok else EXIT_BROKEN
@@ -466,6 +472,7 @@ def demo(
     out: Annotated[Path, typer.Option(help="Directory for what the demo leaves behind.")] = Path("demo-out"),
     json: Annotated[Path | None, typer.Option(help="The figures; default OUT/result.json.")] = None,
     html: Annotated[Path | None, typer.Option(help="The report; default OUT/report.html.")] = None,
+    picture: Annotated[Path | None, typer.Option(help="The age of the newest pose over time, as a PNG file.")] = None,
     no_baseline: Annotated[bool, typer.Option("--no-baseline", help="Leave out the run over plain ZMQ.")] = False,
     keep: Annotated[bool, typer.Option("--keep", help="Keep configuration, keys and logs in OUT.")] = False,
 ) -> None:
@@ -478,12 +485,15 @@ def demo(
         link = load_profile(profile, profiles)
         if bag is not None and not bag.exists():
             raise ConfigError("no such file or directory", file=str(bag))
+        if picture is not None and find_spec("matplotlib") is None:
+            raise ConfigError("--picture needs matplotlib: pip install matplotlib")
         scenario = Scenario(link, duration or link.duration_s, overload=overload, seed=seed, bag=bag)
         options = Options(
             scenario=scenario,
             out=out,
             json_file=json or out / "result.json",
             html_file=html or out / "report.html",
+            picture_file=picture,
             baseline=not no_baseline,
             keep=keep,
             profiles=profiles,

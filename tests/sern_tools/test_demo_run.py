@@ -13,8 +13,9 @@ import uuid
 from pathlib import Path
 
 import pytest
+import typer
 
-from sern_tools.demo import EXIT_BROKEN, EXIT_ERROR, EXIT_INTERRUPTED, EXIT_OK
+from sern_tools.demo import EXIT_BROKEN, EXIT_ERROR, EXIT_INTERRUPTED, EXIT_OK, demo
 from tests.support import until
 
 PROFILES = """
@@ -109,13 +110,20 @@ class Started:
 async def test_a_whole_run_leaves_its_report_and_nothing_else(tmp_path: Path) -> None:
     demo = Started(tmp_path)
     try:
-        await demo.start("--profile", "quick", "--out", "result", "--json", "figures.json")
+        await demo.start("--profile", "quick", "--out", "result", "--json", "figures.json", "--picture", "age.png")
         status = await demo.ended()
         assert status in (EXIT_OK, EXIT_BROKEN), demo.output
         demo.assert_nothing_left()
     finally:
         await demo.clean_up()
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["figures.json", "profiles.yaml", "result", "tmp"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "age.png",
+        "figures.json",
+        "profiles.yaml",
+        "result",
+        "tmp",
+    ]
+    assert (tmp_path / "age.png").read_bytes().startswith(b"\x89PNG")
     assert [path.name for path in (tmp_path / "result").iterdir()] == ["report.html"]
     figures = json.loads((tmp_path / "figures.json").read_text())
     reach = {entry["name"]: entry["ok"] for entry in figures["reach"]}
@@ -174,6 +182,16 @@ async def test_what_is_wrong_is_one_line(tmp_path: Path, arguments: list[str], w
     assert words in demo.output
     assert len(demo.output.splitlines()) == 1
     demo.assert_nothing_left()
+
+
+def test_a_picture_without_matplotlib_is_refused_before_the_run(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    with pytest.raises(typer.Exit) as ended:
+        demo(picture=Path("age.png"))
+    assert ended.value.exit_code == EXIT_ERROR
+    assert capsys.readouterr().err == "sern demo: --picture needs matplotlib: pip install matplotlib\n"
 
 
 @pytest.mark.parametrize("stage", ["1/3", LIVE, "3/3"])
