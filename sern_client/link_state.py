@@ -100,7 +100,11 @@ class LinkState:
         """Also said once where our own link was down in between: of that one line speaks for all."""
         self.soon()
         name, now = change.name, clock.now()
-        if change.given_up:
+        if change.forgotten:
+            gone_s = self._gone_s.pop(name, None)
+            if gone_s is not None:
+                _log.warning("%s is forgotten after %.1f s: nothing of it is taken here any more", name, now - gone_s)
+        elif change.given_up:
             _log.warning(
                 "%s is given up by the relay after %.0f s: its topics end, and it is gone until it is back",
                 name, change.lasted_s,

@@ -299,6 +299,26 @@ async def test_who_is_given_up_is_said_and_stays_away(caplog: pytest.LogCaptureF
     site.state.close()
 
 
+@pytest.mark.parametrize("given_up", [False, True])
+async def test_who_is_forgotten_is_said_once_if_it_was_gone(caplog: pytest.LogCaptureFixture, given_up: bool) -> None:
+    site = Site()
+    site.state.start()
+    for name in ("jackal1", "jackal2"):
+        site.told(name, up=True)
+    await until(lambda: "/jackal1/sern/link" in site.endpoint.open, "its state is published")
+    site.told("jackal1", up=False)
+    if given_up:
+        site.core.peers.told({"t": "peers", "peers": [{"name": "jackal1", "here": False}]}, now=clock.now())
+    site.core.peers.subscribed((), now=clock.now())
+    for name in ("jackal1", "jackal2"):
+        site.core.peers.told({"t": "peers", "peers": [{"name": name, "here": name == "jackal2"}]}, now=clock.now())
+    assert site.state.to_json() == [] and site.state.detail() == ""
+    (line,) = [record for record in caplog.records if "forgotten" in record.message]
+    assert line.levelname == "WARNING" and line.message.startswith("jackal1 is forgotten after ")
+    await until(lambda: list(site.endpoint.open) == ["/sern/link"], "its topic ends, long before the next period")
+    site.state.close()
+
+
 async def test_topics_are_withdrawn_when_nothing_was_heard_for_so_long_and_come_back() -> None:
     site = Site(withdraw_after_s=5.0)
     site.state.start()
