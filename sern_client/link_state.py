@@ -192,6 +192,7 @@ class LinkState:
             peer.name if whole else self._core.link.peer,
             peer.lane,
             why,
+            peer.given_up,
         )
 
     @property
@@ -220,6 +221,7 @@ class LinkState:
                 "round_trip_s": view.round_trip_s,
                 "round_trip_to": view.round_trip_to,
                 "lane": view.lane,
+                "given_up": view.given_up,
             }
             for view in self.views()
             if not view.own
