@@ -100,7 +100,11 @@ class LinkState:
         """Also said once where our own link was down in between: of that one line speaks for all."""
         self.soon()
         name, now = change.name, clock.now()
-        if change.given_up:
+        if change.forgotten:
+            gone_s = self._gone_s.pop(name, None)
+            if gone_s is not None:
+                _log.warning("%s is forgotten after %.1f s: nothing of it is taken here any more", name, now - gone_s)
+        elif change.given_up:
             _log.warning(
                 "%s is given up by the relay after %.0f s: its topics end, and it is gone until it is back",
                 name, change.lasted_s,
@@ -188,6 +192,7 @@ class LinkState:
             peer.name if whole else self._core.link.peer,
             peer.lane,
             why,
+            peer.given_up,
         )
 
     @property
@@ -216,6 +221,7 @@ class LinkState:
                 "round_trip_s": view.round_trip_s,
                 "round_trip_to": view.round_trip_to,
                 "lane": view.lane,
+                "given_up": view.given_up,
             }
             for view in self.views()
             if not view.own

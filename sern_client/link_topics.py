@@ -33,6 +33,7 @@ class LinkView(NamedTuple):
 
     `since_s`: for how long the status has been so; `age_s`: since a message came from there; `round_trip_s`: of the
     way to `round_trip_to`; `lane`: of the far end's hop to the relay (of the own link: ours); `why`: in a few words.
+    `given_up`: the relay waits for the peer no longer.
     """
 
     peer: str
@@ -44,6 +45,7 @@ class LinkView(NamedTuple):
     round_trip_to: str
     lane: str
     why: str
+    given_up: bool = False
 
     @property
     def topic(self) -> TopicName:
@@ -91,6 +93,7 @@ class LinkTopics:
         self._diagnostics = diagnostics
         self._publishers: dict[TopicName, Publisher] = {}
         self._problems: dict[TopicName, tuple[str, float]] = {}  # what was said of it last, and since when
+        self._final: dict[TopicName, tuple[PeerStatus, object]] = {}  # what was published of those that are given up
         self._seq = 0
 
     @property
@@ -99,20 +102,34 @@ class LinkTopics:
         return Counter(self._publishers.keys())
 
     def publish(self, views: Sequence[LinkView], stamp_ns: int) -> None:
-        """Publish all of them as they are now; the topics of others end."""
+        """Publish all of them as they are now; the topics of others end. A peer that is given up is said once, and on
+        /diagnostics as it was then: there may be many of them, for ever."""
         wanted = {view.topic for view in views} | ({DIAGNOSTICS} if self._diagnostics else set())
         for name in [name for name in self._publishers if name not in wanted]:
+            self._final.pop(name, None)
             self._publishers.pop(name).close()
-        statuses = [self._status(view) for view in views]
-        for view, status in zip(views, statuses, strict=True):
-            body = ros_types.serialise(status, STATUS_TYPE, self._encoding)
-            self._publish(view.topic, STATUS_TYPE, body, stamp_ns, latched=True)
+        statuses = [self._said(view, stamp_ns) for view in views]
         if self._diagnostics:
             self._seq = (self._seq + 1) & 0xFFFFFFFF
             header = ros_types.header(stamp_ns, "", self._encoding, self._seq)
             array = ros_types.new(ARRAY_TYPE, self._encoding, header=header, status=statuses)
             body = ros_types.serialise(array, ARRAY_TYPE, self._encoding)
             self._publish(DIAGNOSTICS, ARRAY_TYPE, body, stamp_ns, latched=False)
+
+    def _said(self, view: LinkView, stamp_ns: int) -> object:
+        """The status of a link, which its topic has as well now."""
+        topic = view.topic
+        was, final = self._final.get(topic, (None, None))
+        if view.given_up and was is view.status:
+            return final
+        status = self._status(view)
+        body = ros_types.serialise(status, STATUS_TYPE, self._encoding)
+        published = self._publish(topic, STATUS_TYPE, body, stamp_ns, latched=True)
+        if view.given_up and published:
+            self._final[topic] = view.status, status
+        else:
+            self._final.pop(topic, None)
+        return status
 
     def _status(self, view: LinkView) -> object:
         values = [
@@ -128,10 +145,12 @@ class LinkTopics:
             values=values,
         )
 
-    def _publish(self, name: TopicName, type_name: str, body: bytes, stamp_ns: int, *, latched: bool) -> None:
+    def _publish(self, name: TopicName, type_name: str, body: bytes, stamp_ns: int, *, latched: bool) -> bool:
+        """False: it cannot be published there."""
         publisher = self._publishers.get(name) or self._open(name, type_name, latched=latched)
         if publisher is not None:
             publisher.publish(body, stamp_ns)
+        return publisher is not None
 
     def _open(self, name: TopicName, type_name: str, *, latched: bool) -> Publisher | None:
         """Tried again each time, and said once."""
@@ -151,6 +170,7 @@ class LinkTopics:
     def repair(self, names: Collection[TopicName]) -> None:
         """These are not open at the endpoint as they should be: they are opened anew with the next message."""
         for name in names:
+            self._final.pop(name, None)
             publisher = self._publishers.pop(name, None)
             if publisher is not None:
                 with suppress(Exception):  # it is not what it should be

@@ -217,10 +217,15 @@ class ClientCore:
     def subscribe(self, patterns: tuple[str, ...], *, now: float) -> None:
         """Full-match patterns of the global names this site wants; replaces the earlier ones."""
         self.patterns = patterns
+        self._tell(self.peers.subscribed, patterns, now=now)
         if self.link.established:
             self._send_subscription(now)
 
-    def _send_subscription(self, now: float) -> None:
+    def _send_subscription(self, now: float, known: Sequence[ClientName] = ()) -> None:
+        """`known`: of whom the relay is asked whether they are here."""
+        for start in range(0, len(known), MAX_STRINGS):
+            names = list(known[start : start + MAX_STRINGS])
+            self.link.send_control({"t": "subscribe", "patterns": [], "more": True, "known": names}, now=now)
         parts = [self.patterns[i : i + MAX_STRINGS] for i in range(0, len(self.patterns), MAX_STRINGS)] or [()]
         batch: list[str] = []
         for part in parts:
@@ -292,7 +297,7 @@ class ClientCore:
             for identity, cache in self._latched.items():
                 link.by_stream[identity].prime(cache.replay(), now=now)
         self.peers.session_began(now=now)
-        self._send_subscription(now)
+        self._send_subscription(now, self.peers.lost())
         self._tell(self.events.link_up, resumed=resumed)
 
     def on_down(self, link: Link, reason: str, *, now: float) -> None:
@@ -381,7 +386,7 @@ class ClientCore:
         self._decoder.forget(stream.stream.id, now=now)
         self._held.pop(stream.stream.id, None)
         del self._open[stream.stream.id]
-        self.peers.closed(stream.stream.id.origin)
+        self._tell(self.peers.closed, stream.stream.id.origin, stream.stream.id.topic, now=now)
         self._tell(self.events.stream_closed, stream.stream)
 
     def on_definition(self, link: Link, digest: str, *, now: float) -> None:

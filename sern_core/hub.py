@@ -125,7 +125,7 @@ class Hub(LocalStreams):
         self._subscriptions: dict[ClientName, list[str]] = {}  # parts that have arrived
         self.matching = Matching(self.routing, self._subscribed, self._apply)
         self._fanout = Fanout(self._offer, self._told, self._let_go)
-        self.presence = Presence(self.links, self.local_owners, self._for, self._was_read)
+        self.presence = Presence(self.links, self.local_owners, self.matching.due_s, self._for, self._was_read)
         self._awaited: dict[ClientName, set[TopicName]] = {}
         self._heard: set[ClientName] = set()  # said what they want, to this run of the relay
         self._absent_since: dict[ClientName, float] = {}
@@ -844,6 +844,8 @@ class Hub(LocalStreams):
     def _subscribe(self, client: ClientName, envelope: wire.Envelope, now: float) -> None:
         parts = self._subscriptions.setdefault(client, [])
         parts += wire.take_strings(envelope, "patterns")
+        if "known" in envelope:
+            self.presence.ask(client, map(ClientName, wire.take_strings(envelope, "known", max_length=64)))
         if wire.take_bool(envelope, "more"):
             if len(parts) > MAX_SUBSCRIPTION_PARTS * wire.MAX_ENVELOPE_ITEMS:
                 raise WireError(f"more than {MAX_SUBSCRIPTION_PARTS * wire.MAX_ENVELOPE_ITEMS} subscription patterns")

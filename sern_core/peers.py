@@ -3,7 +3,9 @@
 The relay tells of each peer whether it can be reached (`sern_core/presence.py`), the streams tell when something of it
 came last, and the client's own link says whether any of that is still to be believed: while it is down nobody knows,
 and ages grow. A peer that is gone for longer than the relay waits is given up there, with its streams. Here it stays as
-one that is gone, until it is back: nobody else would still say that it is missing.
+one that is gone, until it is back: nobody else would still say that it is missing. A new session asks the relay whether
+it is here. It is forgotten when this site wants none of the topics any more that it had here, or when the relay does
+not say.
 """
 
 from collections import Counter
@@ -13,15 +15,19 @@ from typing import Any, Final, NamedTuple
 
 from sern_core import wire
 from sern_core.errors import WireError
-from sern_core.types import ClientName
+from sern_core.patterns import PatternError, PatternSet
+from sern_core.presence import MAX_ASKED
+from sern_core.types import ClientName, TopicName
 
 LET_GO_S: Final = 60.0
-"""A peer of which the relay of a new session says nothing for so long, and that has no stream here, is forgotten; one
-that was gone before is given up."""
+"""A peer of which the relay of a new session says nothing for so long, and that has no stream here, is forgotten."""
 MAX_PEERS: Final = 4096
-MAX_GIVEN_UP: Final = 64
-"""Peers that are gone for good, as far as anybody knows, and are still shown. Each costs something every second."""
 """Peers that a relay may tell of; no honest one has as many. The one given up longest ago makes way for another."""
+MAX_GIVEN_UP: Final = 64
+"""Peers that are gone for good, as far as anybody knows, and are still shown. The relay is asked of them in each
+session."""
+MAX_ENDED: Final = 256
+"""Topics of one peer that ended here while it was gone, and that are remembered."""
 MAX_FOR_S: Final = 1e9
 MAX_RTT_S: Final = 1e6
 
@@ -50,14 +56,15 @@ class PeerView(NamedTuple):
 
 
 class PeerChange(NamedTuple):
-    """A peer's status is another one, after `lasted_s` of the one before; or, `given_up`, it is what it was, and the
-    relay has given the peer up. `old` None: it is a new peer."""
+    """A peer's status is another one, after `lasted_s` of the one before; or it is what it was, and the relay has given
+    the peer up (`given_up`), or nothing of it is taken here any more (`forgotten`). `old` None: it is a new peer."""
 
     name: ClientName
     old: PeerStatus | None
     new: PeerStatus
     lasted_s: float
     given_up: bool = False
+    forgotten: bool = False
 
 
 class _Peer:
@@ -75,12 +82,16 @@ class _Peer:
 
 
 class Peers:
-    """`on_change` is told of every peer whose status changes, that comes, and that is given up."""
+    """`on_change` is told of every peer whose status changes, that comes, that is given up, and that is forgotten. Of
+    one that makes way for another nothing is said: it is still gone."""
 
     def __init__(self) -> None:
         self.on_change: Callable[[PeerChange], None] = lambda _change: None
         self._peers: dict[ClientName, _Peer] = {}
         self._streams: Counter[ClientName] = Counter()  # open here, by origin
+        self._ended: dict[ClientName, dict[TopicName, None]] = {}  # its topics that ended while it was gone
+        self._patterns: tuple[str, ...] | None = None  # what this site wants; None: nobody has said
+        self._wants: PatternSet | None = None  # the same, once somebody asked
         self._heard_s: dict[ClientName, float] = {}
         self._session_s = 0.0
         self._session = False
@@ -95,8 +106,7 @@ class Peers:
         """Nobody knows of any peer any more."""
         self._session = False
         for peer in self._peers.values():
-            if not peer.given_up:  # no relay speaks of it until it is back
-                peer.up = None
+            peer.up = None
         self.reached(False, now=now)
 
     def reached(self, answers: bool, *, now: float) -> None:
@@ -110,10 +120,48 @@ class Peers:
         self._streams[origin] += 1
         self._known(origin, now)
 
-    def closed(self, origin: ClientName) -> None:
+    def closed(self, origin: ClientName, topic: TopicName, *, now: float) -> None:
+        """A stream of `origin` has ended here."""
         self._streams[origin] -= 1
         if not self._streams[origin]:
             del self._streams[origin]
+        peer = self._peers.get(origin)
+        if peer is not None and peer.lost:
+            ended = self._ended.setdefault(origin, {})
+            while len(ended) >= MAX_ENDED:
+                del ended[next(iter(ended))]
+            ended[topic] = None
+            self._unwanted(origin, peer, now)
+
+    def subscribed(self, patterns: tuple[str, ...], *, now: float) -> None:
+        """This site wants the topics that these match, and none of what it wanted before: a peer that is given up and
+        had nothing else here is forgotten."""
+        self._patterns, self._wants = patterns, None
+        for name, peer in list(self._peers.items()):
+            self._unwanted(name, peer, now)
+
+    def _unwanted(self, name: ClientName, peer: _Peer, now: float) -> None:
+        if peer.given_up and name not in self._streams and not self._wanted(name):
+            self._forget(name, now)
+
+    def _wanted(self, name: ClientName) -> bool:
+        """Whether this site still wants a topic that a lost peer had here; True where it is not known what it had."""
+        if self._patterns is None:
+            return True
+        topics = self._ended.get(name)
+        if not topics or not self._patterns:
+            return bool(self._patterns)
+        if self._wants is None:
+            try:
+                self._wants = PatternSet(self._patterns)
+            except PatternError:  # nor does the relay take them: what was wanted before stays
+                return True
+        return any(map(self._wants.fullmatch, topics))
+
+    def lost(self) -> list[ClientName]:
+        """Those that were gone when any relay spoke of them last: of them a new session asks. At most MAX_ASKED, those
+        given up last among them."""
+        return [name for name, peer in self._peers.items() if peer.lost][-MAX_ASKED:]
 
     def arrived(self, origin: ClientName, *, now: float) -> None:
         """A message of `origin` came."""
@@ -130,8 +178,9 @@ class Peers:
     def _told(self, item: dict[str, Any], now: float) -> None:
         name = ClientName(wire.take_str(item, "name", max_length=64))
         if "up" not in item:  # we take nothing of it any more
+            here = wire.take_bool(item, "here")  # an older relay does not say: who was gone is gone as far as we know
             if name in self._peers:
-                self._let_go(name, self._peers[name], now)
+                self._let_go(name, self._peers[name], here, now)
             return
         up = wire.take_bool(item, "up")
         for_s = wire.take_float(item, "for", low=0.0, high=MAX_FOR_S) or 0.0
@@ -143,6 +192,8 @@ class Peers:
         if peer.up is not up:
             peer.up, peer.up_since_s = up, now - for_s
         peer.lost, peer.given_up = not up, False
+        if up:
+            self._ended.pop(name, None)
         peer.rtt_s, peer.lane = rtt_s, lane
         self._settle(name, peer, now)
 
@@ -164,19 +215,26 @@ class Peers:
             peer.status, peer.since_s = status, since_s
             self.on_change(PeerChange(name, old, status, lasted_s))
 
-    def _let_go(self, name: ClientName, peer: _Peer, now: float) -> None:
-        """The relay speaks of it no more."""
-        if peer.lost:
+    def _let_go(self, name: ClientName, peer: _Peer, here: bool, now: float) -> None:
+        """We take nothing of it at the relay, where it is or is not."""
+        if peer.lost and not here and self._wanted(name):
             self._give_up(name, peer, now)
             return
+        if peer.lost and here:  # that it is back is said before it is forgotten
+            peer.up, peer.up_since_s = True, now
+            peer.lost = peer.given_up = False
+            self._ended.pop(name, None)
+            self._settle(name, peer, now)
         peer.up = None
         if name not in self._streams:
-            self._forget(name)
+            self._forget(name, now)
 
     def _give_up(self, name: ClientName, peer: _Peer, now: float) -> None:
+        peer.up = False
         if peer.given_up:
+            self._settle(name, peer, now)
             return
-        peer.up, peer.given_up = False, True
+        peer.given_up = True
         self._peers[name] = self._peers.pop(name)  # last: the one given up longest ago is the first of them
         if sum(other.given_up for other in self._peers.values()) > MAX_GIVEN_UP:
             self._make_way()
@@ -187,20 +245,26 @@ class Peers:
         """Forget the peer that was given up longest ago; whether there was one."""
         for name, peer in self._peers.items():
             if peer.given_up and name not in self._streams:
-                self._forget(name)
+                self._drop(name)
                 return True
         return False
 
-    def _forget(self, name: ClientName) -> None:
+    def _forget(self, name: ClientName, now: float) -> None:
+        peer = self._peers[name]
+        self._drop(name)
+        self.on_change(PeerChange(name, peer.status, peer.status, now - peer.since_s, forgotten=True))
+
+    def _drop(self, name: ClientName) -> None:
         del self._peers[name]
         self._heard_s.pop(name, None)
+        self._ended.pop(name, None)
 
     def look(self, *, now: float) -> list[PeerView]:
         """All peers by name. Lets go of those that nothing speaks of any more."""
         if self._session and now - self._session_s > LET_GO_S:
             for name, peer in list(self._peers.items()):
                 if peer.up is None and name not in self._streams:
-                    self._let_go(name, peer, now)
+                    self._forget(name, now)
         return [self._view(name, peer, now) for name, peer in sorted(self._peers.items())]
 
     def _view(self, name: ClientName, peer: _Peer, now: float) -> PeerView:

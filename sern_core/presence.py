@@ -5,12 +5,16 @@ answers, for how long that has been so, over which lane, and how long a round tr
 `sern_core/peers.py` is the client's half. Of who takes its own streams a client is not told: a robot on a thin link
 would pay for every curious onlooker.
 
+A peer whose last stream has ended is one no more. The client is told whether it is *here*, which is whether it has a
+session: a robot that is gone is given up, one that is here has nothing for the client any more. Of those that were not
+here it is told once they are, and it may ask of those that it knows from an earlier session.
+
 What is told travels as control messages, so that bulk cannot hold it up, and is bounded by what there is to know: of
 each peer only its latest state waits, and nothing is said before the client has acknowledged what was said last.
 """
 
 from collections import Counter
-from collections.abc import Callable, Container, Mapping
+from collections.abc import Callable, Container, Iterable, Mapping
 from functools import partial
 from typing import Final, NamedTuple, Protocol
 
@@ -20,6 +24,11 @@ from sern_core.types import ClientName
 
 MAX_TOLD: Final = 24
 """Peers in one message: an envelope holds 4 KiB."""
+MAX_ASKED: Final = 128
+"""Clients of whom a client may ask whether they are here, and of whom it waits to be told that they are."""
+BACK_PAUSE_S: Final = 5.0
+"""A client that is here again has so long to say what it has, before a client that looks for it is told that it has
+nothing there: that one would end what it shows of it, and begin again."""
 RTT_CHANGE: Final = 0.25
 RTT_CHANGE_S: Final = 0.005
 RTT_PAUSE_S: Final = 2.0
@@ -52,35 +61,50 @@ class _State(NamedTuple):
 
 
 class _Watcher:
-    """A client that asked, and the peers of which it is still to be told something. `seq`: of what it was told last."""
+    """A client that asked, and the peers of which it is still to be told something. `seq`: of what it was told last.
+    `missing`: who was not here when it looked for it, the latest last; `back`: who of them is, and since when."""
 
-    __slots__ = ("due", "seq")
+    __slots__ = ("back", "due", "missing", "seq")
 
     def __init__(self) -> None:
         self.due: set[ClientName] = set()
+        self.missing: dict[ClientName, None] = {}
+        self.back: dict[ClientName, float] = {}
         self.seq = 0
+
+    def miss(self, peer: ClientName) -> None:
+        while len(self.missing) >= MAX_ASKED:
+            self.found(next(iter(self.missing)))
+        self.missing[peer] = None
+
+    def found(self, peer: ClientName) -> None:
+        self.missing.pop(peer, None)
+        self.back.pop(peer, None)
 
 
 class Presence:
     """`links` is the relay's table, `local` the names under which the relay itself publishes, which are nobody's peers.
-    `attempt` does something about a client so that its failure is that client's; `after` is called when something was
-    said."""
+    `matching` has the clients of whom it is not known yet what they take. `attempt` does something about a client so
+    that its failure is that client's; `after` is called when something was said."""
 
     def __init__(
         self,
         links: Mapping[ClientName, PeerLink],
         local: Container[ClientName],
+        matching: Container[ClientName],
         attempt: Callable[[ClientName, float, Callable[[], object]], None],
         after: Callable[[], None],
     ) -> None:
         self._links = links
         self._local = local
+        self._matching = matching
         self._attempt = attempt
         self._after = after
         self._taken: dict[ClientName, Counter[ClientName]] = {}  # streams that a client takes, by origin
         self._takers: dict[ClientName, set[ClientName]] = {}  # the same the other way round
         self._states: dict[ClientName, _State] = {}  # of those in `_takers`, as they were looked at last
         self._watchers: dict[ClientName, _Watcher] = {}
+        self._asked: dict[ClientName, set[ClientName]] = {}  # of whom a client asked, until it is known what it takes
 
     # --- who takes whose streams ----------------------------------------------------------------------------------
 
@@ -126,9 +150,21 @@ class Presence:
             watching.due.update(self._taken.get(client, ()))
             self._tell(client, now)
 
+    def ask(self, client: ClientName, names: Iterable[ClientName]) -> None:
+        """A client asks whether these are here, its peers or not. Those above MAX_ASKED are left out."""
+        asked = self._asked.setdefault(client, set())
+        asked.update(list(names)[: MAX_ASKED - len(asked)])
+
     def changed(self, client: ClientName, *, now: float) -> None:
         """The client's session has begun or ended: nobody waits for `sweep`."""
         self._watchers.pop(client, None)  # what it was told was of the session before
+        self._asked.pop(client, None)
+        for watching in self._watchers.values():
+            if client in watching.missing:
+                if self._here(client):
+                    watching.back[client] = now
+                else:
+                    watching.back.pop(client, None)
         if client in self._takers:
             self._look(client, now)
             for taker in self._takers[client]:
@@ -138,8 +174,23 @@ class Presence:
         """See whose path has fallen silent or answers again, and say what is due. Call about once a second."""
         for client in self._takers:
             self._look(client, now)
-        for client in list(self._watchers):
+        for client, watching in list(self._watchers.items()):
+            if client in self._asked and client not in self._matching:
+                self._look_for(client, watching, now)
+            for peer in [peer for peer, since_s in watching.back.items() if now - since_s >= BACK_PAUSE_S]:
+                watching.found(peer)
+                watching.due.add(peer)
             self._tell(client, now)
+
+    def _look_for(self, client: ClientName, watching: _Watcher, now: float) -> None:
+        """It is known what a client takes: see of whom it asked."""
+        taken = self._taken.get(client, ())
+        for peer in self._asked.pop(client):
+            if peer in taken or not self._here(peer):
+                watching.due.add(peer)
+            else:
+                watching.miss(peer)
+                watching.back[peer] = now
 
     def _look(self, client: ClientName, now: float) -> None:
         link = self._links.get(client)
@@ -169,14 +220,22 @@ class Presence:
     def _say(self, client: ClientName, watching: _Watcher, link: PeerLink, now: float) -> None:
         due = sorted(watching.due)
         for start in range(0, len(due), MAX_TOLD):
-            items = [self._item(client, peer, now) for peer in due[start : start + MAX_TOLD]]
+            items = [self._item(client, watching, peer, now) for peer in due[start : start + MAX_TOLD]]
             watching.seq = link.send_control({"t": "peers", "peers": items}, now=now)
         watching.due.clear()
         self._after()
 
-    def _item(self, client: ClientName, peer: ClientName, now: float) -> wire.Envelope:
+    def _here(self, client: ClientName) -> bool:
+        link = self._links.get(client)
+        return link is not None and link.established
+
+    def _item(self, client: ClientName, watching: _Watcher, peer: ClientName, now: float) -> wire.Envelope:
+        watching.found(peer)
         if peer not in self._taken.get(client, ()):
-            return {"name": peer}
+            here = self._here(peer)
+            if not here:
+                watching.miss(peer)
+            return {"name": peer, "here": here}
         if peer not in self._states:
             self._look(peer, now)
         state = self._states[peer]
@@ -194,6 +253,7 @@ class Presence:
         assert takers == {(origin, taker) for taker, origins in taken.items() for origin in origins}
         assert self._states.keys() <= self._takers.keys(), "states of clients of whom nobody takes anything"
         assert self._watchers.keys() <= self._links.keys(), "clients are told that are gone"
+        assert self._asked.keys() <= self._links.keys(), "clients ask that are gone"
 
 
 def _differs(told_s: float | None, rtt_s: float) -> bool:

@@ -349,6 +349,23 @@ def valid() -> list[Vector]:
             },
         ),
         _control(
+            "subscribe-known",
+            "an earlier part, in which a client asks of two that were gone when it heard of them last",
+            {"t": "subscribe", "patterns": [], "more": True, "known": ["jackal2", "jackal3"]},
+        ),
+        _control(
+            "peers-here",
+            "nothing of three is taken: jackal2 is given up, jackal3 is here, and of jackal4 an earlier release tells",
+            {
+                "t": "peers",
+                "peers": [
+                    {"name": "jackal2", "here": False},
+                    {"name": "jackal3", "here": True},
+                    {"name": "jackal4"},
+                ],
+            },
+        ),
+        _control(
             "denied",
             "the client may not have a topic that it named",
             {"t": "denied", "topic": "/jackal2/map", "code": "forbidden", "why": "no access rule grants it"},

@@ -18,7 +18,7 @@ class LinkStateSection(Section):
     diagnostics: bool = True
     """Also publish all of them as one `diagnostic_msgs/DiagnosticArray` on /diagnostics."""
     period_s: Annotated[float, Field(ge=0.1, le=60)] = 1.0
-    """How often they are published; a change at once."""
+    """How often they are published, those of clients that are given up once; a change at once."""
     withdraw_after_s: Seconds | None = None
     """The topics of a client that is not there end here after so long, and come back with it; null: they stay, with
     what is latched in them, until the relay gives the client up (`replay.resume_s` of the relay, 10 minutes)."""

@@ -83,6 +83,35 @@ async def test_a_robot_that_is_killed_is_gone_on_every_way_and_comes_back(tmp_pa
         )
 
 
+async def test_a_robot_that_is_given_up_is_shown_so_over_http_until_it_is_back(tmp_path: Path) -> None:
+    """Also when the site has a new session in between."""
+    async with Lab(tmp_path, "robot1", "site") as lab:
+        relay = lab.process(lab.relay_file(replay={"resume_s": 1.0}))
+        await relay.ready()
+        robot = lab.process(lab.client_file("robot1", ROBOT))
+        site = lab.process(site_file(lab))
+        for process in (robot, site):
+            await process.ready()
+
+        def row() -> tuple[str, bool] | None:
+            """Status, and whether it is given up."""
+            rows = {row["peer"]: row for row in site.json("/api/peers")}
+            return (rows["robot1"]["status"], rows["robot1"]["given_up"]) if "robot1" in rows else None
+
+        await site.until(lambda: row() == ("connected", False), "has the robot")
+        robot.kill()
+        await site.until(lambda: row() == ("gone", True), "shows that it is given up")
+        await site.said("robot1 is given up by the relay after")
+        relay.kill()
+        await site.until(lambda: row() == ("unknown", True), "has lost the relay")
+        lab.process(tmp_path / "relay.yaml")
+        await site.until(lambda: row() == ("gone", True), "has heard that it is still gone")
+        assert is_ready(site, "1 of 1 peers away: robot1 is gone for")
+        lab.process(tmp_path / "robot1.yaml")
+        await site.until(lambda: row() == ("connected", False), "has it back")
+        await site.said("robot1 is back after")
+
+
 async def test_what_the_nodes_are_told_when_robot_and_relay_go(tmp_path: Path) -> None:
     async with Lab(tmp_path, "robot1", "site") as lab:
         relay = lab.process(lab.relay_file())

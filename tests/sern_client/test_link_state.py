@@ -157,6 +157,46 @@ def test_a_topic_that_the_endpoint_refuses_is_said_once_and_costs_the_others_not
     assert len(endpoint.open["/diagnostics"].bodies) == 1
 
 
+def test_who_is_given_up_is_published_once_and_again_when_that_changes() -> None:
+    endpoint = Endpoint()
+    topics = LinkTopics("site", Encoding.CDR, endpoint.advertise, diagnostics=True)
+    gone = VIEWS[2]
+    over = gone._replace(since_s=600.0, why="given up by the relay", given_up=True)
+    topic = "/jackal2/sern/link"
+
+    def publish(view: LinkView) -> tuple[int, str, str]:
+        """Messages on its topic, what the last one says, and what /diagnostics says."""
+        topics.publish([VIEWS[0], view], STAMP_NS)
+        opened = endpoint.open[topic]
+        return len(opened.bodies), decoded(opened).message, decoded(endpoint.open["/diagnostics"]).status[1].message
+
+    for number in (1, 2):
+        assert publish(gone)[0] == number
+    given_up = "jackal2 is gone for 600 s (given up by the relay)"
+    for later_s in range(3):
+        assert publish(over._replace(since_s=600.0 + later_s)) == (3, given_up, given_up)
+    unknown = over._replace(status=UNKNOWN, since_s=1.0, why="our own link is down")
+    for _ in range(2):
+        assert publish(unknown)[:2] == (4, "jackal2 is unknown for 1 s (our own link is down)")
+    assert publish(over)[:2] == (5, given_up)
+    topics.repair([TopicName(topic)])
+    for _ in range(2):
+        assert publish(over)[:2] == (1, given_up)
+    for number in (2, 3):
+        assert publish(gone)[0] == number
+    assert publish(over)[0] == 4
+    topics.publish(VIEWS[:1], STAMP_NS)
+    assert publish(over)[0] == 1  # a new topic of that name
+    assert len(endpoint.open["/sern/link"].bodies) == 15
+    endpoint.refused = {"/jackal3/sern/link"}
+    for _ in range(2):
+        topics.publish([over._replace(peer="jackal3")], STAMP_NS)
+    assert "/jackal3/sern/link" not in endpoint.open
+    endpoint.refused.clear()
+    topics.publish([over._replace(peer="jackal3")], STAMP_NS)
+    assert len(endpoint.open["/jackal3/sern/link"].bodies) == 1
+
+
 def test_what_is_not_open_as_it_should_be_is_opened_anew() -> None:
     endpoint = Endpoint()
     topics = LinkTopics("site", Encoding.ROS1, endpoint.advertise, diagnostics=False)
@@ -289,13 +329,35 @@ async def test_who_is_given_up_is_said_and_stays_away(caplog: pytest.LogCaptureF
     assert line.levelname == "WARNING"
     assert line.message.startswith("jackal1 is given up by the relay after 600 s")
     assert site.state.detail() == "1 of 1 peers away: jackal1 is gone for 600 s (given up by the relay)"
-    assert [(row["peer"], row["status"]) for row in site.state.to_json()] == [("jackal1", "gone")]
+    rows = [(row["peer"], row["status"], row["given_up"]) for row in site.state.to_json()]
+    assert rows == [("jackal1", "gone", True)]
     await until(lambda: "/jackal1/sern/link" in site.endpoint.open, "its state stays published")
     opened = site.endpoint.open["/jackal1/sern/link"]
     assert decoded(opened).level == 2 and "given up by the relay" in decoded(opened).message
     site.told("jackal1", up=True)
     await until(lambda: decoded(opened).level == 0, "it is back")
     assert [record.message for record in caplog.records][-1].startswith("jackal1 is back after")
+    assert [row["given_up"] for row in site.state.to_json()] == [False]
+    site.state.close()
+
+
+@pytest.mark.parametrize("given_up", [False, True])
+async def test_who_is_forgotten_is_said_once_if_it_was_gone(caplog: pytest.LogCaptureFixture, given_up: bool) -> None:
+    site = Site()
+    site.state.start()
+    for name in ("jackal1", "jackal2"):
+        site.told(name, up=True)
+    await until(lambda: "/jackal1/sern/link" in site.endpoint.open, "its state is published")
+    site.told("jackal1", up=False)
+    if given_up:
+        site.core.peers.told({"t": "peers", "peers": [{"name": "jackal1", "here": False}]}, now=clock.now())
+    site.core.peers.subscribed((), now=clock.now())
+    for name in ("jackal1", "jackal2"):
+        site.core.peers.told({"t": "peers", "peers": [{"name": name, "here": name == "jackal2"}]}, now=clock.now())
+    assert site.state.to_json() == [] and site.state.detail() == ""
+    (line,) = [record for record in caplog.records if "forgotten" in record.message]
+    assert line.levelname == "WARNING" and line.message.startswith("jackal1 is forgotten after ")
+    await until(lambda: list(site.endpoint.open) == ["/sern/link"], "its topic ends, long before the next period")
     site.state.close()
 
 

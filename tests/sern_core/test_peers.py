@@ -1,6 +1,7 @@
 """A client knows whether those are there whose streams it takes, however loaded its link is."""
 
 from collections import Counter
+from collections.abc import Callable
 
 import pytest
 
@@ -9,10 +10,11 @@ from sern_core.access import AccessRule, AccessTable
 from sern_core.errors import WireError
 from sern_core.flight import STALL_MIN_S, STALL_RTTS
 from sern_core.hub import HubParams
-from sern_core.lanes import PING_INTERVAL_S
+from sern_core.lanes import PING_INTERVAL_S, Lane
 from sern_core.message import TopicInfo
-from sern_core.peers import LET_GO_S, MAX_GIVEN_UP, MAX_PEERS, PeerChange, Peers, PeerStatus, PeerView
-from sern_core.presence import MAX_TOLD
+from sern_core.params import LinkParams
+from sern_core.peers import LET_GO_S, MAX_ENDED, MAX_GIVEN_UP, MAX_PEERS, PeerChange, Peers, PeerStatus, PeerView
+from sern_core.presence import BACK_PAUSE_S, MAX_ASKED, MAX_TOLD, Presence
 from sern_core.types import ClientName, Encoding, PriorityClass, TopicName
 from sern_sim.models import LinkModel, Window
 from tests.world import SimClient, World, spec
@@ -203,6 +205,8 @@ def test_a_robot_that_the_relay_gives_up_stays_gone_until_it_is_back() -> None:
     assert len(changes) == 6 and peers(site)["robot"].given_up  # said once
     world.until(lambda: statuses(site) == {"robot": CONNECTED}, within_s=100.0)
     assert not peers(site)["robot"].given_up
+    world.run(20.0)
+    assert len(changes) == 7 and changes[-1].new is CONNECTED  # it was never forgotten in between
 
 
 def test_a_robot_that_is_given_up_while_our_own_link_is_down_stays_gone() -> None:
@@ -215,8 +219,74 @@ def test_a_robot_that_is_given_up_while_our_own_link_is_down_stays_gone() -> Non
     world.hops["site"].break_connection(reconnect_s=50.0)
     world.until(lambda: statuses(site) == {"robot": UNKNOWN})
     world.until(lambda: site.closed, within_s=1000.0, what="its streams end here")
-    world.until(lambda: statuses(site) == {"robot": GONE}, within_s=2 * LET_GO_S)
+    world.until(lambda: statuses(site) == {"robot": GONE}, within_s=2.0)
     assert peers(site)["robot"].given_up
+    world.run(2 * LET_GO_S)
+    assert statuses(site) == {"robot": GONE}
+
+
+def test_a_robot_that_was_back_while_our_own_link_was_down_is_not_gone_though_nothing_of_it_is_left() -> None:
+    world = World().watch()
+    robot = world.client("robot", LinkModel(blackouts=(Window(5.0, 20.0),), disconnect_after_s=0.2).as_stream())
+    site = world.client("site", patterns=["/robot/.*"])
+    channel = robot.publish("/robot/odom", spec())
+    world.run(4.9)
+    world.until(lambda: statuses(site) == {"robot": GONE})
+    changes: list[PeerChange] = []
+    site.core.peers.on_change = changes.append
+    world.hops["site"].break_connection(reconnect_s=60.0)
+    world.until(lambda: robot.core.link.established, within_s=60.0)
+    robot.core.unpublish(channel, now=robot.now)
+    world.run(1.0)
+    assert statuses(site) == {"robot": UNKNOWN}
+    world.until(lambda: statuses(site) == {}, within_s=90.0)
+    assert [(change.new, change.given_up, change.forgotten) for change in changes] == [
+        (UNKNOWN, False, False),
+        (CONNECTED, False, False),
+        (CONNECTED, False, True),
+    ]
+    world.run(2 * LET_GO_S)
+    assert statuses(site) == {} and len(changes) == 3
+
+
+def test_a_robot_that_was_given_up_and_comes_back_with_nothing_for_us_is_gone_no_longer() -> None:
+    world = World(hub_params=HubParams(resume_s=20.0)).watch()
+    robot = world.client("robot", LinkModel(blackouts=(Window(5.0, 100.0),), disconnect_after_s=0.2).as_stream())
+    site = world.client("site", patterns=["/robot/.*"])
+    channel = robot.publish("/robot/odom", spec())
+    world.run(4.9)
+    world.until(lambda: statuses(site) == {"robot": GONE})
+    world.until(lambda: peers(site)["robot"].given_up, within_s=60.0)
+    robot.core.unpublish(channel, now=robot.now)
+    changes: list[PeerChange] = []
+    site.core.peers.on_change = changes.append
+    world.until(lambda: statuses(site) == {}, within_s=100.0)
+    assert robot.core.link.established
+    assert [(change.new, change.forgotten) for change in changes] == [(CONNECTED, False), (CONNECTED, True)]
+
+
+@pytest.mark.parametrize("given_up", [False, True])
+@pytest.mark.parametrize("patterns", [(), ("/other/.*",), ("/other/.*", "/robot/map")])
+def test_a_site_that_stops_taking_a_lost_robots_topics_forgets_it(patterns: tuple[str, ...], given_up: bool) -> None:
+    world = World(hub_params=HubParams(resume_s=20.0)).watch()
+    robot = world.client("robot", LinkModel(blackouts=(Window(5.0, 1e6),), disconnect_after_s=0.2).as_stream())
+    site = world.client("site", patterns=["/robot/.*"])
+    robot.publish("/robot/odom", spec())
+    world.run(4.9)
+    world.until(lambda: statuses(site) == {"robot": GONE})
+    if given_up:
+        world.until(lambda: peers(site)["robot"].given_up, within_s=60.0)
+        site.subscribe("/other/.*", "/robot/odom")
+        world.run(2.0)
+        assert peers(site)["robot"].given_up  # still what it wants
+    changes: list[PeerChange] = []
+    site.core.peers.on_change = changes.append
+    site.subscribe(*patterns)
+    world.until(lambda: statuses(site) == {}, within_s=3.0)
+    assert [(change.given_up, change.forgotten) for change in changes] == [(False, True)]
+    world.run(60.0)
+    assert statuses(site) == {} and len(changes) == 1
+    assert site.core.peers._ended == {}
 
 
 def test_a_robot_that_ends_its_streams_while_it_is_there_is_let_go() -> None:
@@ -266,7 +336,8 @@ def test_a_relay_that_begins_anew_tells_of_who_is_there() -> None:
 
 @pytest.mark.parametrize("said_gone", [True, False])
 def test_a_robot_that_a_new_relay_never_hears_of_is_gone_if_it_was_once_its_streams_end(said_gone: bool) -> None:
-    """Of one that was there before, nobody can say that it is gone: it may have nothing for us any more."""
+    """Of one that was there before, nobody can say that it is gone: it may have nothing for us any more. Of one
+    that was gone, the site asks the new relay."""
     world = World().watch()
     robot = world.client("robot", LinkModel(blackouts=(Window(5.0, 1e6),), disconnect_after_s=0.2).as_stream())
     site = world.client("site", patterns=["/robot/.*"])
@@ -279,7 +350,7 @@ def test_a_robot_that_a_new_relay_never_hears_of_is_gone_if_it_was_once_its_stre
         world.run(0.11)
     world.restart_relay()
     world.run(2 * LET_GO_S)
-    assert statuses(site) == {"robot": UNKNOWN}
+    assert statuses(site) == {"robot": GONE if said_gone else UNKNOWN}
     world.until(lambda: site.closed, within_s=1000.0, what="the site's retention is over")
     assert statuses(site) == ({"robot": GONE} if said_gone else {})
 
@@ -377,6 +448,7 @@ def test_many_peers_are_told_in_few_messages() -> None:
         {"name": "a", "up": True, "for": -1.0},
         {"name": "a", "up": True, "for": 1.0, "rtt": "x"},
         {"name": "a", "up": True, "for": 1.0, "lane": "x" * 17},
+        {"name": "a", "here": 1},
     ],
 )
 def test_what_no_relay_says_is_refused(item: wire.Envelope) -> None:
@@ -430,3 +502,165 @@ def test_of_many_that_were_given_up_the_last_are_shown() -> None:
     for number in range(MAX_GIVEN_UP + 3):
         known.told({"t": "peers", "peers": [{"name": f"c{number}"}]}, now=0.0)
     assert {view.name for view in known.look(now=1.0)} == {f"c{number}" for number in range(3, MAX_GIVEN_UP + 3)}
+
+
+@pytest.mark.parametrize("says", [{}, {"here": False}])
+def test_who_was_not_here_is_given_up_and_forgotten_in_a_session_that_says_nothing_of_it(says: wire.Envelope) -> None:
+    """Also by a relay of an earlier version, which does not say whether a client is here."""
+    known = Peers()
+    known.session_began(now=0.0)
+    known.told({"t": "peers", "peers": [{"name": "a", "up": False, "for": 0.0}]}, now=0.0)
+    known.told({"t": "peers", "peers": [{"name": "a"} | says]}, now=0.0)
+    known.session_ended(now=10.0)
+    assert [view.status for view in known.look(now=10.0)] == [UNKNOWN]
+    known.session_began(now=20.0)
+    assert known.lost() == ["a"]
+    (view,) = known.look(now=20.0 + LET_GO_S)
+    assert (view.status, view.given_up) == (UNKNOWN, True)
+    changes: list[PeerChange] = []
+    known.on_change = changes.append
+    assert known.look(now=21.0 + LET_GO_S) == [] and known.lost() == []
+    assert [(change.name, change.forgotten) for change in changes] == [("a", True)]
+
+
+def test_who_is_gone_and_still_has_streams_here_when_it_is_back_without_them_is_forgotten_with_the_last() -> None:
+    known = Peers()
+    known.session_began(now=0.0)
+    known.opened(ClientName("a"), now=0.0)
+    known.told({"t": "peers", "peers": [{"name": "a", "up": False, "for": 0.0}]}, now=0.0)
+    known.told({"t": "peers", "peers": [{"name": "a", "here": True}]}, now=1.0)
+    known.reached(True, now=1.0)
+    assert [(view.name, view.status) for view in known.look(now=2.0 + LET_GO_S)] == [("a", UNKNOWN)]
+    known.closed(ClientName("a"), TopicName("/a/odom"), now=2.0)
+    assert known.look(now=2.0 + LET_GO_S) == []
+
+
+def test_topics_that_ended_are_remembered_up_to_a_limit_and_while_their_origin_is_gone() -> None:
+    known = Peers()
+    known.session_began(now=0.0)
+    name = ClientName("a")
+    known.told({"t": "peers", "peers": [{"name": name, "up": False, "for": 0.0}]}, now=0.0)
+    for number in range(MAX_ENDED + 3):
+        known.opened(name, now=0.0)
+        known.closed(name, TopicName(f"/a/t{number}"), now=0.0)
+    assert list(known._ended[name]) == [f"/a/t{number}" for number in range(3, MAX_ENDED + 3)]
+    known.subscribed(("/(a*",), now=0.0)
+    known.told({"t": "peers", "peers": [{"name": name, "here": False}]}, now=0.0)
+    assert known.look(now=0.0)[0].given_up  # the relay takes no such patterns
+    known.told({"t": "peers", "peers": [{"name": name, "up": True, "for": 0.0}]}, now=0.0)
+    assert known._ended == {}
+
+
+# --- what a client may ask --------------------------------------------------------------------------------------------
+
+
+class Told:
+    """A client's link, as far as `Presence` looks at it."""
+
+    established = True
+    control_heard = 1_000_000
+    lane = Lane(0, LinkParams(), lossless=True)
+
+    def __init__(self) -> None:
+        self.items: list[wire.Envelope] = []
+
+    def send_control(self, envelope: wire.Envelope, attachment: bytes = b"", *, now: float) -> int:
+        self.items += envelope["peers"]
+        return 0
+
+
+def asking(matching: set[ClientName], *others: str) -> tuple[Presence, Told, dict[ClientName, Told]]:
+    def attempt(_client: ClientName, _now: float, call: Callable[[], object]) -> None:
+        call()
+
+    site = Told()
+    links = {ClientName(name): Told() for name in others} | {ClientName("site"): site}
+    presence = Presence(links, set(), matching, attempt, lambda: None)
+    presence.watch(ClientName("site"), now=0.0)
+    return presence, site, links
+
+
+def test_a_client_is_told_who_is_here_once_it_is_known_what_it_takes() -> None:
+    """Before, a robot would be taken for one that is given up, and not for one that is waited for."""
+    matching = {ClientName("site")}
+    presence, site, links = asking(matching, "there")
+    presence.ask(ClientName("site"), map(ClientName, ("taken", "there", "away")))
+    presence.sweep(now=1.0)
+    assert site.items == []
+    presence.joined(ClientName("taken"), ClientName("site"))
+    matching.clear()
+    presence.sweep(now=2.0)
+    assert site.items == [
+        {"name": "away", "here": False},
+        {"name": "taken", "up": False, "for": 0.0},
+    ]
+    presence.sweep(now=2.0 + BACK_PAUSE_S - 0.1)
+    assert len(site.items) == 2
+    presence.sweep(now=2.0 + BACK_PAUSE_S)
+    assert site.items[2:] == [{"name": "there", "here": True}]
+    links[ClientName("away")] = Told()
+    presence.changed(ClientName("away"), now=10.0)
+    links[ClientName("away")].established = False
+    presence.changed(ClientName("away"), now=11.0)
+    presence.sweep(now=20.0)
+    assert len(site.items) == 3
+    links[ClientName("away")].established = True
+    presence.changed(ClientName("away"), now=20.0)
+    presence.sweep(now=20.0 + BACK_PAUSE_S)
+    assert site.items[3:] == [{"name": "away", "here": True}]
+    presence.changed(ClientName("away"), now=30.0)
+    presence.sweep(now=30.0 + BACK_PAUSE_S)
+    assert len(site.items) == 4
+
+
+@pytest.mark.parametrize("asked", [True, False])
+def test_who_is_back_has_some_time_to_say_what_it_has(asked: bool) -> None:
+    presence, site, links = asking(set())
+    peer = ClientName("away")
+    presence.ask(ClientName("site"), [peer])
+    if asked:
+        links[peer] = Told()
+        presence.sweep(now=1.0)
+        assert site.items == []
+    else:
+        presence.sweep(now=1.0)
+        links[peer] = Told()
+        presence.changed(peer, now=1.0)
+        assert site.items == [{"name": "away", "here": False}]
+    presence.joined(peer, ClientName("site"))
+    for second in range(2, 20):
+        presence.sweep(now=float(second))
+    assert [item.get("up") for item in site.items] == ([True] if asked else [None, True])
+
+
+def test_there_is_an_end_to_those_of_whom_a_client_may_ask() -> None:
+    presence, site, _links = asking(set())
+    for _ in range(2):
+        presence.ask(ClientName("site"), [ClientName(f"c{number}") for number in range(MAX_ASKED + 7)])
+    presence.sweep(now=1.0)
+    assert len(site.items) == MAX_ASKED
+    presence.ask(ClientName("site"), [ClientName("new")])
+    presence.sweep(now=2.0)
+    assert len(site.items) == MAX_ASKED + 1 and len(presence._watchers[ClientName("site")].missing) == MAX_ASKED
+
+
+def test_a_client_asks_of_the_last_of_many() -> None:
+    known = Peers()
+    known.session_began(now=0.0)
+    for number in range(MAX_ASKED + 5):
+        known.told({"t": "peers", "peers": [{"name": f"c{number}", "up": False, "for": 0.0}]}, now=0.0)
+    known.told({"t": "peers", "peers": [{"name": "c0", "here": False}]}, now=0.0)
+    assert known.lost() == [*(f"c{number}" for number in range(6, MAX_ASKED + 5)), "c0"]
+
+
+def test_many_lost_robots_are_asked_of_in_parts() -> None:
+    world = World().watch()
+    site = world.client("site", patterns=["/.*"])
+    world.run(1.0)
+    names = [f"r{number:03d}" + "x" * 60 for number in range(MAX_ASKED)]
+    for name in names:
+        site.core.peers.told({"t": "peers", "peers": [{"name": name, "up": False, "for": 0.0}]}, now=site.now)
+    world.hops["site"].break_connection(reconnect_s=1.0)
+    world.until(lambda: statuses(site)[names[0]] is UNKNOWN)
+    world.until(lambda: sum(view.given_up for view in peers(site).values()) == MAX_GIVEN_UP, within_s=10.0)
+    world.validate()
