@@ -223,8 +223,8 @@ class Hub(LocalStreams):
         return list(self.port_of.values())
 
     def sweep(self, *, now: float) -> None:
-        """Let go of clients that stay away, and of ended streams that are fully delivered. Call about once a second, and
-        then `lapse`."""
+        """Let go of clients that stay away, and of ended streams that are fully delivered. Call about once a second,
+        and then `lapse`."""
         self.lapse(now=now)
         for client, since_s in list(self._absent_since.items()):
             if not self.links[client].established and now - since_s > self.params.resume_s:

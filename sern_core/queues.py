@@ -639,8 +639,11 @@ class OutChannel:
         if len(fresh) == 1:
             insort(self.active, fresh[0], key=_SEQ)
         elif fresh:
+            fresh.sort(key=_SEQ)
+            behind = not self.active or self.active[-1].seq < fresh[0].seq
             self.active += fresh
-            self.active.sort(key=_SEQ)  # two runs in order, most often, which is merged in one go
+            if not behind:
+                self.active.sort(key=_SEQ)  # two runs in order, which are merged in one go
 
     def _deactivate(self, out: OutMessage) -> None:
         """It has no more bytes to send, or is given up."""
