@@ -363,6 +363,11 @@ class Hop(Sender):
             self._sweep(now)
         self.dirty = True
 
+    @property
+    def sweep_due_s(self) -> float:
+        """When what has lapsed is looked for next; the time of the last look if there is more."""
+        return self._sweep_due_s
+
     def _sweep(self, now: float) -> None:
         """Expire what nobody will send, also while the link is down."""
         self._sweep_due_s = now + SWEEP_INTERVAL_S

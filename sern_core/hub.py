@@ -223,13 +223,11 @@ class Hub(LocalStreams):
         return list(self.port_of.values())
 
     def sweep(self, *, now: float) -> None:
-        """Let go of clients that stay away, and of ended streams that are fully delivered. Call about once a second."""
+        """Let go of clients that stay away, and of ended streams that are fully delivered. Call about once a second,
+        and then `lapse`."""
+        self.lapse(now=now)
         for client, since_s in list(self._absent_since.items()):
-            link = self.links[client]
-            if link.established:
-                continue
-            link.handle_timeout(now=now)  # retention goes on while a client is away
-            if now - since_s > self.params.resume_s:
+            if not self.links[client].established and now - since_s > self.params.resume_s:
                 self._for(client, now, partial(self._forget, client, now))
         for client, link in list(self.links.items()):
             if client not in self.port_of and link.established:  # only its datagram lane is left
@@ -256,6 +254,17 @@ class Hub(LocalStreams):
                 link.reassembly.work_us = 0
                 self._fanout.go_on(link, now=now)
         self.presence.sweep(now=now)
+
+    def lapse(self, *, now: float) -> bool:
+        """Retention goes on while clients are away. True: there is more to let go of; call again in another turn."""
+        for client in list(self._absent_since):
+            link = self.links[client]
+            if link.established:
+                continue
+            link.handle_timeout(now=now)
+            if link.sweep_due_s == now:  # it was swept now and is due again: it had no room for all
+                return True  # the others when this one has no more
+        return False
 
     def left(self, client: ClientName, *, now: float) -> None:
         """A client has said goodbye. One that has streams, or wants reliable ones, may come back to them (a daemon that

@@ -45,7 +45,10 @@ SHARE_HOLD_S: Final = 1.0
 """The longest that the newest message is held back by a `share`."""
 
 LAPSED_A_SWEEP: Final = 1_000
-"""Messages of a link that become tombstones in one sweep, or runs that are given up in it: some milliseconds."""
+"""Messages of a link that are given up in one sweep: some milliseconds."""
+
+SEEN_PER_LAPSED: Final = 8
+"""So many that a sweep looks at, and that stay as they are, count like one that it gives up."""
 
 OnDrop = Callable[["OutChannel", Sequence[OutMessage], DropReason], None]
 """`on_drop(channel, outs, reason)`: these messages, in their order, are counted as dropped now. Of a reliable stream
@@ -66,6 +69,9 @@ class OutChannel:
         "_buried_to",
         "_cap",
         "_owed_share",
+        "_replays_buried_to",
+        "_replays_to",
+        "_settled_to",
         "acked_seq",
         "active",
         "begun_seq",
@@ -120,7 +126,10 @@ class OutChannel:
         self.begun_seq = 0
         self.next_seq = first  # the next seq expected from `submit`
         self.live_from = 0  # what is kept below it are replays, and between them lies what the peer is not owed
-        self._buried_to = 0  # every message that is kept up to this seq is a tombstone
+        self._buried_to = 0  # every message that is kept up to this seq, and is no replay, is a tombstone
+        self._replays_buried_to = 0  # the same of replays
+        self._replays_to = 0  # the newest that was a replay
+        self._settled_to = 0  # every message that is kept up to this seq is a tombstone, or the peer has it whole
         self.last_sent_s: float | None = None
         self.share = 1.0
         """Share of the messages that are let in (`adapt`)."""
@@ -231,7 +240,8 @@ class OutChannel:
             self.retained_bytes += sum(out.size for out in fresh)
             self.watermark = fresh[0].seq - 1
             self.live_from = max(self.live_from, limit)  # also replays of an earlier time may have others between them
-            self._buried_to = 0
+            self._replays_to = max(self._replays_to, fresh[-1].seq)
+            self._replays_buried_to = self._settled_to = 0
             after = [*(out.seq for out in fresh[1:]), limit]
             gaps = [(out.seq, seq) for out, seq in zip(fresh, after, strict=True) if seq > out.seq + 1]
             if gaps:
@@ -422,17 +432,18 @@ class OutChannel:
         self._drop(out, reason)
 
     def _entomb(self, out: OutMessage, reason: DropReason) -> None:
-        """A tombstone takes the place of a reliable message; it is reported unless that was done before."""
+        """A tombstone takes the place of a reliable message; it is reported unless that was done before. The tombstone
+        has the reason itself: it is read by those alone who did not get the message."""
         size = out.size
         if not out.started:
             self.queued_bytes -= size - 1
         self.retained_bytes -= size - 1
-        reported = out.counted
+        reported, told = out.counted, DropReason.UNCONFIRMED if out.exposed else reason
         if not reported:
-            self._count(out.seq, reason, out.offered_bytes)
+            self._count(out.seq, told, out.offered_bytes)
         out.entomb(reason)
         if not reported:
-            self.on_drop(self, (out,), reason)
+            self.on_drop(self, (out,), told)
 
     def drop_head(self, reason: DropReason, now: float) -> None:
         """Give up the message that would go next (best effort); a reliable one becomes a tombstone."""
@@ -628,8 +639,11 @@ class OutChannel:
         if len(fresh) == 1:
             insort(self.active, fresh[0], key=_SEQ)
         elif fresh:
+            fresh.sort(key=_SEQ)
+            behind = not self.active or self.active[-1].seq < fresh[0].seq
             self.active += fresh
-            self.active.sort(key=_SEQ)  # two runs in order, most often, which is merged in one go
+            if not behind:
+                self.active.sort(key=_SEQ)  # two runs in order, which are merged in one go
 
     def _deactivate(self, out: OutMessage) -> None:
         """It has no more bytes to send, or is given up."""
@@ -770,8 +784,9 @@ class OutChannel:
     def sweep(self, now: float, *, up: bool, room: int = LAPSED_A_SWEEP) -> int:
         """Expire what nobody will send: lifespan and retention, also while the link is down.
 
-        Of a reliable stream at most `room` messages are given up one by one; returns how many were. As many as there
-        was room for: sweep again soon, there may be more. Nothing of that is sent meanwhile (`head`).
+        Of a reliable stream at most `room` messages are given up; `SEEN_PER_LAPSED` that are looked at and stay count
+        like one. Returns how many that makes. As many as there was room for: sweep again soon, there may be more.
+        Nothing of that is sent meanwhile (`head`).
         """
         if not self.reliable:
             if self.newest is not None and self._expired(self.newest, now):
@@ -782,9 +797,11 @@ class OutChannel:
                     self._give_up_begun(self.active[0], DropReason.LIFESPAN)
             return 0
         spent = 0
-        if not up:
+        if not up and self.retained:
             spent = self._leave_behind(now, room)
-        return spent + self._bury(now, room - spent)
+        if self.retained and spent < room:
+            spent += self._bury(now, room - spent)
+        return spent
 
     def _lapsed(self, out: OutMessage, now: float) -> DropReason | None:
         """Why a reliable message that is no tombstone is to be given up now; None if it is not."""
@@ -795,45 +812,70 @@ class OutChannel:
             return DropReason.LIFESPAN
         return None
 
-    @property
-    def _patience_s(self) -> float:
-        """No message that is younger has lapsed. They are in the order of their birth."""
-        lifespan_s, retention_s = self.spec.lifespan_s, self.spec.retention_s
-        return retention_s if lifespan_s is None else min(retention_s, lifespan_s)
-
     def _bury(self, now: float, room: int) -> int:
-        """Put tombstones in the places of reliable messages that have lapsed, of at most `room`; returns how many."""
-        patience_s = self._patience_s
-        retained = self.retained
+        """Put tombstones in the places of reliable messages that have lapsed. What stays was looked at once: those that
+        the peer has whole have their retention left, which ends in their order, and are sent again only to another
+        process there (`peer_restarted`)."""
+        spent = 0
+        if self._replays_to > self.watermark:  # they are kept from later on than what is behind them
+            spent, self._replays_buried_to = self._bury_behind(self._replays_buried_to, now, room, None)
+        if spent < room:
+            behind = max(self._buried_to, self._replays_to)
+            more, self._buried_to = self._bury_behind(behind, now, room - spent, None)
+            spent += more
+        if spent < room and self.spec.lifespan_s is not None:
+            more, self._settled_to = self._bury_behind(self._settled_to, now, room - spent, self.spec.lifespan_s)
+            spent += more
+        return spent
+
+    def _bury_behind(self, seq: int, now: float, room: int, lifespan_s: float | None) -> tuple[int, int]:
+        """The same behind `seq`, up to the first whose retention or lifespan is not over. Returns what of `room` it
+        took, and the seq that it came to."""
+        retained, retention_s = self.retained, self.spec.retention_s
+        start = 0 if seq <= self.watermark else bisect_right(retained, seq, key=_SEQ)
+        if start == len(retained) or self._young(retained[start], now, lifespan_s):
+            return 0, seq  # most often, and it takes no walk to the start
         runs: list[tuple[DropReason | None, list[OutMessage]]] = []
         known: DropReason | None = None
-        count = 0
-        all_buried = True
-        start = bisect_right(retained, self._buried_to, key=_SEQ) if self._buried_to else 0
-        for out in islice(retained, start, None) if start else retained:
-            if out.message.tombstone:
-                if all_buried:
-                    self._buried_to = out.seq
-                continue
-            if now - out.message.born_s + out.message.error_s <= patience_s or count >= room:
+        count = seen = 0
+        for out in islice(retained, start, None):
+            if count + seen // SEEN_PER_LAPSED >= room or self._young(out, now, lifespan_s):
                 break
-            reason = self._lapsed(out, now)
-            if reason is None:
-                all_buried = False
+            if out.message.tombstone:
+                seen += 1
             else:
-                if reason is not known:
-                    runs.append((reason, []))
-                runs[-1][1].append(out)
-                count += 1
-            known = reason  # a span has none in it that goes on
+                reason: DropReason | None = None
+                if now - out.retain_from_s > retention_s:
+                    reason = DropReason.RETENTION
+                elif out.ranges or out.ranges is None or out.fragments_inflight > 0:
+                    reason = DropReason.LIFESPAN
+                if reason is None:
+                    seen += 1
+                else:
+                    if reason is not known:
+                        runs.append((reason, []))
+                    runs[-1][1].append(out)
+                    count += 1
+                known = reason  # a span has none in it that goes on
+            seq = out.seq
         for why, run in runs:
             assert why is not None
             self._entomb_all(run, why)
-        return count
+        return count + seen // SEEN_PER_LAPSED, seq
+
+    def _young(self, out: OutMessage, now: float, lifespan_s: float | None) -> bool:
+        """Whether a reliable message is no tombstone, and its lifespan, or without one its retention, goes on. They are
+        in the order of their birth, and but for replays in that of their retention."""
+        message = out.message
+        if message.tombstone:
+            return False
+        if lifespan_s is None:
+            return now - out.retain_from_s <= self.spec.retention_s
+        return now - message.born_s + message.error_s <= lifespan_s
 
     def _entomb_all(self, outs: list[OutMessage], reason: DropReason) -> None:
         """Tombstones take the places of reliable messages. Those that were not counted are told of together."""
-        lost = [out for out in outs if not out.counted]
+        told = [(run, run[0].exposed) for run in self._runs([out for out in outs if not out.counted])]
         for out in outs:
             freed_bytes = out.size - 1
             self.retained_bytes -= freed_bytes
@@ -841,39 +883,38 @@ class OutChannel:
                 self.queued_bytes -= freed_bytes
             out.entomb(reason)
         self._activate_all([out for out in outs if out.started])
-        for span in self._spans(lost):
-            self._dropped(span, reason)
+        for run, exposed in told:
+            self._dropped(run, DropReason.UNCONFIRMED if exposed else reason)
 
     def _leave_behind(self, now: float, room: int) -> int:
         """Without a session the oldest that have lapsed leave nothing behind: there is nobody to tell, and the
-        announcement of the next session starts behind them. In at most `room` runs; returns in how many."""
-        patience_s = self._patience_s
+        announcement of the next session starts behind them. Returns what of `room` it took."""
         runs: list[tuple[DropReason, list[OutMessage]]] = []
         known: DropReason | None = None
-        last_seq = 0
+        count = seen = last_seq = 0
         for out in self.retained:
-            if not out.message.tombstone:
-                if now - out.message.born_s + out.message.error_s <= patience_s:
-                    break
+            if count + seen // SEEN_PER_LAPSED >= room:
+                break
+            if out.message.tombstone:
+                seen += 1
+            else:
                 reason = self._lapsed(out, now)
                 if reason is None:
                     break
+                count += 1
                 if not out.counted:
                     if reason is not known:
-                        if len(runs) >= room:
-                            break
-                        run: list[OutMessage] = []
-                        runs.append((reason, run))
+                        runs.append((reason, []))
                         known = reason
-                    run.append(out)
+                    runs[-1][1].append(out)
             last_seq = out.seq
         if last_seq:
             self.watermark = last_seq
             self._take_out()
-        for why, run in runs:
-            for span in self._spans(run):
-                self._dropped(span, why)
-        return len(runs)
+        for why, lost in runs:
+            for run in self._runs(lost):
+                self._dropped(run, DropReason.UNCONFIRMED if run[0].exposed else why)
+        return count + seen // SEEN_PER_LAPSED
 
     @property
     def first_seq(self) -> int:
@@ -909,7 +950,7 @@ class OutChannel:
         self.queued_bytes = sum(out.size for out in again)
         self.flying.clear()
         self._deactivate_all()
-        self.acked_seq = self.begun_seq = 0
+        self.acked_seq = self.begun_seq = self._settled_to = 0
 
     def clear(self, reason: DropReason) -> int:
         """The stream ends: whatever is left is dropped for `reason`. Returns what that costs, in microseconds."""

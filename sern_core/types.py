@@ -64,13 +64,13 @@ class ObjectKind(StrEnum):
 class DropReason(StrEnum):
     """Why a message did not go on. Closed: it is a metric label, a log field and a wire value (`DROP_CODES`)."""
 
-    LIFESPAN = "lifespan"  # older than the topic's lifespan
+    LIFESPAN = "lifespan"  # older than the topic's lifespan, and not sent whole
     SUPERSEDED = "superseded"  # a newer sample of a keep-last topic took its place
     RATE_CAP = "rate_cap"  # the topic's max_rate_hz
     UNWANTED = "unwanted"  # nobody subscribes
     REFUSED = "refused"  # a reliable queue is full; the sender was told
     FORBIDDEN = "forbidden"  # access rules
-    RETENTION = "retention"  # a reliable message was not delivered within its retention
+    RETENTION = "retention"  # a reliable message was not delivered within its retention, nor sent whole
     STALE = "stale"  # ordering `paper`: stale in the lowest class (Alg. prioritize, line 9)
     LOST = (
         "lost"  # a receiver has fragments of a best-effort message whose others did not come; its sender counts it too

@@ -283,6 +283,10 @@ class RelayDaemon:
             self._end_lapsed()
             now = clock.now()
             self.hub.sweep(now=now)
+            more = True
+            while more:  # the others have their turns in between
+                await asyncio.sleep(0)
+                more = self.hub.lapse(now=clock.now())
             if self.server is not None:
                 self.server.look()
             self.datagrams.tick()

@@ -136,7 +136,12 @@ class ReplayWorld:
         ):
             port = self._hub_node.port(node.core.name)
             self.network.join(node.core.link, node, port, self._hub_node, up, down, name=str(node.core.name))
-        self.network.every(1.0, lambda now: self.hub.sweep(now=now))
+        self.network.every(1.0, self._sweep)
+
+    def _sweep(self, now: float) -> None:
+        self.hub.sweep(now=now)
+        while self.hub.lapse(now=now):
+            pass
 
     @property
     def arrivals(self) -> dict[TopicName, list[Arrival]]:

@@ -227,7 +227,7 @@ class Run:
         lies = dropped & delivered
         reasons = {drop.reason for drop in self.robot.dropped_out if drop.topic == name and drop.seq in lies}
         # Its sender gave up while the confirmation was under way; of nothing else may a delivery be unknown.
-        assert reasons <= {DropReason.LIFESPAN, DropReason.RETENTION}, f"{name}: {reasons} reported, but delivered"
+        assert reasons <= {DropReason.UNCONFIRMED}, f"{name}: {reasons} reported, but delivered"
 
     def _check_latched(self, channel: OutChannel, topic: Topic) -> None:
         """Whoever is there has the newest messages, `depth` of them where none may be lost or overtaken."""

@@ -439,7 +439,13 @@ class World:
         self.relay = SimHub(self, boot=self._boot())
         self.clients: dict[str, SimClient] = {}
         self.hops: dict[str, Hop] = {}
-        self.network.every(1.0, lambda _now: self.relay.hub.sweep(now=self.relay.now))
+        self.network.every(1.0, self._sweep)
+
+    def _sweep(self, _now: float) -> None:
+        hub, now = self.relay.hub, self.relay.now
+        hub.sweep(now=now)
+        while hub.lapse(now=now):
+            pass
 
     def fault(self, error: Exception) -> None:
         """What a core tells its shell of errors that nobody expects: a test that expects one says so."""

@@ -180,11 +180,16 @@ def backlog_that_lapses_while_its_reader_is_away() -> Input:
     reader.port.disconnected(now=reader.now)
     reader.hub.params = replace(reader.hub.params, resume_s=1e9)
 
-    def take() -> None:
-        reader.hub.sweep(now=reader.now + channel.spec.retention_s + 1)
-        assert not channel.kept and channel.counters.by_reason[DropReason.RETENTION] == AT_BOUND
+    now = reader.now + channel.spec.retention_s + 1
 
-    return Input(0, take)
+    def rest() -> bool:
+        more = reader.hub.lapse(now=now)
+        if not more:
+            reasons = channel.counters.by_reason
+            assert not channel.kept and reasons[DropReason.RETENTION] + reasons[DropReason.UNCONFIRMED] == AT_BOUND
+        return more
+
+    return Input(0, lambda: reader.hub.sweep(now=now), rest=rest)
 
 
 def client_that_is_forgotten() -> Input:

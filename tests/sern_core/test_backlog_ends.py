@@ -132,6 +132,33 @@ def test_what_lapses_in_many_sweeps_is_reported_once_and_never_sent(monkeypatch:
     assert log.counters.offered == log.counters.delivered + log.counters.dropped == 500
 
 
+def test_what_lapses_for_clients_that_are_away_goes_in_many_turns(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also of several clients: one turn is not for all that wait for all of them."""
+    monkeypatch.setattr(hop, "LAPSED_A_SWEEP", 3)
+    world = World(hub_params=HubParams(resume_s=1e6))
+    robot = world.client("robot")
+    sites = [world.client(name, patterns=["/robot/.*"]) for name in ("one", "two", "three")]
+    log = robot.publish("/robot/log", spec(reliable=True, retention_s=60.0))
+    world.run(1.0)
+    for site in sites:
+        world.network.crash_node(site)
+    world.run(1.0)
+    for _ in range(10):
+        assert robot.send(log, b"x")
+    world.run(20.0)
+    hub = world.relay.hub
+    channels = [channel for site in sites for channel in hub.links[site.name].channels.values()]
+    assert [channel.kept for channel in channels] == [10, 10, 10]
+    now = world.relay.now + 60.0
+    hub.sweep(now=now)
+    left = [sum(channel.kept for channel in channels)]
+    while hub.lapse(now=now):
+        left.append(sum(channel.kept for channel in channels))
+    assert left == [27, 24, 21, 17, 14, 11, 7, 4, 1] and not any(channel.kept for channel in channels)
+    world.run(1.0)
+    assert sorted(drop.seq for drop in robot.dropped_out) == list(range(1, 11)) and not log.retained
+
+
 @pytest.mark.parametrize(("reliable", "most", "told"), [(True, 9, 3), (True, 2, 5), (False, 2, 3)])
 def test_an_origin_is_told_of_exactly_what_is_dropped_unless_that_is_in_too_many_runs(
     reliable: bool, most: int, told: int, monkeypatch: pytest.MonkeyPatch

@@ -17,7 +17,7 @@ PROOFS: Final = {
     DropReason.UNWANTED: "test_system_reliable.py",
     DropReason.REFUSED: "test_system_reliable.py",
     DropReason.FORBIDDEN: "test_hub.py",
-    DropReason.RETENTION: "test_system_reliable.py",
+    DropReason.RETENTION: "test_queues.py::test_what_lapses_without_a_link_is_bounded_by_messages_not_by_runs",
     DropReason.STALE: "test_system_service.py",
     DropReason.LOST: "test_fragments.py",
     DropReason.DUPLICATE: "test_fragments.py",

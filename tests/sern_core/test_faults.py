@@ -25,7 +25,7 @@ from tests.fuzz.test_hostile_peer import Hostile
 from tests.sern_core.test_lanes import TwoLanes, models
 from tests.world import SimClient, World, spec
 
-GAVE_UP = {DropReason.LIFESPAN, DropReason.RETENTION, DropReason.FAULT}
+GAVE_UP = {DropReason.UNCONFIRMED, DropReason.FAULT}
 """Reasons of messages that may have been delivered all the same."""
 
 

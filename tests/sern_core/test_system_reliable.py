@@ -126,7 +126,8 @@ def test_a_drop_on_the_second_hop_is_reported_before_the_watermark() -> None:
     world.until(lambda: log.watermark == 5)
     missing = set(range(1, 6)) - set(site.seqs("/robot/log"))
     assert missing and {drop.seq for drop in robot.dropped_out} == missing
-    assert log.counters.by_reason[DropReason.LIFESPAN] == len(missing)
+    by_reason = log.counters.by_reason  # the relay does not know of one that it had sent whole
+    assert by_reason[DropReason.LIFESPAN] + by_reason[DropReason.UNCONFIRMED] == log.counters.dropped == len(missing)
     assert log.counters.delivered == 5 - len(missing)
     assert not any(stream.reports for link in world.links() for stream in link.streams.values())
 
@@ -144,7 +145,7 @@ def test_reports_survive_a_broken_session() -> None:
     world.hops["robot"].break_connection(reconnect_s=1.0)
     world.run(10.0)
     assert sorted(drop.seq for drop in robot.dropped_out) == [1, 2, 3]
-    assert log.counters.by_reason[DropReason.RETENTION] == 3
+    assert log.counters.by_reason[DropReason.UNCONFIRMED] == 3, "they had left the relay whole"
     assert log.watermark == 3 and not log.retained
 
 
