@@ -60,10 +60,6 @@ from sern_runtime.ros_types import ResolvedType
 
 _INFO_QOS: Final = EndpointQos(reliable=True, durability=1)
 _INFO_DEPTH: Final = 64
-READER_HISTORY: Final = 1000
-"""What DDS may hold until the worker takes it, usually within a millisecond. What overflows there nobody could count,
-so the bound that counts is the inbox behind it."""
-
 RELIABLE_DEPTH: Final = 10
 """How many messages a writer keeps for its slow readers where the stream names no depth, as ROS 2 does."""
 RETRY_S: Final = 1.0
@@ -337,13 +333,13 @@ class DdsEndpoint:
         depth: int | None = None,
         header: bool = False,
         id_key: str = "clientid",
+        before: Reader | None = None,
     ) -> Reader:
         """Open a reader; with `header`, of requests or replies, which other SERN endpoints send as well.
 
-        ConfigError when the topic is in use here with another type, or DDS cannot have the type.
+        `before` is closed as soon as there is the new one; what either receives is delivered once. ConfigError when the
+        topic is in use here with another type, or DDS cannot have the type; `before` stays open then.
         """
-        depth = depth or self.options.queue_depth
-        policies = to_policies(qos, depth=max(depth, READER_HISTORY), writer=False, id_key=id_key)
         joined = self._alive()
         ignores = self.graph.ignores
 
@@ -351,11 +347,22 @@ class DdsEndpoint:
             if header or not ignores(sample.handle):
                 deliver(sample)
 
-        entity = self._make(
-            lambda of: DataReader(joined.subscriber, of, policies), "reader", topic, resolved, header=header
-        )
-        inbox = Inbox(depth, checked)
-        reader = Reader(self, entity, qos, inbox, joined.worker.watch(entity, inbox))
+        inbox = Inbox(depth or self.options.queue_depth, checked, repeats=qos.transient_local)
+        policies = to_policies(qos, depth=inbox.history, writer=False, id_key=id_key)
+        if before is not None:
+            before.inbox.record()
+        try:
+            entity = self._make(
+                lambda of: DataReader(joined.subscriber, of, policies), "reader", topic, resolved, header=header
+            )
+        except ConfigError:
+            if before is not None:
+                before.inbox.record(on=False)
+            raise
+        if before is not None:
+            before.close(rest=True)
+        number = joined.worker.watch(entity, inbox, None if before is None else before.inbox)
+        reader = Reader(self, entity, qos, inbox, number)
         self._readers[reader.guid] = reader
         self.graph.local_added(Local(reader.guid, False, topic, names.type_to_dds(resolved.name), qos))
         self._info_changed()

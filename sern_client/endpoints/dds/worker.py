@@ -3,10 +3,10 @@
 import asyncio
 import logging
 import threading
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterable
 from functools import partial
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, TypeAlias
 
 from cyclonedds.builtin import (
     BuiltinTopicDcpsParticipant,
@@ -26,11 +26,18 @@ TAKE_AT_ONCE: Final = 64
 """Samples taken from one reader before the next has its turn."""
 SERVE_S: Final = 0.005
 """How long the event loop is held by what the thread hands over before others have their turn."""
-LAST_TAKES: Final = 16
-"""How often a reader is taken from before it is let go: all that it holds, but not for as long as its writers go on."""
+READER_HISTORY: Final = 1000
+"""What DDS may hold until the worker takes it, usually within a millisecond. What overflows there nobody could count,
+so the bound that counts is the inbox behind it."""
+SAME_S: Final = 10.0
+"""A reader in place of another may get what that one had received so late after its first look."""
 _WAKE, _FIRST = 4, 5
 
 _log = logging.getLogger(__name__)
+
+
+Key: TypeAlias = tuple[int, int, int]
+"""Which sample it is, as far as two readers can tell: handle of its writer, source time stamp, hash of its body."""
 
 
 class Sample(NamedTuple):
@@ -43,16 +50,66 @@ class Inbox:
     """What one reader has received and the event loop has not yet seen: bounded, the oldest go first.
 
     The worker appends, the event loop drains; a deque needs no lock for that. Samples are numbered; `came` is the last
-    number.
+    number. `history`: how many samples its reader may hold. With `repeats`, the reader may be made anew at any time and
+    then gets its history again.
     """
 
-    def __init__(self, depth: int, deliver: Callable[[Sample], None]) -> None:
+    def __init__(self, depth: int, deliver: Callable[[Sample], None], *, repeats: bool = False) -> None:
         self.depth = depth
+        self.history = max(depth, READER_HISTORY)
         self.deliver = deliver
         self.samples: deque[tuple[int, Sample]] = deque()
         self.came = 0
         self.dropped = 0
         self.closed = False
+        self._repeats = repeats
+        self._taken: deque[Key] | None = None
+        """The last that its reader has taken, while another reader may get the same."""
+        self._skipped: Counter[Key] = Counter()
+        """What the reader before took."""
+        self._skip_until_s = 0.0
+        self.record(on=repeats)
+
+    # On the event loop
+
+    def record(self, *, on: bool = True) -> None:
+        """Note what is taken from now on, for the reader to come; to be called before that one is made.
+
+        Off: it is not to come after all.
+        """
+        if on and self._taken is None:
+            self._taken = deque(maxlen=self.history)
+        elif not on and not self._repeats:
+            self._taken = None
+
+    # On the thread
+
+    def follow(self, before: "Inbox") -> None:
+        """Skip once each that the reader of `before` has taken, and what that one was still to skip.
+
+        Both readers receive for a while, so that nothing is lost between them, and a transient-local one gets history.
+        """
+        keys = [*before._skipped.elements(), *(before._taken or ())]
+        self._skipped = Counter(keys[-self.history :])
+        self._skip_until_s = now() + SAME_S
+
+    def is_new(self, body: bytes, stamp_ns: int, handle: int) -> bool:
+        """Whether a sample that is taken was not taken by the reader before."""
+        taken = self._taken
+        if taken is None and not self._skipped:
+            return True
+        key = handle, stamp_ns, hash(body)
+        if taken is not None:
+            taken.append(key)
+        if not self._skipped:
+            return True
+        if now() >= self._skip_until_s:
+            self._skipped.clear()
+            return True
+        times = self._skipped.pop(key, 0)
+        if times > 1:
+            self._skipped[key] = times - 1
+        return not times
 
 
 class Arrived(NamedTuple):
@@ -95,12 +152,17 @@ class Worker:
 
     # On the event loop
 
-    def watch(self, reader: DataReader[Any], inbox: Inbox) -> int:
-        """Take what the reader receives; the number is for `unwatch`."""
+    def watch(self, reader: DataReader[Any], inbox: Inbox, before: Inbox | None = None) -> int:
+        """Take what the reader receives; the number is for `unwatch`.
+
+        `before`: inbox of the reader in whose place it is, which is unwatched already; what that took is skipped.
+        """
         number = self._next
         self._next += 1
 
         def begin() -> None:
+            if before is not None:
+                inbox.follow(before)
             self._inboxes[number] = reader, inbox
             self._waiter.attach_reader(reader, number)
             self._take(number)  # what came before
@@ -117,8 +179,10 @@ class Worker:
 
         def end() -> None:
             self._waiter.detach(number)
+            entry = self._inboxes[number]
             try:
-                for _ in range(LAST_TAKES):
+                # All that it can hold, but not for as long as its writers go on.
+                for _ in range(entry[1].history // TAKE_AT_ONCE + 1):
                     if self._take(number) < TAKE_AT_ONCE:
                         break
             finally:
@@ -246,7 +310,7 @@ class Worker:
         taken = raw.take(reader, TAKE_AT_ONCE)
         self._try(partial(self._find_writers, {info.publication_handle: None for _, info in taken}))
         for body, info in taken:
-            if not info.valid_data:
+            if not info.valid_data or not inbox.is_new(body, info.source_timestamp, info.publication_handle):
                 continue
             inbox.came += 1
             inbox.samples.append((inbox.came, Sample(body, info.source_timestamp, info.publication_handle)))

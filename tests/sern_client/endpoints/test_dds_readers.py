@@ -1,5 +1,6 @@
 """Which readers the dds endpoint has for a topic whose writers come and go."""
 
+import threading
 from collections.abc import AsyncIterator
 from dataclasses import replace
 from typing import Any
@@ -15,10 +16,11 @@ from sern_client.endpoints.dds.endpoint import DdsEndpoint, DdsOptions
 from sern_client.endpoints.dds.graph import Remote
 from sern_client.endpoints.dds.qos import EndpointQos, mismatches, reader_for, within_reach
 from sern_client.endpoints.dds.stream import Stream
+from sern_core.errors import ConfigError
 from sern_core.types import DropReason, Encoding, TopicName
 from sern_runtime.ros_types import topic_info
 from tests.peers.dds.peer import free_domain
-from tests.support import Events, until
+from tests.support import DEADLINE_S, Events, until
 
 STRING = "std_msgs::msg::dds_::String_"
 RELIABLE = EndpointQos(reliable=True)
@@ -80,7 +82,7 @@ class Pair:
 
 
 def body(number: int) -> bytes:
-    return b"\0\x01\0\0\x04\0\0\0" + b"%03d\0" % number
+    return b"\0\x01\0\0\x08\0\0\0" + b"%07d\0" % number
 
 
 @pytest.fixture
@@ -147,3 +149,105 @@ async def test_what_a_reader_has_received_outlives_it(pair: Pair) -> None:
     await until(lambda: pair.got == bodies, "all that was written")
     await until(lambda: not pair.two._leaving, "the end of the reader")
     assert pair.two.drops == {}
+
+
+class Held:
+    """Keeps a worker's thread in a job until `go`."""
+
+    def __init__(self, endpoint: DdsEndpoint) -> None:
+        assert endpoint._joined is not None
+        self._began, self._end = threading.Event(), threading.Event()
+        endpoint._joined.worker._do(self._wait)
+        assert self._began.wait(DEADLINE_S)
+
+    def _wait(self) -> None:
+        self._began.set()
+        assert self._end.wait(DEADLINE_S)
+
+    def go(self) -> None:
+        self._end.set()
+
+
+async def in_the_end(pair: Pair, publisher: Stream) -> list[bytes]:
+    """All that came, when what is written last has come and no reader is being let go."""
+    last = body(9999)
+    await until(lambda: publisher.matched == 1 and not pair.two._leaving, "the end of the readers before")
+    publisher.publish(last, 1)
+    await until(lambda: last in pair.got, "the last message")
+    return pair.got[:-1]
+
+
+@pytest.mark.parametrize("depth", [500, 3000])
+async def test_a_reader_made_anew_takes_nothing_twice(pair: Pair, depth: int) -> None:
+    """Both readers receive while the thread is busy; of the same messages some have the same time stamp."""
+    pair.two.options = replace(pair.two.options, queue_depth=depth)
+    publisher = await pair.connect()
+    held = Held(pair.two)
+    bodies = [body(number) for number in range(depth // 2)] + [body(7), body(7)]
+    for one in bodies[:100]:
+        publisher.publish(one, 1)
+    pair.two.remote_added(writer(50, qos=EndpointQos()))
+    assert [qos.reliable for qos in pair.opened] == [True, False]
+    for one in bodies[100:]:
+        publisher.publish(one, 1)
+    held.go()
+    assert await in_the_end(pair, publisher) == bodies
+    assert pair.two.drops == {}
+
+
+async def test_history_is_not_delivered_again(pair: Pair) -> None:
+    """A transient-local reader gets what there was; one made in its place gets it too, but it was delivered."""
+    info = topic_info("/chat", "std_msgs/msg/String", Encoding.CDR, reliable=True)
+    publisher = pair.one.advertise(replace(info, depth=500, latched=True))
+    bodies = [body(number) for number in range(40)]
+    for one in bodies[:10]:
+        publisher.publish(one, 1)
+    await until(lambda: pair.two.graph.writers("rt/chat"))
+    pair.two.subscribe(TopicName("/chat"), pair.sink)
+    await until(lambda: pair.got == bodies[:10])
+    publisher.publish(bodies[10], 1)
+    await until(lambda: pair.got == bodies[:11])
+    held = Held(pair.two)
+    for one in bodies[11:20]:
+        publisher.publish(one, 1)
+    pair.two.remote_added(writer(50, qos=EndpointQos(durability=1)))
+    for one in bodies[20:30]:
+        publisher.publish(one, 1)
+    pair.two.remote_added(writer(51, qos=EndpointQos()))  # and once more, before the thread had its turn
+    for one in bodies[30:]:
+        publisher.publish(one, 1)
+    held.go()
+    assert [(qos.reliable, qos.durability) for qos in pair.opened] == [(True, 1), (False, 1), (False, 0)]
+    assert await in_the_end(pair, publisher) == bodies
+
+
+async def test_nothing_is_lost_between_two_readers(pair: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The thread does all that it has to do, and a message comes, just before there is the new reader."""
+    publisher = await pair.connect()
+    make = pair.two._make
+
+    def after_a_message(*given: Any, **options: Any) -> Any:
+        Held(pair.two).go()
+        publisher.publish(body(1), 1)
+        return make(*given, **options)
+
+    monkeypatch.setattr(pair.two, "_make", after_a_message)
+    pair.two.remote_added(writer(50, qos=EndpointQos()))
+    assert len(pair.opened) == 2
+    assert await in_the_end(pair, publisher) == [body(1)]
+
+
+async def test_the_reader_before_stays_where_dds_gives_no_other(pair: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
+    publisher = await pair.connect()
+
+    def refuse(*given: Any, **options: Any) -> Any:
+        raise ConfigError("out of resources")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(pair.two, "_make", refuse)
+        pair.two.remote_added(writer(50, qos=EndpointQos()))
+    publisher.publish(body(1), 1)
+    await until(lambda: pair.got == [body(1)])
+    pair.two.remote_added(writer(51, qos=EndpointQos()))
+    assert [qos.reliable for qos in pair.opened] == [True, False, False]
+    assert await in_the_end(pair, publisher) == [body(1)]

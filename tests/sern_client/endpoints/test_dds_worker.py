@@ -12,7 +12,7 @@ from sern_client.endpoints.dds import node_info
 from sern_client.endpoints.dds import worker as module
 from sern_client.endpoints.dds.domain import DomainOptions
 from sern_client.endpoints.dds.endpoint import DdsEndpoint, DdsOptions
-from sern_client.endpoints.dds.worker import SERVE_S, Arrived, Inbox, Sample, Worker
+from sern_client.endpoints.dds.worker import READER_HISTORY, SAME_S, SERVE_S, Arrived, Inbox, Sample, Worker
 from sern_core.types import DropReason
 from tests.peers.dds.peer import free_domain
 from tests.support import Events, until
@@ -108,3 +108,55 @@ async def test_an_endless_list_of_nodes_is_counted_and_not_read(endpoint: DdsEnd
     assert endpoint.drops == {DropReason.UNDECODABLE: 1}
     endpoint._heed_nodes(Sample(b"no such thing", 1, 1))  # of before Iron
     assert endpoint.drops == {DropReason.UNDECODABLE: 1}
+
+
+def took(inbox: Inbox, *stamps_ns: int, handle: int = 7) -> list[int]:
+    """Those of the time stamps that are new to the inbox."""
+    return [stamp_ns for stamp_ns in stamps_ns if inbox.is_new(b"body", stamp_ns, handle)]
+
+
+def test_what_the_reader_before_took_is_skipped_once_each() -> None:
+    before, inbox = Inbox(2, print), Inbox(2, print)
+    assert took(before, 1, 1) == [1, 1]  # nobody is to come after it
+    before.record()
+    assert took(before, 2, 3, 3) == [2, 3, 3]
+    inbox.follow(before)
+    assert took(inbox, 2, handle=8) == [2] and inbox.is_new(b"other", 2, 7)
+    assert took(inbox, 1, 2, 2, 3, 3, 3) == [1, 2, 3]
+
+
+def test_a_third_reader_skips_what_the_second_was_still_to_skip() -> None:
+    first, second, third = (Inbox(2, print) for _ in range(3))
+    first.record()
+    took(first, 1, 2)
+    second.record()
+    second.follow(first)
+    assert took(second, 2, 3) == [3]
+    third.follow(second)
+    assert took(third, 1, 2, 3, 1, 2, 3, 4) == [1, 2, 3, 4]
+
+
+def test_what_is_to_be_skipped_has_an_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = Clock(0.0)
+    monkeypatch.setattr(module, "now", clock)
+    inbox = Inbox(2, print)
+    for _ in range(3):  # each in place of the one before
+        before, inbox = inbox, Inbox(2, print)
+        before.record()
+        took(before, *range(5 * READER_HISTORY))
+        inbox.follow(before)
+        assert sum(inbox._skipped.values()) == READER_HISTORY
+    clock.now_s = SAME_S
+    assert took(inbox, 5 * READER_HISTORY - 1) and not inbox._skipped
+
+
+def test_no_reader_comes_after_all() -> None:
+    volatile, transient_local, inbox = Inbox(2, print), Inbox(2, print, repeats=True), Inbox(2, print)
+    for before in (volatile, transient_local):
+        before.record()
+        before.record(on=False)
+        took(before, 1)
+    inbox.follow(volatile)
+    assert took(inbox, 1) == [1]
+    inbox.follow(transient_local)
+    assert took(inbox, 1) == []
