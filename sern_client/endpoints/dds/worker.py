@@ -29,6 +29,8 @@ SERVE_S: Final = 0.005
 READER_HISTORY: Final = 1000
 """What DDS may hold until the worker takes it, usually within a millisecond. What overflows there nobody could count,
 so the bound that counts is the inbox behind it."""
+MAX_FOUND: Final = 1000
+"""Discoveries that wait for the event loop until DDS is asked for no more: it keeps the state, not each change."""
 SAME_S: Final = 10.0
 """A reader in place of another may get what that one had received so late after its first look."""
 _WAKE, _FIRST = 4, 5
@@ -129,6 +131,8 @@ class Worker:
         self._guard = GuardCondition(participant)
         self._waiter = raw.Waiter(participant)
         self._waiter.attach(self._guard, _WAKE)
+        self._held_waiter = raw.Waiter(participant)
+        self._held_waiter.attach(self._guard, _WAKE)
         readers = {
             PARTICIPANTS: raw.DiscoveryReader(participant, BuiltinTopicDcpsParticipant),
             WRITERS: raw.DiscoveryReader(participant, BuiltinTopicDcpsPublication),
@@ -145,6 +149,10 @@ class Worker:
         # Each counter has one writer (thread, event loop), so what is buffered needs no lock.
         self._taken_bytes = 0
         self._done_bytes = 0
+        # So do these: what was handed over that is no message.
+        self._found = 0
+        self._served = 0
+        self._held = False
         self._faults = 0
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name="sern-dds", daemon=True)
@@ -165,7 +173,8 @@ class Worker:
                 inbox.follow(before)
             self._inboxes[number] = reader, inbox
             self._waiter.attach_reader(reader, number)
-            self._take(number)  # what came before
+            if not self._behind:
+                self._take(number)  # what came before
 
         self._do(begin)
         return number
@@ -226,12 +235,15 @@ class Worker:
                 item = self._ready[0]
                 if not isinstance(item, Arrived):
                     self._ready.popleft()
+                    self._served += 1
                     item()
                 elif self._empty(*item, end_s):
                     self._ready.popleft()
                 if now() >= end_s:
                     break
         finally:
+            if self._held and not self._behind:
+                self._guard.set(True)
             # A fault in one of them is reported by the loop; the others must not wait for the next event.
             if self._ready and not self._drain_due and not self._stopping.is_set():
                 self._drain_due = True
@@ -258,20 +270,36 @@ class Worker:
 
     def _run(self) -> None:
         while not self._stopping.is_set():
-            numbers = self._waiter.wait()
+            numbers = self._wait()
             self._guard.take()
             while self._jobs:
                 self._try(self._jobs.popleft())
             for number in sorted(numbers):
-                if self._stopping.is_set():
+                if self._stopping.is_set() or self._behind:
                     break
                 if number >= _FIRST:
                     self._try(partial(self._take, number))
                 elif number != _WAKE:
                     self._try(partial(self._discover, number))
         self._waiter.close()
+        self._held_waiter.close()
         self._inboxes.clear()
         self._jobs.clear()
+
+    def _wait(self) -> list[int]:
+        """The numbers of what is ready. None while the event loop is behind, but there may be jobs.
+
+        All is left in DDS then, messages too: who speaks is to be known before what is said.
+        """
+        self._held = True  # first: the event loop may catch up at any moment, and has to wake this thread
+        if self._behind:
+            return self._held_waiter.wait()
+        self._held = False
+        return self._waiter.wait()
+
+    @property
+    def _behind(self) -> bool:
+        return self._found - self._served >= MAX_FOUND
 
     def _try(self, step: Callable[[], object]) -> None:
         """What one peer says or one reader does must not end the thread for all."""
@@ -329,6 +357,7 @@ class Worker:
         return len(taken)
 
     def _hand_over(self, item: Arrived | Callable[[], None]) -> None:
+        self._found += not isinstance(item, Arrived)
         self._ready.append(item)
         if not self._drain_due:
             self._drain_due = True

@@ -1,6 +1,7 @@
 """What the thread that waits for DDS hands over, and how the event loop serves it."""
 
 import asyncio
+import threading
 from collections.abc import AsyncIterator, Callable
 from functools import partial
 
@@ -8,14 +9,23 @@ import pytest
 
 pytest.importorskip("cyclonedds", reason="the dds endpoint needs cyclonedds: pip install cyclonedds==11.0.1")
 
-from sern_client.endpoints.dds import node_info
+from cyclonedds.domain import DomainParticipant
+from cyclonedds.pub import DataWriter, Publisher
+from cyclonedds.sub import DataReader, Subscriber
+from cyclonedds.topic import Topic
+
+from sern_client.endpoints.dds import node_info, raw
 from sern_client.endpoints.dds import worker as module
+from sern_client.endpoints.dds.discovery import AT_ONCE, CALLS, MOST_ROUNDS
 from sern_client.endpoints.dds.domain import DomainOptions
 from sern_client.endpoints.dds.endpoint import DdsEndpoint, DdsOptions
-from sern_client.endpoints.dds.worker import READER_HISTORY, SAME_S, SERVE_S, Arrived, Inbox, Sample, Worker
-from sern_core.types import DropReason
+from sern_client.endpoints.dds.idl import TypeMaker
+from sern_client.endpoints.dds.qos import EndpointQos
+from sern_client.endpoints.dds.worker import MAX_FOUND, READER_HISTORY, SAME_S, SERVE_S, Arrived, Inbox, Sample, Worker
+from sern_core.types import DropReason, Encoding
+from sern_runtime import ros_types
 from tests.peers.dds.peer import free_domain
-from tests.support import Events, until
+from tests.support import DEADLINE_S, Events, until
 
 
 class Clock:
@@ -160,3 +170,45 @@ def test_no_reader_comes_after_all() -> None:
     assert took(inbox, 1) == [1]
     inbox.follow(transient_local)
     assert took(inbox, 1) == []
+
+
+async def test_discoveries_wait_in_dds_while_the_event_loop_is_behind(endpoint: DdsEndpoint, worker: Worker) -> None:
+    """Nothing is served until somebody awaits: the thread may look as often as it likes meanwhile."""
+    count = 3 * MAX_FOUND
+    text = ros_types.describe("std_msgs/msg/String", Encoding.CDR)
+    assert text is not None
+    resolved = ros_types.resolve("std_msgs/msg/String", text.definition, Encoding.CDR)
+    other = DomainParticipant(endpoint.options.domain.domain)
+    topic, subscriber = Topic(other, "rt/chat", TypeMaker().make(resolved)), Subscriber(other)
+    readers = [DataReader(subscriber, topic) for _ in range(count)]
+    for _ in range(2 * count // (AT_ONCE * CALLS)):
+        looked = threading.Event()
+        worker._do(looked.set)
+        assert looked.wait(DEADLINE_S)
+    assert MAX_FOUND <= len(worker._ready) <= MAX_FOUND + AT_ONCE * CALLS * (MOST_ROUNDS + 1)
+    await until(lambda: len(endpoint.graph.readers("rt/chat")) == count, "all of them")
+    readers.clear()
+    await until(lambda: not endpoint.graph.readers("rt/chat"), "none of them")
+
+
+async def test_messages_wait_in_dds_while_the_event_loop_is_behind(endpoint: DdsEndpoint, worker: Worker) -> None:
+    """Their writers could not be found. A reader that is let go is emptied all the same, and nothing is lost."""
+    got: list[bytes] = []
+    info = ros_types.resolve("std_msgs/msg/String", "string data", Encoding.CDR)
+    opened = [
+        endpoint.open_reader("rt/chat", info, EndpointQos(), lambda sample: got.append(sample.body)) for _ in range(2)
+    ]
+    other = DomainParticipant(endpoint.options.domain.domain)
+    writer = DataWriter(Publisher(other), Topic(other, "rt/chat", TypeMaker().make(info)))
+    await until(lambda: all(reader.matched for reader in opened))
+    for _ in range(MAX_FOUND):
+        worker._hand_over(lambda: None)
+    body = b"\0\x01\0\0\x04\0\0\0abc\0"
+    raw.write(writer, body, 1)
+    opened[0].close(rest=True)
+    for _ in range(3):
+        looked = threading.Event()
+        worker._do(looked.set)
+        assert looked.wait(DEADLINE_S)
+    assert sum(isinstance(item, Arrived) for item in worker._ready) == 1  # of the one that was let go
+    await until(lambda: got == [body, body])
