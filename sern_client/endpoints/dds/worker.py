@@ -123,9 +123,20 @@ class Arrived(NamedTuple):
 
 
 class Worker:
-    """One thread for all readers of a participant. `stop` ends it."""
+    """One thread for all readers of a participant. `stop` ends it.
 
-    def __init__(self, participant: DomainParticipant, events: DiscoveryEvents, *, max_buffer_bytes: int) -> None:
+    `settle` is called on the event loop after discoveries were told, until it returns False: one step of what follows
+    from all of them together.
+    """
+
+    def __init__(
+        self,
+        participant: DomainParticipant,
+        events: DiscoveryEvents,
+        settle: Callable[[], bool],
+        *,
+        max_buffer_bytes: int,
+    ) -> None:
         self._loop = asyncio.get_running_loop()
         self._max_buffer_bytes = max_buffer_bytes
         self._guard = GuardCondition(participant)
@@ -146,6 +157,8 @@ class Worker:
         self._jobs: deque[Callable[[], None]] = deque()
         self._ready: deque[Arrived | Callable[[], None]] = deque()
         self._drain_due = False
+        self._settle = settle
+        self._unsettled = False
         # Each counter has one writer (thread, event loop), so what is buffered needs no lock.
         self._taken_bytes = 0
         self._done_bytes = 0
@@ -227,27 +240,43 @@ class Worker:
             self._drain()
 
     def _drain(self) -> None:
-        """Serve what is ready, for a few milliseconds; the rest after what else the event loop has to do."""
+        """Serve what is ready, for a few milliseconds; the rest after what else the event loop has to do.
+
+        What follows from all discoveries of a turn is settled at its end, or first in the next: a topic with thousands
+        of writers is not looked at for each of them.
+        """
         self._drain_due = False
         end_s = now() + SERVE_S
         try:
+            if not self._settled(end_s):
+                return
             for _ in range(len(self._ready)):  # what comes meanwhile has its own turn
                 item = self._ready[0]
                 if not isinstance(item, Arrived):
                     self._ready.popleft()
                     self._served += 1
+                    self._unsettled = True
                     item()
                 elif self._empty(*item, end_s):
                     self._ready.popleft()
                 if now() >= end_s:
-                    break
+                    return
+            self._settled(end_s)
         finally:
             if self._held and not self._behind:
                 self._guard.set(True)
             # A fault in one of them is reported by the loop; the others must not wait for the next event.
-            if self._ready and not self._drain_due and not self._stopping.is_set():
+            if (self._ready or self._unsettled) and not self._drain_due and not self._stopping.is_set():
                 self._drain_due = True
                 self._loop.call_soon(self._drain)
+
+    def _settled(self, end_s: float) -> bool:
+        """Settle what was found, until `end_s`. Whether nothing is left, nor the time over."""
+        while self._unsettled:
+            self._unsettled = self._settle()
+            if now() >= end_s:
+                return False
+        return True
 
     def _empty(self, inbox: Inbox, last: int, end_s: float) -> bool:
         """Deliver the samples up to number `last`, or until `end_s`. Whether none of them is left."""

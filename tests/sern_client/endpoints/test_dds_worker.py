@@ -212,3 +212,32 @@ async def test_messages_wait_in_dds_while_the_event_loop_is_behind(endpoint: Dds
         assert looked.wait(DEADLINE_S)
     assert sum(isinstance(item, Arrived) for item in worker._ready) == 1  # of the one that was let go
     await until(lambda: got == [body, body])
+
+
+async def test_changes_are_heeded_once_a_turn(worker: Worker, monkeypatch: pytest.MonkeyPatch) -> None:
+    """All that came in one turn is heeded in the next ones, before what came later, and others have turns between."""
+    left, log = 0, list[str]()
+    clock = Clock(0.0)
+
+    def come() -> None:
+        nonlocal left
+        left = 7
+        log.append("came")
+
+    def heed() -> bool:
+        nonlocal left
+        left -= 1
+        log.append("heeded")
+        return left > 0
+
+    monkeypatch.setattr(module, "now", clock)
+    worker._settle = heed
+    worker._ready.extend([come] * 3)
+    worker._hand_over(come)
+    await until(lambda: len(log) == 11)
+    assert log == ["came"] * 4 + ["heeded"] * 7
+    clock.step_s = SERVE_S  # no time for a second step
+    for _ in range(2):
+        worker._hand_over(come)
+    await until(lambda: len(log) == 27)
+    assert log[11:] == ["came", *["heeded"] * 7] * 2
