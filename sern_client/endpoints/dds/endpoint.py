@@ -8,7 +8,7 @@ that off, for a chain of two links with a domain in the middle.
 import asyncio
 import logging
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -60,10 +60,6 @@ from sern_runtime.ros_types import ResolvedType
 
 _INFO_QOS: Final = EndpointQos(reliable=True, durability=1)
 _INFO_DEPTH: Final = 64
-READER_HISTORY: Final = 1000
-"""What DDS may hold until the worker takes it, usually within a millisecond. What overflows there nobody could count,
-so the bound that counts is the inbox behind it."""
-
 RELIABLE_DEPTH: Final = 10
 """How many messages a writer keeps for its slow readers where the stream names no depth, as ROS 2 does."""
 RETRY_S: Final = 1.0
@@ -142,7 +138,9 @@ class DdsEndpoint:
         self._started_s = 0.0
         self._info_writer: Writer | None = None
         self._info_due = False
-        self._said: set[str] = set()
+        self._changed: dict[Hashable, Callable[[], None]] = {}
+        """What is to be done for topics and services that are not as they were."""
+        self._said: set[int] = set()
 
     # Life cycle
 
@@ -163,7 +161,7 @@ class DdsEndpoint:
         self._events = events
         self._started_s = asyncio.get_running_loop().time()
         self.graph.own = participant.guid
-        worker = Worker(participant, self, max_buffer_bytes=options.max_buffer_bytes)
+        worker = Worker(participant, self, self.settle, max_buffer_bytes=options.max_buffer_bytes)
         self._joined = _Joined(participant, Publisher(participant), Subscriber(participant), worker)
         info = ros_types.resolve(node_info.TYPE, "", Encoding.CDR)
         self.open_reader(DISCOVERY_TOPIC, info, _INFO_QOS, self._heed_nodes, depth=_INFO_DEPTH)
@@ -337,13 +335,13 @@ class DdsEndpoint:
         depth: int | None = None,
         header: bool = False,
         id_key: str = "clientid",
+        before: Reader | None = None,
     ) -> Reader:
         """Open a reader; with `header`, of requests or replies, which other SERN endpoints send as well.
 
-        ConfigError when the topic is in use here with another type, or DDS cannot have the type.
+        `before` is closed as soon as there is the new one; what either receives is delivered once. ConfigError when the
+        topic is in use here with another type, or DDS cannot have the type; `before` stays open then.
         """
-        depth = depth or self.options.queue_depth
-        policies = to_policies(qos, depth=max(depth, READER_HISTORY), writer=False, id_key=id_key)
         joined = self._alive()
         ignores = self.graph.ignores
 
@@ -351,11 +349,22 @@ class DdsEndpoint:
             if header or not ignores(sample.handle):
                 deliver(sample)
 
-        entity = self._make(
-            lambda of: DataReader(joined.subscriber, of, policies), "reader", topic, resolved, header=header
-        )
-        inbox = Inbox(depth, checked)
-        reader = Reader(self, entity, qos, inbox, joined.worker.watch(entity, inbox))
+        inbox = Inbox(depth or self.options.queue_depth, checked, repeats=qos.transient_local)
+        policies = to_policies(qos, depth=inbox.history, writer=False, id_key=id_key)
+        if before is not None:
+            before.inbox.record()
+        try:
+            entity = self._make(
+                lambda of: DataReader(joined.subscriber, of, policies), "reader", topic, resolved, header=header
+            )
+        except ConfigError:
+            if before is not None:
+                before.inbox.record(on=False)
+            raise
+        if before is not None:
+            before.close(rest=True)
+        number = joined.worker.watch(entity, inbox, None if before is None else before.inbox)
+        reader = Reader(self, entity, qos, inbox, number)
         self._readers[reader.guid] = reader
         self.graph.local_added(Local(reader.guid, False, topic, names.type_to_dds(resolved.name), qos))
         self._info_changed()
@@ -460,11 +469,12 @@ class DdsEndpoint:
             reader.dropped for readers in (self._readers, self._leaving) for reader in readers.values()
         )
 
-    def say_once(self, line: str) -> None:
-        """What a person has to know and do something about; each line once."""
-        if line not in self._said and len(self._said) < MAX_COMPLAINTS:
-            self._said.add(line)
-            _log.error("%s", line)
+    def say_once(self, line: str | Callable[[], str], *about: Hashable) -> None:
+        """What a person has to know and do something about: once for each line, or for what it is `about`."""
+        said = hash(about or line)
+        if said not in self._said and len(self._said) < MAX_COMPLAINTS:
+            self._said.add(said)
+            _log.error("%s", line if isinstance(line, str) else line())
 
     # Discovery: told by the worker
 
@@ -483,11 +493,26 @@ class DdsEndpoint:
     # Discovery: told by the graph
 
     def writers_changed(self, name: RosName, topic: str) -> None:
+        self._changed[topic] = partial(self._heed_writers, name, topic)
+        if not self.graph.writers(topic):  # at once: one that comes back in the same turn may say something else
+            self._changed.pop(topic)()
+
+    def services_changed(self, name: TopicName) -> None:
+        self._changed["service", name] = partial(self.services.changed, name)
+
+    def settle(self) -> bool:
+        """Heed one topic or service that changed, however often it did. Whether there is another."""
+        if self._changed:
+            self._changed.pop(next(iter(self._changed)))()
+        return bool(self._changed)
+
+    def _heed_writers(self, name: RosName, topic: str) -> None:
         if self._events is None:
             return
         writers = self.graph.writers(topic)
         known = self._announced.get(name.name)
-        if known is not None and not any(names.type_from_dds(w.type_name) == known.type_name for w in writers):
+        types = {writer.type_name for writer in writers}
+        if known is not None and not any(names.type_from_dds(one) == known.type_name for one in types):
             del self._announced[name.name]
             self._events.topic_removed(name.name)
             known = None
@@ -500,22 +525,25 @@ class DdsEndpoint:
         for subscription in self._subscriptions.get(name.name, ()):
             self._refresh(subscription)
 
-    def services_changed(self, name: TopicName) -> None:
-        self.services.changed(name)
-
     def _describe(self, name: TopicName, writers: list[Remote]) -> TopicInfo | None:
         """The topic as the first of its writers has it whose type is known here."""
+        kinds: dict[tuple[str, str], Remote] = {}
         for writer in writers:
+            kinds.setdefault((writer.type_name, writer.qos.type_hash), writer)
+        for kind, writer in kinds.items():
             type_name = names.type_from_dds(writer.type_name)
             if type_name is None:
                 self.say_once(
-                    f"{name} has the type {names.cut(writer.type_name)}, which is not of ROS 2; it is left alone"
+                    f"{name} has the type {names.cut(writer.type_name)}, which is not of ROS 2; it is left alone",
+                    name,
+                    writer.type_name,
                 )
                 continue
             try:
                 text = self.types.message(type_name, writer.qos.type_hash)
             except ConfigError as error:
-                self.say_once(f"{name} of {self.graph.owner(writer)} is left alone: {names.cut(str(error), 600)}")
+                why = names.cut(str(error), 600)
+                self.say_once(partial(self._left_alone, name, writer, why), name, kind)
                 continue
             every = [other.qos for other in writers if other.type_name == writer.type_name]
             offered = within_reach(every) or every
@@ -534,6 +562,9 @@ class DdsEndpoint:
                 deadline_s=None if deadline_ns >= INFINITE_NS else deadline_ns / 1e9,
             )
         return None
+
+    def _left_alone(self, name: TopicName, writer: Remote, why: str) -> str:
+        return f"{name} of {self.graph.owner(writer)} is left alone: {why}"
 
     # Nodes
 

@@ -35,7 +35,7 @@ class Subscription:
     def refresh(self) -> None:
         """Have a reader that matches all writers there are now that it can, or none while nobody wants the topic.
 
-        What the reader before it has received is delivered.
+        What the reader before it has received is delivered, once. ConfigError where DDS gives no other: that one stays.
         """
         if self.closed:
             return
@@ -49,10 +49,9 @@ class Subscription:
         writers = within_reach(offers)
         if self._reader is not None and not any(mismatches(offer, self._reader.qos) for offer in writers):
             return
-        self._drop(rest=True)
         asked = replace(reader_for(writers), type_hash=self.info.type_hash)
         resolved = ros_types.resolve(self.info.type_name, self.info.definition, Encoding.CDR)
-        self._reader = self._endpoint.open_reader(self.dds_topic, resolved, asked, self._deliver)
+        self._reader = self._endpoint.open_reader(self.dds_topic, resolved, asked, self._deliver, before=self._reader)
 
     @property
     def lacks_reader(self) -> bool:
@@ -93,7 +92,7 @@ class Reader:
         self._entity: DataReader[Any] | None = entity
         self.guid: UUID = entity.guid
         self.qos = qos
-        self._inbox = inbox
+        self.inbox = inbox
         self._number = number
 
     @property
@@ -103,11 +102,11 @@ class Reader:
 
     @property
     def dropped(self) -> int:
-        return self._inbox.dropped
+        return self.inbox.dropped
 
     def close(self, *, rest: bool = False) -> None:
         """With `rest`, what it has received is still delivered."""
-        self._inbox.closed = not rest
+        self.inbox.closed = not rest
         self._entity = None  # the worker is the last to hold it, and lets go on its own thread
         self._endpoint.close_reader(self, self._number)
 

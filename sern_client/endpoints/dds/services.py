@@ -188,6 +188,7 @@ class DdsServices:
         """A service is there when one participant reads its requests and writes its replies."""
         graph = self._endpoint.graph
         repliers = {writer.participant for writer in graph.writers(names.to_dds(name, Role.REPLY))}
+        unknown: set[tuple[str, str]] = set()
         for reader in graph.readers(names.to_dds(name, Role.REQUEST)):
             if reader.participant not in repliers:
                 continue
@@ -197,9 +198,13 @@ class DdsServices:
             if not self._understood(name, reader):
                 continue
             type_name = type_name.removesuffix("_Request")
+            kind = type_name, reader.qos.type_hash
+            if kind in unknown:
+                continue
             try:
-                text = self._endpoint.types.service(type_name, reader.qos.type_hash)
+                text = self._endpoint.types.service(*kind)
             except ConfigError as error:
+                unknown.add(kind)
                 self._endpoint.say_once(
                     f"service {name} of {graph.owner(reader)} is left alone: {names.cut(str(error), 600)}"
                 )

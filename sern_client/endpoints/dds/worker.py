@@ -3,10 +3,10 @@
 import asyncio
 import logging
 import threading
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterable
 from functools import partial
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, TypeAlias
 
 from cyclonedds.builtin import (
     BuiltinTopicDcpsParticipant,
@@ -26,11 +26,20 @@ TAKE_AT_ONCE: Final = 64
 """Samples taken from one reader before the next has its turn."""
 SERVE_S: Final = 0.005
 """How long the event loop is held by what the thread hands over before others have their turn."""
-LAST_TAKES: Final = 16
-"""How often a reader is taken from before it is let go: all that it holds, but not for as long as its writers go on."""
+READER_HISTORY: Final = 1000
+"""What DDS may hold until the worker takes it, usually within a millisecond. What overflows there nobody could count,
+so the bound that counts is the inbox behind it."""
+MAX_FOUND: Final = 1000
+"""Discoveries that wait for the event loop until DDS is asked for no more: it keeps the state, not each change."""
+SAME_S: Final = 10.0
+"""A reader in place of another may get what that one had received so late after its first look."""
 _WAKE, _FIRST = 4, 5
 
 _log = logging.getLogger(__name__)
+
+
+Key: TypeAlias = tuple[int, int, int]
+"""Which sample it is, as far as two readers can tell: handle of its writer, source time stamp, hash of its body."""
 
 
 class Sample(NamedTuple):
@@ -43,16 +52,66 @@ class Inbox:
     """What one reader has received and the event loop has not yet seen: bounded, the oldest go first.
 
     The worker appends, the event loop drains; a deque needs no lock for that. Samples are numbered; `came` is the last
-    number.
+    number. `history`: how many samples its reader may hold. With `repeats`, the reader may be made anew at any time and
+    then gets its history again.
     """
 
-    def __init__(self, depth: int, deliver: Callable[[Sample], None]) -> None:
+    def __init__(self, depth: int, deliver: Callable[[Sample], None], *, repeats: bool = False) -> None:
         self.depth = depth
+        self.history = max(depth, READER_HISTORY)
         self.deliver = deliver
         self.samples: deque[tuple[int, Sample]] = deque()
         self.came = 0
         self.dropped = 0
         self.closed = False
+        self._repeats = repeats
+        self._taken: deque[Key] | None = None
+        """The last that its reader has taken, while another reader may get the same."""
+        self._skipped: Counter[Key] = Counter()
+        """What the reader before took."""
+        self._skip_until_s = 0.0
+        self.record(on=repeats)
+
+    # On the event loop
+
+    def record(self, *, on: bool = True) -> None:
+        """Note what is taken from now on, for the reader to come; to be called before that one is made.
+
+        Off: it is not to come after all.
+        """
+        if on and self._taken is None:
+            self._taken = deque(maxlen=self.history)
+        elif not on and not self._repeats:
+            self._taken = None
+
+    # On the thread
+
+    def follow(self, before: "Inbox") -> None:
+        """Skip once each that the reader of `before` has taken, and what that one was still to skip.
+
+        Both readers receive for a while, so that nothing is lost between them, and a transient-local one gets history.
+        """
+        keys = [*before._skipped.elements(), *(before._taken or ())]
+        self._skipped = Counter(keys[-self.history :])
+        self._skip_until_s = now() + SAME_S
+
+    def is_new(self, body: bytes, stamp_ns: int, handle: int) -> bool:
+        """Whether a sample that is taken was not taken by the reader before."""
+        taken = self._taken
+        if taken is None and not self._skipped:
+            return True
+        key = handle, stamp_ns, hash(body)
+        if taken is not None:
+            taken.append(key)
+        if not self._skipped:
+            return True
+        if now() >= self._skip_until_s:
+            self._skipped.clear()
+            return True
+        times = self._skipped.pop(key, 0)
+        if times > 1:
+            self._skipped[key] = times - 1
+        return not times
 
 
 class Arrived(NamedTuple):
@@ -64,14 +123,27 @@ class Arrived(NamedTuple):
 
 
 class Worker:
-    """One thread for all readers of a participant. `stop` ends it."""
+    """One thread for all readers of a participant. `stop` ends it.
 
-    def __init__(self, participant: DomainParticipant, events: DiscoveryEvents, *, max_buffer_bytes: int) -> None:
+    `settle` is called on the event loop after discoveries were told, until it returns False: one step of what follows
+    from all of them together.
+    """
+
+    def __init__(
+        self,
+        participant: DomainParticipant,
+        events: DiscoveryEvents,
+        settle: Callable[[], bool],
+        *,
+        max_buffer_bytes: int,
+    ) -> None:
         self._loop = asyncio.get_running_loop()
         self._max_buffer_bytes = max_buffer_bytes
         self._guard = GuardCondition(participant)
         self._waiter = raw.Waiter(participant)
         self._waiter.attach(self._guard, _WAKE)
+        self._held_waiter = raw.Waiter(participant)
+        self._held_waiter.attach(self._guard, _WAKE)
         readers = {
             PARTICIPANTS: raw.DiscoveryReader(participant, BuiltinTopicDcpsParticipant),
             WRITERS: raw.DiscoveryReader(participant, BuiltinTopicDcpsPublication),
@@ -85,9 +157,15 @@ class Worker:
         self._jobs: deque[Callable[[], None]] = deque()
         self._ready: deque[Arrived | Callable[[], None]] = deque()
         self._drain_due = False
+        self._settle = settle
+        self._unsettled = False
         # Each counter has one writer (thread, event loop), so what is buffered needs no lock.
         self._taken_bytes = 0
         self._done_bytes = 0
+        # So do these: what was handed over that is no message.
+        self._found = 0
+        self._served = 0
+        self._held = False
         self._faults = 0
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name="sern-dds", daemon=True)
@@ -95,15 +173,21 @@ class Worker:
 
     # On the event loop
 
-    def watch(self, reader: DataReader[Any], inbox: Inbox) -> int:
-        """Take what the reader receives; the number is for `unwatch`."""
+    def watch(self, reader: DataReader[Any], inbox: Inbox, before: Inbox | None = None) -> int:
+        """Take what the reader receives; the number is for `unwatch`.
+
+        `before`: inbox of the reader in whose place it is, which is unwatched already; what that took is skipped.
+        """
         number = self._next
         self._next += 1
 
         def begin() -> None:
+            if before is not None:
+                inbox.follow(before)
             self._inboxes[number] = reader, inbox
             self._waiter.attach_reader(reader, number)
-            self._take(number)  # what came before
+            if not self._behind:
+                self._take(number)  # what came before
 
         self._do(begin)
         return number
@@ -117,8 +201,10 @@ class Worker:
 
         def end() -> None:
             self._waiter.detach(number)
+            entry = self._inboxes[number]
             try:
-                for _ in range(LAST_TAKES):
+                # All that it can hold, but not for as long as its writers go on.
+                for _ in range(entry[1].history // TAKE_AT_ONCE + 1):
                     if self._take(number) < TAKE_AT_ONCE:
                         break
             finally:
@@ -154,24 +240,43 @@ class Worker:
             self._drain()
 
     def _drain(self) -> None:
-        """Serve what is ready, for a few milliseconds; the rest after what else the event loop has to do."""
+        """Serve what is ready, for a few milliseconds; the rest after what else the event loop has to do.
+
+        What follows from all discoveries of a turn is settled at its end, or first in the next: a topic with thousands
+        of writers is not looked at for each of them.
+        """
         self._drain_due = False
         end_s = now() + SERVE_S
         try:
+            if not self._settled(end_s):
+                return
             for _ in range(len(self._ready)):  # what comes meanwhile has its own turn
                 item = self._ready[0]
                 if not isinstance(item, Arrived):
                     self._ready.popleft()
+                    self._served += 1
+                    self._unsettled = True
                     item()
                 elif self._empty(*item, end_s):
                     self._ready.popleft()
                 if now() >= end_s:
-                    break
+                    return
+            self._settled(end_s)
         finally:
+            if self._held and not self._behind:
+                self._guard.set(True)
             # A fault in one of them is reported by the loop; the others must not wait for the next event.
-            if self._ready and not self._drain_due and not self._stopping.is_set():
+            if (self._ready or self._unsettled) and not self._drain_due and not self._stopping.is_set():
                 self._drain_due = True
                 self._loop.call_soon(self._drain)
+
+    def _settled(self, end_s: float) -> bool:
+        """Settle what was found, until `end_s`. Whether nothing is left, nor the time over."""
+        while self._unsettled:
+            self._unsettled = self._settle()
+            if now() >= end_s:
+                return False
+        return True
 
     def _empty(self, inbox: Inbox, last: int, end_s: float) -> bool:
         """Deliver the samples up to number `last`, or until `end_s`. Whether none of them is left."""
@@ -194,20 +299,36 @@ class Worker:
 
     def _run(self) -> None:
         while not self._stopping.is_set():
-            numbers = self._waiter.wait()
+            numbers = self._wait()
             self._guard.take()
             while self._jobs:
                 self._try(self._jobs.popleft())
             for number in sorted(numbers):
-                if self._stopping.is_set():
+                if self._stopping.is_set() or self._behind:
                     break
                 if number >= _FIRST:
                     self._try(partial(self._take, number))
                 elif number != _WAKE:
                     self._try(partial(self._discover, number))
         self._waiter.close()
+        self._held_waiter.close()
         self._inboxes.clear()
         self._jobs.clear()
+
+    def _wait(self) -> list[int]:
+        """The numbers of what is ready. None while the event loop is behind, but there may be jobs.
+
+        All is left in DDS then, messages too: who speaks is to be known before what is said.
+        """
+        self._held = True  # first: the event loop may catch up at any moment, and has to wake this thread
+        if self._behind:
+            return self._held_waiter.wait()
+        self._held = False
+        return self._waiter.wait()
+
+    @property
+    def _behind(self) -> bool:
+        return self._found - self._served >= MAX_FOUND
 
     def _try(self, step: Callable[[], object]) -> None:
         """What one peer says or one reader does must not end the thread for all."""
@@ -246,7 +367,7 @@ class Worker:
         taken = raw.take(reader, TAKE_AT_ONCE)
         self._try(partial(self._find_writers, {info.publication_handle: None for _, info in taken}))
         for body, info in taken:
-            if not info.valid_data:
+            if not info.valid_data or not inbox.is_new(body, info.source_timestamp, info.publication_handle):
                 continue
             inbox.came += 1
             inbox.samples.append((inbox.came, Sample(body, info.source_timestamp, info.publication_handle)))
@@ -265,6 +386,7 @@ class Worker:
         return len(taken)
 
     def _hand_over(self, item: Arrived | Callable[[], None]) -> None:
+        self._found += not isinstance(item, Arrived)
         self._ready.append(item)
         if not self._drain_due:
             self._drain_due = True

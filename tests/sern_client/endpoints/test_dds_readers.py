@@ -1,5 +1,6 @@
 """Which readers the dds endpoint has for a topic whose writers come and go."""
 
+import threading
 from collections.abc import AsyncIterator
 from dataclasses import replace
 from typing import Any
@@ -15,10 +16,11 @@ from sern_client.endpoints.dds.endpoint import DdsEndpoint, DdsOptions
 from sern_client.endpoints.dds.graph import Remote
 from sern_client.endpoints.dds.qos import EndpointQos, mismatches, reader_for, within_reach
 from sern_client.endpoints.dds.stream import Stream
+from sern_core.errors import ConfigError
 from sern_core.types import DropReason, Encoding, TopicName
 from sern_runtime.ros_types import topic_info
 from tests.peers.dds.peer import free_domain
-from tests.support import Events, until
+from tests.support import DEADLINE_S, Events, until
 
 STRING = "std_msgs::msg::dds_::String_"
 RELIABLE = EndpointQos(reliable=True)
@@ -57,6 +59,14 @@ def writer(number: int, **changed: Any) -> Remote:
     return replace(there, **changed)
 
 
+def settle(endpoint: DdsEndpoint) -> int:
+    """Have the endpoint heed all that changed. How many topics and services that were."""
+    count = 1
+    while endpoint.settle():
+        count += 1
+    return count
+
+
 class Pair:
     """Two endpoints of this process in one domain; what `two` opens of readers is in `opened`."""
 
@@ -67,6 +77,11 @@ class Pair:
     def sink(self, body: bytes, stamp_ns: int) -> bool:
         self.got.append(body)
         return True
+
+    def add(self, remote: Remote) -> None:
+        """A writer comes that `two` is told of."""
+        self.two.remote_added(remote)
+        settle(self.two)
 
     async def connect(self) -> Stream:
         """Take /chat of `one` at `two`."""
@@ -80,7 +95,7 @@ class Pair:
 
 
 def body(number: int) -> bytes:
-    return b"\0\x01\0\0\x04\0\0\0" + b"%03d\0" % number
+    return b"\0\x01\0\0\x08\0\0\0" + b"%07d\0" % number
 
 
 @pytest.fixture
@@ -111,11 +126,12 @@ async def pair(monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[Pair]:
 )
 async def test_a_writer_that_never_matches_leaves_the_reader_alone(pair: Pair, changed: dict[str, Any]) -> None:
     publisher = await pair.connect()
-    pair.two.remote_added(writer(50))
-    pair.two.remote_added(writer(51, **changed))
+    pair.add(writer(50))
+    pair.add(writer(51, **changed))
     for number in range(60, 70):
-        pair.two.remote_added(writer(number))
+        pair.add(writer(number))
         pair.two.remote_removed(UUID(int=number))
+        settle(pair.two)
     assert len(pair.opened) == 1
     publisher.publish(body(1), 1)
     await until(lambda: pair.got == [body(1)])
@@ -142,8 +158,163 @@ async def test_what_a_reader_has_received_outlives_it(pair: Pair) -> None:
     bodies = [body(number) for number in range(300)]
     for one in bodies:
         publisher.publish(one, 1)
-    pair.two.remote_added(writer(50, qos=EndpointQos()))
+    pair.add(writer(50, qos=EndpointQos()))
     assert [qos.reliable for qos in pair.opened] == [True, False]
     await until(lambda: pair.got == bodies, "all that was written")
     await until(lambda: not pair.two._leaving, "the end of the reader")
     assert pair.two.drops == {}
+
+
+class Held:
+    """Keeps a worker's thread in a job until `go`."""
+
+    def __init__(self, endpoint: DdsEndpoint) -> None:
+        assert endpoint._joined is not None
+        self._began, self._end = threading.Event(), threading.Event()
+        endpoint._joined.worker._do(self._wait)
+        assert self._began.wait(DEADLINE_S)
+
+    def _wait(self) -> None:
+        self._began.set()
+        assert self._end.wait(DEADLINE_S)
+
+    def go(self) -> None:
+        self._end.set()
+
+
+async def in_the_end(pair: Pair, publisher: Stream) -> list[bytes]:
+    """All that came, when what is written last has come and no reader is being let go."""
+    last = body(9999)
+    await until(lambda: publisher.matched == 1 and not pair.two._leaving, "the end of the readers before")
+    publisher.publish(last, 1)
+    await until(lambda: last in pair.got, "the last message")
+    return pair.got[:-1]
+
+
+@pytest.mark.parametrize("depth", [500, 3000])
+async def test_a_reader_made_anew_takes_nothing_twice(pair: Pair, depth: int) -> None:
+    """Both readers receive while the thread is busy; of the same messages some have the same time stamp."""
+    pair.two.options = replace(pair.two.options, queue_depth=depth)
+    publisher = await pair.connect()
+    held = Held(pair.two)
+    bodies = [body(number) for number in range(depth // 2)] + [body(7), body(7)]
+    for one in bodies[:100]:
+        publisher.publish(one, 1)
+    pair.add(writer(50, qos=EndpointQos()))
+    assert [qos.reliable for qos in pair.opened] == [True, False]
+    for one in bodies[100:]:
+        publisher.publish(one, 1)
+    held.go()
+    assert await in_the_end(pair, publisher) == bodies
+    assert pair.two.drops == {}
+
+
+async def test_history_is_not_delivered_again(pair: Pair) -> None:
+    """A transient-local reader gets what there was; one made in its place gets it too, but it was delivered."""
+    info = topic_info("/chat", "std_msgs/msg/String", Encoding.CDR, reliable=True)
+    publisher = pair.one.advertise(replace(info, depth=500, latched=True))
+    bodies = [body(number) for number in range(40)]
+    for one in bodies[:10]:
+        publisher.publish(one, 1)
+    await until(lambda: pair.two.graph.writers("rt/chat"))
+    pair.two.subscribe(TopicName("/chat"), pair.sink)
+    await until(lambda: pair.got == bodies[:10])
+    publisher.publish(bodies[10], 1)
+    await until(lambda: pair.got == bodies[:11])
+    held = Held(pair.two)
+    for one in bodies[11:20]:
+        publisher.publish(one, 1)
+    pair.add(writer(50, qos=EndpointQos(durability=1)))
+    for one in bodies[20:30]:
+        publisher.publish(one, 1)
+    pair.add(writer(51, qos=EndpointQos()))  # and once more, before the thread had its turn
+    for one in bodies[30:]:
+        publisher.publish(one, 1)
+    held.go()
+    assert [(qos.reliable, qos.durability) for qos in pair.opened] == [(True, 1), (False, 1), (False, 0)]
+    assert await in_the_end(pair, publisher) == bodies
+
+
+async def test_nothing_is_lost_between_two_readers(pair: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The thread does all that it has to do, and a message comes, just before there is the new reader."""
+    publisher = await pair.connect()
+    make = pair.two._make
+
+    def after_a_message(*given: Any, **options: Any) -> Any:
+        Held(pair.two).go()
+        publisher.publish(body(1), 1)
+        return make(*given, **options)
+
+    monkeypatch.setattr(pair.two, "_make", after_a_message)
+    pair.add(writer(50, qos=EndpointQos()))
+    assert len(pair.opened) == 2
+    assert await in_the_end(pair, publisher) == [body(1)]
+
+
+async def test_the_reader_before_stays_where_dds_gives_no_other(pair: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
+    publisher = await pair.connect()
+
+    def refuse(*given: Any, **options: Any) -> Any:
+        raise ConfigError("out of resources")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(pair.two, "_make", refuse)
+        pair.add(writer(50, qos=EndpointQos()))
+    publisher.publish(body(1), 1)
+    await until(lambda: pair.got == [body(1)])
+    pair.add(writer(51, qos=EndpointQos()))
+    assert [qos.reliable for qos in pair.opened] == [True, False, False]
+    assert await in_the_end(pair, publisher) == [body(1)]
+
+
+def test_many_writers_of_unknown_types_are_looked_up_once(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Each type and version is, each time that anything of the topic changed; a line is worded only if it is said."""
+    endpoint, heard = DdsEndpoint(DdsOptions()), Events()
+    endpoint._events = heard
+    lookups: list[tuple[str, str]] = []
+    owners: list[Remote] = []
+    message, owner = endpoint.types.message, endpoint.graph.owner
+
+    def counted(type_name: str, type_hash: str = "") -> Any:
+        lookups.append((type_name, type_hash))
+        return message(type_name, type_hash)
+
+    def named(remote: Remote) -> str:
+        owners.append(remote)
+        return owner(remote)
+
+    monkeypatch.setattr(endpoint.types, "message", counted)
+    monkeypatch.setattr(endpoint.graph, "owner", named)
+    unknown = [writer(k, type_name="x::msg::dds_::T_", qos=replace(RELIABLE, type_hash=str(k % 2))) for k in range(300)]
+    for one in unknown[:200]:
+        endpoint.remote_added(one)
+    assert not lookups and settle(endpoint) == 1
+    assert lookups == [("x/msg/T", "0"), ("x/msg/T", "1")] and owners == unknown[:2]
+    for one in unknown[200:]:
+        endpoint.remote_added(one)
+    endpoint.remote_added(writer(400, topic="rt/other", type_name="no type"))
+    assert settle(endpoint) == 2 and len(lookups) == 4 and len(owners) == 2 and heard.infos == {}
+    assert len(caplog.messages) == 3 and caplog.messages[0].startswith("/chat of participant without a name")
+    endpoint.remote_added(writer(500))
+    settle(endpoint)
+    assert list(heard.infos) == ["/chat"]
+
+
+def test_many_readers_of_unknown_services_are_looked_up_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    endpoint, heard = DdsEndpoint(DdsOptions()), Events()
+    endpoint._events = heard
+    endpoint.watch_services(heard)
+    lookups: list[str] = []
+    service = endpoint.types.service
+
+    def counted(type_name: str, request_hash: str = "") -> Any:
+        lookups.append(type_name)
+        return service(type_name, request_hash)
+
+    monkeypatch.setattr(endpoint.types, "service", counted)
+    endpoint.remote_added(writer(0, topic="rr/addReply", type_name="x::srv::dds_::S_Response_"))
+    for k in range(200):
+        endpoint.remote_added(writer(k + 1, writer=False, topic="rq/addRequest", type_name="x::srv::dds_::S_Request_"))
+    assert settle(endpoint) == 1 and lookups == ["x/srv/S"] and heard.services == {}
