@@ -297,7 +297,7 @@ class ClientCore:
             for identity, cache in self._latched.items():
                 link.by_stream[identity].prime(cache.replay(), now=now)
         self.peers.session_began(now=now)
-        self._send_subscription(now, self.peers.lost())
+        self._send_subscription(now, self.peers.asked())
         self._tell(self.events.link_up, resumed=resumed)
 
     def on_down(self, link: Link, reason: str, *, now: float) -> None:

@@ -18,6 +18,9 @@ without bound, and sums stay what they were."""
 IDLE_S: Final = 3600.0
 """How long the counters of a topic without streams are kept by themselves."""
 
+LOSSES: Final = (DropReason.RETENTION, DropReason.DISCONNECTED, DropReason.SHUTDOWN)
+"""Reasons for which a reliable message is given up that its subscribers still wanted."""
+
 NO_DROPS: Final[Mapping[DropReason, int]] = MappingProxyType(dict.fromkeys(DropReason, 0))
 """What the drops by reason are, of every topic that has had none yet: a table each would take more than all else that
 is counted."""
@@ -57,6 +60,7 @@ class SendCounters(_Drops):
         "priority",
         "refused",
         "refused_bytes",
+        "reliable_unconfirmed",
         "topic",
     )
 
@@ -68,6 +72,8 @@ class SendCounters(_Drops):
         self.delivered = self.delivered_bytes = 0
         self.dropped = self.dropped_bytes = 0
         self.refused = self.refused_bytes = 0
+        self.reliable_unconfirmed = 0
+        """Those dropped as UNCONFIRMED that were lost if they did not arrive: for a reason in LOSSES."""
 
     def add(self, other: "SendCounters") -> None:
         """Take over what another topic's counters say."""
@@ -132,6 +138,7 @@ class ReceiveCounters(_Drops):
 
 _SEND_SUMS: Final = (
     "offered", "offered_bytes", "delivered", "delivered_bytes", "dropped", "dropped_bytes", "refused", "refused_bytes",
+    "reliable_unconfirmed",
 )  # fmt: skip
 
 

@@ -4,8 +4,8 @@ The relay tells of each peer whether it can be reached (`sern_core/presence.py`)
 came last, and the client's own link says whether any of that is still to be believed: while it is down nobody knows,
 and ages grow. A peer that is gone for longer than the relay waits is given up there, with its streams. Here it stays as
 one that is gone, until it is back: nobody else would still say that it is missing. A new session asks the relay whether
-it is here. It is forgotten when this site wants none of the topics any more that it had here, or when the relay does
-not say.
+its peers are here; one that was connected before, and is not, is given up after LET_GO_S. A peer is forgotten when this
+site wants none of the topics any more that it had here, or when the relay does not say.
 """
 
 from collections import Counter
@@ -68,7 +68,7 @@ class PeerChange(NamedTuple):
 
 
 class _Peer:
-    __slots__ = ("given_up", "lane", "lost", "rtt_s", "since_s", "status", "up", "up_since_s")
+    __slots__ = ("absent", "given_up", "lane", "lost", "rtt_s", "since_s", "status", "up", "up_since_s")
 
     def __init__(self, since_s: float) -> None:
         self.status = PeerStatus.UNKNOWN
@@ -78,6 +78,7 @@ class _Peer:
         self.lane = ""
         self.rtt_s: float | None = None
         self.lost = False  # what any relay said last is that it does not reach it
+        self.absent = False  # it was not, and is not here in this session
         self.given_up = False
 
 
@@ -106,7 +107,7 @@ class Peers:
         """Nobody knows of any peer any more."""
         self._session = False
         for peer in self._peers.values():
-            peer.up = None
+            peer.up, peer.absent = None, False
         self.reached(False, now=now)
 
     def reached(self, answers: bool, *, now: float) -> None:
@@ -126,7 +127,7 @@ class Peers:
         if not self._streams[origin]:
             del self._streams[origin]
         peer = self._peers.get(origin)
-        if peer is not None and peer.lost:
+        if peer is not None and not peer.up:
             ended = self._ended.setdefault(origin, {})
             while len(ended) >= MAX_ENDED:
                 del ended[next(iter(ended))]
@@ -158,10 +159,12 @@ class Peers:
                 return True
         return any(map(self._wants.fullmatch, topics))
 
-    def lost(self) -> list[ClientName]:
-        """Those that were gone when any relay spoke of them last: of them a new session asks. At most MAX_ASKED, those
-        given up last among them."""
-        return [name for name, peer in self._peers.items() if peer.lost][-MAX_ASKED:]
+    def asked(self) -> list[ClientName]:
+        """Those of whom a new session asks. At most MAX_ASKED: before others those that were gone when any relay spoke
+        of them last, and of these the ones that were given up last."""
+        names = [name for name, peer in self._peers.items() if not peer.lost]
+        names += [name for name, peer in self._peers.items() if peer.lost]
+        return names[-MAX_ASKED:]
 
     def arrived(self, origin: ClientName, *, now: float) -> None:
         """A message of `origin` came."""
@@ -180,7 +183,7 @@ class Peers:
         if "up" not in item:  # we take nothing of it any more
             here = wire.take_bool(item, "here")  # an older relay does not say: who was gone is gone as far as we know
             if name in self._peers:
-                self._let_go(name, self._peers[name], here, now)
+                self._let_go(name, self._peers[name], here, now, said="here" in item)
             return
         up = wire.take_bool(item, "up")
         for_s = wire.take_float(item, "for", low=0.0, high=MAX_FOR_S) or 0.0
@@ -191,7 +194,7 @@ class Peers:
         peer = self._known(name, now)
         if peer.up is not up:
             peer.up, peer.up_since_s = up, now - for_s
-        peer.lost, peer.given_up = not up, False
+        peer.lost, peer.absent, peer.given_up = not up, False, False
         if up:
             self._ended.pop(name, None)
         peer.rtt_s, peer.lane = rtt_s, lane
@@ -215,8 +218,8 @@ class Peers:
             peer.status, peer.since_s = status, since_s
             self.on_change(PeerChange(name, old, status, lasted_s))
 
-    def _let_go(self, name: ClientName, peer: _Peer, here: bool, now: float) -> None:
-        """We take nothing of it at the relay, where it is or is not."""
+    def _let_go(self, name: ClientName, peer: _Peer, here: bool, now: float, *, said: bool) -> None:
+        """We take nothing of it at the relay, where it is or is not; an older one has not said which."""
         if peer.lost and not here and self._wanted(name):
             self._give_up(name, peer, now)
             return
@@ -225,7 +228,10 @@ class Peers:
             peer.lost = peer.given_up = False
             self._ended.pop(name, None)
             self._settle(name, peer, now)
-        peer.up = None
+        if said and not here and peer.up is None:  # a relay that has just begun may hear of it yet: see `look`
+            peer.absent, peer.up_since_s = True, now
+            return
+        peer.up, peer.absent = None, False
         if name not in self._streams:
             self._forget(name, now)
 
@@ -234,7 +240,7 @@ class Peers:
         if peer.given_up:
             self._settle(name, peer, now)
             return
-        peer.given_up = True
+        peer.lost = peer.given_up = True
         self._peers[name] = self._peers.pop(name)  # last: the one given up longest ago is the first of them
         if sum(other.given_up for other in self._peers.values()) > MAX_GIVEN_UP:
             self._make_way()
@@ -263,7 +269,11 @@ class Peers:
         """All peers by name. Lets go of those that nothing speaks of any more."""
         if self._session and now - self._session_s > LET_GO_S:
             for name, peer in list(self._peers.items()):
-                if peer.up is None and name not in self._streams:
+                if peer.up is not None:
+                    continue
+                if peer.absent and self._wanted(name):
+                    self._give_up(name, peer, now)
+                elif name not in self._streams:
                     self._forget(name, now)
         return [self._view(name, peer, now) for name, peer in sorted(self._peers.items())]
 

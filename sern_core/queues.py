@@ -19,7 +19,7 @@ from operator import attrgetter
 from typing import Any, Final
 
 from sern_core.encoding import ChannelCodec, Coding
-from sern_core.ledger import SendCounters
+from sern_core.ledger import LOSSES, SendCounters
 from sern_core.message import Message, StreamInfo
 from sern_core.out_message import OutMessage, in_sequence
 from sern_core.rate_cap import RateCap
@@ -363,10 +363,25 @@ class OutChannel:
             for out in outs:
                 out.coding = Coding.DONE
 
+    def _told(self, out: OutMessage, reason: DropReason, count: int = 1) -> DropReason:
+        """Whatever the reason to give up so many like this: what may have arrived must not be counted as if it had not.
+        Called once for each message."""
+        if not out.exposed:
+            return reason
+        if self.reliable and reason in LOSSES:
+            self.counters.reliable_unconfirmed += count
+        return DropReason.UNCONFIRMED
+
+    def _give_up(self, lost: list[OutMessage], reason: DropReason) -> int:
+        """Count what is given up and tell of it; returns in how many runs."""
+        count = 0
+        for run in self._runs(lost):
+            self._dropped(run, self._told(run[0], reason, len(run)))
+            count += 1
+        return count
+
     def _drop(self, out: OutMessage, reason: DropReason) -> None:
-        """Whatever the reason to give it up: one that may have arrived must not be counted as if it had not."""
-        if out.exposed:
-            reason = DropReason.UNCONFIRMED
+        reason = self._told(out, reason)
         out.coding = Coding.DONE  # whatever another thread makes of it
         self._count(out.seq, reason, out.offered_bytes)
         self.on_drop(self, (out,), reason)
@@ -402,8 +417,7 @@ class OutChannel:
         while self.queue and self._expired(self.queue[0], now):
             gone.append(self._pop_queue())
         self._uncode(gone)
-        for run in self._runs(gone):
-            self._dropped(run, DropReason.UNCONFIRMED if run[0].exposed else DropReason.LIFESPAN)
+        self._give_up(gone, DropReason.LIFESPAN)
 
     def _overdue(self, out: OutMessage, now: float) -> DropReason | None:
         """Why a message is not to be sent any more, by time; None if it is."""
@@ -438,8 +452,9 @@ class OutChannel:
         if not out.started:
             self.queued_bytes -= size - 1
         self.retained_bytes -= size - 1
-        reported, told = out.counted, DropReason.UNCONFIRMED if out.exposed else reason
+        reported, told = out.counted, reason
         if not reported:
+            told = self._told(out, reason)
             self._count(out.seq, told, out.offered_bytes)
         out.entomb(reason)
         if not reported:
@@ -875,7 +890,8 @@ class OutChannel:
 
     def _entomb_all(self, outs: list[OutMessage], reason: DropReason) -> None:
         """Tombstones take the places of reliable messages. Those that were not counted are told of together."""
-        told = [(run, run[0].exposed) for run in self._runs([out for out in outs if not out.counted])]
+        lost = [out for out in outs if not out.counted]
+        told = [(run, self._told(run[0], reason, len(run))) for run in self._runs(lost)]
         for out in outs:
             freed_bytes = out.size - 1
             self.retained_bytes -= freed_bytes
@@ -883,8 +899,8 @@ class OutChannel:
                 self.queued_bytes -= freed_bytes
             out.entomb(reason)
         self._activate_all([out for out in outs if out.started])
-        for run, exposed in told:
-            self._dropped(run, DropReason.UNCONFIRMED if exposed else reason)
+        for run, why in told:
+            self._dropped(run, why)
 
     def _leave_behind(self, now: float, room: int) -> int:
         """Without a session the oldest that have lapsed leave nothing behind: there is nobody to tell, and the
@@ -912,8 +928,7 @@ class OutChannel:
             self.watermark = last_seq
             self._take_out()
         for why, lost in runs:
-            for run in self._runs(lost):
-                self._dropped(run, DropReason.UNCONFIRMED if run[0].exposed else why)
+            self._give_up(lost, why)
         return count + seen // SEEN_PER_LAPSED
 
     @property
@@ -957,9 +972,7 @@ class OutChannel:
         work_us = self.kept // CLEARED_PER_US
         left = self.retained if self.reliable else [*self.flying.values(), *self.queue]
         self._uncode(left)
-        for run in self._runs([out for out in left if not out.counted]):
-            self._dropped(run, DropReason.UNCONFIRMED if run[0].exposed else reason)
-            work_us += GIVEN_UP_US
+        work_us += GIVEN_UP_US * self._give_up([out for out in left if not out.counted], reason)
         if self.reliable:
             self.gaps = _NOTHING
             self.watermark = max(self.watermark, self.next_seq - 1)

@@ -5,15 +5,14 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from typing import Final
 
 from sern_core.codecs import Coder
-from sern_core.ledger import NO_DROPS, ReceiveLedger
+from sern_core.ledger import LOSSES, NO_DROPS, ReceiveLedger
 from sern_core.link import Link
 from sern_core.types import CLASS_LABELS, DropReason
 from sern_runtime import clock
 from sern_runtime.metrics import LATENCY_EDGES_S, Histogram, HistogramCounts, Labels, Metrics
 
-LOSSES: Final = (DropReason.RETENTION, DropReason.DISCONNECTED, DropReason.SHUTDOWN)
-"""Reasons that an alert looks for: rows at 0 from the start on, so that `increase()` sees the first message. The others
-have a row from their first message on: twenty rows for each topic of each link are too many to write."""
+# An alert looks for the LOSSES: they have rows at 0 from the start on, so that `increase()` sees the first message. The
+# others have a row from their first message on: twenty rows for each topic of each link are too many to write.
 RECEIVED_LOSSES: Final = (DropReason.LOST, DropReason.UNDECODABLE, DropReason.FAULT)
 """The same for what arrives."""
 
@@ -109,6 +108,8 @@ def register_links(metrics: Metrics, links: Callable[[], Collection[Link]]) -> N
     counter("sern_messages_offered_total", "Messages offered to a link.", topic, per_topic("offered"))
     counter("sern_messages_delivered_total", "Messages that the peer has (reliable: delivered to the far end).",
             topic, per_topic("delivered"))  # fmt: skip
+    counter("sern_reliable_unconfirmed_total", "Reliable messages sent whole and given up unconfirmed; perhaps lost.",
+            topic, per_topic("reliable_unconfirmed"))  # fmt: skip
     counter("sern_messages_refused_total", "Messages refused to their source: a reliable queue was full.",
             topic, per_topic("refused"))  # fmt: skip
     counter("sern_bytes_offered_total", "Bytes offered to a link.", topic, per_topic("offered_bytes"))

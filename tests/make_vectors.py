@@ -350,7 +350,7 @@ def valid() -> list[Vector]:
         ),
         _control(
             "subscribe-known",
-            "an earlier part, in which a client asks of two that were gone when it heard of them last",
+            "an earlier part, in which a client asks of two that it knows",
             {"t": "subscribe", "patterns": [], "more": True, "known": ["jackal2", "jackal3"]},
         ),
         _control(

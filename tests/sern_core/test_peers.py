@@ -335,9 +335,8 @@ def test_a_relay_that_begins_anew_tells_of_who_is_there() -> None:
 
 
 @pytest.mark.parametrize("said_gone", [True, False])
-def test_a_robot_that_a_new_relay_never_hears_of_is_gone_if_it_was_once_its_streams_end(said_gone: bool) -> None:
-    """Of one that was there before, nobody can say that it is gone: it may have nothing for us any more. Of one
-    that was gone, the site asks the new relay."""
+def test_a_robot_that_a_new_relay_never_hears_of_is_gone(said_gone: bool) -> None:
+    """Of one that was gone at once; one that was there has LET_GO_S to come to the new relay."""
     world = World().watch()
     robot = world.client("robot", LinkModel(blackouts=(Window(5.0, 1e6),), disconnect_after_s=0.2).as_stream())
     site = world.client("site", patterns=["/robot/.*"])
@@ -349,10 +348,41 @@ def test_a_robot_that_a_new_relay_never_hears_of_is_gone_if_it_was_once_its_stre
     else:
         world.run(0.11)
     world.restart_relay()
-    world.run(2 * LET_GO_S)
+    world.run(LET_GO_S / 2)
     assert statuses(site) == {"robot": GONE if said_gone else UNKNOWN}
+    world.run(LET_GO_S)
+    assert statuses(site) == {"robot": GONE}
     world.until(lambda: site.closed, within_s=1000.0, what="the site's retention is over")
-    assert statuses(site) == ({"robot": GONE} if said_gone else {})
+    assert statuses(site) == {"robot": GONE} and peers(site)["robot"].given_up
+
+
+def test_a_robot_that_dies_while_our_own_link_is_down_is_gone_and_forgotten_with_its_topics() -> None:
+    world = World(hub_params=HubParams(resume_s=20.0)).watch()
+    robot = world.client("robot")
+    site = world.client("site", patterns=["/robot/.*"])
+    robot.publish("/robot/odom", spec())
+    world.until(lambda: statuses(site) == {"robot": CONNECTED})
+    world.hops["site"].break_connection(reconnect_s=60.0)
+    world.until(lambda: statuses(site) == {"robot": UNKNOWN})
+    world.network.crash_node(robot)
+    world.until(lambda: statuses(site) == {"robot": GONE}, within_s=60.0 + 2 * LET_GO_S)
+    assert peers(site)["robot"].given_up
+    world.run(2 * LET_GO_S)
+    assert statuses(site) == {"robot": GONE}
+    site.core.subscribe(("/other/.*",), now=site.now)
+    assert statuses(site) == {}
+
+
+def test_a_robot_that_ends_its_topics_while_our_own_link_is_down_is_let_go() -> None:
+    world = World().watch()
+    robot = world.client("robot")
+    site = world.client("site", patterns=["/robot/.*"])
+    channel = robot.publish("/robot/odom", spec())
+    world.until(lambda: statuses(site) == {"robot": CONNECTED})
+    world.hops["site"].break_connection(reconnect_s=10.0)
+    world.until(lambda: statuses(site) == {"robot": UNKNOWN})
+    robot.core.unpublish(channel, now=robot.now)
+    world.until(lambda: statuses(site) == {}, within_s=20.0)
 
 
 # --- under load -------------------------------------------------------------------------------------------------------
@@ -514,12 +544,12 @@ def test_who_was_not_here_is_given_up_and_forgotten_in_a_session_that_says_nothi
     known.session_ended(now=10.0)
     assert [view.status for view in known.look(now=10.0)] == [UNKNOWN]
     known.session_began(now=20.0)
-    assert known.lost() == ["a"]
+    assert known.asked() == ["a"]
     (view,) = known.look(now=20.0 + LET_GO_S)
     assert (view.status, view.given_up) == (UNKNOWN, True)
     changes: list[PeerChange] = []
     known.on_change = changes.append
-    assert known.look(now=21.0 + LET_GO_S) == [] and known.lost() == []
+    assert known.look(now=21.0 + LET_GO_S) == [] and known.asked() == []
     assert [(change.name, change.forgotten) for change in changes] == [("a", True)]
 
 
@@ -650,7 +680,7 @@ def test_a_client_asks_of_the_last_of_many() -> None:
     for number in range(MAX_ASKED + 5):
         known.told({"t": "peers", "peers": [{"name": f"c{number}", "up": False, "for": 0.0}]}, now=0.0)
     known.told({"t": "peers", "peers": [{"name": "c0", "here": False}]}, now=0.0)
-    assert known.lost() == [*(f"c{number}" for number in range(6, MAX_ASKED + 5)), "c0"]
+    assert known.asked() == [*(f"c{number}" for number in range(6, MAX_ASKED + 5)), "c0"]
 
 
 def test_many_lost_robots_are_asked_of_in_parts() -> None:

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
-from sern_core.ledger import SendLedger
+from sern_core.ledger import LOSSES, SendLedger
 from sern_core.message import Message, StreamId, StreamInfo, TopicInfo, TopicSpec
 from sern_core.out_message import OutMessage
 from sern_core.queues import MESSAGE_OVERHEAD_BYTES, OutChannel
@@ -843,7 +843,30 @@ def test_what_the_peer_has_whole_lapses_with_its_retention() -> None:
     for second in range(11, 3600, 500):
         assert channel.sweep(float(second), up=True) == 0
     assert channel.sweep(3601.0, up=True) == 5 and sender.told == [(1, 5, DropReason.UNCONFIRMED)]
+    assert channel.counters.reliable_unconfirmed == 5
     sender.check()
+
+
+@pytest.mark.parametrize("reason", [*LOSSES, DropReason.UNWANTED])
+def test_what_nobody_wants_any_more_is_no_loss_though_it_was_not_confirmed(reason: DropReason) -> None:
+    sender = _whole_at_the_peer(3)
+    sender.submit(2, 2, now=0.0)
+    sender.channel.clear(reason)
+    counters = sender.channel.counters
+    assert (counters.by_reason[DropReason.UNCONFIRMED], counters.by_reason[reason]) == (3, 2)
+    assert counters.reliable_unconfirmed == (3 if reason in LOSSES else 0)
+
+
+def test_what_is_given_up_as_it_goes_is_a_loss_once() -> None:
+    sender = Sender(spec(reliable=True, retention_s=10.0))
+    sender.submit(1, now=0.0)
+    sender.send_all()
+    sender.channel.peer_restarted()
+    head = sender.channel.head(11.0)
+    assert head is not None and head.message.tombstone and sender.drops == [(1, DropReason.UNCONFIRMED)]
+    sender.channel.clear(DropReason.SHUTDOWN)
+    counters = sender.channel.counters
+    assert counters.reliable_unconfirmed == counters.by_reason[DropReason.UNCONFIRMED] == 1
 
 
 @pytest.mark.parametrize("seed", seeds(40))
