@@ -30,6 +30,11 @@ STATIC = frozenset(
         ".access._grants",
         ".access._grants[][]._exact",
         ".objects._deletions",  # a ring
+        ".presence._watchers[].missing",  # those that a client shows as gone, in its session: at most MAX_ASKED
+        ".peers._ended",  # those of whom is shown that they are gone: at most MAX_GIVEN_UP, with MAX_ENDED topics each
+        ".peers._ended[]",
+        ".peers._heard_s",
+        ".peers._peers",
         ".received.topics[].by_reason",  # one row with all topics that have ended
     }
 )
