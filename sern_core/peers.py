@@ -268,8 +268,9 @@ class Peers:
     def look(self, *, now: float) -> list[PeerView]:
         """All peers by name. Lets go of those that nothing speaks of any more."""
         if self._session and now - self._session_s > LET_GO_S:
-            for name, peer in list(self._peers.items()):
-                if peer.up is not None:
+            for name in list(self._peers):
+                peer = self._peers.get(name)  # None: it has made way for one before it
+                if peer is None or peer.up is not None:
                     continue
                 if peer.absent and self._wanted(name):
                     self._give_up(name, peer, now)

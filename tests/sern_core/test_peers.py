@@ -534,6 +534,26 @@ def test_of_many_that_were_given_up_the_last_are_shown() -> None:
     assert {view.name for view in known.look(now=1.0)} == {f"c{number}" for number in range(3, MAX_GIVEN_UP + 3)}
 
 
+def test_who_makes_way_while_others_are_given_up_is_not_looked_at_again() -> None:
+    """The relay has said of the first of them in this session, and its next message does not come in time."""
+    known = Peers()
+
+    def tell(now: float, **item: object) -> None:
+        known.told({"t": "peers", "peers": [item]}, now=now)
+
+    known.subscribed(("/.*",), now=0.0)
+    known.session_began(now=0.0)
+    tell(0.0, name="a", up=True)
+    names = [f"r{number:03d}" for number in range(MAX_GIVEN_UP)]
+    for name in names:
+        tell(1.0, name=name, up=False)
+        tell(2.0, name=name, here=False)
+    known.session_ended(now=3.0)
+    known.session_began(now=4.0)
+    tell(5.0, name="a", here=False)
+    assert [view.name for view in known.look(now=5.0 + LET_GO_S)] == ["a"]
+
+
 @pytest.mark.parametrize("says", [{}, {"here": False}])
 def test_who_was_not_here_is_given_up_and_forgotten_in_a_session_that_says_nothing_of_it(says: wire.Envelope) -> None:
     """Also by a relay of an earlier version, which does not say whether a client is here."""
