@@ -5,6 +5,7 @@ from collections.abc import Callable
 
 import pytest
 
+from sern_core import presence as presence_module
 from sern_core import wire
 from sern_core.access import AccessRule, AccessTable
 from sern_core.errors import WireError
@@ -692,6 +693,20 @@ def test_there_is_an_end_to_those_of_whom_a_client_may_ask() -> None:
     presence.ask(ClientName("site"), [ClientName("new")])
     presence.sweep(now=2.0)
     assert len(site.items) == MAX_ASKED + 1 and len(presence._watchers[ClientName("site")].missing) == MAX_ASKED
+
+
+def test_what_many_clients_are_told_takes_many_turns(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A relay that begins anew is asked by all of them at once."""
+    monkeypatch.setattr(presence_module, "TOLD_AT_ONCE", 4)
+    presence, _site, links = asking(set(), *(f"s{number}" for number in range(4)))
+    for name in links:
+        presence.watch(name, now=0.0)
+        presence.ask(name, [ClientName(f"c{number}") for number in range(2 * MAX_TOLD)])
+    presence.sweep(now=1.0)
+    told = [sum(len(link.items) for link in links.values()) // MAX_TOLD]
+    while presence.tell(now=1.0):
+        told.append(sum(len(link.items) for link in links.values()) // MAX_TOLD)
+    assert told == [4, 8] and all(len(link.items) == 2 * MAX_TOLD for link in links.values())
 
 
 def test_a_client_asks_of_the_last_of_many() -> None:
