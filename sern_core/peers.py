@@ -181,9 +181,9 @@ class Peers:
     def _told(self, item: dict[str, Any], now: float) -> None:
         name = ClientName(wire.take_str(item, "name", max_length=64))
         if "up" not in item:  # we take nothing of it any more
-            here = wire.take_bool(item, "here")  # an older relay does not say: who was gone is gone as far as we know
+            here = wire.take_bool(item, "here") if "here" in item else None
             if name in self._peers:
-                self._let_go(name, self._peers[name], here, now, said="here" in item)
+                self._let_go(name, self._peers[name], here, now)
             return
         up = wire.take_bool(item, "up")
         for_s = wire.take_float(item, "for", low=0.0, high=MAX_FOR_S) or 0.0
@@ -218,8 +218,9 @@ class Peers:
             peer.status, peer.since_s = status, since_s
             self.on_change(PeerChange(name, old, status, lasted_s))
 
-    def _let_go(self, name: ClientName, peer: _Peer, here: bool, now: float, *, said: bool) -> None:
-        """We take nothing of it at the relay, where it is or is not; an older one has not said which."""
+    def _let_go(self, name: ClientName, peer: _Peer, here: bool | None, now: float) -> None:
+        """We take nothing of it at the relay, where it is or is not. None: an older one does not say; who was gone is
+        gone as far as we know."""
         if peer.lost and not here and self._wanted(name):
             self._give_up(name, peer, now)
             return
@@ -228,7 +229,7 @@ class Peers:
             peer.lost = peer.given_up = False
             self._ended.pop(name, None)
             self._settle(name, peer, now)
-        if said and not here and peer.up is None:  # a relay that has just begun may hear of it yet: see `look`
+        if here is False and peer.up is None:  # a relay that has just begun may hear of it yet: see `look`
             peer.absent, peer.up_since_s = True, now
             return
         peer.up, peer.absent = None, False
