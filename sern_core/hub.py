@@ -858,7 +858,8 @@ class Hub(LocalStreams):
         parts = self._subscriptions.setdefault(client, [])
         parts += wire.take_strings(envelope, "patterns")
         if "known" in envelope:
-            self.presence.ask(client, map(ClientName, wire.take_strings(envelope, "known", max_length=64)))
+            known = wire.take_strings(envelope, "known", max_length=64)
+            self.presence.ask(client, map(ClientName, filter(is_client_name, known)))
         if wire.take_bool(envelope, "more"):
             if len(parts) > MAX_SUBSCRIPTION_PARTS * wire.MAX_ENVELOPE_ITEMS:
                 raise WireError(f"more than {MAX_SUBSCRIPTION_PARTS * wire.MAX_ENVELOPE_ITEMS} subscription patterns")

@@ -718,11 +718,31 @@ def test_a_client_asks_of_the_last_of_many() -> None:
     assert known.asked() == [*(f"c{number}" for number in range(6, MAX_ASKED + 5)), "c0"]
 
 
+def test_of_what_is_no_name_of_a_client_nothing_is_said() -> None:
+    """As it came it may be too long to be said: what is bounded in a name is its characters."""
+    world = World().watch()
+    asking = world.client("asking")
+    world.run(1.0)
+    told: list[wire.Envelope] = []
+
+    def note(envelope: wire.Envelope, *, now: float) -> None:
+        told.append(envelope)
+
+    asking.core.peers.told = note  # type: ignore[method-assign]
+    for start in (0, 12):
+        names = ["robot", *(chr(0x10000 + start + number) * 64 for number in range(12))]
+        envelope = {"t": "subscribe", "patterns": [], "more": start == 0, "peers": True, "known": names}
+        asking.core.link.send_control(envelope, now=asking.now)
+    world.run(3.0)
+    assert [item for envelope in told for item in envelope["peers"]] == [{"name": "robot", "here": False}]
+    world.check_faults()
+
+
 def test_many_lost_robots_are_asked_of_in_parts() -> None:
     world = World().watch()
     site = world.client("site", patterns=["/.*"])
     world.run(1.0)
-    names = [f"r{number:03d}" + "x" * 60 for number in range(MAX_ASKED)]
+    names = [f"r{number:03d}" + "x" * 59 for number in range(MAX_ASKED)]
     for name in names:
         site.core.peers.told({"t": "peers", "peers": [{"name": name, "up": False, "for": 0.0}]}, now=site.now)
     world.hops["site"].break_connection(reconnect_s=1.0)
