@@ -154,9 +154,10 @@ class Presence:
             self._tell(client, now)
 
     def ask(self, client: ClientName, names: Iterable[ClientName]) -> None:
-        """A client asks whether these are here, its peers or not. Those above MAX_ASKED are left out."""
+        """A client asks whether these are here, its peers or not. Those above MAX_ASKED are left out, and the relay's
+        own names: it has no session with itself."""
         asked = self._asked.setdefault(client, set())
-        asked.update(list(names)[: MAX_ASKED - len(asked)])
+        asked.update([name for name in names if name not in self._local][: MAX_ASKED - len(asked)])
 
     def changed(self, client: ClientName, *, now: float) -> None:
         """The client's session has begun or ended: nobody waits for `sweep`."""

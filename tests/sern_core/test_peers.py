@@ -104,6 +104,12 @@ def test_what_the_relay_itself_publishes_is_nobodys() -> None:
     world.run(2.0)
     told = [name for name in statuses(site) if name != "feed_scene"]
     assert told == [] and GONE not in statuses(site).values()
+    world.hops["site"].break_connection(reconnect_s=1.0)
+    world.run(LET_GO_S)
+    world.relay.hub.inject(handle, b"2", 0, now=world.relay.now)
+    world.run(LET_GO_S)
+    assert site.seqs("/scene/pose") == [1, 2]
+    assert GONE not in statuses(site).values(), "the site has asked of it in its new session"
 
 
 def test_a_client_that_does_not_ask_is_told_nothing() -> None:
