@@ -380,6 +380,23 @@ def test_a_robot_that_dies_while_our_own_link_is_down_is_gone_and_forgotten_with
     assert statuses(site) == {}
 
 
+def test_a_robot_that_died_is_gone_though_our_own_link_holds_for_less_than_it_has_to_come() -> None:
+    world = World(hub_params=HubParams(resume_s=20.0)).watch()
+    robot = world.client("robot")
+    site = world.client("site", patterns=["/robot/.*"])
+    robot.publish("/robot/odom", spec())
+    world.until(lambda: statuses(site) == {"robot": CONNECTED})
+    world.hops["site"].break_connection(reconnect_s=30.0)
+    world.network.crash_node(robot)
+    world.run(30.0)
+    for _ in range(2):
+        assert statuses(site) == {"robot": UNKNOWN}
+        world.run(LET_GO_S / 2)
+        world.hops["site"].break_connection(reconnect_s=1.0)
+        world.run(5.0)
+    assert statuses(site) == {"robot": GONE} and peers(site)["robot"].given_up
+
+
 def test_a_robot_that_ends_its_topics_while_our_own_link_is_down_is_let_go() -> None:
     world = World().watch()
     robot = world.client("robot")
@@ -558,7 +575,7 @@ def test_who_makes_way_while_others_are_given_up_is_not_looked_at_again() -> Non
     known.session_ended(now=3.0)
     known.session_began(now=4.0)
     tell(5.0, name="a", here=False)
-    assert [view.name for view in known.look(now=5.0 + LET_GO_S)] == ["a"]
+    assert [view.name for view in known.look(now=6.0 + LET_GO_S)] == ["a"]
 
 
 @pytest.mark.parametrize("says", [{}, {"here": False}])
