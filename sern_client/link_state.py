@@ -103,7 +103,10 @@ class LinkState:
         if change.forgotten:
             gone_s = self._gone_s.pop(name, None)
             if gone_s is not None:
-                _log.warning("%s is forgotten after %.1f s: nothing of it is taken here any more", name, now - gone_s)
+                _log.warning(
+                    "%s is forgotten after %.1f s: it has nothing that is wanted here, as far as the relay says",
+                    name, now - gone_s,
+                )  # fmt: skip
         elif change.given_up:
             _log.warning(
                 "%s is given up by the relay after %.0f s: its topics end, and it is gone until it is back",
@@ -180,7 +183,7 @@ class LinkState:
         why = {
             PeerStatus.CONNECTED: "",
             PeerStatus.GONE: "given up by the relay" if peer.given_up else "the relay does not reach it",
-            PeerStatus.UNKNOWN: "the relay has not told of it" if self._own_up else "our own link is down",
+            PeerStatus.UNKNOWN: "the relay does not say" if self._own_up else "our own link is down",
         }[peer.status]
         return LinkView(
             peer.name,

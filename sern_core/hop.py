@@ -363,11 +363,6 @@ class Hop(Sender):
             self._sweep(now)
         self.dirty = True
 
-    @property
-    def sweep_due_s(self) -> float:
-        """When what has lapsed is looked for next; the time of the last look if there is more."""
-        return self._sweep_due_s
-
     def _sweep(self, now: float) -> None:
         """Expire what nobody will send, also while the link is down."""
         self._sweep_due_s = now + SWEEP_INTERVAL_S
@@ -381,6 +376,7 @@ class Hop(Sender):
                 self._refresh(channel, now)
             if channel.watermark > watermark:
                 self._watermark_moved(channel)
+        self.lapsed += LAPSED_A_SWEEP - room
         if room <= 0:
             self._sweep_due_s = now  # the rest in another turn of the loop
         for stream in self.incoming.values():

@@ -39,7 +39,7 @@ from sern_core.objects import ObjectRegistry
 from sern_core.out_message import OutMessage
 from sern_core.params import LinkParams, SchedulerParams
 from sern_core.presence import Presence
-from sern_core.queues import OutChannel
+from sern_core.queues import LAPSED_A_SWEEP, OutChannel
 from sern_core.replay import ReplayStore, as_replays, kept_bytes, newest_that_fit
 from sern_core.routing import UNIT_S, BadPatternError, Denied, Match, RouteChange, RoutingTable
 from sern_core.rules import is_client_name, name_problem
@@ -256,15 +256,19 @@ class Hub(LocalStreams):
         self.presence.sweep(now=now)
 
     def lapse(self, *, now: float) -> bool:
-        """Retention goes on while clients are away. True: there is more to let go of; call again in another turn."""
+        """Retention goes on while clients are away, and clients are told of their peers. True: there is more to do;
+        call again in another turn."""
+        room = LAPSED_A_SWEEP  # for all together: each may have a little
         for client in list(self._absent_since):
             link = self.links[client]
             if link.established:
                 continue
+            lapsed = link.lapsed
             link.handle_timeout(now=now)
-            if link.sweep_due_s == now:  # it was swept now and is due again: it had no room for all
-                return True  # the others when this one has no more
-        return False
+            room -= link.lapsed - lapsed
+            if room <= 0:
+                return True
+        return self.presence.tell(now=now)
 
     def left(self, client: ClientName, *, now: float) -> None:
         """A client has said goodbye. One that has streams, or wants reliable ones, may come back to them (a daemon that
@@ -854,7 +858,8 @@ class Hub(LocalStreams):
         parts = self._subscriptions.setdefault(client, [])
         parts += wire.take_strings(envelope, "patterns")
         if "known" in envelope:
-            self.presence.ask(client, map(ClientName, wire.take_strings(envelope, "known", max_length=64)))
+            known = wire.take_strings(envelope, "known", max_length=64)
+            self.presence.ask(client, map(ClientName, filter(is_client_name, known)))
         if wire.take_bool(envelope, "more"):
             if len(parts) > MAX_SUBSCRIPTION_PARTS * wire.MAX_ENVELOPE_ITEMS:
                 raise WireError(f"more than {MAX_SUBSCRIPTION_PARTS * wire.MAX_ENVELOPE_ITEMS} subscription patterns")

@@ -68,7 +68,7 @@ class PeerChange(NamedTuple):
 
 
 class _Peer:
-    __slots__ = ("absent", "given_up", "lane", "lost", "rtt_s", "since_s", "status", "up", "up_since_s")
+    __slots__ = ("absent", "absent_s", "given_up", "lane", "lost", "rtt_s", "since_s", "status", "up", "up_since_s")
 
     def __init__(self, since_s: float) -> None:
         self.status = PeerStatus.UNKNOWN
@@ -79,6 +79,7 @@ class _Peer:
         self.rtt_s: float | None = None
         self.lost = False  # what any relay said last is that it does not reach it
         self.absent = False  # it was not, and is not here in this session
+        self.absent_s: float | None = None  # since when, in whatever sessions, nothing else was said
         self.given_up = False
 
 
@@ -181,9 +182,9 @@ class Peers:
     def _told(self, item: dict[str, Any], now: float) -> None:
         name = ClientName(wire.take_str(item, "name", max_length=64))
         if "up" not in item:  # we take nothing of it any more
-            here = wire.take_bool(item, "here")  # an older relay does not say: who was gone is gone as far as we know
+            here = wire.take_bool(item, "here") if "here" in item else None
             if name in self._peers:
-                self._let_go(name, self._peers[name], here, now, said="here" in item)
+                self._let_go(name, self._peers[name], here, now)
             return
         up = wire.take_bool(item, "up")
         for_s = wire.take_float(item, "for", low=0.0, high=MAX_FOR_S) or 0.0
@@ -194,7 +195,7 @@ class Peers:
         peer = self._known(name, now)
         if peer.up is not up:
             peer.up, peer.up_since_s = up, now - for_s
-        peer.lost, peer.absent, peer.given_up = not up, False, False
+        peer.lost, peer.absent, peer.absent_s, peer.given_up = not up, False, None, False
         if up:
             self._ended.pop(name, None)
         peer.rtt_s, peer.lane = rtt_s, lane
@@ -218,8 +219,9 @@ class Peers:
             peer.status, peer.since_s = status, since_s
             self.on_change(PeerChange(name, old, status, lasted_s))
 
-    def _let_go(self, name: ClientName, peer: _Peer, here: bool, now: float, *, said: bool) -> None:
-        """We take nothing of it at the relay, where it is or is not; an older one has not said which."""
+    def _let_go(self, name: ClientName, peer: _Peer, here: bool | None, now: float) -> None:
+        """We take nothing of it at the relay, where it is or is not. None: an older one does not say; who was gone is
+        gone as far as we know."""
         if peer.lost and not here and self._wanted(name):
             self._give_up(name, peer, now)
             return
@@ -228,10 +230,11 @@ class Peers:
             peer.lost = peer.given_up = False
             self._ended.pop(name, None)
             self._settle(name, peer, now)
-        if said and not here and peer.up is None:  # a relay that has just begun may hear of it yet: see `look`
-            peer.absent, peer.up_since_s = True, now
+        if here is False and peer.up is None:  # a relay that has just begun may hear of it yet: see `look`
+            peer.absent_s = now if peer.absent_s is None else peer.absent_s
+            peer.absent, peer.up_since_s = True, peer.absent_s
             return
-        peer.up, peer.absent = None, False
+        peer.up, peer.absent, peer.absent_s = None, False, None
         if name not in self._streams:
             self._forget(name, now)
 
@@ -267,14 +270,17 @@ class Peers:
 
     def look(self, *, now: float) -> list[PeerView]:
         """All peers by name. Lets go of those that nothing speaks of any more."""
-        if self._session and now - self._session_s > LET_GO_S:
-            for name, peer in list(self._peers.items()):
-                if peer.up is not None:
-                    continue
-                if peer.absent and self._wanted(name):
-                    self._give_up(name, peer, now)
-                elif name not in self._streams:
-                    self._forget(name, now)
+        for name in list(self._peers) if self._session else ():
+            peer = self._peers.get(name)  # None: it has made way for one before it
+            if peer is None or peer.up is not None:
+                continue
+            since_s = peer.up_since_s if peer.absent else self._session_s
+            if now - since_s <= LET_GO_S:
+                continue
+            if peer.absent and self._wanted(name):
+                self._give_up(name, peer, now)
+            elif name not in self._streams:
+                self._forget(name, now)
         return [self._view(name, peer, now) for name, peer in sorted(self._peers.items())]
 
     def _view(self, name: ClientName, peer: _Peer, now: float) -> PeerView:

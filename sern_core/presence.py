@@ -16,6 +16,7 @@ each peer only its latest state waits, and nothing is said before the client has
 from collections import Counter
 from collections.abc import Callable, Container, Iterable, Mapping
 from functools import partial
+from math import ceil
 from typing import Final, NamedTuple, Protocol
 
 from sern_core import wire
@@ -24,6 +25,8 @@ from sern_core.types import ClientName
 
 MAX_TOLD: Final = 24
 """Peers in one message: an envelope holds 4 KiB."""
+TOLD_AT_ONCE: Final = 500
+"""Messages in one turn of the loop: some milliseconds."""
 MAX_ASKED: Final = 128
 """Clients of whom a client may ask whether they are here, and of whom it waits to be told that they are."""
 BACK_PAUSE_S: Final = 5.0
@@ -151,9 +154,10 @@ class Presence:
             self._tell(client, now)
 
     def ask(self, client: ClientName, names: Iterable[ClientName]) -> None:
-        """A client asks whether these are here, its peers or not. Those above MAX_ASKED are left out."""
+        """A client asks whether these are here, its peers or not. Those above MAX_ASKED are left out, and the relay's
+        own names: it has no session with itself."""
         asked = self._asked.setdefault(client, set())
-        asked.update(list(names)[: MAX_ASKED - len(asked)])
+        asked.update([name for name in names if name not in self._local][: MAX_ASKED - len(asked)])
 
     def changed(self, client: ClientName, *, now: float) -> None:
         """The client's session has begun or ended: nobody waits for `sweep`."""
@@ -171,16 +175,25 @@ class Presence:
                 self._tell(taker, now)
 
     def sweep(self, *, now: float) -> None:
-        """See whose path has fallen silent or answers again, and say what is due. Call about once a second."""
+        """See whose path has fallen silent or answers again, and say what is due. Call about once a second, and then
+        `tell`."""
         for client in self._takers:
             self._look(client, now)
+        self.tell(now=now)
+
+    def tell(self, *, now: float) -> bool:
+        """Say what is due. True: there may be more; call again in another turn."""
+        room = TOLD_AT_ONCE
         for client, watching in list(self._watchers.items()):
             if client in self._asked and client not in self._matching:
                 self._look_for(client, watching, now)
             for peer in [peer for peer, since_s in watching.back.items() if now - since_s >= BACK_PAUSE_S]:
                 watching.found(peer)
                 watching.due.add(peer)
-            self._tell(client, now)
+            room -= self._tell(client, now)
+            if room <= 0:
+                return True
+        return False
 
     def _look_for(self, client: ClientName, watching: _Watcher, now: float) -> None:
         """It is known what a client takes: see of whom it asked."""
@@ -209,13 +222,16 @@ class Presence:
             for taker in self._takers[client]:
                 self._due(taker, client)
 
-    def _tell(self, client: ClientName, now: float) -> None:
+    def _tell(self, client: ClientName, now: float) -> int:
+        """Returns how many messages it took."""
         watching, link = self._watchers.get(client), self._links.get(client)
         if watching is None or link is None or not watching.due or not link.established:
-            return
+            return 0
         if link.control_heard < watching.seq:
-            return  # it is told the latest once it has heard of what was said before
+            return 0  # it is told the latest once it has heard of what was said before
+        count = ceil(len(watching.due) / MAX_TOLD)
         self._attempt(client, now, partial(self._say, client, watching, link, now))
+        return count
 
     def _say(self, client: ClientName, watching: _Watcher, link: PeerLink, now: float) -> None:
         due = sorted(watching.due)

@@ -132,6 +132,8 @@ class Sender(ABC):
         self._unsaid = False  # answers or reports about the peer's streams wait to be told
         self._rx_lane = self.lane
         self._sweep_due_s = now + SWEEP_INTERVAL_S
+        self.lapsed = 0
+        """Messages that sweeps have let go of so far, and what they looked at beside."""
         self._rate_due_s = now
         self._up_since_s = now
         self.cadences = Cadences()

@@ -5,6 +5,7 @@ from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
 from sern_core import client, hop
+from sern_core import hub as hub_module
 from sern_core.access import AccessRule, AccessTable
 from sern_core.hub import HubParams
 from sern_core.message import Message
@@ -132,9 +133,13 @@ def test_what_lapses_in_many_sweeps_is_reported_once_and_never_sent(monkeypatch:
     assert log.counters.offered == log.counters.delivered + log.counters.dropped == 500
 
 
-def test_what_lapses_for_clients_that_are_away_goes_in_many_turns(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Also of several clients: one turn is not for all that wait for all of them."""
-    monkeypatch.setattr(hop, "LAPSED_A_SWEEP", 3)
+@pytest.mark.parametrize(("count", "kept"), [(10, [27, 24, 21, 17, 14, 11, 7, 4, 1]), (2, [2])])
+def test_what_lapses_for_clients_that_are_away_goes_in_many_turns(
+    count: int, kept: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also of several clients: one turn is not for all that wait for all of them, however little it is of each."""
+    for module in (hop, hub_module):
+        monkeypatch.setattr(module, "LAPSED_A_SWEEP", 3)
     world = World(hub_params=HubParams(resume_s=1e6))
     robot = world.client("robot")
     sites = [world.client(name, patterns=["/robot/.*"]) for name in ("one", "two", "three")]
@@ -143,20 +148,20 @@ def test_what_lapses_for_clients_that_are_away_goes_in_many_turns(monkeypatch: p
     for site in sites:
         world.network.crash_node(site)
     world.run(1.0)
-    for _ in range(10):
+    for _ in range(count):
         assert robot.send(log, b"x")
     world.run(20.0)
     hub = world.relay.hub
     channels = [channel for site in sites for channel in hub.links[site.name].channels.values()]
-    assert [channel.kept for channel in channels] == [10, 10, 10]
+    assert [channel.kept for channel in channels] == [count] * 3
     now = world.relay.now + 60.0
     hub.sweep(now=now)
     left = [sum(channel.kept for channel in channels)]
     while hub.lapse(now=now):
         left.append(sum(channel.kept for channel in channels))
-    assert left == [27, 24, 21, 17, 14, 11, 7, 4, 1] and not any(channel.kept for channel in channels)
+    assert left == kept and not any(channel.kept for channel in channels)
     world.run(1.0)
-    assert sorted(drop.seq for drop in robot.dropped_out) == list(range(1, 11)) and not log.retained
+    assert sorted(drop.seq for drop in robot.dropped_out) == list(range(1, count + 1)) and not log.retained
 
 
 @pytest.mark.parametrize(("reliable", "most", "told"), [(True, 9, 3), (True, 2, 5), (False, 2, 3)])

@@ -5,6 +5,7 @@ from collections.abc import Callable
 
 import pytest
 
+from sern_core import presence as presence_module
 from sern_core import wire
 from sern_core.access import AccessRule, AccessTable
 from sern_core.errors import WireError
@@ -103,6 +104,12 @@ def test_what_the_relay_itself_publishes_is_nobodys() -> None:
     world.run(2.0)
     told = [name for name in statuses(site) if name != "feed_scene"]
     assert told == [] and GONE not in statuses(site).values()
+    world.hops["site"].break_connection(reconnect_s=1.0)
+    world.run(LET_GO_S)
+    world.relay.hub.inject(handle, b"2", 0, now=world.relay.now)
+    world.run(LET_GO_S)
+    assert site.seqs("/scene/pose") == [1, 2]
+    assert GONE not in statuses(site).values(), "the site has asked of it in its new session"
 
 
 def test_a_client_that_does_not_ask_is_told_nothing() -> None:
@@ -373,6 +380,23 @@ def test_a_robot_that_dies_while_our_own_link_is_down_is_gone_and_forgotten_with
     assert statuses(site) == {}
 
 
+def test_a_robot_that_died_is_gone_though_our_own_link_holds_for_less_than_it_has_to_come() -> None:
+    world = World(hub_params=HubParams(resume_s=20.0)).watch()
+    robot = world.client("robot")
+    site = world.client("site", patterns=["/robot/.*"])
+    robot.publish("/robot/odom", spec())
+    world.until(lambda: statuses(site) == {"robot": CONNECTED})
+    world.hops["site"].break_connection(reconnect_s=30.0)
+    world.network.crash_node(robot)
+    world.run(30.0)
+    for _ in range(2):
+        assert statuses(site) == {"robot": UNKNOWN}
+        world.run(LET_GO_S / 2)
+        world.hops["site"].break_connection(reconnect_s=1.0)
+        world.run(5.0)
+    assert statuses(site) == {"robot": GONE} and peers(site)["robot"].given_up
+
+
 def test_a_robot_that_ends_its_topics_while_our_own_link_is_down_is_let_go() -> None:
     world = World().watch()
     robot = world.client("robot")
@@ -534,6 +558,26 @@ def test_of_many_that_were_given_up_the_last_are_shown() -> None:
     assert {view.name for view in known.look(now=1.0)} == {f"c{number}" for number in range(3, MAX_GIVEN_UP + 3)}
 
 
+def test_who_makes_way_while_others_are_given_up_is_not_looked_at_again() -> None:
+    """The relay has said of the first of them in this session, and its next message does not come in time."""
+    known = Peers()
+
+    def tell(now: float, **item: object) -> None:
+        known.told({"t": "peers", "peers": [item]}, now=now)
+
+    known.subscribed(("/.*",), now=0.0)
+    known.session_began(now=0.0)
+    tell(0.0, name="a", up=True)
+    names = [f"r{number:03d}" for number in range(MAX_GIVEN_UP)]
+    for name in names:
+        tell(1.0, name=name, up=False)
+        tell(2.0, name=name, here=False)
+    known.session_ended(now=3.0)
+    known.session_began(now=4.0)
+    tell(5.0, name="a", here=False)
+    assert [view.name for view in known.look(now=6.0 + LET_GO_S)] == ["a"]
+
+
 @pytest.mark.parametrize("says", [{}, {"here": False}])
 def test_who_was_not_here_is_given_up_and_forgotten_in_a_session_that_says_nothing_of_it(says: wire.Envelope) -> None:
     """Also by a relay of an earlier version, which does not say whether a client is here."""
@@ -674,6 +718,20 @@ def test_there_is_an_end_to_those_of_whom_a_client_may_ask() -> None:
     assert len(site.items) == MAX_ASKED + 1 and len(presence._watchers[ClientName("site")].missing) == MAX_ASKED
 
 
+def test_what_many_clients_are_told_takes_many_turns(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A relay that begins anew is asked by all of them at once."""
+    monkeypatch.setattr(presence_module, "TOLD_AT_ONCE", 4)
+    presence, _site, links = asking(set(), *(f"s{number}" for number in range(4)))
+    for name in links:
+        presence.watch(name, now=0.0)
+        presence.ask(name, [ClientName(f"c{number}") for number in range(2 * MAX_TOLD)])
+    presence.sweep(now=1.0)
+    told = [sum(len(link.items) for link in links.values()) // MAX_TOLD]
+    while presence.tell(now=1.0):
+        told.append(sum(len(link.items) for link in links.values()) // MAX_TOLD)
+    assert told == [4, 8] and all(len(link.items) == 2 * MAX_TOLD for link in links.values())
+
+
 def test_a_client_asks_of_the_last_of_many() -> None:
     known = Peers()
     known.session_began(now=0.0)
@@ -683,11 +741,31 @@ def test_a_client_asks_of_the_last_of_many() -> None:
     assert known.asked() == [*(f"c{number}" for number in range(6, MAX_ASKED + 5)), "c0"]
 
 
+def test_of_what_is_no_name_of_a_client_nothing_is_said() -> None:
+    """As it came it may be too long to be said: what is bounded in a name is its characters."""
+    world = World().watch()
+    asking = world.client("asking")
+    world.run(1.0)
+    told: list[wire.Envelope] = []
+
+    def note(envelope: wire.Envelope, *, now: float) -> None:
+        told.append(envelope)
+
+    asking.core.peers.told = note  # type: ignore[method-assign]
+    for start in (0, 12):
+        names = ["robot", *(chr(0x10000 + start + number) * 64 for number in range(12))]
+        envelope = {"t": "subscribe", "patterns": [], "more": start == 0, "peers": True, "known": names}
+        asking.core.link.send_control(envelope, now=asking.now)
+    world.run(3.0)
+    assert [item for envelope in told for item in envelope["peers"]] == [{"name": "robot", "here": False}]
+    world.check_faults()
+
+
 def test_many_lost_robots_are_asked_of_in_parts() -> None:
     world = World().watch()
     site = world.client("site", patterns=["/.*"])
     world.run(1.0)
-    names = [f"r{number:03d}" + "x" * 60 for number in range(MAX_ASKED)]
+    names = [f"r{number:03d}" + "x" * 59 for number in range(MAX_ASKED)]
     for name in names:
         site.core.peers.told({"t": "peers", "peers": [{"name": name, "up": False, "for": 0.0}]}, now=site.now)
     world.hops["site"].break_connection(reconnect_s=1.0)

@@ -297,9 +297,12 @@ class DdsEndpoint:
         except ConfigError as error:
             self.say_once(f"{subscription.info.name} is not taken: {error}")
             # Some of what DDS refuses it accepts a moment later: a reader right after the one before it was closed.
-            asyncio.get_running_loop().call_later(RETRY_S, self._refresh_again, subscription)
+            if not subscription.asks_again:
+                subscription.asks_again = True
+                asyncio.get_running_loop().call_later(RETRY_S, self._refresh_again, subscription)
 
     def _refresh_again(self, subscription: Subscription) -> None:
+        subscription.asks_again = False
         if self._joined is not None and subscription in self._subscriptions.get(subscription.info.name, ()):
             self._refresh(subscription)
 

@@ -31,6 +31,8 @@ class Subscription:
         self._reader: Reader | None = None
         self.closed = False
         self.wanted = True
+        self.asks_again = False
+        """DDS gave no reader, and is asked once more in a moment."""
 
     def refresh(self) -> None:
         """Have a reader that matches all writers there are now that it can, or none while nobody wants the topic.

@@ -303,7 +303,8 @@ class Worker:
             self._guard.take()
             while self._jobs:
                 self._try(self._jobs.popleft())
-            for number in sorted(numbers):
+            # Messages first: discoveries may leave no time for more. Writers that are new are found before those are.
+            for number in sorted(numbers, reverse=True):
                 if self._stopping.is_set() or self._behind:
                     break
                 if number >= _FIRST:

@@ -1,8 +1,10 @@
 """Which readers the dds endpoint has for a topic whose writers come and go."""
 
+import asyncio
 import threading
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 from uuid import UUID
 
@@ -265,6 +267,29 @@ async def test_the_reader_before_stays_where_dds_gives_no_other(pair: Pair, monk
     pair.add(writer(51, qos=EndpointQos()))
     assert [qos.reliable for qos in pair.opened] == [True, False, False]
     assert await in_the_end(pair, publisher) == [body(1)]
+
+
+async def test_what_dds_refuses_is_asked_for_again_once_a_second(pair: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
+    """However often the writers of the topic changed meanwhile."""
+    await pair.connect()
+    again: list[Callable[[], object]] = []
+
+    def later(_delay_s: float, call: Callable[..., object], *given: object) -> None:
+        again.append(partial(call, *given))
+
+    def refuse(*given: Any, **options: Any) -> Any:
+        raise ConfigError("out of resources")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(pair.two, "_make", refuse)
+        patch.setattr(asyncio.get_running_loop(), "call_later", later)
+        for number in range(50, 60):
+            pair.add(writer(number, qos=EndpointQos()))
+        assert len(again) == 1
+        again.pop()()
+        assert len(again) == 1
+    again.pop()()
+    assert not again and pair.opened[-1] == replace(pair.opened[0], reliable=False, durability=0)
 
 
 def test_many_writers_of_unknown_types_are_looked_up_once(

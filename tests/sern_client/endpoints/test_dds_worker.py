@@ -16,7 +16,7 @@ from cyclonedds.topic import Topic
 
 from sern_client.endpoints.dds import node_info, raw
 from sern_client.endpoints.dds import worker as module
-from sern_client.endpoints.dds.discovery import AT_ONCE, CALLS, MOST_ROUNDS
+from sern_client.endpoints.dds.discovery import AT_ONCE, CALLS, MOST_ROUNDS, WRITERS
 from sern_client.endpoints.dds.domain import DomainOptions
 from sern_client.endpoints.dds.endpoint import DdsEndpoint, DdsOptions
 from sern_client.endpoints.dds.idl import TypeMaker
@@ -219,6 +219,37 @@ async def test_messages_wait_in_dds_while_the_event_loop_is_behind(endpoint: Dds
         assert looked.wait(DEADLINE_S)
     assert sum(isinstance(item, Arrived) for item in worker._ready) == 1  # of the one that was let go
     await until(lambda: got == [body, body])
+
+
+async def test_messages_arrive_during_a_flood_of_discoveries(
+    endpoint: DdsEndpoint, worker: Worker, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whenever the event loop has caught up, there are so many more that it is behind again."""
+    got: list[bytes] = []
+    info = ros_types.resolve("std_msgs/msg/String", "string data", Encoding.CDR)
+    reader = endpoint.open_reader("rt/chat", info, EndpointQos(), lambda sample: got.append(sample.body))
+    other = DomainParticipant(endpoint.options.domain.domain)
+    writer = DataWriter(Publisher(other), Topic(other, "rt/chat", TypeMaker().make(info)))
+    await until(lambda: reader.matched and endpoint.graph.writers("rt/chat"))
+    wait, begun, over = worker._waiter.wait, threading.Event(), threading.Event()
+
+    def ready() -> list[int]:
+        return sorted({WRITERS, *wait(1_000_000)}) if not over.is_set() else wait()
+
+    def discover(_number: int) -> None:
+        worker._ready.extend([lambda: None] * MAX_FOUND)  # at once: the event loop comes to none of them meanwhile
+        worker._found += MAX_FOUND
+        worker._hand_over(lambda: None)
+        begun.set()
+
+    monkeypatch.setattr(worker, "_discover", discover)
+    monkeypatch.setattr(worker._waiter, "wait", ready)
+    worker._do(lambda: None)  # it may be waiting as before
+    await until(begun.is_set)
+    body = b"\0\x01\0\0\x04\0\0\0abc\0"
+    raw.write(writer, body, 1)
+    await until(lambda: got == [body])
+    over.set()
 
 
 async def test_changes_are_heeded_once_a_turn(worker: Worker, monkeypatch: pytest.MonkeyPatch) -> None:
