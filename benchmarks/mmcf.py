@@ -207,7 +207,7 @@ def measure(options: argparse.Namespace, report: Report) -> None:
     for profile_name in PROFILES:
         for name in names:
             mine = [r for r in results if (r.trace, r.profile) == (name, profile_name)]
-            report.note(f"{profile_name} {name}: the best fixed one is {add_best_fixed(mine)}")
+            report.detail(f"{profile_name} {name}: the best fixed one is {add_best_fixed(mine)}")
             for policy in POLICIES:
                 runs = [r.runs[policy] for r in mine]
                 costs = [one.cost for one in runs]
