@@ -53,7 +53,7 @@ explore: setup
 
 # Of the matrix also the quarter that is in every `make test`.
 lab: setup
-	$(BIN)/python -m pytest tests/matrix -m 'lab_long or not lab_long'
+	$(BIN)/python -m pytest tests/matrix -m 'lab_long or not lab_long' --figures build/matrix.json
 	$(BIN)/python -m pytest tests/lab -m lab_long
 
 bench: setup
