@@ -134,7 +134,10 @@ def _by_policy(rows: Sequence[Mapping[str, Any]]) -> Iterator[list[str]]:
 
 
 def headline(document: Mapping[str, Any]) -> str:
-    """What README.md shows of a benchmark in IN_README: its commit, and a table for each of the cases there."""
+    """What README.md shows of a benchmark in IN_README: its commit, and a table for each of the cases there.
+
+    Raises ConfigError when one of them was not measured.
+    """
     lines = [f"Commit {document['commit']}:"]
     for case, metrics in IN_README[document["benchmark"]].items():
         rows = [
@@ -142,6 +145,10 @@ def headline(document: Mapping[str, Any]) -> str:
             for row in document["rows"]
             if row["case"] == case
         ]
+        if not any(_metrics(row) for row in rows):
+            raise ConfigError(
+                f"{document['benchmark']} has no figures of {case!r}, which README.md shows: measure all of it"
+            )
         lines += ["", *_figures(rows, {"system": case})]
     return "\n".join(lines)
 

@@ -122,6 +122,13 @@ def test_the_readme_gets_what_it_shows_of_a_case() -> None:
     ]
 
 
+def test_a_part_of_a_benchmark_does_not_empty_the_readme() -> None:
+    found = Report("link")
+    found.row("4 Mbit/s 50 ms, 2x", "sern-udp", pose_p50_ms=28.44)
+    with pytest.raises(ConfigError, match="link has no figures of '4 Mbit/s 50 ms, blackout 10 s'"):
+        headline(found.as_json())
+
+
 def test_a_benchmark_that_is_in_no_document_is_refused() -> None:
     with pytest.raises(ConfigError, match="relay is in no document"):
         list(contents(Report("relay").as_json()))
