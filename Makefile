@@ -6,7 +6,7 @@ TEST_PROCESSES ?= 3
 RANDOM_TESTS = $(shell grep -rlE '^(from|import) (hypothesis|tests\.exploring)' tests --include='test_*.py' | grep -v tests/peers)
 PACKAGES := sern_core sern_runtime sern_relay sern_client sern_sim sern_tools benchmarks tests
 
-.PHONY: help setup lint format types test explore lab bench performance endpoints figures demo schemas clean
+.PHONY: help setup lint format types test explore lab bench performance endpoints figures picture demo schemas clean
 
 help:
 	@echo "make setup    create $(VENV) with pinned dependencies"
@@ -16,6 +16,7 @@ help:
 	@echo "make lab      the whole matrix of bad links, and the longer runs over tc netem, which need root"
 	@echo "make performance   as root: measure link, fleet and policies of docs/performance.md anew, two hours of an idle machine"
 	@echo "make endpoints, make figures   the other tables: ROS endpoints, 15 minutes; virtual time, summaries and codecs, 30"
+	@echo "make picture  the demo, and its picture for README.md"
 	@echo "make bench    the quick benchmarks;  make schemas: regenerate schemas/ and the configuration reference"
 
 PYTHON_NEEDED := SERN needs 3.11 to 3.13: make PYTHON=python3.11, or see deploy/README.md, 1
@@ -85,6 +86,10 @@ figures: setup
 	$(BIN)/python -m benchmarks.mmcf_replay --plots docs/images --json build/mmcf_replay.json
 	$(BIN)/python -m benchmarks.mmcf --plots docs/images --json build/mmcf.json
 	$(BIN)/python -m benchmarks.document $(addprefix build/,$(addsuffix .json,thin_link codecs summaries mmcf_recovery mmcf_replay mmcf))
+
+picture: setup
+	$(BIN)/sern demo --out build/demo --picture docs/images/demo.png
+	$(BIN)/python -m benchmarks.document build/demo/result.json
 
 demo: setup
 	$(BIN)/sern demo

@@ -32,8 +32,9 @@ IN_README: Final[Mapping[str, Mapping[str, tuple[str, ...]]]] = {
         "4 Mbit/s 50 ms, blackout 10 s": ("fresh_s",),
     },
     "endpoints": {"ros1 1 kHz + 20 MB/s": ("odom_p50_ms", "cloud_p50_ms", "cpu_percent")},
+    "demo": {"control": ("delivered_messages", "latency_p50_s", "latency_p99_s")},
 }
-"""Cases and metrics that README.md shows."""
+"""Cases and metrics that README.md shows. What the demo writes has the shape of a benchmark."""
 TOGETHER: Final = frozenset({"codecs", "summaries", "thin_link", "mmcf_replay", "matrix"})
 """Benchmarks whose cases are rows of one table, as far as they have a metric in common."""
 BY_POLICY: Final = frozenset({"mmcf"})
@@ -198,10 +199,14 @@ def contents(document: Mapping[str, Any], into: Path | None = None) -> Iterator[
     Raises ConfigError when no document has a place for it.
     """
     name = document["benchmark"]
-    if into is None and name not in DOCUMENTS:
-        raise ConfigError(f"{name} is in no document; those that are: {', '.join(sorted(DOCUMENTS))}")
-    yield into or DOCUMENTS[name], render(document)
-    if into is None and name in IN_README:
+    if into is not None:
+        yield into, render(document)
+        return
+    if name not in DOCUMENTS and name not in IN_README:
+        raise ConfigError(f"{name} is in no document; those that are: {', '.join(sorted({*DOCUMENTS, *IN_README}))}")
+    if name in DOCUMENTS:
+        yield DOCUMENTS[name], render(document)
+    if name in IN_README:
         yield README, headline(document)
 
 

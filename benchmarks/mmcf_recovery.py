@@ -185,7 +185,7 @@ def measure(options: argparse.Namespace, report: Report) -> None:
             least = min(before for before, *_ in mine)
             report.reach(f"{case.name}: share of the clouds before, the least", least, 0.9, at_least=True)
     report.note(
-        f"virtual time, {len(seeds)} seeds; the link is bad for {RETURNS_S - FALLS_S:g} s; clouds: what came "
+        f"virtual time, seeds: {len(seeds)}; the link is bad for {RETURNS_S - FALLS_S:g} s; clouds: what came "
         f"of those offered in the {END_S - RETURNS_S:g} s since"
     )
 

@@ -129,6 +129,18 @@ def test_a_part_of_a_benchmark_does_not_empty_the_readme() -> None:
         headline(found.as_json())
 
 
+def test_what_the_demo_writes_goes_into_the_readme_alone() -> None:
+    result = {"case": "control", "system": "SERN", "delivered_messages": 800, "latency_p99_s": 0.05, "offered_bytes": 9}
+    document = {"benchmark": "demo", "commit": "abc", "rows": [result], "reach": []}
+    ((into, text),) = contents(document)
+    assert into == README
+    assert text.splitlines()[2:] == [
+        "| control | delivered, messages | latency p99, s |",
+        "| --- | --- | --- |",
+        "| SERN | 800 | 0.050 |",
+    ]
+
+
 def test_a_benchmark_that_is_in_no_document_is_refused() -> None:
     with pytest.raises(ConfigError, match="relay is in no document"):
         list(contents(Report("relay").as_json()))

@@ -10,7 +10,7 @@ import pytest
 pytest.importorskip("psutil")
 
 from benchmarks import ready, recordings
-from benchmarks.document import DOCUMENT, DOCUMENTS, README
+from benchmarks.document import DOCUMENT, DOCUMENTS, IN_README, README
 from sern_tools.lab.host import LabError
 from tests.support import DEADLINE_S
 
@@ -87,3 +87,6 @@ def test_every_table_of_a_benchmark_has_a_verb_that_writes_it() -> None:
         assert files == [f"build/{words[0].partition('.')[2]}.json" for words in measured if "--json" in words]
         written |= {Path(file).stem for file in files}
     assert written | {"matrix"} == set(DOCUMENTS)
+    (document,) = steps("picture")
+    assert document == ["benchmarks.document", "build/demo/result.json"]
+    assert set(IN_README) == (written & set(IN_README)) | {"demo"}
