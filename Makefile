@@ -6,7 +6,7 @@ TEST_PROCESSES ?= 3
 RANDOM_TESTS = $(shell grep -rlE '^(from|import) (hypothesis|tests\.exploring)' tests --include='test_*.py' | grep -v tests/peers)
 PACKAGES := sern_core sern_runtime sern_relay sern_client sern_sim sern_tools benchmarks tests
 
-.PHONY: help setup lint format types test explore lab bench performance demo schemas clean
+.PHONY: help setup lint format types test explore lab bench performance endpoints figures picture demo schemas clean
 
 help:
 	@echo "make setup    create $(VENV) with pinned dependencies"
@@ -15,6 +15,8 @@ help:
 	@echo "make explore  the tests with random input, with new cases and ten times as many; SEED=... repeats a run"
 	@echo "make lab      the whole matrix of bad links, and the longer runs over tc netem, which need root"
 	@echo "make performance   as root: measure link, fleet and policies of docs/performance.md anew, two hours of an idle machine"
+	@echo "make endpoints, make figures   the other tables: ROS endpoints, 15 minutes; virtual time, summaries and codecs, 30"
+	@echo "make picture  the demo, and its picture for README.md"
 	@echo "make bench    the quick benchmarks;  make schemas: regenerate schemas/ and the configuration reference"
 
 PYTHON_NEEDED := SERN needs 3.11 to 3.13: make PYTHON=python3.11, or see deploy/README.md, 1
@@ -53,7 +55,7 @@ explore: setup
 
 # Of the matrix also the quarter that is in every `make test`.
 lab: setup
-	$(BIN)/python -m pytest tests/matrix -m 'lab_long or not lab_long'
+	$(BIN)/python -m pytest tests/matrix -m 'lab_long or not lab_long' --figures build/matrix.json
 	$(BIN)/python -m pytest tests/lab -m lab_long
 
 bench: setup
@@ -68,6 +70,26 @@ performance: setup
 	$(BIN)/python -m benchmarks.robots --figure docs/images/perf-robots.png --json build/robots.json
 	$(BIN)/python -m benchmarks.mmcf_lab --runs 20 --json build/mmcf_lab.json
 	$(BIN)/python -m benchmarks.document build/link.json build/robots.json build/mmcf_lab.json
+
+endpoints: setup
+	mkdir -p build
+	$(BIN)/python -m benchmarks.endpoints --json build/endpoints.json
+	$(BIN)/python -m benchmarks.document build/endpoints.json
+
+# Neither root nor ROS is needed.
+figures: setup
+	mkdir -p build
+	$(BIN)/python -m benchmarks.thin_link --json build/thin_link.json
+	$(BIN)/python -m benchmarks.codecs --json build/codecs.json
+	$(BIN)/python -m benchmarks.summaries --plots docs/images --json build/summaries.json
+	$(BIN)/python -m benchmarks.mmcf_recovery --json build/mmcf_recovery.json
+	$(BIN)/python -m benchmarks.mmcf_replay --plots docs/images --json build/mmcf_replay.json
+	$(BIN)/python -m benchmarks.mmcf --plots docs/images --json build/mmcf.json
+	$(BIN)/python -m benchmarks.document $(addprefix build/,$(addsuffix .json,thin_link codecs summaries mmcf_recovery mmcf_replay mmcf))
+
+picture: setup
+	$(BIN)/sern demo --out build/demo --picture docs/images/demo.png
+	$(BIN)/python -m benchmarks.document build/demo/result.json
 
 demo: setup
 	$(BIN)/sern demo

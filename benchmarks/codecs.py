@@ -108,7 +108,7 @@ def run(options: argparse.Namespace, report: Report) -> None:
     budget_s = BUDGET_S / 8 if options.quick else BUDGET_S
     cases = recorded()
     if not cases:
-        report.note(f"no recordings in {DATA}: made messages only")
+        report.note("no recordings beside the checkout: made messages only")
     for case, (type_name, bodies) in (cases | made()).items():
         size = sum(map(len, bodies)) / len(bodies)
         topic = LossyTopic(tuple(LOSSY), Encoding.ROS1, DEFAULT_LOSSY)

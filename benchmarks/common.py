@@ -5,7 +5,7 @@
     {"benchmark": NAME, "commit": HASH,
      "rows":  [{"case": ..., "system": ..., "<metric>_<unit>": number, ...}, ...],
      "reach": [{"name": ..., "value": number, "limit": number, "at_least": bool, "ok": bool}, ...],
-     "notes": [...]}
+     "notes": [...], "details": [...]}
 
 `benchmarks.document` puts such a file into docs/performance.md. A reach is a figure the project set out to keep.
 Missing one is printed plainly and is not an error: the exit code is non-zero only if the benchmark could not run.
@@ -64,12 +64,14 @@ class Reach:
 
 @dataclass
 class Report:
-    """What a benchmark found, in the order it found it. `notes` say under which conditions."""
+    """What a benchmark found, in the order it found it. `notes` say under which conditions; `details` are printed and
+    stay out of the documents."""
 
     benchmark: str
     rows: list[Row] = field(default_factory=list)
     reaches: list[Reach] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
+    details: list[str] = field(default_factory=list)
 
     def row(self, case: str, system: str, **metrics: float) -> None:
         self.rows.append(Row(case, system, metrics))
@@ -79,6 +81,9 @@ class Report:
 
     def note(self, text: str) -> None:
         self.notes.append(text)
+
+    def detail(self, text: str) -> None:
+        self.details.append(text)
 
     def value(self, case: str, system: str, metric: str) -> float:
         """A metric measured before. Raises KeyError if there is none."""
@@ -97,6 +102,7 @@ class Report:
                 for r in self.reaches
             ],
             "notes": self.notes,
+            "details": self.details,
         }
 
     def print(self, console: Console) -> None:
@@ -105,7 +111,7 @@ class Report:
         for metrics, rows in self._tables():
             self._print_table(console, title, metrics, rows)
             title = None
-        for text in self.notes:
+        for text in (*self.notes, *self.details):
             console.print(text, markup=False, highlight=False)
         for r in self.reaches:
             verdict = "reached" if r.ok else "MISSED "

@@ -1,13 +1,13 @@
-"""Put the figures of benchmarks into docs/performance.md: `python -m benchmarks.document FILE...` (what --json wrote).
+"""Put the figures of benchmarks into the documents: `python -m benchmarks.document FILE...` (what --json wrote).
 
-Replaces what stands between `<!-- NAME begin -->` and `<!-- NAME end -->` there, NAME being the benchmark's; the rest
-of the document is left alone.
+Replaces what stands between `<!-- NAME begin -->` and `<!-- NAME end -->` in the document of the benchmark NAME, and in
+README.md what that shows of it. The rest of the documents is left alone.
 """
 
 import argparse
 import json
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import groupby
 from pathlib import Path
 from typing import Any, Final
@@ -15,7 +15,30 @@ from typing import Any, Final
 from benchmarks.link.figures import NEVER_S
 from sern_core.errors import ConfigError, SernError
 
-DOCUMENT: Final = Path(__file__).resolve().parent.parent / "docs" / "performance.md"
+ROOT: Final = Path(__file__).resolve().parent.parent
+README: Final = ROOT / "README.md"
+DOCUMENT: Final = ROOT / "docs" / "performance.md"
+THEORY: Final = ROOT / "docs" / "adaptation-theory.md"
+DOCUMENTS: Final = {
+    **dict.fromkeys(("link", "robots", "endpoints", "mmcf_lab", "thin_link", "codecs"), DOCUMENT),
+    **dict.fromkeys(("mmcf", "mmcf_replay", "mmcf_recovery"), THEORY),
+    "summaries": ROOT / "docs" / "summaries.md",
+    "matrix": ROOT / "docs" / "lab.md",
+}
+"""The document of each benchmark that has a place in one."""
+IN_README: Final[Mapping[str, Mapping[str, tuple[str, ...]]]] = {
+    "link": {
+        "4 Mbit/s 50 ms, 2x": ("pose_p50_ms", "pose_p99_ms", "poses_percent", "goodput_Mbps"),
+        "4 Mbit/s 50 ms, blackout 10 s": ("fresh_s",),
+    },
+    "endpoints": {"ros1 1 kHz + 20 MB/s": ("odom_p50_ms", "cloud_p50_ms", "cpu_percent")},
+    "demo": {"control": ("delivered_messages", "latency_p50_s", "latency_p99_s")},
+}
+"""Cases and metrics that README.md shows. What the demo writes has the shape of a benchmark."""
+TOGETHER: Final = frozenset({"codecs", "summaries", "thin_link", "mmcf_replay", "matrix"})
+"""Benchmarks whose cases are rows of one table, as far as they have a metric in common."""
+BY_POLICY: Final = frozenset({"mmcf"})
+"""Benchmarks whose cases are a mission profile and a trace: a table for each profile, a column for each policy."""
 TITLES: Final = {
     "poses_percent": "poses, %",
     "wire_percent": "link used, %",
@@ -40,14 +63,16 @@ TITLES: Final = {
 """Titles of columns whose metric's name does not say it well."""
 PURE: Final = "1"
 """The unit of a number without one."""
+COUNT: Final = "count"
 UNITS: Final = {"percent": "%", "Mbps": "Mbit/s", "us": "µs"}
 FIXED: Final = ("case", "system")
+OURS: Final = "mmcf"
 
 
 def _title(metric: str) -> str:
     quantity, _, unit = metric.rpartition("_")
-    if unit == PURE:
-        return TITLES.get(metric, quantity)
+    if unit in (PURE, COUNT):
+        return TITLES.get(metric, quantity.replace("_", " "))
     return TITLES.get(metric) or f"{quantity.replace('_', ' ').replace('cpu', 'CPU')}, {UNITS.get(unit, unit)}"
 
 
@@ -67,22 +92,83 @@ def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
     return [f"| {' | '.join(cells)} |" for cells in (head, ["---"] * len(head), *rows)]
 
 
-def _figures(rows: Sequence[Mapping[str, Any]], first: str) -> list[str]:
-    """One table; a column for each metric that any of its rows has. `first`: case or system."""
+def _figures(rows: Sequence[Mapping[str, Any]], first: Mapping[str, str]) -> list[str]:
+    """One table; a column for each metric that any of its rows has. `first`: titles of those in front, by case or
+    system."""
     metrics = list(dict.fromkeys(name for row in rows for name in row if name not in FIXED))
-    body = [[str(row[first]), *(_cell(name, row.get(name)) for name in metrics)] for row in rows]
-    return _table([first, *map(_title, metrics)], body)
+    body = [[*(str(row[name]) for name in first), *(_cell(name, row.get(name)) for name in metrics)] for row in rows]
+    return _table([*first.values(), *map(_title, metrics)], body)
+
+
+def _metrics(row: Mapping[str, Any]) -> set[str]:
+    return set(row) - set(FIXED)
+
+
+def _together(rows: Sequence[Mapping[str, Any]]) -> Iterator[list[str]]:
+    """Tables of rows that follow each other and have a metric in common, with a column for case and system each."""
+    tables: list[list[Mapping[str, Any]]] = []
+    for row in rows:
+        if not tables or not _metrics(row) & set().union(*map(_metrics, tables[-1])):
+            tables.append([])
+        tables[-1].append(row)
+    for table in tables:
+        yield _figures(table, {"case": "case", "system": "system"})
+
+
+def _by_policy(rows: Sequence[Mapping[str, Any]]) -> Iterator[list[str]]:
+    """A table for each profile, the first word of a case: costs by trace and policy, and how often MMCF switched."""
+    policies = list(dict.fromkeys(row["system"] for row in rows))
+    found = {(row["case"], row["system"]): row for row in rows}
+    for profile, group in groupby(dict.fromkeys(row["case"] for row in rows), key=lambda case: case.split()[0]):
+        body = []
+        for case in group:
+            ours = found[case, OURS]
+            body.append(
+                [
+                    case.partition(" ")[2],
+                    *(_cell("cost_1", found[case, policy]["cost_1"]) for policy in policies),
+                    _cell("plusminus_1", ours.get("plusminus_1")),
+                    f"{ours['switches_1']:.1f}",
+                ]
+            )
+        yield _table([profile, *policies, f"± (95 %) of {OURS}", "switches a minute"], body)
+
+
+def headline(document: Mapping[str, Any]) -> str:
+    """What README.md shows of a benchmark in IN_README: its commit, and a table for each of the cases there.
+
+    Raises ConfigError when one of them was not measured.
+    """
+    lines = [f"Commit {document['commit']}:"]
+    for case, metrics in IN_README[document["benchmark"]].items():
+        rows = [
+            {name: value for name, value in row.items() if name in (*FIXED, *metrics)}
+            for row in document["rows"]
+            if row["case"] == case
+        ]
+        if not any(_metrics(row) for row in rows):
+            raise ConfigError(
+                f"{document['benchmark']} has no figures of {case!r}, which README.md shows: measure all of it"
+            )
+        lines += ["", *_figures(rows, {"system": case})]
+    return "\n".join(lines)
 
 
 def render(document: Mapping[str, Any]) -> str:
     """The figures of one benchmark as Markdown: the conditions, a table a case, and what was set out."""
     rows, reaches = document["rows"], document["reach"]
     lines = [f"Commit {document['commit']}; {'; '.join(document['notes'])}."]
-    if len({row["system"] for row in rows}) == 1:
-        lines += ["", *_figures(rows, "case")]
+    if document["benchmark"] in TOGETHER:
+        for table in _together(rows):
+            lines += ["", *table]
+    elif document["benchmark"] in BY_POLICY:
+        for table in _by_policy(rows):
+            lines += ["", *table]
+    elif len({row["system"] for row in rows}) == 1:
+        lines += ["", *_figures(rows, {"case": "case"})]
     else:
         for case, group in groupby(rows, key=lambda row: row["case"]):
-            lines += ["", f"### {case}", "", *_figures(list(group), "system")]
+            lines += ["", f"### {case}", "", *_figures(list(group), {"system": "system"})]
     if reaches:
         body = [
             [
@@ -107,20 +193,41 @@ def insert(text: str, name: str, content: str) -> str:
     return f"{before}{begin}\n{content}\n{end}{rest.partition(end)[2]}"
 
 
+def contents(document: Mapping[str, Any], into: Path | None = None) -> Iterator[tuple[Path, str]]:
+    """What is written of a benchmark, and where; `into` alone if it is given.
+
+    Raises ConfigError when no document has a place for it.
+    """
+    name = document["benchmark"]
+    if into is not None:
+        yield into, render(document)
+        return
+    if name not in DOCUMENTS and name not in IN_README:
+        raise ConfigError(f"{name} is in no document; those that are: {', '.join(sorted({*DOCUMENTS, *IN_README}))}")
+    if name in DOCUMENTS:
+        yield DOCUMENTS[name], render(document)
+    if name in IN_README:
+        yield README, headline(document)
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.document", description=__doc__)
     parser.add_argument("files", nargs="+", type=Path, metavar="FILE", help="what --json of a benchmark wrote")
-    parser.add_argument("--into", type=Path, default=DOCUMENT, metavar="FILE", help="default: docs/performance.md")
+    parser.add_argument("--into", type=Path, metavar="FILE", help="default: the document of each benchmark")
     options = parser.parse_args()
+    texts: dict[Path, str] = {}
     try:
-        text = options.into.read_text(encoding="utf-8")
         for path in options.files:
             try:
                 document = json.loads(path.read_text(encoding="utf-8"))
-                text = insert(text, document["benchmark"], render(document))
+                for into, content in contents(document, options.into):
+                    if into not in texts:
+                        texts[into] = into.read_text(encoding="utf-8")
+                    texts[into] = insert(texts[into], document["benchmark"], content)
             except (ValueError, KeyError, TypeError) as error:
                 raise ConfigError(f"not what a benchmark writes with --json ({error!r})", file=str(path)) from error
-        options.into.write_text(text, encoding="utf-8")
+        for into, text in texts.items():
+            into.write_text(text, encoding="utf-8")
     except (SernError, OSError) as error:
         print(f"benchmarks.document: {error}", file=sys.stderr)
         return 1

@@ -1,6 +1,6 @@
 """Whether everything is there that the steps of `make performance` need, before the first of them begins.
 
-The steps take half an hour together, and what one of them lacks would be told when the others are over. Each thing that
+The steps take two hours together, and what one of them lacks would be told when the others are over. Each thing that
 is missing is a line of its own; what is only made up (recordings) is said and is no failure.
 """
 
@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Final
 
 from benchmarks import recordings
-from benchmarks.document import DOCUMENT, insert
+from benchmarks.document import DOCUMENT, IN_README, README, insert
 from sern_client.endpoints.clouds import read_ply
 from sern_core.errors import SernError
 from sern_tools.explain_replay import read_bag
@@ -25,7 +25,9 @@ FOLDERS: Final = ("build", "docs/images")
 ROOT: Final = DOCUMENT.parents[1]
 
 
-def lacking(document: Path = DOCUMENT, data: Path = recordings.DATA, root: Path = ROOT) -> Iterator[str]:
+def lacking(
+    document: Path = DOCUMENT, data: Path = recordings.DATA, root: Path = ROOT, readme: Path = README
+) -> Iterator[str]:
     """What is missing or cannot be used, and for what."""
     try:
         choose(f"{os.getpid()}")
@@ -47,14 +49,15 @@ def lacking(document: Path = DOCUMENT, data: Path = recordings.DATA, root: Path 
     for folder in FOLDERS:
         if not _writable(root / folder):
             yield f"{root / folder}: cannot be written"
-    try:
-        text = document.read_text(encoding="utf-8")
-        for step in STEPS:
-            insert(text, step, "")
-        if not os.access(document, os.W_OK):
-            yield f"document: {document} cannot be written"
-    except (SernError, OSError) as error:
-        yield f"document: {document}: {error}"
+    for path, steps in ((document, STEPS), (readme, [step for step in STEPS if step in IN_README])):
+        try:
+            text = path.read_text(encoding="utf-8")
+            for step in steps:
+                insert(text, step, "")
+            if not os.access(path, os.W_OK):
+                yield f"document: {path} cannot be written"
+        except (SernError, OSError) as error:
+            yield f"document: {path}: {error}"
 
 
 def _writable(folder: Path) -> bool:

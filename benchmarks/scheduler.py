@@ -4,7 +4,8 @@ A decision is everything the link asks of the scheduler for one fragment: `pick`
 pending in the slot afterwards. All topics are of one class and always have a message, sizes are log-uniform between
 60 B and 60 kB, and the winner's next message replaces it each time: the case that no cached choice can shorten.
 Rescoring is bare: it knows no classes, floors or bucket, so that at few topics it has less to do than a decision here.
-`single` is a lone topic whose message comes and goes: `offer`, `pick`, `charge`, `withdraw`.
+`single` is a lone topic whose message comes and goes: `offer`, `pick`, `charge`, `withdraw`. All is CPU time;
+a decision is held against what a bare forwarder takes for the datagram that it is about (`benchmarks.reference`).
 """
 
 import argparse
@@ -12,9 +13,10 @@ import math
 import sys
 from collections.abc import Callable
 from random import Random
-from time import perf_counter
+from time import process_time
 
 from benchmarks.common import Report, interleaved, main, pin_cpu
+from benchmarks.reference import reach_forwarding
 from sern_core.params import SchedulerParams
 from sern_core.scheduler import Scheduler
 from sern_core.types import PriorityClass
@@ -23,7 +25,7 @@ COUNTS = (10, 100, 1000)
 STEP_S = 1e-3  # time between decisions: 1200 bytes at 9.6 Mbit/s
 NBYTES = 1200
 BULK = PriorityClass.BULK
-DECISION_LIMIT_US = 3.0
+DECISION_LIMIT = 0.5  # by forwarding one datagram
 
 
 class Rescoring:
@@ -68,14 +70,14 @@ def decisions(count: int, repeats: int) -> Callable[[], float]:
     def measure() -> float:
         nonlocal now
         pick, charge, offer = scheduler.pick, scheduler.charge, scheduler.offer
-        started = perf_counter()
+        started = process_time()
         for _ in range(repeats):
             now += STEP_S
             slot = pick(now=now)
             assert slot is not None
             charge(BULK, NBYTES, now=now)
             offer(slot, priority=BULK, weight=1.0, size_bytes=size_bytes[slot], since_s=now)
-        return (perf_counter() - started) / repeats * 1e6
+        return (process_time() - started) / repeats * 1e6
 
     return measure
 
@@ -87,11 +89,11 @@ def picks(count: int, repeats: int) -> Callable[[], float]:
     def measure() -> float:
         nonlocal now
         pick = scheduler.pick
-        started = perf_counter()
+        started = process_time()
         for _ in range(repeats):
             now += 1e-6  # ages stay below their limit
             pick(now=now)
-        return (perf_counter() - started) / repeats * 1e6
+        return (process_time() - started) / repeats * 1e6
 
     return measure
 
@@ -105,13 +107,13 @@ def rescored(count: int, repeats: int, *, whole_decision: bool) -> Callable[[], 
 
     def measure() -> float:
         nonlocal now
-        started = perf_counter()
+        started = process_time()
         for _ in range(repeats):
             now += STEP_S
             slot = peer.pick(now=now)
             if whole_decision:
                 peer.offer(slot, weight=1.0, size_bytes=size_bytes[slot], since_s=now)
-        return (perf_counter() - started) / repeats * 1e6
+        return (process_time() - started) / repeats * 1e6
 
     return measure
 
@@ -124,14 +126,14 @@ def single(priority: PriorityClass, repeats: int) -> Callable[[], float]:
     def measure() -> float:
         nonlocal now
         offer, pick, charge, withdraw = scheduler.offer, scheduler.pick, scheduler.charge, scheduler.withdraw
-        started = perf_counter()
+        started = process_time()
         for _ in range(repeats):
             now += STEP_S
             offer(1, priority=priority, weight=1.0, size_bytes=100.0, since_s=now)
             pick(now=now)
             charge(priority, 160, now=now)
             withdraw(1)
-        return (perf_counter() - started) / repeats * 1e6
+        return (process_time() - started) / repeats * 1e6
 
     return measure
 
@@ -164,7 +166,7 @@ def run(options: argparse.Namespace, report: Report) -> None:
 
     few, many = COUNTS[0], COUNTS[-1]
     at_many = report.value(f"{many} topics", "sern", "decision_us")
-    report.reach(f"decision at {many} topics, us", at_many, DECISION_LIMIT_US)
+    reach_forwarding(report, f"CPU of a decision at {many} topics", at_many, DECISION_LIMIT)
     report.reach(
         f"growth of a decision from {few} to {many} topics (log n)",
         at_many / report.value(f"{few} topics", "sern", "decision_us"),

@@ -56,9 +56,9 @@ JUNK: Final = {"junk, unknown": False, "junk, bad tag": True}
 """Whether its session is one that the server knows."""
 CASES: Final = ("seal", "socket", "forward", *JUNK)
 JUNK_LIMIT: Final = 0.25
-"""CPU of refusing a datagram, by that of forwarding one: 5 µs, 10 % of a core at JUNK_HZ, where forwarding takes 20."""
+"""CPU of refusing a datagram, by that of forwarding one."""
 SEAL_LIMITS: Final = {Cipher.AES_256_GCM: 3.0, Cipher.CHACHA20_POLY1305: 3.0}
-"""What sealing costs, times the bare AEAD: 2 and 3.5 µs where that takes 0.65 and 1.2."""
+"""What sealing costs, times the bare AEAD."""
 WINDOW: Final = 32
 """Datagrams in flight in the closed loop."""
 ECHO_HZ: Final = 100

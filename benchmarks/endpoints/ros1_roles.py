@@ -9,6 +9,7 @@ import json
 import statistics
 import sys
 import time
+import xmlrpc.client
 from collections.abc import Callable, Sequence
 from typing import Any, Final
 
@@ -220,6 +221,14 @@ async def follow(master: str, count: int) -> None:
     await asyncio.Event().wait()
 
 
+def poll(master: str) -> None:
+    """The bare poller: asks a master for its state as often as an endpoint does, by Python's own client."""
+    asked, period_s = xmlrpc.client.ServerProxy(master), 1 / Ros1Options(master, HOST, "poller").poll_hz
+    while True:
+        asked.getSystemState("/poller")
+        time.sleep(period_s)
+
+
 def main(role: str, *arguments: str) -> None:
     if role in ("source", "sink"):
         common.pin_cpu()
@@ -234,6 +243,8 @@ def main(role: str, *arguments: str) -> None:
             uvloop.run(many(master, int(count)))
         case "follow", (master, count):
             uvloop.run(follow(master, int(count)))
+        case "poll", (master,):
+            poll(master)
         case _:
             raise SystemExit(f"no role {role} with {len(arguments)} arguments")
 

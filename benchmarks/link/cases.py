@@ -40,17 +40,12 @@ FLOODS: Final = (1.3, 2.0, 4.0, 13.0)
 """Class control, times what the link carries."""
 FLOOD_AGE_S: Final = 0.2
 """Four round trips."""
-BARE_PERCENT: Final = 1.25
-"""CPU of the bare forwarder at 4 Mbit/s on the machine of docs/performance.md, as estimated from a slower one by what
-else both have run. What was set out in shares of a core of that machine is held as multiples of this."""
-BARE_FAST_PERCENT: Final = 3.9
-"""The same at 20 Mbit/s, where a datagram wakes it more cheaply."""
-BARE_US: Final = 33.0
-"""What a datagram of the full size costs it at 4 Mbit/s."""
-CPU_LIMIT: Final = 5.0 / BARE_PERCENT
-CPU_LIMIT_FAST: Final = 12.0 / BARE_FAST_PERCENT
-JUNK_LIMIT: Final = 5.0 / BARE_US
-"""5 µs each are a tenth of a core at JUNK_HZ."""
+CPU_LIMIT: Final = 4.0
+"""CPU of the busier side, times that of a bare forwarder for the same datagrams in the same run."""
+CPU_LIMIT_FAST: Final = 3.1
+"""The same at 20 Mbit/s, where a datagram often finds both awake."""
+JUNK_LIMIT: Final = 0.15
+"""CPU of refusing a datagram, by that of forwarding one of the full size."""
 FULL: Final = Load(even_hz=360.0, even_bytes=ROOM_BYTES)
 """Datagrams of the full size, nine tenths of what 4 Mbit/s carry."""
 

@@ -1,11 +1,13 @@
 """Benchmarks write their figures into the documentation themselves."""
 
 import json
+import sys
+from pathlib import Path
 
 import pytest
 
 from benchmarks.common import Report
-from benchmarks.document import DOCUMENT, insert, render
+from benchmarks.document import DOCUMENT, DOCUMENTS, IN_README, README, contents, headline, insert, main, render
 from benchmarks.link.figures import NEVER_S
 from sern_core.errors import ConfigError
 
@@ -65,14 +67,113 @@ def test_counts_have_no_places_and_small_times_enough() -> None:
     assert "| sern | 0.2 | 3 | 24,000 | 0.2 |" in text
 
 
-@pytest.mark.parametrize("name", ["link", "robots", "mmcf_lab", "endpoints"])
+def test_cases_that_have_a_metric_in_common_are_rows_of_one_table() -> None:
+    found = Report("thin_link")
+    found.row("datagrams", "pose", arrived_count=998, age_p50_s=0.282)
+    found.row("stream", "clouds", arrived_count=0)
+    found.row("a third robot", "mmcf", gap_s=0.056)
+    assert render(found.as_json()).splitlines()[2:] == [
+        "| case | system | arrived | age p50, s |",
+        "| --- | --- | --- | --- |",
+        "| datagrams | pose | 998 | 0.28 |",
+        "| stream | clouds | 0 | – |",
+        "",
+        "| case | system | gap, s |",
+        "| --- | --- | --- |",
+        "| a third robot | mmcf | 0.056 |",
+    ]
+
+
+def test_policies_are_columns_where_a_case_is_a_profile_and_a_trace() -> None:
+    found = Report("mmcf")
+    for number, case in enumerate(("mapping step", "mapping wave", "balanced step")):
+        found.row(case, "fixed", cost_1=0.2 + number / 10, switches_1=0.0)
+        found.row(case, "mmcf", cost_1=0.1 + number / 10, switches_1=2.04, plusminus_1=0.01)
+    found.detail("mapping step: the best fixed one is x")
+    text = render(found.as_json())
+    assert "best fixed" not in text
+    assert text.splitlines()[2:] == [
+        "| mapping | fixed | mmcf | ± (95 %) of mmcf | switches a minute |",
+        "| --- | --- | --- | --- | --- |",
+        "| step | 0.200 | 0.100 | 0.010 | 2.0 |",
+        "| wave | 0.300 | 0.200 | 0.010 | 2.0 |",
+        "",
+        "| balanced | fixed | mmcf | ± (95 %) of mmcf | switches a minute |",
+        "| --- | --- | --- | --- | --- |",
+        "| step | 0.400 | 0.300 | 0.010 | 2.0 |",
+    ]
+
+
+def test_the_readme_gets_what_it_shows_of_a_case() -> None:
+    found = Report("link")
+    found.row("4 Mbit/s 50 ms, idle", "sern-udp", pose_p50_ms=1.0)
+    found.row("4 Mbit/s 50 ms, 2x", "sern-udp", pose_p50_ms=28.44, goodput_Mbps=3.612, relay_cpu_percent=5.0)
+    found.row("4 Mbit/s 50 ms, blackout 10 s", "sern-udp", fresh_s=0.2)
+    assert headline({**found.as_json(), "commit": "abc"}).splitlines() == [
+        "Commit abc:",
+        "",
+        "| 4 Mbit/s 50 ms, 2x | pose p50, ms | goodput, Mbit/s |",
+        "| --- | --- | --- |",
+        "| sern-udp | 28.4 | 3.61 |",
+        "",
+        "| 4 Mbit/s 50 ms, blackout 10 s | first fresh pose, s |",
+        "| --- | --- |",
+        "| sern-udp | 0.20 |",
+    ]
+
+
+def test_a_part_of_a_benchmark_does_not_empty_the_readme() -> None:
+    found = Report("link")
+    found.row("4 Mbit/s 50 ms, 2x", "sern-udp", pose_p50_ms=28.44)
+    with pytest.raises(ConfigError, match="link has no figures of '4 Mbit/s 50 ms, blackout 10 s'"):
+        headline(found.as_json())
+
+
+def test_what_the_demo_writes_goes_into_the_readme_alone() -> None:
+    result = {"case": "control", "system": "SERN", "delivered_messages": 800, "latency_p99_s": 0.05, "offered_bytes": 9}
+    document = {"benchmark": "demo", "commit": "abc", "rows": [result], "reach": []}
+    ((into, text),) = contents(document)
+    assert into == README
+    assert text.splitlines()[2:] == [
+        "| control | delivered, messages | latency p99, s |",
+        "| --- | --- | --- |",
+        "| SERN | 800 | 0.050 |",
+    ]
+
+
+def test_a_benchmark_that_is_in_no_document_is_refused() -> None:
+    with pytest.raises(ConfigError, match="relay is in no document"):
+        list(contents(Report("relay").as_json()))
+
+
+def test_all_documents_are_written_at_once_or_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    into = tmp_path / "here.md"
+    into.write_text("a <!-- link begin --> old <!-- link end --> b")
+    good, bad = tmp_path / "link.json", tmp_path / "robots.json"
+    good.write_text(json.dumps(report().as_json()))
+    bad.write_text(json.dumps({**report().as_json(), "benchmark": "robots"}))
+    monkeypatch.setattr(sys, "argv", ["document", str(good), str(bad), "--into", str(into)])
+    assert main() == 1
+    assert "old" in into.read_text()
+    monkeypatch.setattr(sys, "argv", ["document", str(good), "--into", str(into)])
+    assert main() == 0
+    assert "old" not in into.read_text() and "| tcpros | 9,672 | 3.70 | – |" in into.read_text()
+
+
+@pytest.mark.parametrize("name", DOCUMENTS)
 def test_the_document_has_a_place_for_them_and_keeps_the_rest(name: str) -> None:
-    text = DOCUMENT.read_text(encoding="utf-8")
+    text = DOCUMENTS[name].read_text(encoding="utf-8")
     once = insert(text, name, "figures")
     assert insert(once, name, "figures") == once
     assert f"<!-- {name} begin -->\nfigures\n<!-- {name} end -->" in once
     before, _, rest = text.partition(f"<!-- {name} begin -->")
     assert once.startswith(before) and once.endswith(rest.partition(f"<!-- {name} end -->")[2])
+
+
+@pytest.mark.parametrize("name", IN_README)
+def test_the_readme_has_a_place_for_what_it_shows(name: str) -> None:
+    text = README.read_text(encoding="utf-8")
+    assert f"<!-- {name} begin -->\nfigures\n<!-- {name} end -->" in insert(text, name, "figures")
 
 
 def test_pictures_of_the_document_are_there() -> None:

@@ -1,0 +1,131 @@
+"""The bounds and times that the guides name are those of the code."""
+
+import re
+from pathlib import Path
+from typing import Final
+
+import pytest
+
+from sern_client import latest
+from sern_client.endpoints import first
+from sern_client.endpoints.ros1 import Ros1Options, hold
+from sern_core import (
+    access,
+    answering,
+    decoding,
+    definitions,
+    draining,
+    drop_reports,
+    fragments,
+    hub,
+    ledger,
+    link,
+    numbering,
+    peers,
+    queues,
+    replay,
+    routing,
+)
+from sern_core.objects import ObjectLimits
+from sern_relay import server, transforms
+from sern_runtime import express, feed_inflow, feed_subscriptions
+from sern_runtime.config.relay import RelaySection, ReplaySection
+
+ROOT: Final = Path(__file__).resolve().parents[2]
+ROUTING, OBJECTS = routing.RoutingLimits(), ObjectLimits()
+
+
+def nbytes(count: int) -> str:
+    """Bytes as the guides write them."""
+    for unit, name in ((2**20, "MiB"), (2**10, "KiB")):
+        if count % unit == 0:
+            return f"{count // unit} {name}"
+    raise ValueError(count)
+
+
+def default(section: type[RelaySection] | type[ReplaySection], key: str) -> int:
+    return int(section.model_fields[key].default)
+
+
+BOUNDS: Final[dict[str, tuple[str, ...]]] = {
+    "messages that wait for a client": (
+        nbytes(access.DEFAULT_QUEUE_BYTES),
+        f"{queues.MESSAGE_OVERHEAD_BYTES} bytes a message",
+    ),
+    "half-received and waiting": (f"{fragments.PARTIAL_IDLE_S:g} s without a fragment",),
+    "latched messages for late joiners": (
+        nbytes(default(ReplaySection, "cache_bytes")),
+        f"{replay.MAX_REPLAY_MESSAGES:,} of a stream",
+    ),
+    "streams announced": (f"{ROUTING.max_streams:,} ",),
+    "patterns and names subscribed to": (f"{ROUTING.max_patterns} and {ROUTING.max_exact:,}",),
+    "parts of an unfinished subscription": (
+        f"{ROUTING.max_exact:,} patterns",
+        f"{answering.MAX_OWED:,} names",
+    ),
+    "definitions (": (
+        nbytes(definitions.MAX_PEER_DEFINITION_BYTES),
+        f"{definitions.MAX_DEFINITIONS:,} texts",
+        f"{definitions.LINGERING_TEXTS} texts ({nbytes(definitions.LINGERING_BYTES)})",
+    ),
+    "definitions asked for": (f"{definitions.MAX_PEER_DEFINITIONS:,} that nobody",),
+    "reports of drops": (
+        f"{drop_reports.MAX_KEPT_REPORTS:,} runs",
+        f"above {drop_reports.MAX_REPORTS:,} runs",
+        f"for {drop_reports.UNREAD_S:g} s",
+    ),
+    "control messages to a client": (
+        f"{link.MAX_UNHEARD:,} answers",
+        f"{nbytes(link.MAX_TOLD_BYTES)} + {nbytes(link.MAX_TOLD_CHANNEL_BYTES)} a channel",
+    ),
+    "objects (": (
+        f"{OBJECTS.max_objects_per_owner:,};",
+        f"{nbytes(OBJECTS.max_bytes_per_owner)}, of {nbytes(OBJECTS.max_total_bytes)} in all",
+    ),
+    "large values of objects": (f"{nbytes(OBJECTS.max_held_per_owner)}, of {nbytes(OBJECTS.max_held_bytes)} in all",),
+    "transforms as objects": (f"{transforms.MAX_PAIRS:,} pairs", f"{transforms.MAX_WAITING} messages"),
+    "clients that are waited for": (f"{hub.MAX_AWAITED_CLIENTS:,};", f"{hub.MAX_AWAITED_TOPICS:,} each"),
+    "boots of a client": (f"| {routing.RETIRED_BOOTS} |",),
+    "numbers of streams": (f"{numbering.MAX_ENDED:,},",),
+    "counters by topic": (f"{ledger.MAX_TOPICS:,} ",),
+    "decisions of the access rules": (f"{access.CACHE_ENTRIES:,} ",),
+    "bodies that are being decoded": (nbytes(decoding.MAX_WAITING_BYTES),),
+    "connections, half-open ones": (f"{default(RelaySection, 'max_connections')} |",),
+    "connections of one client": (f"{server.MAX_PORTS}; {express.CONNECTIONS} |",),
+    "connections of the plain feed": (f"{feed_inflow.MAX_CONNECTIONS} |",),
+    "latest values at a client": (f"{latest.MAX_TOPICS:,} streams", f"{latest.MAX_VALUE_BYTES // 1024} kB each"),
+}
+"""What the rows of the table in docs/operations.md say, by their beginning."""
+TIMES: Final = {
+    "docs/ros2-dds.md": (f"{first.HOLD_S:g} s at most", f"For {first.LEARN_S:g} s after its start"),
+    "docs/ros1.md": (
+        f"for {hold.HOLD_S:g} s at most",
+        f"`poll_hz`, {1 / Ros1Options('http://localhost:1', 'localhost', 'x').poll_hz:g} s",
+    ),
+    "docs/operations.md": (
+        f"`replay.resume_s`, {default(ReplaySection, 'resume_s') // 60} minutes",
+        f"of more than {peers.MAX_GIVEN_UP} such clients",
+        f"than {draining.MAX_DRAINING} of them or {nbytes(draining.MAX_DRAINING_BYTES)}",
+    ),
+}
+
+
+@pytest.mark.parametrize("beginning", BOUNDS)
+def test_what_is_kept_is_bounded_as_the_table_says(beginning: str) -> None:
+    section = (ROOT / "docs/operations.md").read_text().partition("## What is kept, and how much\n")[2]
+    (row,) = [line for line in section.splitlines() if line.startswith(f"| {beginning}")]
+    plain = row.replace("`", "")
+    assert [bound for bound in BOUNDS[beginning] if not re.search(rf"(?<![\d,]){re.escape(bound)}", plain)] == [], row
+
+
+@pytest.mark.parametrize("guide", TIMES)
+def test_times_that_a_guide_names_are_those_of_the_code(guide: str) -> None:
+    text = " ".join((ROOT / guide).read_text().split())
+    assert [said for said in TIMES[guide] if said not in text] == []
+
+
+def test_feeds_subscriptions_are_bounded_as_the_table_says() -> None:
+    text = (ROOT / "docs/operations.md").read_text()
+    assert f"each its length and {feed_subscriptions.ENTRY_BYTES} bytes" in text
+    assert f"| role | {nbytes(feed_subscriptions.ROLE_BYTES)} |" in text
+    assert f"| connection | {feed_subscriptions.KEPT_BYTES // 1024} kB |" in text
