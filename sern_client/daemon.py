@@ -45,7 +45,7 @@ from sern_runtime.draining import Progress
 from sern_runtime.entry import blamed_on, end_tasks, log_warnings, serve
 from sern_runtime.http import Health, HttpServer
 from sern_runtime.internal_errors import InternalErrors
-from sern_runtime.keys import load_public, load_secret
+from sern_runtime.keys import load_secret, load_server_keys
 from sern_runtime.link_metrics import register_codecs, register_links, register_received
 from sern_runtime.loop import Shutdown
 from sern_runtime.message_log import LoggedFates, MessageLog
@@ -208,13 +208,7 @@ class ClientDaemon:
         keys = load_secret(self.loaded.resolve(relay.secret_key_file)) if relay.secret_key_file else None
         server_keys: tuple[str, ...] = ()
         if relay.server_key_file:
-            public = load_public(self.loaded.resolve(relay.server_key_file))
-            server_keys = tuple(key.key for key in public.valid_at(time.time()))
-            if not server_keys:
-                raise ConfigError(
-                    "holds no key that is valid now; ask for the relay's new public key",
-                    file=str(self.loaded.resolve(relay.server_key_file)),
-                )
+            server_keys = load_server_keys(self.loaded.resolve(relay.server_key_file), at_s=time.time())
         if model.http.listen is not None:
             with blamed_on(self.loaded.path, "http", "listen"):
                 self._http = self._make_http(model.http.listen)

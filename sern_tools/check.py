@@ -3,6 +3,7 @@ only the name is looked up."""
 
 import asyncio
 import difflib
+import time
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Final
@@ -50,6 +51,9 @@ def run_check(path: Path, *, out: Console | None = None, err: Console | None = N
     if isinstance(loaded.model, (keys.PublicKeyFile, keys.SecretKeyFile)):
         odd = keys.misnamed(path, ClientName(loaded.model.name))
         _lines(err, [f"warning: {odd}"] if odd else [])
+    if isinstance(loaded.model, keys.PublicKeyFile):
+        lapse = keys.load_public(path).lapse(time.time())
+        _lines(err, [f"warning: {path} {lapse}"] if lapse else [])
     _lines(err, [f"warning: {text}" for text in loaded.warnings])
     if isinstance(loaded.model, ClientFile):
         problem = _unresolved(loaded.model.relay.endpoint)

@@ -39,7 +39,7 @@ from sern_core.session import DISPLACED
 from sern_core.types import ClientName, DropReason, Encoding, TopicName
 from sern_runtime import clock
 from sern_runtime.config.client import RelayConnection, load_client
-from sern_runtime.keys import SecretKey, load_public, load_secret
+from sern_runtime.keys import SecretKey, load_secret, load_server_keys
 from sern_runtime.loop import Shutdown, run
 from sern_runtime.zmq_socket import HANDSHAKE_IVL_MS
 from sern_tools.api import NotFoundError, checked_api, drop_output, get_json, is_stream, local_api, say
@@ -171,7 +171,7 @@ def identity_from_file(path: Path) -> Identity:
         model.name,
         relay.endpoint,
         load_secret(loaded.resolve(relay.secret_key_file)) if relay.secret_key_file else None,
-        _valid_keys(loaded.resolve(relay.server_key_file)) if relay.server_key_file else (),
+        load_server_keys(loaded.resolve(relay.server_key_file), at_s=time.time()) if relay.server_key_file else (),
         model.link.params(),
         model.scheduler.params(),
         model.http.listen,
@@ -200,17 +200,10 @@ def identity_from_options(endpoint: str, key: Path | None, server_key: Path | No
         client_name(name) if pair is None and name is not None else ClientName("") if pair is None else pair.name,
         endpoint,
         pair,
-        () if server_key is None else _valid_keys(server_key),
+        () if server_key is None else load_server_keys(server_key, at_s=time.time()),
         LinkParams(),
         SchedulerParams(),
     )
-
-
-def _valid_keys(path: Path) -> tuple[str, ...]:
-    keys = tuple(key.key for key in load_public(path).valid_at(time.time()))
-    if not keys:
-        raise ConfigError("holds no key that is valid now; ask for the relay's new public key", file=str(path))
-    return keys
 
 
 class Listener:

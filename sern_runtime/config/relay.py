@@ -1,5 +1,6 @@
 """The file of the relay daemon (`sern-relay`): where it listens, who may do what, and its limits."""
 
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Literal, Self
@@ -363,7 +364,7 @@ class RelayFile(FileModel):
         except ConfigError as error:
             yield FileProblem(loc, str(error))
             return
-        for warning in directory.warnings:
+        for warning in (*directory.warnings, *directory.lapsed(at_s=time.time())):
             yield FileProblem(loc, warning, warning=True)
         if not directory.names:
             yield FileProblem(loc, f"{directory.path} holds no .pub file: no client can connect", warning=True)

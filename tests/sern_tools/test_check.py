@@ -349,6 +349,34 @@ def test_key_files_with_the_name_of_somebody_else(deployed: Path) -> None:
     assert err.count("warning") == 1
 
 
+def windowed(path: Path, window: str) -> None:
+    """Give the only key of a public key file a window."""
+    path.write_text(f"{path.read_text()}    {window}\n")
+
+
+def test_a_relay_whose_keys_do_not_hold_is_an_error_as_at_the_start(deployed: Path) -> None:
+    windowed(deployed / "relay.pub", 'not_after: "2020-01-01T00:00:00Z"')
+    expired = (
+        "has no key that is valid now: the last one expired at 2020-01-01T00:00:00Z, and this machine's clock says"
+    )
+    code, _, err = ran(deployed / "site.yaml")
+    assert (code, err.count("\n")) == (2, 1)
+    assert f"relay.server_key_file: {deployed}/relay.pub: {expired}" in err
+    code, _, err = ran(deployed / "relay.pub")
+    assert code == 0
+    assert err.startswith(f"warning: {deployed}/relay.pub {expired}")
+
+
+def test_a_client_whose_keys_do_not_hold_is_a_warning_at_the_relay(deployed: Path) -> None:
+    windowed(deployed / "clients" / "jackal1.pub", 'not_before: "2999-01-01T00:00:00Z"')
+    code, out, err = ran(deployed / "relay.yaml")
+    assert (code, err.count("\n")) == (0, 1)
+    later = "jackal1 has no key that is valid now: the next one is not valid before 2999-01-01T00:00:00Z, and this "
+    assert f"relay.clients_dir: {later}machine's clock says 2" in err
+    assert err.endswith(": it cannot connect\n")
+    assert out.endswith("relay.yaml: right\n")
+
+
 def test_command_line_alone_and_inside_another(deployed: Path) -> None:
     outer = typer.Typer()
     outer.add_typer(check.app, name="check")
