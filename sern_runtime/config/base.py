@@ -6,7 +6,7 @@ Validators raise `fault(...)` with a finished phrase; `load.py` puts file, line 
 
 import ipaddress
 import re
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Final, Self
@@ -18,7 +18,7 @@ from sern_core.access import LONGEST_NAME, with_self
 from sern_core.errors import UsageError
 from sern_core.patterns import compile_pattern, matches_a_name
 from sern_core.rules import client_name, normal_namespace, topic_name
-from sern_runtime.config.yaml import Loc
+from sern_runtime.config.yaml import Data, Loc
 
 _HOST: Final = re.compile(r"[A-Za-z0-9_](?:[A-Za-z0-9_.-]{0,251}[A-Za-z0-9_])?")
 _TCP: Final = re.compile(r"tcp://(\[[0-9A-Fa-f:.%a-z]+\]|[^:/\[\]]+):([0-9]{1,5})")
@@ -55,6 +55,12 @@ class FileProblem:
 
 class FileModel(Section):
     """A whole file. `file_problems` is the second step of checking: it looks at the other files that this one names."""
+
+    @classmethod
+    def foreign(cls, data: Mapping[str, Data]) -> str | None:
+        """What is said of a file that is plainly another kind of ours; None: it may be of this one."""
+        del data
+        return None
 
     def placed(self, base_dir: Path) -> Self:
         """The same with its sockets (ipc://) where they are, relative paths starting at `base_dir`."""

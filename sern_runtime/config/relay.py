@@ -1,7 +1,7 @@
 """The file of the relay daemon (`sern-relay`): where it listens, who may do what, and its limits."""
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
@@ -48,6 +48,7 @@ from sern_runtime.config.shared import (
     output_problems,
     secret_key_problems,
 )
+from sern_runtime.config.yaml import Data
 from sern_runtime.keys import KeyDirectory
 
 DEFAULT_HTTP_LISTEN = "127.0.0.1:5580"
@@ -296,6 +297,15 @@ class RelayFile(FileModel):
     """CSV file with a line for every message received and dropped; null: none. For trials: it grows without end."""
     summary: PathText | None = None
     """JSON file with the counters, written at exit; null: none."""
+
+    @classmethod
+    def foreign(cls, data: Mapping[str, Data]) -> str | None:
+        needed = "a relay's is needed here (relay, access)"
+        if "sern_key" in data:
+            return f"is a key file; {needed}"
+        if data.keys() & {"client", "endpoint"}:
+            return f"is a client's file, which sern-client reads; {needed}"
+        return None
 
     @model_validator(mode="after")
     def _addresses(self) -> "RelayFile":
