@@ -115,6 +115,14 @@ def _summary(out: Console, loaded: Loaded[FileModel]) -> None:
     _lines(out, [f"{loaded.path}: right"])
 
 
+def _table(*titles: str) -> Table:
+    """Patterns are shown whole: a long one goes on in the next line."""
+    table = Table(box=None, pad_edge=False)
+    for title in titles:
+        table.add_column(title, overflow="fold")
+    return table
+
+
 def _client_summary(out: Console, model: ClientFile) -> None:
     safety = "no encryption" if model.relay.insecure else "CURVE"
     _lines(
@@ -127,7 +135,7 @@ def _client_summary(out: Console, model: ClientFile) -> None:
             f"scheduler {model.scheduler.ordering}, window {model.link.window.algorithm}",
         ],
     )
-    table = Table("#", "match", "class", "direction", "reliability", "lifespan s", "rate Hz", box=None, pad_edge=False)
+    table = _table("#", "match", "class", "direction", "reliability", "lifespan s", "rate Hz")
     for index, rule in enumerate(model.topics):
         lifespan = "for ever" if rule.lifespan_s is None else str(rule.lifespan_s)
         rate = "" if rule.max_rate_hz is None else f"{rule.max_rate_hz:g}"
@@ -148,7 +156,7 @@ def _relay_summary(out: Console, model: RelayFile) -> None:
             f"http {model.http.listen or 'off'}",
         ],
     )
-    table = Table("#", "client", "may publish", "may subscribe", box=None, pad_edge=False)
+    table = _table("#", "client", "may publish", "may subscribe")
     for index, rule in enumerate(model.access):
         cells = (str(index), rule.client, " ".join(rule.publish), " ".join(rule.subscribe))
         table.add_row(*(Text(cell) for cell in cells))

@@ -26,8 +26,9 @@ _IPC_MAX_CHARS: Final = 100  # a Unix socket path holds 107 bytes on Linux
 _SOCKET_MAX_BYTES: Final = 107
 LONG_COMMAND_S: Final = 60.0
 """A command that is older moves nobody's robot on purpose."""
-UNITS_READ_ONLY: Final = Path("/etc")
-"""What the systemd units show to the daemons read-only, and where their configuration is (`deploy/systemd`)."""
+UNITS_CONFIGURED: Final = Path("/etc")
+UNITS_WRITE: Final = Path("/var/lib/sern")
+"""Where the configuration of the systemd units is, and all that they let a daemon write (`deploy/systemd`)."""
 _LOOPBACK_NAMES: Final = frozenset({"localhost", "ip6-localhost"})
 
 
@@ -247,13 +248,22 @@ def resolve(base_dir: Path, text: str) -> Path:
     return base_dir / Path(text).expanduser()
 
 
-def unit_problems(path: Path, loc: Loc) -> Iterator[FileProblem]:
-    """A warning of a file that the daemon is to write where the units of `deploy` let it write nothing."""
-    if path.resolve().is_relative_to(UNITS_READ_ONLY):
+def unit_problems(base_dir: Path, path: Path, loc: Loc) -> Iterator[FileProblem]:
+    """A warning of a file that the daemon is to write where the units of `deploy` let it write nothing: by the place of
+    the configuration it is one of theirs, or the file is beside those that are."""
+    written, configured = path.resolve(), UNITS_CONFIGURED
+    by_unit = written.is_relative_to(configured) or base_dir.resolve().is_relative_to(configured)
+    if by_unit and not written.is_relative_to(UNITS_WRITE):
         problem = (
-            f"{path}: under the systemd units nothing can be written below {UNITS_READ_ONLY}; name /var/lib/sern/..."
+            f"{path}: under the systemd units nothing can be written outside of {UNITS_WRITE}; name a path there, or "
+            "add ReadWritePaths= to the unit"
         )
         yield FileProblem(loc, problem, warning=True)
+
+
+def unit_makes(base_dir: Path, directory: Path) -> bool:
+    """Whether a folder that may not be there yet is the one that systemd makes when it starts the unit."""
+    return directory == UNITS_WRITE and base_dir.resolve().is_relative_to(UNITS_CONFIGURED)
 
 
 def place(base_dir: Path, endpoint: str) -> str:

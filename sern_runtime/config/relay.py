@@ -8,10 +8,10 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, model_validator
 
 from sern_core.access import DEFAULT_QUEUE_BYTES, AccessRule
-from sern_core.errors import ConfigError
+from sern_core.errors import ConfigError, UsageError
 from sern_core.objects import COMMAND_OBJECT_TYPES
 from sern_core.patterns import PatternSet, compile_pattern
-from sern_core.rules import AUTO, FeedRole, FeedTopic, TopicRule, plain_type
+from sern_core.rules import AUTO, FeedRole, FeedTopic, TopicRule, client_name, plain_type
 from sern_core.types import ClientName, Durability, Encoding, PriorityClass, Reliability
 from sern_runtime import ros_types
 from sern_runtime.config.adaptation import AdaptationSection
@@ -382,6 +382,10 @@ class RelayFile(FileModel):
             if role.owner in directory.names:
                 problem = f"the relay publishes for this role as {role.owner}, and there is a client of that name"
                 yield FileProblem(("feed", "roles", index, "name"), problem)
+        for index, section in enumerate(self.access):
+            if directory.names and _is_name(section.client) and section.client not in directory.names:
+                problem = f"no .pub file in {directory.path} is of {section.client}: it cannot connect"
+                yield FileProblem(("access", index, "client"), problem, warning=True)
         rules = PatternSet(section.client for section in self.access)
         for name in directory.names:
             if not rules.fullmatch(name):
@@ -402,6 +406,14 @@ class RelayFile(FileModel):
                 if entry.commands:
                     place, reliable = (*at, "types", number, "lifespan_s"), entry.reliability == "reliable"
                     yield from lifespan_problem(entry.lifespan_s, place, reliable=reliable)
+
+
+def _is_name(pattern: str) -> bool:
+    """Whether it matches one client alone, of which the name is."""
+    try:
+        return client_name(pattern) == pattern
+    except UsageError:
+        return False
 
 
 def load_relay(path: Path, *, files: bool = True) -> Loaded[RelayFile]:

@@ -22,6 +22,7 @@ from sern_runtime.config.base import (
     Section,
     described,
     resolve,
+    unit_makes,
     unit_problems,
 )
 from sern_runtime.config.yaml import Loc
@@ -224,9 +225,11 @@ def output_problems(base_dir: Path, text: PathText | None, loc: Loc) -> Iterator
     path = resolve(base_dir, text)
     if path.is_dir():
         yield FileProblem(loc, f"{path} is a directory; a file is needed")
+    elif not path.parent.is_dir() and unit_makes(base_dir, path.parent):
+        return
     elif not path.parent.is_dir():
         yield FileProblem(loc, f"{path.parent}: no such directory; create it first")
     elif not os.access(path.parent, os.W_OK):
         yield FileProblem(loc, f"{path.parent}: may not be written")
     else:
-        yield from unit_problems(path, loc)
+        yield from unit_problems(base_dir, path, loc)

@@ -3,6 +3,7 @@
 import asyncio
 import shutil
 import sys
+from collections import Counter
 from io import StringIO
 from pathlib import Path
 
@@ -375,6 +376,23 @@ def test_a_client_whose_keys_do_not_hold_is_a_warning_at_the_relay(deployed: Pat
     assert f"relay.clients_dir: {later}machine's clock says 2" in err
     assert err.endswith(": it cannot connect\n")
     assert out.endswith("relay.yaml: right\n")
+
+
+def test_a_client_that_a_rule_names_and_that_has_no_key_is_a_warning(deployed: Path) -> None:
+    (deployed / "clients" / "site1.pub").unlink()
+    (deployed / "clients" / "husky1.pub").unlink()  # its rule is for many
+    code, _, err = ran(deployed / "relay.yaml")
+    assert (code, err.count("\n")) == (0, 1)
+    assert err.endswith(f"access.0.client: no .pub file in {deployed}/clients is of site1: it cannot connect\n")
+
+
+def test_a_narrow_terminal_shows_every_pattern_whole(deployed: Path) -> None:
+    wide, narrow = StringIO(), StringIO()
+    for file, width in ((wide, 1000), (narrow, 60)):
+        assert check.run_check(deployed / "relay.yaml", out=Console(file=file, width=width)) == 0
+    letters = [Counter(file.getvalue().replace("\n", "").replace(" ", "")) for file in (wide, narrow)]
+    assert letters[0] == letters[1]
+    assert "…" not in narrow.getvalue()
 
 
 def test_command_line_alone_and_inside_another(deployed: Path) -> None:
