@@ -333,10 +333,11 @@ class ClientDaemon:
         """Why there is no link, as far as it is known."""
         if self.core.link.established:
             return SILENT
-        unresolved = None if self._name is None else self._name.problem
+        unresolved, at = (None, "") if self._name is None else (self._name.problem, self._name.at)
+        where = f" ({at})" if at else ""
         if self.reason == NOT_YET and self._transport is not None and self._transport.waiting:
-            return WAITING
-        return unresolved or self.bridge.rejected_reason or self.reason
+            return f"{WAITING}{where}"
+        return unresolved or self.bridge.rejected_reason or f"{self.reason}{where}"
 
     def _put_node(self) -> None:
         """Tell the relay's registry who we are."""

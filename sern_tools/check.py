@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from sern_client.relay_name import name_in, unresolved
+from sern_client.relay_name import UnresolvedError, name_in, resolve
 from sern_core.errors import ConfigError
 from sern_core.types import ClientName
 from sern_runtime import keys
@@ -68,14 +68,18 @@ def _unresolved(endpoint: str) -> str | None:
     if named is None:
         return None
 
-    async def ask() -> str | None:
-        try:
-            return await asyncio.wait_for(unresolved(*named), RESOLVE_S)
-        except TimeoutError:
-            return f"no answer within {RESOLVE_S:g} s"
+    async def ask() -> None:
+        await asyncio.wait_for(resolve(*named), RESOLVE_S)
 
-    why = asyncio.run(ask())
-    return None if why is None else f"{named[0]} does not resolve on this machine now: {why}"
+    try:
+        asyncio.run(ask())
+    except TimeoutError:
+        why = f"no answer within {RESOLVE_S:g} s"
+    except UnresolvedError as error:
+        why = str(error)
+    else:
+        return None
+    return f"{named[0]} does not resolve on this machine now: {why}"
 
 
 def detect(document: Document) -> type[FileModel]:

@@ -382,9 +382,9 @@ class RelayFile(FileModel):
             if role.owner in directory.names:
                 problem = f"the relay publishes for this role as {role.owner}, and there is a client of that name"
                 yield FileProblem(("feed", "roles", index, "name"), problem)
-        for index, section in enumerate(self.access):
-            if directory.names and _is_name(section.client) and section.client not in directory.names:
-                problem = f"no .pub file in {directory.path} is of {section.client}: it cannot connect"
+        for index, rule in enumerate(self.access):
+            if directory.names and _is_name(rule.client) and rule.client not in directory.names:
+                problem = f"no .pub file in {directory.path} is of {rule.client}: it cannot connect"
                 yield FileProblem(("access", index, "client"), problem, warning=True)
         rules = PatternSet(section.client for section in self.access)
         for name in directory.names:

@@ -10,6 +10,7 @@ import zmq
 
 from sern_client import relay_name
 from sern_client.daemon import SILENT
+from sern_client.relay_name import UnresolvedError
 from sern_core.lanes import LANE_UDP
 from sern_core.message import TopicInfo
 from sern_core.types import Encoding, TopicName
@@ -44,9 +45,9 @@ async def test_a_relay_that_does_not_resolve_is_said_at_once_and_again(
     monkeypatch.setattr(relay_name, "SAY_AGAIN_S", (0.0, 0.0))
 
     async def unknown(_host: str, _port: int) -> str:
-        return "name or service not known"
+        raise UnresolvedError("name or service not known")
 
-    monkeypatch.setattr(relay_name, "unresolved", unknown)
+    monkeypatch.setattr(relay_name, "resolve", unknown)
     async with Lab(tmp_path, "robot1") as lab:
         config = lab.client_file("robot1", ROBOT, relay={"endpoint": f"tcp://relay.example:{lab.port}"})
         robot = await lab.client(config)
@@ -59,19 +60,21 @@ async def test_a_relay_that_does_not_resolve_is_said_at_once_and_again(
         assert robot._ready().reason.startswith(text)
         assert robot._name is not None
 
-        async def resolves(_host: str, _port: int) -> None:
-            return None
+        async def resolves(_host: str, _port: int) -> str:
+            return "192.0.2.1"
 
-        monkeypatch.setattr(relay_name, "unresolved", resolves)
-        await until(lambda: any("relay.example resolves again, after" in message for message in caplog.messages))
-        assert "does not resolve" not in robot._ready().reason
+        monkeypatch.setattr(relay_name, "resolve", resolves)
+        again = "relay.example resolves again, to 192.0.2.1, after"
+        await until(lambda: any(again in message for message in caplog.messages))
+        assert robot._ready().reason.endswith(" (relay.example is 192.0.2.1)")
 
 
 async def test_why_a_name_does_not_resolve() -> None:
-    assert await relay_name.unresolved("localhost", 5555) is None
+    assert await relay_name.resolve("localhost", 5555) == "127.0.0.1"
     for name in ("::1", "no..host"):  # no IPv4 address, and no name: nobody else is asked
-        why = await relay_name.unresolved(name, 5555)
-        assert why and "\n" not in why
+        with pytest.raises(UnresolvedError) as why:
+            await relay_name.resolve(name, 5555)
+        assert str(why.value) and "\n" not in str(why.value)
 
 
 def test_only_names_are_looked_up() -> None:

@@ -12,7 +12,7 @@ import typer
 from rich.console import Console
 from typer.testing import CliRunner
 
-from sern_client.relay_name import unresolved
+from sern_client.relay_name import UnresolvedError, resolve
 from sern_runtime.config import endpoints
 from sern_tools import check
 from sern_tools.keygen import run_keygen
@@ -28,9 +28,9 @@ def resolver(monkeypatch: pytest.MonkeyPatch) -> None:
     """One that knows no name. The resolver of this machine may hang, and know more names than there are."""
 
     async def knows_none(_host: str, _port: int) -> str:
-        return NO_NAME
+        raise UnresolvedError(NO_NAME)
 
-    monkeypatch.setattr(check, "unresolved", knows_none)
+    monkeypatch.setattr(check, "resolve", knows_none)
 
 
 def ran(path: Path) -> tuple[int, str, str]:
@@ -71,15 +71,16 @@ def test_a_relay_that_does_not_resolve_is_a_warning(deployed: Path) -> None:
 
 async def test_why_a_name_does_not_resolve() -> None:
     """One that no resolver has to be asked about: a label has 63 characters at most."""
-    assert "label" in (await unresolved("a" * 64, 5555) or "")
-    assert await unresolved("127.0.0.1", 5555) is None
+    with pytest.raises(UnresolvedError, match="label"):
+        await resolve("a" * 64, 5555)
+    assert await resolve("127.0.0.1", 5555) == "127.0.0.1"
 
 
 def test_a_resolver_that_does_not_answer_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
     async def asks(_host: str, _port: int) -> None:
         await asyncio.Event().wait()
 
-    monkeypatch.setattr(check, "unresolved", asks)
+    monkeypatch.setattr(check, "resolve", asks)
     monkeypatch.setattr(check, "RESOLVE_S", 0.0)
     problem = check._unresolved("tcp://relay.example:5555")
     assert problem == "relay.example does not resolve on this machine now: no answer within 0 s"
