@@ -152,6 +152,26 @@ async def test_a_session_that_outlives_its_connection_says_that_there_is_another
         assert robot._said == set()
 
 
+async def test_a_reload_that_fails_twice_says_what_is_wrong_now_until_one_works(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    async with Lab(tmp_path, "robot1") as lab:
+        relay = await lab.relay()
+        good = relay.loaded.path.read_text()
+        for number, bad in enumerate((good.replace('"access"', '"acces"'), good.replace('"clients"', '"nobody"')), 1):
+            relay.loaded.path.write_text(bad)
+            relay.reload()
+            assert relay.reloads_failed == number
+        assert relay._status().endswith(f"relay.clients_dir: {tmp_path}/nobody: no such directory")
+        assert "acces:" not in relay._status()
+        failed = [record for record in caplog.records if "reload failed, the old configuration stays" in record.message]
+        assert [record.levelname for record in failed] == ["ERROR", "ERROR"]
+        relay.loaded.path.write_text(good)
+        relay.reload()
+        assert relay._status() == "0 clients, 0 streams"
+        assert sum("the reload works again" in message for message in caplog.messages) == 1
+
+
 async def test_before_anything_has_come_back_nothing_else_is_said(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
