@@ -31,6 +31,7 @@ from sern_core.client import ClientCore
 from sern_core.errors import ConfigError
 from sern_core.lossy import missing
 from sern_core.patterns import compile_pattern
+from sern_core.session import NEW_SESSION
 from sern_core.trace import DecisionTrace
 from sern_core.types import CLASS_LABELS, DropReason, ObjectKind
 from sern_runtime import clock, ros_types
@@ -269,15 +270,20 @@ class ClientDaemon:
         """Told by the transport and by the session on it, usually of the same thing."""
         self.reason = reason
         self.link_state.soon()
+        silent_since_s = None
         if not self.core.link.established:  # else the session goes on over the other lane
+            silent_since_s = self._outages.since_s(self.core.link.peer)
             self._outages.forget(self.core.link.peer)
         if self._stopping:
             return
         if not self._said:
             self._down_since_s = clock.now()
+        if silent_since_s is not None:  # it began before anybody gave it up
+            self._down_since_s = min(self._down_since_s, silent_since_s)
         if reason not in self._said:
             self._said.add(reason)
-            _log.warning("%s: %s; trying again until it works", self.loaded.model.relay.endpoint, reason)
+            then = "" if reason == NEW_SESSION else "; trying again until it works"
+            _log.warning("%s: %s%s", self.loaded.model.relay.endpoint, reason, then)
 
     def _link_up(self) -> None:
         if self._said:  # in the words and at the level of the loss

@@ -35,7 +35,7 @@ from sern_core.errors import ConfigError, RefusedError, SernError, UsageError
 from sern_core.message import Message, StreamId, StreamInfo
 from sern_core.params import LinkParams, SchedulerParams
 from sern_core.rules import client_name, name_problem
-from sern_core.session import DISPLACED
+from sern_core.session import DISPLACED, NEW_SESSION
 from sern_core.types import ClientName, DropReason, Encoding, TopicName
 from sern_runtime import clock
 from sern_runtime.config.client import RelayConnection, load_client
@@ -52,8 +52,6 @@ LEAVE_S: Final = 1.0
 """How long to wait for the relay to take the subscription back; its `resume_s` ends it otherwise."""
 RIVAL_TURNS: Final = 3
 """New sessions on one connection, after which somebody else must be using our name."""
-NEW_SESSION: Final = "new session"
-"""The reason that `sern_core.link` gives when the relay has it begin anew on a connection that is up."""
 UNHEARD: Final = "the relay does not answer"
 """The reason while nothing has come of the connection, neither way."""
 TAKEN: Final = "another process connected as "

@@ -13,7 +13,9 @@ from sern_client.daemon import SILENT
 from sern_client.relay_name import UnresolvedError
 from sern_core.lanes import LANE_UDP
 from sern_core.message import TopicInfo
+from sern_core.session import NEW_SESSION
 from sern_core.types import Encoding, TopicName
+from sern_runtime import clock
 from sern_runtime.transport_watch import WAITING
 from sern_runtime.zmq_socket import make_client
 from tests.daemons import Lab, write_bag
@@ -121,6 +123,32 @@ async def test_a_recovery_is_said_like_the_loss(tmp_path: Path, caplog: pytest.L
         assert lines[f"{lab.endpoint}: the connection to the relay was lost; trying again until it works"] == "WARNING"
         assert lines[f"{lab.endpoint}: the link is there again"] == "WARNING"
         await lab.end(robot)
+
+
+async def test_an_outage_that_began_with_silence_is_counted_from_there(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A relay that hangs: first no answer in a session that waits, and then the connection is given up."""
+    async with Lab(tmp_path, "robot1") as lab:
+        relay = await lab.relay()
+        robot = await lab.connected(lab.client_file("robot1", ROBOT, relay={"udp": False}))
+        assert relay.server is not None
+        robot._outages.look("relay", lost=True, gone="silent", back="back", now=clock.now() - 100.0)
+        relay.server.cut_client("robot1")
+        said = f"{lab.endpoint}: the link is there again, after "
+        await until(lambda: any(message.startswith(said) for message in caplog.messages))
+        (text,) = [message for message in caplog.messages if message.startswith(said)]
+        assert int(text.removeprefix(said).removesuffix(" s")) >= 100
+
+
+async def test_a_relay_that_goes_on_with_no_session_is_said_in_words(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    async with Lab(tmp_path, "robot1") as lab:
+        await lab.relay()
+        robot = await lab.connected(lab.client_file("robot1", ROBOT))
+        robot._link_down(NEW_SESSION)
+        assert caplog.messages[-1] == f"{lab.endpoint}: the session could not go on, and another begins"
 
 
 async def test_a_relay_that_hangs_is_not_said_to_be_there(tmp_path: Path) -> None:
