@@ -405,6 +405,8 @@ class RelayDaemon:
                         ("client", "code"), self._transforms_refused)  # fmt: skip
         metrics.counter("sern_feed_messages_total", "Messages of the plain feed, by role and what became of them.",
                         ("role", "result"), self._fed)  # fmt: skip
+        metrics.gauge("sern_relay_reload_failed", "1 while what the last reload read is not all in force.",
+                      read=lambda: [((), float(self._unreloaded is not None))])  # fmt: skip
         metrics.counter("sern_relay_reload_failures_total", "Reloads that kept the old configuration.",
                         read=lambda: [((), float(self.reloads_failed))])  # fmt: skip
         metrics.counter("sern_http_refused_total", "Requests to the HTTP server that were none.",

@@ -19,6 +19,7 @@ from sern_runtime import clock
 from sern_runtime.transport_watch import WAITING
 from sern_runtime.zmq_socket import make_client
 from tests.daemons import Lab, write_bag
+from tests.loopback.test_http_api import get
 from tests.support import until
 
 ROBOT = {"kind": "synthetic", "role": "robot", "topics": 1}
@@ -192,11 +193,13 @@ async def test_a_reload_that_fails_twice_says_what_is_wrong_now_until_one_works(
             assert relay.reloads_failed == number
         assert relay._status().endswith(f"relay.clients_dir: {tmp_path}/nobody: no such directory")
         assert "acces:" not in relay._status()
+        assert "\nsern_relay_reload_failed 1.0\n" in (await get(relay, "/metrics"))[1]
         failed = [record for record in caplog.records if "reload failed, the old configuration stays" in record.message]
         assert [record.levelname for record in failed] == ["ERROR", "ERROR"]
         relay.loaded.path.write_text(good)
         relay.reload()
         assert relay._status() == "0 clients, 0 streams"
+        assert "\nsern_relay_reload_failed 0.0\n" in (await get(relay, "/metrics"))[1]
         assert sum("the reload works again" in message for message in caplog.messages) == 1
 
 
