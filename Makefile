@@ -11,7 +11,7 @@ PACKAGES := sern_core sern_runtime sern_relay sern_client sern_sim sern_tools be
 help:
 	@echo "make setup    create $(VENV) with pinned dependencies"
 	@echo "make demo     relay, robot and site over a bad link, on this machine, next to plain ZMQ"
-	@echo "make test     every test;  make lint, make types: static checks"
+	@echo "make test     the tests but the longer ones of make lab;  make lint, make types: static checks"
 	@echo "make explore  the tests with random input, with new cases and ten times as many; SEED=... repeats a run"
 	@echo "make lab      the whole matrix of bad links, and the longer runs over tc netem, which need root"
 	@echo "make performance   as root: measure link, fleet and policies of docs/performance.md anew, two hours of an idle machine"

@@ -31,6 +31,7 @@ from sern_core.client import ClientCore
 from sern_core.errors import ConfigError
 from sern_core.lossy import missing
 from sern_core.patterns import compile_pattern
+from sern_core.session import NEW_SESSION
 from sern_core.trace import DecisionTrace
 from sern_core.types import CLASS_LABELS, DropReason, ObjectKind
 from sern_runtime import clock, ros_types
@@ -45,7 +46,7 @@ from sern_runtime.draining import Progress
 from sern_runtime.entry import blamed_on, end_tasks, log_warnings, serve
 from sern_runtime.http import Health, HttpServer
 from sern_runtime.internal_errors import InternalErrors
-from sern_runtime.keys import load_public, load_secret
+from sern_runtime.keys import load_secret, load_server_keys
 from sern_runtime.link_metrics import register_codecs, register_links, register_received
 from sern_runtime.loop import Shutdown
 from sern_runtime.message_log import LoggedFates, MessageLog
@@ -208,13 +209,7 @@ class ClientDaemon:
         keys = load_secret(self.loaded.resolve(relay.secret_key_file)) if relay.secret_key_file else None
         server_keys: tuple[str, ...] = ()
         if relay.server_key_file:
-            public = load_public(self.loaded.resolve(relay.server_key_file))
-            server_keys = tuple(key.key for key in public.valid_at(time.time()))
-            if not server_keys:
-                raise ConfigError(
-                    "holds no key that is valid now; ask for the relay's new public key",
-                    file=str(self.loaded.resolve(relay.server_key_file)),
-                )
+            server_keys = load_server_keys(self.loaded.resolve(relay.server_key_file), at_s=time.time())
         if model.http.listen is not None:
             with blamed_on(self.loaded.path, "http", "listen"):
                 self._http = self._make_http(model.http.listen)
@@ -275,15 +270,20 @@ class ClientDaemon:
         """Told by the transport and by the session on it, usually of the same thing."""
         self.reason = reason
         self.link_state.soon()
+        silent_since_s = None
         if not self.core.link.established:  # else the session goes on over the other lane
+            silent_since_s = self._outages.since_s(self.core.link.peer)
             self._outages.forget(self.core.link.peer)
         if self._stopping:
             return
         if not self._said:
             self._down_since_s = clock.now()
+        if silent_since_s is not None:  # it began before anybody gave it up
+            self._down_since_s = min(self._down_since_s, silent_since_s)
         if reason not in self._said:
             self._said.add(reason)
-            _log.warning("%s: %s; trying again until it works", self.loaded.model.relay.endpoint, reason)
+            then = "" if reason == NEW_SESSION else "; trying again until it works"
+            _log.warning("%s: %s%s", self.loaded.model.relay.endpoint, reason, then)
 
     def _link_up(self) -> None:
         if self._said:  # in the words and at the level of the loss
@@ -339,10 +339,11 @@ class ClientDaemon:
         """Why there is no link, as far as it is known."""
         if self.core.link.established:
             return SILENT
-        unresolved = None if self._name is None else self._name.problem
+        unresolved, at = (None, "") if self._name is None else (self._name.problem, self._name.at)
+        where = f" ({at})" if at else ""
         if self.reason == NOT_YET and self._transport is not None and self._transport.waiting:
-            return WAITING
-        return unresolved or self.bridge.rejected_reason or self.reason
+            return f"{WAITING}{where}"
+        return unresolved or self.bridge.rejected_reason or f"{self.reason}{where}"
 
     def _put_node(self) -> None:
         """Tell the relay's registry who we are."""

@@ -1,4 +1,4 @@
-"""Whether the relay's name resolves. libzmq asks again and again by itself, and never says that there is no answer."""
+"""Whether the relay's name resolves, and to what. libzmq asks again and again by itself, and tells neither."""
 
 import asyncio
 import ipaddress
@@ -16,15 +16,21 @@ SAY_AGAIN_S: Final = (10.0, 600.0)
 _log = logging.getLogger(__name__)
 
 
-async def unresolved(host: str, port: int) -> str | None:
-    """Why `host` has no IPv4 address now, as the resolver says it; None when it has one. libzmq asks for IPv4 only."""
+class UnresolvedError(Exception):
+    """A name has no IPv4 address now; why, as the resolver says it."""
+
+
+async def resolve(host: str, port: int) -> str:
+    """The addresses that `host` has now, with commas; sorted, as name servers change the order at each answer. IPv4,
+    because libzmq asks for no other. Raises UnresolvedError."""
+    loop = asyncio.get_running_loop()
     try:
-        await asyncio.get_running_loop().getaddrinfo(host, port, family=socket.AF_INET, type=socket.SOCK_STREAM)
+        found = await loop.getaddrinfo(host, port, family=socket.AF_INET, type=socket.SOCK_STREAM)
     except socket.gaierror as error:
-        return (error.strerror or str(error)).lower()
+        raise UnresolvedError((error.strerror or str(error)).lower()) from error
     except (OSError, UnicodeError) as error:
-        return str(error)
-    return None
+        raise UnresolvedError(str(error)) from error
+    return ", ".join(sorted({str(address[0]) for *_, address in found}))
 
 
 def name_in(endpoint: str) -> tuple[str, int] | None:
@@ -45,6 +51,8 @@ class RelayName:
     def __init__(self, endpoint: str, host: str, port: int) -> None:
         self.problem: str | None = None
         """What is wrong, for `/readyz` and the status; None: it resolved, or is not known yet."""
+        self.at = ""
+        """Where it leads, for the same; empty: it is not known."""
         self._endpoint = endpoint
         self._host = host
         self._port = port
@@ -53,6 +61,7 @@ class RelayName:
         self._since_s = 0.0
         self._say_s = 0.0
         self._pause_s = SAY_AGAIN_S[0]
+        self._address = ""  # the last one that was known
 
     def tick(self, *, connected: bool) -> None:
         """`connected`: the relay answers, so its address is known."""
@@ -66,12 +75,17 @@ class RelayName:
             self._task = asyncio.get_running_loop().create_task(self._look(), name="relay-name")
 
     async def _look(self) -> None:
-        why = await unresolved(self._host, self._port)
-        if why is None:
-            self._resolved()
-            return
+        try:
+            address = await resolve(self._host, self._port)
+        except UnresolvedError as error:
+            self._unresolved(str(error))
+        else:
+            self._resolved(address)
+
+    def _unresolved(self, why: str) -> None:
         now = clock.now()
         first = self.problem is None
+        self.at = ""
         self.problem = f"the relay's name {self._host} does not resolve: {why}"
         if first:
             self._since_s = now
@@ -84,10 +98,21 @@ class RelayName:
             return
         self._say_s = now + self._pause_s
 
-    def _resolved(self) -> None:
+    def _resolved(self, address: str = "") -> None:
+        """Say that it does again, and where it leads if that is another place than before. Empty: whoever made the
+        connection knows the address."""
+        before, self._address = self._address, address or self._address
+        if address:
+            self.at = f"{self._host} is {address}"
         if self.problem is not None:
             self.problem = None
-            _log.warning("%s: %s resolves again, after %.0f s", self._endpoint, self._host, clock.now() - self._since_s)
+            to = f", to {address}" if address else ""
+            down_s = clock.now() - self._since_s
+            _log.warning("%s: %s resolves again%s, after %.0f s", self._endpoint, self._host, to, down_s)
+        elif address and not before:
+            _log.info("%s: %s", self._endpoint, self.at)
+        elif address and address != before:
+            _log.warning("%s: %s is %s now, and was %s", self._endpoint, self._host, address, before)
 
     def close(self) -> None:
         """Idempotent."""

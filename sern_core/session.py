@@ -51,6 +51,8 @@ DISPLACED_S: Final = (0.5, 10.0)
 """First and longest pause after the second short session in a row, and those that follow."""
 DISPLACED: Final = "displaced"
 """The code of the refusal that ends a session because another process connected under its name."""
+NEW_SESSION: Final = "the session could not go on, and another begins"
+"""The reason of an end on a connection that is up."""
 MAX_UNREAD_BYTES: Final = 32 * 2**20
 UNREAD_OVERHEAD_BYTES: Final = 256
 """Datagrams of a peer that wait to be read, each with so much beside it: far more than any window lets a peer send that
@@ -201,7 +203,7 @@ class Session(Hop):
             self._end_session(reason, now)
 
     def _greet(self, due_s: float, now: float) -> None:
-        self._end_session("new session", now)
+        self._end_session(NEW_SESSION, now)
         self.tag = self.tag % 255 + 1
         self._hello_due_s = due_s
         self.dirty = True
@@ -274,7 +276,7 @@ class Session(Hop):
         self._hello_stamp_us = stamp_us
         self.transport_up = True
         if not again:
-            self._end_session("new session", now)
+            self._end_session(NEW_SESSION, now)
             self.tag = tag
             self.version = version
         elif another_connection:
@@ -575,7 +577,7 @@ class Session(Hop):
                 self.lanes[LANE_ZMQ].stalled = False
                 self._choose_lane(now)
             else:
-                self._end_session("new session", now)
+                self._end_session(NEW_SESSION, now)
                 self._establish(boot, now)
             self.clock.sample(echo_us * 1e-6, at_us * 1e-6, header.stamp_us * 1e-6, now)
             # Without it the first packets on a long path would be given up before they can be acknowledged.

@@ -38,7 +38,7 @@ from sern_runtime.draining import Progress
 from sern_runtime.entry import blamed_on, end_tasks, log_warnings, serve
 from sern_runtime.http import Health, HttpServer
 from sern_runtime.internal_errors import InternalErrors
-from sern_runtime.keys import KeyDirectory, KeyStatus, load_secret, user_id
+from sern_runtime.keys import KeyDirectory, KeyStatus, clock_says, load_secret, user_id
 from sern_runtime.link_metrics import AgeHistograms, register_codecs, register_links, register_received
 from sern_runtime.loop import Shutdown
 from sern_runtime.message_log import LoggedFates, MessageLog
@@ -47,7 +47,7 @@ from sern_runtime.optional import OptionalParts
 from sern_runtime.outages import Outages
 from sern_runtime.sdnotify import Notifier, Watchdog
 from sern_runtime.topics_view import announced_summary, link_summary, received_summary
-from sern_runtime.zap import TemporaryRefusal, ZapHandler, self_test
+from sern_runtime.zap import Refusal, TemporaryRefusal, ZapHandler, self_test
 
 ZAP_DOMAIN: Final = "sern"
 PATIENCE_S: Final = 5.0
@@ -228,16 +228,16 @@ class RelayDaemon:
         self.notifier.ready(f"{model.name} on {', '.join(relay.listen)}")
         _log.info("relay %s listens on %s", model.name, ", ".join(relay.listen))
 
-    def _lookup(self, public_key: str, address: str) -> str | TemporaryRefusal | None:
+    def _lookup(self, public_key: str, _address: str) -> str | Refusal | TemporaryRefusal | None:
         assert self.directory is not None
-        match = self.directory.lookup(public_key, at_s=time.time())
-        if match.status is KeyStatus.VALID and match.name is not None:
+        at_s = time.time()
+        match = self.directory.lookup(public_key, at_s=at_s)
+        if match.name is None or match.key is None:
+            return None
+        if match.status is KeyStatus.VALID:
             return user_id(match.name, public_key)
-        if match.status is KeyStatus.NOT_YET:
-            return TemporaryRefusal(f"the key of {match.name} is not valid yet")
-        if match.name is not None:  # an unknown key is reported by the handler
-            _log.warning("%s: the key of %s has expired", address, match.name)
-        return None
+        refusal = TemporaryRefusal if match.status is KeyStatus.NOT_YET else Refusal
+        return refusal(f"the key of {match.name} {match.key.lapse(at_s)}, and {clock_says(at_s)}")
 
     def _valid_keys(self) -> dict[ClientName, frozenset[str]]:
         """The keys that hold now, by client."""
@@ -405,6 +405,8 @@ class RelayDaemon:
                         ("client", "code"), self._transforms_refused)  # fmt: skip
         metrics.counter("sern_feed_messages_total", "Messages of the plain feed, by role and what became of them.",
                         ("role", "result"), self._fed)  # fmt: skip
+        metrics.gauge("sern_relay_reload_failed", "1 while what the last reload read is not all in force.",
+                      read=lambda: [((), float(self._unreloaded is not None))])  # fmt: skip
         metrics.counter("sern_relay_reload_failures_total", "Reloads that kept the old configuration.",
                         read=lambda: [((), float(self.reloads_failed))])  # fmt: skip
         metrics.counter("sern_http_refused_total", "Requests to the HTTP server that were none.",

@@ -66,6 +66,15 @@ def _unix_s(text: str) -> float:
         raise fault(f"{text[:40]!r} is out of range") from error
 
 
+def _utc(at_s: float) -> str:
+    return f"{datetime.fromtimestamp(at_s, UTC):%Y-%m-%dT%H:%M:%SZ}"
+
+
+def clock_says(at_s: float) -> str:
+    """The time by which keys are judged, for whoever wonders whether it is right."""
+    return f"this machine's clock says {_utc(at_s)}"
+
+
 KeyText = Annotated[str, AfterValidator(_check_z85), Field(json_schema_extra={"pattern": _Z85.pattern})]
 UtcText = Annotated[str, AfterValidator(_check_utc), Field(json_schema_extra={"format": "date-time"})]
 
@@ -132,6 +141,16 @@ class PublicKey:
             return KeyStatus.EXPIRED
         return KeyStatus.VALID
 
+    def lapse(self, at_s: float) -> str:
+        """Why it does not hold at that time; empty if it does."""
+        match self.status(at_s):
+            case KeyStatus.NOT_YET if self.not_before_s is not None:
+                return f"is not valid before {_utc(self.not_before_s)}"
+            case KeyStatus.EXPIRED if self.not_after_s is not None:
+                return f"expired at {_utc(self.not_after_s)}"
+            case _:
+                return ""
+
 
 @dataclass(frozen=True, slots=True)
 class PublicKeys:
@@ -142,6 +161,18 @@ class PublicKeys:
 
     def valid_at(self, at_s: float) -> tuple[PublicKey, ...]:
         return tuple(key for key in self.keys if key.status(at_s) is KeyStatus.VALID)
+
+    def lapse(self, at_s: float) -> str | None:
+        """A phrase when none of them holds at that time: which comes next or was the last, and what the clock says,
+        because that may be what is wrong. Else None."""
+        if self.valid_at(at_s):
+            return None
+        coming = [key for key in self.keys if key.status(at_s) is KeyStatus.NOT_YET]
+        if coming:
+            why = f"the next one {min(coming, key=lambda key: key.not_before_s or 0.0).lapse(at_s)}"
+        else:
+            why = f"the last one {max(self.keys, key=lambda key: key.not_after_s or 0.0).lapse(at_s)}"
+        return f"has no key that is valid now: {why}, and {clock_says(at_s)}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,10 +193,11 @@ class KeyStatus(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class KeyMatch:
-    """The answer of a directory about one key. `name` is None when the key is unknown."""
+    """The answer of a directory about one key. `name` and `key` are None when the key is unknown."""
 
     status: KeyStatus
     name: ClientName | None = None
+    key: PublicKey | None = None
 
 
 def generate(name: ClientName) -> SecretKey:
@@ -200,6 +232,16 @@ def load_public(path: Path) -> PublicKeys:
         for entry in model.keys
     )
     return PublicKeys(ClientName(model.name), keys)
+
+
+def load_server_keys(path: Path, *, at_s: float) -> tuple[str, ...]:
+    """The keys (Z85) in the relay's public key file that hold at `at_s`, in the order in which they are tried.
+    ConfigError when none does."""
+    public = load_public(path)
+    lapse = public.lapse(at_s)
+    if lapse is not None:
+        raise ConfigError(f"{lapse}; set the clock, or ask for the relay's new public key", file=str(path))
+    return tuple(key.key for key in public.valid_at(at_s))
 
 
 def load_secret(path: Path) -> SecretKey:
@@ -335,12 +377,17 @@ class KeyDirectory:
     def keys_of(self, name: ClientName) -> tuple[PublicKey, ...]:
         return tuple(key for owner, key, _ in self._by_key.values() if owner == name)
 
+    def lapsed(self, *, at_s: float) -> tuple[str, ...]:
+        """A phrase for each client of which no key holds at `at_s`."""
+        found = ((name, PublicKeys(name, self.keys_of(name)).lapse(at_s)) for name in self.names)
+        return tuple(f"{name} {lapse}: it cannot connect" for name, lapse in found if lapse is not None)
+
     def lookup(self, public_key: str | bytes, *, at_s: float) -> KeyMatch:
         """Whose key this is and whether it holds now. `public_key` is Z85 text, or 32 raw bytes as ZAP hands over."""
         found = self._by_key.get(_as_z85(public_key))
         if found is None:
             return KeyMatch(KeyStatus.UNKNOWN)
-        return KeyMatch(found[1].status(at_s), found[0])
+        return KeyMatch(found[1].status(at_s), found[0], found[1])
 
 
 def _as_z85(key: str | bytes) -> str:

@@ -37,6 +37,11 @@ class Outages:
             outage.said = True
             self._log.log(self._level, "%s", gone)
 
+    def since_s(self, peer: str) -> float | None:
+        """Since when it has been silent; None: it is not."""
+        outage = self._outages.get(peer)
+        return None if outage is None else outage.since_s
+
     def forget(self, peer: str) -> None:
         """Its silence ended with something else, of which was told."""
         self._outages.pop(peer, None)

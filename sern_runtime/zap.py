@@ -34,6 +34,14 @@ _PING_DOMAIN: Final = b"\0ping"  # no socket can have it: libzmq takes domains f
 _log = logging.getLogger(__name__)
 
 
+class Refusal:
+    """A lookup's answer about a key that is known and does not hold: as for an unknown one the client is told 400.
+    `reason` is for the log."""
+
+    def __init__(self, reason: str) -> None:
+        self.reason = reason
+
+
 class TemporaryRefusal:
     """A lookup's answer "not now": the client is told 300 and tries again by itself. `reason` is for the log."""
 
@@ -41,8 +49,8 @@ class TemporaryRefusal:
         self.reason = reason
 
 
-Lookup = Callable[[str, str], "str | TemporaryRefusal | None"]
-"""`lookup(public_key_z85, address) -> User-Id`, None for an unknown key, or a TemporaryRefusal."""
+Lookup = Callable[[str, str], "str | Refusal | TemporaryRefusal | None"]
+"""`lookup(public_key_z85, address) -> User-Id`, None for an unknown key, or a refusal."""
 
 Admit = Callable[[str], bool]
 """`admit(address) -> bool`: the connection cap, asked before the lookup. False is answered 300."""
@@ -141,9 +149,10 @@ class ZapHandler:
             counters.probes += 1
             self._expected.discard(public_key)
             return b"400", b"no such key", b""
-        if answer is None or answer == "":
+        if isinstance(answer, Refusal) or not answer:
             counters.unknown_key += 1
-            _log.warning("refused a connection from %s: unknown key %s", address, public_key)
+            why = answer.reason if isinstance(answer, Refusal) else f"unknown key {public_key}"
+            _log.warning("refused a connection from %s: %s", address, why)
             return b"400", b"no such key", b""
         if isinstance(answer, TemporaryRefusal):
             counters.not_now += 1

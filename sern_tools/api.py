@@ -19,11 +19,16 @@ from sern_runtime.entry import EXIT_CONFIG, EXIT_FAILED
 
 LOCAL_APIS: Final = tuple(f"http://127.0.0.1:{port}" for port in (5580, 5581, 5582))
 """Where the daemons of the examples answer: relay, robot, site."""
+PROBED: Final = "/api/link"
 PROBE_S: Final = 1.0
 TIMEOUT_S: Final = 5.0
 
 # A daemon's HTTP server is on loopback or on a private network: a proxy for the outside must not come in between.
 _opener = urllib.request.build_opener(urllib.request.ProxyHandler({}))
+
+
+class SilentError(SernError):
+    """A connection was made, and no answer came in time."""
 
 
 class NotFoundError(SernError):
@@ -43,18 +48,31 @@ def checked_api(api: str) -> str:
 
 
 def local_api() -> str:
-    """The daemon of this machine, at the first of `LOCAL_APIS` that answers. Raises SernError where none does."""
+    """The daemon of this machine, at the first of `LOCAL_APIS` that answers. One before it that hangs is named on
+    standard error. Raises SernError where none answers."""
+    silent: list[str] = []
     for api in LOCAL_APIS:
         try:
-            get_json(api, "/api/link", timeout_s=PROBE_S)
+            get_json(api, PROBED, timeout_s=PROBE_S)
+        except SilentError:
+            silent.append(api.removeprefix("http://"))
         except SernError:
             continue
-        return api
+        else:
+            if silent:
+                print(f"warning: {_hung(silent)}; asking {api}", file=sys.stderr)
+            return api
+    if silent:
+        raise SernError(f"no daemon answers on this machine; {_hung(silent)}")
     ports = ", ".join(api.rpartition(":")[2] for api in LOCAL_APIS)
     raise SernError(
         f"no daemon answers on this machine (127.0.0.1, ports {ports}); is one running, and is http.listen set in its "
         "file? --api gives another address"
     )
+
+
+def _hung(addresses: list[str]) -> str:
+    return f"{', '.join(addresses)} takes connections and is silent: its daemon hangs, or it is none of SERN"
 
 
 def get_json(api: str, path: str, *, timeout_s: float | None = None) -> Any:
@@ -75,9 +93,10 @@ def get_json(api: str, path: str, *, timeout_s: float | None = None) -> Any:
         raise SernError(
             f"{api}: no answer ({str(reason).lower()}); is the daemon running, and is http.listen set in its file?"
         ) from None
-    except (OSError, http.client.HTTPException, ValueError) as error:
-        problem = "no answer in time" if isinstance(error, TimeoutError) else "the answer is not JSON"
-        raise SernError(f"{api}{path}: {problem}; is this a SERN daemon?") from None
+    except TimeoutError:
+        raise SilentError(f"{api}{path}: no answer in time; it hangs, or is no SERN daemon") from None
+    except (OSError, http.client.HTTPException, ValueError):
+        raise SernError(f"{api}{path}: the answer is not JSON; is this a SERN daemon?") from None
 
 
 def is_stream(item: Mapping[str, Any]) -> bool:

@@ -3,6 +3,7 @@ only the name is looked up."""
 
 import asyncio
 import difflib
+import time
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Final
@@ -12,7 +13,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from sern_client.relay_name import name_in, unresolved
+from sern_client.relay_name import UnresolvedError, name_in, resolve
 from sern_core.errors import ConfigError
 from sern_core.types import ClientName
 from sern_runtime import keys
@@ -50,6 +51,9 @@ def run_check(path: Path, *, out: Console | None = None, err: Console | None = N
     if isinstance(loaded.model, (keys.PublicKeyFile, keys.SecretKeyFile)):
         odd = keys.misnamed(path, ClientName(loaded.model.name))
         _lines(err, [f"warning: {odd}"] if odd else [])
+    if isinstance(loaded.model, keys.PublicKeyFile):
+        lapse = keys.load_public(path).lapse(time.time())
+        _lines(err, [f"warning: {path} {lapse}"] if lapse else [])
     _lines(err, [f"warning: {text}" for text in loaded.warnings])
     if isinstance(loaded.model, ClientFile):
         problem = _unresolved(loaded.model.relay.endpoint)
@@ -64,14 +68,18 @@ def _unresolved(endpoint: str) -> str | None:
     if named is None:
         return None
 
-    async def ask() -> str | None:
-        try:
-            return await asyncio.wait_for(unresolved(*named), RESOLVE_S)
-        except TimeoutError:
-            return f"no answer within {RESOLVE_S:g} s"
+    async def ask() -> None:
+        await asyncio.wait_for(resolve(*named), RESOLVE_S)
 
-    why = asyncio.run(ask())
-    return None if why is None else f"{named[0]} does not resolve on this machine now: {why}"
+    try:
+        asyncio.run(ask())
+    except TimeoutError:
+        why = f"no answer within {RESOLVE_S:g} s"
+    except UnresolvedError as error:
+        why = str(error)
+    else:
+        return None
+    return f"{named[0]} does not resolve on this machine now: {why}"
 
 
 def detect(document: Document) -> type[FileModel]:
@@ -111,6 +119,14 @@ def _summary(out: Console, loaded: Loaded[FileModel]) -> None:
     _lines(out, [f"{loaded.path}: right"])
 
 
+def _table(*titles: str) -> Table:
+    """Patterns are shown whole: a long one goes on in the next line."""
+    table = Table(box=None, pad_edge=False)
+    for title in titles:
+        table.add_column(title, overflow="fold")
+    return table
+
+
 def _client_summary(out: Console, model: ClientFile) -> None:
     safety = "no encryption" if model.relay.insecure else "CURVE"
     _lines(
@@ -123,7 +139,7 @@ def _client_summary(out: Console, model: ClientFile) -> None:
             f"scheduler {model.scheduler.ordering}, window {model.link.window.algorithm}",
         ],
     )
-    table = Table("#", "match", "class", "direction", "reliability", "lifespan s", "rate Hz", box=None, pad_edge=False)
+    table = _table("#", "match", "class", "direction", "reliability", "lifespan s", "rate Hz")
     for index, rule in enumerate(model.topics):
         lifespan = "for ever" if rule.lifespan_s is None else str(rule.lifespan_s)
         rate = "" if rule.max_rate_hz is None else f"{rule.max_rate_hz:g}"
@@ -144,7 +160,7 @@ def _relay_summary(out: Console, model: RelayFile) -> None:
             f"http {model.http.listen or 'off'}",
         ],
     )
-    table = Table("#", "client", "may publish", "may subscribe", box=None, pad_edge=False)
+    table = _table("#", "client", "may publish", "may subscribe")
     for index, rule in enumerate(model.access):
         cells = (str(index), rule.client, " ".join(rule.publish), " ".join(rule.subscribe))
         table.add_row(*(Text(cell) for cell in cells))

@@ -35,11 +35,11 @@ from sern_core.errors import ConfigError, RefusedError, SernError, UsageError
 from sern_core.message import Message, StreamId, StreamInfo
 from sern_core.params import LinkParams, SchedulerParams
 from sern_core.rules import client_name, name_problem
-from sern_core.session import DISPLACED
+from sern_core.session import DISPLACED, NEW_SESSION
 from sern_core.types import ClientName, DropReason, Encoding, TopicName
 from sern_runtime import clock
 from sern_runtime.config.client import RelayConnection, load_client
-from sern_runtime.keys import SecretKey, load_public, load_secret
+from sern_runtime.keys import SecretKey, load_secret, load_server_keys
 from sern_runtime.loop import Shutdown, run
 from sern_runtime.zmq_socket import HANDSHAKE_IVL_MS
 from sern_tools.api import NotFoundError, checked_api, drop_output, get_json, is_stream, local_api, say
@@ -52,8 +52,6 @@ LEAVE_S: Final = 1.0
 """How long to wait for the relay to take the subscription back; its `resume_s` ends it otherwise."""
 RIVAL_TURNS: Final = 3
 """New sessions on one connection, after which somebody else must be using our name."""
-NEW_SESSION: Final = "new session"
-"""The reason that `sern_core.link` gives when the relay has it begin anew on a connection that is up."""
 UNHEARD: Final = "the relay does not answer"
 """The reason while nothing has come of the connection, neither way."""
 TAKEN: Final = "another process connected as "
@@ -171,7 +169,7 @@ def identity_from_file(path: Path) -> Identity:
         model.name,
         relay.endpoint,
         load_secret(loaded.resolve(relay.secret_key_file)) if relay.secret_key_file else None,
-        _valid_keys(loaded.resolve(relay.server_key_file)) if relay.server_key_file else (),
+        load_server_keys(loaded.resolve(relay.server_key_file), at_s=time.time()) if relay.server_key_file else (),
         model.link.params(),
         model.scheduler.params(),
         model.http.listen,
@@ -200,17 +198,10 @@ def identity_from_options(endpoint: str, key: Path | None, server_key: Path | No
         client_name(name) if pair is None and name is not None else ClientName("") if pair is None else pair.name,
         endpoint,
         pair,
-        () if server_key is None else _valid_keys(server_key),
+        () if server_key is None else load_server_keys(server_key, at_s=time.time()),
         LinkParams(),
         SchedulerParams(),
     )
-
-
-def _valid_keys(path: Path) -> tuple[str, ...]:
-    keys = tuple(key.key for key in load_public(path).valid_at(time.time()))
-    if not keys:
-        raise ConfigError("holds no key that is valid now; ask for the relay's new public key", file=str(path))
-    return keys
 
 
 class Listener:

@@ -46,12 +46,13 @@ class Rig:
     adapter: HopAdapter
     steps: list[Step] = field(default_factory=list)
 
-    def feed(self, channel: OutChannel, rate_hz: float, size: int, *, until_s: float = 1e9) -> None:
+    def feed(self, channel: OutChannel, rate_hz: float, size: int, *, until_s: float = 1e9, body: bytes = TEXT) -> None:
+        """Send the first `size` bytes of `body`."""
         world = self.world
 
         def send(now: float) -> None:
             if world.network.elapsed_s < until_s and channel.slot in self.robot.core.link.channels:
-                self.robot.core.send(channel, TEXT[:size], 0, now=now)
+                self.robot.core.send(channel, body[:size], 0, now=now)
 
         # Off the beat of the intervals, as sources are.
         world.network.after(

@@ -43,6 +43,9 @@ MEMORY: Final = 3
 """Intervals that demand is told from."""
 FULL: Final = 0.85
 """A link of which such a share was used is called saturated."""
+UNFILLED: Final = 2.0
+"""A link that was never full carries more than it had to. Taken for what it had to, it would be full at once: what fits
+with room to spare would be left out."""
 MIN_DEADLINE_S: Final = 1e-3
 """A peer may announce a lifespan of 0: its messages are as good as late, which costs what it costs."""
 LOSSY_MODE: Final = "lossy"
@@ -204,7 +207,8 @@ class HopAdapter:
 
     def _capacity_bps(self) -> float | None:
         """What the path can carry, as far as anybody knows: the estimate, or what is tried; and while there was never
-        enough to send to tell it, what the ranges call a full link, or what was carried where that is more."""
+        enough to send to tell it, what the ranges call a full link, or UNFILLED times what was carried if that is
+        more."""
         return self._trial.read(self._estimate_bps())
 
     def _estimate_bps(self) -> float | None:
@@ -214,7 +218,7 @@ class HopAdapter:
         estimator = link.lane.estimator
         if estimator.rate_bps is not None:
             return estimator.rate_bps
-        return max(self.params.ranges.bandwidth_max_bps, estimator.bound_bps or 0.0)
+        return max(self.params.ranges.bandwidth_max_bps, UNFILLED * (estimator.bound_bps or 0.0))
 
     def _channels(self) -> list[OutChannel]:
         """Those that somebody wants."""

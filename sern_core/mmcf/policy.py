@@ -191,13 +191,23 @@ class CapacityPlan:
         while self._levels[0].at_s < now - self._memory_s:
             self._levels.popleft()
 
+    def _latest(self) -> tuple[float, ...]:
+        latest = self._levels[-1].readings_bps
+        if len(latest) == 1 and len(self._levels) > 1:
+            return (self._levels[-2].readings_bps[-1], latest[0])
+        return latest
+
     @property
     def steady(self) -> bool:
         """Whether the estimates of the last interval agree."""
-        latest = self._levels[-1].readings_bps
-        if len(latest) == 1 and len(self._levels) > 1:
-            latest = (self._levels[-2].readings_bps[-1], latest[0])
+        latest = self._latest()
         return max(latest) - min(latest) <= 2.0 * STEADY * max(latest)
+
+    @property
+    def fell(self) -> bool:
+        """Whether the last estimate is clearly below others of the last interval."""
+        latest = self._latest()
+        return latest[-1] < (1.0 - 2.0 * STEADY) * max(latest)
 
     def path(self) -> CapacityPath | None:
         """The capacities of late where the link swings, whole swings of them; None where it holds still, or has just
@@ -294,7 +304,20 @@ class Mmcf(Policy):
         path = self._plan.path()
         predictions = predictor.corrected(predictor.predict(situation, residuals.ratios, path), factors)
         lows = 0.0 if path is None else PLANNED_SHARE * link.capacity_bps / max(min(path.capacities_bps), 1.0)
-        return self._choose(predictions, active, swings=path is not None, lows=lows)
+        tells = path is None and not self._plan.fell  # what was so is so yet
+        proven = self._proven(measurement) if measurement is not None and tells else frozenset()
+        return self._choose(predictions, active, swings=path is not None, lows=lows, proven=proven)
+
+    def _proven(self, measurement: Measurement) -> frozenset[PriorityClass]:
+        """The classes whose floors what is in force has just kept. Summaries that arrive prove nothing of what they
+        stand for."""
+        if any(self._active.summaries or ()):
+            return frozenset()
+        return frozenset(
+            found.priority
+            for found in measurement.classes
+            if found.offered and found.on_time >= FLOOR_KEPT * self.floors[found.priority] * found.offered
+        )
 
     def _prefer_raw(self, predictions: Predictions, active: int) -> None:
         """Mark the summaries that raw messages come before. One class at a time, the others' levels being equal."""
@@ -330,8 +353,14 @@ class Mmcf(Policy):
             return False
         return bool(mine.on_time[index] >= (RAW_BACK_SERVED if back else RAW_SERVED) * mine.needed[index])
 
-    def _keep_floors(self, predictions: Predictions, active: int, lows: float) -> None:
+    def _keep_floors(
+        self, predictions: Predictions, active: int, lows: float, proven: frozenset[PriorityClass]
+    ) -> None:
         """Mark what stays below the floor of a class, where something else keeps it; the most urgent class first.
+
+        `proven`: on a link that did not get worse what is in force has kept the floors of these classes. So it keeps
+        them, whatever is foreseen, and so does what is foreseen to be no worse: the formulas know the sizes in a class
+        by mean and spread alone, and see too many lost where clouds are among small messages.
 
         `lows`: the planned capacity over the least one of a link that swings, 0 of one that does not. There a floor
         counts only if there is room for it in the bad moments too: else it would be followed up and down.
@@ -342,6 +371,8 @@ class Mmcf(Policy):
             feasible = predictions.obstacle == 0
             here = ~np.isnan(mine.on_time)  # else the class has no traffic at that level
             keeps = feasible & (~here | (mine.on_time >= FLOOR_KEPT * floor))
+            if mine.priority in proven and feasible[active] and here[active]:
+                keeps |= feasible & here & (mine.on_time >= mine.on_time[active])
             if not floor or not (keeps & roomy).any():
                 continue
             if not keeps[active] and feasible[active]:
@@ -366,9 +397,17 @@ class Mmcf(Policy):
         places = [int(i) for i in np.flatnonzero(same) if grid.configurations[i].summaries == level]
         return min(places, key=lambda i: (float(grid.queues[i].sum()), float(predictions.cost[i])))
 
-    def _choose(self, predictions: Predictions, active: int, *, swings: bool, lows: float) -> Decision:
+    def _choose(
+        self,
+        predictions: Predictions,
+        active: int,
+        *,
+        swings: bool,
+        lows: float,
+        proven: frozenset[PriorityClass] = frozenset(),
+    ) -> Decision:
         self._prefer_raw(predictions, active)
-        self._keep_floors(predictions, active, lows)
+        self._keep_floors(predictions, active, lows, proven)
         best = self._shortest(predictions, predictions.best())
         current_cost, best_cost = float(predictions.cost[active]), float(predictions.cost[best])
         if swings:

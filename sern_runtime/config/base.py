@@ -6,7 +6,7 @@ Validators raise `fault(...)` with a finished phrase; `load.py` puts file, line 
 
 import ipaddress
 import re
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Final, Self
@@ -18,7 +18,7 @@ from sern_core.access import LONGEST_NAME, with_self
 from sern_core.errors import UsageError
 from sern_core.patterns import compile_pattern, matches_a_name
 from sern_core.rules import client_name, normal_namespace, topic_name
-from sern_runtime.config.yaml import Loc
+from sern_runtime.config.yaml import Data, Loc
 
 _HOST: Final = re.compile(r"[A-Za-z0-9_](?:[A-Za-z0-9_.-]{0,251}[A-Za-z0-9_])?")
 _TCP: Final = re.compile(r"tcp://(\[[0-9A-Fa-f:.%a-z]+\]|[^:/\[\]]+):([0-9]{1,5})")
@@ -26,8 +26,9 @@ _IPC_MAX_CHARS: Final = 100  # a Unix socket path holds 107 bytes on Linux
 _SOCKET_MAX_BYTES: Final = 107
 LONG_COMMAND_S: Final = 60.0
 """A command that is older moves nobody's robot on purpose."""
-UNITS_READ_ONLY: Final = Path("/etc")
-"""What the systemd units show to the daemons read-only, and where their configuration is (`deploy/systemd`)."""
+UNITS_CONFIGURED: Final = Path("/etc")
+UNITS_WRITE: Final = Path("/var/lib/sern")
+"""Where the configuration of the systemd units is, and all that they let a daemon write (`deploy/systemd`)."""
 _LOOPBACK_NAMES: Final = frozenset({"localhost", "ip6-localhost"})
 
 
@@ -55,6 +56,12 @@ class FileProblem:
 
 class FileModel(Section):
     """A whole file. `file_problems` is the second step of checking: it looks at the other files that this one names."""
+
+    @classmethod
+    def foreign(cls, data: Mapping[str, Data]) -> str | None:
+        """What is said of a file that is plainly another kind of ours; None: it may be of this one."""
+        del data
+        return None
 
     def placed(self, base_dir: Path) -> Self:
         """The same with its sockets (ipc://) where they are, relative paths starting at `base_dir`."""
@@ -241,13 +248,22 @@ def resolve(base_dir: Path, text: str) -> Path:
     return base_dir / Path(text).expanduser()
 
 
-def unit_problems(path: Path, loc: Loc) -> Iterator[FileProblem]:
-    """A warning of a file that the daemon is to write where the units of `deploy` let it write nothing."""
-    if path.resolve().is_relative_to(UNITS_READ_ONLY):
+def unit_problems(base_dir: Path, path: Path, loc: Loc) -> Iterator[FileProblem]:
+    """A warning of a file that the daemon is to write where the units of `deploy` let it write nothing: by the place of
+    the configuration it is one of theirs, or the file is beside those that are."""
+    written, configured = path.resolve(), UNITS_CONFIGURED
+    by_unit = written.is_relative_to(configured) or base_dir.resolve().is_relative_to(configured)
+    if by_unit and not written.is_relative_to(UNITS_WRITE):
         problem = (
-            f"{path}: under the systemd units nothing can be written below {UNITS_READ_ONLY}; name /var/lib/sern/..."
+            f"{path}: under the systemd units nothing can be written outside of {UNITS_WRITE}; name a path there, or "
+            "add ReadWritePaths= to the unit"
         )
         yield FileProblem(loc, problem, warning=True)
+
+
+def unit_makes(base_dir: Path, directory: Path) -> bool:
+    """Whether a folder that may not be there yet is the one that systemd makes when it starts the unit."""
+    return directory == UNITS_WRITE and base_dir.resolve().is_relative_to(UNITS_CONFIGURED)
 
 
 def place(base_dir: Path, endpoint: str) -> str:

@@ -1,7 +1,7 @@
 """The file of a client daemon (`sern-client`): who it is, its relay, its endpoints, and what to do with which topic."""
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Final, Literal, Self
@@ -67,6 +67,7 @@ from sern_runtime.config.shared import (
     secret_key_problems,
 )
 from sern_runtime.config.summaries import OneOrMoreSummaries, one_or_list, specs
+from sern_runtime.config.yaml import Data
 
 
 class ClientSection(Section):
@@ -447,6 +448,16 @@ class ClientFile(FileModel):
     """CSV file with a line for each message offered, delivered, dropped; null: none. For trials: grows without end."""
     summary: PathText | None = None
     """JSON file with the counters, written at exit; null: none."""
+
+    @classmethod
+    def foreign(cls, data: Mapping[str, Data]) -> str | None:
+        needed = "a client's is needed here (client, relay, endpoint)"
+        if "sern_key" in data:
+            return f"is a key file; {needed}"
+        relay = data.get("relay")
+        if not data.keys() & {"client", "endpoint"} and isinstance(relay, dict) and "listen" in relay:
+            return f"is a relay's file, which sern-relay reads; {needed}"
+        return None
 
     @model_validator(mode="after")
     def _rules_fit(self) -> "ClientFile":

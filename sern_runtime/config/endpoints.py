@@ -5,6 +5,7 @@ schema and reference follow from there; `sern_client` makes the endpoint from th
 """
 
 import importlib.util
+import os
 import re
 import sys
 from collections.abc import Iterator
@@ -29,6 +30,7 @@ from sern_runtime.config.base import (
     pattern_problems,
     resolve,
     unexpected,
+    unit_makes,
     unit_problems,
 )
 from sern_runtime.config.yaml import Loc
@@ -193,10 +195,12 @@ class RecordEndpoint(EndpointBase):
         path = resolve(base_dir, self.path)
         if path.is_file() and not self.overwrite:
             yield FileProblem((*loc, "path"), f"{path} exists; set overwrite: true or name another file")
-        elif not path.is_dir() and not path.parent.is_dir():
+        elif not path.is_dir() and not path.parent.is_dir() and not unit_makes(base_dir, path.parent):
             yield FileProblem((*loc, "path"), f"{path.parent}: no such directory; create it first")
+        elif path.is_dir() and not os.access(path, os.W_OK):
+            yield FileProblem((*loc, "path"), f"{path}: may not be written")
         else:
-            yield from unit_problems(path, (*loc, "path"))
+            yield from unit_problems(base_dir, path, (*loc, "path"))
 
 
 def _check_uri(text: str) -> str:

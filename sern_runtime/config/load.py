@@ -71,6 +71,9 @@ def check_bytes(data: bytes, path: Path, model: type[M]) -> Checked[M]:
 
 
 def check_document(document: Document, path: Path, model: type[M], *, files: bool) -> Checked[M]:
+    foreign = model.foreign(document.data) if isinstance(document.data, dict) else None
+    if foreign is not None:
+        return Checked(None, (document.error((), foreign),))
     try:
         # JSON, because pydantic's strict mode then takes lists for tuples and words for enums, and nothing else.
         value = model.model_validate_json(json.dumps(document.data))

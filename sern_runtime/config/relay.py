@@ -1,16 +1,17 @@
 """The file of the relay daemon (`sern-relay`): where it listens, who may do what, and its limits."""
 
-from collections.abc import Iterator
+import time
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
 from sern_core.access import DEFAULT_QUEUE_BYTES, AccessRule
-from sern_core.errors import ConfigError
+from sern_core.errors import ConfigError, UsageError
 from sern_core.objects import COMMAND_OBJECT_TYPES
 from sern_core.patterns import PatternSet, compile_pattern
-from sern_core.rules import AUTO, FeedRole, FeedTopic, TopicRule, plain_type
+from sern_core.rules import AUTO, FeedRole, FeedTopic, TopicRule, client_name, plain_type
 from sern_core.types import ClientName, Durability, Encoding, PriorityClass, Reliability
 from sern_runtime import ros_types
 from sern_runtime.config.adaptation import AdaptationSection
@@ -47,6 +48,7 @@ from sern_runtime.config.shared import (
     output_problems,
     secret_key_problems,
 )
+from sern_runtime.config.yaml import Data
 from sern_runtime.keys import KeyDirectory
 
 DEFAULT_HTTP_LISTEN = "127.0.0.1:5580"
@@ -296,6 +298,15 @@ class RelayFile(FileModel):
     summary: PathText | None = None
     """JSON file with the counters, written at exit; null: none."""
 
+    @classmethod
+    def foreign(cls, data: Mapping[str, Data]) -> str | None:
+        needed = "a relay's is needed here (relay, access)"
+        if "sern_key" in data:
+            return f"is a key file; {needed}"
+        if data.keys() & {"client", "endpoint"}:
+            return f"is a client's file, which sern-client reads; {needed}"
+        return None
+
     @model_validator(mode="after")
     def _addresses(self) -> "RelayFile":
         taken = {endpoint: f"relay.listen.{index}" for index, endpoint in enumerate(self.relay.listen)}
@@ -363,7 +374,7 @@ class RelayFile(FileModel):
         except ConfigError as error:
             yield FileProblem(loc, str(error))
             return
-        for warning in directory.warnings:
+        for warning in (*directory.warnings, *directory.lapsed(at_s=time.time())):
             yield FileProblem(loc, warning, warning=True)
         if not directory.names:
             yield FileProblem(loc, f"{directory.path} holds no .pub file: no client can connect", warning=True)
@@ -371,6 +382,10 @@ class RelayFile(FileModel):
             if role.owner in directory.names:
                 problem = f"the relay publishes for this role as {role.owner}, and there is a client of that name"
                 yield FileProblem(("feed", "roles", index, "name"), problem)
+        for index, rule in enumerate(self.access):
+            if directory.names and _is_name(rule.client) and rule.client not in directory.names:
+                problem = f"no .pub file in {directory.path} is of {rule.client}: it cannot connect"
+                yield FileProblem(("access", index, "client"), problem, warning=True)
         rules = PatternSet(section.client for section in self.access)
         for name in directory.names:
             if not rules.fullmatch(name):
@@ -391,6 +406,14 @@ class RelayFile(FileModel):
                 if entry.commands:
                     place, reliable = (*at, "types", number, "lifespan_s"), entry.reliability == "reliable"
                     yield from lifespan_problem(entry.lifespan_s, place, reliable=reliable)
+
+
+def _is_name(pattern: str) -> bool:
+    """Whether it matches one client alone, of which the name is."""
+    try:
+        return client_name(pattern) == pattern
+    except UsageError:
+        return False
 
 
 def load_relay(path: Path, *, files: bool = True) -> Loaded[RelayFile]:

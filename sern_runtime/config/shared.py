@@ -1,6 +1,7 @@
 """Sections that relay and client files have in common; defaults come from the dataclasses that the core reads."""
 
 import os
+import time
 from collections.abc import Iterator
 from enum import StrEnum
 from pathlib import Path
@@ -21,11 +22,12 @@ from sern_runtime.config.base import (
     Section,
     described,
     resolve,
+    unit_makes,
     unit_problems,
 )
 from sern_runtime.config.yaml import Loc
 from sern_runtime.dscp import DSCP_NAMES, Marks
-from sern_runtime.keys import PUBLIC_SUFFIX, load_public, load_secret, secret_warning
+from sern_runtime.keys import PUBLIC_SUFFIX, load_public, load_secret, load_server_keys, secret_warning
 
 ClassWord = Literal["control", "state", "bulk"]
 DscpName = Literal[
@@ -175,6 +177,7 @@ def public_key_problems(base_dir: Path, text: PathText, loc: Loc, *, client: str
     """Problems of the relay's public key file, as `client` has it."""
     path = resolve(base_dir, text)
     try:
+        load_server_keys(path, at_s=time.time())
         keys = load_public(path)
     except ConfigError as error:
         yield FileProblem(loc, str(error))
@@ -222,9 +225,11 @@ def output_problems(base_dir: Path, text: PathText | None, loc: Loc) -> Iterator
     path = resolve(base_dir, text)
     if path.is_dir():
         yield FileProblem(loc, f"{path} is a directory; a file is needed")
+    elif not path.parent.is_dir() and unit_makes(base_dir, path.parent):
+        return
     elif not path.parent.is_dir():
         yield FileProblem(loc, f"{path.parent}: no such directory; create it first")
     elif not os.access(path.parent, os.W_OK):
         yield FileProblem(loc, f"{path.parent}: may not be written")
     else:
-        yield from unit_problems(path, loc)
+        yield from unit_problems(base_dir, path, loc)

@@ -1,13 +1,16 @@
 """The shipped files of a Husky, its relay and its sites, with what a real Husky publishes: a recording of one drives
-them."""
+them. Where it is not beside the checkout, one with the same topics does, made of a simulated robot."""
 
 from pathlib import Path
+from random import Random
 from typing import Any, Final
 
 import pytest
-from rosbags.rosbag1 import Reader
+from rosbags.rosbag1 import Reader, Writer
+from rosbags.typesys import Stores, get_typestore
 from ruamel.yaml import YAML
 
+from sern_client.endpoints.jackal import JACKAL, JackalSource, Sizes
 from sern_core.types import Encoding, TopicName
 from sern_runtime import ros_types
 from tests.daemons import Lab, bodies, recording
@@ -20,6 +23,24 @@ NEEDED: Final = {
     "/imu/data": "sensor_msgs/msg/Imu",
 }
 """What an operator drives by: where it is on the map, how it moves, and how it leans. This robot fuses none of it."""
+
+
+MADE: Final = {"/fix": "/navsat/fix", "/husky_velocity_controller/odom": "/odometry/filtered", "/imu/data": "/imu/data"}
+"""What the simulated robot calls them."""
+
+
+def made(path: Path) -> Path:
+    """A recording of the topics of NEEDED, 20 messages each."""
+    store, source = get_typestore(Stores.ROS1_NOETIC), JackalSource(Random(1), Encoding.ROS1, Sizes(), patrol=True)
+    plans = {name: next(plan for plan in JACKAL if plan.name == original) for name, original in MADE.items()}
+    with Writer(path) as writer:
+        connections = {name: writer.add_connection(name, kind, typestore=store) for name, kind in NEEDED.items()}
+        for number in range(20):
+            source.advance(0.1 * number)
+            stamp_ns = 1_700_000_000_000_000_000 + number * 100_000_000
+            for name, plan in plans.items():
+                writer.write(connections[name], stamp_ns, source.body(plan, stamp_ns))
+    return path
 
 
 def shipped(name: str) -> dict[str, Any]:
@@ -39,9 +60,10 @@ def here(lab: Lab, name: str, endpoint: dict[str, object]) -> Path:
     return lab.client_file(client["name"], endpoint, **{"discovery": {"mode": "manual"}, **content}, client=client)
 
 
+@pytest.mark.parametrize("drive", ["real", "made"])
 @pytest.mark.parametrize("site", ["site-noetic", "site-jazzy"])
-async def test_what_an_operator_needs_of_a_real_husky_arrives(tmp_path: Path, site: str) -> None:
-    bag = recording("husky_gps_imu_odom.bag")
+async def test_what_an_operator_needs_of_a_husky_arrives(tmp_path: Path, site: str, drive: str) -> None:
+    bag = recording("husky_gps_imu_odom.bag") if drive == "real" else made(tmp_path / "made.bag")
     with Reader(bag) as reader:
         assert {connection.topic for connection in reader.connections} == NEEDED.keys()
     async with Lab(tmp_path, "husky1", "site1") as lab:

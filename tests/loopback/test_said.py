@@ -10,12 +10,16 @@ import zmq
 
 from sern_client import relay_name
 from sern_client.daemon import SILENT
+from sern_client.relay_name import UnresolvedError
 from sern_core.lanes import LANE_UDP
 from sern_core.message import TopicInfo
+from sern_core.session import NEW_SESSION
 from sern_core.types import Encoding, TopicName
+from sern_runtime import clock
 from sern_runtime.transport_watch import WAITING
 from sern_runtime.zmq_socket import make_client
 from tests.daemons import Lab, write_bag
+from tests.loopback.test_http_api import get
 from tests.support import until
 
 ROBOT = {"kind": "synthetic", "role": "robot", "topics": 1}
@@ -44,9 +48,9 @@ async def test_a_relay_that_does_not_resolve_is_said_at_once_and_again(
     monkeypatch.setattr(relay_name, "SAY_AGAIN_S", (0.0, 0.0))
 
     async def unknown(_host: str, _port: int) -> str:
-        return "name or service not known"
+        raise UnresolvedError("name or service not known")
 
-    monkeypatch.setattr(relay_name, "unresolved", unknown)
+    monkeypatch.setattr(relay_name, "resolve", unknown)
     async with Lab(tmp_path, "robot1") as lab:
         config = lab.client_file("robot1", ROBOT, relay={"endpoint": f"tcp://relay.example:{lab.port}"})
         robot = await lab.client(config)
@@ -59,19 +63,21 @@ async def test_a_relay_that_does_not_resolve_is_said_at_once_and_again(
         assert robot._ready().reason.startswith(text)
         assert robot._name is not None
 
-        async def resolves(_host: str, _port: int) -> None:
-            return None
+        async def resolves(_host: str, _port: int) -> str:
+            return "192.0.2.1"
 
-        monkeypatch.setattr(relay_name, "unresolved", resolves)
-        await until(lambda: any("relay.example resolves again, after" in message for message in caplog.messages))
-        assert "does not resolve" not in robot._ready().reason
+        monkeypatch.setattr(relay_name, "resolve", resolves)
+        again = "relay.example resolves again, to 192.0.2.1, after"
+        await until(lambda: any(again in message for message in caplog.messages))
+        assert robot._ready().reason.endswith(" (relay.example is 192.0.2.1)")
 
 
 async def test_why_a_name_does_not_resolve() -> None:
-    assert await relay_name.unresolved("localhost", 5555) is None
+    assert await relay_name.resolve("localhost", 5555) == "127.0.0.1"
     for name in ("::1", "no..host"):  # no IPv4 address, and no name: nobody else is asked
-        why = await relay_name.unresolved(name, 5555)
-        assert why and "\n" not in why
+        with pytest.raises(UnresolvedError) as why:
+            await relay_name.resolve(name, 5555)
+        assert str(why.value) and "\n" not in str(why.value)
 
 
 def test_only_names_are_looked_up() -> None:
@@ -120,6 +126,32 @@ async def test_a_recovery_is_said_like_the_loss(tmp_path: Path, caplog: pytest.L
         await lab.end(robot)
 
 
+async def test_an_outage_that_began_with_silence_is_counted_from_there(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A relay that hangs: first no answer in a session that waits, and then the connection is given up."""
+    async with Lab(tmp_path, "robot1") as lab:
+        relay = await lab.relay()
+        robot = await lab.connected(lab.client_file("robot1", ROBOT, relay={"udp": False}))
+        assert relay.server is not None
+        robot._outages.look("relay", lost=True, gone="silent", back="back", now=clock.now() - 100.0)
+        relay.server.cut_client("robot1")
+        said = f"{lab.endpoint}: the link is there again, after "
+        await until(lambda: any(message.startswith(said) for message in caplog.messages))
+        (text,) = [message for message in caplog.messages if message.startswith(said)]
+        assert int(text.removeprefix(said).removesuffix(" s")) >= 100
+
+
+async def test_a_relay_that_goes_on_with_no_session_is_said_in_words(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    async with Lab(tmp_path, "robot1") as lab:
+        await lab.relay()
+        robot = await lab.connected(lab.client_file("robot1", ROBOT))
+        robot._link_down(NEW_SESSION)
+        assert caplog.messages[-1] == f"{lab.endpoint}: the session could not go on, and another begins"
+
+
 async def test_a_relay_that_hangs_is_not_said_to_be_there(tmp_path: Path) -> None:
     async with Lab(tmp_path, "robot1") as lab:
         relay = await lab.process(lab.relay_file()).ready()
@@ -147,6 +179,28 @@ async def test_a_session_that_outlives_its_connection_says_that_there_is_another
         await until(lambda: any("the connection is there again, after " in message for message in caplog.messages))
         assert not any("the link is there again" in message for message in caplog.messages)  # it was never gone
         assert robot._said == set()
+
+
+async def test_a_reload_that_fails_twice_says_what_is_wrong_now_until_one_works(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    async with Lab(tmp_path, "robot1") as lab:
+        relay = await lab.relay()
+        good = relay.loaded.path.read_text()
+        for number, bad in enumerate((good.replace('"access"', '"acces"'), good.replace('"clients"', '"nobody"')), 1):
+            relay.loaded.path.write_text(bad)
+            relay.reload()
+            assert relay.reloads_failed == number
+        assert relay._status().endswith(f"relay.clients_dir: {tmp_path}/nobody: no such directory")
+        assert "acces:" not in relay._status()
+        assert "\nsern_relay_reload_failed 1.0\n" in (await get(relay, "/metrics"))[1]
+        failed = [record for record in caplog.records if "reload failed, the old configuration stays" in record.message]
+        assert [record.levelname for record in failed] == ["ERROR", "ERROR"]
+        relay.loaded.path.write_text(good)
+        relay.reload()
+        assert relay._status() == "0 clients, 0 streams"
+        assert "\nsern_relay_reload_failed 0.0\n" in (await get(relay, "/metrics"))[1]
+        assert sum("the reload works again" in message for message in caplog.messages) == 1
 
 
 async def test_before_anything_has_come_back_nothing_else_is_said(

@@ -10,7 +10,7 @@ from sern_core.errors import SernError, UsageError
 from sern_runtime.keys import SecretKey
 from sern_runtime.monitor import EventKind, MonitorEvent, SocketMonitor
 from sern_runtime.transport_watch import TransportWatch
-from sern_runtime.zap import TemporaryRefusal, ZapHandler, reachable, self_test
+from sern_runtime.zap import Refusal, TemporaryRefusal, ZapHandler, reachable, self_test
 from sern_runtime.zmq_socket import DealerSocket, RouterSocket, make_client, make_server
 from tests.support import until
 
@@ -23,7 +23,7 @@ class Site:
     def __init__(self, context: Context, keys: SecretKey) -> None:
         self.context = context
         self.keys = keys
-        self.known: dict[str, str | TemporaryRefusal] = {}
+        self.known: dict[str, str | Refusal | TemporaryRefusal] = {}
         self.handler = ZapHandler(context)
         self.handler.add_domain("sern", lambda key, _address: self.known.get(key))
         self.seen: list[tuple[str, bytes]] = []
@@ -88,6 +88,17 @@ async def test_an_unknown_key_is_refused_and_the_client_told_to_rebuild(
     assert site.seen == []
     assert stranger_keys.public_key in caplog.text
     assert stranger_keys.secret_key not in caplog.text
+
+
+async def test_a_key_that_is_known_and_refused_is_not_called_unknown(
+    site: Site, robot_keys: SecretKey, caplog: pytest.LogCaptureFixture
+) -> None:
+    site.known[robot_keys.public_key] = Refusal("the key of robot1 expired")
+    _, events = site.client(robot_keys)
+    await until(lambda: "rebuild" in events)
+    assert site.handler.counters.unknown_key == 1
+    assert "refused a connection from 127.0.0.1: the key of robot1 expired" in caplog.messages
+    assert "unknown key" not in caplog.text
 
 
 async def test_not_now_is_no_final_refusal(site: Site, robot_keys: SecretKey) -> None:

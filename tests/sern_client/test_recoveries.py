@@ -22,7 +22,7 @@ from sern_client.endpoints.ros1.header import encode_header
 from sern_client.express import ClientExpress
 from sern_client.guard import Guard
 from sern_client.link_topics import LinkTopics
-from sern_client.relay_name import RelayName
+from sern_client.relay_name import RelayName, UnresolvedError
 from sern_client.withdrawal import Withdrawal
 from sern_core.errors import ConfigError
 from sern_core.lanes import LANE_EXPRESS, LANE_ZMQ
@@ -340,12 +340,15 @@ async def zenoh_router(scene: Scene) -> None:
 
 
 async def name_of_the_relay(scene: Scene) -> None:
-    now, found = scene.clock(), iter(("name or service not known", None))
+    now, found = scene.clock(), iter((UnresolvedError("name or service not known"), "192.0.2.1"))
 
-    async def unresolved(_host: str, _port: int) -> str | None:
-        return next(found)
+    async def resolve(_host: str, _port: int) -> str:
+        answer = next(found)
+        if isinstance(answer, UnresolvedError):
+            raise answer
+        return answer
 
-    scene.patch.setattr(relay_name, "unresolved", unresolved)
+    scene.patch.setattr(relay_name, "resolve", resolve)
     name = RelayName("tcp://relay.example:5555", "relay.example", 5555)
     for _ in range(2):
         name.tick(connected=False)

@@ -6,7 +6,7 @@ from itertools import pairwise
 import pytest
 
 from sern_client import relay_name
-from sern_client.relay_name import ASK_AGAIN_S, RelayName
+from sern_client.relay_name import ASK_AGAIN_S, RelayName, UnresolvedError
 from sern_runtime import clock
 
 TICK_S = 0.5
@@ -19,15 +19,18 @@ class World:
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.now = 0.0
         self.resolves_s = float("inf")
+        self.address = "192.0.2.1"
         self.asked: list[float] = []
         monkeypatch.setattr(clock, "now", lambda: self.now)
-        monkeypatch.setattr(relay_name, "unresolved", self._unresolved)
+        monkeypatch.setattr(relay_name, "resolve", self._resolve)
         self.name = RelayName("tcp://relay.example:5555", "relay.example", 5555)
 
-    async def _unresolved(self, host: str, port: int) -> str | None:
+    async def _resolve(self, host: str, port: int) -> str:
         assert (host, port) == ("relay.example", 5555)
         self.asked.append(self.now)
-        return None if self.now >= self.resolves_s else "name or service not known"
+        if self.now < self.resolves_s:
+            raise UnresolvedError("name or service not known")
+        return self.address
 
     async def run(self, until_s: float, *, connected: bool = False) -> None:
         """Tick as the daemon does. A look-up that is due has its answer before the next tick."""
@@ -69,7 +72,7 @@ async def test_a_name_that_failed_before_begins_anew(world: World, caplog: pytes
     world.resolves_s = 100.0
     await world.run(200)
     assert world.name.problem is None
-    assert caplog.messages[-1] == "tcp://relay.example:5555: relay.example resolves again, after 100 s"
+    assert caplog.messages[-1] == "tcp://relay.example:5555: relay.example resolves again, to 192.0.2.1, after 100 s"
     caplog.clear()
     world.resolves_s = float("inf")
     await world.run(240)
@@ -83,3 +86,35 @@ async def test_a_relay_that_answers_is_not_looked_up(world: World, caplog: pytes
     await world.run(120, connected=True)  # a connection says that it resolves, whoever found the address
     assert world.name.problem is None
     assert caplog.messages[-1].endswith("relay.example resolves again, after 6 s")
+
+
+async def test_where_it_leads_is_said_once_and_when_it_changes(world: World, caplog: pytest.LogCaptureFixture) -> None:
+    """As where a hotel's network answers every name with its own address."""
+    caplog.set_level("INFO")
+    world.resolves_s = 0.0
+    await world.run(30)
+    assert world.name.at == "relay.example is 192.0.2.1"
+    world.address = "10.0.0.1"
+    await world.run(60)
+    assert world.name.at == "relay.example is 10.0.0.1"
+    world.resolves_s = float("inf")
+    await world.run(70)
+    assert world.name.at == ""
+    world.resolves_s = 0.0
+    await world.run(80)
+    await world.run(90, connected=True)
+    world.address = "192.0.2.1"
+    await world.run(100)
+    said = [
+        (record.levelname, record.getMessage().removeprefix("tcp://relay.example:5555: ")) for record in caplog.records
+    ]
+    assert said == [
+        ("INFO", "relay.example is 192.0.2.1"),
+        ("WARNING", "relay.example is 10.0.0.1 now, and was 192.0.2.1"),
+        (
+            "WARNING",
+            "the relay's name relay.example does not resolve: name or service not known; trying again until it does",
+        ),
+        ("WARNING", "relay.example resolves again, to 10.0.0.1, after 10 s"),
+        ("WARNING", "relay.example is 192.0.2.1 now, and was 10.0.0.1"),
+    ]

@@ -1,12 +1,14 @@
 """After a link returns, what fits on it flows again within seconds, and looking for that harms no thin link."""
 
 from math import inf
+from random import Random
 
 import pytest
 
 from sern_core.mmcf.cost import Ranges
 from sern_core.mmcf.model import ClassOutcome, Configuration
 from sern_core.mmcf.policy import Mmcf
+from sern_core.mmcf.predict import Grid
 from sern_core.mmcf.trial import REST_INTERVALS, TIMED_GAIN, TIMED_INTERVALS, TRIED, CapacityTrial
 from sern_core.params import LinkParams
 from sern_sim.models import LinkModel, RateStep, Window
@@ -69,6 +71,50 @@ def test_within_five_seconds_of_its_return_a_link_carries_what_it_did(
         thin = [got for got in r.site.on("/robot/pose") if FALLS_S + 5.0 < got.at_s - start_s < RETURNS_S]
         in_time = sum(got.age_s < 0.3 for got in thin)
         assert in_time >= 0.9 * 50.0 * (RETURNS_S - FALLS_S - 5.0), "commands go on"
+    r.world.validate()
+
+
+@pytest.mark.parametrize("lossless", [False, True], ids=["datagrams", "stream"])
+def test_a_wide_link_that_was_never_full_is_not_taken_to_be_as_narrow_as_what_was_offered(*, lossless: bool) -> None:
+    """Many small messages, one after the other: there is never more to send than the link takes."""
+    policy = Mmcf(
+        Grid.of(
+            rates=[(1.0,), (1.0, 0.5), (1.0, 0.4, 0.1)],
+            queues=[(10,), (1, 10), (1, 10)],
+            codecs=("none",),  # it must fit as it is
+            redundancy=(0, 1),
+        ),
+        weights=WEIGHTS,
+        ranges=Ranges(),
+        floors=FLOORS,
+        initial=Configuration(queues=(10, 10, 10)),
+    )
+    r = rig(policy, LinkModel(rate_bps=1e9, delay_s=1e-4), lossless=lossless, link=LinkParams())
+    r.feed(r.robot.publish("/robot/pose", spec(CONTROL, lifespan_s=1.0)), 250.0, 380)
+    r.feed(r.robot.publish("/robot/images", spec(BULK, depth=1)), 100.0, 10_700)
+    r.world.run(6.0)
+    assert [step.decision.chosen.rates for step in r.steps] == [(1.0, 1.0, 1.0)] * len(r.steps)
+    assert len(r.site.on("/robot/images")) >= 0.99 * 6.0 * 100.0
+    r.world.validate()
+
+
+MIXED = ((5.0, 200_000), (5.0, 3_400), (50.0, 112), (20.0, 70), (10.0, 61), (5.0, 120), (1.0, 500), (1.0, 200))
+"""Rates and sizes of what a robot has in class bulk where no rule names it: clouds among many small topics."""
+
+
+@pytest.mark.parametrize("lossless", [False, True], ids=["datagrams", "stream"])
+def test_a_class_of_large_and_small_messages_is_not_thinned_on_a_link_that_has_room_for_it(*, lossless: bool) -> None:
+    """The formulas know a class by the mean and the spread of its sizes, and foresee that a queue of such sizes is
+    overrun. What arrives says otherwise."""
+    policy = Mmcf(GRID, weights=WEIGHTS, ranges=Ranges(), floors=FLOORS, initial=Configuration(queues=(10, 10, 10)))
+    r = rig(policy, LinkModel(rate_bps=1e9, delay_s=1e-4), lossless=lossless, link=LinkParams())
+    body = Random(7).randbytes(200_000)
+    r.feed(r.robot.publish("/robot/pose", spec(CONTROL, lifespan_s=1.0)), 250.0, 380)
+    for number, (rate_hz, size) in enumerate(MIXED):
+        r.feed(r.robot.publish(f"/robot/{number}", spec(BULK, lifespan_s=1.0)), rate_hz, size, body=body)
+    r.world.run(10.0)
+    assert [step.decision.chosen.rates for step in r.steps] == [(1.0, 1.0, 1.0)] * len(r.steps)
+    assert r.adapter.switches <= 2
     r.world.validate()
 
 

@@ -160,15 +160,44 @@ def test_directory_looks_up_by_key_and_time(tmp_path: Path) -> None:
         (200.0, KeyStatus.VALID, KeyStatus.VALID),
         (201.0, KeyStatus.EXPIRED, KeyStatus.VALID),
     ):
-        assert directory.lookup(old.key, at_s=at_s) == KeyMatch(old_status, NAME)
-        assert directory.lookup(new.key, at_s=at_s) == KeyMatch(new_status, NAME)
-    assert directory.lookup(z85.decode(other.key), at_s=0) == KeyMatch(KeyStatus.VALID, ClientName("site1"))
-    assert directory.lookup(other.key.encode(), at_s=0) == KeyMatch(KeyStatus.VALID, ClientName("site1"))
+        assert directory.lookup(old.key, at_s=at_s) == KeyMatch(old_status, NAME, old)
+        assert directory.lookup(new.key, at_s=at_s) == KeyMatch(new_status, NAME, new)
+    assert directory.lookup(z85.decode(other.key), at_s=0) == KeyMatch(KeyStatus.VALID, ClientName("site1"), other)
+    assert directory.lookup(other.key.encode(), at_s=0) == KeyMatch(KeyStatus.VALID, ClientName("site1"), other)
     for unknown in (new_key().key, "", b"", b"\xff" * 40, b"\xff" * 32):
         assert directory.lookup(unknown, at_s=150) == KeyMatch(KeyStatus.UNKNOWN)
     keys_now = keys.load_public(tmp_path / "jackal1.pub")
     assert keys_now.valid_at(150) == (old,)
     assert keys_now.valid_at(250) == ()
+
+
+@pytest.mark.parametrize(
+    ("entries", "why"),
+    [
+        ([(None, 100.0), (None, 200.0)], "the last one expired at 1970-01-01T00:03:20Z"),
+        ([(4000.0, None), (3000.0, 5000.0)], "the next one is not valid before 1970-01-01T00:50:00Z"),
+        ([(None, 100.0), (3000.0, None)], "the next one is not valid before 1970-01-01T00:50:00Z"),
+    ],
+)
+def test_a_file_of_which_no_key_holds_says_why_and_what_the_clock_says(
+    tmp_path: Path, entries: list[tuple[float | None, float | None]], why: str
+) -> None:
+    """A machine without a battery for its clock begins in the past."""
+    path = public(tmp_path, *(new_key(*window) for window in entries), name="relay", file="relay.pub")
+    said = f"has no key that is valid now: {why}, and this machine's clock says 1970-01-01T00:16:40Z"
+    with pytest.raises(ConfigError) as caught:
+        keys.load_server_keys(path, at_s=1000.0)
+    assert str(caught.value) == f"{path}: {said}; set the clock, or ask for the relay's new public key"
+    assert KeyDirectory(tmp_path).lapsed(at_s=1000.0) == (f"relay {said}: it cannot connect",)
+
+
+def test_keys_that_hold_now_are_tried_in_the_order_of_the_file(tmp_path: Path) -> None:
+    old, new, later = new_key(not_after_s=200.0), new_key(), new_key(not_before_s=300.0)
+    path = public(tmp_path, old, later, new)
+    assert keys.load_server_keys(path, at_s=100.0) == (old.key, new.key)
+    assert keys.load_server_keys(path, at_s=250.0) == (new.key,)
+    assert keys.load_server_keys(path, at_s=350.0) == (later.key, new.key)
+    assert KeyDirectory(tmp_path).lapsed(at_s=250.0) == ()
 
 
 @pytest.mark.parametrize("name", ["site1", "jackal1"])

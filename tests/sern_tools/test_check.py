@@ -3,6 +3,7 @@
 import asyncio
 import shutil
 import sys
+from collections import Counter
 from io import StringIO
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import typer
 from rich.console import Console
 from typer.testing import CliRunner
 
-from sern_client.relay_name import unresolved
+from sern_client.relay_name import UnresolvedError, resolve
 from sern_runtime.config import endpoints
 from sern_tools import check
 from sern_tools.keygen import run_keygen
@@ -27,9 +28,9 @@ def resolver(monkeypatch: pytest.MonkeyPatch) -> None:
     """One that knows no name. The resolver of this machine may hang, and know more names than there are."""
 
     async def knows_none(_host: str, _port: int) -> str:
-        return NO_NAME
+        raise UnresolvedError(NO_NAME)
 
-    monkeypatch.setattr(check, "unresolved", knows_none)
+    monkeypatch.setattr(check, "resolve", knows_none)
 
 
 def ran(path: Path) -> tuple[int, str, str]:
@@ -70,15 +71,16 @@ def test_a_relay_that_does_not_resolve_is_a_warning(deployed: Path) -> None:
 
 async def test_why_a_name_does_not_resolve() -> None:
     """One that no resolver has to be asked about: a label has 63 characters at most."""
-    assert "label" in (await unresolved("a" * 64, 5555) or "")
-    assert await unresolved("127.0.0.1", 5555) is None
+    with pytest.raises(UnresolvedError, match="label"):
+        await resolve("a" * 64, 5555)
+    assert await resolve("127.0.0.1", 5555) == "127.0.0.1"
 
 
 def test_a_resolver_that_does_not_answer_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
     async def asks(_host: str, _port: int) -> None:
         await asyncio.Event().wait()
 
-    monkeypatch.setattr(check, "unresolved", asks)
+    monkeypatch.setattr(check, "resolve", asks)
     monkeypatch.setattr(check, "RESOLVE_S", 0.0)
     problem = check._unresolved("tcp://relay.example:5555")
     assert problem == "relay.example does not resolve on this machine now: no answer within 0 s"
@@ -347,6 +349,51 @@ def test_key_files_with_the_name_of_somebody_else(deployed: Path) -> None:
     code, _, err = ran(site)
     assert f"relay.server_key_file: {deployed}/site1.pub is the key of site1, this client; the relay's is needed" in err
     assert err.count("warning") == 1
+
+
+def windowed(path: Path, window: str) -> None:
+    """Give the only key of a public key file a window."""
+    path.write_text(f"{path.read_text()}    {window}\n")
+
+
+def test_a_relay_whose_keys_do_not_hold_is_an_error_as_at_the_start(deployed: Path) -> None:
+    windowed(deployed / "relay.pub", 'not_after: "2020-01-01T00:00:00Z"')
+    expired = (
+        "has no key that is valid now: the last one expired at 2020-01-01T00:00:00Z, and this machine's clock says"
+    )
+    code, _, err = ran(deployed / "site.yaml")
+    assert (code, err.count("\n")) == (2, 1)
+    assert f"relay.server_key_file: {deployed}/relay.pub: {expired}" in err
+    code, _, err = ran(deployed / "relay.pub")
+    assert code == 0
+    assert err.startswith(f"warning: {deployed}/relay.pub {expired}")
+
+
+def test_a_client_whose_keys_do_not_hold_is_a_warning_at_the_relay(deployed: Path) -> None:
+    windowed(deployed / "clients" / "jackal1.pub", 'not_before: "2999-01-01T00:00:00Z"')
+    code, out, err = ran(deployed / "relay.yaml")
+    assert (code, err.count("\n")) == (0, 1)
+    later = "jackal1 has no key that is valid now: the next one is not valid before 2999-01-01T00:00:00Z, and this "
+    assert f"relay.clients_dir: {later}machine's clock says 2" in err
+    assert err.endswith(": it cannot connect\n")
+    assert out.endswith("relay.yaml: right\n")
+
+
+def test_a_client_that_a_rule_names_and_that_has_no_key_is_a_warning(deployed: Path) -> None:
+    (deployed / "clients" / "site1.pub").unlink()
+    (deployed / "clients" / "husky1.pub").unlink()  # its rule is for many
+    code, _, err = ran(deployed / "relay.yaml")
+    assert (code, err.count("\n")) == (0, 1)
+    assert err.endswith(f"access.0.client: no .pub file in {deployed}/clients is of site1: it cannot connect\n")
+
+
+def test_a_narrow_terminal_shows_every_pattern_whole(deployed: Path) -> None:
+    wide, narrow = StringIO(), StringIO()
+    for file, width in ((wide, 1000), (narrow, 60)):
+        assert check.run_check(deployed / "relay.yaml", out=Console(file=file, width=width)) == 0
+    letters = [Counter(file.getvalue().replace("\n", "").replace(" ", "")) for file in (wide, narrow)]
+    assert letters[0] == letters[1]
+    assert "…" not in narrow.getvalue()
 
 
 def test_command_line_alone_and_inside_another(deployed: Path) -> None:

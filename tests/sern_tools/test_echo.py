@@ -23,6 +23,7 @@ from typer.testing import CliRunner
 
 from sern_core.errors import ConfigError, RefusedError, SernError, UsageError
 from sern_core.message import Message, StreamId, StreamInfo, TopicInfo, TopicSpec
+from sern_core.session import NEW_SESSION
 from sern_core.types import ClientName, DropReason, Encoding, TopicName
 from sern_runtime import ros_types
 from sern_runtime.loop import Shutdown
@@ -185,7 +186,7 @@ async def test_a_rival_with_our_name_is_seen() -> None:
     assert said == ["link down: connection lost; waiting", "connected again"]
     assert listener.turns == 0
     for _ in range(3):
-        listener.link_down("new session")
+        listener.link_down(NEW_SESSION)
     assert listener.turns == 3
 
 

@@ -1,6 +1,7 @@
 """`sern topics`: counters become rates, a relay and a client are told apart, and what is wrong is one line."""
 
 import json
+import socket
 import threading
 from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler, HTTPServer
@@ -217,6 +218,27 @@ def test_what_a_daemon_may_answer(stub: str, monkeypatch: pytest.MonkeyPatch) ->
     ):
         with pytest.raises(error, match=words):
             api.get_json(stub, path)
+
+
+@pytest.mark.parametrize("others", ["answers", "nobody"])
+def test_a_daemon_that_hangs_is_not_taken_for_none(
+    stub: str, others: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The kernel takes the connection, and nobody reads it: so does a relay that was stopped."""
+    monkeypatch.setattr(api, "PROBE_S", 0.05)
+    with socket.create_server(("127.0.0.1", 0)) as hung:
+        port = hung.getsockname()[1]
+        silent = f"127.0.0.1:{port} takes connections and is silent: its daemon hangs, or it is none of SERN"
+        monkeypatch.setattr(api, "PROBED", "/api/empty")
+        if others == "answers":
+            monkeypatch.setattr(api, "LOCAL_APIS", (f"http://127.0.0.1:{port}", stub))
+            assert api.local_api() == stub
+            assert capsys.readouterr().err == f"warning: {silent}; asking {stub}\n"
+        else:
+            monkeypatch.setattr(api, "LOCAL_APIS", (f"http://127.0.0.1:{port}",))
+            with pytest.raises(SernError) as none:
+                api.local_api()
+            assert str(none.value) == f"no daemon answers on this machine; {silent}"
 
 
 @pytest.mark.parametrize("text", ["127.0.0.1:5580", "ftp://host", "http://", "http://host:x", "http://host:99999"])

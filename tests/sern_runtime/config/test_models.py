@@ -1,6 +1,8 @@
 """Good files, what they become for the core, and the second step: the files that they name."""
 
+import os
 import re
+import shutil
 from pathlib import Path
 
 import pytest
@@ -225,16 +227,66 @@ def test_what_the_units_cannot_write_is_warned_of(keyed: Path, monkeypatch: pyte
     path = keyed / "client.yaml"
     path.write_text(CLIENT_KEYED + f"endpoint: {{kind: record, path: .}}\n{named}\n", encoding="utf-8")
     assert load_client(path).warnings == ()
-    monkeypatch.setattr(config_base, "UNITS_READ_ONLY", keyed)
+    monkeypatch.setattr(config_base, "UNITS_CONFIGURED", keyed)
     loaded = load_client(path)
     key, _, name = named.partition(": ")
+    outside = "under the systemd units nothing can be written outside of /var/lib/sern"
     assert [warning.removeprefix(str(path)).split(";")[0] for warning in loaded.warnings] == [
-        f":6: endpoint.path: {keyed}: under the systemd units nothing can be written below {keyed}",
-        f":7: {key}: {keyed / name}: under the systemd units nothing can be written below {keyed}",
+        f":6: endpoint.path: {keyed}: {outside}",
+        f":7: {key}: {keyed / name}: {outside}",
     ]
     path = keyed / "relay.yaml"
     path.write_text(RELAY_KEYED + f"{named}\n", encoding="utf-8")
     assert sum(f"{key}: {keyed / name}: under the systemd units" in said for said in load_relay(path).warnings) == 1
+
+
+def test_a_file_of_the_units_that_writes_elsewhere_is_warned_of(keyed: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A home directory is read-only there, as everything is but the state directory."""
+    kept, home, etc = keyed / "kept", keyed / "home", keyed / "etc"
+    for directory in (kept, home):
+        directory.mkdir()
+    shutil.copytree(keyed, etc)
+    path = etc / "client.yaml"
+    path.write_text(
+        CLIENT_KEYED + f"endpoint: {{kind: record, path: '{kept}/'}}\nsummary: '{home}/s.json'\n", encoding="utf-8"
+    )
+    assert load_client(path).warnings == ()
+    monkeypatch.setattr(config_base, "UNITS_CONFIGURED", etc)
+    monkeypatch.setattr(config_base, "UNITS_WRITE", kept)
+    (warning,) = load_client(path).warnings
+    assert warning.removeprefix(str(path)) == (
+        f":7: summary: {home}/s.json: under the systemd units nothing can be written outside of {kept}; name a path "
+        "there, or add ReadWritePaths= to the unit"
+    )
+
+
+def test_the_folder_that_systemd_makes_need_not_be_there(keyed: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A file is checked before the unit is started for the first time."""
+    state = keyed / "state"
+    path = keyed / "client.yaml"
+    path.write_text(
+        CLIENT_KEYED + f"endpoint: {{kind: record, path: '{state}/bags/'}}\nsummary: '{state}/s.json'\n",
+        encoding="utf-8",
+    )
+    missing = f"{state}: no such directory; create it first"
+    monkeypatch.setattr(config_base, "UNITS_WRITE", state)
+    assert problems(path, ClientFile) == [
+        f"/client.yaml:6: endpoint.path: {missing}", f"/client.yaml:7: summary: {missing}",
+    ]  # fmt: skip
+    monkeypatch.setattr(config_base, "UNITS_CONFIGURED", keyed)
+    assert load_client(path).warnings == ()
+
+
+def test_a_folder_for_recordings_that_may_not_be_written_is_an_error(
+    keyed: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (keyed / "bags").mkdir()
+    path = keyed / "client.yaml"
+    path.write_text(CLIENT_KEYED + "endpoint: {kind: record, path: bags}\n", encoding="utf-8")
+    assert problems(path, ClientFile) == []
+    access = os.access
+    monkeypatch.setattr(os, "access", lambda file, mode: file != keyed / "bags" and access(file, mode))  # root may all
+    assert problems(path, ClientFile) == [f"/client.yaml:6: endpoint.path: {keyed}/bags: may not be written"]
 
 
 def test_files_that_are_not_there(keyed: Path) -> None:
