@@ -11,6 +11,9 @@ Theory of operation
     *Window.* The queue is W − B·RTT, so an error of q is corrected as what it is in bytes: W += γ·B·(q* − q). While
     the path looks empty the step doubles every epoch, up to a quarter of W. A queue above `hi` cuts W to what the
     receiver saw; one far above for longer than a moment does it at once (the link got slower).
+    *Jitter* hides whether the path is empty. There the queue's answer to the window tells (`room`): it follows
+    where the path is full. Where it does not the window grows, by more each time, and what packets wait for each
+    other's jitter is taken out of q.
     *Pacing.* On a path without jitter a little below B while something queues: the window bounds, the pace keeps the
     queue short. Where packets take long it also tries the empty path, in small steps, with a window that leaves room.
     What is lost on the way is added. B does not follow what our own pacing made of it.
@@ -28,6 +31,7 @@ from typing import Final
 
 from sern_core.capacity import AckSample, CapacityEstimator, Receiver
 from sern_core.control.parts import BaseDelay, Cubic, Eased, GreatestRate, LatelyArrived, Swing, Train
+from sern_core.control.room import Room
 
 MIN_EPOCH_S: Final = 0.040
 MIN_EPOCH_SAMPLES: Final = 4
@@ -54,6 +58,10 @@ CLEAR_PACKETS: Final = 1.0
 """The path counts as empty when four packets of five met at most about one other."""
 FIRST_GROWTH: Final = 0.02
 MAX_GROWTH: Final = 0.25
+ROOM_GAIN: Final = 1.25
+QUICKER_EPOCHS: Final = 8
+HELD_SPREADS: Final = 2.0
+"""At most so many spreads of the delay are taken for what jitter holds back: it may be a queue after all."""
 CUT: Final = 0.95
 EMERGENCY_CUT: Final = 0.9
 WENT: Final = 0.25
@@ -122,6 +130,7 @@ class HybridWindow(CapacityEstimator):
         self._pacing: float | None = None  # bytes/s
         self._capped = False  # it keeps below the capacity
         self._calm = False
+        self._jittery = False  # more than packets in each other's way make of it
         self._loss = 0.0  # smoothed share
         self._gentle = False  # calm, and a packet takes long enough to be steered for
         self._small, self._large = BaseDelay(), BaseDelay()
@@ -159,6 +168,11 @@ class HybridWindow(CapacityEstimator):
         self._high_since_s: float | None = None
         self._hold_until_s = -inf
         self._empty_epochs = 0
+        self._room = Room()
+        self._held_s = 0.0  # what packets are held by the jitter of those before them, beyond the least delay
+        self._leasts: deque[float] = deque(maxlen=QUICKER_EPOCHS)  # of the delay of large packets
+        self._changed_s = -inf  # when the link was seen to have got slower or faster
+        self._early_s = 0.0  # by how much the packets of the last epoch came sooner than that
         self._above_epochs = 0
         self._pinned = Swing()  # of the queue while the window is at its least
         self._recent: deque[float] = deque(maxlen=STUCK_EPOCHS)  # queues of the last epochs
@@ -254,7 +268,7 @@ class HybridWindow(CapacityEstimator):
                 base = self._small
         base.epoch.append(delay_s)
         least = base.least
-        queue_s = delay_s - least[0][1] if least else 0.0
+        queue_s = delay_s - least[0][1] - self._held_s if least else 0.0
         self._samples.append((queue_s, back_s))
         if self._saturated and self._rate is not None:
             size = nbytes or self._fragment
@@ -335,8 +349,11 @@ class HybridWindow(CapacityEstimator):
     def _forget_rate(self, now: float, rate: float) -> None:
         if self._faster_rate is None and self._rate is not None and self._rate >= self._peak / 2:
             self._faster_rate = self._rate  # we had most of the link
-        if self._most_queue_s is None and self._rate is not None and rate < SLOWER * self._rate:
-            self._most_queue_s = 0.0
+        if self._rate is not None and rate < SLOWER * self._rate:
+            self._room = Room()
+            self._changed_s = now
+            if self._most_queue_s is None:
+                self._most_queue_s = 0.0
         self._rates.clear()
         self._note_rate(now, rate)
 
@@ -429,8 +446,16 @@ class HybridWindow(CapacityEstimator):
                 base.epoch.clear()
         if queues[fifth] < -self._high_s and now < self._adopted_until_s:
             self._rival_until_s = now + RIVAL_MEMORY_S  # the short way is back: it was a queue
+        leasts = self._leasts
+        leasts.append(self._large.value_s or 0.0)
+        if max(leasts) - leasts[-1] > 0.5 * self._serialise_s > CALM_PACKET_S:
+            leasts.clear()
+            self._changed_s = now  # no packet can take less than the link needs for it
+            self._room.hurry()
+        early_s, self._early_s = self._early_s, max(0.0, -queues[fifth])
+        self._held_s = max(0.0, self._held_s - min(early_s, self._early_s))
         known = self._large.least or self._small.least
-        rtt_s = self._rtt_s = max(1e-5, known[0][1] + backs[count // 2])
+        rtt_s = self._rtt_s = max(1e-5, known[0][1] + self._held_s + backs[count // 2])
         spread_s = queues[count * 4 // 5] - queues[fifth]
         self._jitter_s += 0.1 * (min(spread_s, 0.020 + 0.2 * rtt_s) - self._jitter_s)
         # Of the link, not of our share of it: by the greatest rate seen lately.
@@ -442,6 +467,8 @@ class HybridWindow(CapacityEstimator):
         noise_s = NOISE * max(0.0, self._jitter_s - serialise_s)
         # A slower flow wants a longer queue than a faster one, so that their shares meet.
         self._calm = noise_s <= CALM_NOISE_S and serialise_s <= CALM_PACKET_S
+        least_spread_s = sorted(self._spreads)[len(self._spreads) // 8]
+        self._jittery = least_spread_s > (CALM_NOISE_S if serialise_s <= CALM_PACKET_S else serialise_s)
         # Fragments of a stream grow with its rate, and TCP cuts them anew: what they take is not known so well.
         self._gentle = self._calm and serialise_s >= GENTLE_PACKET_S and self._fragment <= self._first_fragment_bytes
         packets = GENTLE_PACKETS if self._gentle else CALM_PACKETS if self._calm else TARGET_PACKETS
@@ -457,7 +484,7 @@ class HybridWindow(CapacityEstimator):
         if self._judging and self._drain_until_s is None:
             self._judging = False
             self._judge(now, queue_s, rtt_s)
-        if queue_s < 0.25 * self._target_s:
+        if queue_s < 0.25 * self._target_s or self._room.steps:
             self._emptied_s = now
         limited = 2 * self._limited >= count
         lost = self._lost_bytes / max(1, self._lost_bytes + self._acked_bytes)
@@ -474,6 +501,7 @@ class HybridWindow(CapacityEstimator):
                 self._end_startup(min(self._window, rate * rtt_s) if rate else self._window / 2)
         elif limited:
             if self._cubic is not None:
+                self._room.clear()
                 window = min(self._cubic.window(now, rtt_s + queue_s, self._fragment), MAX_WINDOW_BYTES)
                 most = 1.5 * self._window if queue_s < COMPETE_QUEUE_S else self._window
                 self._window = min(max(window, MIN_WINDOW_FRAGMENTS * self._fragment), most)
@@ -499,6 +527,7 @@ class HybridWindow(CapacityEstimator):
             return
         window = self._window
         if queue_s > self._high_s:
+            self._room.clear()
             self._empty_epochs = 0
             self._above_epochs += 1
             if now >= self._hold_until_s:
@@ -512,6 +541,7 @@ class HybridWindow(CapacityEstimator):
             if now >= self._rival_until_s:
                 self._calm_window = window
             target_s = self._target_s
+            queue_s = self._look_for_room(now, window, queue_s, rate)
             step = GAIN * rate * max(target_s - queue_s, -queue_s)
             if queue_s >= 0.25 * target_s:
                 self._empty_epochs = 0
@@ -520,15 +550,45 @@ class HybridWindow(CapacityEstimator):
                 self._empty_epochs += 1
                 if self._empty_epochs > PATIENT_EPOCHS:
                     step = max(step, FIRST_GROWTH * window) * 2 ** min(self._empty_epochs - PATIENT_EPOCHS - 1, 8)
+            if self._room.trying:
+                step = max(step, self._room.step(window))
             if step > 0:
-                most = 1.4 * rate * (rtt_s + target_s) + 3 * self._fragment
-                if self._capped and self._gentle:
+                gain = ROOM_GAIN if self._room.steps and not self._empty_epochs else 1.4
+                most = gain * rate * (rtt_s + target_s) + 3 * self._fragment
+                if self._capped and self._gentle and not self._room.trying:
                     # It does not bind, so it would run away.
                     most = self._probing * rate / (1 - self._loss) * (rtt_s + target_s) + self._fragment
                 window = max(window, min(window + min(step, MAX_GROWTH * window), most))
             else:
                 window = min(window, 1.1 * rate * (rtt_s + queue_s) + 4 * self._fragment) + step
         self._window = min(max(window, MIN_WINDOW_FRAGMENTS * self._fragment), MAX_WINDOW_BYTES)
+
+    def _look_for_room(self, now: float, window: float, queue_s: float, rate: float) -> float:
+        """The queue without what jitter holds packets back. In order they wait for those before them, the longer the
+        closer they follow each other: that is in no delay of slower times, and is no queue."""
+        room = self._room
+        tries = (self._jittery and not self._calm) or now < self._changed_s + BASE_WINDOW_S
+        if not (tries or room.trying) or now < self._rival_until_s:
+            room.clear()
+            return queue_s
+        has_room = room.note(
+            now,
+            window,
+            queue_s,
+            rate=rate,
+            spread_s=max(self._jitter_s, self._serialise_s),
+            binds=not self._capped,
+            tries=tries,
+            patient=self._calm,
+        )
+        if not has_room or self._calm or not self._jittery:
+            return queue_s
+        held_s = min(room.queue_s - self._target_s / 2, HELD_SPREADS * self._jitter_s - self._held_s)
+        if held_s <= 0.0:
+            return queue_s
+        self._held_s += held_s
+        room.shift(held_s)
+        return max(0.0, queue_s - held_s)
 
     def _pace(self) -> None:
         rtt_s = self._rtt_s
@@ -547,6 +607,8 @@ class HybridWindow(CapacityEstimator):
         rate = self._rate
         if rate is None or not self._peak:
             return  # nothing has been delivered in an epoch yet
+        if self._room.trying:
+            return
         if self._queue_s < 0.25 * self._target_s:
             if self._gentle and self._saturated:
                 pacing = self._probing * rate / (1 - self._loss)
@@ -569,6 +631,7 @@ class HybridWindow(CapacityEstimator):
     def _drain(self, now: float, rtt_s: float) -> None:
         if self._rate is None:
             return
+        self._room.clear()
         self._saved_window = self._window
         self._window = max(min(self._window, DRAIN_GAIN * self._rate * rtt_s), MIN_WINDOW_FRAGMENTS * self._fragment)
         wait_s = rtt_s + self._queue_s if self._cubic is not None or self._above_epochs else rtt_s
@@ -623,7 +686,7 @@ class HybridWindow(CapacityEstimator):
         """What looked like a queue is a longer way."""
         for base in (self._small, self._large):
             if base.least:
-                delay_s = base.least[0][1] + queue_s
+                delay_s = base.least[0][1] + self._held_s + queue_s
                 base.least.clear()
                 base.least.append((now, delay_s))
         far = self._rtt_s is not None and queue_s > WENT_RTTS * self._rtt_s
@@ -633,7 +696,7 @@ class HybridWindow(CapacityEstimator):
             self._peak = self._rate  # what packets take on a link so much slower is what made it longer
             self._fragment = min(self._fragment, max(self._longest, self._first_fragment_bytes))
             self._most_queue_s = None
-        self._queue_s = 0.0
+        self._queue_s = self._held_s = 0.0
         self._above_epochs = 0
         self._adopted_until_s = now + RIVAL_MEMORY_S
         self._start_again(now)
@@ -670,5 +733,6 @@ class HybridWindow(CapacityEstimator):
         self._rate = None
         self._saturated = False  # what begins anew shows little at first
         self._restart()
+        self._changed_s = now
         self._window = max(min(self._window, self._initial_bytes), MIN_WINDOW_FRAGMENTS * self._fragment)
         self._start_again(now)
