@@ -15,6 +15,9 @@ from sern_core.mmcf.model import ClassOutcome
 
 TRIED: Final = 2
 """Intervals until a trial is judged: in the first the estimate grows."""
+RISES: Final = 1.2
+"""An estimate that has become so many times what it was an interval ago is on its way: the trial is judged later. On
+long round trips it takes several intervals."""
 REST_INTERVALS: Final = (5, 40)
 """After a trial that failed, unless the estimate grows: twice as many each time, so that over the minutes trials have
 less than a tenth of the time, and so of the link."""
@@ -40,6 +43,7 @@ class CapacityTrial:
         self._best_bps = assumed_min_bps
         self._assumed_bps: float | None = None
         self._greatest_bps = 0.0  # estimate during the trial
+        self._judged_bps = 0.0  # the same when the last interval was over
         self._intervals = 0
         self._timed = False
         self._eased_s: float | None = None  # what was acted upon
@@ -90,7 +94,9 @@ class CapacityTrial:
         grew, eased = grew and (thinned or summarised), eased and (thinned or summarised)
         if self._assumed_bps is not None:
             self._intervals += 1
-            if self._intervals >= TRIED:
+            rises = self._greatest_bps > RISES * self._judged_bps
+            self._judged_bps = self._greatest_bps
+            if self._intervals >= TRIED and not rises:
                 self._end(outcomes, now)
             return
         if not thinned or summarised:
@@ -105,7 +111,8 @@ class CapacityTrial:
     def _begin(self, assumed_bps: float, estimate_bps: float, *, timed: bool) -> None:
         self._due_s = None
         if estimate_bps < ENOUGH * assumed_bps:
-            self._assumed_bps, self._greatest_bps, self._intervals = assumed_bps, estimate_bps, 0
+            self._assumed_bps, self._intervals = assumed_bps, 0
+            self._greatest_bps = self._judged_bps = estimate_bps
             self._timed = timed
 
     def _end(self, outcomes: tuple[ClassOutcome, ...], now: float) -> None:

@@ -173,6 +173,20 @@ def test_a_link_that_eased_is_taken_to_be_as_good_as_it_was_until_it_fails() -> 
     assert d.second() == 1e6, "it rests"
 
 
+def test_it_is_not_judged_while_the_estimate_comes_up() -> None:
+    """On a long round trip that takes longer than the two intervals."""
+    d = Driven(20e6)
+    d.second()
+    d.estimate_bps = 0.3e6
+    d.second()
+    d.eased_s = d.now
+    assert d.second() == 20e6
+    for estimate_bps in (0.4e6, 0.8e6, 1.6e6, 3.2e6):
+        d.estimate_bps = estimate_bps
+        assert d.second(on_time=0) == 20e6
+    assert d.second(on_time=0) == 3.2e6, "it rises no more"
+
+
 def test_one_that_succeeds_stays_until_the_estimate_has_come_up_or_seen_the_link_get_slower() -> None:
     d = Driven(20e6)
     d.second()
