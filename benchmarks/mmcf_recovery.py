@@ -34,7 +34,7 @@ POSE_HZ: Final = 50.0
 POSE_BYTES: Final = 120
 CLOUD_BYTES: Final = 100_000
 PART: Final = 0.5
-"""Of the link's rate that the clouds take as they are; that says how many a second."""
+"""Share of the link's rate that the clouds take as they are. It decides how many are sent a second."""
 WINDOW_S: Final = 5.0
 ENOUGH: Final = 0.8
 MAX_BYTES: Final = 2**24

@@ -78,7 +78,7 @@ class _Peer:
         self.lane = ""
         self.rtt_s: float | None = None
         self.lost = False  # what any relay said last is that it does not reach it
-        self.absent = False  # it was not, and is not here in this session
+        self.absent = False  # nobody said so, but the relay that we have now does not have it
         self.absent_s: float | None = None  # since when, in whatever sessions, nothing else was said
         self.given_up = False
 

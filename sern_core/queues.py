@@ -48,7 +48,7 @@ LAPSED_A_SWEEP: Final = 1_000
 """Messages of a link that are given up in one sweep: some milliseconds."""
 
 SEEN_PER_LAPSED: Final = 8
-"""So many that a sweep looks at, and that stay as they are, count like one that it gives up."""
+"""Messages that a sweep looks at and keeps, for one that it gives up, in the price of the sweep."""
 
 OnDrop = Callable[["OutChannel", Sequence[OutMessage], DropReason], None]
 """`on_drop(channel, outs, reason)`: these messages, in their order, are counted as dropped now. Of a reliable stream

@@ -13,14 +13,14 @@ from typing import Final
 EPOCHS: Final = 3
 """What a window does to the queue is seen an epoch or two later: a change counts when so many epochs have had it."""
 SHARE: Final = 0.5
-"""Of the queue that a full path would have. Half way between none and all is told most surely."""
+"""Share of the queue that a full path would have. Half way between none and all is told most surely."""
 SHRANK: Final = 2.0
 """Spreads. A window shrinks because the queue was long, and that may be by chance: it takes more to be believed."""
 GROWTH: Final = 0.05
 """Share of the window; twice as much each time that the path had room again."""
 MARGIN: Final = 1.1
 WAIT_S: Final = 2.0
-"""So long nothing has told until the window is made larger for it. Twice as long each time that the path was full..."""
+"""Time without an answer until the window is made larger to get one. It doubles each time that the path was full..."""
 MOST_WAIT_S: Final = 8.0
 PATIENT_S: Final = 32.0
 """... up to this, and from this on a path whose packets hide the jitter: it steers well, and a try is a queue."""
@@ -51,7 +51,7 @@ class Room:
 
     def __init__(self) -> None:
         self.steps = 0
-        """So many times in a row the path had room."""
+        """Times in a row that the path had room."""
         self._wanted_bytes = 0.0  # the window that will tell; 0: none is wanted
         self._tried_epochs = 0  # since then
         self._hurried = False
@@ -176,7 +176,7 @@ class Room:
         self._least_s = self._most_s = queue_s
 
     def shift(self, delay_s: float) -> None:
-        """So much of what was taken for a queue is none."""
+        """Take `delay_s` off what was noted as queue: it is none."""
         self._queues = deque([queue_s - delay_s for queue_s in self._queues], maxlen=2)
         self._least_s -= delay_s
         self._most_s -= delay_s

@@ -67,7 +67,7 @@ def steps(verb: str) -> list[list[str]]:
     return [words[words.index("-m") + 1 :] for words in lines]
 
 
-needs_make = pytest.mark.skipif(shutil.which("make") is None, reason="needs make")
+needs_make = pytest.mark.skipif(shutil.which("make") is None, reason="make is not installed: apt-get install make")
 
 
 @needs_make

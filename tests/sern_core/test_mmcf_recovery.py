@@ -160,6 +160,16 @@ class Driven:
         return self.trial.read(self.estimate_bps)
 
 
+def eased(estimate_bps: float) -> Driven:
+    """One of a link that carried 20 Mbit/s, got thin, and eased a moment ago."""
+    driven = Driven(20e6)
+    driven.second()
+    driven.estimate_bps = estimate_bps
+    driven.second()
+    driven.eased_s = driven.now
+    return driven
+
+
 def test_a_link_that_eased_is_taken_to_be_as_good_as_it_was_until_it_fails() -> None:
     d = Driven(20e6)
     assert d.second() == 20e6
@@ -175,11 +185,7 @@ def test_a_link_that_eased_is_taken_to_be_as_good_as_it_was_until_it_fails() -> 
 
 def test_it_is_not_judged_while_the_estimate_comes_up() -> None:
     """On a long round trip that takes longer than the two intervals."""
-    d = Driven(20e6)
-    d.second()
-    d.estimate_bps = 0.3e6
-    d.second()
-    d.eased_s = d.now
+    d = eased(0.3e6)
     assert d.second() == 20e6
     for estimate_bps in (0.4e6, 0.8e6, 1.6e6, 3.2e6):
         d.estimate_bps = estimate_bps
@@ -188,11 +194,7 @@ def test_it_is_not_judged_while_the_estimate_comes_up() -> None:
 
 
 def test_one_that_succeeds_stays_until_the_estimate_has_come_up_or_seen_the_link_get_slower() -> None:
-    d = Driven(20e6)
-    d.second()
-    d.estimate_bps = 1e6
-    d.second()
-    d.eased_s = d.now
+    d = eased(1e6)
     assert [d.second() for _ in range(30)] == [20e6] * 30
     d.estimate_bps = 5e6
     assert d.second() == 20e6
@@ -215,11 +217,7 @@ def test_failures_rest_longer_each_time_so_that_trials_have_a_tenth_of_the_time(
 
 
 def test_an_estimate_that_grew_is_reason_enough_whatever_failed_before() -> None:
-    d = Driven(20e6)
-    d.second()
-    d.estimate_bps = 1e6
-    d.second()
-    d.eased_s = d.now
+    d = eased(1e6)
     assert [d.second(on_time=0) for _ in range(TRIED + 1)][-1] == 1e6
     d.estimate_bps = 1.7e6
     assert d.second() == 20e6
@@ -238,11 +236,7 @@ def test_in_time_a_little_more_is_tried_where_messages_are_left_out() -> None:
 
 
 def test_nothing_is_assumed_of_a_link_that_nothing_comes_through() -> None:
-    d = Driven(20e6)
-    d.second()
-    d.estimate_bps = 1e6
-    d.second()
-    d.eased_s = d.now
+    d = eased(1e6)
     assert d.second() == 20e6
     d.estimate_bps = None
     assert d.second() is None

@@ -363,12 +363,18 @@ def test_a_robot_that_a_new_relay_never_hears_of_is_gone(said_gone: bool) -> Non
     assert statuses(site) == {"robot": GONE} and peers(site)["robot"].given_up
 
 
-def test_a_robot_that_dies_while_our_own_link_is_down_is_gone_and_forgotten_with_its_topics() -> None:
+def robot_at_a_site() -> tuple[World, SimClient, SimClient]:
+    """A robot that is connected, and a site that takes its topic; the relay waits 20 s for whoever goes."""
     world = World(hub_params=HubParams(resume_s=20.0)).watch()
     robot = world.client("robot")
     site = world.client("site", patterns=["/robot/.*"])
     robot.publish("/robot/odom", spec())
     world.until(lambda: statuses(site) == {"robot": CONNECTED})
+    return world, robot, site
+
+
+def test_a_robot_that_dies_while_our_own_link_is_down_is_gone_and_forgotten_with_its_topics() -> None:
+    world, robot, site = robot_at_a_site()
     world.hops["site"].break_connection(reconnect_s=60.0)
     world.until(lambda: statuses(site) == {"robot": UNKNOWN})
     world.network.crash_node(robot)
@@ -381,11 +387,7 @@ def test_a_robot_that_dies_while_our_own_link_is_down_is_gone_and_forgotten_with
 
 
 def test_a_robot_that_died_is_gone_though_our_own_link_holds_for_less_than_it_has_to_come() -> None:
-    world = World(hub_params=HubParams(resume_s=20.0)).watch()
-    robot = world.client("robot")
-    site = world.client("site", patterns=["/robot/.*"])
-    robot.publish("/robot/odom", spec())
-    world.until(lambda: statuses(site) == {"robot": CONNECTED})
+    world, robot, site = robot_at_a_site()
     world.hops["site"].break_connection(reconnect_s=30.0)
     world.network.crash_node(robot)
     world.run(30.0)
@@ -559,7 +561,7 @@ def test_of_many_that_were_given_up_the_last_are_shown() -> None:
 
 
 def test_who_makes_way_while_others_are_given_up_is_not_looked_at_again() -> None:
-    """The relay has said of the first of them in this session, and its next message does not come in time."""
+    """The relay has told of the first of them, and its next message does not come in time."""
     known = Peers()
 
     def tell(now: float, **item: object) -> None:
