@@ -154,10 +154,11 @@ class Ros1Endpoint:
         for topic in self._topics.values():
             topic.close()
         self._topics.clear()
+        for publication in list(self._publications.values()):
+            self._ended(publication)
+        await self._ended.all_gone()
         await self._graph.stop(UNREGISTER_S)
         self._master.close()
-        for publication in list(self._publications.values()):
-            publication.close()
         await self._tcpros.stop()
         self._publications.clear()
         await self._api.stop()
@@ -314,8 +315,9 @@ class Ros1Endpoint:
     def desired(self) -> dict[Registration, str]:
         if self._off:
             return {}
+        publications = [*self._ended.leaving, *self._publications.values()]
         return (
-            {Registration("publisher", name): publication.type_name for name, publication in self._publications.items()}
+            {Registration("publisher", publication.topic): publication.type_name for publication in publications}
             | {Registration("subscriber", topic.topic): "" for topic in self._topics.values() if topic.sinks}
             | dict.fromkeys((Registration("service", name) for name in self._host_of_services.served), "")
         )
@@ -343,7 +345,7 @@ class Ros1Endpoint:
         return f"rosrpc://{self.host}:{self._tcpros_port}"
 
     def _graph_changed(self, state: SystemState) -> None:
-        if self._off:
+        if self._off or self._events is None:
             return
         self._state = state
         for name, nodes in () if self.publishes_only else state.publishers.items():
@@ -441,9 +443,7 @@ class Ros1Endpoint:
         self._topics.clear()
         self._services.update({})
         for publication in list(self._publications.values()):
-            publication.close()
-        self._publications.clear()
-        self._graph.poll_now()
+            self._ended(publication)
 
 
 def _type_of(topic: Topic) -> str:

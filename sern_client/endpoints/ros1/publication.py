@@ -10,6 +10,7 @@ import asyncio
 import logging
 from collections import deque
 from collections.abc import Callable, Iterable
+from functools import partial
 from math import inf
 from typing import TYPE_CHECKING, Final
 
@@ -29,6 +30,9 @@ JOIN_BYTES: Final = 32 * 1024
 """Up to this size a message and its length are joined: one copy is cheaper than two writes."""
 WRITE_BUFFER_BYTES: Final = 128 * 1024
 """What may wait in the transport, where it cannot be overtaken; the rest waits in the queue."""
+LAST_READ_S: Final = 1.0
+"""How long the master does not hear of the end of a topic while subscribers read its last messages. roscpp throws away
+what it has not read when it hears of the end."""
 
 _log = logging.getLogger(__name__)
 
@@ -48,11 +52,12 @@ class Feed:
         self._queue: deque[bytes] = deque()
         self._queued_bytes = 0
         self._paused = False
+        self._over = False  # nothing follows what was sent
         link.transport.set_write_buffer_limits(high=WRITE_BUFFER_BYTES)
 
     def send(self, body: bytes, frame: bytes | None) -> None:
         """`frame` is the body with its length in front, where that was worth making."""
-        if self._transport is None or self._transport.is_closing():
+        if self._transport is None or self._over or self._transport.is_closing():
             return
         if self._paused:
             self._keep(body)
@@ -96,13 +101,20 @@ class Feed:
         for _ in self._queue:
             self.publication.limits.drop(DropReason.DISCONNECTED)
         self._queue.clear()
-        self.publication.feeds.discard(self)
+        self.publication.left(self)
 
-    def close(self) -> None:
-        """What was published before is still sent: the last of it may be a stop command."""
-        if self._transport is not None:
+    def finish(self) -> None:
+        """Send what was published before, the last of it may be a stop command, and then say that this was all. The
+        subscriber ends the connection when it has read it."""
+        if self._transport is not None and not self._over:
+            self._over = True
             while self._queue:
                 self._write(self._queue.popleft(), None)
+            self._transport.write_eof()
+
+    def close(self) -> None:
+        """End the connection. What was sent still leaves."""
+        if self._transport is not None:
             self._transport.close()
 
 
@@ -130,6 +142,8 @@ class Publication:
         self.handles: list[Handle] = []
         self.closed = False
         """Nobody can be served any more."""
+        self.on_read: Callable[[], None] | None = None
+        """Called when, after `close`, the last subscriber has gone."""
         self.latched = info.latched or is_static_tf(topic, info.type_name)
         self._static = TfLatch(Encoding.ROS1) if is_static_tf(topic, info.type_name) else None
         self._last: dict[Handle, bytes] = {}
@@ -232,9 +246,22 @@ class Publication:
         else:
             self.hold.hurry()
 
+    def left(self, feed: Feed) -> None:
+        """A subscriber has gone."""
+        self.feeds.discard(feed)
+        if self.closed and not self.feeds and self.on_read is not None:
+            self.on_read()
+
     def close(self) -> None:
+        """Send what was published, and nothing more."""
         self.closed = True
         self.hold.close()
+        for feed in list(self.feeds):
+            feed.finish()
+
+    def cut(self) -> None:
+        """Wait for no subscriber any more."""
+        self.on_read = None
         for feed in list(self.feeds):
             feed.close()
 
@@ -264,14 +291,39 @@ class Handle:
 
 
 class Ended:
-    """Takes a publication that has ended out of the table it is in."""
+    """Takes a publication that has ended out of the table it is in, and keeps it until its subscribers have read its
+    last messages, for `LAST_READ_S` at most. `changed` is called when it is gone."""
 
     def __init__(self, publications: dict[str, Publication], changed: Callable[[], None]) -> None:
         self._publications = publications
         self._changed = changed
+        self._leaving: dict[Publication, asyncio.TimerHandle] = {}
+        self._none_leaves = asyncio.Event()
+        self._none_leaves.set()
+
+    @property
+    def leaving(self) -> Iterable[Publication]:
+        """Publications whose last messages are being read."""
+        return self._leaving.keys()
 
     def __call__(self, publication: Publication) -> None:
         if self._publications.get(publication.topic) is publication:
             del self._publications[publication.topic]
-            self._changed()
         publication.close()
+        if publication.feeds and publication not in self._leaving:
+            publication.on_read = partial(self._gone, publication)
+            timer = asyncio.get_running_loop().call_later(LAST_READ_S, self._gone, publication)
+            self._leaving[publication] = timer
+            self._none_leaves.clear()
+        self._changed()
+
+    def _gone(self, publication: Publication) -> None:
+        self._leaving.pop(publication).cancel()
+        if not self._leaving:
+            self._none_leaves.set()
+        publication.cut()
+        self._changed()
+
+    async def all_gone(self) -> None:
+        """Return when all subscribers have read the last messages, or have had their time."""
+        await self._none_leaves.wait()
