@@ -13,7 +13,7 @@ Theory of operation
     receiver saw; one far above for longer than a moment does it at once (the link got slower).
     *Jitter* hides whether the path is empty. There the queue's answer to the window tells (`room`): it follows
     where the path is full. Where it does not the window grows, by more each time, and what packets wait for each
-    other's jitter is taken out of q.
+    other's jitter is taken out of q. What is lost then beyond what is usual counts like a queue.
     *Pacing.* On a path without jitter a little below B while something queues: the window bounds, the pace keeps the
     queue short. Where packets take long it also tries the empty path, in small steps, with a window that leaves room.
     What is lost on the way is added. B does not follow what our own pacing made of it.
@@ -60,8 +60,10 @@ FIRST_GROWTH: Final = 0.02
 MAX_GROWTH: Final = 0.25
 ROOM_GAIN: Final = 1.25
 QUICKER_EPOCHS: Final = 8
-HELD_SPREADS: Final = 2.0
+HELD_SPREADS: Final = 1.5
 """At most so many spreads of the delay are taken for what jitter holds back: it may be a queue after all."""
+LOST_BY_CHANCE: Final = 3.0
+"""Standard deviations of what is lost in an epoch, where packets are lost one by one."""
 CUT: Final = 0.95
 EMERGENCY_CUT: Final = 0.9
 WENT: Final = 0.25
@@ -139,6 +141,7 @@ class HybridWindow(CapacityEstimator):
         self._serialise_s = 0.0
         self._jitter_s = 0.0
         self._spreads: deque[float] = deque(maxlen=16)
+        self._least_spread_s = 0.0  # of these, but for chance: what jitter makes of them, whoever else sends
         self._target_s = 0.0
         self._high_s = inf
         self._rtt_s: float | None = None  # with our own queue on the way out empty
@@ -467,7 +470,7 @@ class HybridWindow(CapacityEstimator):
         noise_s = NOISE * max(0.0, self._jitter_s - serialise_s)
         # A slower flow wants a longer queue than a faster one, so that their shares meet.
         self._calm = noise_s <= CALM_NOISE_S and serialise_s <= CALM_PACKET_S
-        least_spread_s = sorted(self._spreads)[len(self._spreads) // 8]
+        least_spread_s = self._least_spread_s = sorted(self._spreads)[len(self._spreads) // 8]
         self._jittery = least_spread_s > (CALM_NOISE_S if serialise_s <= CALM_PACKET_S else serialise_s)
         # Fragments of a stream grow with its rate, and TCP cuts them anew: what they take is not known so well.
         self._gentle = self._calm and serialise_s >= GENTLE_PACKET_S and self._fragment <= self._first_fragment_bytes
@@ -488,7 +491,8 @@ class HybridWindow(CapacityEstimator):
             self._emptied_s = now
         limited = 2 * self._limited >= count
         lost = self._lost_bytes / max(1, self._lost_bytes + self._acked_bytes)
-        self._loss += 0.05 * (min(lost, 0.2) - self._loss)
+        if not self._room.trying:  # what a larger window loses is not usual
+            self._loss += 0.05 * (min(lost, 0.2) - self._loss)
         if self._drain_until_s is not None:
             if now >= self._drain_until_s:
                 self._window = self._saved_window
@@ -506,7 +510,7 @@ class HybridWindow(CapacityEstimator):
                 most = 1.5 * self._window if queue_s < COMPETE_QUEUE_S else self._window
                 self._window = min(max(window, MIN_WINDOW_FRAGMENTS * self._fragment), most)
             else:
-                self._steer(now, queue_s, rtt_s)
+                self._steer(now, queue_s, rtt_s, lost)
             stuck = self._cubic is None and (self._above_epochs >= STUCK_EPOCHS or self._is_pinned(now, queue_s))
             stuck = stuck and not self._own(queue_s)
             if stuck and now < self._rival_until_s:
@@ -521,7 +525,7 @@ class HybridWindow(CapacityEstimator):
         self._lost_bytes = self._acked_bytes = 0
         self._epoch_s = now
 
-    def _steer(self, now: float, queue_s: float, rtt_s: float) -> None:
+    def _steer(self, now: float, queue_s: float, rtt_s: float, lost: float) -> None:
         rate = self._rate
         if rate is None:
             return
@@ -541,7 +545,11 @@ class HybridWindow(CapacityEstimator):
             if now >= self._rival_until_s:
                 self._calm_window = window
             target_s = self._target_s
-            queue_s = self._look_for_room(now, window, queue_s, rate)
+            queue_s = self._look_for_room(now, window, queue_s, rate, lost)
+            back_bytes, self._room.back_bytes = self._room.back_bytes, None
+            if back_bytes is not None and back_bytes < window:
+                queue_s = max(0.0, queue_s - (window - back_bytes) / rate)
+                window = back_bytes
             step = GAIN * rate * max(target_s - queue_s, -queue_s)
             if queue_s >= 0.25 * target_s:
                 self._empty_epochs = 0
@@ -563,7 +571,7 @@ class HybridWindow(CapacityEstimator):
                 window = min(window, 1.1 * rate * (rtt_s + queue_s) + 4 * self._fragment) + step
         self._window = min(max(window, MIN_WINDOW_FRAGMENTS * self._fragment), MAX_WINDOW_BYTES)
 
-    def _look_for_room(self, now: float, window: float, queue_s: float, rate: float) -> float:
+    def _look_for_room(self, now: float, window: float, queue_s: float, rate: float, lost: float) -> float:
         """The queue without what jitter holds packets back. In order they wait for those before them, the longer the
         closer they follow each other: that is in no delay of slower times, and is no queue."""
         room = self._room
@@ -571,24 +579,36 @@ class HybridWindow(CapacityEstimator):
         if not (tries or room.trying) or now < self._rival_until_s:
             room.clear()
             return queue_s
+        unusual = self._unusual(lost)
         has_room = room.note(
             now,
             window,
             queue_s,
             rate=rate,
             spread_s=max(self._jitter_s, self._serialise_s),
+            lost=unusual,
             binds=not self._capped,
             tries=tries,
             patient=self._calm,
         )
+        if room.back_bytes is not None and unusual > 0.0:
+            queue_s += self._held_s  # the path drops what it cannot keep, so what was taken for jitter is all it keeps
+            self._held_s = 0.0
+            room.clear()
         if not has_room or self._calm or not self._jittery:
             return queue_s
-        held_s = min(room.queue_s - self._target_s / 2, HELD_SPREADS * self._jitter_s - self._held_s)
+        held_s = min(room.queue_s - self._target_s / 2, HELD_SPREADS * self._least_spread_s - self._held_s)
         if held_s <= 0.0:
             return queue_s
         self._held_s += held_s
         room.shift(held_s)
         return max(0.0, queue_s - held_s)
+
+    def _unusual(self, lost: float) -> float:
+        """What was lost in the epoch beyond what may be by chance where as much is lost as usual."""
+        count = (self._lost_bytes + self._acked_bytes) / self._fragment
+        usual = self._loss
+        return lost - usual if count * (lost - usual) > LOST_BY_CHANCE * (usual * count) ** 0.5 + 2.0 else 0.0
 
     def _pace(self) -> None:
         rtt_s = self._rtt_s

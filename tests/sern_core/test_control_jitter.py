@@ -1,6 +1,8 @@
 """The window estimator on links with jitter, in virtual time: what a link carries again is found again, and no queue is
 built for it where there is little jitter."""
 
+from dataclasses import replace
+
 import pytest
 
 from benchmarks.flows import World
@@ -69,12 +71,36 @@ def test_a_queue_is_no_longer_than_jitter_makes_it(jitter_s: float) -> None:
     assert world.goodput_bps(5.0, 30.0) > 0.93 * carries_bps(8e6)
 
 
+@pytest.mark.parametrize(
+    ("queue_packets", "loss", "lost_at_most"), [(12, 0.0, 0.02), (8, 0.02, 0.1), (6, 0.0, 0.1)], ids=["12", "8", "6"]
+)
+def test_a_path_that_drops_what_it_cannot_keep_is_full(queue_packets: int, loss: float, lost_at_most: float) -> None:
+    """Its queue is shorter than jitter, so it does not answer: what is lost does."""
+    model = replace(link(8e6, 0.005), queue_packets=queue_packets, loss=loss)
+    world = run(model, 20.0, 1)
+    flow = world.flows[0]
+    assert flow.lost_packets <= lost_at_most * flow.sent_packets
+    assert world.goodput_bps(5.0, 20.0) > 0.85 * carries_bps(8e6) * (1.0 - loss)
+
+
+@pytest.mark.parametrize("seed", [2, 4])
+def test_two_that_share_a_link_with_jitter_do_not_take_each_other_for_rivals(seed: int) -> None:
+    """What the one takes for jitter is a queue to the other, which would fill what there is of it."""
+    world = World(link(8e6, 0.005), seed=seed)
+    for start_s in (0.0, 5.0):
+        world.flow(HybridWindow(), start_s=start_s)
+    world.run(30.0)
+    for index in range(2):
+        assert at(world.poses_ms(15.0, index=index), 0.99) < 1e3 * DELAY_S + 50.0
+    assert world.goodput_bps(15.0, 30.0, 0) + world.goodput_bps(15.0, 30.0, 1) > 0.93 * carries_bps(8e6)
+
+
 RATE = 1e6
 
 
-def note(room: Room, epoch: int, window: float, queue_s: float, **more: bool) -> bool:
+def note(room: Room, epoch: int, window: float, queue_s: float, *, lost: float = 0.0, **more: bool) -> bool:
     flags = {"binds": True, "tries": True, "patient": False, **more}
-    return room.note(0.06 * epoch, window, queue_s, rate=RATE, spread_s=0.005, **flags)
+    return room.note(0.06 * epoch, window, queue_s, rate=RATE, spread_s=0.005, lost=lost, **flags)
 
 
 @pytest.mark.parametrize(("full", "steps"), [(False, 4), (True, 0)])
@@ -115,3 +141,37 @@ def test_nothing_is_tried_where_it_may_not_be_and_no_window_tells_that_does_not_
     for epoch in range(2030, 2033):
         note(room, epoch, 60_000, 0.001, tries=False)
     assert room.trying
+
+
+def test_what_is_lost_of_a_larger_window_is_an_answer_and_the_window_goes_back() -> None:
+    room, window = Room(), 60_000.0
+    for epoch in range(80):
+        over = max(0.0, window - 60_000) / window
+        assert not note(room, epoch, window, 0.002, lost=over)
+        if room.back_bytes is not None:
+            break
+        if room.trying:
+            window += max(0.0, room.step(window))
+    assert window > 60_000 and room.back_bytes == 60_000 and not room.trying
+
+
+def test_loss_of_one_epoch_is_no_answer() -> None:
+    room, window = Room(), 60_000.0
+    for epoch in range(80):
+        has_room = note(room, epoch, window, 0.002, lost=0.2 * (epoch % 3 == 0))
+        assert room.back_bytes is None
+        if has_room:
+            return
+        if room.trying:
+            window += max(0.0, room.step(window))
+    pytest.fail("the path has room")
+
+
+def test_a_window_that_cannot_be_made_larger_is_tried_less_and_less() -> None:
+    """Four minutes: as long as there is no answer each try waits longer."""
+    room = Room()
+    tried = 0
+    for epoch in range(4000):
+        note(room, epoch, 60_000, 0.002)
+        tried += room.trying
+    assert 0 < tried < 0.15 * 4000
