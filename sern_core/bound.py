@@ -1,7 +1,7 @@
 """The bound of what may wait for one client at the relay (`access.max_queue_bytes`).
 
 Counted is what the client's link holds: queued or under way, of reliable streams all that is not confirmed, and for
-each message `MESSAGE_OVERHEAD_BYTES` beside its body. When a message would exceed the bound, what waits makes room, the
+each message `CLIENT_OVERHEAD_BYTES` beside its body. When a message would exceed the bound, what waits makes room, the
 lowest class first: best effort oldest first, then, only for a message of a more urgent class, reliable ones newest
 first; never what has begun transmission, and nothing that is more urgent than the message. If that is not enough, the
 message itself is dropped. Every loss is counted as `queue_full`, and of a reliable stream the origin is told. What made
@@ -13,14 +13,14 @@ from typing import Final
 
 from sern_core.link import Link
 from sern_core.message import Message
-from sern_core.queues import GIVEN_UP_US, MESSAGE_OVERHEAD_BYTES, OutChannel
+from sern_core.queues import CLEARED_PER_US, CLIENT_OVERHEAD_BYTES, GIVEN_UP_US, OutChannel
 from sern_core.types import CLASSES, DropReason
 
 UNKNOWN: Final = math.inf
 FULL_S: Final = 0.01
 """A message that found no room speaks so long for those of its size and class that come after it: adding up what a link
 holds is too dear to be done for each."""
-TOMBSTONE_BYTES: Final = 1 + MESSAGE_OVERHEAD_BYTES
+TOMBSTONE_BYTES: Final = 1 + CLIENT_OVERHEAD_BYTES
 ADDED_UP_PER_US: Final = 2
 """Channels of a link that are added up in a microsecond. That and what is given up are charged to whoever sent the
 message that needs room (`Reassembly.work_us`)."""
@@ -46,7 +46,7 @@ class QueueBound:
         """Make room for `message` of `channel` and submit it; without room it is dropped as `queue_full`. A reliable
         one leaves a tombstone if there is room for that, else a gap. Returns what making room cost, in microseconds."""
         self._work_us = 0
-        size = len(message.body) + MESSAGE_OVERHEAD_BYTES
+        size = len(message.body) + CLIENT_OVERHEAD_BYTES
         if self._at_most_bytes + size <= self.max_bytes:
             self._at_most_bytes += size
             link.submit(channel, message, now=now, forced=True)
@@ -66,8 +66,8 @@ class QueueBound:
             return False
         self._work_us += len(link.channels) // ADDED_UP_PER_US
         excess_bytes = sum(other.kept_bytes for other in link.channels.values()) + size - self.max_bytes
-        if channel.coalesced and channel.queue:
-            excess_bytes -= channel.queue[0].size + MESSAGE_OVERHEAD_BYTES  # the message takes its place
+        if _takes_the_place(channel):
+            excess_bytes -= channel.unbegun_bytes + channel.unbegun * CLIENT_OVERHEAD_BYTES
         if excess_bytes > 0 and shed:
             excess_bytes = self._shed(link, channel, excess_bytes, now)
         if excess_bytes <= 0:
@@ -81,16 +81,24 @@ class QueueBound:
     def _shed(self, link: Link, incoming: OutChannel, excess_bytes: int, now: float) -> int:
         """Drop what waits until the excess is gone; returns what is left of it."""
         priority = incoming.spec.priority
-        waiting = [c for c in link.channels.values() if c.queue and not (c is incoming and c.coalesced)]
+        waiting = [c for c in link.channels.values() if c.unbegun and not (c is incoming and _takes_the_place(c))]
         for lowest in reversed(CLASSES[priority:]):
             rows = [channel for channel in waiting if channel.spec.priority is lowest]
             for reliable in (False, True):
                 if reliable and lowest is priority:
                     continue  # among equals, who came first stays
                 # The largest queues first: fewest streams lose anything.
-                chosen = sorted((c for c in rows if c.reliable is reliable), key=lambda c: (-c.queued_bytes, c.slot))
+                chosen = sorted((c for c in rows if c.reliable is reliable), key=lambda c: (-c.unbegun_bytes, c.slot))
                 for channel in chosen:
-                    while excess_bytes > 0 and (freed_bytes := link.shed(channel, DropReason.QUEUE_FULL, now=now)):
-                        excess_bytes -= freed_bytes
-                        self._work_us += GIVEN_UP_US
+                    if excess_bytes <= 0:
+                        return excess_bytes
+                    kept = channel.kept
+                    excess_bytes -= link.shed(channel, excess_bytes, DropReason.QUEUE_FULL, now=now)
+                    self._work_us += GIVEN_UP_US + (kept - channel.kept) // CLEARED_PER_US
         return excess_bytes
+
+
+def _takes_the_place(channel: OutChannel) -> bool:
+    """Whether a message of `channel` takes the place of all that waits there. Where the adaptation leaves messages out
+    it may be held back beside it."""
+    return channel.coalesced and channel.share >= 1.0

@@ -31,8 +31,11 @@ PIECE_BYTES: Final = 128
 """What a piece of a half-received message costs beside its bytes."""
 PIECES_PAID: Final = 16
 """Pieces are charged for so many at a time."""
-HELD_OVERHEAD_BYTES: Final = 512
-"""What a half-received or waiting message costs beside its body: without it, small ones could fill the memory."""
+PIECES_INCLUDED: Final = 4
+"""Pieces that a half-received message may have before more are charged for."""
+HELD_OVERHEAD_BYTES: Final = 1024
+"""What a half-received or waiting message counts for beside its body: without it, small ones could fill the memory. It
+is more than they take, since a peer ends all of them at a word, in one turn of the loop."""
 SLICE_US: Final = 6000
 """What reading may cost before others get their turn, in microseconds as they are charged here and by the owner."""
 TURN_US: Final = 4
@@ -71,7 +74,7 @@ class Partial:
     def __init__(self, total: int) -> None:
         self.total = total
         self.held_bytes = total + HELD_OVERHEAD_BYTES  # as `Reassembly` counts it
-        self.paid_pieces = HELD_OVERHEAD_BYTES // PIECE_BYTES
+        self.paid_pieces = PIECES_INCLUDED
         self.born_s: float | None = None  # known with the first fragment
         self.error_s = 0.0
         self.codec = 0

@@ -40,7 +40,7 @@ from sern_core.out_message import OutMessage
 from sern_core.params import LinkParams, SchedulerParams
 from sern_core.presence import Presence
 from sern_core.queues import LAPSED_A_SWEEP, OutChannel
-from sern_core.replay import ReplayStore, as_replays, kept_bytes, newest_that_fit
+from sern_core.replay import ReplayStore, as_replays, newest_that_fit, waiting_bytes
 from sern_core.routing import UNIT_S, BadPatternError, Denied, Match, RouteChange, RoutingTable
 from sern_core.rules import is_client_name, name_problem
 from sern_core.session import DISPLACED
@@ -501,7 +501,7 @@ class Hub(LocalStreams):
         for message in messages[:start]:
             counters.offer(len(message.body))
             counters.drop(DropReason.QUEUE_FULL, len(message.body))
-        self._room = client, now, room_bytes - sum(map(kept_bytes, messages[start:]))
+        self._room = client, now, room_bytes - sum(map(waiting_bytes, messages[start:]))
         return as_replays(messages[start:])
 
     def _replay_units(self, identity: StreamId) -> int:

@@ -6,7 +6,7 @@ from itertools import takewhile
 from typing import Final
 
 from sern_core.message import Message
-from sern_core.queues import MESSAGE_OVERHEAD_BYTES
+from sern_core.queues import CLIENT_OVERHEAD_BYTES, MESSAGE_OVERHEAD_BYTES
 
 UNBOUNDED_BYTES: Final = 2**62
 MAX_REPLAY_MESSAGES: Final = 1000
@@ -18,11 +18,16 @@ def kept_bytes(message: Message) -> int:
     return len(message.body) + MESSAGE_OVERHEAD_BYTES
 
 
+def waiting_bytes(message: Message) -> int:
+    """What it will count for in the bound of a client that it waits for."""
+    return len(message.body) + CLIENT_OVERHEAD_BYTES
+
+
 def newest_that_fit(messages: Sequence[Message], room_bytes: int) -> int:
-    """How many of the messages, counted from the newest and last, fit into the room."""
+    """How many of the messages, counted from the newest and last, fit into the room that a client's bound leaves."""
     count = 0
     for message in reversed(messages):
-        room_bytes -= kept_bytes(message)
+        room_bytes -= waiting_bytes(message)
         if room_bytes < 0:
             break
         count += 1

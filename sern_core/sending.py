@@ -259,11 +259,18 @@ class Sender(ABC):
         self.trace.record(now, message.stream.topic, TraceEvent.DROPPED, seq=message.seq, reason=reason)
         self._refresh(channel, now)
 
-    def shed(self, channel: OutChannel, reason: DropReason, *, seq: int | None = None, now: float) -> int:
-        """Give up one message that waits and has not been begun (of a reliable stream, number `seq` if given); returns
-        the bytes that are free now, overhead included, 0: none."""
+    def abandon(self, channel: OutChannel, seq: int, reason: DropReason, *, now: float) -> bool:
+        """Give up message `seq` of a reliable stream, if nothing of it was sent; its receiver is told."""
         self._now = now
-        freed_bytes = channel.shed(reason, seq=seq)
+        abandoned = channel.abandon(seq, reason)
+        self._refresh(channel, now)
+        return abandoned
+
+    def shed(self, channel: OutChannel, room_bytes: int, reason: DropReason, *, now: float) -> int:
+        """Give up messages that wait and have not been begun until the channel's `kept_bytes` is less by `room_bytes`;
+        returns by how much it is less, 0: there was none."""
+        self._now = now
+        freed_bytes = channel.shed(room_bytes, reason)
         self._refresh(channel, now)
         if channel.gaps and channel.watermark >= channel.gaps[0][0]:  # nothing of the stream is left before it
             self._watermark_moved(channel)

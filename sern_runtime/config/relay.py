@@ -120,7 +120,7 @@ class AccessSection(Section):
     max_bytes_per_s: Annotated[float, Field(gt=0, le=1e12)] | None = None
     """Bytes a second taken from it over all its topics; null: no limit."""
     max_queue_bytes: Bytes | None = DEFAULT_QUEUE_BYTES
-    """Bytes that may wait for it at the relay, 768 for each message beside its body. Beyond, best effort of the lowest
+    """Bytes that may wait for it at the relay, 2048 for each message beside its body. Beyond, best effort of the lowest
     class is dropped first, then what does not fit, counted as `queue_full` and reported if reliable; null: no limit,
     for a relay whose clients are all trusted."""
 

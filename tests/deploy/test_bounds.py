@@ -50,7 +50,7 @@ def default(section: type[RelaySection] | type[ReplaySection], key: str) -> int:
 BOUNDS: Final[dict[str, tuple[str, ...]]] = {
     "messages that wait for a client": (
         nbytes(access.DEFAULT_QUEUE_BYTES),
-        f"{queues.MESSAGE_OVERHEAD_BYTES} bytes a message",
+        f"{queues.CLIENT_OVERHEAD_BYTES} bytes a message",
     ),
     "half-received and waiting": (f"{fragments.PARTIAL_IDLE_S:g} s without a fragment",),
     "latched messages for late joiners": (

@@ -10,7 +10,8 @@ import pytest
 from sern_core import wire
 from sern_core.access import DEFAULT_QUEUE_BYTES, AccessRule, AccessTable
 from sern_core.control.fixed import FixedWindow
-from sern_core.queues import MESSAGE_OVERHEAD_BYTES, OutChannel
+from sern_core.params import LinkParams
+from sern_core.queues import CLIENT_OVERHEAD_BYTES, OutChannel
 from sern_core.types import DropReason, PriorityClass
 from tests.fuzz.price import Input, Make, within_budget
 from tests.fuzz.test_hostile_peer import Hostile, _piece, _whole
@@ -20,13 +21,12 @@ from tests.world import World
 WINDOW_BYTES = 640_000
 IN_FLIGHT = 16_000
 """One-byte messages: forty share a datagram."""
-BOUND_BYTES = 5_200_000
+BOUND_BYTES = 13_800_000
 STREAMS = 100
-BACKLOG = 80_000
-AT_BOUND = DEFAULT_QUEUE_BYTES // (MESSAGE_OVERHEAD_BYTES + 1) // 1_600 * 1_600
+BACKLOG = DEFAULT_QUEUE_BYTES // (CLIENT_OVERHEAD_BYTES + 1) // 1_600 * 1_600
 """One-byte messages that may wait for a client by default."""
 GAPS = 20_000
-HALF_RECEIVED = 120_000
+HALF_RECEIVED = 60_000
 
 
 def origin_and_reader() -> tuple[Hostile, Hostile]:
@@ -76,7 +76,7 @@ def messages_that_need_room() -> Input:
         now=origin.now,
     )
     channels = hub.links[reader.name].channels
-    waits = BOUND_BYTES // (MESSAGE_OVERHEAD_BYTES + 2)
+    waits = BOUND_BYTES // (CLIENT_OVERHEAD_BYTES + 2)
     for first in range(1, waits, 1_000):
         said(origin, *(_whole(1, seq, b"yy") for seq in range(first, min(first + 1_000, waits + 1))))
     assert sum(len(channel.queue) for channel in channels.values()) == waits
@@ -89,6 +89,24 @@ def messages_that_need_room() -> Input:
         return more
 
     return Input(len(frames), lambda: origin.say(frames), rest=rest)
+
+
+def message_that_needs_much_room() -> Input:
+    """The largest message that a relay takes is urgent, and the bound of its reader is full of small reliable ones."""
+    origin, _reader, channel = filled_backlog(BACKLOG)
+    origin.announce(2, "/origin/urgent", reliable=True)
+    origin.hub.links[origin.name].reassembly.limit_bytes = 64 * 2**20
+    total = LinkParams().max_message_bytes
+    *begin, last_piece = (_piece(2, 1, at, total, bytes(min(60_000, total - at))) for at in range(0, total, 60_000))
+    for piece in begin:
+        origin.say(piece)
+
+    def rest() -> bool:
+        more = one_more_slice(origin)
+        assert more or BACKLOG - channel.kept > 6_000
+        return more
+
+    return Input(total, lambda: origin.say(last_piece), rest=rest)
 
 
 def plain(seq: int) -> bytes:
@@ -176,7 +194,7 @@ def backlog_that_lapses() -> Input:
 
 
 def backlog_that_lapses_while_its_reader_is_away() -> Input:
-    _origin, reader, channel = filled_backlog(AT_BOUND)
+    _origin, reader, channel = filled_backlog(BACKLOG)
     reader.port.disconnected(now=reader.now)
     reader.hub.params = replace(reader.hub.params, resume_s=1e9)
 
@@ -186,7 +204,7 @@ def backlog_that_lapses_while_its_reader_is_away() -> Input:
         more = reader.hub.lapse(now=now)
         if not more:
             reasons = channel.counters.by_reason
-            assert not channel.kept and reasons[DropReason.RETENTION] + reasons[DropReason.UNCONFIRMED] == AT_BOUND
+            assert not channel.kept and reasons[DropReason.RETENTION] + reasons[DropReason.UNCONFIRMED] == BACKLOG
         return more
 
     return Input(0, lambda: reader.hub.sweep(now=now), rest=rest)
@@ -194,7 +212,7 @@ def backlog_that_lapses_while_its_reader_is_away() -> Input:
 
 def client_that_is_forgotten() -> Input:
     """A client is revoked for which an origin has filled all there is room for, every second message a tombstone."""
-    _origin, reader, channel = filled_backlog(AT_BOUND, buried)
+    _origin, reader, channel = filled_backlog(BACKLOG, buried)
     reader.port.disconnected(now=reader.now)
 
     def take() -> None:
@@ -213,7 +231,7 @@ def stream_that_ends_half_received() -> Input:
     for first in range(1, HALF_RECEIVED, 1_500):
         said(peer, *(_piece(1, seq, 0, 2) for seq in range(first, first + 1_500)))
     frame = control(peer, wire.encode_control({"t": "retract", "ch": 1}))
-    assert reassembly.held_bytes > 512 * HALF_RECEIVED
+    assert reassembly.held_bytes > 0.9 * reassembly.limit_bytes
 
     def rest() -> bool:
         more = one_more_slice(peer)
@@ -226,13 +244,14 @@ def stream_that_ends_half_received() -> Input:
 EVENTS = (
     connection_that_ends,
     messages_that_need_room,
+    message_that_needs_much_room,
     backlog_that_ends("backlog_not_wanted", UNWANTED),
     backlog_that_ends("backlog_refused", {"t": "refuse", "ch": 1, "code": "forbidden", "why": ""}),
     backlog_that_ends("backlog_dropped", {"t": "dropped", "ch": 1, "seq": 1, "code": 1, "to": "x", "n": 2**61}),
     backlog_that_ends("backlog_unsubscribed", {"t": "subscribe", "patterns": [], "more": False}),
     backlog_that_ends("backlog_confirmed"),
-    backlog_that_ends("all_but_one_confirmed", fill=partial(filled_backlog, AT_BOUND), confirmed=AT_BOUND - 1),
-    backlog_that_ends("backlog_of_tombstones", UNWANTED, fill=partial(filled_backlog, AT_BOUND, buried)),
+    backlog_that_ends("all_but_one_confirmed", confirmed=BACKLOG - 1),
+    backlog_that_ends("backlog_of_tombstones", UNWANTED, fill=partial(filled_backlog, BACKLOG, buried)),
     backlog_that_ends("backlog_with_gaps", UNWANTED, fill=partial(backlog_with_gaps, GAPS)),
     backlog_that_lapses,
     backlog_that_lapses_while_its_reader_is_away,

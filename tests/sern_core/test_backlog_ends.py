@@ -11,7 +11,7 @@ from sern_core.hub import HubParams
 from sern_core.message import Message
 from sern_core.out_message import OutMessage
 from sern_core.params import LinkParams
-from sern_core.queues import MESSAGE_OVERHEAD_BYTES, OutChannel
+from sern_core.queues import CLIENT_OVERHEAD_BYTES, OutChannel
 from sern_core.types import ClientName, DropReason
 from sern_sim.models import LinkModel
 from tests.exploring import cases
@@ -20,7 +20,7 @@ from tests.world import World, spec
 PHASES = (Phase.explicit, Phase.generate)
 LARGE_BYTES = 2_000
 """Fits into no bound of what waits."""
-ROOM_BYTES = 24 * (MESSAGE_OVERHEAD_BYTES + 1)
+ROOM_BYTES = 24 * (CLIENT_OVERHEAD_BYTES + 1)
 ENDS = ("stays away", "leaves", "forbidden", "comes back")
 ACTIONS = ("small", "small", "large", "too large", "lapse", "joins", "goes")
 
@@ -59,7 +59,7 @@ def test_what_ends_is_what_waited_and_nothing_else(actions: list[str], end: str,
         elif action == "lapse":  # gives up what it sends meanwhile: a gap for all
             world.hops["robot"].break_connection(reconnect_s=1.0)
             assert robot.send(log, b"x")
-            robot.core.link.shed(log, DropReason.QUEUE_FULL, now=robot.now)
+            robot.core.link.shed(log, 1, DropReason.QUEUE_FULL, now=robot.now)
             world.run(1.5)
         elif action == "joins" and not joined:
             joined = here = True

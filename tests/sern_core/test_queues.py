@@ -13,7 +13,7 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, pr
 from sern_core.ledger import LOSSES, SendLedger
 from sern_core.message import Message, StreamId, StreamInfo, TopicInfo, TopicSpec
 from sern_core.out_message import OutMessage
-from sern_core.queues import MESSAGE_OVERHEAD_BYTES, OutChannel
+from sern_core.queues import CLIENT_OVERHEAD_BYTES, OutChannel
 from sern_core.types import ClientName, DropReason, Encoding, TopicName
 from tests.exploring import cases, seeds
 from tests.steps import steps
@@ -117,7 +117,7 @@ def test_what_is_held_back_has_a_lifespan_and_an_end() -> None:
         (lambda sender: sender.channel.release(1.0), DropReason.LIFESPAN),
         (lambda sender: sender.channel.clear(DropReason.SHUTDOWN), DropReason.SHUTDOWN),
         (lambda sender: sender.channel.set_wanted(False), DropReason.UNWANTED),
-        (lambda sender: sender.channel.shed(DropReason.QUEUE_FULL), DropReason.QUEUE_FULL),
+        (lambda sender: sender.channel.shed(1, DropReason.QUEUE_FULL), DropReason.QUEUE_FULL),
     ):
         sender = Sender(spec(depth=1, max_rate_hz=1.0, lifespan_s=0.3))
         sender.submit(now=0.0)
@@ -334,15 +334,15 @@ def test_what_makes_room_leaves_nothing_behind_but_one_gap() -> None:
     assert sender.take() is not None  # 1 has begun
     sender.submit(3)
     kept_bytes = channel.kept_bytes
-    freed_bytes = [channel.shed(DropReason.QUEUE_FULL) for _ in range(3)]
-    assert freed_bytes == [100 + MESSAGE_OVERHEAD_BYTES] * 3 and channel.kept_bytes == kept_bytes - sum(freed_bytes)
+    freed_bytes = [channel.shed(1, DropReason.QUEUE_FULL) for _ in range(3)]
+    assert freed_bytes == [100 + CLIENT_OVERHEAD_BYTES] * 3 and channel.kept_bytes == kept_bytes - sum(freed_bytes)
     assert sender.waiting == [2] and list(channel.gaps) == [(2, 6)]
     channel.leave_out(sender.message(6), DropReason.QUEUE_FULL)
     sender.submit(1)
     assert sender.waiting == [2, 7] and list(channel.gaps) == [(2, 7)]
-    assert channel.shed(DropReason.QUEUE_FULL) and channel.shed(DropReason.QUEUE_FULL)
+    assert channel.shed(1, DropReason.QUEUE_FULL) and channel.shed(1, DropReason.QUEUE_FULL)
     assert list(channel.gaps) == [(1, 8)] and sender.waiting == []
-    assert channel.shed(DropReason.QUEUE_FULL) == 0, "what has begun goes on"
+    assert channel.shed(1, DropReason.QUEUE_FULL) == 0, "what has begun goes on"
     assert sorted(seq for seq, _ in sender.drops) == [2, 3, 4, 5, 6, 7]
     assert channel.next_gap() is None
     channel.delivered_to(1)
@@ -355,10 +355,10 @@ def test_what_makes_room_and_was_reported_before_is_not_reported_again() -> None
     channel = sender.channel
     sender.submit(3)
     channel.reported(6, DropReason.RATE_CAP)
-    assert channel.shed(DropReason.UNWANTED, seq=7) == 99 and channel.shed(DropReason.UNWANTED, seq=7) == 0
+    assert channel.abandon(7, DropReason.UNWANTED) and not channel.abandon(7, DropReason.UNWANTED)
     assert [bool(out.message.tombstone) for out in channel.queue] == [False, False, True]
     for size in (1, 100, 100):
-        assert channel.shed(DropReason.QUEUE_FULL) == size + MESSAGE_OVERHEAD_BYTES
+        assert channel.shed(1, DropReason.QUEUE_FULL) == size + CLIENT_OVERHEAD_BYTES
     assert sender.drops == [(6, DropReason.RATE_CAP), (7, DropReason.UNWANTED), (5, DropReason.QUEUE_FULL)]
     assert channel.next_gap() == 8 and channel.kept_bytes == 0
     sender.check()
@@ -369,7 +369,7 @@ def test_what_an_earlier_process_may_have_makes_room_as_unconfirmed() -> None:
     sender.submit(2)
     assert sender.take() is not None
     sender.channel.peer_restarted()
-    assert sender.channel.shed(DropReason.QUEUE_FULL) and sender.channel.shed(DropReason.QUEUE_FULL)
+    assert sender.channel.shed(1, DropReason.QUEUE_FULL) and sender.channel.shed(1, DropReason.QUEUE_FULL)
     assert sender.drops == [(2, DropReason.QUEUE_FULL), (1, DropReason.UNCONFIRMED)]
     sender.check()
 
@@ -505,10 +505,14 @@ class Channel(RuleBasedStateMachine):
     def drop_head(self) -> None:
         self.sender.channel.drop_head(DropReason.STALE, self.now)
 
-    @rule(count=st.integers(1, 3))
-    def shed(self, count: int) -> None:
-        for _ in range(count):
-            self.sender.channel.shed(DropReason.QUEUE_FULL)
+    @rule(room_bytes=st.integers(1, 3 * CLIENT_OVERHEAD_BYTES))
+    def shed(self, room_bytes: int) -> None:
+        channel = self.sender.channel
+        kept_bytes, kept = channel.kept_bytes, channel.kept
+        freed_bytes = channel.shed(room_bytes, DropReason.QUEUE_FULL)
+        assert channel.kept_bytes == kept_bytes - freed_bytes
+        assert freed_bytes >= room_bytes or not (channel.queue or channel.newest)
+        assert kept - channel.kept <= -(-room_bytes // CLIENT_OVERHEAD_BYTES)
 
     @precondition(lambda self: self.sender.channel.reliable)
     @rule()

@@ -10,7 +10,7 @@ from sern_core.access import AccessRule, AccessTable
 from sern_core.announce import Announcement, encode_announcement
 from sern_core.hub import REPLAY_US, HubParams
 from sern_core.message import Message, StreamId, StreamInfo, TopicInfo
-from sern_core.queues import MESSAGE_OVERHEAD_BYTES, OutChannel
+from sern_core.queues import CLIENT_OVERHEAD_BYTES, MESSAGE_OVERHEAD_BYTES, OutChannel
 from sern_core.replay import MAX_REPLAY_MESSAGES, LatchedCache, ReplayStore
 from sern_core.routing import SLICE_UNITS, UNIT_S
 from sern_core.types import ClientName, DropReason, Encoding, PriorityClass, TopicName
@@ -124,7 +124,7 @@ def test_of_a_deep_stream_the_newest_are_kept_and_the_others_counted() -> None:
 def test_a_late_joiner_gets_the_newest_that_may_wait_for_it(
     reliable: bool, restarts: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    room_bytes = 30 * (100 + UNIT)
+    room_bytes = 30 * (100 + CLIENT_OVERHEAD_BYTES)
     late_rule = AccessRule(client="late", subscribe=(".*",), max_queue_bytes=room_bytes)
     world = World(access=AccessTable([late_rule, AccessRule(client=".*", publish=(".*",), subscribe=(".*",))]))
     hub = world.relay.hub

@@ -8,7 +8,7 @@ from sern_core.announce import Announcement, encode_announcement
 from sern_core.errors import WireError
 from sern_core.link import SEVERAL
 from sern_core.message import StreamId, StreamInfo, TopicInfo
-from sern_core.queues import MESSAGE_OVERHEAD_BYTES
+from sern_core.queues import CLIENT_OVERHEAD_BYTES
 from sern_core.types import DropReason, Encoding, PriorityClass, TopicName
 from sern_sim.models import LinkModel
 from tests.fuzz.test_hostile_peer import Hostile, _whole
@@ -149,7 +149,7 @@ def test_what_makes_room_newest_first_is_one_run() -> None:
     reader.port.disconnected(now=reader.now)
     hub = reader.hub
     rule = AccessRule(
-        client=".*", publish=(".*",), subscribe=(".*",), max_queue_bytes=300 * (MESSAGE_OVERHEAD_BYTES + 1)
+        client=".*", publish=(".*",), subscribe=(".*",), max_queue_bytes=300 * (CLIENT_OVERHEAD_BYTES + 1)
     )
     hub.revoke(AccessTable([rule]), now=robot.now)
     for seq in range(1, 301):
