@@ -19,7 +19,7 @@ help:
 	@echo "make picture  the demo, and its picture for README.md"
 	@echo "make bench    the quick benchmarks;  make schemas: regenerate schemas/ and the configuration reference"
 
-PYTHON_NEEDED := SERN needs 3.11 to 3.13: make PYTHON=python3.11, or see deploy/README.md, 1
+PYTHON_NEEDED := SERN needs 3.11 to 3.13: make PYTHON=python3.11 $(or $(MAKECMDGOALS),setup), or see deploy/README.md, 1
 PYTHON_HAS := import sys; print("%d.%d" % sys.version_info[:2]); sys.exit(sys.version_info < (3, 11))
 
 $(VENV)/.ready: pyproject.toml constraints.txt

@@ -335,7 +335,7 @@ class ServiceBridge:
         except asyncio.CancelledError:
             if not used.gone:  # its caller is gone: if the call still waits here, it is not made
                 used.numbers.pop(seq, None)
-                self._core.link.shed(calls, DropReason.UNWANTED, seq=seq, now=clock.now())
+                self._core.link.abandon(calls, seq, DropReason.UNWANTED, now=clock.now())
             raise
         finally:
             used.waiting.pop(number, None)

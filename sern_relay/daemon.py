@@ -321,8 +321,14 @@ class RelayDaemon:
             del self._away_since_s[client]
 
     def _status(self) -> str:
-        """One line for `systemctl status`. A failed reload stays in it until a good one."""
-        state = f"{self._clients_up()} clients, {len(self.hub.relayed)} streams"
+        """One line for `systemctl status`."""
+        return self._and_reload(f"{self._clients_up()} clients, {len(self.hub.relayed)} streams")
+
+    def _readiness(self) -> Health:
+        return Health(ok=self._ready, reason=self._and_reload("listening" if self._ready else "starting"))
+
+    def _and_reload(self, state: str) -> str:
+        """A failed reload stays beside the state until a good one; it changes nothing of what the relay does."""
         return state if self._unreloaded is None else f"{state}; {self._unreloaded}"
 
     def _clients_up(self) -> int:
@@ -415,7 +421,7 @@ class RelayDaemon:
             listen,
             registry,
             health=lambda: Health(ok=True, reason="running"),
-            ready=lambda: Health(ok=self._ready, reason="listening" if self._ready else "starting"),
+            ready=self._readiness,
             json_routes={
                 "/api/link": lambda: [link.snapshot() for link in self.hub.links.values()],
                 "/api/objects": objects_view(self.hub),

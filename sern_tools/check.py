@@ -4,7 +4,7 @@ only the name is looked up."""
 import asyncio
 import difflib
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -45,22 +45,27 @@ def run_check(path: Path, *, out: Console | None = None, err: Console | None = N
         _lines(err, [str(error) for error in checked.errors])
         return EXIT_USER_ERROR
     loaded = checked.loaded
-    if isinstance(loaded.model, keys.SecretKeyFile):
-        warning = keys.secret_warning(path)
-        _lines(err, [f"warning: {warning}"] if warning else [])
-    if isinstance(loaded.model, (keys.PublicKeyFile, keys.SecretKeyFile)):
-        odd = keys.misnamed(path, ClientName(loaded.model.name))
-        _lines(err, [f"warning: {odd}"] if odd else [])
-    if isinstance(loaded.model, keys.PublicKeyFile):
-        lapse = keys.load_public(path).lapse(time.time())
-        _lines(err, [f"warning: {path} {lapse}"] if lapse else [])
-    _lines(err, [f"warning: {text}" for text in loaded.warnings])
-    if isinstance(loaded.model, ClientFile):
-        problem = _unresolved(loaded.model.relay.endpoint)
-        if problem is not None:  # no error: the file may be for another machine, and the name be made later
-            _lines(err, [f"warning: {document.error(('relay', 'endpoint'), problem)}"])
     _summary(out, loaded)
+    # Below the tables, which may be longer than a terminal.
+    _lines(err, [f"warning: {text}" for text in _warnings(loaded, document)])
+    _lines(out, [f"{loaded.path}: right"])
     return EXIT_OK
+
+
+def _warnings(loaded: Loaded[FileModel], document: Document) -> Iterator[str]:
+    """What is wrong in all likelihood, and no error: the file may be for another machine, or a name be made later."""
+    model, path = loaded.model, loaded.path
+    if isinstance(model, keys.SecretKeyFile) and (open_to_others := keys.secret_warning(path)):
+        yield open_to_others
+    if isinstance(model, (keys.PublicKeyFile, keys.SecretKeyFile)) and (
+        odd := keys.misnamed(path, ClientName(model.name))
+    ):
+        yield odd
+    if isinstance(model, keys.PublicKeyFile) and (lapse := keys.load_public(path).lapse(time.time())):
+        yield f"{path} {lapse}"
+    yield from loaded.warnings
+    if isinstance(model, ClientFile) and (problem := _unresolved(model.relay.endpoint)):
+        yield str(document.error(("relay", "endpoint"), problem))
 
 
 def _unresolved(endpoint: str) -> str | None:
@@ -116,7 +121,6 @@ def _summary(out: Console, loaded: Loaded[FileModel]) -> None:
         _lines(out, [f"public key file of {model.name}, {len(model.keys)} key(s)"])
     elif isinstance(model, keys.SecretKeyFile):
         _lines(out, [f"secret key file of {model.name}"])
-    _lines(out, [f"{loaded.path}: right"])
 
 
 def _table(*titles: str) -> Table:

@@ -30,6 +30,7 @@ import typer
 from rich.console import Console
 
 from sern_core.errors import ConfigError, SernError
+from sern_runtime.config.endpoints import installing
 from sern_runtime.profiles import load_profile
 from sern_tools import demo_charts, demo_report
 from sern_tools.counters import Counters, read_counters
@@ -53,6 +54,7 @@ from sern_tools.demo_scenario import (
 from sern_tools.message_log import TopicLog, read_logs
 from sern_tools.ports import free_ports
 from sern_tools.processes import DRAIN_S, Child, Children, program, swept
+from sern_tools.processors import ProcessorTime, crowded
 from sern_tools.shaping import RateSchedule
 from sern_tools.summary import RunFacts, analyse, judge
 
@@ -116,7 +118,9 @@ class Demo:
         words = ", ".join(f"from the {origin} {demo_report.seconds(value)}" for origin, value in floor_s.items())
         self._say(f"     one way, idle: {words}")
         self._say(f"2/{total}  SERN, {self.scenario.duration_s:g} s: {demo_report.load_words(self.scenario)}")
+        before = ProcessorTime.now()
         sern = await self.run_sern()
+        busy = crowded(before, ProcessorTime.now())
         carried = {SERN_NAME: sern.carried}
         baseline = None
         if self.options.baseline:
@@ -124,7 +128,8 @@ class Demo:
             baseline = await self.run_baseline()
             carried[BASELINE_NAME] = baseline.carried
         self._say("reading the logs")
-        return self.judge(started, floor_s, sern, baseline, carried)
+        report = self.judge(started, floor_s, sern, baseline, carried)
+        return replace(report, remarks=() if busy is None else (busy,))
 
     def _say(self, text: str) -> None:
         self.console.print(text, highlight=False)
@@ -486,7 +491,7 @@ def demo(
         if bag is not None and not bag.exists():
             raise ConfigError("no such file or directory", file=str(bag))
         if picture is not None and find_spec("matplotlib") is None:
-            raise ConfigError("--picture needs matplotlib: pip install matplotlib")
+            raise ConfigError(f"--picture needs matplotlib: {installing('matplotlib')}")
         scenario = Scenario(link, duration or link.duration_s, overload=overload, seed=seed, bag=bag)
         options = Options(
             scenario=scenario,

@@ -15,6 +15,7 @@ from rich.table import Table
 from rich.text import Text
 
 from sern_core.types import CLASS_LABELS
+from sern_runtime.config.endpoints import installing
 from sern_sim.profiles import LinkProfile
 from sern_tools import demo_charts
 from sern_tools.checkout import commit
@@ -331,7 +332,8 @@ def _figures(report: Report) -> list[str]:
             ("Delivered and dropped, by class", demo_charts.drops(report.results)),
         ]
     except ImportError:
-        return ["<p>No pictures: matplotlib is not installed (<code>pip install matplotlib</code>).</p>"]
+        command = html.escape(installing("matplotlib"))
+        return [f"<p>No pictures: matplotlib is not installed (<code>{command}</code>).</p>"]
     return [
         f'<h2>{title}</h2><img alt="{title}" src="data:image/png;base64,{base64.b64encode(png).decode()}">'
         for title, png in charts

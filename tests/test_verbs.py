@@ -76,6 +76,7 @@ else:
     if status:
         (line,) = said
         assert f"is Python {version[0]}.{version[1]}, SERN needs 3.11 to 3.13" in line and "deploy/README.md" in line
+        assert "make PYTHON=python3.11 setup" in line  # without its verb it would print the help
         assert not (tmp_path / "asked").exists() and not (tmp_path / "venv").exists()
     else:
         assert said == [] and (tmp_path / "asked").read_text() == f"-m venv {tmp_path / 'venv'}"

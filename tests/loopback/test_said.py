@@ -194,12 +194,15 @@ async def test_a_reload_that_fails_twice_says_what_is_wrong_now_until_one_works(
         assert relay._status().endswith(f"relay.clients_dir: {tmp_path}/nobody: no such directory")
         assert "acces:" not in relay._status()
         assert "\nsern_relay_reload_failed 1.0\n" in (await get(relay, "/metrics"))[1]
+        status, line = await get(relay, "/readyz")
+        assert status == 200 and line.startswith("listening; reload failed, the old configuration stays: ")
         failed = [record for record in caplog.records if "reload failed, the old configuration stays" in record.message]
         assert [record.levelname for record in failed] == ["ERROR", "ERROR"]
         relay.loaded.path.write_text(good)
         relay.reload()
         assert relay._status() == "0 clients, 0 streams"
         assert "\nsern_relay_reload_failed 0.0\n" in (await get(relay, "/metrics"))[1]
+        assert await get(relay, "/readyz") == (200, "listening\n")
         assert sum("the reload works again" in message for message in caplog.messages) == 1
 
 

@@ -69,6 +69,20 @@ def test_a_relay_that_does_not_resolve_is_a_warning(deployed: Path) -> None:
     assert out.endswith("site.yaml: right\n")
 
 
+def test_warnings_stand_where_they_are_seen_after_the_tables(deployed: Path) -> None:
+    """A terminal shows its last lines, and the tables of an example are longer than one."""
+    terminal = StringIO()
+    text = (deployed / "robot.yaml").read_text()
+    (deployed / "robot.yaml").write_text(text.replace('match: "/cmd_vel", ', 'match: "cmd_vel", '))
+    console = Console(file=terminal, width=200)
+    assert check.run_check(deployed / "robot.yaml", out=console, err=console) == 0
+    *others, pattern, name, last = terminal.getvalue().splitlines()
+    assert pattern.endswith("matches no topic: names begin with '/'; /cmd_vel?")
+    assert name.endswith(f"relay.example does not resolve on this machine now: {NO_NAME}")
+    assert last == f"{deployed}/robot.yaml: right"
+    assert not any("warning" in line for line in others)
+
+
 async def test_why_a_name_does_not_resolve() -> None:
     """One that no resolver has to be asked about: a label has 63 characters at most."""
     with pytest.raises(UnresolvedError, match="label"):

@@ -199,7 +199,7 @@ def test_without_matplotlib_the_page_has_no_pictures(monkeypatch: pytest.MonkeyP
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     page = page_of(report_of())
     assert page.sources == []
-    assert "matplotlib is not installed" in " ".join(page.words)
+    assert f"{sys.executable} -m pip install matplotlib" in " ".join(page.words)
 
 
 def test_what_became_of_a_class_adds_up() -> None:

@@ -191,7 +191,8 @@ def test_a_picture_without_matplotlib_is_refused_before_the_run(
     with pytest.raises(typer.Exit) as ended:
         demo(picture=Path("age.png"))
     assert ended.value.exit_code == EXIT_ERROR
-    assert capsys.readouterr().err == "sern demo: --picture needs matplotlib: pip install matplotlib\n"
+    command = f"{sys.executable} -m pip install matplotlib"
+    assert capsys.readouterr().err == f"sern demo: --picture needs matplotlib: {command}\n"
 
 
 @pytest.mark.parametrize("stage", ["1/3", LIVE, "3/3"])

@@ -19,6 +19,7 @@ from typing import Any, Final
 
 from sern_client.endpoints.handover import Handover
 from sern_core.errors import ConfigError
+from sern_runtime.config.endpoints import installing
 from sern_runtime.ros_types import one_line
 
 DEFAULT_CONNECT: Final = ("tcp/localhost:7447",)
@@ -35,12 +36,12 @@ _log = logging.getLogger(__name__)
 
 
 def load_zenoh() -> ModuleType:
-    """The zenoh module; ConfigError naming the extra that brings it."""
+    """The zenoh module; ConfigError naming the command that installs it."""
     try:
         import zenoh
         import zenoh.ext
     except ImportError:
-        raise ConfigError("needs the zenoh library: pip install eclipse-zenoh") from None
+        raise ConfigError(f"needs the zenoh library: {installing('eclipse-zenoh')}") from None
     return zenoh
 
 

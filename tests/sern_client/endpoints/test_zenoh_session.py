@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+import sys
 from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,7 @@ from sern_client.endpoints.zenoh import session as module
 from sern_client.endpoints.zenoh.endpoint import ZenohEndpoint, ZenohOptions
 from sern_client.endpoints.zenoh.session import SessionOptions, load_zenoh, make_config
 from sern_client.factory import make_section
-from sern_core.errors import ServiceError
+from sern_core.errors import ConfigError, ServiceError
 from sern_core.types import DropReason, Encoding, TopicName
 from sern_runtime import ros_types
 from sern_runtime.config import endpoints as sections
@@ -60,6 +61,14 @@ async def test_a_loop_that_is_behind_counts_what_it_drops(monkeypatch: pytest.Mo
         assert endpoint.drops == {DropReason.QUEUE_FULL: 2}
     finally:
         await endpoint.stop()
+
+
+def test_without_the_library_the_command_is_named_that_installs_it_here(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Another pip would put it beside SERN, or refuse to."""
+    monkeypatch.setitem(sys.modules, "zenoh", None)
+    with pytest.raises(ConfigError) as raised:
+        load_zenoh()
+    assert str(raised.value) == f"needs the zenoh library: {sys.executable} -m pip install eclipse-zenoh"
 
 
 def configured(options: SessionOptions) -> dict[str, Any]:
