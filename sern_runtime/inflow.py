@@ -14,6 +14,7 @@ import asyncio
 import ctypes
 import resource
 import threading
+import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Final, Generic, Protocol, TypeVar
@@ -29,7 +30,8 @@ LOOK_S: Final = 3e-6
 SHARE: Final = 0.005
 FORGIVEN_BYTES_PER_S: Final = 1024.0
 """Heartbeats of an idle connection: they bring bytes and no message."""
-TRIM_AFTER_S: Final = 1.0
+TRIM_AFTER_S: Final = (1.0, 4.0, 16.0)
+"""From one time to the next."""
 
 
 class Handle(Protocol):
@@ -155,22 +157,44 @@ def resident_bytes() -> int:
         return 0
 
 
-_trimming = threading.Lock()
+class Trimmer:
+    """Asks the C library to give freed memory back to the system, beside the loop and several times: libzmq frees what
+    it had read of a connection in a thread of its own, on a busy machine long after the connection was cut.
+    """
+
+    def __init__(self, trim: Callable[[], object], sleep: Callable[[float], object] = time.sleep) -> None:
+        self._trim = trim
+        self._sleep = sleep
+        self._lock = threading.Lock()
+        self._delays_s: list[float] = []
+        self._running = False
+
+    def __call__(self) -> None:
+        """Trim after each of `TRIM_AFTER_S`, counted anew when called again meanwhile."""
+        with self._lock:
+            self._delays_s = list(TRIM_AFTER_S)
+            if self._running:
+                return
+            self._running = True
+        threading.Thread(target=self._run, name="trim-memory", daemon=True).start()
+
+    def _run(self) -> None:
+        while True:
+            with self._lock:
+                if not self._delays_s:
+                    self._running = False
+                    return
+                delay_s = self._delays_s.pop(0)
+            self._sleep(delay_s)
+            self._trim()
 
 
-def trim_memory() -> None:
-    """Give freed memory back to the system, beside the loop and after a moment in which more may be freed. Nothing
-    where the C library has no `malloc_trim`, or while an earlier call waits."""
-    if _trimming.acquire(blocking=False):
-        timer = threading.Timer(TRIM_AFTER_S, _trim)
-        timer.daemon = True
-        timer.start()
+def _malloc_trim() -> None:
+    """Nothing where the C library has no such function."""
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+    if trim is not None:
+        trim(0)
 
 
-def _trim() -> None:
-    try:
-        trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
-        if trim is not None:
-            trim(0)
-    finally:
-        _trimming.release()
+trim_memory: Final = Trimmer(_malloc_trim)
+"""The one of this process."""

@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 import zmq
 
-from sern_runtime.inflow import LIMIT_BYTES, Inflow
+from sern_runtime.inflow import LIMIT_BYTES, TRIM_AFTER_S, Inflow, Trimmer
 from sern_runtime.monitor import ConnectionTable, TcpHandle
 from sern_runtime.zmq_socket import SKIP_FRAMES, DealerSocket, FrameSocket, RouterSocket, make_client, make_server
-from tests.support import until
+from tests.support import DEADLINE_S, until
 
 Context = zmq.Context[zmq.Socket[bytes]]
 GREETING = b"\xff" + bytes(8) + b"\x7f\x03\x00NULL".ljust(54, b"\0") + b"\0"
@@ -183,6 +183,57 @@ async def test_other_sockets_drop_them_in_slices_too(zmq_context: Context, kind:
     assert reader.drains >= drains + 5
     sender.close(linger=0)
     reader.close()
+
+
+class Trims:
+    """A trimmer whose times pass one by one, when the test says so."""
+
+    def __init__(self) -> None:
+        self.trims = 0
+        self.delays_s: list[float] = []
+        self._asleep = threading.Semaphore(0)
+        self._awake = threading.Semaphore(0)
+        self.trimmer = Trimmer(self._trim, self._sleep)
+
+    def _trim(self) -> None:
+        self.trims += 1
+
+    def _sleep(self, delay_s: float) -> None:
+        self.delays_s.append(delay_s)
+        self._asleep.release()
+        assert self._awake.acquire(timeout=DEADLINE_S)
+
+    def asleep(self) -> None:
+        assert self._asleep.acquire(timeout=DEADLINE_S)
+
+    def wake(self) -> None:
+        self._awake.release()
+
+
+async def test_memory_that_is_freed_late_is_given_back_too() -> None:
+    trims = Trims()
+    trims.trimmer()
+    for number in range(len(TRIM_AFTER_S)):
+        trims.asleep()
+        assert trims.trims == number
+        trims.wake()
+    await until(lambda: trims.trims == len(TRIM_AFTER_S), "trimmed")
+    assert trims.delays_s == list(TRIM_AFTER_S)
+
+
+async def test_the_times_of_giving_back_count_anew_when_more_was_cut() -> None:
+    trims = Trims()
+    trims.trimmer()
+    trims.asleep()
+    trims.wake()
+    trims.asleep()
+    trims.trimmer()
+    for _ in TRIM_AFTER_S:
+        trims.wake()
+        trims.asleep()
+    trims.wake()
+    await until(lambda: trims.trims == 2 + len(TRIM_AFTER_S), "trimmed")
+    assert trims.delays_s == [*TRIM_AFTER_S[:2], *TRIM_AFTER_S]
 
 
 class FakeHandle:
