@@ -26,7 +26,8 @@ from numpy.typing import NDArray
 from benchmarks import recordings
 from benchmarks.common import Report, interleaved, main
 from sern_client.endpoints.clouds import cloud_body, read_ply
-from sern_core.codecs import Compression, encode
+from sern_core.codec_names import Compression
+from sern_core.codecs import encode
 from sern_core.errors import UsageError
 from sern_core.summaries.bodies import Header
 from sern_core.summaries.clouds import read_cloud

@@ -40,8 +40,9 @@ from sern_core.errors import ConfigError, UsageError
 from sern_core.lease import CommandLease
 from sern_core.ledger import MAX_TOPICS, OTHER_TOPIC
 from sern_core.message import Message, StreamId, StreamInfo, TopicInfo
+from sern_core.names import to_global
 from sern_core.queues import OutChannel
-from sern_core.rules import Discovery, ResolvedTopic, RuleSet, to_global
+from sern_core.rules import Discovery, ResolvedTopic, RuleSet
 from sern_core.services import parse as parse_service
 from sern_core.session import DISPLACED
 from sern_core.summaries.transforms import is_static

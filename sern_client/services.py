@@ -22,8 +22,8 @@ from sern_core.client import ClientCore
 from sern_core.errors import ConfigError, ServiceError, UsageError
 from sern_core.ledger import MAX_TOPICS, OTHER_TOPIC
 from sern_core.message import Message, StreamId, StreamInfo, TopicInfo, TopicSpec
+from sern_core.names import to_global, to_local
 from sern_core.queues import OutChannel
-from sern_core.rules import to_global, to_local
 from sern_core.services import (
     CALL,
     MAX_CALLS,

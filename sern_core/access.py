@@ -15,8 +15,8 @@ from enum import StrEnum
 from typing import Final, NamedTuple
 
 from sern_core.errors import ConfigError, UsageError
+from sern_core.names import NAME_MAX_CHARS
 from sern_core.patterns import PatternError, PatternSet, compile_pattern
-from sern_core.rules import NAME_MAX_CHARS
 from sern_core.types import ClientName, TopicName
 
 SELF: Final = "{self}"

@@ -13,7 +13,7 @@ from typing import Final
 from sern_core import wire
 from sern_core.errors import UsageError, WireError
 from sern_core.message import StreamId, StreamInfo, TopicInfo, TopicSpec
-from sern_core.rules import NAME_MAX_CHARS
+from sern_core.names import NAME_MAX_CHARS
 from sern_core.types import ClientName, Durability, Encoding, PriorityClass, Reliability, TopicName
 
 DEFINITION_HASH_CHARS: Final = 32
@@ -21,6 +21,8 @@ MAX_DEPTH: Final = 100_000
 MAX_TIME_S: Final = 1e9
 MAX_STRINGS: Final = 48
 """Items of one list in an envelope (below wire.MAX_ENVELOPE_ITEMS); longer lists are sent in parts."""
+MAX_ASKED: Final = 128
+"""Clients of whom a client may ask whether they are here, and of whom it waits to be told that they are."""
 MAX_HASH_CHARS: Final = 128
 MAX_ATTRIBUTES: Final = 16
 MAX_ATTRIBUTE_CHARS: Final = 256

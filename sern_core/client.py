@@ -11,7 +11,8 @@ from typing import Final, ParamSpec, Protocol
 
 from sern_core import wire
 from sern_core.announce import MAX_STRINGS, Announcement, check_stream
-from sern_core.codecs import CodecProfile, Coder, Compression
+from sern_core.codec_names import Compression
+from sern_core.codecs import CodecProfile, Coder
 from sern_core.decoding import Decoder
 from sern_core.definitions import DefinitionStore
 from sern_core.errors import ConfigError, WireError

@@ -18,15 +18,14 @@ import sys
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from enum import IntEnum, StrEnum
 from struct import Struct
 from typing import Final, NamedTuple
 
 import lz4.block
 
 from sern_core import lossy
+from sern_core.codec_names import Codec, Compression, LossyParams
 from sern_core.errors import CodecError
-from sern_core.lossy import LossyParams
 from sern_core.types import Encoding
 
 if sys.version_info >= (3, 14):
@@ -50,27 +49,6 @@ MAX_LZ4_RATIO: Final = 255
 ZSTD_MAGIC: Final = b"\x28\xb5\x2f\xfd"
 MIN_WINDOW_LOG: Final = 10
 MAX_WINDOW_LOG: Final = 27
-
-
-class Codec(IntEnum):
-    """The codec byte of DATA_FIRST: how a body is encoded."""
-
-    NONE = 0
-    LZ4 = 1  # one LZ4 block
-    ZSTD = 2  # one Zstandard frame, of any level
-    DRACO = 3  # a point cloud, thinned; lossy
-    JPEG = 4  # an image; lossy
-
-
-class Compression(StrEnum):
-    """The modes z of the paper's eq. (config_vector): what a sender may do with a body."""
-
-    NONE = "none"
-    LZ4 = "lz4"
-    ZSTD = "zstd"
-    ZSTD_STRONG = "zstd_strong"
-    VOXEL_DRACO = "voxel_draco"  # lossy, for point clouds
-    JPEG = "jpeg"  # lossy, for images
 
 
 CODEC_OF: Final = {

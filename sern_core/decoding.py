@@ -8,7 +8,8 @@ from collections import deque
 from collections.abc import Callable
 from typing import Final, Generic, TypeVar
 
-from sern_core.codecs import Codec, Coder, Work, raw_size
+from sern_core.codec_names import Codec
+from sern_core.codecs import Coder, Work, raw_size
 from sern_core.errors import CodecError
 from sern_core.message import Message, StreamId, StreamInfo
 from sern_core.types import DropReason

@@ -8,116 +8,20 @@ expires. At most `MAX_RUNNING` are encoded at a time; who comes later waits with
 """
 
 from collections.abc import Callable
-from enum import IntEnum
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
-from sern_core.codecs import (
-    LOSSLESS,
-    MIN_BYTES,
-    Codec,
-    CodecProfile,
-    Coder,
-    Compression,
-    Encoded,
-    LossyTopic,
-    Work,
-    blend,
-    quickest,
-)
-from sern_core.errors import UsageError
+from sern_core.codec_names import Codec, Compression
+from sern_core.codecs import MIN_BYTES, CodecProfile, Coder, Encoded, Work, blend
+from sern_core.coding import ChannelCodec, Coding
 from sern_core.message import Message
+from sern_core.out_message import OutMessage
+from sern_core.queues import OutChannel
 from sern_core.types import PriorityClass
-
-if TYPE_CHECKING:
-    from sern_core.out_message import OutMessage
-    from sern_core.queues import OutChannel
 
 PROBE_EVERY: Final = 50
 """One message in so many is encoded in every mode, to know what each makes of the topic."""
-CHOOSE_INTERVAL_S: Final = 0.1
-"""How long a choice of `auto` stands."""
 MAX_RUNNING: Final = 2
 """Bodies of one link that other threads encode at a time: what leaves next, and one behind it."""
-RATIO_GAIN: Final = 0.2
-
-
-class Coding(IntEnum):
-    """Where one body stands."""
-
-    RAW = 0  # nobody has looked at it yet
-    HELD = 1  # chosen, and waits for its turn to be encoded
-    RUNNING = 2  # another thread encodes it
-    DONE = 3  # goes as it is now
-
-
-class ChannelCodec:
-    """What one channel does with its bodies, and what it found out about them."""
-
-    __slots__ = (
-        "due_s",
-        "encoded_bytes",
-        "messages_to_probe",
-        "mode",
-        "modes",
-        "probing",
-        "profiles",
-        "ratio",
-        "raw_bytes",
-        "setting",
-        "topic",
-    )
-
-    def __init__(self, setting: Compression | None, topic: LossyTopic | None = None) -> None:
-        self.topic = topic
-        """The lossy modes that are allowed; None: none."""
-        self.modes = LOSSLESS[1:] if topic is None else (*LOSSLESS[1:], *topic.modes)
-        """What there is to choose from, beside `none`."""
-        self.setting = setting
-        """The mode to use; None: whichever is quickest (`auto`)."""
-        self.mode = setting or Compression.NONE
-        """The mode in use."""
-        self.profiles: dict[Compression, CodecProfile] = {}
-        """What each mode makes of this topic, as measured; empty before the first message."""
-        self.ratio = 1.0
-        """What becomes of a body, by bytes, in recent messages: what is left of one that is not encoded yet."""
-        self.raw_bytes = 0
-        self.encoded_bytes = 0
-        """Bytes of all messages chosen so far, before and after, those that went as they were included."""
-        self.messages_to_probe = 0
-        self.probing = False
-        self.due_s = -float("inf")
-
-    def choose(self, nbytes: int, rate_bps: float | None, now: float) -> Compression:
-        """The mode for a body of `nbytes`. On a link that has never been full (rate None) nothing is to be gained."""
-        if now >= self.due_s:
-            self.due_s = now + CHOOSE_INTERVAL_S
-            if self.setting is not None:
-                self.mode = self.setting
-            elif rate_bps:
-                self.mode = quickest(self.profiles, self.modes, nbytes, rate_bps / 8)
-            else:
-                self.mode = Compression.NONE
-        return self.mode
-
-    def use(self, setting: Compression | None) -> None:
-        """Another mode from the next body on. UsageError for a lossy one that the topic does not allow."""
-        if setting is not None and setting is not Compression.NONE and setting not in self.modes:
-            raise UsageError(f"{setting} loses something, and the topic does not allow it (`lossy`)")
-        self.setting = setting
-        self.due_s = -float("inf")
-        if setting is not None:
-            self.mode = setting
-            profile = self.profiles.get(setting)
-            if setting is Compression.NONE:
-                self.ratio = 1.0
-            elif profile is not None:
-                self.ratio = min(1.0, profile.ratio)
-
-    def measured(self, raw_bytes: int, encoded_bytes: int) -> None:
-        """A body went from `raw_bytes` to `encoded_bytes`."""
-        self.raw_bytes += raw_bytes
-        self.encoded_bytes += encoded_bytes
-        self.ratio += RATIO_GAIN * (encoded_bytes / raw_bytes - self.ratio)
 
 
 class EncodeRequest(Work):
@@ -125,7 +29,7 @@ class EncodeRequest(Work):
 
     __slots__ = ("channel", "encoder", "message", "mode", "out", "priority", "result", "topic")
 
-    def __init__(self, encoder: "Encoder", channel: "OutChannel", out: "OutMessage", mode: Compression) -> None:
+    def __init__(self, encoder: "Encoder", channel: OutChannel, out: OutMessage, mode: Compression) -> None:
         self.encoder = encoder
         self.channel = channel
         self.out = out
@@ -173,7 +77,7 @@ class Encoder:
     """The encoding of one link. `refresh` tells its scheduler that what a channel would send next has changed."""
 
     def __init__(
-        self, coder: Coder, *, rate_bps: Callable[[], float | None], refresh: Callable[["OutChannel", float], None]
+        self, coder: Coder, *, rate_bps: Callable[[], float | None], refresh: Callable[[OutChannel, float], None]
     ) -> None:
         self.coder = coder
         self.running = 0
@@ -181,7 +85,7 @@ class Encoder:
         self._refresh = refresh
         self._held: list[tuple[OutChannel, OutMessage]] = []
 
-    def ready(self, channel: "OutChannel", out: "OutMessage", codec: ChannelCodec, *, now: float) -> bool:
+    def ready(self, channel: OutChannel, out: OutMessage, codec: ChannelCodec, *, now: float) -> bool:
         """The scheduler has chosen `out`, whose body nobody has looked at: may it go now? False: not yet."""
         message = out.message
         size = out.size
@@ -220,7 +124,7 @@ class Encoder:
             self.coder.offload(probe)
 
     def _apply(
-        self, channel: "OutChannel", out: "OutMessage", codec: ChannelCodec, encoded: Encoded | None, mode: Compression
+        self, channel: OutChannel, out: OutMessage, codec: ChannelCodec, encoded: Encoded | None, mode: Compression
     ) -> None:
         """The body is what it will be. None: as it was."""
         size = out.size

@@ -34,6 +34,7 @@ from sern_core.lanes import LANE_EXPRESS
 from sern_core.ledger import ReceiveLedger
 from sern_core.link import TIDY_S, Link
 from sern_core.message import Message, StreamId, StreamInfo
+from sern_core.names import is_client_name, name_problem
 from sern_core.object_control import apply_object
 from sern_core.objects import ObjectRegistry
 from sern_core.out_message import OutMessage
@@ -42,7 +43,6 @@ from sern_core.presence import Presence
 from sern_core.queues import LAPSED_A_SWEEP, OutChannel
 from sern_core.replay import ReplayStore, as_replays, newest_that_fit, waiting_bytes
 from sern_core.routing import UNIT_S, BadPatternError, Denied, Match, RouteChange, RoutingTable
-from sern_core.rules import is_client_name, name_problem
 from sern_core.session import DISPLACED
 from sern_core.trace import DecisionTrace
 from sern_core.types import DROP_CODES, ClientName, DropReason, TopicName

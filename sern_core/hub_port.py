@@ -5,26 +5,44 @@ HELLO, and a newer connection of the same client takes the session over. `Hub` k
 """
 
 import math
-from typing import TYPE_CHECKING, Final
+from collections.abc import Container
+from typing import Final, Protocol
 
 from sern_core import wire
 from sern_core.errors import RemoteError, VersionError
+from sern_core.hub_matching import Matching
 from sern_core.link import Link
 from sern_core.sending import microseconds
 from sern_core.session import DISPLACED
 from sern_core.types import ClientName
 
-if TYPE_CHECKING:
-    from sern_core.hub import Hub
-
 RESET_INTERVAL_S: Final = 0.5
+
+
+class PortHub(Protocol):
+    """What a port needs of the hub that keeps its link."""
+
+    port_of: "dict[ClientName, HubPort]"
+    """The connection that has the session of each client."""
+    matching: Matching
+
+    @property
+    def local_owners(self) -> Container[str]: ...
+
+    def greet(self, port: "HubPort", hello: wire.Envelope, header: wire.Header, *, now: float) -> None: ...
+
+    def left(self, client: ClientName, *, now: float) -> None: ...
+
+    def failed(self, client: ClientName, error: Exception, *, now: float) -> None: ...
+
+    def after(self) -> None: ...
 
 
 class HubPort:
     """One transport connection of one client, as the lane below sees it. `client` is bound to the peer's key;
     `address` is where it comes from, for people."""
 
-    def __init__(self, hub: "Hub", client: ClientName, address: str = "") -> None:
+    def __init__(self, hub: PortHub, client: ClientName, address: str = "") -> None:
         self.hub = hub
         self.client = client
         self.address = address

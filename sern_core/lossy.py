@@ -27,6 +27,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from sern_core.codec_names import LossyParams
 from sern_core.errors import BodyError, CodecError
 from sern_core.summaries.bodies import BodyReader, BodyWriter, Header
 from sern_core.summaries.clouds import Cloud, Field, read_cloud, write_cloud
@@ -51,17 +52,6 @@ _POINT_BYTES: Final = 12
 _XYZ: Final = tuple(Field(name, 4 * i, 7) for i, name in enumerate("xyz"))
 _KINDS: Final = (Encoding.ROS1, Encoding.CDR)
 _PIXELS: Final = {"rgb8": 3, "bgr8": 3, "mono8": 1}
-
-
-@dataclass(frozen=True, slots=True)
-class LossyParams:
-    """How much may be lost. `voxel_m`: edge of a voxel in metres; `jpeg_quality` from 1 to 95."""
-
-    voxel_m: float = 0.1
-    jpeg_quality: int = 75
-
-
-DEFAULT_LOSSY: Final = LossyParams()
 
 
 def missing(mode: str) -> str | None:

@@ -3,8 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
-from sern_core.codecs import Codec, Compression
-from sern_core.lossy import DEFAULT_LOSSY, LossyParams
+from sern_core.codec_names import DEFAULT_LOSSY, Codec, Compression, LossyParams
 from sern_core.types import (
     DROP_REASONS,
     ClientName,

@@ -26,10 +26,12 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Final
 
-from sern_core.codecs import Codec, Work, decode, raw_size
+from sern_core.codec_names import Codec
+from sern_core.codecs import Work, decode, raw_size
 from sern_core.errors import CodecError, RefusedError
 from sern_core.message import StreamId, StreamInfo
-from sern_core.rules import COMMAND_TYPES, plain_type
+from sern_core.names import plain_type
+from sern_core.rules import COMMAND_TYPES
 from sern_core.types import ClientName, ObjectKind, PriorityClass, TopicName
 from sern_core.xr_object import ChangedIds, ObjectChanges, XrObject
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 
-from sern_core.encoding import Coding
+from sern_core.coding import Coding
 from sern_core.message import Message
 from sern_core.types import DROP_CODES, DropReason
 

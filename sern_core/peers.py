@@ -14,9 +14,9 @@ from enum import StrEnum
 from typing import Any, Final, NamedTuple
 
 from sern_core import wire
+from sern_core.announce import MAX_ASKED
 from sern_core.errors import WireError
 from sern_core.patterns import PatternError, PatternSet
-from sern_core.presence import MAX_ASKED
 from sern_core.types import ClientName, TopicName
 
 LET_GO_S: Final = 60.0

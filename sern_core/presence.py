@@ -20,6 +20,7 @@ from math import ceil
 from typing import Final, NamedTuple, Protocol
 
 from sern_core import wire
+from sern_core.announce import MAX_ASKED
 from sern_core.lanes import Lane
 from sern_core.types import ClientName
 
@@ -27,8 +28,6 @@ MAX_TOLD: Final = 24
 """Peers in one message: an envelope holds 4 KiB."""
 TOLD_AT_ONCE: Final = 500
 """Messages in one turn of the loop: some milliseconds."""
-MAX_ASKED: Final = 128
-"""Clients of whom a client may ask whether they are here, and of whom it waits to be told that they are."""
 BACK_PAUSE_S: Final = 5.0
 """A client that is here again has so long to say what it has, before a client that looks for it is told that it has
 nothing there: that one would end what it shows of it, and begin again."""

@@ -18,7 +18,7 @@ from math import inf
 from operator import attrgetter
 from typing import Any, Final
 
-from sern_core.encoding import ChannelCodec, Coding
+from sern_core.coding import ChannelCodec, Coding
 from sern_core.ledger import LOSSES, SendCounters
 from sern_core.message import Message, StreamInfo
 from sern_core.out_message import OutMessage, in_sequence

@@ -30,8 +30,8 @@ from typing import Final, NamedTuple
 from sern_core.access import AccessTable
 from sern_core.errors import RefusedError
 from sern_core.message import StreamId, StreamInfo, TopicInfo
+from sern_core.names import name_problem, plain_type
 from sern_core.patterns import MAX_CLIENT_PROGRAM, PatternError, PatternSet
-from sern_core.rules import name_problem, plain_type
 from sern_core.types import ClientName, TopicName
 
 RETIRED_BOOTS: Final = 8

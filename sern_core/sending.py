@@ -13,8 +13,10 @@ from typing import Any, Final, NamedTuple
 from sern_core import wire
 from sern_core.cadence import Cadences
 from sern_core.clocksync import ClockSync
-from sern_core.codecs import LOSSY, Coder, Compression, LossyTopic
-from sern_core.encoding import ChannelCodec, Coding, Encoder
+from sern_core.codec_names import Compression
+from sern_core.codecs import LOSSY, Coder, LossyTopic
+from sern_core.coding import ChannelCodec, Coding
+from sern_core.encoding import Encoder
 from sern_core.fragments import InStream, Reassembly
 from sern_core.lanes import (
     COPY_DELAY_S,
@@ -26,10 +28,10 @@ from sern_core.lanes import (
 )
 from sern_core.ledger import SendCounters, SendLedger
 from sern_core.message import Message, StreamId, StreamInfo, TopicInfo, TopicSpec
+from sern_core.names import plain_type
 from sern_core.out_message import OutMessage
 from sern_core.params import LinkParams, SchedulerParams
 from sern_core.queues import OutChannel
-from sern_core.rules import plain_type
 from sern_core.scheduler import Scheduler
 from sern_core.trace import DecisionTrace, TraceEvent
 from sern_core.types import (

@@ -10,8 +10,8 @@ from sern_core import wire
 from sern_core.errors import RemoteError, UsageError, WireError
 from sern_core.hub import Hub
 from sern_core.hub_port import HubPort
+from sern_core.names import client_name
 from sern_core.params import Redundancy
-from sern_core.rules import client_name
 from sern_core.types import ClientName
 from sern_relay.express import JOIN, Joined, RelayExpress
 from sern_runtime import clock

@@ -25,8 +25,8 @@ from typing import Final
 
 from sern_core.errors import BodyError, RefusedError
 from sern_core.message import Message, StreamId, StreamInfo
+from sern_core.names import plain_type
 from sern_core.objects import ObjectRegistry
-from sern_core.rules import plain_type
 from sern_core.summaries.transforms import Transform, read_transforms
 from sern_core.types import ClientName, Encoding, ObjectKind
 from sern_runtime.clock import now

@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from dataclasses import asdict
 from typing import Any
 
-from sern_core.encoding import ChannelCodec
+from sern_core.coding import ChannelCodec
 from sern_core.ledger import ReceiveLedger
 from sern_core.link import Link
 from sern_core.message import StreamInfo

@@ -33,8 +33,8 @@ from sern_core import wire
 from sern_core.client import ClientCore
 from sern_core.errors import ConfigError, RefusedError, SernError, UsageError
 from sern_core.message import Message, StreamId, StreamInfo
+from sern_core.names import client_name, name_problem
 from sern_core.params import LinkParams, SchedulerParams
-from sern_core.rules import client_name, name_problem
 from sern_core.session import DISPLACED, NEW_SESSION
 from sern_core.types import ClientName, DropReason, Encoding, TopicName
 from sern_runtime import clock

@@ -12,13 +12,13 @@ from typing import NamedTuple
 from sern_core import wire
 from sern_core.access import AccessRule, AccessTable
 from sern_core.client import ClientCore
-from sern_core.codecs import Coder, Compression, Work, raw_size
+from sern_core.codec_names import DEFAULT_LOSSY, Compression, LossyParams
+from sern_core.codecs import Coder, Work, raw_size
 from sern_core.decoding import DecodeRequest
 from sern_core.encoding import EncodeRequest
 from sern_core.hub import Hub, HubParams
 from sern_core.hub_port import HubPort
 from sern_core.link import Link
-from sern_core.lossy import DEFAULT_LOSSY, LossyParams
 from sern_core.message import Message, StreamId, StreamInfo, TopicInfo, TopicSpec
 from sern_core.params import LinkParams, SchedulerParams
 from sern_core.queues import OutChannel

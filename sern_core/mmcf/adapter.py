@@ -13,7 +13,8 @@ from math import isfinite
 from statistics import fmean
 from typing import Final, NamedTuple
 
-from sern_core.codecs import LOSSLESS, LOSSY, RAW_PROFILE, CodecProfile, Coder, Compression
+from sern_core.codec_names import Compression
+from sern_core.codecs import LOSSLESS, LOSSY, RAW_PROFILE, CodecProfile, Coder
 from sern_core.link import Link
 from sern_core.mmcf.cost import Ranges, Weights, cost, measure
 from sern_core.mmcf.levels import Offer, RawProbe, Summarised, apply_levels, chosen, level_of, offers_by_level

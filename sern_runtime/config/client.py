@@ -8,9 +8,9 @@ from typing import Annotated, Final, Literal, Self
 
 from pydantic import Discriminator, Field, Tag, model_validator
 
-from sern_core.codecs import Compression
-from sern_core.lossy import DEFAULT_LOSSY, LossyParams
+from sern_core.codec_names import DEFAULT_LOSSY, Compression, LossyParams
 from sern_core.message import DEFAULT_RELIABLE_QUEUE_BYTES
+from sern_core.names import name_problem, normal_namespace
 from sern_core.objects import COMMAND_OBJECT_TYPES
 from sern_core.patterns import MAX_CLIENT_PROGRAM, PatternError, PatternSet, compile_pattern
 from sern_core.rules import (
@@ -24,8 +24,6 @@ from sern_core.rules import (
     RuleError,
     RuleSet,
     TopicRule,
-    name_problem,
-    normal_namespace,
 )
 from sern_core.services import ServiceRule, subscriptions
 from sern_core.types import ClientName, Durability, PriorityClass, Reliability, TopicName

@@ -9,9 +9,10 @@ from pydantic import Field, model_validator
 
 from sern_core.access import DEFAULT_QUEUE_BYTES, AccessRule
 from sern_core.errors import ConfigError, UsageError
+from sern_core.names import client_name, plain_type
 from sern_core.objects import COMMAND_OBJECT_TYPES
 from sern_core.patterns import PatternSet, compile_pattern
-from sern_core.rules import AUTO, FeedRole, FeedTopic, TopicRule, client_name, plain_type
+from sern_core.rules import AUTO, FeedRole, FeedTopic, TopicRule
 from sern_core.types import ClientName, Durability, Encoding, PriorityClass, Reliability
 from sern_runtime import ros_types
 from sern_runtime.config.adaptation import AdaptationSection

@@ -5,8 +5,8 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, Discriminator, Field, Tag, model_validator
 
 from sern_core.errors import UsageError
+from sern_core.names import topic_name
 from sern_core.replay import MAX_REPLAY_MESSAGES
-from sern_core.rules import topic_name
 from sern_core.summaries.mask import MAX_CELLS, MaskParams
 from sern_core.summaries.obstacles import Band
 from sern_core.summaries.patches import PatchParams

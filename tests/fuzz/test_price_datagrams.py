@@ -12,7 +12,8 @@ import pytest
 
 from sern_core import wire
 from sern_core.announce import Announcement, definition_hash, encode_announcement
-from sern_core.codecs import Compression, encode
+from sern_core.codec_names import Compression
+from sern_core.codecs import encode
 from sern_core.errors import WireError
 from sern_core.message import StreamId, StreamInfo, TopicInfo
 from sern_core.types import Encoding, TopicName

@@ -11,7 +11,8 @@ import zmq
 from sern_client.daemon import ClientDaemon
 from sern_client.endpoints.clouds import read_ply
 from sern_core import lossy
-from sern_core.codecs import Coder, Compression, Work
+from sern_core.codec_names import Compression
+from sern_core.codecs import Coder, Work
 from sern_core.errors import ConfigError
 from sern_core.params import LinkParams
 from sern_core.summaries.voxel import thin_rows

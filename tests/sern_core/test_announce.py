@@ -25,7 +25,7 @@ from sern_core.announce import (
 )
 from sern_core.errors import UsageError, WireError
 from sern_core.message import StreamId, StreamInfo, TopicInfo, TopicSpec
-from sern_core.rules import NAME_MAX_CHARS
+from sern_core.names import NAME_MAX_CHARS
 from sern_core.types import ClientName, Durability, Encoding, PriorityClass, Reliability, TopicName
 from tests.exploring import cases
 

@@ -10,7 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sern_core import codecs
-from sern_core.codecs import SIZE, Codec, CodecProfile, Coder, Compression, decode, encode, quickest
+from sern_core.codec_names import Codec, Compression
+from sern_core.codecs import SIZE, CodecProfile, Coder, decode, encode, quickest
 from sern_core.errors import CodecError
 from tests.exploring import cases
 

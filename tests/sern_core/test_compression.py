@@ -7,8 +7,10 @@ from random import Random
 import pytest
 
 from sern_core import codecs
-from sern_core.codecs import SIZE, Codec, Compression
-from sern_core.encoding import PROBE_EVERY, Coding
+from sern_core.codec_names import Codec, Compression
+from sern_core.codecs import SIZE
+from sern_core.coding import Coding
+from sern_core.encoding import PROBE_EVERY
 from sern_core.message import Message
 from sern_core.queues import OutChannel
 from sern_core.types import DropReason, PriorityClass

@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 
 from sern_core import wire
 from sern_core.announce import definition_hash
-from sern_core.codecs import Coder, Compression
+from sern_core.codec_names import Compression
+from sern_core.codecs import Coder
 from sern_core.errors import CodecError, RemoteError, UsageError
 from sern_core.fragments import Partial
 from sern_core.lanes import LANE_UDP, LANE_ZMQ

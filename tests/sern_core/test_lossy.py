@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from sern_client.endpoints.clouds import cloud_body, read_ply
 from sern_core import codecs, lossy
-from sern_core.codecs import SIZE, Codec, Coder, Compression, LossyTopic, decode, encode
+from sern_core.codec_names import Codec, Compression, LossyParams
+from sern_core.codecs import SIZE, Coder, LossyTopic, decode, encode
 from sern_core.errors import CodecError, UsageError
-from sern_core.lossy import LossyParams
 from sern_core.summaries.clouds import read_cloud
 from sern_core.summaries.voxel import thin_rows
 from sern_core.types import Encoding, PriorityClass

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 
-from sern_core.codecs import Compression
+from sern_core.codec_names import Compression
 from sern_core.mmcf.adapter import LOSSY_MODE
 from sern_core.mmcf.cost import Ranges
 from sern_core.mmcf.model import Configuration

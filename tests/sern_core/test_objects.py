@@ -10,7 +10,8 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule, run_state_machine_as_test
 
-from sern_core.codecs import SIZE, Compression, encode
+from sern_core.codec_names import Compression
+from sern_core.codecs import SIZE, encode
 from sern_core.errors import RefusedError
 from sern_core.message import StreamId, StreamInfo, TopicInfo, TopicSpec
 from sern_core.objects import ObjectLimits, ObjectRegistry, kind_of, topic_object_id

@@ -8,6 +8,7 @@ import pytest
 from sern_core import presence as presence_module
 from sern_core import wire
 from sern_core.access import AccessRule, AccessTable
+from sern_core.announce import MAX_ASKED
 from sern_core.errors import WireError
 from sern_core.flight import STALL_MIN_S, STALL_RTTS
 from sern_core.hub import HubParams
@@ -15,7 +16,7 @@ from sern_core.lanes import PING_INTERVAL_S, Lane
 from sern_core.message import TopicInfo
 from sern_core.params import LinkParams
 from sern_core.peers import LET_GO_S, MAX_ENDED, MAX_GIVEN_UP, MAX_PEERS, PeerChange, Peers, PeerStatus, PeerView
-from sern_core.presence import BACK_PAUSE_S, MAX_ASKED, MAX_TOLD, Presence
+from sern_core.presence import BACK_PAUSE_S, MAX_TOLD, Presence
 from sern_core.types import ClientName, Encoding, PriorityClass, TopicName
 from sern_sim.models import LinkModel, Window
 from tests.world import SimClient, World, spec

@@ -9,6 +9,16 @@ from hypothesis import strategies as st
 
 from sern_core.errors import ConfigError, UsageError
 from sern_core.message import KAPPA, TopicInfo, TopicSpec
+from sern_core.names import (
+    client_name,
+    in_namespace,
+    name_problem,
+    normal_namespace,
+    plain_type,
+    to_global,
+    to_local,
+    topic_name,
+)
 from sern_core.patterns import PatternSet, compile_pattern
 from sern_core.rules import (
     Auto,
@@ -21,14 +31,6 @@ from sern_core.rules import (
     RuleError,
     RuleSet,
     TopicRule,
-    client_name,
-    in_namespace,
-    name_problem,
-    normal_namespace,
-    plain_type,
-    to_global,
-    to_local,
-    topic_name,
 )
 from sern_core.types import Durability, Encoding, PriorityClass, Reliability, TopicName
 from tests.exploring import cases

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from sern_core import announce, wire
-from sern_core.codecs import Codec
+from sern_core.codec_names import Codec
 from sern_core.errors import WireError
 from sern_core.message import StreamId, StreamInfo, TopicInfo, TopicSpec
 from sern_core.types import DROP_CODES, ClientName, Encoding, TopicName

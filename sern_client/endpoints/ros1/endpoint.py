@@ -45,7 +45,7 @@ from sern_client.endpoints.ros1.subscription import ReceiveCounters, Source, Sub
 from sern_client.endpoints.ros1.xmlrpc import CallError, XmlRpcServer, check_host, split_uri
 from sern_core.errors import ConfigError, UsageError
 from sern_core.message import TopicInfo
-from sern_core.rules import name_problem
+from sern_core.names import name_problem
 from sern_core.types import DropReason, Encoding, TopicName
 from sern_runtime import ros_types
 

@@ -5,7 +5,7 @@ from xmlrpc.client import Fault
 
 from sern_client.endpoints.ros1.xmlrpc import CallError, XmlRpcClient, decode_call, value_of
 from sern_core.errors import WireError
-from sern_core.rules import name_problem
+from sern_core.names import name_problem
 
 ANY: Final = "*"
 """The type or md5sum that fits every other."""

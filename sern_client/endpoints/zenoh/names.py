@@ -17,7 +17,7 @@ from enum import StrEnum
 from typing import Final, NamedTuple
 
 from sern_core.errors import WireError
-from sern_core.rules import name_problem
+from sern_core.names import name_problem
 from sern_core.types import TopicName
 
 SPACE: Final = "@ros2_lv"
