@@ -19,7 +19,7 @@ from heapq import heappop, heappush
 from random import Random
 from typing import Any, Final
 
-from sern_core.errors import UsageError
+from sern_core.vocabulary.errors import UsageError
 from sern_sim.events import EventLog, SimulationStuck, SimulationTimeoutError
 from sern_sim.links import NEVER, NS, Link, LinkStats, to_ns
 from sern_sim.models import LinkModel
