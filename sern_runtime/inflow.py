@@ -7,7 +7,7 @@ kernel's count of the bytes that were read from a connection: a SERN datagram is
 more than `limit_bytes` were read since the last message came out, no message of ours is on its way, and the connection
 is cut; libzmq then throws the frames away.
 
-`trim_memory` gives back to the system what the C library would keep of them.
+What the C library keeps of them is bounded (`keep_little_memory`), and given back to the system (`trim_memory`).
 """
 
 import asyncio
@@ -32,6 +32,12 @@ FORGIVEN_BYTES_PER_S: Final = 1024.0
 """Heartbeats of an idle connection: they bring bytes and no message."""
 TRIM_AFTER_S: Final = (1.0, 4.0, 16.0)
 """From one time to the next."""
+KEPT_BYTES: Final = 8 * 2**20
+"""Free memory at the end of a thread's heap above which glibc gives it back."""
+MAPPED_BYTES: Final = 4 * 2**20
+"""From this size on glibc maps a block by itself and gives it back when it is freed."""
+_M_TRIM_THRESHOLD: Final = -1
+_M_MMAP_THRESHOLD: Final = -3
 
 
 class Handle(Protocol):
@@ -80,6 +86,7 @@ class Inflow(Generic[H]):
         period_s: float = PERIOD_S,
         clock: Callable[[], float] = now,
     ) -> None:
+        keep_little_memory()
         self.endless = 0
         """Connections that were cut."""
         self.suspects: set[H] = set()
@@ -187,6 +194,18 @@ class Trimmer:
                 delay_s = self._delays_s.pop(0)
             self._sleep(delay_s)
             self._trim()
+
+
+def keep_little_memory() -> None:
+    """Keep glibc from raising its bounds. Idempotent; nothing with another C library.
+
+    Whenever a large block is freed it keeps twice as much as that, up to 64 MiB, at the end of each heap of a thread,
+    where `malloc_trim` does not reach.
+    """
+    library = ctypes.CDLL(None)
+    if hasattr(library, "gnu_get_libc_version"):
+        library.mallopt(_M_TRIM_THRESHOLD, KEPT_BYTES)
+        library.mallopt(_M_MMAP_THRESHOLD, MAPPED_BYTES)
 
 
 def _malloc_trim() -> None:

@@ -19,15 +19,20 @@ OUTGOING: Final = Path("/proc/sys/net/ipv4/ip_local_port_range")
 """First and last port that the kernel gives to outgoing connections, which could take one before its owner listens."""
 USUAL: Final = range(15_000, 32_000)
 """Ports below those, unless it was told otherwise."""
+DDS_PORTS: Final = 100
+"""Of every 250 ports from 7400 on, so many at the beginning are those of a DDS domain (DDSI-RTPS, 9.6.1.1) with up to
+44 participants on this host. They are taken whenever a node starts."""
 
 
 def own_ports(outgoing: Path = OUTGOING) -> list[int]:
-    """Those of USUAL that outgoing connections never have; all of them where that leaves none, or cannot be read."""
+    """Those of USUAL that neither DDS nor outgoing connections take. Those of outgoing ones too where that leaves none,
+    or cannot be read."""
+    ports = [port for port in USUAL if (port - 7400) % 250 >= DDS_PORTS]
     try:
         first, last = map(int, outgoing.read_text().split())
     except (OSError, ValueError):
-        return list(USUAL)
-    return [port for port in USUAL if not first <= port <= last] or list(USUAL)
+        return ports
+    return [port for port in ports if not first <= port <= last] or ports
 
 
 PORTS: Final[Sequence[int]] = own_ports()
@@ -61,16 +66,16 @@ def release_claims() -> None:
 
 
 def free_ports(count: int) -> list[int]:
-    """Ports on loopback that nobody listens on now, and that no other process of this kind is given meanwhile.
+    """Ports on loopback that nobody has, over TCP or UDP, and that no other process of this kind is given meanwhile.
 
     Raises SernError when there are none.
     """
     with ExitStack() as held:
         found: list[int] = []
         for port in random.SystemRandom().sample(PORTS, len(PORTS)):
-            sock = held.enter_context(socket.socket())
             try:
-                sock.bind((HOST, port))
+                for kind in (socket.SOCK_STREAM, socket.SOCK_DGRAM):
+                    held.enter_context(socket.socket(type=kind)).bind((HOST, port))
             except OSError:
                 continue
             if claim(f"port-{port}"):

@@ -22,6 +22,10 @@ def own_claims(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     ports.release_claims()
 
 
+def of_dds(port: int) -> bool:
+    return (port - 7400) % 250 < ports.DDS_PORTS
+
+
 def test_a_claim_holds_in_this_process_and_in_others_until_it_is_released() -> None:
     assert ports.claim(f"{NAME}-one")
     assert not ports.claim(f"{NAME}-one")
@@ -54,11 +58,21 @@ def test_ports_that_the_kernel_gives_to_outgoing_connections_are_left_to_it(
 ) -> None:
     said = tmp_path / "ip_local_port_range"
     said.write_text(outgoing)
-    assert ports.own_ports(said) == [port for part in left for port in part]
+    assert ports.own_ports(said) == [port for part in left for port in part if not of_dds(port)]
 
 
 def test_without_word_of_the_kernel_the_usual_ports_are_taken(tmp_path: Path) -> None:
-    assert ports.own_ports(tmp_path / "none") == list(range(15_000, 32_000))
+    assert ports.own_ports(tmp_path / "none") == [port for port in range(15_000, 32_000) if not of_dds(port)]
+
+
+def test_ports_that_dds_takes_without_asking_are_left_to_it() -> None:
+    multicast, unicast = (0, 1), (10, 11)
+    taken = {7400 + 250 * domain + offset for domain in range(100) for offset in multicast}
+    taken |= {
+        7400 + 250 * domain + offset + 2 * peer for domain in range(100) for offset in unicast for peer in range(45)
+    }
+    assert not set(ports.PORTS) & taken
+    assert len(ports.PORTS) > 5_000
 
 
 def test_the_ports_given_here_are_none_that_this_kernel_gives() -> None:
@@ -77,7 +91,8 @@ def test_ports_that_are_in_use_or_claimed_are_not_given(monkeypatch: pytest.Monk
     ports.release_claims()
     assert ports.free_ports(1) == [first]
     ports.release_claims()
-    with socket.socket() as listener:
-        listener.bind((ports.HOST, first))
-        with pytest.raises(SernError, match="no 1 free ports"):
-            ports.free_ports(1)
+    for kind in (socket.SOCK_STREAM, socket.SOCK_DGRAM):
+        with socket.socket(type=kind) as listener:
+            listener.bind((ports.HOST, first))
+            with pytest.raises(SernError, match="no 1 free ports"):
+                ports.free_ports(1)
