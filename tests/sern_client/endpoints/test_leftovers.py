@@ -297,7 +297,7 @@ import asyncio, sys
 from pathlib import Path
 from sern_client.endpoints.record import RecordEndpoint, RecordOptions
 from sern_runtime.ros_types import topic_info
-from sern_core.types import Encoding
+from sern_core.vocabulary.types import Encoding
 
 async def main():
     recorder = RecordEndpoint(RecordOptions(Path(sys.argv[1]), flush_s=0.02))

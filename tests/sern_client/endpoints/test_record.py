@@ -447,7 +447,7 @@ import asyncio, os, signal, sys
 from pathlib import Path
 from sern_client.endpoints.record import RecordEndpoint, RecordOptions
 from sern_runtime.ros_types import topic_info
-from sern_core.types import Encoding
+from sern_core.vocabulary.types import Encoding
 
 async def main(stop):
     recorder = RecordEndpoint(RecordOptions(Path(sys.argv[1])))
