@@ -17,7 +17,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
-from sern_core.errors import SernError
+from sern_core.vocabulary.errors import SernError
 from sern_runtime import clock
 from sern_tools.processes import Children, failure
 

@@ -18,10 +18,11 @@ from rosbags.highlevel import AnyReader
 from benchmarks.common import Report, main, pin_cpu
 from benchmarks.recordings import DATA, DRIVE, SCANS
 from sern_client.endpoints.clouds import cloud_body, read_ply
-from sern_core import lossy
-from sern_core.codecs import LOSSLESS, LOSSY, Codec, Compression, LossyTopic, decode, encode
-from sern_core.lossy import DEFAULT_LOSSY, IMAGE_TYPE
-from sern_core.types import Encoding
+from sern_core.bodies import lossy
+from sern_core.bodies.codecs import LOSSLESS, LOSSY, LossyTopic, decode, encode
+from sern_core.bodies.lossy import IMAGE_TYPE
+from sern_core.vocabulary.codec_names import DEFAULT_LOSSY, Codec, Compression
+from sern_core.vocabulary.types import Encoding
 from sern_runtime import ros_types
 
 BAGS: Final = {"husky": DRIVE, "jackal": "jackal_imu_odom.bag"}

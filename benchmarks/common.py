@@ -27,7 +27,7 @@ from typing import Final, TypeVar
 from rich.console import Console
 from rich.table import Table
 
-from sern_core.errors import SernError
+from sern_core.vocabulary.errors import SernError
 from sern_tools.checkout import commit
 
 REALTIME_PRIORITY = 10

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from benchmarks.link.figures import NEVER_S
-from sern_core.errors import ConfigError, SernError
+from sern_core.vocabulary.errors import ConfigError, SernError
 
 ROOT: Final = Path(__file__).resolve().parent.parent
 README: Final = ROOT / "README.md"

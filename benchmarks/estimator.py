@@ -16,6 +16,7 @@ from time import process_time
 from typing import Final
 
 from benchmarks.common import Report, interleaved, main
+from benchmarks.delay import DelayWindow
 from benchmarks.flows import (
     DATAGRAM_BYTES,
     FRAGMENT_TIME_S,
@@ -29,10 +30,9 @@ from benchmarks.flows import (
     World,
 )
 from benchmarks.reference import reach_forwarding
-from sern_core.capacity import AckSample, CapacityEstimator
-from sern_core.control.delay import DelayWindow
-from sern_core.control.fixed import FixedWindow
-from sern_core.control.hybrid import HybridWindow
+from sern_core.path.capacity import AckSample, CapacityEstimator
+from sern_core.path.congestion.fixed import FixedWindow
+from sern_core.path.congestion.hybrid import HybridWindow
 from sern_sim.models import SEGMENT_BYTES, BurstLoss, LinkModel, RateStep, Window
 
 Maker = Callable[[], CapacityEstimator]

@@ -1,8 +1,8 @@
 """Flows of one hop in virtual time, without what a hop carries: a window, its packets and its acknowledgements.
 
-A `Site` is a port that any number of flows share, so that they meet in one bottleneck. A `Flow` sends bulk (as much
-as its window allows, while it is switched on) and a pose every 20 ms that passes the window; its `Sink` acknowledges
-as a hop does. The flight and the arrivals are those of `sern_core.flight`. `Cubic` and `BbrLike` are small models of
+A `Site` is a port that any number of flows share, so that they meet in one bottleneck. A `Flow` sends bulk (as much as
+its window allows, while it is switched on) and a pose every 20 ms that passes the window; its `Sink` acknowledges as a
+hop does. The flight and the arrivals are those of `sern_core.path.flight`. `Cubic` and `BbrLike` are small models of
 what TCP would do in the place of an estimator, for company in a bottleneck.
 """
 
@@ -11,8 +11,8 @@ from math import inf
 from struct import Struct
 from typing import Final, Protocol
 
-from sern_core.capacity import AckSample, CapacityEstimator, Pacer
-from sern_core.flight import ACK_DELAY_S, Arrivals, Flight
+from sern_core.path.capacity import AckSample, CapacityEstimator, Pacer
+from sern_core.path.flight import ACK_DELAY_S, Arrivals, Flight
 from sern_sim.models import LinkModel
 from sern_sim.network import Hop, Network
 

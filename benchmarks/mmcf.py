@@ -30,10 +30,10 @@ from benchmarks.mmcf_queue import Queues
 from benchmarks.mmcf_run import INTERVAL_S, Observer, Run, controlled, fixed, oracle, run
 from benchmarks.mmcf_traces import CODECS, GRID, Trace, traces
 from benchmarks.reference import reach_forwarding
-from sern_core.mmcf.cost import Ranges, cost, profile, profile_floors
-from sern_core.mmcf.model import Configuration, Measurement, Terms
-from sern_core.mmcf.policy import FLOOR_KEPT, Decision, Mmcf, fixed_reliability, fixed_throughput
-from sern_core.mmcf.predict import Grid
+from sern_core.adaptation.cost import Ranges, cost, profile, profile_floors
+from sern_core.adaptation.model import Configuration, Measurement, Terms
+from sern_core.adaptation.policy import FLOOR_KEPT, Decision, Mmcf, fixed_reliability, fixed_throughput
+from sern_core.adaptation.predict import Grid
 
 PROFILES = ("teleoperation", "mapping")
 POLICIES = ("fixed_throughput", "fixed_reliability", "luckiest_fixed", "best_fixed", "fixed_range", "mmcf", "oracle")

@@ -26,12 +26,12 @@ from benchmarks.link.children import Running
 from benchmarks.link.runs import DRAIN_S, START_S, sleep_until, start_daemon, start_relay
 from benchmarks.link.sern import RELAY_PORT
 from benchmarks.mmcf_replay import CLOUD_HZ, EVERY_NTH_POINT, recorded, tabulate
-from sern_core.errors import SernError
-from sern_core.message import TopicSpec
-from sern_core.mmcf.adapter import AdapterParams
-from sern_core.mmcf.cost import measure as measure_cost
-from sern_core.mmcf.model import ClassDemand, ClassOutcome, Terms
-from sern_core.types import CLASS_LABELS, CLASSES, DropReason
+from sern_core.adaptation.adapter import AdapterParams
+from sern_core.adaptation.cost import measure as measure_cost
+from sern_core.adaptation.model import ClassDemand, ClassOutcome, Terms
+from sern_core.vocabulary.errors import SernError
+from sern_core.vocabulary.message import TopicSpec
+from sern_core.vocabulary.types import CLASS_LABELS, CLASSES, DropReason
 from sern_runtime.config.adaptation import AdaptationSection
 from sern_sim.models import LinkModel
 from sern_tools.api import get_json

@@ -14,9 +14,9 @@ from math import ceil, inf
 from random import Random
 from typing import Final
 
-from sern_core.codecs import CodecProfile
-from sern_core.mmcf.model import NO_CODEC, ClassOutcome, Configuration
-from sern_core.types import CLASSES, PriorityClass
+from sern_core.adaptation.model import NO_CODEC, ClassOutcome, Configuration
+from sern_core.bodies.codecs import CodecProfile
+from sern_core.vocabulary.types import CLASSES, PriorityClass
 
 FRAGMENT_BYTES: Final = 1140
 HEADER_BYTES: Final = 60

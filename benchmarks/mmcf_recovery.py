@@ -18,10 +18,10 @@ from typing import Final
 
 from benchmarks.common import Report, main, positive
 from benchmarks.link.figures import NEVER_S
-from sern_core.codecs import Coder
-from sern_core.message import TopicInfo, TopicSpec
-from sern_core.mmcf.adapter import SAMPLES, HopAdapter
-from sern_core.types import Encoding, PriorityClass, TopicName
+from sern_core.adaptation.adapter import SAMPLES, HopAdapter
+from sern_core.bodies.codecs import Coder
+from sern_core.vocabulary.message import TopicInfo, TopicSpec
+from sern_core.vocabulary.types import Encoding, PriorityClass, TopicName
 from sern_runtime.config.adaptation import AdaptationSection
 from sern_runtime.profiles import load_profile
 from sern_sim.models import LinkModel, RateStep, Window

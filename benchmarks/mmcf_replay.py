@@ -23,13 +23,13 @@ from time import perf_counter
 from benchmarks import recordings
 from benchmarks.common import Report, half_width_95, main, positive
 from sern_client.endpoints.clouds import CLOUD_TYPE, cloud_body
-from sern_core.codecs import Coder
-from sern_core.message import TopicInfo, TopicSpec
-from sern_core.mmcf.adapter import SAMPLES, HopAdapter, Step
-from sern_core.mmcf.cost import cost
-from sern_core.mmcf.model import Terms
-from sern_core.queues import OutChannel
-from sern_core.types import Encoding, PriorityClass, TopicName
+from sern_core.adaptation.adapter import SAMPLES, HopAdapter, Step
+from sern_core.adaptation.cost import cost
+from sern_core.adaptation.model import Terms
+from sern_core.bodies.codecs import Coder
+from sern_core.stream.out_channel import OutChannel
+from sern_core.vocabulary.message import TopicInfo, TopicSpec
+from sern_core.vocabulary.types import Encoding, PriorityClass, TopicName
 from sern_runtime.config.adaptation import AdaptationSection
 from sern_runtime.profiles import load_profile
 from sern_sim.models import LinkModel

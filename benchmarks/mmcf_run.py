@@ -9,11 +9,11 @@ from typing import Final
 
 from benchmarks.mmcf_queue import Queues, arrivals, slowed
 from benchmarks.mmcf_traces import NEEDED, Trace
-from sern_core.codecs import CodecProfile
-from sern_core.mmcf.cost import Ranges, Weights, cost, measure
-from sern_core.mmcf.model import ClassDemand, Configuration, LinkState, Measurement, Situation, Terms
-from sern_core.mmcf.policy import Decision, Policy
-from sern_core.types import CLASSES
+from sern_core.adaptation.cost import Ranges, Weights, cost, measure
+from sern_core.adaptation.model import ClassDemand, Configuration, LinkState, Measurement, Situation, Terms
+from sern_core.adaptation.policy import Decision, Policy
+from sern_core.bodies.codecs import CodecProfile
+from sern_core.vocabulary.types import CLASSES
 
 INTERVAL_S: Final = 1.0
 LAG_S: Final = 0.3

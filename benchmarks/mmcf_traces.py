@@ -6,9 +6,9 @@ from random import Random
 from typing import Final
 
 from benchmarks.mmcf_queue import Path, Topic
-from sern_core.codecs import CodecProfile
-from sern_core.mmcf.predict import Grid
-from sern_core.types import PriorityClass
+from sern_core.adaptation.predict import Grid
+from sern_core.bodies.codecs import CodecProfile
+from sern_core.vocabulary.types import PriorityClass
 
 CODECS: Final = ("lz4", "zstd", "draco")
 NEEDED: Final = {PriorityClass.CONTROL: 1.0, PriorityClass.STATE: 1.0, PriorityClass.BULK: 0.4}

@@ -14,7 +14,7 @@ from typing import Final
 from benchmarks import recordings
 from benchmarks.document import DOCUMENT, IN_README, README, insert
 from sern_client.endpoints.clouds import read_ply
-from sern_core.errors import SernError
+from sern_core.vocabulary.errors import SernError
 from sern_tools.explain_replay import read_bag
 from sern_tools.lab.backends import choose
 

@@ -19,8 +19,8 @@ from rosbags.typesys import Stores, get_typestore
 
 from sern_client.endpoints.clouds import read_ply
 from sern_client.endpoints.jackal import JACKAL, JackalSource, Plan, Sizes
-from sern_core.message import TopicInfo
-from sern_core.types import Encoding
+from sern_core.vocabulary.message import TopicInfo
+from sern_core.vocabulary.types import Encoding
 from sern_sim.robot import SimulatedJackal
 from sern_tools.explain_replay import read_bag
 

@@ -13,7 +13,7 @@ from typing import Final
 
 from benchmarks.common import Report
 from benchmarks.link.forwarder import Forwarder, Hops
-from sern_core.errors import SernError
+from sern_core.vocabulary.errors import SernError
 from sern_runtime.seal import ROOM_BYTES, Sealer, Side
 
 BATCH: Final = 32

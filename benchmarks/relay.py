@@ -39,14 +39,14 @@ import zmq
 from benchmarks import common
 from benchmarks.child import Worker, await_workers
 from sern_client.transport import RelayTransport
-from sern_core import wire
-from sern_core.client import ClientCore
-from sern_core.errors import SernError
-from sern_core.message import Message, StreamInfo, TopicInfo, TopicSpec
-from sern_core.params import LinkParams, SchedulerParams
-from sern_core.patterns import compile_pattern
-from sern_core.rules import FeedRole
-from sern_core.types import ClientName, DropReason, Encoding, PriorityClass, TopicName
+from sern_core.site.client import ClientCore
+from sern_core.topics.patterns import compile_pattern
+from sern_core.topics.rules import FeedRole
+from sern_core.vocabulary.errors import SernError
+from sern_core.vocabulary.message import Message, StreamInfo, TopicInfo, TopicSpec
+from sern_core.vocabulary.params import LinkParams, SchedulerParams
+from sern_core.vocabulary.types import ClientName, DropReason, Encoding, PriorityClass, TopicName
+from sern_core.wire import framing
 from sern_relay.daemon import RelayDaemon
 from sern_runtime import clock, logs
 from sern_runtime.config.relay import load_relay
@@ -250,7 +250,7 @@ class IdleSite:
 
     def link_down(self, reason: str) -> None: ...
 
-    def lane_offered(self, parameters: wire.Envelope) -> None: ...
+    def lane_offered(self, parameters: framing.Envelope) -> None: ...
 
     def lane_closed(self) -> None: ...
 

@@ -34,12 +34,12 @@ from benchmarks import common
 from benchmarks.child import Worker, await_workers
 from benchmarks.relay import IdleSite, cpu_s
 from sern_client.transport import RelayTransport
-from sern_core.client import ClientCore
-from sern_core.errors import ConfigError, SernError
-from sern_core.message import Message, StreamInfo, TopicInfo, TopicSpec
-from sern_core.params import LinkParams, SchedulerParams
-from sern_core.queues import OutChannel
-from sern_core.types import CLASS_LABELS, ClientName, Encoding, PriorityClass, TopicName
+from sern_core.site.client import ClientCore
+from sern_core.stream.out_channel import OutChannel
+from sern_core.vocabulary.errors import ConfigError, SernError
+from sern_core.vocabulary.message import Message, StreamInfo, TopicInfo, TopicSpec
+from sern_core.vocabulary.params import LinkParams, SchedulerParams
+from sern_core.vocabulary.types import CLASS_LABELS, ClientName, Encoding, PriorityClass, TopicName
 from sern_relay.daemon import RelayDaemon
 from sern_runtime import clock, logs
 from sern_runtime.config.relay import load_relay

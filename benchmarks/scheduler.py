@@ -17,9 +17,9 @@ from time import process_time
 
 from benchmarks.common import Report, interleaved, main, pin_cpu
 from benchmarks.reference import reach_forwarding
-from sern_core.params import SchedulerParams
-from sern_core.scheduler import Scheduler
-from sern_core.types import PriorityClass
+from sern_core.stream.scheduler import Scheduler
+from sern_core.vocabulary.params import SchedulerParams
+from sern_core.vocabulary.types import PriorityClass
 
 COUNTS = (10, 100, 1000)
 STEP_S = 1e-3  # time between decisions: 1200 bytes at 9.6 Mbit/s

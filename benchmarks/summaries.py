@@ -26,8 +26,7 @@ from numpy.typing import NDArray
 from benchmarks import recordings
 from benchmarks.common import Report, interleaved, main
 from sern_client.endpoints.clouds import cloud_body, read_ply
-from sern_core.codecs import Compression, encode
-from sern_core.errors import UsageError
+from sern_core.bodies.codecs import encode
 from sern_core.summaries.bodies import Header
 from sern_core.summaries.clouds import read_cloud
 from sern_core.summaries.grids import Grid, GridFrame, read_grid, write_grid
@@ -36,7 +35,9 @@ from sern_core.summaries.patches import GridRebuilder, PatchMaker, PatchParams
 from sern_core.summaries.scan import ScanMaker, ScanParams
 from sern_core.summaries.transforms import Transform, TransformMerger, write_transforms
 from sern_core.summaries.voxel import VoxelPoint, thin_cloud
-from sern_core.types import Encoding
+from sern_core.vocabulary.codec_names import Compression
+from sern_core.vocabulary.errors import UsageError
+from sern_core.vocabulary.types import Encoding
 
 CDR = Encoding.CDR
 MAP_CELLS = 1000

@@ -33,8 +33,8 @@ from cryptography.hazmat.primitives.ciphers.aead import AESGCM, ChaCha20Poly1305
 from benchmarks.child import Worker
 from benchmarks.common import Report, interleaved, main, medians, repetition_arguments, repetitions, try_realtime
 from benchmarks.link.forwarder import Forwarder, Hops
-from sern_core.errors import SernError
-from sern_core.types import ClientName
+from sern_core.vocabulary.errors import SernError
+from sern_core.vocabulary.types import ClientName
 from sern_runtime import udp_socket
 from sern_runtime.seal import (
     KEY_BYTES,

@@ -14,9 +14,9 @@ from dataclasses import dataclass
 from typing import Final
 
 from benchmarks.common import Report, main
-from sern_core.errors import SernError
-from sern_core.queues import OutChannel
-from sern_core.types import DropReason, PriorityClass
+from sern_core.stream.out_channel import OutChannel
+from sern_core.vocabulary.errors import SernError
+from sern_core.vocabulary.types import DropReason, PriorityClass
 from sern_sim.models import LinkModel
 from tests.world import SimClient, World, spec
 

@@ -19,11 +19,11 @@ from math import inf
 from typing import Any, Final, NamedTuple
 
 from sern_client.endpoints.base import Publisher, ServiceInfo, Sink
-from sern_core.errors import ConfigError
-from sern_core.message import StreamId, TopicInfo
-from sern_core.patterns import Pattern
-from sern_core.queues import OutChannel
-from sern_core.types import DropReason, Encoding, TopicName
+from sern_core.stream.out_channel import OutChannel
+from sern_core.topics.patterns import Pattern
+from sern_core.vocabulary.errors import ConfigError
+from sern_core.vocabulary.message import StreamId, TopicInfo
+from sern_core.vocabulary.types import DropReason, Encoding, TopicName
 from sern_runtime import clock, ros_services, ros_types
 from sern_runtime.loop import Timer
 

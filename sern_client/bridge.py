@@ -34,18 +34,19 @@ from sern_client.tf_merge import LatchedTransforms, MergedTransforms
 from sern_client.udp import ClientLane
 from sern_client.update_topics import UpdateTopics
 from sern_client.withdrawal import Kept, Withdrawable, Withdrawal
-from sern_core import wire
-from sern_core.client import ClientCore
-from sern_core.errors import ConfigError, UsageError
-from sern_core.lease import CommandLease
-from sern_core.ledger import MAX_TOPICS, OTHER_TOPIC
-from sern_core.message import Message, StreamId, StreamInfo, TopicInfo
-from sern_core.queues import OutChannel
-from sern_core.rules import Discovery, ResolvedTopic, RuleSet, to_global
-from sern_core.services import parse as parse_service
-from sern_core.session import DISPLACED
+from sern_core.link.session import DISPLACED
+from sern_core.site.client import ClientCore
+from sern_core.site.lease import CommandLease
+from sern_core.site.services import parse as parse_service
+from sern_core.stream.out_channel import OutChannel
 from sern_core.summaries.transforms import is_static
-from sern_core.types import ClientName, DropReason, Encoding, TopicName
+from sern_core.topics.rules import Discovery, ResolvedTopic, RuleSet
+from sern_core.vocabulary.errors import ConfigError, UsageError
+from sern_core.vocabulary.ledger import MAX_TOPICS, OTHER_TOPIC
+from sern_core.vocabulary.message import Message, StreamId, StreamInfo, TopicInfo
+from sern_core.vocabulary.names import to_global
+from sern_core.vocabulary.types import ClientName, DropReason, Encoding, TopicName
+from sern_core.wire import framing
 from sern_runtime import clock, ros_types
 from sern_runtime.fine_timer import fine_timer
 from sern_runtime.link_metrics import AgeHistograms
@@ -387,7 +388,7 @@ class Bridge:
             _log.error("the relay refuses us (%s): %s", code, text)
         self.rejected_reason = text
 
-    def lane_offered(self, parameters: wire.Envelope) -> None:
+    def lane_offered(self, parameters: framing.Envelope) -> None:
         if self.lane is not None:
             self.lane.offered(parameters)
 

@@ -30,9 +30,9 @@ from sern_client.endpoints.base import (
     ServiceServer,
     publisher_within,
 )
-from sern_core.errors import BodyError, ConfigError, ServiceError
-from sern_core.message import TopicInfo
-from sern_core.types import Encoding
+from sern_core.vocabulary.errors import BodyError, ConfigError, ServiceError
+from sern_core.vocabulary.message import TopicInfo
+from sern_core.vocabulary.types import Encoding
 from sern_runtime import ros_bodies, ros_services, ros_types
 from sern_runtime.ros_types import Counterpart, ResolvedType, one_line
 

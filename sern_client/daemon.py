@@ -27,13 +27,13 @@ from sern_client.services import ServiceBridge
 from sern_client.summarise import register_summaries
 from sern_client.transport import RelayTransport
 from sern_client.udp import ClientLane
-from sern_core.client import ClientCore
-from sern_core.errors import ConfigError
-from sern_core.lossy import missing
-from sern_core.patterns import compile_pattern
-from sern_core.session import NEW_SESSION
-from sern_core.trace import DecisionTrace
-from sern_core.types import CLASS_LABELS, DropReason, ObjectKind
+from sern_core.bodies.lossy import missing
+from sern_core.link.session import NEW_SESSION
+from sern_core.site.client import ClientCore
+from sern_core.topics.patterns import compile_pattern
+from sern_core.vocabulary.errors import ConfigError
+from sern_core.vocabulary.trace import DecisionTrace
+from sern_core.vocabulary.types import CLASS_LABELS, DropReason, ObjectKind
 from sern_runtime import clock, ros_types
 from sern_runtime.adaptation import Adaptation
 from sern_runtime.codec_pool import CodecPool, make_coder

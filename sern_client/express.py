@@ -6,12 +6,12 @@ from collections.abc import Callable
 from typing import Final
 
 from sern_client.transport import Dialer, RelayTransport
-from sern_core import wire
-from sern_core.client import ClientCore
-from sern_core.errors import ConfigError, RemoteError
-from sern_core.lane_port import LanePort
-from sern_core.lanes import LANE_EXPRESS, LANE_ZMQ
-from sern_core.params import Redundancy
+from sern_core.link.lane_port import LanePort
+from sern_core.path.lanes import LANE_EXPRESS, LANE_ZMQ
+from sern_core.site.client import ClientCore
+from sern_core.vocabulary.errors import ConfigError, RemoteError
+from sern_core.vocabulary.params import Redundancy
+from sern_core.wire import framing
 from sern_runtime import clock
 from sern_runtime.express import CONNECTIONS, ExpressPaths
 from sern_runtime.monitor import TcpHandle
@@ -123,7 +123,7 @@ class ClientExpress:
             asyncio.get_running_loop().call_soon(self._give_up)
         self._kick()
 
-    def received(self, connection: "_Connection", data: wire.Datagram) -> None:
+    def received(self, connection: "_Connection", data: framing.Datagram) -> None:
         if not self.core.link.reads:
             return
         try:
@@ -173,7 +173,7 @@ class _Connection:
         self._up = False
         self._lane.lost(self, answered=True)
 
-    def received(self, data: wire.Datagram) -> None:
+    def received(self, data: framing.Datagram) -> None:
         self._answered = True
         self._lane.received(self, data)
 

@@ -15,9 +15,9 @@ from sern_client.endpoints.synthetic import SyntheticEndpoint, SyntheticOptions
 from sern_client.endpoints.zenoh.endpoint import ZenohEndpoint, ZenohOptions
 from sern_client.endpoints.zenoh.session import SessionOptions
 from sern_client.link_topics import LinkTopics
-from sern_core.errors import ConfigError, UsageError
-from sern_core.message import TopicInfo
-from sern_core.types import Encoding
+from sern_core.vocabulary.errors import ConfigError, UsageError
+from sern_core.vocabulary.message import TopicInfo
+from sern_core.vocabulary.types import Encoding
 from sern_runtime.config import endpoints as sections
 from sern_runtime.config.client import ClientFile
 from sern_runtime.config.load import Loaded

@@ -12,9 +12,9 @@ means nothing to tf2 and is dropped where a prefix is added.
 import logging
 from collections.abc import Callable
 
-from sern_core.errors import BodyError, ConfigError
-from sern_core.message import TopicInfo
-from sern_core.types import Encoding
+from sern_core.vocabulary.errors import BodyError, ConfigError
+from sern_core.vocabulary.message import TopicInfo
+from sern_core.vocabulary.types import Encoding
 from sern_runtime import ros_bodies, ros_types
 from sern_runtime.ros_bodies import Plan
 

@@ -19,7 +19,7 @@ from typing import Final, Self
 
 from sern_client.endpoints.base import GUARD_SUFFIX
 from sern_client.factory import named_sections
-from sern_core.message import TopicInfo
+from sern_core.vocabulary.message import TopicInfo
 from sern_runtime import clock
 from sern_runtime.config import endpoints as sections
 from sern_runtime.config.client import ClientFile

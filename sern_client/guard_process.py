@@ -39,10 +39,10 @@ from sern_client.endpoints.base import Endpoint, Publisher
 from sern_client.endpoints.composite import CompositeEndpoint
 from sern_client.endpoints.ros1 import Ros1Endpoint
 from sern_client.factory import make_section
-from sern_core.errors import ConfigError
-from sern_core.lease import GuardLease
-from sern_core.message import TopicInfo
-from sern_core.types import Encoding, TopicName
+from sern_core.site.lease import GuardLease
+from sern_core.vocabulary.errors import ConfigError
+from sern_core.vocabulary.message import TopicInfo
+from sern_core.vocabulary.types import Encoding, TopicName
 from sern_runtime import clock, logs
 from sern_runtime.config.base import resolve
 from sern_runtime.config.endpoints import EndpointSection

@@ -10,8 +10,8 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Final
 
 from sern_client.endpoints.base import KeepingEndpoint
-from sern_core.message import StreamId
-from sern_core.types import DropReason
+from sern_core.vocabulary.message import StreamId
+from sern_core.vocabulary.types import DropReason
 
 Hold = Callable[[StreamId, int], None]
 """`hold(stream, seq)`: do not confirm it yet."""

@@ -4,10 +4,10 @@ import base64
 from collections.abc import Mapping
 from typing import Any, Final
 
-from sern_core.announce import definition_hash
-from sern_core.errors import UsageError
-from sern_core.message import StreamId, StreamInfo
-from sern_core.objects import topic_object_id
+from sern_core.relay.objects import topic_object_id
+from sern_core.vocabulary.errors import UsageError
+from sern_core.vocabulary.message import StreamId, StreamInfo
+from sern_core.wire.announce import definition_hash
 from sern_runtime.http import JsonQuery
 
 MAX_VALUE_BYTES: Final = 4_096

@@ -8,8 +8,8 @@ relay are still owed is the relay's to keep. The streams of one topic (a grid an
 from collections.abc import Callable
 from typing import Final
 
-from sern_core.queues import OutChannel
-from sern_core.types import TopicName
+from sern_core.stream.out_channel import OutChannel
+from sern_core.vocabulary.types import TopicName
 
 LEAVE_S: Final = 10.0
 """Longest wait for what a topic that ended still has to deliver. It ends early when the topic comes back."""

@@ -1,7 +1,7 @@
 """Says at this site who is there: in the log, on ROS, over HTTP and in the metrics; and ends topics of who is not.
 
-Everything is made here, from what the core knows (`sern_core/peers.py`), so a full link cannot keep it from the site's
-nodes: what has to come over the link is a relay's few words of control about each peer.
+Everything is made here, from what the core knows (`sern_core/site/peers.py`), so a full link cannot keep it from the
+site's nodes: what has to come over the link is a relay's few words of control about each peer.
 """
 
 import logging
@@ -11,9 +11,9 @@ from collections.abc import Callable
 from typing import Final, Protocol
 
 from sern_client.link_topics import LinkTopics, LinkView
-from sern_core.client import ClientCore
-from sern_core.peers import MAX_PEERS, PeerChange, PeerStatus, PeerView
-from sern_core.types import ClientName, TopicName
+from sern_core.site.client import ClientCore
+from sern_core.site.peers import MAX_PEERS, PeerChange, PeerStatus, PeerView
+from sern_core.vocabulary.types import ClientName, TopicName
 from sern_runtime import clock
 from sern_runtime.loop import Timer
 from sern_runtime.metrics import Metrics

@@ -11,10 +11,10 @@ from contextlib import suppress
 from typing import Final, NamedTuple
 
 from sern_client.endpoints.base import Publisher
-from sern_core.errors import ConfigError
-from sern_core.message import TopicInfo
-from sern_core.peers import PeerStatus
-from sern_core.types import Encoding, TopicName
+from sern_core.site.peers import PeerStatus
+from sern_core.vocabulary.errors import ConfigError
+from sern_core.vocabulary.message import TopicInfo
+from sern_core.vocabulary.types import Encoding, TopicName
 from sern_runtime import clock, ros_types
 
 STATUS_TYPE: Final = "diagnostic_msgs/msg/DiagnosticStatus"

@@ -16,12 +16,12 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Final
 
-from sern_core.errors import BodyError
-from sern_core.message import Message, StreamId, StreamInfo
 from sern_core.summaries.grids import GRID_TYPE, UPDATE_TYPE
 from sern_core.summaries.patches import GridRebuilder
 from sern_core.summaries.spec import SummaryKind
-from sern_core.types import ClientName, Encoding, TopicName
+from sern_core.vocabulary.errors import BodyError
+from sern_core.vocabulary.message import Message, StreamId, StreamInfo
+from sern_core.vocabulary.types import ClientName, Encoding, TopicName
 from sern_runtime.clock import now as clock_now
 from sern_runtime.loop import Timer
 

@@ -1,8 +1,8 @@
 """Services across the bridge: one site offers a service of its own, others use it as if it were theirs.
 
-The streams are those of `sern_core.services`. Calls and answers are reliable and have the caller's timeout as their
-lifespan: a call is executed at most once, never after its caller has given up, and whatever happens to the link the
-caller hears within its timeout.
+The streams are those of `sern_core.site.services`. Calls and answers are reliable and have the caller's timeout as
+their lifespan: a call is executed at most once, never after its caller has given up, and whatever happens to the link
+the caller hears within its timeout.
 """
 
 import asyncio
@@ -18,13 +18,8 @@ from typing import Final
 from sern_client import conversion
 from sern_client.actions import cancel_request, refusal
 from sern_client.endpoints.base import ServiceEndpoint, ServiceInfo, ServiceServer
-from sern_core.client import ClientCore
-from sern_core.errors import ConfigError, ServiceError, UsageError
-from sern_core.ledger import MAX_TOPICS, OTHER_TOPIC
-from sern_core.message import Message, StreamId, StreamInfo, TopicInfo, TopicSpec
-from sern_core.queues import OutChannel
-from sern_core.rules import to_global, to_local
-from sern_core.services import (
+from sern_core.site.client import ClientCore
+from sern_core.site.services import (
     CALL,
     MAX_CALLS,
     REPLY,
@@ -35,7 +30,12 @@ from sern_core.services import (
     parse,
     reply_name,
 )
-from sern_core.types import DropReason, Durability, PriorityClass, Reliability, TopicName
+from sern_core.stream.out_channel import OutChannel
+from sern_core.vocabulary.errors import ConfigError, ServiceError, UsageError
+from sern_core.vocabulary.ledger import MAX_TOPICS, OTHER_TOPIC
+from sern_core.vocabulary.message import Message, StreamId, StreamInfo, TopicInfo, TopicSpec
+from sern_core.vocabulary.names import to_global, to_local
+from sern_core.vocabulary.types import DropReason, Durability, PriorityClass, Reliability, TopicName
 from sern_runtime import clock
 
 MAX_ERROR_CHARS: Final = 512

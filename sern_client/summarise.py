@@ -22,12 +22,9 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import Final, NamedTuple, Protocol
 
-from sern_core.client import ClientCore
-from sern_core.errors import BodyError, UsageError
-from sern_core.message import KAPPA, StreamId, TopicInfo, TopicSpec
-from sern_core.queues import OutChannel
-from sern_core.rate_cap import RateCap
-from sern_core.rules import AUTO, ResolvedTopic, TopicRule
+from sern_core.site.client import ClientCore
+from sern_core.stream.out_channel import OutChannel
+from sern_core.stream.rate_cap import RateCap
 from sern_core.summaries.grids import UPDATE_TYPE
 from sern_core.summaries.mask import MaskMaker, MaskParams
 from sern_core.summaries.patches import PatchMaker, PatchParams
@@ -41,7 +38,10 @@ from sern_core.summaries.spec import (
     VoxelParams,
 )
 from sern_core.summaries.voxel import thin_cloud
-from sern_core.types import DropReason, Durability, Encoding, PriorityClass, Reliability, TopicName
+from sern_core.topics.rules import AUTO, ResolvedTopic, TopicRule
+from sern_core.vocabulary.errors import BodyError, UsageError
+from sern_core.vocabulary.message import KAPPA, StreamId, TopicInfo, TopicSpec
+from sern_core.vocabulary.types import DropReason, Durability, Encoding, PriorityClass, Reliability, TopicName
 from sern_runtime import clock, ros_types
 from sern_runtime.loop import Timer
 from sern_runtime.metrics import Labels, Metrics

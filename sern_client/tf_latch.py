@@ -9,9 +9,9 @@ heard of.
 from collections.abc import Hashable
 from typing import Final
 
-from sern_core.errors import BodyError, ConfigError
 from sern_core.summaries.transforms import Transform, read_transforms, write_transforms
-from sern_core.types import Encoding
+from sern_core.vocabulary.errors import BodyError, ConfigError
+from sern_core.vocabulary.types import Encoding
 from sern_runtime import ros_types
 
 TF_STATIC: Final = "/tf_static"

@@ -8,12 +8,12 @@ import logging
 from typing import Final
 
 from sern_client.summarise import POLL_S, Send
-from sern_core.client import ClientCore
-from sern_core.errors import BodyError
-from sern_core.message import StreamId
-from sern_core.queues import OutChannel
+from sern_core.site.client import ClientCore
+from sern_core.stream.out_channel import OutChannel
 from sern_core.summaries.transforms import StaticTransforms, TransformMerger
-from sern_core.types import DropReason, Encoding, TopicName
+from sern_core.vocabulary.errors import BodyError
+from sern_core.vocabulary.message import StreamId
+from sern_core.vocabulary.types import DropReason, Encoding, TopicName
 from sern_runtime import clock
 from sern_runtime.loop import Timer
 

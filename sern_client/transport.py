@@ -8,9 +8,9 @@ from typing import Final, Protocol
 
 import zmq
 
-from sern_core import wire
-from sern_core.errors import ConfigError, RemoteError
-from sern_core.link import Link
+from sern_core.link.link import Link
+from sern_core.vocabulary.errors import ConfigError, RemoteError
+from sern_core.wire import framing
 from sern_runtime import clock
 from sern_runtime.dscp import Marks
 from sern_runtime.inflow import Inflow
@@ -39,7 +39,7 @@ class DialerEvents(Protocol):
     def given_up(self, reason: str) -> None:
         """The socket is made anew after a pause."""
 
-    def received(self, data: wire.Datagram) -> None: ...
+    def received(self, data: framing.Datagram) -> None: ...
 
     def writable(self) -> None: ...
 
@@ -269,7 +269,7 @@ class RelayTransport:
         self.pump.reset()
         self.link.disconnected(now=clock.now(), reason=reason)
 
-    def received(self, data: wire.Datagram) -> None:
+    def received(self, data: framing.Datagram) -> None:
         if not self.link.reads:
             return
         try:

@@ -5,12 +5,12 @@ from collections.abc import Callable
 from math import inf
 from typing import Final
 
-from sern_core import wire
-from sern_core.client import ClientCore
-from sern_core.errors import RemoteError, SernError
-from sern_core.lane_port import LanePort
-from sern_core.lanes import LANE_UDP, LANE_ZMQ
-from sern_core.link import Link
+from sern_core.link.lane_port import LanePort
+from sern_core.link.link import Link
+from sern_core.path.lanes import LANE_UDP, LANE_ZMQ
+from sern_core.site.client import ClientCore
+from sern_core.vocabulary.errors import RemoteError, SernError
+from sern_core.wire import framing
 from sern_runtime import clock
 from sern_runtime.dscp import Marks
 from sern_runtime.pump import Pump
@@ -54,7 +54,7 @@ class ClientLane:
         self._asked_s = clock.now()
         self.core.ask_lane(offered_ciphers(), now=clock.now())
 
-    def offered(self, envelope: wire.Envelope) -> None:
+    def offered(self, envelope: framing.Envelope) -> None:
         """The relay's answer. Raises WireError when it is none."""
         parameters = SessionParameters.from_envelope(envelope)
         self.closed()

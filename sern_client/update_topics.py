@@ -9,9 +9,9 @@ from collections.abc import Callable
 from itertools import islice
 from typing import Final
 
-from sern_core.message import StreamId
-from sern_core.patterns import PatternSet
-from sern_core.types import TopicName
+from sern_core.topics.patterns import PatternSet
+from sern_core.vocabulary.message import StreamId
+from sern_core.vocabulary.types import TopicName
 from sern_runtime import clock
 from sern_runtime.loop import Timer
 

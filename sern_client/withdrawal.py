@@ -10,9 +10,9 @@ from collections.abc import Callable, Mapping
 from typing import Final, Protocol
 
 from sern_client.endpoints.base import Publisher
-from sern_core.errors import ConfigError
-from sern_core.message import StreamId, StreamInfo, TopicInfo
-from sern_core.types import ClientName
+from sern_core.vocabulary.errors import ConfigError
+from sern_core.vocabulary.message import StreamId, StreamInfo, TopicInfo
+from sern_core.vocabulary.types import ClientName
 from sern_runtime import clock
 
 MAX_KEPT: Final = 10

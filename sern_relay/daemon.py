@@ -12,16 +12,16 @@ from typing import Final
 import zmq
 from prometheus_client import CollectorRegistry
 
-from sern_core.access import AccessTable
-from sern_core.decoding import Decoder
-from sern_core.errors import ConfigError
-from sern_core.hub import Hub, HubParams
-from sern_core.ledger import MAX_TOPICS
-from sern_core.link import Link
-from sern_core.message import Message, StreamInfo
-from sern_core.queues import OutChannel
-from sern_core.rules import FeedRole
-from sern_core.types import ClientName, DropReason, TopicName
+from sern_core.link.link import Link
+from sern_core.relay.access import AccessTable
+from sern_core.relay.hub import Hub, HubParams
+from sern_core.stream.decoding import Decoder
+from sern_core.stream.out_channel import OutChannel
+from sern_core.topics.rules import FeedRole
+from sern_core.vocabulary.errors import ConfigError
+from sern_core.vocabulary.ledger import MAX_TOPICS
+from sern_core.vocabulary.message import Message, StreamInfo
+from sern_core.vocabulary.types import ClientName, DropReason, TopicName
 from sern_relay.feed import RelayFeed
 from sern_relay.objects_view import objects_view
 from sern_relay.server import RelayServer

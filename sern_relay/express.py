@@ -5,21 +5,21 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Final, NamedTuple
 
-from sern_core import wire
-from sern_core.errors import WireError
-from sern_core.hub import Hub
-from sern_core.lane_port import LanePort
-from sern_core.lanes import LANE_EXPRESS
-from sern_core.link import Link
-from sern_core.params import Redundancy
-from sern_core.types import ClientName
+from sern_core.link.lane_port import LanePort
+from sern_core.link.link import Link
+from sern_core.path.lanes import LANE_EXPRESS
+from sern_core.relay.hub import Hub
+from sern_core.vocabulary.errors import WireError
+from sern_core.vocabulary.params import Redundancy
+from sern_core.vocabulary.types import ClientName
+from sern_core.wire import framing
 from sern_runtime import clock
 from sern_runtime.express import CONNECTIONS, ExpressPaths
 from sern_runtime.monitor import Connection
 from sern_runtime.pump import Pump
 from sern_runtime.zmq_socket import SendResult
 
-JOIN: Final = bytes((wire.Kind.JOIN,))
+JOIN: Final = bytes((framing.Kind.JOIN,))
 """The third byte of a datagram that joins."""
 
 
@@ -93,7 +93,7 @@ class RelayExpress:
         lane.pump.kick()
         return older
 
-    def received(self, routing_id: bytes, joined: Joined, data: wire.Datagram) -> None:
+    def received(self, routing_id: bytes, joined: Joined, data: framing.Datagram) -> None:
         """Raises RemoteError; the caller closes the connection."""
         if data[2:3] == JOIN:  # of the next session
             if self.join(routing_id, joined, bytes(data)) is not None:

@@ -15,12 +15,12 @@ from typing import Final
 
 import zmq
 
-from sern_core.errors import RefusedError
-from sern_core.hub import Hub
-from sern_core.hub_events import Relayed
-from sern_core.message import Message, StreamId, StreamInfo
-from sern_core.rules import FeedRole, FeedTopic, RuleSet
-from sern_core.types import ClientName, Durability, PriorityClass, TopicName
+from sern_core.relay.hub import Hub
+from sern_core.relay.hub_events import Relayed
+from sern_core.topics.rules import FeedRole, FeedTopic, RuleSet
+from sern_core.vocabulary.errors import RefusedError
+from sern_core.vocabulary.message import Message, StreamId, StreamInfo
+from sern_core.vocabulary.types import ClientName, Durability, PriorityClass, TopicName
 from sern_runtime import ros_types
 from sern_runtime.clock import now
 from sern_runtime.feed import Feed, FeedHeader

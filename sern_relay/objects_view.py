@@ -23,13 +23,13 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
-from sern_core.announce import definition_hash
-from sern_core.codecs import INLINE_BYTES
-from sern_core.errors import UsageError
-from sern_core.hub import Hub
-from sern_core.objects import ValueRequest, text_hash
-from sern_core.types import ClientName, ObjectKind, TopicName
-from sern_core.xr_object import object_to_json
+from sern_core.bodies.codecs import INLINE_BYTES
+from sern_core.relay.hub import Hub
+from sern_core.relay.objects import ValueRequest, text_hash
+from sern_core.relay.xr_object import object_to_json
+from sern_core.vocabulary.errors import UsageError
+from sern_core.vocabulary.types import ClientName, ObjectKind, TopicName
+from sern_core.wire.announce import definition_hash
 from sern_runtime import clock
 from sern_runtime.http import JsonParts, JsonQuery
 

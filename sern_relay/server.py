@@ -6,13 +6,13 @@ from typing import Final
 
 import zmq
 
-from sern_core import wire
-from sern_core.errors import RemoteError, UsageError, WireError
-from sern_core.hub import Hub
-from sern_core.hub_port import HubPort
-from sern_core.params import Redundancy
-from sern_core.rules import client_name
-from sern_core.types import ClientName
+from sern_core.relay.hub import Hub
+from sern_core.relay.hub_port import HubPort
+from sern_core.vocabulary.errors import RemoteError, UsageError, WireError
+from sern_core.vocabulary.names import client_name
+from sern_core.vocabulary.params import Redundancy
+from sern_core.vocabulary.types import ClientName
+from sern_core.wire import framing
 from sern_relay.express import JOIN, Joined, RelayExpress
 from sern_runtime import clock
 from sern_runtime.dscp import Marks
@@ -119,7 +119,7 @@ class RelayServer:
         self.connections.close()
         self.socket.close()
 
-    def _received(self, routing_id: bytes, user: str, data: wire.Datagram) -> None:
+    def _received(self, routing_id: bytes, user: str, data: framing.Datagram) -> None:
         session = self._sessions.get(routing_id)
         if session is None:
             joined = self.express.joined.get(routing_id)
@@ -158,7 +158,7 @@ class RelayServer:
         whose = connection.user if connection is not None and connection.user else handle.peer[0]
         _log.warning("connection of %s closed: a message without end", whose)
 
-    def _received_express(self, routing_id: bytes, joined: Joined, user: str, data: wire.Datagram) -> None:
+    def _received_express(self, routing_id: bytes, joined: Joined, user: str, data: framing.Datagram) -> None:
         if user != joined.user:
             problem = f"its identity changed to {user!r}"
         else:
@@ -248,10 +248,10 @@ class RelayServer:
     @staticmethod
     def _claimed(data: bytes) -> str:
         """Without keys the first datagram must be a HELLO or a JOIN, and its name is believed."""
-        header = wire.decode_header(data)
-        if header.kind not in (wire.Kind.HELLO, wire.Kind.JOIN):
+        header = framing.decode_header(data)
+        if header.kind not in (framing.Kind.HELLO, framing.Kind.JOIN):
             raise WireError("the first datagram of a connection must be HELLO or JOIN")
-        return wire.take_str(wire.decode_handshake(data), "name", max_length=64)
+        return framing.take_str(framing.decode_handshake(data), "name", max_length=64)
 
     def flush(self) -> None:
         """Let every port that has something to say say it."""

@@ -23,12 +23,12 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from typing import Final
 
-from sern_core.errors import BodyError, RefusedError
-from sern_core.message import Message, StreamId, StreamInfo
-from sern_core.objects import ObjectRegistry
-from sern_core.rules import plain_type
+from sern_core.relay.objects import ObjectRegistry
 from sern_core.summaries.transforms import Transform, read_transforms
-from sern_core.types import ClientName, Encoding, ObjectKind
+from sern_core.vocabulary.errors import BodyError, RefusedError
+from sern_core.vocabulary.message import Message, StreamId, StreamInfo
+from sern_core.vocabulary.names import plain_type
+from sern_core.vocabulary.types import ClientName, Encoding, ObjectKind
 from sern_runtime.clock import now
 from sern_runtime.loop import Timer
 from sern_runtime.optional import OptionalParts

@@ -5,12 +5,12 @@ import logging
 from collections.abc import Callable, Sequence
 from typing import Final
 
-from sern_core.errors import RefusedError, RemoteError
-from sern_core.hub import Hub
-from sern_core.lane_port import LanePort
-from sern_core.lanes import LANE_UDP
-from sern_core.link import Link
-from sern_core.types import ClientName
+from sern_core.link.lane_port import LanePort
+from sern_core.link.link import Link
+from sern_core.path.lanes import LANE_UDP
+from sern_core.relay.hub import Hub
+from sern_core.vocabulary.errors import RefusedError, RemoteError
+from sern_core.vocabulary.types import ClientName
 from sern_runtime import clock
 from sern_runtime.addresses import plain_host
 from sern_runtime.config.base import split_tcp

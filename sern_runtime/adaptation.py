@@ -6,15 +6,15 @@ from collections import deque
 from collections.abc import Callable, Collection, Iterable, Sequence
 from typing import Any, Final
 
-from sern_core.codecs import Coder
-from sern_core.link import Link
-from sern_core.mmcf.adapter import SAMPLES, HopAdapter
-from sern_core.mmcf.levels import Summarised
-from sern_core.mmcf.report import adapter_json, step_json
-from sern_core.out_message import OutMessage
-from sern_core.queues import OutChannel
-from sern_core.rules import TopicRule
-from sern_core.types import CLASS_LABELS, CLASSES
+from sern_core.adaptation.adapter import SAMPLES, HopAdapter
+from sern_core.adaptation.levels import Summarised
+from sern_core.adaptation.report import adapter_json, step_json
+from sern_core.bodies.codecs import Coder
+from sern_core.link.link import Link
+from sern_core.stream.out_channel import OutChannel
+from sern_core.stream.out_message import OutMessage
+from sern_core.topics.rules import TopicRule
+from sern_core.vocabulary.types import CLASS_LABELS, CLASSES
 from sern_runtime import clock
 from sern_runtime.config.adaptation import AdaptationSection
 from sern_runtime.metrics import Labels, Metrics

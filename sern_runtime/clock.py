@@ -5,7 +5,7 @@ young after an hour's sleep as before it. Neither is ever stepped; the wall cloc
 event loop's own timers run on CLOCK_MONOTONIC, so only delays are given to them; `FineTimer` runs on this clock.
 
 A machine that is stopped from outside (a paused virtual machine) has no clock that goes on. What its peers' clocks tell
-then is told in sern_core/clocksync.py.
+then is told in sern_core/path/clocksync.py.
 """
 
 import time

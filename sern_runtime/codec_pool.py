@@ -10,8 +10,8 @@ from contextlib import suppress
 from heapq import heappop, heappush
 from typing import Final
 
-from sern_core.codecs import Coder, Work
-from sern_core.params import LinkParams
+from sern_core.bodies.codecs import Coder, Work
+from sern_core.vocabulary.params import LinkParams
 from sern_runtime import clock
 from sern_runtime.optional import OptionalParts
 

@@ -5,8 +5,8 @@ import logging
 from collections.abc import Callable, Collection
 from typing import Final
 
-from sern_core.lanes import LANE_UDP, LANE_ZMQ
-from sern_core.link import Link
+from sern_core.link.link import Link
+from sern_core.path.lanes import LANE_UDP, LANE_ZMQ
 from sern_runtime import clock
 from sern_runtime.metrics import Metrics
 

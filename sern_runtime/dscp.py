@@ -14,7 +14,7 @@ stays, `setsockopt` costs nothing.
 from dataclasses import dataclass
 from typing import Final
 
-from sern_core.types import PriorityClass
+from sern_core.vocabulary.types import PriorityClass
 
 DSCP_NAMES: Final = {
     "cs0": 0,

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
 
-from sern_core.errors import ConfigError, SernError
+from sern_core.vocabulary.errors import ConfigError, SernError
 from sern_runtime import logs
 from sern_runtime.config.shared import LogSection
 from sern_runtime.config.yaml import Loc, read_document

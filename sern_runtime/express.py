@@ -8,8 +8,8 @@ carry the same packet number, by which the core knows a copy.
 from collections.abc import Callable
 from typing import Final, Generic, TypeVar
 
-from sern_core.lanes import COPY_LOSS
-from sern_core.params import Redundancy
+from sern_core.path.lanes import COPY_LOSS
+from sern_core.vocabulary.params import Redundancy
 from sern_runtime.monitor import TcpHandle
 from sern_runtime.zmq_socket import SendResult
 

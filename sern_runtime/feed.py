@@ -34,10 +34,10 @@ from typing import Final, NamedTuple
 
 import zmq
 
-from sern_core.access import RateGuard
-from sern_core.errors import ConfigError
-from sern_core.rules import FeedRole
-from sern_core.types import CLASSES, PriorityClass, TopicName
+from sern_core.relay.access import RateGuard
+from sern_core.topics.rules import FeedRole
+from sern_core.vocabulary.errors import ConfigError
+from sern_core.vocabulary.types import CLASSES, PriorityClass, TopicName
 from sern_runtime.clock import now
 from sern_runtime.feed_inflow import SUBSCRIBER_BYTES, TOLD_BYTES, FeedInflow
 from sern_runtime.feed_subscriptions import Subscriptions

@@ -12,7 +12,7 @@ from aiohttp.http_exceptions import HttpProcessingError
 from prometheus_client import CollectorRegistry
 from prometheus_client.exposition import choose_encoder
 
-from sern_core.errors import ConfigError, UsageError
+from sern_core.vocabulary.errors import ConfigError, UsageError
 from sern_runtime.metrics import exposition
 from sern_runtime.optional import OptionalParts
 

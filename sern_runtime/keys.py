@@ -20,9 +20,9 @@ import zmq
 from pydantic import AfterValidator, Field, model_validator
 from zmq.utils import z85
 
-from sern_core.errors import ConfigError, UsageError
-from sern_core.rules import client_name
-from sern_core.types import ClientName
+from sern_core.vocabulary.errors import ConfigError, UsageError
+from sern_core.vocabulary.names import client_name
+from sern_core.vocabulary.types import ClientName
 from sern_runtime.config.base import ClientText, FileModel, Section, fault
 from sern_runtime.config.load import Loaded, check_document
 from sern_runtime.config.yaml import read_document

@@ -4,10 +4,10 @@ import math
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from typing import Final
 
-from sern_core.codecs import Coder
-from sern_core.ledger import LOSSES, NO_DROPS, ReceiveLedger
-from sern_core.link import Link
-from sern_core.types import CLASS_LABELS, DropReason
+from sern_core.bodies.codecs import Coder
+from sern_core.link.link import Link
+from sern_core.vocabulary.ledger import LOSSES, NO_DROPS, ReceiveLedger
+from sern_core.vocabulary.types import CLASS_LABELS, DropReason
 from sern_runtime import clock
 from sern_runtime.metrics import LATENCY_EDGES_S, Histogram, HistogramCounts, Labels, Metrics
 

@@ -18,10 +18,10 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Final, TextIO
 
-from sern_core.errors import ConfigError
-from sern_core.link import Link
-from sern_core.message import Message, StreamInfo
-from sern_core.types import CLASS_LABELS, ClientName, DropReason
+from sern_core.link.link import Link
+from sern_core.vocabulary.errors import ConfigError
+from sern_core.vocabulary.message import Message, StreamInfo
+from sern_core.vocabulary.types import CLASS_LABELS, ClientName, DropReason
 from sern_runtime.optional import OptionalParts
 
 HEADER: Final = ("event", "wall_ns", "topic", "class", "seq", "bytes", "stamp_ns", "crc32", "age_s", "reason", "peer")

@@ -26,7 +26,7 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Histo
 from prometheus_client.registry import Collector
 from prometheus_client.samples import Sample
 
-from sern_core.errors import UsageError
+from sern_core.vocabulary.errors import UsageError
 
 Labels = tuple[str, ...]
 Numbers = Iterable[tuple[Labels, float]]

@@ -13,7 +13,7 @@ from typing import Annotated, Any, Final, Literal, Self
 
 from pydantic import Field, model_validator
 
-from sern_core.errors import ConfigError, UsageError
+from sern_core.vocabulary.errors import ConfigError, UsageError
 from sern_runtime.config.base import FileModel, FileProblem, Section, fault
 from sern_runtime.config.load import check_document
 from sern_runtime.config.yaml import Document, Node, read_document, shown_key

@@ -20,8 +20,8 @@ from typing import Final, NamedTuple
 from rosbags.interfaces import Nodetype
 from rosbags.interfaces.typing import FieldDesc, Typesdict
 
-from sern_core.errors import BodyError, ConfigError
-from sern_core.types import Encoding
+from sern_core.vocabulary.errors import BodyError, ConfigError
+from sern_core.vocabulary.types import Encoding
 from sern_runtime.ros_types import ResolvedType
 
 MAX_STEPS: Final = 24_000

@@ -11,8 +11,8 @@ from typing import Final, NamedTuple
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_typestore
 
-from sern_core.errors import ConfigError
-from sern_core.types import Encoding
+from sern_core.vocabulary.errors import ConfigError
+from sern_core.vocabulary.types import Encoding
 from sern_runtime import ros_types
 from sern_runtime.ros_types import Counterpart, ResolvedType, TypeText
 

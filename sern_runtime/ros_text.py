@@ -20,7 +20,7 @@ from rosbags.interfaces import Nodetype
 from rosbags.interfaces.typing import BaseDesc, Basename, Constdefs, Fielddefs, FieldDesc, NameDesc, Typesdict
 from rosbags.typesys.base import normalize_fieldname
 
-from sern_core.errors import ConfigError
+from sern_core.vocabulary.errors import ConfigError
 
 SEPARATOR: Final = "=" * 80
 MAX_CHARACTERS: Final = 2**18

@@ -23,9 +23,9 @@ from rosbags.typesys import Stores, get_types_from_idl, get_typestore
 from rosbags.typesys.base import normalize_fieldname
 from rosbags.typesys.store import Typestore
 
-from sern_core.errors import ConfigError, UsageError
-from sern_core.message import TopicInfo
-from sern_core.types import Encoding, TopicName
+from sern_core.vocabulary.errors import ConfigError, UsageError
+from sern_core.vocabulary.message import TopicInfo
+from sern_core.vocabulary.types import Encoding, TopicName
 from sern_runtime import ros_text
 
 MAX_IDL_TEXT: Final = 2**16

@@ -44,8 +44,8 @@ from cryptography.hazmat.primitives.ciphers.aead import AESGCM, ChaCha20Poly1305
 from cryptography.hazmat.primitives.hashes import SHA256
 from cryptography.hazmat.primitives.kdf.hkdf import HKDF
 
-from sern_core import wire
-from sern_core.errors import RefusedError, SernError, UsageError, WireError
+from sern_core.vocabulary.errors import RefusedError, SernError, UsageError, WireError
+from sern_core.wire import framing
 
 UDP_PAYLOAD_BYTES: Final = 1200
 """Largest UDP payload: what every IPv6 path (1280) and nearly every tunnel carries whole (RFC 9000, 14)."""
@@ -146,21 +146,21 @@ class SessionParameters:
     def draw(cls, session_id: int, cipher: Cipher, port: int) -> Self:
         return cls(session_id, os.urandom(SECRET_BYTES), cipher, port)
 
-    def to_envelope(self) -> wire.Envelope:
+    def to_envelope(self) -> framing.Envelope:
         """Keys `sid`, `secret` (hexadecimal), `cipher` and `port`, for a control message."""
         return {"sid": self.id, "secret": self.secret.hex(), "cipher": self.cipher.value, "port": self.port}
 
     @classmethod
-    def from_envelope(cls, envelope: wire.Envelope) -> Self:
+    def from_envelope(cls, envelope: framing.Envelope) -> Self:
         """Raises WireError."""
         try:
-            secret = bytes.fromhex(wire.take_str(envelope, "secret", max_length=2 * SECRET_BYTES))
-            cipher = Cipher(wire.take_str(envelope, "cipher", max_length=64))
+            secret = bytes.fromhex(framing.take_str(envelope, "secret", max_length=2 * SECRET_BYTES))
+            cipher = Cipher(framing.take_str(envelope, "cipher", max_length=64))
             return cls(
-                wire.take_int(envelope, "sid", high=0xFFFFFFFF),
+                framing.take_int(envelope, "sid", high=0xFFFFFFFF),
                 secret,
                 cipher,
-                wire.take_int(envelope, "port", low=1, high=0xFFFF),
+                framing.take_int(envelope, "port", low=1, high=0xFFFF),
             )
         except (ValueError, UsageError):
             raise WireError("the parameters of a UDP session are not valid") from None  # names no part of the secret

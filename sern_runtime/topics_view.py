@@ -4,11 +4,11 @@ from collections.abc import Iterable
 from dataclasses import asdict
 from typing import Any
 
-from sern_core.encoding import ChannelCodec
-from sern_core.ledger import ReceiveLedger
-from sern_core.link import Link
-from sern_core.message import StreamInfo
-from sern_core.types import CLASS_LABELS
+from sern_core.link.link import Link
+from sern_core.stream.coding import ChannelCodec
+from sern_core.vocabulary.ledger import ReceiveLedger
+from sern_core.vocabulary.message import StreamInfo
+from sern_core.vocabulary.types import CLASS_LABELS
 
 TopicView = dict[str, Any]
 """The counters of one topic, as `json.dumps` takes them."""

@@ -25,8 +25,8 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from typing import Final
 
-from sern_core.errors import UsageError
-from sern_core.types import ClientName
+from sern_core.vocabulary.errors import UsageError
+from sern_core.vocabulary.types import ClientName
 from sern_runtime import clock
 from sern_runtime.seal import (
     ROOM_BYTES,

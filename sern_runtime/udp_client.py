@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Final
 
-from sern_core.errors import UsageError
+from sern_core.vocabulary.errors import UsageError
 from sern_runtime import clock
 from sern_runtime.seal import RekeyError, SessionParameters, Side
 from sern_runtime.udp import (

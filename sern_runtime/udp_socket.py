@@ -29,7 +29,7 @@ from array import array
 from collections.abc import Callable, Collection
 from typing import Final
 
-from sern_core.errors import ConfigError
+from sern_core.vocabulary.errors import ConfigError
 from sern_runtime.seal import SEAL_BYTES, UDP_PAYLOAD_BYTES
 from sern_runtime.zmq_socket import SendResult
 

@@ -21,7 +21,7 @@ from typing import Final
 import zmq
 from zmq.utils import z85
 
-from sern_core.errors import ConfigError, SernError, UsageError
+from sern_core.vocabulary.errors import ConfigError, SernError, UsageError
 from sern_runtime.addresses import plain_host
 from sern_runtime.monitor import EventKind, MonitorEvent, SocketMonitor
 from sern_runtime.zmq_socket import DealerSocket, FrameSocket, connect_curve

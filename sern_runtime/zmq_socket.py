@@ -30,7 +30,7 @@ from typing import Final, NamedTuple, Protocol, cast
 
 import zmq
 
-from sern_core.errors import ConfigError, UsageError
+from sern_core.vocabulary.errors import ConfigError, UsageError
 from sern_runtime.addresses import plain_host
 from sern_runtime.inflow import trim_memory
 

@@ -4,7 +4,7 @@ from collections import deque
 from hashlib import blake2b
 from typing import Final, NamedTuple
 
-from sern_core.errors import SernError
+from sern_core.vocabulary.errors import SernError
 
 RECENT_EVENTS: Final = 1000
 

@@ -14,7 +14,7 @@ from math import isfinite
 from random import Random
 from typing import Final, NamedTuple
 
-from sern_core.errors import UsageError
+from sern_core.vocabulary.errors import UsageError
 from sern_sim.models import SEGMENT_BYTES, Jitter, LinkModel
 
 NS: Final = 1_000_000_000

@@ -14,7 +14,7 @@ from enum import StrEnum
 from math import ceil, floor, inf
 from typing import Final, NamedTuple
 
-from sern_core.errors import UsageError
+from sern_core.vocabulary.errors import UsageError
 
 DEFAULT_QUEUE_PACKETS: Final = 100
 """Packets a bottleneck holds; small home and field routers are of this order."""

@@ -8,7 +8,7 @@ delay instead of being held back. Packets have their real headers there, so `ove
 import re
 from typing import Final
 
-from sern_core.errors import UsageError
+from sern_core.vocabulary.errors import UsageError
 from sern_sim.models import Jitter, LinkModel
 from sern_sim.profiles import LinkProfile
 

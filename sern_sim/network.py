@@ -19,11 +19,11 @@ from heapq import heappop, heappush
 from random import Random
 from typing import Any, Final
 
-from sern_core.errors import UsageError
+from sern_core.vocabulary.errors import UsageError
 from sern_sim.events import EventLog, SimulationStuck, SimulationTimeoutError
-from sern_sim.links import NEVER, NS, Link, LinkStats, to_ns
+from sern_sim.links import NEVER, NS, Link, to_ns
 from sern_sim.models import LinkModel
-from sern_sim.ports import Node, NodeState, Port, Slot, SoloNode
+from sern_sim.ports import Direction, Node, NodeState, Port, Slot, SoloNode
 
 MAX_EVENTS_PER_INSTANT: Final = 100_000
 """More events and datagrams than this at one instant are an endless loop, not traffic (a stall of a fast stream
@@ -37,35 +37,6 @@ is caught; below 2^17 s, where a float resolves 0.015 ns and the offset changes 
 _DELIVER, _TIMER, _CALL, _CONNECT, _BREAK = range(5)
 
 
-class Direction:
-    """One direction of a hop: its link and what became of the packets."""
-
-    __slots__ = ("_network", "_source", "_target", "epoch", "link", "name", "open")
-
-    def __init__(self, network: "Network", link: Link, source: Slot, target: Slot, name: str) -> None:
-        self._network = network
-        self._source = source
-        self._target = target
-        self.link = link
-        self.name = name
-        self.open = False
-        self.epoch = 0  # arrivals of an earlier epoch were under way when the connection broke
-
-    @property
-    def model(self) -> LinkModel:
-        return self.link.model
-
-    @property
-    def stats(self) -> LinkStats:
-        """Counters since the start of the run; `later.minus(earlier)` for a part of it."""
-        return self.link.stats(self._network.elapsed_ns)
-
-    @property
-    def backlog_packets(self) -> int:
-        """Packets in the bottleneck's queue now."""
-        return self.link.backlog_packets(self._network.elapsed_ns)
-
-
 class Hop:
     """Two ports and the links between them. `forward` is a to b, `backward` b to a."""
 
@@ -76,8 +47,8 @@ class Hop:
         self.name = name
         self._a = a
         self._b = b
-        self.forward = Direction(network, forward, a, b, f"{name}>")
-        self.backward = Direction(network, backward, b, a, f"{name}<")
+        self.forward = Direction(network, forward, b, f"{name}>")
+        self.backward = Direction(network, backward, a, f"{name}<")
         a.out = self.forward
         b.out = self.backward
         self.connected = False
@@ -460,7 +431,7 @@ class Network:
             return
         link.delivered_packets += 1
         link.delivered_bytes += len(data)
-        slot = direction._target
+        slot = direction.target
         if self._log is not None:
             self._log.add(self.elapsed_ns, "receive", slot.name, data)
         slot.receive(data, now=self.now)

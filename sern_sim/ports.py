@@ -1,12 +1,10 @@
 """Ports and nodes: what the virtual-time network joins, and how it keeps them."""
 
 from collections.abc import Callable, Iterable, Sequence
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
-from sern_sim.links import NEVER
-
-if TYPE_CHECKING:
-    from sern_sim.network import Direction
+from sern_sim.links import NEVER, Link, LinkStats
+from sern_sim.models import LinkModel
 
 
 class Port(Protocol):
@@ -72,6 +70,41 @@ class NodeState:
         self.alive = True
         self.after_event: Callable[[float], bool | None] | None = getattr(node, "after_event", None)
         self.take_dirty: Callable[[], Iterable[Port]] | None = getattr(node, "take_dirty", None)
+
+
+class Clock(Protocol):
+    """What counters and queues are as of."""
+
+    @property
+    def elapsed_ns(self) -> int: ...
+
+
+class Direction:
+    """One direction of a hop: its link and what became of the packets."""
+
+    __slots__ = ("_clock", "epoch", "link", "name", "open", "target")
+
+    def __init__(self, clock: Clock, link: Link, target: "Slot", name: str) -> None:
+        self._clock = clock
+        self.target = target
+        self.link = link
+        self.name = name
+        self.open = False
+        self.epoch = 0  # arrivals of an earlier epoch were under way when the connection broke
+
+    @property
+    def model(self) -> LinkModel:
+        return self.link.model
+
+    @property
+    def stats(self) -> LinkStats:
+        """Counters since the start of the run; `later.minus(earlier)` for a part of it."""
+        return self.link.stats(self._clock.elapsed_ns)
+
+    @property
+    def backlog_packets(self) -> int:
+        """Packets in the bottleneck's queue now."""
+        return self.link.backlog_packets(self._clock.elapsed_ns)
 
 
 class Slot:

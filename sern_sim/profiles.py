@@ -7,7 +7,7 @@ virtual-time network (`Network.join(..., profile.up, profile.down)`), the shapin
 from dataclasses import dataclass, replace
 from typing import Final
 
-from sern_core.errors import UsageError
+from sern_core.vocabulary.errors import UsageError
 from sern_sim.models import LinkModel
 
 DEFAULT_DURATION_S: Final = 60.0

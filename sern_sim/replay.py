@@ -13,16 +13,16 @@ from functools import partial
 from random import Random
 from typing import Any, Final, NamedTuple
 
-from sern_core.access import AccessRule, AccessTable
-from sern_core.client import ClientCore
-from sern_core.codecs import Coder
-from sern_core.hub import Hub
-from sern_core.hub_port import HubPort
-from sern_core.message import Message, StreamInfo, TopicInfo, TopicSpec
-from sern_core.params import LinkParams, SchedulerParams
-from sern_core.queues import OutChannel
-from sern_core.trace import DecisionTrace
-from sern_core.types import ClientName, TopicName
+from sern_core.bodies.codecs import Coder
+from sern_core.relay.access import AccessRule, AccessTable
+from sern_core.relay.hub import Hub
+from sern_core.relay.hub_port import HubPort
+from sern_core.site.client import ClientCore
+from sern_core.stream.out_channel import OutChannel
+from sern_core.vocabulary.message import Message, StreamInfo, TopicInfo, TopicSpec
+from sern_core.vocabulary.params import LinkParams, SchedulerParams
+from sern_core.vocabulary.trace import DecisionTrace
+from sern_core.vocabulary.types import ClientName, TopicName
 from sern_sim.models import LinkModel
 from sern_sim.network import Network
 from sern_sim.ports import Port

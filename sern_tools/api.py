@@ -14,7 +14,7 @@ from collections.abc import Mapping
 from typing import Any, Final
 from urllib.parse import urlsplit
 
-from sern_core.errors import ConfigError, SernError, UsageError
+from sern_core.vocabulary.errors import ConfigError, SernError, UsageError
 from sern_runtime.entry import EXIT_CONFIG, EXIT_FAILED
 
 LOCAL_APIS: Final = tuple(f"http://127.0.0.1:{port}" for port in (5580, 5581, 5582))

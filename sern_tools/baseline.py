@@ -32,10 +32,11 @@ import zmq.asyncio
 
 from sern_client.endpoints.base import Endpoint, Subscription
 from sern_client.factory import make_endpoint
-from sern_core.errors import ConfigError, SernError
-from sern_core.message import TopicInfo
-from sern_core.rules import ResolvedTopic, to_global
-from sern_core.types import CLASS_LABELS, TopicName
+from sern_core.topics.rules import ResolvedTopic
+from sern_core.vocabulary.errors import ConfigError, SernError
+from sern_core.vocabulary.message import TopicInfo
+from sern_core.vocabulary.names import to_global
+from sern_core.vocabulary.types import CLASS_LABELS, TopicName
 from sern_runtime.config.client import ClientFile, load_client
 from sern_tools.message_log import Delivery, MessageLog, Offer
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from sern_core.errors import ConfigError
+from sern_core.vocabulary.errors import ConfigError
 
 
 @dataclass(frozen=True, slots=True)

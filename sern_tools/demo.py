@@ -29,7 +29,7 @@ import aiohttp
 import typer
 from rich.console import Console
 
-from sern_core.errors import ConfigError, SernError
+from sern_core.vocabulary.errors import ConfigError, SernError
 from sern_runtime.config.endpoints import installing
 from sern_runtime.profiles import load_profile
 from sern_tools import demo_charts, demo_report

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from sern_core.types import CLASS_LABELS
+from sern_core.vocabulary.types import CLASS_LABELS
 from sern_sim.profiles import LinkProfile
 from sern_tools.shaping import RateSchedule
 from sern_tools.summary import Floats, Result

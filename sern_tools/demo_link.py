@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from sern_core.errors import SernError
+from sern_core.vocabulary.errors import SernError
 from sern_tools.demo_report import Carried
 from sern_tools.demo_scenario import FAR_HOST
 from sern_tools.processes import Child, Children

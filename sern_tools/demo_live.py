@@ -11,7 +11,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from sern_core.types import CLASS_LABELS
+from sern_core.vocabulary.types import CLASS_LABELS
 from sern_sim.profiles import LinkProfile
 
 LINE_INTERVAL_S: Final = 5.0

@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from sern_core.types import CLASS_LABELS
+from sern_core.vocabulary.types import CLASS_LABELS
 from sern_runtime.config.endpoints import installing
 from sern_sim.profiles import LinkProfile
 from sern_tools import demo_charts

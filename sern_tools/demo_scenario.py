@@ -11,8 +11,8 @@ from typing import Any, Final
 
 from ruamel.yaml import YAML
 
-from sern_core.errors import ConfigError
-from sern_core.params import SchedulerParams
+from sern_core.vocabulary.errors import ConfigError
+from sern_core.vocabulary.params import SchedulerParams
 from sern_sim.profiles import LinkProfile
 from sern_tools.keygen import make_keys
 from sern_tools.shaping import RateSchedule

@@ -29,14 +29,14 @@ import zmq
 from pydantic import ValidationError
 
 from sern_client.transport import RelayTransport
-from sern_core import wire
-from sern_core.client import ClientCore
-from sern_core.errors import ConfigError, RefusedError, SernError, UsageError
-from sern_core.message import Message, StreamId, StreamInfo
-from sern_core.params import LinkParams, SchedulerParams
-from sern_core.rules import client_name, name_problem
-from sern_core.session import DISPLACED, NEW_SESSION
-from sern_core.types import ClientName, DropReason, Encoding, TopicName
+from sern_core.link.session import DISPLACED, NEW_SESSION
+from sern_core.site.client import ClientCore
+from sern_core.vocabulary.errors import ConfigError, RefusedError, SernError, UsageError
+from sern_core.vocabulary.message import Message, StreamId, StreamInfo
+from sern_core.vocabulary.names import client_name, name_problem
+from sern_core.vocabulary.params import LinkParams, SchedulerParams
+from sern_core.vocabulary.types import ClientName, DropReason, Encoding, TopicName
+from sern_core.wire import framing
 from sern_runtime import clock
 from sern_runtime.config.client import RelayConnection, load_client
 from sern_runtime.keys import SecretKey, load_secret, load_server_keys
@@ -231,7 +231,7 @@ class Listener:
         elif not self.done and not reason.startswith(TAKEN):  # `rejected` says it next
             self._warn(f"link down: {reason}; waiting")
 
-    def lane_offered(self, parameters: wire.Envelope) -> None:
+    def lane_offered(self, parameters: framing.Envelope) -> None:
         """Never asked for: one lane is enough to look."""
 
     def lane_closed(self) -> None:

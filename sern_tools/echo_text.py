@@ -9,8 +9,8 @@ from typing import Any, Final
 import numpy as np
 from rosbags.typesys import TypesysError
 
-from sern_core.errors import ConfigError, SernError
-from sern_core.types import Encoding
+from sern_core.vocabulary.errors import ConfigError, SernError
+from sern_core.vocabulary.types import Encoding
 from sern_runtime import ros_types
 
 MAX_ITEMS: Final = 32

@@ -13,9 +13,9 @@ from typing import Annotated, Any, Final
 
 import typer
 
-from sern_core.errors import SernError, UsageError
-from sern_core.trace import DecisionTrace, TraceEvent
-from sern_core.types import TopicName
+from sern_core.vocabulary.errors import SernError, UsageError
+from sern_core.vocabulary.trace import DecisionTrace, TraceEvent
+from sern_core.vocabulary.types import TopicName
 from sern_runtime.profiles import load_profile
 from sern_tools.api import NotFoundError, checked_api, drop_output, get_json, say
 from sern_tools.explain_replay import Clouds, Setup, replay

@@ -11,16 +11,16 @@ from rosbags.rosbag1 import Reader as Reader1
 from rosbags.rosbag2 import Reader as Reader2
 
 from sern_client.endpoints.clouds import CLOUD_TYPE, CloudSource
-from sern_core.codecs import Coder
-from sern_core.errors import ConfigError, UsageError
-from sern_core.message import TopicInfo, TopicSpec
-from sern_core.mmcf.adapter import SAMPLES, HopAdapter, Step
-from sern_core.mmcf.report import step_json
-from sern_core.params import LinkParams, SchedulerParams
-from sern_core.patterns import compile_pattern
-from sern_core.rules import RuleSet, TopicRule
-from sern_core.trace import DecisionTrace
-from sern_core.types import Encoding, PriorityClass, TopicName
+from sern_core.adaptation.adapter import SAMPLES, HopAdapter, Step
+from sern_core.adaptation.report import step_json
+from sern_core.bodies.codecs import Coder
+from sern_core.topics.patterns import compile_pattern
+from sern_core.topics.rules import RuleSet, TopicRule
+from sern_core.vocabulary.errors import ConfigError, UsageError
+from sern_core.vocabulary.message import TopicInfo, TopicSpec
+from sern_core.vocabulary.params import LinkParams, SchedulerParams
+from sern_core.vocabulary.trace import DecisionTrace
+from sern_core.vocabulary.types import Encoding, PriorityClass, TopicName
 from sern_runtime import ros_types
 from sern_runtime.config.adaptation import AdaptationSection
 from sern_runtime.config.client import load_client

@@ -5,8 +5,8 @@ from typing import Annotated, Literal
 
 import typer
 
-from sern_core.errors import ConfigError, SernError
-from sern_core.rules import client_name
+from sern_core.vocabulary.errors import ConfigError, SernError
+from sern_core.vocabulary.names import client_name
 from sern_runtime import keys
 
 EXIT_USER_ERROR = 2

@@ -15,7 +15,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Final, NamedTuple, TextIO
 
-from sern_core.errors import ConfigError
+from sern_core.vocabulary.errors import ConfigError
 
 HEADER: Final = ("event", "wall_ns", "topic", "class", "seq", "bytes", "stamp_ns", "crc32", "age_s", "reason", "peer")
 

@@ -12,7 +12,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Final
 
-from sern_core.errors import SernError
+from sern_core.vocabulary.errors import SernError
 
 HOST: Final = "127.0.0.1"
 OUTGOING: Final = Path("/proc/sys/net/ipv4/ip_local_port_range")

@@ -18,7 +18,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, Self
 
-from sern_core.errors import SernError
+from sern_core.vocabulary.errors import SernError
 from sern_tools import child as launcher
 from sern_tools import sweeper as sweeping
 

@@ -33,7 +33,7 @@ from dataclasses import dataclass, field
 from random import Random
 from typing import Final, Self
 
-from sern_core.errors import SernError
+from sern_core.vocabulary.errors import SernError
 from sern_sim.models import LinkModel
 from sern_sim.profiles import LinkProfile
 from sern_tools.proxy_datagrams import DatagramRoute, Loss

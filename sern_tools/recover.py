@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from sern_client.endpoints.leftovers import finish, in_use
-from sern_core.errors import ConfigError
+from sern_core.vocabulary.errors import ConfigError
 
 
 def recover(

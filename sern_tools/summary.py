@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from sern_core.types import CLASS_LABELS
+from sern_core.vocabulary.types import CLASS_LABELS
 from sern_tools.counters import Counters
 from sern_tools.fates import NO_DROP, UNCONFIRMED, Fates, Route, fates
 from sern_tools.message_log import Event, TopicLog

@@ -18,10 +18,10 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from sern_core.errors import SernError, UsageError
-from sern_core.patterns import Pattern, compile_pattern
-from sern_core.services import parse as parse_service
-from sern_core.types import CLASS_LABELS, TopicName
+from sern_core.site.services import parse as parse_service
+from sern_core.topics.patterns import Pattern, compile_pattern
+from sern_core.vocabulary.errors import SernError, UsageError
+from sern_core.vocabulary.types import CLASS_LABELS, TopicName
 from sern_tools.api import NotFoundError, checked_api, drop_output, get_json, is_stream, local_api, say
 
 MIN_INTERVAL_S: Final = 0.1

@@ -3,15 +3,15 @@
 from dataclasses import dataclass, field
 from random import Random
 
-from sern_core.mmcf.adapter import SAMPLES, AdapterParams, HopAdapter, Step
-from sern_core.mmcf.cost import Ranges, profile
-from sern_core.mmcf.model import Configuration
-from sern_core.mmcf.policy import Mmcf, Policy
-from sern_core.mmcf.predict import Grid
-from sern_core.params import LinkParams
-from sern_core.queues import OutChannel
+from sern_core.adaptation.adapter import SAMPLES, AdapterParams, HopAdapter, Step
+from sern_core.adaptation.cost import Ranges, profile
+from sern_core.adaptation.model import Configuration
+from sern_core.adaptation.policy import Mmcf, Policy
+from sern_core.adaptation.predict import Grid
+from sern_core.stream.out_channel import OutChannel
 from sern_core.summaries.spec import SummaryLevel, SummaryProfile
-from sern_core.types import PriorityClass
+from sern_core.vocabulary.params import LinkParams
+from sern_core.vocabulary.types import PriorityClass
 from sern_sim.models import LinkModel
 from tests.world import SimClient, World
 

@@ -17,7 +17,7 @@ import pytest
 import uvloop
 import zmq
 
-from sern_core.types import ClientName
+from sern_core.vocabulary.types import ClientName
 from sern_runtime.keys import SecretKey, generate
 from sern_runtime.loop import raise_open_files
 from sern_tools.ports import release_claims

@@ -24,7 +24,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from sern_client.daemon import ClientDaemon
 from sern_client.endpoints.base import Endpoint
-from sern_core.types import ClientName
+from sern_core.vocabulary.types import ClientName
 from sern_relay.daemon import RelayDaemon
 from sern_runtime.config.client import load_client
 from sern_runtime.config.relay import load_relay

@@ -14,9 +14,9 @@ from sern_client.endpoints.base import (
     Subscription,
     TopicEvents,
 )
-from sern_core.errors import ConfigError, ServiceError
-from sern_core.message import TopicInfo
-from sern_core.types import Encoding, TopicName
+from sern_core.vocabulary.errors import ConfigError, ServiceError
+from sern_core.vocabulary.message import TopicInfo
+from sern_core.vocabulary.types import Encoding, TopicName
 
 
 class Served:

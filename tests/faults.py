@@ -6,15 +6,15 @@ from contextlib import ExitStack, contextmanager
 from typing import Any
 from unittest.mock import patch
 
-from sern_core.client import ClientCore
-from sern_core.control.hybrid import HybridWindow
-from sern_core.flight import Flight
-from sern_core.fragments import InStream
-from sern_core.hub import Hub
-from sern_core.link import Link, LinkHandler
-from sern_core.objects import ObjectRegistry
-from sern_core.queues import OutChannel
-from sern_core.scheduler import Scheduler
+from sern_core.link.link import Link, LinkHandler
+from sern_core.path.congestion.hybrid import HybridWindow
+from sern_core.path.flight import Flight
+from sern_core.relay.hub import Hub
+from sern_core.relay.objects import ObjectRegistry
+from sern_core.site.client import ClientCore
+from sern_core.stream.in_stream import InStream
+from sern_core.stream.out_channel import OutChannel
+from sern_core.stream.scheduler import Scheduler
 from tests.world import SimClient, SimHub
 
 

@@ -11,17 +11,25 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final
 
-from sern_core import wire
-from sern_core.announce import Announcement, definition_hash, encode_announcement
-from sern_core.errors import RemoteError
-from sern_core.message import StreamId, StreamInfo, TopicInfo, TopicSpec
-from sern_core.types import DROP_CODES, ClientName, DropReason, Durability, Encoding, PriorityClass, TopicName
+from sern_core.vocabulary.errors import RemoteError
+from sern_core.vocabulary.message import StreamId, StreamInfo, TopicInfo, TopicSpec
+from sern_core.vocabulary.types import (
+    DROP_CODES,
+    ClientName,
+    DropReason,
+    Durability,
+    Encoding,
+    PriorityClass,
+    TopicName,
+)
+from sern_core.wire import framing
+from sern_core.wire.announce import Announcement, definition_hash, encode_announcement
 
 DIRECTORY: Final = Path(__file__).resolve().parents[1] / "schemas" / "vectors"
 
 Vector = dict[str, Any]
 
-FLAGS: Final = {"TOMBSTONE": wire.FLAG_TOMBSTONE, "REPLAY": wire.FLAG_REPLAY, "URGENT": wire.FLAG_URGENT}
+FLAGS: Final = {"TOMBSTONE": framing.FLAG_TOMBSTONE, "REPLAY": framing.FLAG_REPLAY, "URGENT": framing.FLAG_URGENT}
 DEFINITION: Final = "std_msgs/Header header\nfloat64[] ranges\n"
 
 
@@ -34,24 +42,24 @@ def encode_frame(frame: Vector) -> bytes:
             flags = sum(FLAGS[name] for name in frame["flags"])
             body = bytes.fromhex(frame["body"])
             if frame["offset"]:
-                head = wire.encode_data_next(
+                head = framing.encode_data_next(
                     flags, frame["channel"], frame["seq"], frame["offset"], frame["total"], len(body)
                 )
             else:
-                head = wire.encode_data_first(
+                head = framing.encode_data_first(
                     flags,
                     frame["channel"],
                     frame["seq"],
                     frame["total"],
                     len(body),
                     frame["stamp_ns"],
-                    (frame["age_100us"] + 0.5) * wire.AGE_UNIT_S,
+                    (frame["age_100us"] + 0.5) * framing.AGE_UNIT_S,
                     frame["codec"],
-                    wire.AGE_ERRORS_S[frame["age_error"]],
+                    framing.AGE_ERRORS_S[frame["age_error"]],
                 )
             return head + body
         case "ACK":
-            return wire.encode_ack(
+            return framing.encode_ack(
                 frame["lane"],
                 frame["highest"],
                 frame["sack"],
@@ -60,20 +68,20 @@ def encode_frame(frame: Vector) -> bytes:
                 frame["cumulative_bytes"],
             )
         case "WATERMARK":
-            return wire.encode_watermark(frame["channel"], frame["delivered"])
+            return framing.encode_watermark(frame["channel"], frame["delivered"])
         case _:
-            return wire.PING_FRAME
+            return framing.PING_FRAME
 
 
 def encode(vector: Vector) -> bytes:
     """The bytes that a vector's meaning stands for."""
     if vector["layer"] == "control":
-        return wire.encode_control(vector["envelope"], vector["attachment"].encode())
+        return framing.encode_control(vector["envelope"], vector["attachment"].encode())
     header = vector["header"]
-    kind = wire.Kind[header["kind"]]
-    if kind is not wire.Kind.DATA:
-        return wire.encode_handshake(kind, header["tag"], header["stamp_us"], vector["envelope"])
-    head = wire.encode_header(kind, header["tag"], header["number"], header["stamp_us"], version=header["version"])
+    kind = framing.Kind[header["kind"]]
+    if kind is not framing.Kind.DATA:
+        return framing.encode_handshake(kind, header["tag"], header["stamp_us"], vector["envelope"])
+    head = framing.encode_header(kind, header["tag"], header["number"], header["stamp_us"], version=header["version"])
     return b"".join((head, *map(encode_frame, vector["frames"])))
 
 
@@ -90,7 +98,7 @@ class Frames:
         seq: int,
         offset: int,
         total: int,
-        body: wire.Datagram,
+        body: framing.Datagram,
         stamp_ns: int,
         age_s: float,
         codec: int,
@@ -106,12 +114,12 @@ class Frames:
             "body": body.hex(),
         }
         if offset == 0:
-            age = round(age_s / wire.AGE_UNIT_S)
+            age = round(age_s / framing.AGE_UNIT_S)
             frame |= {
                 "stamp_ns": stamp_ns,
                 "age_100us": age,
                 "codec": codec,
-                "age_error": wire.AGE_ERRORS_S.index(error_s),
+                "age_error": framing.AGE_ERRORS_S.index(error_s),
             }
         self.frames.append(frame)
 
@@ -138,20 +146,20 @@ class Frames:
 def decode(layer: str, data: bytes) -> Vector:
     """The meaning of bytes, without name and text. Raises what the codec raises."""
     if layer == "control":
-        envelope, attachment = wire.decode_control(data)
+        envelope, attachment = framing.decode_control(data)
         return {"layer": layer, "envelope": envelope, "attachment": attachment.decode()}
-    header = wire.decode_header(data)
+    header = framing.decode_header(data)
     head = {
         "version": header.version,
-        "kind": wire.Kind(header.kind).name,
+        "kind": framing.Kind(header.kind).name,
         "tag": header.tag,
         "number": header.number,
         "stamp_us": header.stamp_us,
     }
-    if header.kind != wire.Kind.DATA:
-        return {"layer": layer, "header": head, "envelope": wire.decode_handshake(data)}
+    if header.kind != framing.Kind.DATA:
+        return {"layer": layer, "header": head, "envelope": framing.decode_handshake(data)}
     sink = Frames()
-    wire.decode_frames(data, sink)
+    framing.decode_frames(data, sink)
     return {"layer": layer, "header": head, "frames": sink.frames}
 
 
@@ -159,7 +167,7 @@ def decode(layer: str, data: bytes) -> Vector:
 
 
 def _handshake(name: str, what: str, kind: str, envelope: Vector, *, tag: int = 7) -> Vector:
-    header = {"version": wire.HANDSHAKE_VERSION, "kind": kind, "tag": tag, "number": 0, "stamp_us": 1_500_000}
+    header = {"version": framing.HANDSHAKE_VERSION, "kind": kind, "tag": tag, "number": 0, "stamp_us": 1_500_000}
     return {"name": name, "what": what, "layer": "datagram", "header": header, "envelope": envelope}
 
 
@@ -419,7 +427,7 @@ def _bad_bytes() -> Iterator[tuple[str, str, bytes]]:
     def changed(data: bytes, at: int, value: int, size: int = 1) -> bytes:
         return data[:at] + value.to_bytes(size) + data[at + size :]
 
-    for length in range(wire.HEADER_BYTES):
+    for length in range(framing.HEADER_BYTES):
         yield f"header-of-{length}", "datagram", header[:length]
     yield "oversize-datagram", "datagram", b""  # filled in by `rejected`: too long to print
     yield "bad-magic", "datagram", changed(header, 0, 0x54)
@@ -445,14 +453,18 @@ def _bad_bytes() -> Iterator[tuple[str, str, bytes]]:
     yield "fragment-outside", "datagram", changed(whole, first + 12, 4, 4)
     yield "fragment-outside-at-offset", "datagram", changed(by_name["data-next"], first + 8, 6, 4)
     yield "fragment-wraps", "datagram", changed(by_name["data-next"], first + 8, 0xFFFF_FFFF, 4)
-    yield "empty-fragment", "datagram", header + wire.encode_data_next(0, 3, 41, 5, 10, 0)
-    yield "empty-first-fragment", "datagram", header + wire.encode_data_first(0, 3, 41, 10, 0, 0, 0.0, 0)
-    size = wire.MAX_FRAGMENT_BYTES + 1
-    yield "oversize-fragment", "datagram", header + wire.encode_data_first(0, 3, 41, size, size, 0, 0.0, 0)
-    tombstone = wire.FLAG_TOMBSTONE
-    yield "tombstone-of-two", "datagram", header + wire.encode_data_first(tombstone, 3, 41, 2, 2, 0, 0.0, 0) + b"\1\1"
-    yield "tombstone-of-none", "datagram", header + wire.encode_data_first(tombstone, 3, 41, 0, 0, 0, 0.0, 0)
-    yield "tombstone-empty-of-one", "datagram", header + wire.encode_data_first(tombstone, 3, 41, 1, 0, 0, 0.0, 0)
+    yield "empty-fragment", "datagram", header + framing.encode_data_next(0, 3, 41, 5, 10, 0)
+    yield "empty-first-fragment", "datagram", header + framing.encode_data_first(0, 3, 41, 10, 0, 0, 0.0, 0)
+    size = framing.MAX_FRAGMENT_BYTES + 1
+    yield "oversize-fragment", "datagram", header + framing.encode_data_first(0, 3, 41, size, size, 0, 0.0, 0)
+    tombstone = framing.FLAG_TOMBSTONE
+    yield (
+        "tombstone-of-two",
+        "datagram",
+        header + framing.encode_data_first(tombstone, 3, 41, 2, 2, 0, 0.0, 0) + b"\1\1",
+    )
+    yield "tombstone-of-none", "datagram", header + framing.encode_data_first(tombstone, 3, 41, 0, 0, 0, 0.0, 0)
+    yield "tombstone-empty-of-one", "datagram", header + framing.encode_data_first(tombstone, 3, 41, 1, 0, 0, 0.0, 0)
     yield "five-acks", "datagram", header + 5 * by_name["ack"][first:]
 
     def envelope(data: bytes) -> bytes:
@@ -501,7 +513,7 @@ def _bad_bytes() -> Iterator[tuple[str, str, bytes]]:
     yield "zlib-garbage", "control", synced + b"\x00garbage"
     yield "zlib-wrong-checksum", "control", synced + packed[:-1] + bytes([packed[-1] ^ 1])
     yield "zlib-dictionary", "control", synced + b"\x78\xf9\x00\x00\x00\x01"
-    yield "zlib-bomb", "control", synced + zlib.compress(bytes(wire.MAX_ATTACHMENT_BYTES + 1), 9)
+    yield "zlib-bomb", "control", synced + zlib.compress(bytes(framing.MAX_ATTACHMENT_BYTES + 1), 9)
 
 
 def rejected() -> list[Vector]:
@@ -509,7 +521,7 @@ def rejected() -> list[Vector]:
     vectors = []
     for name, layer, data in _bad_bytes():
         if name == "oversize-datagram":
-            data = bytes(wire.MAX_DATAGRAM_BYTES + 1)
+            data = bytes(framing.MAX_DATAGRAM_BYTES + 1)
             shown: Vector = {"zero_bytes": len(data)}
         else:
             shown = {"hex": data.hex()}

@@ -10,10 +10,10 @@ from itertools import pairwise
 
 from hypothesis import strategies as st
 
-from sern_core.fragments import PARTIAL_IDLE_S
-from sern_core.message import StreamId, TopicSpec
-from sern_core.queues import OutChannel
-from sern_core.types import DropReason, PriorityClass
+from sern_core.stream.in_stream import PARTIAL_IDLE_S
+from sern_core.stream.out_channel import OutChannel
+from sern_core.vocabulary.message import StreamId, TopicSpec
+from sern_core.vocabulary.types import DropReason, PriorityClass
 from sern_sim.models import Jitter, LinkModel, Window
 from tests.world import Clock, SimClient, World, spec
 

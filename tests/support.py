@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Final
 
 from sern_client.endpoints.base import ServiceInfo
-from sern_core.message import TopicInfo
-from sern_core.types import TopicName
+from sern_core.vocabulary.message import TopicInfo
+from sern_core.vocabulary.types import TopicName
 
 DEADLINE_S: Final = 60.0
 """Long enough for a machine that is busy with much else; reached only when something is broken."""

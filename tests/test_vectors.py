@@ -6,9 +6,10 @@ from typing import Any
 
 import pytest
 
-from sern_core import codecs, wire
-from sern_core.announce import decode_announcement, encode_announcement
-from sern_core.errors import RemoteError
+from sern_core.bodies import codecs
+from sern_core.vocabulary.errors import RemoteError
+from sern_core.wire import framing
+from sern_core.wire.announce import decode_announcement, encode_announcement
 from tests.make_vectors import DIRECTORY, FLAGS, decode, encode, files
 
 VALID = sorted(path for path in DIRECTORY.glob("*.json") if path.name != "rejected.json")
@@ -60,7 +61,7 @@ def test_every_kind_frame_and_flag_has_a_vector() -> None:
     vectors = [load(path) for path in VALID]
     headers = {vector["header"]["kind"] for vector in vectors if "header" in vector}
     frames = [frame for vector in vectors for frame in vector.get("frames", ())]
-    assert headers == {kind.name for kind in wire.Kind}
+    assert headers == {kind.name for kind in framing.Kind}
     assert {frame["type"] for frame in frames} == {"DATA", "ACK", "WATERMARK", "PING"}
     assert {flag for frame in frames for flag in frame.get("flags", ())} == set(FLAGS)
 

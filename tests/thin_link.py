@@ -7,7 +7,7 @@ such a link, so that is what a pose may have to wait for. Nothing adapts.
 from dataclasses import dataclass
 from typing import Final
 
-from sern_core.types import PriorityClass
+from sern_core.vocabulary.types import PriorityClass
 from sern_sim.models import LinkModel
 from tests.world import SimClient, World, spec
 

@@ -9,21 +9,20 @@ from dataclasses import dataclass, field
 from random import Random
 from typing import NamedTuple
 
-from sern_core import wire
-from sern_core.access import AccessRule, AccessTable
-from sern_core.client import ClientCore
-from sern_core.codecs import Coder, Compression, Work, raw_size
-from sern_core.decoding import DecodeRequest
-from sern_core.encoding import EncodeRequest
-from sern_core.hub import Hub, HubParams
-from sern_core.hub_port import HubPort
-from sern_core.link import Link
-from sern_core.lossy import DEFAULT_LOSSY, LossyParams
-from sern_core.message import Message, StreamId, StreamInfo, TopicInfo, TopicSpec
-from sern_core.params import LinkParams, SchedulerParams
-from sern_core.queues import OutChannel
-from sern_core.sending import SentPing
-from sern_core.types import (
+from sern_core.bodies.codecs import Coder, Work, raw_size
+from sern_core.link.link import Link
+from sern_core.link.sending import SentPing
+from sern_core.relay.access import AccessRule, AccessTable
+from sern_core.relay.hub import Hub, HubParams
+from sern_core.relay.hub_port import HubPort
+from sern_core.site.client import ClientCore
+from sern_core.stream.decoding import DecodeRequest
+from sern_core.stream.encoding import EncodeRequest
+from sern_core.stream.out_channel import OutChannel
+from sern_core.vocabulary.codec_names import DEFAULT_LOSSY, Compression, LossyParams
+from sern_core.vocabulary.message import Message, StreamId, StreamInfo, TopicInfo, TopicSpec
+from sern_core.vocabulary.params import LinkParams, SchedulerParams
+from sern_core.vocabulary.types import (
     ClientName,
     DropReason,
     Durability,
@@ -32,6 +31,7 @@ from sern_core.types import (
     Reliability,
     TopicName,
 )
+from sern_core.wire import framing
 from sern_sim.models import LinkModel
 from sern_sim.network import Hop, Network
 from sern_sim.ports import Port
@@ -227,7 +227,7 @@ class SimClient:
     def link_down(self, reason: str) -> None:
         self.downs.append(reason)
 
-    def lane_offered(self, parameters: wire.Envelope) -> None: ...
+    def lane_offered(self, parameters: framing.Envelope) -> None: ...
 
     def lane_closed(self) -> None:
         self.lanes_closed += 1

@@ -15,7 +15,7 @@ from typing import Final
 from benchmarks import common
 from benchmarks.common import MissingError
 from benchmarks.endpoints.shared import ROUNDS
-from sern_core.errors import SernError
+from sern_core.vocabulary.errors import SernError
 
 PARTS: Final = ("ros1", "dds", "discovery")
 

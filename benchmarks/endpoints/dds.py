@@ -29,8 +29,8 @@ from benchmarks.common import MissingError
 from benchmarks.endpoints import shared
 from benchmarks.endpoints.dds_roles import DEPTHS, TYPES
 from benchmarks.endpoints.shared import ALONE, CHAIN, DIRECT, HOST, START_S, Figures, within
-from sern_core.errors import SernError
-from sern_core.types import Encoding
+from sern_core.vocabulary.errors import SernError
+from sern_core.vocabulary.types import Encoding
 from sern_runtime import ros_types
 from sern_tools.ports import free_ports
 from sern_tools.processes import Child, Children

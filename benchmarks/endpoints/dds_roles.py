@@ -19,8 +19,8 @@ from benchmarks.zenoh_session import open_session
 from sern_client.endpoints.dds.domain import DomainOptions
 from sern_client.endpoints.dds.endpoint import DdsEndpoint, DdsOptions
 from sern_client.endpoints.handover import Handover
-from sern_core.message import TopicInfo
-from sern_core.types import Encoding, TopicName
+from sern_core.vocabulary.message import TopicInfo
+from sern_core.vocabulary.types import Encoding, TopicName
 from sern_runtime import ros_types
 
 TYPES: Final = {"/bench/odom": "nav_msgs/msg/Odometry", "/bench/cloud": "sensor_msgs/msg/PointCloud2"}

@@ -15,9 +15,9 @@ from benchmarks.endpoints.ros1 import ROSMASTER, Ros, need, running
 from benchmarks.endpoints.ros1_roles import ODOM, TYPES, advertise, body
 from benchmarks.endpoints.shared import CHAIN, HOST, within
 from sern_client.endpoints.ros1 import Ros1Endpoint, Ros1Options
-from sern_core.errors import SernError
-from sern_core.message import TopicInfo
-from sern_core.types import TopicName
+from sern_core.vocabulary.errors import SernError
+from sern_core.vocabulary.message import TopicInfo
+from sern_core.vocabulary.types import TopicName
 
 TOPICS: Final = 10
 """A round, one after the other."""

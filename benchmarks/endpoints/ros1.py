@@ -30,7 +30,7 @@ from benchmarks.endpoints import shared
 from benchmarks.endpoints.ros1_roles import CLOUD, ODOM, TYPES
 from benchmarks.endpoints.shared import ALONE, CHAIN, DIRECT, HOST, START_S, Figures, said, within
 from sern_client.endpoints.ros1.xmlrpc import CallError, XmlRpcClient
-from sern_core.errors import SernError
+from sern_core.vocabulary.errors import SernError
 from sern_tools.ports import free_ports
 from sern_tools.processes import Child, Children
 

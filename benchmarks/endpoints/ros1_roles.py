@@ -23,9 +23,9 @@ from sern_client.endpoints.ros1.frames import Frames
 from sern_client.endpoints.ros1.header import BRIDGE_FIELD, encode_header
 from sern_client.endpoints.ros1.publication import Handle
 from sern_client.endpoints.ros1.xmlrpc import CallError, XmlRpcClient
-from sern_core.errors import WireError
-from sern_core.message import TopicInfo
-from sern_core.types import Encoding, TopicName
+from sern_core.vocabulary.errors import WireError
+from sern_core.vocabulary.message import TopicInfo
+from sern_core.vocabulary.types import Encoding, TopicName
 from sern_runtime import ros_types
 
 ODOM, CLOUD = "/bench/odom", "/bench/cloud"

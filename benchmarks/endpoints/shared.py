@@ -13,7 +13,7 @@ from typing import Any, Final, TypeVar
 
 from benchmarks import child, common
 from benchmarks.common import MissingError
-from sern_core.errors import SernError
+from sern_core.vocabulary.errors import SernError
 from sern_tools.keygen import make_keys
 from sern_tools.ports import free_ports
 from sern_tools.processes import Child, Children

@@ -14,7 +14,7 @@ from benchmarks.link.forwarder import FORWARDER
 from benchmarks.link.junk import JUNK_HZ, Junk
 from benchmarks.link.load import Kind, Load
 from benchmarks.link.runs import Outcome, Step, run
-from sern_core.errors import SernError
+from sern_core.vocabulary.errors import SernError
 from sern_runtime.seal import ROOM_BYTES
 from sern_sim.models import LinkModel
 from sern_tools.lab.lab import Lab

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Final
 
 from benchmarks import child
-from sern_core.errors import SernError
+from sern_core.vocabulary.errors import SernError
 from sern_tools.processes import last_words
 
 STOP_S: Final = 20.0

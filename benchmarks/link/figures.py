@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 from benchmarks.link.load import FLOOD_BYTES, Kind, Load, Records
 from benchmarks.link.runs import Outcome
 from benchmarks.link.sern import SAMPLE_COLUMNS, TOPICS
-from sern_core import wire
-from sern_core.errors import SernError
-from sern_core.lanes import DATAGRAM_BYTES
+from sern_core.path.lanes import DATAGRAM_BYTES
+from sern_core.vocabulary.errors import SernError
+from sern_core.wire import framing
 from sern_runtime.seal import ROOM_BYTES, SEAL_BYTES, UDP_PAYLOAD_BYTES
 from sern_runtime.udp import OVERHEAD_BYTES
 
@@ -90,9 +90,11 @@ def ceiling_bps(outcome: Outcome) -> float:
     model = outcome.model
     assert model.rate_bps is not None
     pose = next(flow for flow in outcome.load.flows if flow.kind is Kind.POSE)
-    pose_wire_bytes = pose.size_bytes + wire.HEADER_BYTES + wire.DATA_FIRST_BYTES + OVERHEAD_BYTES + ETHERNET_BYTES
+    pose_wire_bytes = (
+        pose.size_bytes + framing.HEADER_BYTES + framing.DATA_FIRST_BYTES + OVERHEAD_BYTES + ETHERNET_BYTES
+    )
     rest_bps = model.rate_bps - 8 * pose.rate_hz * pose_wire_bytes
-    body_bytes = DATAGRAM_BYTES - wire.HEADER_BYTES - wire.DATA_BYTES
+    body_bytes = DATAGRAM_BYTES - framing.HEADER_BYTES - framing.DATA_BYTES
     whole_bps = rest_bps * body_bytes / (UDP_PAYLOAD_BYTES + ETHERNET_BYTES) + 8 * pose.rate_hz * pose.size_bytes
     return whole_bps * (1 - model.mean_loss)
 
@@ -100,7 +102,7 @@ def ceiling_bps(outcome: Outcome) -> float:
 def flood_ceiling_bps(outcome: Outcome) -> float:
     """What a link can carry of messages of `FLOOD_BYTES`, one in a datagram."""
     assert outcome.model.rate_bps is not None
-    overhead_bytes = wire.HEADER_BYTES + wire.DATA_FIRST_BYTES + OVERHEAD_BYTES + ETHERNET_BYTES
+    overhead_bytes = framing.HEADER_BYTES + framing.DATA_FIRST_BYTES + OVERHEAD_BYTES + ETHERNET_BYTES
     return outcome.model.rate_bps * FLOOD_BYTES / (FLOOD_BYTES + overhead_bytes)
 
 

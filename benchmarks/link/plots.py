@@ -8,7 +8,7 @@ from benchmarks.link import figures
 from benchmarks.link.load import Kind
 from benchmarks.link.runs import Outcome
 from benchmarks.link.sern import SAMPLE_COLUMNS
-from sern_core.errors import ConfigError
+from sern_core.vocabulary.errors import ConfigError
 
 SIZE_INCHES: Final = (7.5, 3.6)
 DPI: Final = 110

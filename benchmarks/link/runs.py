@@ -21,7 +21,7 @@ from benchmarks.link.children import Running, environment
 from benchmarks.link.forwarder import FORWARDER, Hops
 from benchmarks.link.load import Load, Records, Spec, read_log
 from benchmarks.link.sern import RELAY_PORT
-from sern_core.errors import SernError
+from sern_core.vocabulary.errors import SernError
 from sern_sim.models import LinkModel
 from sern_tools.keygen import make_keys
 from sern_tools.lab.backends import DEVICE, NETWORK, PREFIX

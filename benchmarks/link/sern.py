@@ -14,11 +14,11 @@ from sern_client.daemon import TICK_S
 from sern_client.express import ClientExpress
 from sern_client.transport import RelayTransport
 from sern_client.udp import ClientLane
-from sern_core import wire
-from sern_core.client import ClientCore
-from sern_core.message import KAPPA, Message, StreamInfo, TopicInfo, TopicSpec
-from sern_core.params import LinkParams, SchedulerParams
-from sern_core.types import ClientName, DropReason, Encoding, PriorityClass, TopicName
+from sern_core.site.client import ClientCore
+from sern_core.vocabulary.message import KAPPA, Message, StreamInfo, TopicInfo, TopicSpec
+from sern_core.vocabulary.params import LinkParams, SchedulerParams
+from sern_core.vocabulary.types import ClientName, DropReason, Encoding, PriorityClass, TopicName
+from sern_core.wire import framing
 from sern_runtime import clock, logs
 from sern_runtime.keys import load_public, load_secret
 from sern_runtime.topics_view import both_ways
@@ -137,7 +137,7 @@ class End:
     def rejected(self, code: str, text: str) -> None:
         self.problems.append(text)
 
-    def lane_offered(self, parameters: wire.Envelope) -> None:
+    def lane_offered(self, parameters: framing.Envelope) -> None:
         if self._lane is not None:
             self._lane.offered(parameters)
         if self.spec.sends:  # for an attacker who has seen it on the wire, where it is in clear

@@ -33,10 +33,10 @@ from sern_client.endpoints.base import Difference, Held, Publisher, Sink, TopicE
 from sern_client.endpoints.clock import Clock, SystemClock
 from sern_client.endpoints.held import HeldSubscription
 from sern_client.endpoints.leftovers import ACTIVE
-from sern_core.errors import ConfigError, UsageError
-from sern_core.message import TopicInfo
-from sern_core.patterns import PatternError, PatternSet
-from sern_core.types import Encoding, TopicName
+from sern_core.topics.patterns import PatternError, PatternSet
+from sern_core.vocabulary.errors import ConfigError, UsageError
+from sern_core.vocabulary.message import TopicInfo
+from sern_core.vocabulary.types import Encoding, TopicName
 from sern_runtime import ros_types
 from sern_runtime.ros_types import one_line
 

@@ -36,9 +36,9 @@ from sern_client.endpoints.bag_index import (
     write_mcap_index,
 )
 from sern_client.endpoints.leftovers import lock
-from sern_core.errors import ConfigError
-from sern_core.message import TopicInfo
-from sern_core.types import TopicName
+from sern_core.vocabulary.errors import ConfigError
+from sern_core.vocabulary.message import TopicInfo
+from sern_core.vocabulary.types import TopicName
 
 MAX_TIME: Final = 2**63 - 1
 CHUNK_BYTES: Final = 2**20

@@ -10,8 +10,8 @@ from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final, Protocol, runtime_checkable
 
-from sern_core.message import TopicInfo
-from sern_core.types import DropReason, Encoding, TopicName
+from sern_core.vocabulary.message import TopicInfo
+from sern_core.vocabulary.types import DropReason, Encoding, TopicName
 
 GUARD_SUFFIX: Final = "_guard"
 """What the node of a client's guard (sern_client/guard.py) has behind the name of the client's own node. It publishes

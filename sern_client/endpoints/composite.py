@@ -28,9 +28,9 @@ from sern_client.endpoints.base import (
     TopicEvents,
     publisher_within,
 )
-from sern_core.errors import ConfigError, ServiceError, UsageError
-from sern_core.message import TopicInfo
-from sern_core.types import DropReason, TopicName
+from sern_core.vocabulary.errors import ConfigError, ServiceError, UsageError
+from sern_core.vocabulary.message import TopicInfo
+from sern_core.vocabulary.types import DropReason, TopicName
 
 AGAIN_S: Final = 1.0
 """A member that cannot take a topic because of another one may be able to so long after that has ended."""

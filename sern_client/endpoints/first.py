@@ -12,7 +12,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import Final, NamedTuple
 
-from sern_core.types import DropReason
+from sern_core.vocabulary.types import DropReason
 
 HOLD_S: Final = 1.0
 """How long subscribers are waited for, from the publisher's beginning or when the graph is learned. To connect takes

@@ -38,7 +38,7 @@ from typing import Any, Final
 import numpy as np
 
 from sern_client.endpoints.clouds import CLOUD_TYPE, CloudSource, cloud_body
-from sern_core.types import Encoding
+from sern_core.vocabulary.types import Encoding
 from sern_runtime import ros_types
 from sern_sim.robot import GRAVITY_MPS2, GYRO_NOISE_RADPS, STEP_S, Pose2, SimulatedJackal
 

@@ -44,8 +44,8 @@ from sern_client.endpoints.bag_index import (
     write_bag_index,
     write_mcap_index,
 )
-from sern_core.errors import ConfigError
-from sern_core.types import Encoding
+from sern_core.vocabulary.errors import ConfigError
+from sern_core.vocabulary.types import Encoding
 from sern_runtime import ros_types
 
 ACTIVE: Final = ".active"

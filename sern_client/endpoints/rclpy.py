@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Final
 
 from sern_client.endpoints.base import GUARD_SUFFIX, Difference, Held, Publisher, Sink, Subscription, TopicEvents
 from sern_client.endpoints.handover import Handover
-from sern_core.errors import ConfigError, UsageError
-from sern_core.message import TopicInfo
-from sern_core.types import DropReason, Encoding, TopicName
+from sern_core.vocabulary.errors import ConfigError, UsageError
+from sern_core.vocabulary.message import TopicInfo
+from sern_core.vocabulary.types import DropReason, Encoding, TopicName
 from sern_runtime import ros_types
 from sern_runtime.entry import end_tasks
 from sern_runtime.ros_files import TypeFiles

@@ -29,9 +29,9 @@ from rosbags.rosbag2 import WriterError as WriterError2
 from sern_client.endpoints.bag_files import BagFile, McapFile, RecordFile, active_path
 from sern_client.endpoints.base import Difference, Held, KeptUpTo, Sink, Subscription, TopicEvents
 from sern_client.endpoints.leftovers import ACTIVE, finish, in_use, put_aside
-from sern_core.errors import ConfigError, UsageError
-from sern_core.message import TopicInfo
-from sern_core.types import DropReason, Encoding, TopicName
+from sern_core.vocabulary.errors import ConfigError, UsageError
+from sern_core.vocabulary.message import TopicInfo
+from sern_core.vocabulary.types import DropReason, Encoding, TopicName
 from sern_runtime import clock, ros_types
 from sern_runtime.ros_types import one_line
 

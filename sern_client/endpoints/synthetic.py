@@ -18,9 +18,9 @@ from sern_client.endpoints.base import Difference, Held, Sink, TopicEvents
 from sern_client.endpoints.clock import Clock, SystemClock
 from sern_client.endpoints.held import HeldSubscription
 from sern_client.endpoints.jackal import JACKAL, JackalSource, OperatorSource, Plan, Sizes
-from sern_core.errors import ConfigError, UsageError
-from sern_core.message import TopicInfo
-from sern_core.types import Encoding, TopicName
+from sern_core.vocabulary.errors import ConfigError, UsageError
+from sern_core.vocabulary.message import TopicInfo
+from sern_core.vocabulary.types import Encoding, TopicName
 from sern_runtime import ros_types
 from sern_sim.robot import STEP_S, RobotState
 

@@ -15,8 +15,8 @@ import struct
 from dataclasses import dataclass
 from typing import Final
 
-from sern_core.errors import BodyError
-from sern_core.types import Encoding
+from sern_core.vocabulary.errors import BodyError
+from sern_core.vocabulary.types import Encoding
 
 MAX_TEXT_BYTES: Final = 4096
 """Longest string taken: frame ids and field names are short, and a length that is not one is found at once."""

@@ -12,9 +12,9 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from sern_core.errors import BodyError
 from sern_core.summaries.bodies import BodyReader, BodyWriter, Header
-from sern_core.types import Encoding
+from sern_core.vocabulary.errors import BodyError
+from sern_core.vocabulary.types import Encoding
 
 CLOUD_TYPE: Final = "sensor_msgs/msg/PointCloud2"
 MAX_FIELDS: Final = 64

@@ -12,9 +12,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from sern_core.errors import BodyError
 from sern_core.summaries.bodies import BodyReader, BodyWriter, Header
-from sern_core.types import Encoding
+from sern_core.vocabulary.errors import BodyError
+from sern_core.vocabulary.types import Encoding
 
 GRID_TYPE: Final = "nav_msgs/msg/OccupancyGrid"
 UPDATE_TYPE: Final = "map_msgs/msg/OccupancyGridUpdate"

@@ -9,11 +9,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from sern_core.errors import UsageError
 from sern_core.summaries.clouds import read_cloud
 from sern_core.summaries.grids import Grid, GridFrame, write_grid
 from sern_core.summaries.obstacles import Band, ObstacleFinder
-from sern_core.types import Encoding
+from sern_core.vocabulary.errors import UsageError
+from sern_core.vocabulary.types import Encoding
 
 OCCUPIED: Final = 100
 FREE: Final = 0

@@ -16,8 +16,8 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sern_core.errors import BodyError
 from sern_core.summaries.clouds import Cloud, valid_rows
+from sern_core.vocabulary.errors import BodyError
 
 MAX_SLOPE: Final = 0.36
 """tan 20°: a steeper plane is no ground that a wheeled robot stands on, or the frame is not upright."""

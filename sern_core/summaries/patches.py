@@ -21,7 +21,6 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sern_core.errors import BodyError
 from sern_core.summaries.bodies import Header
 from sern_core.summaries.grids import (
     Grid,
@@ -31,7 +30,8 @@ from sern_core.summaries.grids import (
     write_grid,
     write_update,
 )
-from sern_core.types import Encoding
+from sern_core.vocabulary.errors import BodyError
+from sern_core.vocabulary.types import Encoding
 
 MAX_RECTANGLES: Final = 8
 RECTANGLE_BYTES: Final = 128

@@ -15,11 +15,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from sern_core.errors import UsageError
 from sern_core.summaries.bodies import BodyWriter
 from sern_core.summaries.clouds import read_cloud
 from sern_core.summaries.obstacles import Band, ObstacleFinder
-from sern_core.types import Encoding
+from sern_core.vocabulary.errors import UsageError
+from sern_core.vocabulary.types import Encoding
 
 SCAN_TYPE: Final = "sensor_msgs/msg/LaserScan"
 MAX_BEAMS: Final = 7200

@@ -10,7 +10,7 @@ from sern_core.summaries.mask import MaskParams
 from sern_core.summaries.patches import PatchParams
 from sern_core.summaries.scan import SCAN_TYPE, ScanParams
 from sern_core.summaries.voxel import VoxelPoint
-from sern_core.types import PriorityClass
+from sern_core.vocabulary.types import PriorityClass
 
 BEST_EFFORT_KEYFRAME_S: Final = 10.0
 """How often a changed grid is repeated whole where patches can be lost without a word."""

@@ -11,9 +11,9 @@ child has one parent, and a new one replaces the old, as in tf2's buffer.
 from dataclasses import dataclass
 from typing import Final
 
-from sern_core.errors import BodyError
 from sern_core.summaries.bodies import BodyReader, BodyWriter, Header
-from sern_core.types import Encoding
+from sern_core.vocabulary.errors import BodyError
+from sern_core.vocabulary.types import Encoding
 
 TF_TYPES: Final = frozenset({"tf2_msgs/TFMessage", "tf/tfMessage"})  # the older one has the same layout
 MAX_TRANSFORMS: Final = 4096

@@ -9,9 +9,9 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from sern_core.errors import UsageError
 from sern_core.summaries.clouds import read_cloud, valid_rows, write_cloud
-from sern_core.types import Encoding
+from sern_core.vocabulary.errors import UsageError
+from sern_core.vocabulary.types import Encoding
 
 _KEY_BITS: Final = 64
 

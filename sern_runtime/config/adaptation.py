@@ -6,12 +6,12 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from sern_core.mmcf.adapter import AdapterParams
-from sern_core.mmcf.cost import SUM_TOLERANCE, Ranges, Weights, profile, profile_floors
-from sern_core.mmcf.model import NO_CODEC, Configuration
-from sern_core.mmcf.policy import FixedPolicy, Mmcf, Policy, fixed_reliability, fixed_throughput
-from sern_core.mmcf.predict import Bounds, Grid, Predictor
-from sern_core.types import CLASSES, PriorityClass
+from sern_core.adaptation.adapter import AdapterParams
+from sern_core.adaptation.cost import SUM_TOLERANCE, Ranges, Weights, profile, profile_floors
+from sern_core.adaptation.model import NO_CODEC, Configuration
+from sern_core.adaptation.policy import FixedPolicy, Mmcf, Policy, fixed_reliability, fixed_throughput
+from sern_core.adaptation.predict import Bounds, Grid, Predictor
+from sern_core.vocabulary.types import CLASSES, PriorityClass
 from sern_runtime.config.base import Section, fault
 
 _RANGES = Ranges()

@@ -14,10 +14,10 @@ from typing import Annotated, Any, Final, Self
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, WrapValidator
 from pydantic_core import PydanticCustomError
 
-from sern_core.access import LONGEST_NAME, with_self
-from sern_core.errors import UsageError
-from sern_core.patterns import compile_pattern, matches_a_name
-from sern_core.rules import client_name, normal_namespace, topic_name
+from sern_core.relay.access import LONGEST_NAME, with_self
+from sern_core.topics.patterns import compile_pattern, matches_a_name
+from sern_core.vocabulary.errors import UsageError
+from sern_core.vocabulary.names import client_name, normal_namespace, topic_name
 from sern_runtime.config.yaml import Data, Loc
 
 _HOST: Final = re.compile(r"[A-Za-z0-9_](?:[A-Za-z0-9_.-]{0,251}[A-Za-z0-9_])?")

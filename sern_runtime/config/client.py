@@ -8,12 +8,10 @@ from typing import Annotated, Final, Literal, Self
 
 from pydantic import Discriminator, Field, Tag, model_validator
 
-from sern_core.codecs import Compression
-from sern_core.lossy import DEFAULT_LOSSY, LossyParams
-from sern_core.message import DEFAULT_RELIABLE_QUEUE_BYTES
-from sern_core.objects import COMMAND_OBJECT_TYPES
-from sern_core.patterns import MAX_CLIENT_PROGRAM, PatternError, PatternSet, compile_pattern
-from sern_core.rules import (
+from sern_core.relay.objects import COMMAND_OBJECT_TYPES
+from sern_core.site.services import ServiceRule, subscriptions
+from sern_core.topics.patterns import MAX_CLIENT_PROGRAM, PatternError, PatternSet, compile_pattern
+from sern_core.topics.rules import (
     AUTO,
     COMMAND_TYPES,
     Direction,
@@ -24,11 +22,11 @@ from sern_core.rules import (
     RuleError,
     RuleSet,
     TopicRule,
-    name_problem,
-    normal_namespace,
 )
-from sern_core.services import ServiceRule, subscriptions
-from sern_core.types import ClientName, Durability, PriorityClass, Reliability, TopicName
+from sern_core.vocabulary.codec_names import DEFAULT_LOSSY, Compression, LossyParams
+from sern_core.vocabulary.message import DEFAULT_RELIABLE_QUEUE_BYTES
+from sern_core.vocabulary.names import name_problem, normal_namespace
+from sern_core.vocabulary.types import ClientName, Durability, PriorityClass, Reliability, TopicName
 from sern_runtime.config.adaptation import AdaptationSection
 from sern_runtime.config.base import (
     Bytes,
@@ -84,7 +82,7 @@ class ClientSection(Section):
 
     @property
     def normal_namespace(self) -> str:
-        """`/` or `/part`: what `sern_core.rules.to_global` takes."""
+        """`/` or `/part`: what `sern_core.topics.rules.to_global` takes."""
         return normal_namespace(self.namespace or self.name)
 
 

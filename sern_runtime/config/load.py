@@ -13,7 +13,7 @@ from typing import Any, Final, Generic, TypeVar, get_args
 from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
-from sern_core.errors import ConfigError
+from sern_core.vocabulary.errors import ConfigError
 from sern_runtime.config.base import FileModel, Section, resolve
 from sern_runtime.config.yaml import Document, Loc, Node, parse_document, read_document
 

@@ -7,12 +7,13 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from sern_core.access import DEFAULT_QUEUE_BYTES, AccessRule
-from sern_core.errors import ConfigError, UsageError
-from sern_core.objects import COMMAND_OBJECT_TYPES
-from sern_core.patterns import PatternSet, compile_pattern
-from sern_core.rules import AUTO, FeedRole, FeedTopic, TopicRule, client_name, plain_type
-from sern_core.types import ClientName, Durability, Encoding, PriorityClass, Reliability
+from sern_core.relay.access import DEFAULT_QUEUE_BYTES, AccessRule
+from sern_core.relay.objects import COMMAND_OBJECT_TYPES
+from sern_core.topics.patterns import PatternSet, compile_pattern
+from sern_core.topics.rules import AUTO, FeedRole, FeedTopic, TopicRule
+from sern_core.vocabulary.errors import ConfigError, UsageError
+from sern_core.vocabulary.names import client_name, plain_type
+from sern_core.vocabulary.types import ClientName, Durability, Encoding, PriorityClass, Reliability
 from sern_runtime import ros_types
 from sern_runtime.config.adaptation import AdaptationSection
 from sern_runtime.config.base import (
@@ -334,7 +335,7 @@ class RelayFile(FileModel):
         return ClientName(self.relay.name)
 
     def access_rules(self) -> tuple[AccessRule, ...]:
-        """The rules for `sern_core.access.AccessTable`, those of the feed's roles first."""
+        """The rules for `sern_core.relay.access.AccessTable`, those of the feed's roles first."""
         roles = (
             AccessRule(client=role.owner, publish=tuple(pattern.pattern for pattern in role.publish))
             for role in self.feed_roles()

@@ -9,9 +9,9 @@ from typing import Annotated, Literal, get_args
 
 from pydantic import Field
 
-from sern_core.errors import ConfigError
-from sern_core.params import LinkParams, Redundancy, SchedulerParams, WindowAlgorithm, WindowParams
-from sern_core.types import Ordering
+from sern_core.vocabulary.errors import ConfigError
+from sern_core.vocabulary.params import LinkParams, Redundancy, SchedulerParams, WindowAlgorithm, WindowParams
+from sern_core.vocabulary.types import Ordering
 from sern_runtime.config.base import (
     Bytes,
     FileProblem,

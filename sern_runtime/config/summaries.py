@@ -4,16 +4,16 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Discriminator, Field, Tag, model_validator
 
-from sern_core.errors import UsageError
-from sern_core.replay import MAX_REPLAY_MESSAGES
-from sern_core.rules import topic_name
+from sern_core.stream.latched import MAX_REPLAY_MESSAGES
 from sern_core.summaries.mask import MAX_CELLS, MaskParams
 from sern_core.summaries.obstacles import Band
 from sern_core.summaries.patches import PatchParams
 from sern_core.summaries.scan import MAX_BEAMS, ScanParams
 from sern_core.summaries.spec import SummaryLevel, SummarySpec, VoxelParams
 from sern_core.summaries.voxel import VoxelPoint
-from sern_core.types import PriorityClass
+from sern_core.vocabulary.errors import UsageError
+from sern_core.vocabulary.names import topic_name
+from sern_core.vocabulary.types import PriorityClass
 from sern_runtime.config.base import Seconds, Section, fault
 from sern_runtime.config.shared import ClassWord
 

@@ -31,7 +31,7 @@ from ruamel.yaml.events import (
 )
 from ruamel.yaml.reader import ReaderError
 
-from sern_core.errors import ConfigError
+from sern_core.vocabulary.errors import ConfigError
 
 MAX_FILE_BYTES: Final = 256 * 1024
 MAX_DEPTH: Final = 16

@@ -14,7 +14,7 @@ from typing import Annotated, Any, Final, NoReturn
 
 import typer
 
-from sern_core.errors import SernError, UsageError
+from sern_core.vocabulary.errors import SernError, UsageError
 from sern_runtime.profiles import load_profile
 from sern_tools.lab.control import Control, ask, describe, running, take_down
 from sern_tools.lab.host import missing_rights

@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Final
 
-from sern_core.errors import SernError, UsageError
+from sern_core.vocabulary.errors import SernError, UsageError
 from sern_sim.models import Jitter, LinkModel
 from sern_sim.profiles import LinkProfile
 from sern_tools.lab.host import LabError

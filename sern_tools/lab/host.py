@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Final, TypeVar
 
-from sern_core.errors import SernError
+from sern_core.vocabulary.errors import SernError
 
 NETNS_DIR: Final = Path("/run/netns")
 """Where `ip netns` keeps the names."""

@@ -27,7 +27,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, Literal, Self, TypedDict, TypeVar, Unpack
 
-from sern_core.errors import UsageError
+from sern_core.vocabulary.errors import UsageError
 from sern_sim.models import BurstLoss, Jitter, LinkModel
 from sern_sim.netem import netem_options
 from sern_sim.profiles import LinkProfile

@@ -13,7 +13,7 @@ import pytest
 
 from benchmarks import child, common
 from benchmarks.child import Worker, await_workers
-from sern_core.errors import SernError
+from sern_core.vocabulary.errors import SernError
 from sern_tools.processes import Children
 from tests.support import DEADLINE_S
 
@@ -135,7 +135,7 @@ def test_of_a_worker_the_error_remains(capfd: pytest.CaptureFixture[str]) -> Non
             await_workers(lambda: False, [worker], "nothing happened", DEADLINE_S)
     finally:
         worker.end(patient=True)
-    assert str(caught.value) == "the relay ended (exit status 1): sern_core.errors.SernError: no such link"
+    assert str(caught.value) == "the relay ended (exit status 1): sern_core.vocabulary.errors.SernError: no such link"
     assert capfd.readouterr().err == ""
 
 

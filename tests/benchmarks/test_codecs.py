@@ -1,7 +1,8 @@
 """The benchmark of codecs measures what is there."""
 
 from benchmarks.codecs import made, modes_of, seconds_each
-from sern_core.codecs import LOSSLESS, Codec, Compression, decode, encode
+from sern_core.bodies.codecs import LOSSLESS, decode, encode
+from sern_core.vocabulary.codec_names import Codec, Compression
 
 
 def test_made_messages_come_back_and_only_lossless_modes_fit_all() -> None:

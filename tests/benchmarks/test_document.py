@@ -9,7 +9,7 @@ import pytest
 from benchmarks.common import Report
 from benchmarks.document import DOCUMENT, DOCUMENTS, IN_README, README, contents, headline, insert, main, render
 from benchmarks.link.figures import NEVER_S
-from sern_core.errors import ConfigError
+from sern_core.vocabulary.errors import ConfigError
 
 
 def report() -> Report:

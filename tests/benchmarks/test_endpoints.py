@@ -17,7 +17,7 @@ from benchmarks.endpoints import __main__ as endpoints
 from benchmarks.endpoints import ros1, shared
 from benchmarks.endpoints.ros1_roles import figures
 from benchmarks.endpoints.shared import ALONE, CHAIN, DIRECT, ROBOT, SITE, Rounds
-from sern_core.errors import SernError
+from sern_core.vocabulary.errors import SernError
 from sern_runtime.config.client import load_client
 from sern_runtime.config.relay import load_relay
 from sern_runtime.keys import load_public

@@ -13,7 +13,7 @@ from benchmarks.link import figures
 from benchmarks.link.load import Kind, Load, Log, Records, read_log
 from benchmarks.link.runs import Outcome
 from benchmarks.link.sern import SAMPLE_COLUMNS, TOPICS
-from sern_core.errors import SernError
+from sern_core.vocabulary.errors import SernError
 from sern_sim.models import LinkModel
 
 S = 1_000_000_000

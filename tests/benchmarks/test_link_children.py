@@ -15,7 +15,7 @@ from benchmarks.child import cpu_s
 from benchmarks.link import runs
 from benchmarks.link.children import Running, environment
 from benchmarks.link.peers import send_datagram
-from sern_core.errors import SernError
+from sern_core.vocabulary.errors import SernError
 from sern_tools.processes import last_words
 from tests.support import Patience
 

@@ -17,7 +17,7 @@ from benchmarks.link.cases import Bench
 from benchmarks.link.forwarder import Forwarder, Hops
 from benchmarks.link.load import Kind, Load
 from benchmarks.link.runs import Outcome
-from sern_core.errors import SernError
+from sern_core.vocabulary.errors import SernError
 from sern_runtime.seal import ROOM_BYTES, SEAL_BYTES, Opener, Sealer, Side
 from sern_sim.models import LinkModel
 from sern_tools.lab.lab import Lab

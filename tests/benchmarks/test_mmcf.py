@@ -7,11 +7,11 @@ from benchmarks.mmcf_queue import Path, Queues, arrivals
 from benchmarks.mmcf_replay import reconfigure
 from benchmarks.mmcf_run import Interval, Observer, Run, controlled, fixed, oracle, run, start
 from benchmarks.mmcf_traces import CODECS, GRID, Trace, robot, traces
-from sern_core.mmcf.cost import Ranges, profile
-from sern_core.mmcf.model import Configuration, Measurement, Terms
-from sern_core.mmcf.playback import CapacityPath
-from sern_core.mmcf.policy import Mmcf, fixed_reliability, fixed_throughput
-from sern_core.mmcf.predict import Predictor
+from sern_core.adaptation.cost import Ranges, profile
+from sern_core.adaptation.model import Configuration, Measurement, Terms
+from sern_core.adaptation.playback import CapacityPath
+from sern_core.adaptation.policy import Mmcf, fixed_reliability, fixed_throughput
+from sern_core.adaptation.predict import Predictor
 
 RANGES = Ranges()
 WEIGHTS = profile("teleoperation")

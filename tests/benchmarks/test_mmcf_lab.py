@@ -12,11 +12,11 @@ from benchmarks.common import Report, half_width_95
 from benchmarks.mmcf_lab import LINK, ROBOT, THIN_BPS, Edge, intervals, rates_bps, robot_file, site_file, staged
 from benchmarks.mmcf_replay import EVERY_NTH_POINT, POLICIES, PROFILES, recorded, tabulate
 from sern_client.endpoints.clouds import read_ply
-from sern_core.errors import SernError
-from sern_core.message import TopicSpec
-from sern_core.mmcf.adapter import AdapterParams
-from sern_core.mmcf.model import Terms
-from sern_core.types import PriorityClass
+from sern_core.adaptation.adapter import AdapterParams
+from sern_core.adaptation.model import Terms
+from sern_core.vocabulary.errors import SernError
+from sern_core.vocabulary.message import TopicSpec
+from sern_core.vocabulary.types import PriorityClass
 from sern_runtime.config.adaptation import AdaptationSection
 from sern_runtime.config.client import load_client
 from sern_tools.keygen import make_keys

@@ -7,7 +7,7 @@ pytest.importorskip("psutil")
 from benchmarks import reference
 from benchmarks.common import Report
 from benchmarks.link.forwarder import Forwarder
-from sern_core.errors import SernError
+from sern_core.vocabulary.errors import SernError
 
 
 def test_the_bare_forwarder_is_measured_over_real_sockets() -> None:

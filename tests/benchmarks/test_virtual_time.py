@@ -3,7 +3,7 @@
 import pytest
 
 from benchmarks.virtual_time import POSE_PERIOD_S, POSES, THIN, simulate
-from sern_core.errors import SernError
+from sern_core.vocabulary.errors import SernError
 
 SHORT_S = 100.0
 LONG_S = 300.0

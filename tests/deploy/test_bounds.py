@@ -9,24 +9,13 @@ import pytest
 from sern_client import latest
 from sern_client.endpoints import first
 from sern_client.endpoints.ros1 import Ros1Options, hold
-from sern_core import (
-    access,
-    answering,
-    decoding,
-    definitions,
-    draining,
-    drop_reports,
-    fragments,
-    hub,
-    ledger,
-    link,
-    numbering,
-    peers,
-    queues,
-    replay,
-    routing,
-)
-from sern_core.objects import ObjectLimits
+from sern_core.link import answering, definitions, link
+from sern_core.relay import access, draining, hub, routing
+from sern_core.relay.objects import ObjectLimits
+from sern_core.site import peers
+from sern_core.stream import decoding, drop_reports, in_stream, latched, out_channel
+from sern_core.vocabulary import ledger
+from sern_core.wire import numbering
 from sern_relay import server, transforms
 from sern_runtime import express, feed_inflow, feed_subscriptions
 from sern_runtime.config.relay import RelaySection, ReplaySection
@@ -50,12 +39,12 @@ def default(section: type[RelaySection] | type[ReplaySection], key: str) -> int:
 BOUNDS: Final[dict[str, tuple[str, ...]]] = {
     "messages that wait for a client": (
         nbytes(access.DEFAULT_QUEUE_BYTES),
-        f"{queues.CLIENT_OVERHEAD_BYTES} bytes a message",
+        f"{out_channel.CLIENT_OVERHEAD_BYTES} bytes a message",
     ),
-    "half-received and waiting": (f"{fragments.PARTIAL_IDLE_S:g} s without a fragment",),
+    "half-received and waiting": (f"{in_stream.PARTIAL_IDLE_S:g} s without a fragment",),
     "latched messages for late joiners": (
         nbytes(default(ReplaySection, "cache_bytes")),
-        f"{replay.MAX_REPLAY_MESSAGES:,} of a stream",
+        f"{latched.MAX_REPLAY_MESSAGES:,} of a stream",
     ),
     "streams announced": (f"{ROUTING.max_streams:,} ",),
     "patterns and names subscribed to": (f"{ROUTING.max_patterns} and {ROUTING.max_exact:,}",),
@@ -103,7 +92,7 @@ TIMES: Final = {
         f"`poll_hz`, {1 / Ros1Options('http://localhost:1', 'localhost', 'x').poll_hz:g} s",
     ),
     "docs/operations.md": (
-        f"`replay.resume_s`, {default(ReplaySection, 'resume_s') // 60} minutes",
+        f"`latched.resume_s`, {default(ReplaySection, 'resume_s') // 60} minutes",
         f"of more than {peers.MAX_GIVEN_UP} such clients",
         f"than {draining.MAX_DRAINING} of them or {nbytes(draining.MAX_DRAINING_BYTES)}",
     ),

@@ -5,13 +5,13 @@ from typing import Final, NamedTuple
 
 import pytest
 
-from sern_core.access import AccessTable
-from sern_core.message import TopicInfo
-from sern_core.mmcf.cost import profile
-from sern_core.mmcf.policy import Mmcf
-from sern_core.patterns import compile_pattern
-from sern_core.rules import Direction
-from sern_core.types import ClientName, Encoding, PriorityClass, TopicName
+from sern_core.adaptation.cost import profile
+from sern_core.adaptation.policy import Mmcf
+from sern_core.relay.access import AccessTable
+from sern_core.topics.patterns import compile_pattern
+from sern_core.topics.rules import Direction
+from sern_core.vocabulary.message import TopicInfo
+from sern_core.vocabulary.types import ClientName, Encoding, PriorityClass, TopicName
 from sern_runtime.config.client import ClientFile, load_client
 from sern_runtime.config.relay import load_relay
 

@@ -11,7 +11,7 @@ from rosbags.typesys import Stores, get_typestore
 from ruamel.yaml import YAML
 
 from sern_client.endpoints.jackal import JACKAL, JackalSource, Sizes
-from sern_core.types import Encoding, TopicName
+from sern_core.vocabulary.types import Encoding, TopicName
 from sern_runtime import ros_types
 from tests.daemons import Lab, bodies, recording
 from tests.support import until

@@ -13,7 +13,7 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 from ruamel.yaml import YAML
 
-from sern_core.types import DropReason
+from sern_core.vocabulary.types import DropReason
 from tests.daemons import Lab, write_bag
 
 DEPLOY: Final = Path(__file__).resolve().parents[2] / "deploy"

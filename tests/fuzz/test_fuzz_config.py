@@ -6,7 +6,7 @@ from pathlib import Path
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from sern_core.errors import ConfigError
+from sern_core.vocabulary.errors import ConfigError
 from sern_runtime import keys
 from sern_runtime.config.base import FileModel
 from sern_runtime.config.client import ClientFile

@@ -7,10 +7,10 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from sern_core import wire
-from sern_core.announce import Announcement, decode_announcement, definition_hash, encode_announcement
-from sern_core.errors import VersionError, WireError
-from sern_core.types import PriorityClass
+from sern_core.vocabulary.errors import VersionError, WireError
+from sern_core.vocabulary.types import PriorityClass
+from sern_core.wire import framing
+from sern_core.wire.announce import Announcement, decode_announcement, definition_hash, encode_announcement
 from sern_sim.ports import Port
 from tests.exploring import cases
 from tests.make_vectors import Frames, decode, rejected, valid
@@ -63,7 +63,7 @@ def mutated(originals: list[bytes]) -> st.SearchStrategy[bytes]:
                 case 3:
                     data[at:at] = data[at : at + draw(st.integers(1, 32))]
                 case _:
-                    data += draw(st.sampled_from(originals))[wire.HEADER_BYTES :]
+                    data += draw(st.sampled_from(originals))[framing.HEADER_BYTES :]
         return bytes(data)
 
     return build()
@@ -75,27 +75,27 @@ def mutated(originals: list[bytes]) -> st.SearchStrategy[bytes]:
 @STEADY
 @given(st.binary(max_size=200))
 def test_any_bytes(data: bytes) -> None:
-    for decode_part in (wire.decode_header, wire.decode_envelope, wire.decode_control):
+    for decode_part in (framing.decode_header, framing.decode_envelope, framing.decode_control):
         assert len(data) > 0 or meaning(lambda part=decode_part: part(data)) is None  # type: ignore[misc]
         meaning(lambda part=decode_part: part(data))  # type: ignore[misc]
-    if len(data) >= wire.HEADER_BYTES:
-        tried(lambda: wire.decode_frames(data, Frames()))
-        meaning(lambda: wire.decode_handshake(data))
+    if len(data) >= framing.HEADER_BYTES:
+        tried(lambda: framing.decode_frames(data, Frames()))
+        meaning(lambda: framing.decode_handshake(data))
 
 
 @STEADY
 @given(mutated(DATAGRAMS))
 def test_mutated_datagrams(data: bytes) -> None:
-    assert meaning(lambda: decode("datagram", data)) is None or data[0] == wire.MAGIC
+    assert meaning(lambda: decode("datagram", data)) is None or data[0] == framing.MAGIC
 
 
 @STEADY
 @given(mutated(CONTROLS))
 def test_mutated_control_messages(body: bytes) -> None:
-    said: list[tuple[wire.Envelope, bytes]] = []
-    if tried(lambda: said.append(wire.decode_control(body))):
-        again = wire.encode_control(*said[0])
-        assert wire.encode_control(*wire.decode_control(again)) == again
+    said: list[tuple[framing.Envelope, bytes]] = []
+    if tried(lambda: said.append(framing.decode_control(body))):
+        again = framing.encode_control(*said[0])
+        assert framing.encode_control(*framing.decode_control(again)) == again
 
 
 VALUES = (
@@ -108,7 +108,7 @@ VALUES = (
     | st.lists(st.text(max_size=4) | st.integers(), max_size=4)
     | st.dictionaries(st.text(max_size=4), st.text(max_size=4) | st.none(), max_size=4)
 )
-ANNOUNCE: Final = wire.decode_control(GOOD["announce"][1])[0]
+ANNOUNCE: Final = framing.decode_control(GOOD["announce"][1])[0]
 
 
 @STEADY
@@ -121,7 +121,7 @@ def test_any_values_in_an_announcement(changes: dict[str, Any], left_out: set[st
     if tried(lambda: result.append(decode_announcement(envelope))):
         again = encode_announcement(result[0])
         assert decode_announcement(again) == result[0]
-        assert wire.envelope_bytes(again) <= wire.MAX_ENVELOPE_BYTES
+        assert framing.envelope_bytes(again) <= framing.MAX_ENVELOPE_BYTES
 
 
 @pytest.mark.parametrize("name", GOOD)
@@ -223,12 +223,12 @@ def assert_in_order_after(datagrams: list[bytes], *, to_relay: bool) -> None:
 
 # A header that passes, so that what follows it is looked at.
 BEHIND_A_HEADER = st.builds(
-    lambda number, stamp, rest: wire.encode_header(wire.Kind.DATA, TAG, number, stamp) + rest,
+    lambda number, stamp, rest: framing.encode_header(framing.Kind.DATA, TAG, number, stamp) + rest,
     st.sampled_from([0, 1, 5, 40, 2**31, 2**32 - 1]),
     st.sampled_from([0, 10**6, 2**63, 2**64 - 1]),
-    st.lists(st.sampled_from([d[wire.HEADER_BYTES :] for d in DATAGRAMS if d[2] == wire.Kind.DATA]), max_size=5).map(
-        b"".join
-    )
+    st.lists(
+        st.sampled_from([d[framing.HEADER_BYTES :] for d in DATAGRAMS if d[2] == framing.Kind.DATA]), max_size=5
+    ).map(b"".join)
     | st.binary(max_size=60),
 )
 FEW = settings(STEADY, max_examples=cases(120))
@@ -249,11 +249,11 @@ def test_any_datagrams_to_a_client(datagrams: list[bytes]) -> None:
 FRAMES = st.one_of(
     st.builds(
         lambda flags, channel, seq, offset, more, body: (
-            wire.encode_data_next(flags, channel, seq, offset, offset + len(body) + more, len(body)) + body
+            framing.encode_data_next(flags, channel, seq, offset, offset + len(body) + more, len(body)) + body
             if offset
-            else wire.encode_data_first(flags, channel, seq, len(body) + more, len(body), 1, 0.01, 0) + body
+            else framing.encode_data_first(flags, channel, seq, len(body) + more, len(body), 1, 0.01, 0) + body
         ),
-        st.sampled_from([0, wire.FLAG_URGENT, wire.FLAG_REPLAY]),
+        st.sampled_from([0, framing.FLAG_URGENT, framing.FLAG_REPLAY]),
         st.integers(0, 4) | st.just(65_535),
         st.integers(0, 6) | st.sampled_from([2**31 - 1, 2**31 + 1, 2**32 - 1]),
         st.sampled_from([0, 1, 5, 2**31]),
@@ -261,13 +261,13 @@ FRAMES = st.one_of(
         st.binary(min_size=1, max_size=10),
     ),
     st.builds(
-        lambda channel, seq, code: wire.encode_data_first(1, channel, seq, 1, 1, 0, 0.0, 0) + bytes([code]),
+        lambda channel, seq, code: framing.encode_data_first(1, channel, seq, 1, 1, 0, 0.0, 0) + bytes([code]),
         st.integers(0, 4),
         st.integers(0, 6),
         st.integers(0, 255),
     ),
     st.builds(
-        wire.encode_ack,
+        framing.encode_ack,
         st.sampled_from([0, 0, 0, 1]),
         st.integers(0, 8) | st.just(2**32 - 1),
         st.sampled_from([0, 7, 2**64 - 1]),
@@ -275,8 +275,10 @@ FRAMES = st.one_of(
         st.sampled_from([0, 10**5, 2**64 - 1]),
         st.sampled_from([0, 10**5, 2**64 - 1]),
     ),
-    st.builds(wire.encode_watermark, st.integers(0, 4) | st.just(65_535), st.sampled_from([0, 1, 2, 2**31, 2**32 - 1])),
-    st.just(wire.PING_FRAME),
+    st.builds(
+        framing.encode_watermark, st.integers(0, 4) | st.just(65_535), st.sampled_from([0, 1, 2, 2**31, 2**32 - 1])
+    ),
+    st.just(framing.PING_FRAME),
 )
 
 
@@ -286,7 +288,7 @@ def test_valid_frames_in_any_order(rounds: list[list[bytes]], to_relay: bool) ->
     numbers = range(50, 50 + len(rounds))
     assert_in_order_after(
         [
-            wire.encode_header(wire.Kind.DATA, TAG, number, number * 20_000) + b"".join(frames)
+            framing.encode_header(framing.Kind.DATA, TAG, number, number * 20_000) + b"".join(frames)
             for number, frames in zip(numbers, rounds, strict=True)
         ],
         to_relay=to_relay,
@@ -294,7 +296,7 @@ def test_valid_frames_in_any_order(rounds: list[list[bytes]], to_relay: bool) ->
 
 
 CONTROL_VALUES: Final[dict[str, st.SearchStrategy[Any]]] = {
-    "t": st.sampled_from(sorted({wire.decode_control(body)[0]["t"] for body in CONTROLS} | {"nonsense"})),
+    "t": st.sampled_from(sorted({framing.decode_control(body)[0]["t"] for body in CONTROLS} | {"nonsense"})),
     "ch": st.integers(0, 5),
     "seq": st.integers(0, 6) | st.sampled_from([2**31, 2**62, 2**63 - 1]),
     "first": st.integers(0, 6) | st.sampled_from([2**31, 2**62]),
@@ -321,7 +323,7 @@ CONTROL_VALUES: Final[dict[str, st.SearchStrategy[Any]]] = {
 @given(
     st.lists(
         st.tuples(
-            st.sampled_from(CONTROLS).map(lambda body: wire.decode_control(body)[0]),
+            st.sampled_from(CONTROLS).map(lambda body: framing.decode_control(body)[0]),
             st.fixed_dictionaries({}, optional=CONTROL_VALUES),
             st.sampled_from([b"", b"uint8 pose", b"\xff"]),
         ),
@@ -337,8 +339,8 @@ def test_control_messages_with_any_values(said: list[tuple[Any, Any, bytes]], to
     first = mine._control.next_seq
     datagrams = []
     for index, (envelope, changes, attachment) in enumerate(said):
-        body = wire.encode_control({key: changes.get(key, value) for key, value in envelope.items()}, attachment)
-        head = wire.encode_data_first(0, 0, first + index, len(body), len(body), 0, 0.0, 0)
+        body = framing.encode_control({key: changes.get(key, value) for key, value in envelope.items()}, attachment)
+        head = framing.encode_data_first(0, 0, first + index, len(body), len(body), 0, 0.0, 0)
         number = mine.lane.flight.next_number + index
-        datagrams.append(wire.encode_header(wire.Kind.DATA, TAG, number, 10**6) + head + body)
+        datagrams.append(framing.encode_header(framing.Kind.DATA, TAG, number, 10**6) + head + body)
     assert_in_order_after(datagrams, to_relay=to_relay)

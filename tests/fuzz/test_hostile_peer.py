@@ -7,13 +7,14 @@ from typing import Any, Final
 
 import pytest
 
-from sern_core import definitions, session, wire
-from sern_core import hub as relay_core
-from sern_core import link as hop_end
-from sern_core.announce import Announcement, definition_hash, encode_announcement
-from sern_core.errors import WireError
-from sern_core.message import StreamId, StreamInfo, TopicInfo
-from sern_core.types import ClientName, Encoding, PriorityClass, TopicName
+from sern_core.link import definitions, session
+from sern_core.link import link as hop_end
+from sern_core.relay import hub as relay_core
+from sern_core.vocabulary.errors import WireError
+from sern_core.vocabulary.message import StreamId, StreamInfo, TopicInfo
+from sern_core.vocabulary.types import ClientName, Encoding, PriorityClass, TopicName
+from sern_core.wire import framing
+from sern_core.wire.announce import Announcement, definition_hash, encode_announcement
 from tests.fuzz.test_fuzz_wire import Duet
 from tests.world import World, spec
 
@@ -37,24 +38,24 @@ class Hostile:
 
     def hello(self, tag: int = 1, name: str | None = None) -> None:
         hello = {"name": name or self.name, "boot": self.boot, "vmin": 1, "vmax": 1}
-        self.port.receive(wire.encode_handshake(wire.Kind.HELLO, tag, 0, hello), now=self.now)
+        self.port.receive(framing.encode_handshake(framing.Kind.HELLO, tag, 0, hello), now=self.now)
 
     def say(self, *frames: bytes, number: int | None = None) -> None:
         self.number = self.number + 1 if number is None else number
-        head = wire.encode_header(wire.Kind.DATA, self.tag, self.number, int(self.now * 1e6))
+        head = framing.encode_header(framing.Kind.DATA, self.tag, self.number, int(self.now * 1e6))
         self.said_bytes += sum(map(len, frames))
         self.port.receive(head + b"".join(frames), now=self.now)
         self.now += 1e-4
 
     def control(self, envelope: dict[str, Any], attachment: bytes = b"") -> None:
         self.control_seq += 1
-        body = wire.encode_control(envelope, attachment)
+        body = framing.encode_control(envelope, attachment)
         for start in range(0, len(body), 60_000):
             piece = body[start : start + 60_000]
             head = (
-                wire.encode_data_next(0, 0, self.control_seq, start, len(body), len(piece))
+                framing.encode_data_next(0, 0, self.control_seq, start, len(body), len(piece))
                 if start
-                else wire.encode_data_first(0, 0, self.control_seq, len(body), len(piece), 0, 0.0, 0)
+                else framing.encode_data_first(0, 0, self.control_seq, len(body), len(piece), 0, 0.0, 0)
             )
             self.say(head + piece)
 
@@ -77,13 +78,13 @@ class Hostile:
 
 
 def _whole(channel: int, seq: int, body: bytes = b"x", *, flags: int = 0) -> bytes:
-    return wire.encode_data_first(flags, channel, seq, len(body), len(body), 0, 0.0, 0) + body
+    return framing.encode_data_first(flags, channel, seq, len(body), len(body), 0, 0.0, 0) + body
 
 
 def _piece(channel: int, seq: int, offset: int, total: int, body: bytes = b"x") -> bytes:
     if offset:
-        return wire.encode_data_next(0, channel, seq, offset, total, len(body)) + body
-    return wire.encode_data_first(0, channel, seq, total, len(body), 0, 0.0, 0) + body
+        return framing.encode_data_next(0, channel, seq, offset, total, len(body)) + body
+    return framing.encode_data_first(0, channel, seq, total, len(body), 0, 0.0, 0) + body
 
 
 Attack = Callable[[Hostile], Iterator[None]]
@@ -151,7 +152,7 @@ def definitions_nobody_asked_for(peer: Hostile) -> Iterator[None]:
 @attack
 def large_definitions(peer: Hostile) -> Iterator[None]:
     for index in range(300):
-        text = f"#{index}".ljust(wire.MAX_ATTACHMENT_BYTES)
+        text = f"#{index}".ljust(framing.MAX_ATTACHMENT_BYTES)
         peer.announce(index + 1, f"/robot/t{index}", digest=definition_hash(text))
         peer.control({"t": "define", "dh": definition_hash(text)}, text.encode())
         yield
@@ -177,7 +178,7 @@ def the_same_definition_again(peer: Hostile) -> Iterator[None]:
 @attack
 def a_jump_of_the_packet_number(peer: Hostile) -> Iterator[None]:
     for number in (1, 2**31, 2**32 - 1):
-        peer.say(wire.PING_FRAME, number=number)
+        peer.say(framing.PING_FRAME, number=number)
         yield
 
 
@@ -211,13 +212,13 @@ def empty_messages_that_wait(peer: Hostile) -> Iterator[None]:
 def tombstones_that_wait(peer: Hostile) -> Iterator[None]:
     peer.announce(1, "/robot/a", reliable=True)
     for seq in range(0, 60_000, 60):
-        peer.say(*(_whole(1, seq + i + 3, b"\x01", flags=wire.FLAG_TOMBSTONE) for i in range(60)))
+        peer.say(*(_whole(1, seq + i + 3, b"\x01", flags=framing.FLAG_TOMBSTONE) for i in range(60)))
         yield
 
 
 @attack
 def control_messages_that_wait(peer: Hostile) -> Iterator[None]:
-    body = wire.encode_control({"t": "synced"})
+    body = framing.encode_control({"t": "synced"})
     for seq in range(0, 60_000, 60):
         peer.say(*(_whole(0, seq + i + 3, body) for i in range(60)))
         yield
@@ -284,7 +285,7 @@ def wants_of_every_kind(peer: Hostile) -> Iterator[None]:
 @attack
 def watermarks_of_unknown_channels(peer: Hostile) -> Iterator[None]:
     for start in range(0, 65_000, 500):
-        peer.say(*(wire.encode_watermark(start + i, 2**31) for i in range(500)))
+        peer.say(*(framing.encode_watermark(start + i, 2**31) for i in range(500)))
         yield
 
 
@@ -306,7 +307,7 @@ def subscriptions_again_and_again(peer: Hostile) -> Iterator[None]:
 def data_of_no_session(peer: Hostile) -> Iterator[None]:
     peer.tag = 99
     for _ in range(3_000):
-        peer.say(wire.PING_FRAME)
+        peer.say(framing.PING_FRAME)
         yield
 
 

@@ -7,12 +7,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sern_core import wire
-from sern_core.announce import Announcement, definition_hash, encode_announcement
-from sern_core.errors import WireError
-from sern_core.hub_port import HubPort
-from sern_core.message import StreamId, StreamInfo, TopicInfo
-from sern_core.types import DROP_CODES, ClientName, Encoding, TopicName
+from sern_core.relay.hub_port import HubPort
+from sern_core.vocabulary.errors import WireError
+from sern_core.vocabulary.message import StreamId, StreamInfo, TopicInfo
+from sern_core.vocabulary.types import DROP_CODES, ClientName, Encoding, TopicName
+from sern_core.wire import framing
+from sern_core.wire.announce import Announcement, definition_hash, encode_announcement
 from tests.exploring import cases
 from tests.fuzz.test_hostile_peer import Hostile
 from tests.world import Got, SimClient, World, spec
@@ -43,12 +43,12 @@ class Peer(Hostile):
         newest = nbytes = 0
         while (data := self.port.next_datagram(now=self.now)) is not None:
             nbytes += len(data)
-            header = wire.decode_header(data)
-            if header.kind == wire.Kind.DATA and header.number:
+            header = framing.decode_header(data)
+            if header.kind == framing.Kind.DATA and header.number:
                 newest = header.number
         if newest:
             stamp_us = int(self.now * 1e6)
-            self.say(wire.encode_ack(0, newest, 2**64 - 1, stamp_us, stamp_us, nbytes))
+            self.say(framing.encode_ack(0, newest, 2**64 - 1, stamp_us, stamp_us, nbytes))
 
     def cut(self) -> None:
         """The relay closes the connection of whoever sends what no client sends."""
@@ -142,7 +142,7 @@ CHANNELS = st.integers(1, 5)
 
 GREATEST: dict[str, list[object]] = {
     "attr": [*GOOD_MAPS],
-    "first": [2**31, wire.MAX_SEQ - 1, wire.MAX_SEQ],
+    "first": [2**31, framing.MAX_SEQ - 1, framing.MAX_SEQ],
     "type": ["x" * 255, "\u00e9/b", "\U0001f916" * 255],
     "hash": ["", "x" * 128, "\U0001f916" * 128],
     "dh": ["", "0" * 32, definition_hash(TEXT), definition_hash("other")],
@@ -157,14 +157,14 @@ GREATEST: dict[str, list[object]] = {
 """What may be said and is at an edge."""
 
 
-def _announcement(topic: str, channel: int, reliable: bool, latched: bool, digest: str) -> wire.Envelope:
+def _announcement(topic: str, channel: int, reliable: bool, latched: bool, digest: str) -> framing.Envelope:
     identity = StreamId(ClientName("robot"), 77, TopicName(topic))
     info = TopicInfo(identity.topic, "a/b", Encoding.CDR, "RIHS01_0")
     stream = StreamInfo(identity, info, spec(reliable=reliable, latched=latched, depth=3, many_writers=topic == "/tf"))
     return encode_announcement(Announcement(channel, stream, digest, 1))
 
 
-def _control(envelope: wire.Envelope, attachment: bytes = b"") -> Action:
+def _control(envelope: framing.Envelope, attachment: bytes = b"") -> Action:
     def say(peer: Peer) -> None:
         peer.control(envelope, attachment)
 
@@ -222,12 +222,12 @@ def frames(draw: st.DrawFn) -> bytes:
     channel, seq = draw(CHANNELS), draw(SEQS)
     stamp_ns = draw(st.sampled_from([0, 1, -1, 2**63 - 1, -(2**63)]))
     age, error = draw(st.sampled_from([0, 1, 10_000, 2**32 - 1])), draw(st.sampled_from([0, 1, 254, 255]))
-    flags, codec, offset = draw(st.sampled_from([0, 0, wire.FLAG_REPLAY, wire.FLAG_URGENT])), 0, 0
+    flags, codec, offset = draw(st.sampled_from([0, 0, framing.FLAG_REPLAY, framing.FLAG_URGENT])), 0, 0
     match draw(st.sampled_from(["whole", "whole", "codec", "tombstone", "piece", "watermark"])):
         case "watermark":
-            return wire.encode_watermark(channel, seq)
+            return framing.encode_watermark(channel, seq)
         case "tombstone":
-            flags |= wire.FLAG_TOMBSTONE
+            flags |= framing.FLAG_TOMBSTONE
             body = bytes([draw(st.sampled_from([0, 1, 255, *DROP_CODES.values()]))])
             total = 1
         case "piece":
@@ -240,9 +240,9 @@ def frames(draw: st.DrawFn) -> bytes:
         flags, codec = draw(st.integers(0, 255)), draw(st.integers(0, 255))
         total = draw(st.sampled_from([0, 1, 2**32 - 1]))
     if offset:
-        return wire.DATA_FIXED.pack(wire.FRAME_DATA, flags, channel, seq, offset, total, len(body)) + body
-    head = (wire.FRAME_DATA, flags, channel, seq, 0, total, len(body), stamp_ns, age, codec, error)
-    return wire.DATA_FIRST.pack(*head) + body
+        return framing.DATA_FIXED.pack(framing.FRAME_DATA, flags, channel, seq, offset, total, len(body)) + body
+    head = (framing.FRAME_DATA, flags, channel, seq, 0, total, len(body), stamp_ns, age, codec, error)
+    return framing.DATA_FIRST.pack(*head) + body
 
 
 @st.composite
@@ -269,7 +269,7 @@ def test_nothing_that_a_client_says_cuts_off_another(first: list[Action], then: 
 # The ones that have done it ------------------------------------------------------------------------------------------
 
 
-def _poison(**changes: object) -> wire.Envelope:
+def _poison(**changes: object) -> framing.Envelope:
     return {**_announcement("/robot/p", 1, True, False, ""), **changes}
 
 
@@ -280,12 +280,12 @@ def _poison(**changes: object) -> wire.Envelope:
         (_poison(attr={"definition": "zzzz no hash"}), True),
         (_poison(attr={f"k{number}": "v" for number in range(16)}, dh="0" * 32), False),  # its definition never comes
         (_poison(attr={f"k{number:02}": "v" * 253 for number in range(4)}, dh=definition_hash(TEXT)), True),
-        (_poison(first=wire.MAX_SEQ), True),
+        (_poison(first=framing.MAX_SEQ), True),
         (_poison(type="\u00e9/b"), False),
         (_poison(hash="\U0001f916" * 128), False),
     ],
 )
-def test_announcements_at_the_edge(envelope: wire.Envelope, opened: bool) -> None:
+def test_announcements_at_the_edge(envelope: framing.Envelope, opened: bool) -> None:
     yard = Yard()
     yard.do(_control(envelope))
     yard.check()
@@ -309,12 +309,12 @@ def refusals(yard: Yard) -> list[tuple[str, str]]:
 def test_a_stream_cannot_count_beyond_what_can_be_announced(reliable: bool) -> None:
     """The last seq of all; one more, and whoever subscribes later could not be told where the stream is."""
     yard = Yard()
-    announcement = _announcement("/robot/p", 1, reliable, False, "") | {"first": wire.MAX_SEQ - 1}
-    last = wire.encode_data_first(0, 1, wire.MAX_SEQ - 1, 1, 1, 0, 0.0, 0) + b"x"
-    beyond = wire.encode_data_first(0, 1, wire.MAX_SEQ, 1, 1, 0, 0.0, 0) + b"x"
+    announcement = _announcement("/robot/p", 1, reliable, False, "") | {"first": framing.MAX_SEQ - 1}
+    last = framing.encode_data_first(0, 1, framing.MAX_SEQ - 1, 1, 1, 0, 0.0, 0) + b"x"
+    beyond = framing.encode_data_first(0, 1, framing.MAX_SEQ, 1, 1, 0, 0.0, 0) + b"x"
     yard.do(_control(announcement), lambda peer: peer.say(last))
     yard.world.run(0.5)
-    assert [got.seq for got in yard.site.on("/robot/p")] == [wire.MAX_SEQ - 1]
+    assert [got.seq for got in yard.site.on("/robot/p")] == [framing.MAX_SEQ - 1]
     assert yard.peer.cuts == 0
     yard.do(lambda peer: peer.say(beyond))
     assert yard.peer.cuts == 1

@@ -7,12 +7,12 @@ from typing import Final
 
 import pytest
 
-from sern_core import wire
-from sern_core.access import DEFAULT_QUEUE_BYTES, AccessRule, AccessTable
-from sern_core.control.fixed import FixedWindow
-from sern_core.params import LinkParams
-from sern_core.queues import CLIENT_OVERHEAD_BYTES, OutChannel
-from sern_core.types import DropReason, PriorityClass
+from sern_core.path.congestion.fixed import FixedWindow
+from sern_core.relay.access import DEFAULT_QUEUE_BYTES, AccessRule, AccessTable
+from sern_core.stream.out_channel import CLIENT_OVERHEAD_BYTES, OutChannel
+from sern_core.vocabulary.params import LinkParams
+from sern_core.vocabulary.types import DropReason, PriorityClass
+from sern_core.wire import framing
 from tests.fuzz.price import Input, Make, within_budget
 from tests.fuzz.test_hostile_peer import Hostile, _piece, _whole
 from tests.fuzz.test_price_datagrams import control, filled, one_more_slice, said
@@ -46,8 +46,8 @@ def connection_that_ends() -> Input:
     while reader.port.next_datagram(now=reader.now) is not None:
         pass
     reader.say(
-        wire.encode_ack(0, link.lane.flight.next_number - 1, 0, 0, int(reader.now * 1e6), 100),
-        control(reader, wire.encode_control({"t": "want", "ch": 1, "on": True})),
+        framing.encode_ack(0, link.lane.flight.next_number - 1, 0, 0, int(reader.now * 1e6), 100),
+        control(reader, framing.encode_control({"t": "want", "ch": 1, "on": True})),
     )
     for first in range(1, 24_000, 1_600):
         said(origin, *(_whole(1, seq) for seq in range(first, first + 1_600)))
@@ -115,7 +115,7 @@ def plain(seq: int) -> bytes:
 
 def buried(seq: int) -> bytes:
     """Every second one is a tombstone."""
-    return _whole(1, seq, b"\x01", flags=wire.FLAG_TOMBSTONE) if seq % 2 == 0 else _whole(1, seq)
+    return _whole(1, seq, b"\x01", flags=framing.FLAG_TOMBSTONE) if seq % 2 == 0 else _whole(1, seq)
 
 
 def filled_backlog(count: int, frame: Callable[[int], bytes] = plain) -> tuple[Hostile, Hostile, OutChannel]:
@@ -134,7 +134,7 @@ def backlog_with_gaps(count: int) -> tuple[Hostile, Hostile, OutChannel]:
     for start in range(0, count, 400):
         frames = []
         for index in range(start, start + 400):
-            first = wire.encode_control({"t": "first", "ch": 1, "seq": 3 + 2 * index})
+            first = framing.encode_control({"t": "first", "ch": 1, "seq": 3 + 2 * index})
             frames += [_whole(1, 1 + 2 * index), control(origin, first)]
         said(origin, *frames)
     (channel,) = reader.hub.links[reader.name].channels.values()
@@ -156,8 +156,8 @@ def backlog_that_ends(name: str, *says: dict[str, object], fill: Fill = in_order
     def make() -> Input:
         _origin, reader, channel = fill()
         last_seq = channel.next_seq - 1
-        frames = b"".join(control(reader, wire.encode_control(envelope)) for envelope in says)
-        frames = frames or wire.encode_watermark(1, confirmed)
+        frames = b"".join(control(reader, framing.encode_control(envelope)) for envelope in says)
+        frames = frames or framing.encode_watermark(1, confirmed)
 
         def rest() -> bool:
             more = one_more_slice(reader)
@@ -230,7 +230,7 @@ def stream_that_ends_half_received() -> Input:
     peer.announce(1, "/robot/a", reliable=True)
     for first in range(1, HALF_RECEIVED, 1_500):
         said(peer, *(_piece(1, seq, 0, 2) for seq in range(first, first + 1_500)))
-    frame = control(peer, wire.encode_control({"t": "retract", "ch": 1}))
+    frame = control(peer, framing.encode_control({"t": "retract", "ch": 1}))
     assert reassembly.held_bytes > 0.9 * reassembly.limit_bytes
 
     def rest() -> bool:

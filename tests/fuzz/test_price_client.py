@@ -10,13 +10,13 @@ import pytest
 from sern_client.bridge import Bridge
 from sern_client.endpoints.ros1.endpoint import Ros1Endpoint, Ros1Options
 from sern_client.endpoints.ros1.subscription import Topic
-from sern_core.client import ClientCore
-from sern_core.message import DEFAULT_RELIABLE_QUEUE_BYTES
-from sern_core.params import LinkParams, SchedulerParams
-from sern_core.patterns import compile_pattern
-from sern_core.queues import MESSAGE_OVERHEAD_BYTES
-from sern_core.rules import Discovery, DiscoveryMode, RuleSet, TopicRule
-from sern_core.types import DROP_CODES, ClientName, DropReason, Encoding, Reliability, TopicName
+from sern_core.site.client import ClientCore
+from sern_core.stream.out_channel import MESSAGE_OVERHEAD_BYTES
+from sern_core.topics.patterns import compile_pattern
+from sern_core.topics.rules import Discovery, DiscoveryMode, RuleSet, TopicRule
+from sern_core.vocabulary.message import DEFAULT_RELIABLE_QUEUE_BYTES
+from sern_core.vocabulary.params import LinkParams, SchedulerParams
+from sern_core.vocabulary.types import DROP_CODES, ClientName, DropReason, Encoding, Reliability, TopicName
 from sern_runtime import clock, ros_types
 from tests.fuzz.price import Input, Make, within_budget
 from tests.fuzz.test_hostile_peer import Hostile

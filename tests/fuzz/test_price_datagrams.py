@@ -10,12 +10,13 @@ from typing import Final
 
 import pytest
 
-from sern_core import wire
-from sern_core.announce import Announcement, definition_hash, encode_announcement
-from sern_core.codecs import Compression, encode
-from sern_core.errors import WireError
-from sern_core.message import StreamId, StreamInfo, TopicInfo
-from sern_core.types import Encoding, TopicName
+from sern_core.bodies.codecs import encode
+from sern_core.vocabulary.codec_names import Compression
+from sern_core.vocabulary.errors import WireError
+from sern_core.vocabulary.message import StreamId, StreamInfo, TopicInfo
+from sern_core.vocabulary.types import Encoding, TopicName
+from sern_core.wire import framing
+from sern_core.wire.announce import Announcement, definition_hash, encode_announcement
 from tests.exploring import seeds
 from tests.fuzz.price import Input, Make, within_budget, within_memory
 from tests.fuzz.test_hostile_peer import Hostile, _piece, _whole
@@ -59,7 +60,7 @@ def datagram(
         peer.hub.links[peer.name].reassembly.limit_bytes = 64 * 2**20
         frames = b"".join(prepare(peer))
         before = peer.said_bytes if sets_off else 0
-        assert len(frames) <= wire.MAX_DATAGRAM_BYTES - wire.HEADER_BYTES
+        assert len(frames) <= framing.MAX_DATAGRAM_BYTES - framing.HEADER_BYTES
 
         def take() -> object:
             with suppress(WireError):  # then its session ends
@@ -170,7 +171,7 @@ def messages_out_of_order(peer: Hostile) -> list[bytes]:
 @datagram
 def tombstones(peer: Hostile) -> list[bytes]:
     peer.announce(1, "/robot/a", reliable=True)
-    return filled(lambda index: _whole(1, index + 1, b"\x01", flags=wire.FLAG_TOMBSTONE))
+    return filled(lambda index: _whole(1, index + 1, b"\x01", flags=framing.FLAG_TOMBSTONE))
 
 
 @datagram
@@ -180,47 +181,47 @@ def messages_of_channels_that_do_not_exist(peer: Hostile) -> list[bytes]:
 
 @datagram
 def pings(peer: Hostile) -> list[bytes]:
-    return [wire.PING_FRAME] * 60_000
+    return [framing.PING_FRAME] * 60_000
 
 
 @datagram
 def watermarks(peer: Hostile) -> list[bytes]:
-    return filled(lambda index: wire.encode_watermark(1 + index % 100, index))
+    return filled(lambda index: framing.encode_watermark(1 + index % 100, index))
 
 
 @datagram
 def acknowledgements(peer: Hostile) -> list[bytes]:
-    return [wire.encode_ack(0, 1, 2**64 - 1, 0, 0, 10**9)] * wire.MAX_ACK_FRAMES
+    return [framing.encode_ack(0, 1, 2**64 - 1, 0, 0, 10**9)] * framing.MAX_ACK_FRAMES
 
 
 def control(peer: Hostile, body: bytes) -> bytes:
     peer.control_seq += 1
-    return wire.encode_data_first(0, 0, peer.control_seq, len(body), len(body), 0, 0.0, 0) + body
+    return framing.encode_data_first(0, 0, peer.control_seq, len(body), len(body), 0, 0.0, 0) + body
 
 
 @datagram
 def attachments_that_unpack_to_a_megabyte(peer: Hostile) -> list[bytes]:
-    head = wire.encode_envelope({"t": "define", "hash": "00" * 16})
-    body = struct.pack("!H", len(head)) + head + zlib.compress(bytes(wire.MAX_ATTACHMENT_BYTES), 9)
+    head = framing.encode_envelope({"t": "define", "hash": "00" * 16})
+    body = struct.pack("!H", len(head)) + head + zlib.compress(bytes(framing.MAX_ATTACHMENT_BYTES), 9)
     return filled(lambda _: control(peer, body))
 
 
 @datagram
 def definitions_of_a_megabyte(peer: Hostile) -> list[bytes]:
-    text = "#" * (wire.MAX_ATTACHMENT_BYTES - 8)
-    return filled(lambda _: control(peer, wire.encode_control(
+    text = "#" * (framing.MAX_ATTACHMENT_BYTES - 8)
+    return filled(lambda _: control(peer, framing.encode_control(
         {"t": "define", "dh": definition_hash(text)}, text.encode())))  # fmt: skip
 
 
 @datagram
 def attachments_where_none_belongs(peer: Hostile) -> list[bytes]:
-    body = wire.encode_control({"t": "retract", "ch": 9}, bytes(wire.MAX_ATTACHMENT_BYTES))
+    body = framing.encode_control({"t": "retract", "ch": 9}, bytes(framing.MAX_ATTACHMENT_BYTES))
     return filled(lambda _: control(peer, body))
 
 
 @datagram
 def attachments_that_unpack_to_more(peer: Hostile) -> list[bytes]:
-    head = wire.encode_envelope({"t": "define", "hash": "00" * 16})
+    head = framing.encode_envelope({"t": "define", "hash": "00" * 16})
     body = struct.pack("!H", len(head)) + head + zlib.compress(bytes(40 * 2**20), 9)[:60_000]
     return [control(peer, body)]
 
@@ -228,7 +229,7 @@ def attachments_that_unpack_to_more(peer: Hostile) -> list[bytes]:
 @datagram
 def envelopes_of_many_items(peer: Hostile) -> list[bytes]:
     inner = {f"k{index:02}": [index] * 12 for index in range(60)}
-    return filled(lambda index: control(peer, wire.encode_control({"t": "nothing", "x": inner})))
+    return filled(lambda index: control(peer, framing.encode_control({"t": "nothing", "x": inner})))
 
 
 @datagram
@@ -242,7 +243,7 @@ def announcements(peer: Hostile) -> list[bytes]:
     def announcement(index: int) -> bytes:
         info = TopicInfo(TopicName(f"/robot/t{index}"), "a/b", Encoding.CDR)
         stream = StreamInfo(StreamId(peer.name, peer.boot, info.name), info, spec())
-        return control(peer, wire.encode_control(encode_announcement(Announcement(1 + index, stream, "", 1, ()))))
+        return control(peer, framing.encode_control(encode_announcement(Announcement(1 + index, stream, "", 1, ()))))
 
     return filled(announcement)
 
@@ -258,7 +259,7 @@ datagram(announcements, clients=50, patterns=(HOSTILE_PATTERN,))
 def patterns_against_two_hundred_topics(peer: Hostile) -> list[bytes]:
     for index in range(200):
         peer.announce(1 + index, f"/robot/{'abcdefghij' * 8}{index}")
-    return filled(lambda index: control(peer, wire.encode_control(
+    return filled(lambda index: control(peer, framing.encode_control(
         {"t": "subscribe", "patterns": [HOSTILE_PATTERN[:-1] + chr(97 + index % 26)], "more": False})))  # fmt: skip
 
 
@@ -275,7 +276,7 @@ def with_channels(peer: Hostile, count: int) -> None:
 @for_fifty
 def answers_about_many_channels(peer: Hostile) -> list[bytes]:
     with_channels(peer, 8 * len(peer.hub.links))
-    return filled(lambda index: control(peer, wire.encode_control(
+    return filled(lambda index: control(peer, framing.encode_control(
         {"t": "want", "ch": 1, "on": bool(index % 2), "chs": [2, 0xFFFF]})))  # fmt: skip
 
 
@@ -286,10 +287,10 @@ def hello_after_long_lists() -> Input:
     names = [f"{index:x}" for index in range(8190)]
     rows = [names[start : start + 48] for start in range(0, len(names), 48)]
     for row in rows[:-1]:
-        said(peer, control(peer, wire.encode_control({"t": "want", "ch": 1, "on": True, "owed": row, "more": True})))
+        said(peer, control(peer, framing.encode_control({"t": "want", "ch": 1, "on": True, "owed": row, "more": True})))
     runs = [2, len(peer.hub.links[peer.name].channels)]
-    said(peer, control(peer, wire.encode_control({"t": "want", "ch": 1, "on": True, "owed": rows[-1], "chs": runs})))
-    said(peer, control(peer, wire.encode_control({"t": "want", "ch": 1, "on": True, "add": ["x"], "chs": runs})))
+    said(peer, control(peer, framing.encode_control({"t": "want", "ch": 1, "on": True, "owed": rows[-1], "chs": runs})))
+    said(peer, control(peer, framing.encode_control({"t": "want", "ch": 1, "on": True, "add": ["x"], "chs": runs})))
     return Input(peer.said_bytes, partial(peer.hello, 2))
 
 
@@ -306,7 +307,9 @@ def streams_owed_to_absent_clients() -> Input:
     def owed(index: int) -> bytes:
         identity = StreamId(peer.name, peer.boot, TopicName(f"/robot/t{index}"))
         stream = StreamInfo(identity, TopicInfo(identity.topic, "a/b", Encoding.CDR), spec(reliable=True))
-        return control(peer, wire.encode_control(encode_announcement(Announcement(1 + index, stream, "", 1, absent))))
+        return control(
+            peer, framing.encode_control(encode_announcement(Announcement(1 + index, stream, "", 1, absent)))
+        )
 
     for index in range(100):
         said(peer, owed(index))
@@ -326,23 +329,23 @@ def runs_of_dropped_messages(peer: Hostile) -> list[bytes]:
     peer.control({"t": "subscribe", "patterns": ["/other/.*"], "more": False})
     for start in range(1, 3000, 500):
         said(other, *(_whole(1, seq) for seq in range(start, start + 500)))
-    return filled(lambda index: control(peer, wire.encode_control(
+    return filled(lambda index: control(peer, framing.encode_control(
         {"t": "dropped", "ch": 1, "seq": 1 + index % 3000, "code": 1, "to": "x", "n": 3000})))  # fmt: skip
 
 
 @for_fifty
 def objects_as_large_as_they_may_be(peer: Hostile) -> list[bytes]:
-    return filled(lambda index: control(peer, wire.encode_control(
-        {"t": "object", "op": "put", "id": f"robot/o{index}", "type": "a/b"}, bytes(wire.MAX_ATTACHMENT_BYTES)
+    return filled(lambda index: control(peer, framing.encode_control(
+        {"t": "object", "op": "put", "id": f"robot/o{index}", "type": "a/b"}, bytes(framing.MAX_ATTACHMENT_BYTES)
     )))  # fmt: skip
 
 
 @for_fifty
 def definitions_that_fifty_may_wait_for(peer: Hostile) -> list[bytes]:
-    texts = [f"{index}" + "#" * (wire.MAX_ATTACHMENT_BYTES - 9) for index in range(4)]
+    texts = [f"{index}" + "#" * (framing.MAX_ATTACHMENT_BYTES - 9) for index in range(4)]
     for index, text in enumerate(texts):
         peer.announce(1 + index, f"/robot/t{index}", digest=definition_hash(text))
-    return filled(lambda index: control(peer, wire.encode_control(
+    return filled(lambda index: control(peer, framing.encode_control(
         {"t": "define", "dh": definition_hash(texts[index % 4])}, texts[index % 4].encode())))  # fmt: skip
 
 
@@ -350,7 +353,7 @@ def definitions_that_fifty_may_wait_for(peer: Hostile) -> list[bytes]:
 def streams_that_are_gone(peer: Hostile) -> list[bytes]:
     for index in range(300):
         peer.announce(1 + index, f"/robot/t{index}")
-    return filled(lambda index: control(peer, wire.encode_control({"t": "retract", "ch": 1 + index})))
+    return filled(lambda index: control(peer, framing.encode_control({"t": "retract", "ch": 1 + index})))
 
 
 def all_streams_at_once(peer: Hostile) -> list[bytes]:
@@ -358,7 +361,7 @@ def all_streams_at_once(peer: Hostile) -> list[bytes]:
         peer.announce(1 + index, f"/robot/t{index}")
     peer.hello(2)
     peer.tag, peer.control_seq = 2, 0
-    return [control(peer, wire.encode_control({"t": "synced", "batch": True}))]
+    return [control(peer, framing.encode_control({"t": "synced", "batch": True}))]
 
 
 def the_one_they_wait_for(peer: Hostile) -> list[bytes]:
@@ -370,7 +373,7 @@ def the_one_they_wait_for(peer: Hostile) -> list[bytes]:
 
 def none_below(peer: Hostile) -> list[bytes]:
     the_one_they_wait_for(peer)
-    return [control(peer, wire.encode_control({"t": "first", "ch": 1, "seq": 100_000}))]
+    return [control(peer, framing.encode_control({"t": "first", "ch": 1, "seq": 100_000}))]
 
 
 WAITING: Final = 60_000
@@ -384,7 +387,7 @@ def full(peer: Hostile, frame: Callable[[int], bytes]) -> None:
 
 
 def step_by_step(peer: Hostile) -> list[bytes]:
-    return filled(lambda index: control(peer, wire.encode_control({"t": "first", "ch": 1, "seq": 2 + index})))
+    return filled(lambda index: control(peer, framing.encode_control({"t": "first", "ch": 1, "seq": 2 + index})))
 
 
 @datagram
@@ -401,7 +404,7 @@ def first_of_ever_one_more_before_many_half_received(peer: Hostile) -> list[byte
 
 def none_of_the_half_received(peer: Hostile) -> list[bytes]:
     full(peer, lambda seq: _piece(1, seq, 0, 2))
-    return [control(peer, wire.encode_control({"t": "first", "ch": 1, "seq": 2_000_000}))]
+    return [control(peer, framing.encode_control({"t": "first", "ch": 1, "seq": 2_000_000}))]
 
 
 datagram(none_of_the_half_received, sets_off=True)
@@ -421,7 +424,7 @@ def encoded(mode: Compression, raw: bytes) -> Prepare:
         peer.announce(1, "/robot/a")
         codec, body = encode(mode, raw)
         size = len(body)
-        return filled(lambda index: wire.encode_data_first(0, 1, index + 1, size, size, 0, 0.0, codec) + body)
+        return filled(lambda index: framing.encode_data_first(0, 1, index + 1, size, size, 0, 0.0, codec) + body)
 
     prepare.__name__ = f"{mode} of {len(raw)} zeros"
     return datagram(prepare)
@@ -478,14 +481,16 @@ def fuzzed_frame(rng: random.Random, peer: Hostile) -> bytes:
         return _piece(channel, seq, offset, total, rng.randbytes(1 + rng.randrange(min(50, total - offset))))
     if what == 2:
         fields = {"ch": rng.randrange(9), "dh": "0" * 32, "seq": 7, "id": "a", "op": "put", "on": True}
-        envelope: wire.Envelope = {key: value for key, value in fields.items() if rng.random() < 0.5}
+        envelope: framing.Envelope = {key: value for key, value in fields.items() if rng.random() < 0.5}
         kinds = ("announce", "subscribe", "object", "define", "need", "want", "first", "synced")
         envelope["t"] = rng.choice(kinds)
-        return control(peer, wire.encode_control(envelope, bytes(rng.choice((0, 100, 10**6)))))
+        return control(peer, framing.encode_control(envelope, bytes(rng.choice((0, 100, 10**6)))))
     if what == 3:
-        return wire.encode_watermark(channel, seq)
+        return framing.encode_watermark(channel, seq)
     if what == 4:
-        return wire.encode_ack(0, rng.randrange(3), rng.getrandbits(64), rng.getrandbits(63), rng.getrandbits(63), seq)
+        return framing.encode_ack(
+            0, rng.randrange(3), rng.getrandbits(64), rng.getrandbits(63), rng.getrandbits(63), seq
+        )
     return bytes([rng.randrange(6)]) + rng.randbytes(rng.randrange(40))
 
 

@@ -10,10 +10,10 @@ import pytest
 from sern_client import actions, conversion
 from sern_client.frames import FramePrefixer
 from sern_client.tf_latch import TfLatch
-from sern_core.errors import BodyError, ConfigError
-from sern_core.message import TopicInfo
 from sern_core.summaries import transforms
-from sern_core.types import Encoding, TopicName
+from sern_core.vocabulary.errors import BodyError, ConfigError
+from sern_core.vocabulary.message import TopicInfo
+from sern_core.vocabulary.types import Encoding, TopicName
 from sern_runtime import ros_services, ros_text, ros_types
 from tests.exploring import seeds
 from tests.fuzz.price import Input, Make, within_budget, within_memory

@@ -14,14 +14,14 @@ from sern_client.bridge import Bridge
 from sern_client.endpoints.ros1.endpoint import Ros1Endpoint, Ros1Options
 from sern_client.endpoints.ros1.hold import Hold
 from sern_client.endpoints.ros1.subscription import Topic
-from sern_core.client import ClientCore
-from sern_core.message import StreamInfo
-from sern_core.params import LinkParams, SchedulerParams
-from sern_core.patterns import compile_pattern
-from sern_core.rules import Discovery, DiscoveryMode, RuleSet, TopicRule
+from sern_core.site.client import ClientCore
 from sern_core.summaries.patches import PatchParams
 from sern_core.summaries.spec import SummarySpec, VoxelParams
-from sern_core.types import ClientName, DropReason, Encoding, TopicName
+from sern_core.topics.patterns import compile_pattern
+from sern_core.topics.rules import Discovery, DiscoveryMode, RuleSet, TopicRule
+from sern_core.vocabulary.message import StreamInfo
+from sern_core.vocabulary.params import LinkParams, SchedulerParams
+from sern_core.vocabulary.types import ClientName, DropReason, Encoding, TopicName
 from sern_runtime import ros_types
 from tests.steps import steps
 

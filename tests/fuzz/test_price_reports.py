@@ -2,9 +2,9 @@
 
 import pytest
 
-from sern_core import wire
-from sern_core.drop_reports import MAX_KEPT_REPORTS, DropReports
-from sern_core.types import DROP_CODES, DropReason, PriorityClass
+from sern_core.stream.drop_reports import MAX_KEPT_REPORTS, DropReports
+from sern_core.vocabulary.types import DROP_CODES, DropReason, PriorityClass
+from sern_core.wire import framing
 from tests.fuzz.price import Input, Make, within_budget
 from tests.fuzz.test_hostile_peer import Hostile, _whole
 from tests.fuzz.test_price_datagrams import control, filled, one_more_slice, said
@@ -43,7 +43,7 @@ def of_one_each() -> Input:
 
     def dropped(index: int) -> bytes:
         seq = FIRST + BACKLOG - 2 - 2 * index
-        return control(reader, wire.encode_control({"t": "dropped", "ch": 1, "seq": seq, "code": LOST, "to": "x"}))
+        return control(reader, framing.encode_control({"t": "dropped", "ch": 1, "seq": seq, "code": LOST, "to": "x"}))
 
     frames = filled(dropped)
     assert 500 < len(frames) < BACKLOG // 2
@@ -62,7 +62,7 @@ def of_a_run_that_holds_many() -> Input:
     """A run of messages of which every second one is reported already, by somebody else."""
     reader, _origin, reports = crowded(first=FIRST - BACKLOG)
     frame = control(
-        reader, wire.encode_control({"t": "dropped", "ch": 1, "seq": 1, "code": LOST, "to": "x", "n": 2**61})
+        reader, framing.encode_control({"t": "dropped", "ch": 1, "seq": 1, "code": LOST, "to": "x", "n": 2**61})
     )
 
     def rest() -> bool:

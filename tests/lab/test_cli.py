@@ -10,7 +10,7 @@ from contextlib import contextmanager
 import pytest
 from typer.testing import CliRunner
 
-from sern_core.errors import SernError
+from sern_core.vocabulary.errors import SernError
 from sern_runtime.profiles import load_profile
 from sern_tools.lab.cli import app, split_commands
 from sern_tools.lab.control import Control, ask

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from sern_core.errors import UsageError
+from sern_core.vocabulary.errors import UsageError
 from sern_runtime.profiles import load_profile
 from sern_sim.models import BurstLoss, Jitter, LinkModel, RateStep, Window
 from sern_sim.profiles import LinkProfile

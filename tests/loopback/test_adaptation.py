@@ -6,7 +6,7 @@ from pathlib import Path
 
 from prometheus_client import CollectorRegistry
 
-from sern_core.types import Encoding, TopicName
+from sern_core.vocabulary.types import Encoding, TopicName
 from sern_runtime.metrics import Metrics
 from sern_sim.models import LinkModel, RateStep
 from sern_tools.proxy import Route, ShapingProxy

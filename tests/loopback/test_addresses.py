@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from sern_client.daemon import ClientDaemon
-from sern_core.lanes import LANE_UDP
-from sern_core.types import ClientName
+from sern_core.path.lanes import LANE_UDP
+from sern_core.vocabulary.types import ClientName
 from sern_relay.daemon import RelayDaemon
 from sern_runtime.seal import offered_ciphers
 from sern_tools.ports import free_ports

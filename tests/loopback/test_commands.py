@@ -11,8 +11,8 @@ import pytest
 from sern_client.daemon import ClientDaemon
 from sern_client.endpoints.base import Publisher
 from sern_client.endpoints.synthetic import SyntheticEndpoint
-from sern_core.message import TopicInfo
-from sern_core.types import TopicName
+from sern_core.vocabulary.message import TopicInfo
+from sern_core.vocabulary.types import TopicName
 from sern_runtime import ros_types
 from tests.daemons import Lab, endpoint_of
 from tests.support import until

@@ -10,19 +10,20 @@ import zmq
 
 from sern_client.daemon import ClientDaemon
 from sern_client.endpoints.clouds import read_ply
-from sern_core import lossy
-from sern_core.codecs import Coder, Compression, Work
-from sern_core.errors import ConfigError
-from sern_core.params import LinkParams
+from sern_core.bodies import lossy
+from sern_core.bodies.codecs import Coder, Work
 from sern_core.summaries.voxel import thin_rows
-from sern_core.types import Encoding, TopicName
+from sern_core.vocabulary.codec_names import Compression
+from sern_core.vocabulary.errors import ConfigError
+from sern_core.vocabulary.params import LinkParams
+from sern_core.vocabulary.types import Encoding, TopicName
 from sern_runtime import ros_types
 from sern_runtime.codec_pool import CodecPool, make_coder
 from sern_runtime.config.client import load_client
 from sern_tools.ports import free_ports
 from tests.daemons import HOST, Lab, bodies, recording, under
 from tests.loopback.test_summaries import bag_of
-from tests.sern_core.test_lossy import IMAGE, image_body, scene
+from tests.sern_core.bodies.test_lossy import IMAGE, image_body, scene
 from tests.support import until
 
 CLOUDS = TopicName("/robot1/points")

@@ -10,9 +10,9 @@ import pytest
 from pydantic import ValidationError
 
 from sern_client.daemon import ClientDaemon
-from sern_core.lanes import LANE_UDP
-from sern_core.message import TopicInfo, TopicSpec
-from sern_core.types import ClientName, Encoding, PriorityClass, TopicName
+from sern_core.path.lanes import LANE_UDP
+from sern_core.vocabulary.message import TopicInfo, TopicSpec
+from sern_core.vocabulary.types import ClientName, Encoding, PriorityClass, TopicName
 from sern_relay.daemon import RelayDaemon
 from sern_runtime import clock
 from sern_runtime.config.shared import DscpSection

@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 
 from sern_client.daemon import ClientDaemon
-from sern_core.params import Redundancy
-from sern_core.types import ClientName
+from sern_core.vocabulary.params import Redundancy
+from sern_core.vocabulary.types import ClientName
 from sern_relay.daemon import RelayDaemon
 from sern_runtime.express import CONNECTIONS, MIN_SEGMENTS, ExpressPaths
 from sern_runtime.monitor import TcpHandle, TcpInfo

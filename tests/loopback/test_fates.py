@@ -4,7 +4,7 @@ and connections that are cut while messages are under way."""
 from pathlib import Path
 
 from sern_client.daemon import ClientDaemon
-from sern_core.types import ClientName
+from sern_core.vocabulary.types import ClientName
 from sern_runtime.profiles import load_profile
 from sern_sim.models import LinkModel
 from sern_tools.counters import read_counters

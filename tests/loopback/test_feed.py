@@ -10,10 +10,10 @@ import zmq
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sern_core.errors import ConfigError
-from sern_core.patterns import compile_pattern
-from sern_core.rules import FeedRole
-from sern_core.types import PriorityClass, TopicName
+from sern_core.topics.patterns import compile_pattern
+from sern_core.topics.rules import FeedRole
+from sern_core.vocabulary.errors import ConfigError
+from sern_core.vocabulary.types import PriorityClass, TopicName
 from sern_runtime.feed import Feed, FeedHeader, parse_topic, topic_frame
 from tests.support import until
 

@@ -7,8 +7,8 @@ from typing import cast
 import pytest
 import zmq
 
-from sern_core.patterns import compile_pattern
-from sern_core.rules import FeedRole
+from sern_core.topics.patterns import compile_pattern
+from sern_core.topics.rules import FeedRole
 from sern_runtime.feed import Feed
 from sern_runtime.feed_inflow import GROWTH_BYTES, GROWTH_MULTIPLE, FeedInflow
 from sern_runtime.inflow import LIMIT_BYTES, Inflow, resident_bytes

@@ -5,9 +5,9 @@ from collections.abc import AsyncIterator
 import pytest
 import zmq
 
-from sern_core.patterns import compile_pattern
-from sern_core.rules import FeedRole
-from sern_core.types import PriorityClass
+from sern_core.topics.patterns import compile_pattern
+from sern_core.topics.rules import FeedRole
+from sern_core.vocabulary.types import PriorityClass
 from sern_runtime import feed_inflow
 from sern_runtime.feed import Feed, FeedHeader
 from tests.loopback import test_inflow

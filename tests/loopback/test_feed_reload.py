@@ -9,9 +9,9 @@ import pytest
 import zmq
 
 from sern_client.daemon import ClientDaemon
-from sern_core.patterns import compile_pattern
-from sern_core.rules import FeedRole
-from sern_core.types import TopicName
+from sern_core.topics.patterns import compile_pattern
+from sern_core.topics.rules import FeedRole
+from sern_core.vocabulary.types import TopicName
 from sern_relay.daemon import RelayDaemon
 from sern_runtime import clock
 from sern_runtime.feed import Feed

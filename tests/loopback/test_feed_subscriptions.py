@@ -8,10 +8,10 @@ from typing import cast
 import pytest
 import zmq
 
-from sern_core.hub import Hub
-from sern_core.patterns import compile_pattern
-from sern_core.rules import FeedRole
-from sern_core.types import PriorityClass, TopicName
+from sern_core.relay.hub import Hub
+from sern_core.topics.patterns import compile_pattern
+from sern_core.topics.rules import FeedRole
+from sern_core.vocabulary.types import PriorityClass, TopicName
 from sern_relay.feed import INTEREST_STREAMS, RelayFeed
 from sern_runtime import feed_inflow, feed_subscriptions
 from sern_runtime.feed import MAX_SUBSCRIPTION_BYTES, MAX_TOPIC_BYTES, Feed, FeedHeader, topic_frame

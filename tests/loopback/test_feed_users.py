@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 import zmq
 
-from sern_core.patterns import compile_pattern
-from sern_core.rules import FeedRole
-from sern_core.types import PriorityClass, TopicName
+from sern_core.topics.patterns import compile_pattern
+from sern_core.topics.rules import FeedRole
+from sern_core.vocabulary.types import PriorityClass, TopicName
 from sern_runtime import feed as feed_module
 from sern_runtime.feed import Feed, FeedHeader, topic_frame
 from sern_runtime.zmq_socket import bind_all

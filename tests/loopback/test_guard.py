@@ -13,7 +13,7 @@ import pytest
 
 from sern_client.endpoints.ros1 import Ros1Endpoint
 from sern_client.guard import Guard
-from sern_core.types import Encoding, TopicName
+from sern_core.vocabulary.types import Encoding, TopicName
 from sern_runtime import clock, ros_types
 from sern_runtime.config.client import load_client
 from tests.daemons import HOST, Lab, Process

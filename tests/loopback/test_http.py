@@ -10,7 +10,7 @@ import pytest
 from prometheus_client import CollectorRegistry
 from prometheus_client.parser import text_string_to_metric_families
 
-from sern_core.errors import ConfigError, UsageError
+from sern_core.vocabulary.errors import ConfigError, UsageError
 from sern_runtime.http import IDLE_S, Health, HttpServer, parse_listen
 from sern_runtime.metrics import Metrics
 from tests.support import until

@@ -12,8 +12,8 @@ from prometheus_client.parser import text_string_to_metric_families
 from typer.testing import CliRunner
 
 from sern_client.daemon import ClientDaemon
-from sern_core.ledger import LOSSES
-from sern_core.types import CLASS_LABELS, ClientName
+from sern_core.vocabulary.ledger import LOSSES
+from sern_core.vocabulary.types import CLASS_LABELS, ClientName
 from sern_relay.daemon import RelayDaemon
 from sern_runtime.link_metrics import RECEIVED_LOSSES
 from sern_runtime.metrics import check_names

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 import zmq
 
-from sern_core.types import ClientName
+from sern_core.vocabulary.types import ClientName
 from sern_runtime.keys import PublicKey, PublicKeys, load_public, load_secret, write_public
 from sern_runtime.monitor import ConnectionTable
 from tests.daemons import Lab

@@ -8,7 +8,7 @@ import pytest
 
 from sern_client.endpoints.clouds import read_ply
 from sern_client.endpoints.synthetic import LATE_S, SyntheticEndpoint
-from sern_core.types import Encoding, TopicName
+from sern_core.vocabulary.types import Encoding, TopicName
 from sern_runtime import ros_types
 from sern_tools.message_log import read_logs
 from tests.daemons import Lab, bodies, endpoint_of, recording

@@ -9,7 +9,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from sern_client.daemon import ClientDaemon
 from sern_client.endpoints.synthetic import SyntheticEndpoint
-from sern_core.types import ClientName
+from sern_core.vocabulary.types import ClientName
 from sern_sim.models import LinkModel
 from sern_tools.proxy import Route, ShapingProxy
 from tests.daemons import HOST, Lab, Process, endpoint_of

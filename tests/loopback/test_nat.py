@@ -122,7 +122,9 @@ async def test_a_forgotten_mapping_loses_nothing_reliable(
 ) -> None:
     """The sender is behind the NAT, or the receiver. `everything`: the NAT has forgotten the TCP connection as well, as
     one does that was restarted."""
-    monkeypatch.setattr("sern_core.flight.STALL_MIN_S", 30.0)  # a busy machine's pause is no lane without datagrams
+    monkeypatch.setattr(
+        "sern_core.path.flight.STALL_MIN_S", 30.0
+    )  # a busy machine's pause is no lane without datagrams
     (port,) = free_ports(1)
     bag = write_bag(tmp_path / "run.bag", {"/log": COUNT})
     nat = Nat(port)

@@ -10,8 +10,8 @@ from urllib.parse import urlencode
 import aiohttp
 import pytest
 
-from sern_core.codecs import decode
-from sern_core.types import ObjectKind, TopicName
+from sern_core.bodies.codecs import decode
+from sern_core.vocabulary.types import ObjectKind, TopicName
 from sern_relay.daemon import RelayDaemon
 from tests.daemons import Lab
 from tests.support import until
@@ -122,7 +122,7 @@ async def test_an_encoded_cloud_is_decoded_beside_the_loop_when_somebody_asks(
         threads.add(threading.get_ident())
         return decode(codec, body, max_bytes=max_bytes)
 
-    monkeypatch.setattr("sern_core.objects.decode", noted)
+    monkeypatch.setattr("sern_core.relay.objects.decode", noted)
     endpoint = {"kind": "synthetic", "role": "robot", "topics": ["/points"], "cloud_bytes": 200_000}
     rule = {"match": "/points", "compression": "zstd", "reliability": "reliable", "class": "state"}
     async with Lab(tmp_path, "jackal1", "operator1") as lab:

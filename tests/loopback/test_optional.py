@@ -7,7 +7,7 @@ import aiohttp
 import pytest
 
 from sern_client.daemon import ClientDaemon
-from sern_core.mmcf.adapter import HopAdapter
+from sern_core.adaptation.adapter import HopAdapter
 from sern_relay.daemon import RelayDaemon
 from sern_relay.feed import RelayFeed
 from sern_relay.transforms import TransformObjects

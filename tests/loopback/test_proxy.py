@@ -10,7 +10,7 @@ from collections.abc import AsyncIterator
 
 import pytest
 
-from sern_core.errors import SernError
+from sern_core.vocabulary.errors import SernError
 from sern_sim.models import LinkModel, RateStep, Window
 from sern_tools.proxy import EARLY_S, Route, ShapingProxy, address
 from tests.support import DEADLINE_S, until

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from sern_client.endpoints.bag_files import BagFile, McapFile
-from sern_core.types import Encoding
+from sern_core.vocabulary.types import Encoding
 from sern_runtime.ros_types import topic_info
 from tests.daemons import Lab, Process, bodies
 

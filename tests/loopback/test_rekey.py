@@ -7,10 +7,10 @@ import pytest
 
 from sern_client import udp as client_udp
 from sern_client.daemon import ClientDaemon
-from sern_core.lanes import LANE_UDP
-from sern_core.message import TopicInfo, TopicSpec
-from sern_core.queues import OutChannel
-from sern_core.types import ClientName, Encoding, PriorityClass, TopicName
+from sern_core.path.lanes import LANE_UDP
+from sern_core.stream.out_channel import OutChannel
+from sern_core.vocabulary.message import TopicInfo, TopicSpec
+from sern_core.vocabulary.types import ClientName, Encoding, PriorityClass, TopicName
 from sern_relay.daemon import RelayDaemon
 from sern_runtime import clock, seal
 from tests.daemons import Lab

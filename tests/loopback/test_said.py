@@ -11,10 +11,10 @@ import zmq
 from sern_client import relay_name
 from sern_client.daemon import SILENT
 from sern_client.relay_name import UnresolvedError
-from sern_core.lanes import LANE_UDP
-from sern_core.message import TopicInfo
-from sern_core.session import NEW_SESSION
-from sern_core.types import Encoding, TopicName
+from sern_core.link.session import NEW_SESSION
+from sern_core.path.lanes import LANE_UDP
+from sern_core.vocabulary.message import TopicInfo
+from sern_core.vocabulary.types import Encoding, TopicName
 from sern_runtime import clock
 from sern_runtime.transport_watch import WAITING
 from sern_runtime.zmq_socket import make_client

@@ -22,8 +22,8 @@ import zmq
 import sern_core
 import sern_relay.daemon
 from sern_client.daemon import ClientDaemon
-from sern_core import wire
-from sern_core.types import ClientName, TopicName
+from sern_core.vocabulary.types import ClientName, TopicName
+from sern_core.wire import framing
 from sern_relay.daemon import REFUSAL_CODES, RelayDaemon
 from sern_relay.server import MAX_PORTS
 from sern_runtime.keys import PublicKey, PublicKeys, SecretKey, generate, load_public, load_secret, write_public
@@ -121,8 +121,8 @@ async def bystanders(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> AsyncI
 
 
 def hello(name: str, tag: int = 1) -> bytes:
-    envelope: wire.Envelope = {"name": name, "boot": 7, "vmin": wire.VERSION_MIN, "vmax": wire.VERSION_MAX}
-    return wire.encode_handshake(wire.Kind.HELLO, tag, 0, envelope)
+    envelope: framing.Envelope = {"name": name, "boot": 7, "vmin": framing.VERSION_MIN, "vmax": framing.VERSION_MAX}
+    return framing.encode_handshake(framing.Kind.HELLO, tag, 0, envelope)
 
 
 async def test_a_stranger_and_a_client_without_keys_are_counted_and_shut_out(
@@ -173,8 +173,8 @@ async def test_a_name_that_is_not_the_keys_is_refused_to_the_client(
         async with Stranger(world.lab, load_secret(world.lab.directory / "robot2.key")) as impostor:
             await impostor.send(hello("robot1"))
             await until(lambda: impostor.received)
-            assert wire.decode_header(impostor.received[0]).kind == wire.Kind.REFUSE
-            answer = wire.decode_handshake(impostor.received[0])
+            assert framing.decode_header(impostor.received[0]).kind == framing.Kind.REFUSE
+            answer = framing.decode_handshake(impostor.received[0])
             assert answer == {"code": "name", "why": "your key belongs to robot2, not to robot1"}
         assert "robot2" not in world.relay.hub.port_of
 
@@ -200,8 +200,8 @@ async def test_nobody_joins_the_session_of_another(tmp_path: Path, caplog: pytes
         assert server is not None
         said = world.robot.core.link.join(now=0.0)  # as if it had been overheard
         assert said is not None
-        envelope = wire.decode_handshake(said) | {"name": "robot2"}
-        own_name = wire.encode_handshake(wire.Kind.JOIN, wire.decode_header(said).tag, 0, envelope)
+        envelope = framing.decode_handshake(said) | {"name": "robot2"}
+        own_name = framing.encode_handshake(framing.Kind.JOIN, framing.decode_header(said).tag, 0, envelope)
         keys = load_secret(world.lab.directory / "robot2.key")
         for number, datagram in enumerate((said, own_name), start=1):
             async with Stranger(world.lab, keys) as impostor:
@@ -218,7 +218,7 @@ async def test_one_client_has_a_few_connections(tmp_path: Path, caplog: pytest.L
         server = world.relay.server
         assert server is not None
         keys = load_secret(world.lab.directory / "robot2.key")
-        stray = wire.encode_header(wire.Kind.DATA, 1, 1, 0)
+        stray = framing.encode_header(framing.Kind.DATA, 1, 1, 0)
         strangers = [await stack.enter_async_context(Stranger(world.lab, keys)) for _ in range(MAX_PORTS + 4)]
         await strangers[0].send(hello("robot2"))
         await until(lambda: strangers[0].received, "one has a session")
@@ -246,8 +246,8 @@ async def test_connections_for_class_control_count_over_all_sessions(
         for tag in range(1, 4):
             await lane.send(hello("robot2", tag))
             await until(lambda: "robot2" in world.relay.hub.links, "a session")
-            envelope: wire.Envelope = {"name": "robot2", "boot": 7, "relay": world.relay.hub.boot}
-            join = wire.encode_handshake(wire.Kind.JOIN, tag, 0, envelope)
+            envelope: framing.Envelope = {"name": "robot2", "boot": 7, "relay": world.relay.hub.boot}
+            join = framing.encode_handshake(framing.Kind.JOIN, tag, 0, envelope)
 
             def joined(count: int) -> bool:
                 lanes = server_express._lanes
@@ -258,7 +258,7 @@ async def test_connections_for_class_control_count_over_all_sessions(
                 express = await stack.enter_async_context(Stranger(world.lab, keys))
                 await express.send(join)
                 await until(partial(joined, count), "it has joined")
-            await lane.send(wire.encode_handshake(wire.Kind.CLOSE, tag, 0, {"code": "bye", "why": "bye"}))
+            await lane.send(framing.encode_handshake(framing.Kind.CLOSE, tag, 0, {"code": "bye", "why": "bye"}))
             await until(lambda: "robot2" not in world.relay.hub.links, "it is forgotten")
             assert sum(each.client == "robot2" for each in server.express.joined.values()) <= 2
         assert server.express.refused == 0
@@ -298,30 +298,30 @@ def oversize() -> list[bytes]:
 
 
 def bomb() -> list[bytes]:
-    header = wire.encode_header(wire.Kind.HELLO, 1, 0, 0)
+    header = framing.encode_header(framing.Kind.HELLO, 1, 0, 0)
     return [header + b"\xdf\xff\xff\xff\xff" + b"\xa1a\x80" * 1000]
 
 
 BAD: dict[str, Callable[[], list[bytes]]] = {
     "no frame at all": lambda: [b""],
     "noise": lambda: [bytes(range(200))],
-    "a later version": lambda: [wire.encode_header(wire.Kind.HELLO, 1, 0, 0, version=99) + b"\x80"],
-    "a WELCOME": lambda: [hello("robot2"), wire.encode_handshake(wire.Kind.WELCOME, 1, 0, {})],
+    "a later version": lambda: [framing.encode_header(framing.Kind.HELLO, 1, 0, 0, version=99) + b"\x80"],
+    "a WELCOME": lambda: [hello("robot2"), framing.encode_handshake(framing.Kind.WELCOME, 1, 0, {})],
     "an acknowledgement of nothing": lambda: [
         hello("robot2"),
-        wire.encode_header(wire.Kind.DATA, 1, 1, 0) + wire.encode_ack(0, 4_000_000, 0, 0, 0, 0),
+        framing.encode_header(framing.Kind.DATA, 1, 1, 0) + framing.encode_ack(0, 4_000_000, 0, 0, 0, 0),
     ],
-    "half a frame": lambda: [hello("robot2"), wire.encode_header(wire.Kind.DATA, 1, 1, 0) + b"\x01\0\0"],
+    "half a frame": lambda: [hello("robot2"), framing.encode_header(framing.Kind.DATA, 1, 1, 0) + b"\x01\0\0"],
     "a control message of nobody": lambda: [hello("robot2"), control({"t": "nonsense"})],
     "a subscription that is no list": lambda: [hello("robot2"), control({"t": "subscribe", "patterns": 7})],
     "a map of four billion": bomb,
 }
 
 
-def control(envelope: wire.Envelope) -> bytes:
-    body = wire.encode_control(envelope)
-    head = wire.encode_data_first(0, 0, 1, len(body), len(body), 0, 0.0, 0)
-    return wire.encode_header(wire.Kind.DATA, 1, 1, 0) + head + body
+def control(envelope: framing.Envelope) -> bytes:
+    body = framing.encode_control(envelope)
+    head = framing.encode_data_first(0, 0, 1, len(body), len(body), 0, 0.0, 0)
+    return framing.encode_header(framing.Kind.DATA, 1, 1, 0) + head + body
 
 
 @pytest.mark.parametrize("kind", BAD)

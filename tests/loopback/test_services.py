@@ -15,10 +15,10 @@ from sern_client import daemon as client_daemon
 from sern_client.daemon import ClientDaemon
 from sern_client.endpoints.base import ServiceHandler, ServiceInfo
 from sern_client.services import MAX_ERROR_CHARS, ServiceBridge
-from sern_core.errors import ConfigError, ServiceError
-from sern_core.message import Message, StreamId, StreamInfo, TopicInfo, TopicSpec
-from sern_core.services import CALL, REPLY, call_name, reply_name
-from sern_core.types import ClientName, DropReason, Encoding, TopicName
+from sern_core.site.services import CALL, REPLY, call_name, reply_name
+from sern_core.vocabulary.errors import ConfigError, ServiceError
+from sern_core.vocabulary.message import Message, StreamId, StreamInfo, TopicInfo, TopicSpec
+from sern_core.vocabulary.types import ClientName, DropReason, Encoding, TopicName
 from sern_runtime import clock
 from sern_runtime.config.client import load_client
 from tests.daemons import Lab

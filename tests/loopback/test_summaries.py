@@ -13,7 +13,7 @@ from sern_client.endpoints.clouds import read_ply
 from sern_client.endpoints.synthetic import LATE_S, SyntheticEndpoint
 from sern_core.summaries.spec import SummaryLevel
 from sern_core.summaries.voxel import thin_rows
-from sern_core.types import ClientName, Encoding, TopicName
+from sern_core.vocabulary.types import ClientName, Encoding, TopicName
 from sern_runtime import ros_types
 from tests.daemons import START_NS, Lab, balance, bodies, endpoint_of, recording
 from tests.sern_core.summaries import scenes

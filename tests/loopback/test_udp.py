@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from sern_core.errors import ConfigError, RefusedError, UsageError
+from sern_core.vocabulary.errors import ConfigError, RefusedError, UsageError
 from sern_runtime import udp, udp_socket
 from sern_runtime.seal import UDP_PAYLOAD_BYTES, Cipher, SessionParameters, Side
 from sern_runtime.udp import (

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from sern_core.errors import UsageError
+from sern_core.vocabulary.errors import UsageError
 from sern_runtime import udp, udp_client
 from sern_runtime.seal import Cipher, SessionParameters, Side, make_seals
 from sern_runtime.udp import INNER_BYTES, TYPE_CHALLENGE, TYPE_RESPONSE

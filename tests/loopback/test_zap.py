@@ -6,7 +6,7 @@ import socket as socketlib
 import pytest
 import zmq
 
-from sern_core.errors import SernError, UsageError
+from sern_core.vocabulary.errors import SernError, UsageError
 from sern_runtime.keys import SecretKey
 from sern_runtime.monitor import EventKind, MonitorEvent, SocketMonitor
 from sern_runtime.transport_watch import TransportWatch

@@ -9,7 +9,7 @@ from functools import partial
 import pytest
 import zmq
 
-from sern_core.errors import ConfigError, UsageError
+from sern_core.vocabulary.errors import ConfigError, UsageError
 from sern_runtime import zmq_socket
 from sern_runtime.keys import SecretKey
 from sern_runtime.zap import ZapHandler

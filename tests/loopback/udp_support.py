@@ -4,7 +4,7 @@ import socket as socketlib
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 
-from sern_core.types import ClientName
+from sern_core.vocabulary.types import ClientName
 from sern_runtime.seal import Cipher, SessionParameters, Side, make_seals
 from sern_runtime.udp import TYPE_CHALLENGE, TYPE_DATA, TYPE_RESPONSE, UdpServer, UdpSession
 from sern_runtime.udp_client import UdpClient

@@ -8,14 +8,14 @@ differ.
 from collections.abc import Callable
 from itertools import pairwise
 
-from sern_core.lane_port import LanePort
-from sern_core.lanes import LANE_UDP
-from sern_core.link import Link
-from sern_core.message import TopicSpec
-from sern_core.params import SchedulerParams
-from sern_core.queues import OutChannel
-from sern_core.scheduler import CREDIT_QUANTA, DEFAULT_QUANTUM_BYTES, Scheduler
-from sern_core.types import CLASS_LABELS, ClientName, PriorityClass
+from sern_core.link.lane_port import LanePort
+from sern_core.link.link import Link
+from sern_core.path.lanes import LANE_UDP
+from sern_core.stream.out_channel import OutChannel
+from sern_core.stream.scheduler import CREDIT_QUANTA, DEFAULT_QUANTUM_BYTES, Scheduler
+from sern_core.vocabulary.message import TopicSpec
+from sern_core.vocabulary.params import SchedulerParams
+from sern_core.vocabulary.types import CLASS_LABELS, ClientName, PriorityClass
 from sern_sim.events import SimulationTimeoutError
 from sern_sim.models import LinkModel
 from tests.matrix.cells import SETTLE_S, Cell, Lanes, path_of

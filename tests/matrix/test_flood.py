@@ -11,10 +11,10 @@ from itertools import product
 
 import pytest
 
-from sern_core import wire
-from sern_core.lane_port import LanePort
-from sern_core.lanes import LANE_EXPRESS, LANE_UDP, OVERHEAD_BYTES
-from sern_core.types import ClientName, PriorityClass
+from sern_core.link.lane_port import LanePort
+from sern_core.path.lanes import LANE_EXPRESS, LANE_UDP, OVERHEAD_BYTES
+from sern_core.vocabulary.types import ClientName, PriorityClass
+from sern_core.wire import framing
 from sern_sim.models import LinkModel
 from tests.world import Got, World, spec
 
@@ -28,7 +28,7 @@ WARM_S = 1.0
 """Until the sender knows what the link carries; ages are asked for from the beginning."""
 LOAD_S = 6.0
 SIZE_BYTES = 1000
-CARRIES = SIZE_BYTES / (SIZE_BYTES + wire.HEADER_BYTES + wire.DATA_FIRST_BYTES + OVERHEAD_BYTES)
+CARRIES = SIZE_BYTES / (SIZE_BYTES + framing.HEADER_BYTES + framing.DATA_FIRST_BYTES + OVERHEAD_BYTES)
 """Share of the rate that is left to bodies of that size, one in a datagram."""
 FLOOD, BEAT, CLOUD = "/robot/flood", "/robot/beat", "/robot/points"
 

@@ -10,7 +10,7 @@ from collections.abc import Callable
 
 import pytest
 
-from sern_core.types import DropReason, PriorityClass
+from sern_core.vocabulary.types import DropReason, PriorityClass
 from tests.matrix.cells import CELLS, PROFILES, THINNED, Cell, Fault, Lanes, Load
 from tests.matrix.play import Play
 from tests.world import World, spec

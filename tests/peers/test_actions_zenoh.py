@@ -12,8 +12,8 @@ import pytest
 
 from sern_client.endpoints.base import ServiceInfo
 from sern_client.endpoints.zenoh.endpoint import ZenohEndpoint, ZenohOptions
-from sern_core.message import TopicInfo
-from sern_core.types import Encoding, TopicName
+from sern_core.vocabulary.message import TopicInfo
+from sern_core.vocabulary.types import Encoding, TopicName
 from tests.daemons import Lab
 from tests.peers.test_zenoh import Router
 from tests.support import DEADLINE_S, Events, until

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from sern_core.types import Encoding
+from sern_core.vocabulary.types import Encoding
 from sern_runtime import ros_services
 from tests.daemons import HOST, Lab
 from tests.peers.ros1.lab import RosLab, need

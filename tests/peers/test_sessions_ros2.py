@@ -7,7 +7,7 @@ from sern_client.endpoints.dds.domain import DomainOptions
 from sern_client.endpoints.dds.endpoint import DdsEndpoint, DdsOptions
 from sern_client.endpoints.zenoh.endpoint import ZenohEndpoint, ZenohOptions
 from sern_client.endpoints.zenoh.session import SessionOptions
-from sern_core.types import Encoding
+from sern_core.vocabulary.types import Encoding
 from sern_tools.ports import free_ports
 from tests.exploring import seeds
 from tests.peers.dds.peer import LEASE_S, free_domain

@@ -14,9 +14,9 @@ from sern_client.endpoints.zenoh import names
 from sern_client.endpoints.zenoh.endpoint import ZenohEndpoint, ZenohOptions
 from sern_client.endpoints.zenoh.services import _Server
 from sern_client.endpoints.zenoh.session import SessionOptions
-from sern_core.errors import ConfigError, ServiceError, UsageError
-from sern_core.message import TopicInfo
-from sern_core.types import Encoding, TopicName
+from sern_core.vocabulary.errors import ConfigError, ServiceError, UsageError
+from sern_core.vocabulary.message import TopicInfo
+from sern_core.vocabulary.types import Encoding, TopicName
 from sern_runtime import ros_services, ros_types
 from sern_tools.ports import free_ports
 from tests.daemons import Lab, bodies, under, write_bag

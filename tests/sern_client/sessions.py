@@ -13,14 +13,14 @@ from typing import Any, Final
 
 from sern_client.bridge import Bridge
 from sern_client.endpoints.base import Endpoint
-from sern_core.client import ClientCore
-from sern_core.hub import Hub
-from sern_core.hub_port import HubPort
-from sern_core.message import TopicInfo
-from sern_core.params import LinkParams, SchedulerParams
-from sern_core.queues import OutChannel
-from sern_core.rules import Discovery, DiscoveryMode, RuleSet
-from sern_core.types import ClientName, Encoding
+from sern_core.relay.hub import Hub
+from sern_core.relay.hub_port import HubPort
+from sern_core.site.client import ClientCore
+from sern_core.stream.out_channel import OutChannel
+from sern_core.topics.rules import Discovery, DiscoveryMode, RuleSet
+from sern_core.vocabulary.message import TopicInfo
+from sern_core.vocabulary.params import LinkParams, SchedulerParams
+from sern_core.vocabulary.types import ClientName, Encoding
 from sern_runtime import ros_types
 from tests.support import until
 from tests.world import OPEN_ACCESS, spec

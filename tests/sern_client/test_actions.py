@@ -23,12 +23,12 @@ from sern_client.actions import (
     refusal,
 )
 from sern_client.endpoints.base import ServiceInfo, Sink
-from sern_core.errors import ConfigError
-from sern_core.ledger import SendCounters
-from sern_core.message import StreamId, StreamInfo, TopicInfo, TopicSpec
-from sern_core.patterns import compile_pattern
-from sern_core.queues import OutChannel
-from sern_core.types import ClientName, DropReason, Encoding, PriorityClass, TopicName
+from sern_core.stream.out_channel import OutChannel
+from sern_core.topics.patterns import compile_pattern
+from sern_core.vocabulary.errors import ConfigError
+from sern_core.vocabulary.ledger import SendCounters
+from sern_core.vocabulary.message import StreamId, StreamInfo, TopicInfo, TopicSpec
+from sern_core.vocabulary.types import ClientName, DropReason, Encoding, PriorityClass, TopicName
 from sern_runtime import clock, ros_types
 from tests.steps import steps
 from tests.support import until

@@ -9,7 +9,7 @@ import pytest
 from sern_client.checks import CHECK_S, CONFIRM_S, REPAIR_S, TableCheck
 from sern_client.endpoints.base import Difference, Held
 from sern_client.endpoints.ros1.publication import Handle
-from sern_core.types import Encoding, TopicName
+from sern_core.vocabulary.types import Encoding, TopicName
 from tests.sern_client.endpoints.ros1.fakes import FakeMaster, running
 from tests.sern_client.sessions import Changes
 from tests.support import until

@@ -15,9 +15,9 @@ from rosbags.typesys import Stores, get_typestore
 
 from sern_client.conversion import Converter, converted, converted_service
 from sern_client.endpoints.base import Difference, Held, Publisher, ServiceInfo, Sink, Subscription, TopicEvents
-from sern_core.errors import ConfigError, UsageError
-from sern_core.message import TopicInfo
-from sern_core.types import Encoding, TopicName
+from sern_core.vocabulary.errors import ConfigError, UsageError
+from sern_core.vocabulary.message import TopicInfo
+from sern_core.vocabulary.types import Encoding, TopicName
 from sern_runtime import ros_types
 from sern_runtime.ros_types import topic_info
 from tests.daemons import recording

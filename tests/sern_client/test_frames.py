@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sern_client.frames import FramePrefixer, Rewrite
-from sern_core.message import TopicInfo
-from sern_core.types import Encoding, TopicName
+from sern_core.vocabulary.message import TopicInfo
+from sern_core.vocabulary.types import Encoding, TopicName
 from sern_runtime import ros_types
 
 BOTH = pytest.mark.parametrize("encoding", [Encoding.ROS1, Encoding.CDR])

@@ -11,7 +11,7 @@ import uvloop
 
 from sern_client import guard
 from sern_client.guard import Guard
-from sern_core.types import Encoding
+from sern_core.vocabulary.types import Encoding
 from sern_runtime import clock, ros_types
 from sern_runtime.config.endpoints import Ros1Endpoint
 from sern_runtime.config.shared import LogSection

@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 
 from sern_client.endpoints.base import KeptUpTo
 from sern_client.keeping import Keeping
-from sern_core.message import StreamId
-from sern_core.types import ClientName, DropReason, TopicName
+from sern_core.vocabulary.message import StreamId
+from sern_core.vocabulary.types import ClientName, DropReason, TopicName
 
 STREAM = StreamId(ClientName("robot"), 1, TopicName("/robot/chat"))
 

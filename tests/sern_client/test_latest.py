@@ -7,9 +7,9 @@ import pytest
 
 from sern_client import latest
 from sern_client.latest import MAX_VALUE_BYTES, LatestValues
-from sern_core.errors import UsageError
-from sern_core.message import StreamId, StreamInfo, TopicInfo, TopicSpec
-from sern_core.types import ClientName, Encoding, TopicName
+from sern_core.vocabulary.errors import UsageError
+from sern_core.vocabulary.message import StreamId, StreamInfo, TopicInfo, TopicSpec
+from sern_core.vocabulary.types import ClientName, Encoding, TopicName
 
 
 def stream(topic: str) -> StreamInfo:

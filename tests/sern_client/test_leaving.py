@@ -5,14 +5,14 @@ from collections.abc import Callable
 from sern_client.bridge import Bridge
 from sern_client.endpoints.base import Sink
 from sern_client.leaving import LEAVE_S, Leaving
-from sern_core.client import ClientCore
-from sern_core.params import LinkParams, SchedulerParams
-from sern_core.patterns import compile_pattern
-from sern_core.queues import OutChannel
-from sern_core.rules import Discovery, DiscoveryMode, RuleSet, TopicRule
+from sern_core.site.client import ClientCore
+from sern_core.stream.out_channel import OutChannel
 from sern_core.summaries.patches import PatchParams
 from sern_core.summaries.spec import SummarySpec
-from sern_core.types import ClientName, Encoding, TopicName
+from sern_core.topics.patterns import compile_pattern
+from sern_core.topics.rules import Discovery, DiscoveryMode, RuleSet, TopicRule
+from sern_core.vocabulary.params import LinkParams, SchedulerParams
+from sern_core.vocabulary.types import ClientName, Encoding, TopicName
 from sern_runtime import clock, ros_types
 from sern_sim.models import LinkModel, Window
 from tests.world import SimClient, World, spec

@@ -12,13 +12,13 @@ from sern_client.endpoints.base import Publisher
 from sern_client.link_state import LinkState
 from sern_client.link_topics import ARRAY_TYPE, STATUS_TYPE, LinkTopics, LinkView
 from sern_client.withdrawal import MAX_KEPT, Kept, Withdrawal
-from sern_core.client import ClientCore
-from sern_core.errors import ConfigError
-from sern_core.message import Message, StreamId, StreamInfo, TopicInfo
-from sern_core.params import LinkParams, SchedulerParams
-from sern_core.peers import PeerStatus
-from sern_core.rules import Discovery, DiscoveryMode, RuleSet
-from sern_core.types import ClientName, Encoding, TopicName
+from sern_core.site.client import ClientCore
+from sern_core.site.peers import PeerStatus
+from sern_core.topics.rules import Discovery, DiscoveryMode, RuleSet
+from sern_core.vocabulary.errors import ConfigError
+from sern_core.vocabulary.message import Message, StreamId, StreamInfo, TopicInfo
+from sern_core.vocabulary.params import LinkParams, SchedulerParams
+from sern_core.vocabulary.types import ClientName, Encoding, TopicName
 from sern_runtime import clock, ros_types
 from sern_runtime.optional import OptionalParts
 from tests.sern_client.sessions import Ignored

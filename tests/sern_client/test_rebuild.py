@@ -8,7 +8,6 @@ import pytest
 from numpy.typing import NDArray
 
 from sern_client.rebuild import MAX_OWED, REST, Owed, Rebuilds
-from sern_core.message import Message, StreamId, StreamInfo, TopicInfo, TopicSpec
 from sern_core.summaries.bodies import Header
 from sern_core.summaries.grids import (
     GRID_TYPE,
@@ -20,7 +19,8 @@ from sern_core.summaries.grids import (
     write_grid,
     write_update,
 )
-from sern_core.types import ClientName, Encoding, TopicName
+from sern_core.vocabulary.message import Message, StreamId, StreamInfo, TopicInfo, TopicSpec
+from sern_core.vocabulary.types import ClientName, Encoding, TopicName
 from tests.support import until
 
 CDR = Encoding.CDR

@@ -24,11 +24,11 @@ from sern_client.guard import Guard
 from sern_client.link_topics import LinkTopics
 from sern_client.relay_name import RelayName, UnresolvedError
 from sern_client.withdrawal import Withdrawal
-from sern_core.errors import ConfigError
-from sern_core.lanes import LANE_EXPRESS, LANE_ZMQ
-from sern_core.message import StreamId
-from sern_core.params import Redundancy
-from sern_core.types import ClientName, Encoding, TopicName
+from sern_core.path.lanes import LANE_EXPRESS, LANE_ZMQ
+from sern_core.vocabulary.errors import ConfigError
+from sern_core.vocabulary.message import StreamId
+from sern_core.vocabulary.params import Redundancy
+from sern_core.vocabulary.types import ClientName, Encoding, TopicName
 from sern_relay.daemon import RelayDaemon
 from sern_runtime import clock, datagram_watch
 from sern_runtime.config.client import load_client

@@ -15,7 +15,7 @@ from sern_client.endpoints.record import RecordEndpoint, RecordOptions
 from sern_client.endpoints.ros1 import Ros1Endpoint, Ros1Options
 from sern_client.endpoints.ros1.xmlrpc import XmlRpcClient
 from sern_client.endpoints.synthetic import SyntheticEndpoint, SyntheticOptions
-from sern_core.types import Encoding
+from sern_core.vocabulary.types import Encoding
 from sern_runtime import ros_types
 from tests.exploring import seeds
 from tests.sern_client.endpoints.ros1.fakes import HOST, FakeMaster

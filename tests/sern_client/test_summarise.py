@@ -20,15 +20,15 @@ from sern_client.summarise import (
     patch_work,
 )
 from sern_client.tf_merge import LatchedTransforms, MergedTransforms
-from sern_core.client import ClientCore
-from sern_core.errors import BodyError
-from sern_core.message import TopicInfo, TopicSpec
-from sern_core.params import LinkParams, SchedulerParams
-from sern_core.queues import OutChannel
-from sern_core.rate_cap import RateCap
+from sern_core.site.client import ClientCore
+from sern_core.stream.out_channel import OutChannel
+from sern_core.stream.rate_cap import RateCap
 from sern_core.summaries.patches import PatchMaker, PatchParams
 from sern_core.summaries.spec import SummaryLevel, SummarySpec, VoxelParams
-from sern_core.types import ClientName, DropReason, Durability, Encoding, Reliability, TopicName
+from sern_core.vocabulary.errors import BodyError
+from sern_core.vocabulary.message import TopicInfo, TopicSpec
+from sern_core.vocabulary.params import LinkParams, SchedulerParams
+from sern_core.vocabulary.types import ClientName, DropReason, Durability, Encoding, Reliability, TopicName
 from tests.sern_core.summaries.test_patches import grid_body
 from tests.sern_core.summaries.test_transforms import message as tf_message
 from tests.sern_core.summaries.test_transforms import pairs, transform

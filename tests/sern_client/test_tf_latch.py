@@ -3,8 +3,8 @@
 import pytest
 
 from sern_client.tf_latch import MAX_TRANSFORMS, TF_TYPE, TfLatch, is_static_tf
-from sern_core.errors import ConfigError
-from sern_core.types import Encoding
+from sern_core.vocabulary.errors import ConfigError
+from sern_core.vocabulary.types import Encoding
 from sern_runtime import ros_types
 
 ENCODINGS = (Encoding.ROS1, Encoding.CDR)

@@ -9,12 +9,12 @@ from sern_client import update_topics
 from sern_client.bridge import Bridge
 from sern_client.endpoints.record import RecordEndpoint, RecordOptions
 from sern_client.update_topics import MAX_TOPICS, UpdateTopics
-from sern_core.client import ClientCore
-from sern_core.message import StreamId, StreamInfo
-from sern_core.params import LinkParams, SchedulerParams
-from sern_core.rules import Discovery, DiscoveryMode, RuleSet
+from sern_core.site.client import ClientCore
 from sern_core.summaries.grids import GRID_TYPE, UPDATE_TYPE
-from sern_core.types import ClientName, Encoding, TopicName
+from sern_core.topics.rules import Discovery, DiscoveryMode, RuleSet
+from sern_core.vocabulary.message import StreamId, StreamInfo
+from sern_core.vocabulary.params import LinkParams, SchedulerParams
+from sern_core.vocabulary.types import ClientName, Encoding, TopicName
 from sern_runtime import clock, ros_types
 from tests.support import Events, until
 from tests.world import spec

@@ -7,10 +7,10 @@ from typing import Any
 
 import pytest
 
-from sern_core.announce import definition_hash
-from sern_core.errors import UsageError
-from sern_core.message import TopicInfo
-from sern_core.types import ClientName, Encoding, TopicName
+from sern_core.vocabulary.errors import UsageError
+from sern_core.vocabulary.message import TopicInfo
+from sern_core.vocabulary.types import ClientName, Encoding, TopicName
+from sern_core.wire.announce import definition_hash
 from sern_relay.objects_view import objects_view
 from sern_runtime import http
 from sern_runtime.http import JsonParts

@@ -5,10 +5,10 @@ import math
 
 import pytest
 
-from sern_core.message import Message, StreamId, StreamInfo, TopicInfo
-from sern_core.objects import ObjectRegistry
+from sern_core.relay.objects import ObjectRegistry
 from sern_core.summaries.transforms import Transform, read_transforms
-from sern_core.types import ClientName, Encoding, ObjectKind, TopicName
+from sern_core.vocabulary.message import Message, StreamId, StreamInfo, TopicInfo
+from sern_core.vocabulary.types import ClientName, Encoding, ObjectKind, TopicName
 from sern_relay import transforms
 from sern_relay.transforms import TransformObjects
 from sern_runtime import ros_types

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import pytest
 from prometheus_client import CollectorRegistry, generate_latest
 
-from sern_core.params import SchedulerParams
+from sern_core.vocabulary.params import SchedulerParams
 from sern_runtime.collector import THRESHOLDS, CollectorWatch
 from sern_runtime.metrics import Metrics
 from tests.world import Clock, World, spec

@@ -7,8 +7,8 @@ import pytest
 import zmq
 from zmq.utils import z85
 
-from sern_core.errors import ConfigError, UsageError
-from sern_core.types import ClientName
+from sern_core.vocabulary.errors import ConfigError, UsageError
+from sern_core.vocabulary.types import ClientName
 from sern_runtime import keys
 from sern_runtime.keys import KeyDirectory, KeyMatch, KeyStatus, PublicKey, PublicKeys
 

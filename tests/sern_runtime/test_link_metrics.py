@@ -11,8 +11,8 @@ from prometheus_client.exposition import generate_latest
 from prometheus_client.openmetrics.exposition import generate_latest as generate_openmetrics
 from prometheus_client.parser import text_string_to_metric_families
 
-from sern_core.ledger import LOSSES, ReceiveCounters, ReceiveLedger, SendCounters
-from sern_core.types import DropReason, PriorityClass, TopicName
+from sern_core.vocabulary.ledger import LOSSES, ReceiveCounters, ReceiveLedger, SendCounters
+from sern_core.vocabulary.types import DropReason, PriorityClass, TopicName
 from sern_runtime import metrics as module
 from sern_runtime.link_metrics import AgeHistograms, register_links, register_received
 from sern_runtime.metrics import SLICE_ROWS, Metrics, exposition

@@ -4,7 +4,7 @@ import pytest
 from prometheus_client import CollectorRegistry, Gauge, generate_latest
 from prometheus_client.parser import text_string_to_metric_families
 
-from sern_core.errors import UsageError
+from sern_core.vocabulary.errors import UsageError
 from sern_runtime.metrics import (
     LATENCY_EDGES_S,
     MAX_LABEL_SETS,

@@ -6,7 +6,7 @@ import logging
 import pytest
 from prometheus_client import CollectorRegistry
 
-from sern_core.codecs import Work
+from sern_core.bodies.codecs import Work
 from sern_runtime import optional
 from sern_runtime.codec_pool import CodecPool
 from sern_runtime.metrics import Metrics

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from sern_core.errors import ConfigError
+from sern_core.vocabulary.errors import ConfigError
 from sern_runtime import profiles as module
 from sern_runtime.profiles import LinkSection, find_profiles_file, load_profile, load_profiles
 from sern_sim.models import BurstLoss, Flap, Jitter, LinkModel, RateStep, Window

@@ -12,9 +12,9 @@ from rosbags.typesys.store import Typestore
 
 from sern_client import conversion
 from sern_client.frames import FramePrefixer
-from sern_core.errors import BodyError, ConfigError
-from sern_core.message import TopicInfo
-from sern_core.types import Encoding, TopicName
+from sern_core.vocabulary.errors import BodyError, ConfigError
+from sern_core.vocabulary.message import TopicInfo
+from sern_core.vocabulary.types import Encoding, TopicName
 from sern_runtime import ros_bodies, ros_text, ros_types
 
 ROS1, CDR = Encoding.ROS1, Encoding.CDR

@@ -9,9 +9,9 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from sern_client import conversion
 from sern_client.frames import FramePrefixer
-from sern_core.errors import ConfigError
-from sern_core.message import TopicInfo
-from sern_core.types import Encoding, TopicName
+from sern_core.vocabulary.errors import ConfigError
+from sern_core.vocabulary.message import TopicInfo
+from sern_core.vocabulary.types import Encoding, TopicName
 from sern_runtime import ros_text, ros_types
 
 SEP = ros_text.SEPARATOR

@@ -3,8 +3,8 @@
 import pytest
 from rosbags.typesys import Stores, get_typestore
 
-from sern_core.errors import ConfigError, UsageError
-from sern_core.types import Encoding
+from sern_core.vocabulary.errors import ConfigError, UsageError
+from sern_core.vocabulary.types import Encoding
 from sern_runtime import ros_types
 
 ROS1, CDR = Encoding.ROS1, Encoding.CDR

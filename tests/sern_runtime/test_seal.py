@@ -8,8 +8,8 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from sern_core.errors import RefusedError, UsageError, WireError
-from sern_core.wire import decode_envelope, encode_envelope
+from sern_core.vocabulary.errors import RefusedError, UsageError, WireError
+from sern_core.wire.framing import decode_envelope, encode_envelope
 from sern_runtime import seal
 from sern_runtime.seal import (
     CLEAR_BYTES,

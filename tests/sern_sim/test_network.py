@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import pytest
 
-from sern_core.errors import UsageError
+from sern_core.vocabulary.errors import UsageError
 from sern_sim.events import EventLog, SimulationStuck, SimulationTimeoutError
 from sern_sim.models import PERFECT, BurstLoss, Jitter, LinkModel, RateStep
 from sern_sim.network import Network

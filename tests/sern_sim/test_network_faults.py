@@ -5,7 +5,7 @@ from random import Random
 
 import pytest
 
-from sern_core.errors import UsageError
+from sern_core.vocabulary.errors import UsageError
 from sern_sim.links import LOST, NS, Link
 from sern_sim.models import PERFECT, BurstLoss, Flap, Jitter, LinkModel, RateStep, Window
 from sern_sim.network import Network

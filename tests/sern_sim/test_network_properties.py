@@ -8,7 +8,8 @@ from hypothesis import strategies as st
 
 from sern_sim.links import LOST, NS, Link
 from sern_sim.models import LinkMode, LinkModel, RateStep, Window
-from sern_sim.network import Direction, Network
+from sern_sim.network import Network
+from sern_sim.ports import Direction
 from tests.exploring import cases
 from tests.sern_sim.strategies import link_models, rate_steps, windows
 from tests.sern_sim.toys import ArqReceiver, ArqSender

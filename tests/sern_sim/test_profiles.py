@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 
-from sern_core.errors import UsageError
+from sern_core.vocabulary.errors import UsageError
 from sern_sim.models import BurstLoss, Flap, Jitter, LinkMode, LinkModel, RateStep, Window
 from sern_sim.netem import netem_commands, netem_options, netem_removal, netem_timeline
 from sern_sim.profiles import LinkProfile

@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from sern_client.endpoints.base import Difference, Held, Publisher, Sink, Subscription, TopicEvents
-from sern_core.errors import UsageError
-from sern_core.message import TopicInfo
-from sern_core.types import Encoding, TopicName
+from sern_core.vocabulary.errors import UsageError
+from sern_core.vocabulary.message import TopicInfo
+from sern_core.vocabulary.types import Encoding, TopicName
 from sern_runtime.config.client import load_client
 from sern_runtime.profiles import load_profile
 from sern_tools.baseline import Baseline

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from sern_core.errors import ConfigError
+from sern_core.vocabulary.errors import ConfigError
 from sern_tools.counters import Counters, read_counters
 
 SENT = {

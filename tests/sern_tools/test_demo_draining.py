@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from sern_core.errors import SernError
+from sern_core.vocabulary.errors import SernError
 from sern_tools import demo
 from sern_tools.demo_scenario import ROBOT, SITE
 from sern_tools.processes import Children

@@ -4,9 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from sern_core.errors import ConfigError
-from sern_core.message import TopicInfo
-from sern_core.types import Encoding, PriorityClass, TopicName
+from sern_core.vocabulary.errors import ConfigError
+from sern_core.vocabulary.message import TopicInfo
+from sern_core.vocabulary.types import Encoding, PriorityClass, TopicName
 from sern_runtime.config.client import load_client
 from sern_runtime.config.relay import load_relay
 from sern_runtime.profiles import load_profile, load_profiles

@@ -21,10 +21,10 @@ from hypothesis import strategies as st
 from ruamel.yaml import YAML
 from typer.testing import CliRunner
 
-from sern_core.errors import ConfigError, RefusedError, SernError, UsageError
-from sern_core.message import Message, StreamId, StreamInfo, TopicInfo, TopicSpec
-from sern_core.session import NEW_SESSION
-from sern_core.types import ClientName, DropReason, Encoding, TopicName
+from sern_core.link.session import NEW_SESSION
+from sern_core.vocabulary.errors import ConfigError, RefusedError, SernError, UsageError
+from sern_core.vocabulary.message import Message, StreamId, StreamInfo, TopicInfo, TopicSpec
+from sern_core.vocabulary.types import ClientName, DropReason, Encoding, TopicName
 from sern_runtime import ros_types
 from sern_runtime.loop import Shutdown
 from sern_runtime.transport_watch import CUT, ENDED, LOST, NOBODY

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from sern_core.trace import DecisionTrace, TraceEvent
-from sern_core.types import TopicName
+from sern_core.vocabulary.trace import DecisionTrace, TraceEvent
+from sern_core.vocabulary.types import TopicName
 from sern_tools.commands import app
 from sern_tools.explain import WIDTH, story, trace_of
 from sern_tools.explain_replay import Setup, read_bag

@@ -6,10 +6,10 @@ import pytest
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
-from sern_core.link import Link
-from sern_core.message import Message, StreamInfo
-from sern_core.queues import OutChannel
-from sern_core.types import ClientName, DropReason, PriorityClass
+from sern_core.link.link import Link
+from sern_core.stream.out_channel import OutChannel
+from sern_core.vocabulary.message import Message, StreamInfo
+from sern_core.vocabulary.types import ClientName, DropReason, PriorityClass
 from sern_sim.models import LinkModel
 from sern_tools.fates import Fate, Fates, Route, fates
 from sern_tools.message_log import Delivery, Offer, TopicLog
@@ -21,7 +21,7 @@ ROUTE = Route("robot", "relay", "site")
 
 
 class Recorder:
-    """`sern_core.fates.Fates` of one place, into the log of one topic."""
+    """`sern_core.vocabulary.fates.Fates` of one place, into the log of one topic."""
 
     def __init__(self, log: TopicLog, place: str) -> None:
         self.log = log

@@ -6,7 +6,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from sern_core.errors import ConfigError, UsageError
+from sern_core.vocabulary.errors import ConfigError, UsageError
 from sern_runtime import keys
 from sern_tools import keygen
 

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from sern_core.errors import ConfigError
+from sern_core.vocabulary.errors import ConfigError
 from sern_tools.message_log import HEADER, Delivery, Event, MessageLog, Offer, read_logs
 
 HEAD = ",".join(HEADER) + "\n"

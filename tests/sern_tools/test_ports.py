@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from sern_core.errors import SernError
+from sern_core.vocabulary.errors import SernError
 from sern_tools import ports
 
 NAME = f"tests-{os.getpid()}"

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from sern_core.errors import SernError
+from sern_core.vocabulary.errors import SernError
 from sern_tools import child as launcher
 from sern_tools import processes
 from sern_tools.processes import Child, Children, program

@@ -6,7 +6,7 @@ from pathlib import Path
 from typer.testing import CliRunner
 
 from sern_client.endpoints.leftovers import lock
-from sern_core.types import Encoding
+from sern_core.vocabulary.types import Encoding
 from sern_tools.commands import app
 from tests.sern_client.endpoints.test_leftovers import interrupted, read
 

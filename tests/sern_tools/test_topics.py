@@ -13,8 +13,8 @@ import pytest
 from rich.console import Console
 from typer.testing import CliRunner
 
-from sern_core.errors import SernError, UsageError
-from sern_core.patterns import compile_pattern
+from sern_core.topics.patterns import compile_pattern
+from sern_core.vocabulary.errors import SernError, UsageError
 from sern_tools import api
 from sern_tools.commands import app
 from sern_tools.ports import free_ports

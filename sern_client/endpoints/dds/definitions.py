@@ -3,8 +3,8 @@
 from collections.abc import Iterable
 from pathlib import Path
 
-from sern_core.errors import ConfigError
-from sern_core.types import Encoding
+from sern_core.vocabulary.errors import ConfigError
+from sern_core.vocabulary.types import Encoding
 from sern_runtime import ros_services, ros_types
 from sern_runtime.ros_files import TypeFiles
 from sern_runtime.ros_types import TypeText

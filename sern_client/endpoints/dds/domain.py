@@ -8,7 +8,7 @@ from xml.sax.saxutils import quoteattr
 from cyclonedds.core import DDSException
 from cyclonedds.domain import Domain
 
-from sern_core.errors import ConfigError
+from sern_core.vocabulary.errors import ConfigError
 
 MAX_DOMAIN: Final = 232
 LOOPBACK_FRAGMENT_BYTES: Final = 62_000

@@ -52,9 +52,9 @@ from sern_client.endpoints.dds.services import DdsServices
 from sern_client.endpoints.dds.stream import Stream
 from sern_client.endpoints.dds.worker import Inbox, Sample, Worker
 from sern_client.endpoints.first import LEARN_S, FirstMessages
-from sern_core.errors import ConfigError, UsageError
-from sern_core.message import TopicInfo
-from sern_core.types import DropReason, Encoding, TopicName
+from sern_core.vocabulary.errors import ConfigError, UsageError
+from sern_core.vocabulary.message import TopicInfo
+from sern_core.vocabulary.types import DropReason, Encoding, TopicName
 from sern_runtime import ros_types
 from sern_runtime.ros_types import ResolvedType
 

@@ -12,8 +12,8 @@ from sern_client.endpoints.dds import names, raw
 from sern_client.endpoints.dds.qos import EndpointQos, mismatches, reader_for, within_reach
 from sern_client.endpoints.dds.worker import Inbox, Sample
 from sern_client.endpoints.first import Readers
-from sern_core.message import TopicInfo
-from sern_core.types import Encoding
+from sern_core.vocabulary.message import TopicInfo
+from sern_core.vocabulary.types import Encoding
 from sern_runtime import ros_types
 
 if TYPE_CHECKING:

@@ -14,7 +14,7 @@ from sern_client.endpoints.dds import names, node_info, qos
 from sern_client.endpoints.dds.names import Role, RosName
 from sern_client.endpoints.dds.node_info import Node
 from sern_client.endpoints.dds.qos import EndpointQos
-from sern_core.types import TopicName
+from sern_core.vocabulary.types import TopicName
 
 FAST_DDS: Final = b"\x01\x0f"
 """How the GUIDs of eProsima's DDS begin: their vendor id."""

@@ -13,7 +13,7 @@ from rosbags.interfaces.typing import Fielddefs, FieldDesc
 from rosbags.typesys.store import Typestore
 
 from sern_client.endpoints.dds.names import type_to_dds
-from sern_core.errors import ConfigError
+from sern_core.vocabulary.errors import ConfigError
 from sern_runtime.ros_types import ResolvedType
 
 MAX_BOUND: Final = 0xFFFF

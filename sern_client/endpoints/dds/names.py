@@ -11,9 +11,9 @@ from typing import Final, NamedTuple
 
 from sern_client.endpoints.zenoh.names import dds_type as type_to_dds
 from sern_client.endpoints.zenoh.names import ros_type
-from sern_core.errors import WireError
-from sern_core.rules import name_problem
-from sern_core.types import TopicName
+from sern_core.vocabulary.errors import WireError
+from sern_core.vocabulary.names import name_problem
+from sern_core.vocabulary.types import TopicName
 
 __all__ = ["DISCOVERY_TOPIC", "SERN_KEY", "Role", "RosName", "cut", "from_dds", "read_user_data", "to_dds"]
 __all__ += ["type_from_dds", "type_to_dds", "user_data"]

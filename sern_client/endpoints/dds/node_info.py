@@ -7,7 +7,7 @@ from uuid import UUID
 
 import numpy as np
 
-from sern_core.types import Encoding
+from sern_core.vocabulary.types import Encoding
 from sern_runtime import ros_types
 
 TYPE: Final = "rmw_dds_common/msg/ParticipantEntitiesInfo"

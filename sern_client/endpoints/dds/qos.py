@@ -11,7 +11,7 @@ from cyclonedds.core import Policy, Qos
 
 from sern_client.endpoints.dds.names import read_user_data, user_data
 from sern_client.endpoints.dds.raw import INFINITE_NS, Announced
-from sern_core.message import TopicInfo
+from sern_core.vocabulary.message import TopicInfo
 
 _DURABILITY: Final = ("volatile", "transient_local", "transient", "persistent")
 _LIVELINESS: Final = ("automatic", "manual_by_participant", "manual_by_topic")

@@ -21,8 +21,8 @@ from sern_client.endpoints.dds.graph import Remote, puts_header
 from sern_client.endpoints.dds.names import Role
 from sern_client.endpoints.dds.qos import EndpointQos
 from sern_client.endpoints.dds.worker import Sample
-from sern_core.errors import ConfigError, ServiceError, UsageError
-from sern_core.types import Encoding, TopicName
+from sern_core.vocabulary.errors import ConfigError, ServiceError, UsageError
+from sern_core.vocabulary.types import Encoding, TopicName
 from sern_runtime import ros_services
 
 if TYPE_CHECKING:

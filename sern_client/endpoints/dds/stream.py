@@ -6,7 +6,7 @@ from typing import Protocol
 from uuid import UUID
 
 from sern_client.endpoints.first import FirstMessages
-from sern_core.types import TopicName
+from sern_core.vocabulary.types import TopicName
 
 
 class Writer(Protocol):

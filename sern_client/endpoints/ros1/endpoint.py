@@ -43,10 +43,10 @@ from sern_client.endpoints.ros1.services import Served, ServiceHost, ServiceWatc
 from sern_client.endpoints.ros1.slave import BusLink, SlaveApi
 from sern_client.endpoints.ros1.subscription import ReceiveCounters, Source, Subscription, Topic
 from sern_client.endpoints.ros1.xmlrpc import CallError, XmlRpcServer, check_host, split_uri
-from sern_core.errors import ConfigError, UsageError
-from sern_core.message import TopicInfo
-from sern_core.rules import name_problem
-from sern_core.types import DropReason, Encoding, TopicName
+from sern_core.vocabulary.errors import ConfigError, UsageError
+from sern_core.vocabulary.message import TopicInfo
+from sern_core.vocabulary.names import name_problem
+from sern_core.vocabulary.types import DropReason, Encoding, TopicName
 from sern_runtime import ros_types
 
 DEFAULT_MASTER_URI: Final = "http://localhost:11311"

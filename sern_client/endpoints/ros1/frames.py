@@ -13,7 +13,7 @@ from abc import ABC, abstractmethod
 from typing import Final, cast
 
 from sern_client.endpoints.ros1.header import MAX_HEADER_BYTES, decode_header
-from sern_core.errors import WireError
+from sern_core.vocabulary.errors import WireError
 
 SCRATCH_BYTES: Final = 256 * 1024
 HANDSHAKE_S: Final = 10.0

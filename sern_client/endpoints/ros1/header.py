@@ -13,7 +13,7 @@ import struct
 from collections.abc import Mapping
 from typing import Final
 
-from sern_core.errors import WireError
+from sern_core.vocabulary.errors import WireError
 
 MAX_HEADER_BYTES: Final = 1_200_000
 """The longest accepted definition text (1 MiB) and the other fields; what a stranger may make us hold."""

@@ -12,7 +12,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterable
 from typing import Final
 
-from sern_core.types import DropReason
+from sern_core.vocabulary.types import DropReason
 
 HOLD_S: Final = 2.0
 """How long a message is kept, and how long after our registration a subscriber is waited for. They connect within some

@@ -6,7 +6,7 @@ continuation lines) is spoken by ROS nodes, and it is refused.
 
 from typing import Final, NamedTuple
 
-from sern_core.errors import WireError
+from sern_core.vocabulary.errors import WireError
 
 MAX_HEAD_BYTES: Final = 16 * 1024
 

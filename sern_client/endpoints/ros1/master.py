@@ -4,8 +4,8 @@ from typing import Any, Final, NamedTuple
 from xmlrpc.client import Fault
 
 from sern_client.endpoints.ros1.xmlrpc import CallError, XmlRpcClient, decode_call, value_of
-from sern_core.errors import WireError
-from sern_core.rules import name_problem
+from sern_core.vocabulary.errors import WireError
+from sern_core.vocabulary.names import name_problem
 
 ANY: Final = "*"
 """The type or md5sum that fits every other."""

@@ -18,9 +18,9 @@ from sern_client.endpoints.ros1.frames import LENGTH
 from sern_client.endpoints.ros1.header import BRIDGE_FIELD, shown
 from sern_client.endpoints.ros1.hold import Hold
 from sern_client.tf_latch import TfLatch, is_static_tf
-from sern_core.errors import ConfigError
-from sern_core.message import TopicInfo
-from sern_core.types import DropReason, Encoding
+from sern_core.vocabulary.errors import ConfigError
+from sern_core.vocabulary.message import TopicInfo
+from sern_core.vocabulary.types import DropReason, Encoding
 from sern_runtime import ros_types
 
 if TYPE_CHECKING:

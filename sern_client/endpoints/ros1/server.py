@@ -10,7 +10,7 @@ from sern_client.endpoints.ros1.frames import Frames
 from sern_client.endpoints.ros1.header import encode_header, shown
 from sern_client.endpoints.ros1.listener import Listener
 from sern_client.endpoints.ros1.publication import Feed, Publication
-from sern_core.errors import WireError
+from sern_core.vocabulary.errors import WireError
 
 MAX_CONNECTIONS: Final = 2048
 FLUSH_S: Final = 0.5

@@ -23,8 +23,8 @@ from sern_client.endpoints.ros1.header import (
 from sern_client.endpoints.ros1.master import ANY, Master, Table
 from sern_client.endpoints.ros1.server import Inbound
 from sern_client.endpoints.ros1.xmlrpc import CallError, reason, split_uri
-from sern_core.errors import ConfigError, ServiceError, UsageError, WireError
-from sern_core.types import Encoding, TopicName
+from sern_core.vocabulary.errors import ConfigError, ServiceError, UsageError, WireError
+from sern_core.vocabulary.types import Encoding, TopicName
 from sern_runtime import clock, ros_types
 
 PROBE_S: Final = 5.0

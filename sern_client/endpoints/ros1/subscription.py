@@ -19,9 +19,9 @@ from sern_client.endpoints.ros1.header import BRIDGE_FIELD, check_lengths, encod
 from sern_client.endpoints.ros1.master import ANY
 from sern_client.endpoints.ros1.xmlrpc import MAX_REQUEST_BYTES, CallError, XmlRpcClient, check_host, reason
 from sern_client.tf_latch import TfLatch, is_static_tf
-from sern_core.errors import ConfigError, WireError
-from sern_core.message import TopicInfo
-from sern_core.types import DropReason, Encoding, TopicName
+from sern_core.vocabulary.errors import ConfigError, WireError
+from sern_core.vocabulary.message import TopicInfo
+from sern_core.vocabulary.types import DropReason, Encoding, TopicName
 from sern_runtime import clock, ros_types
 
 CONNECT_S: Final = 5.0

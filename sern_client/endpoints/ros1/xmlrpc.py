@@ -10,7 +10,7 @@ from xmlrpc.client import Fault, dumps, loads
 
 from sern_client.endpoints.ros1.http import HttpMessage, HttpReader
 from sern_client.endpoints.ros1.listener import Listener
-from sern_core.errors import RemoteError, WireError
+from sern_core.vocabulary.errors import RemoteError, WireError
 from sern_runtime.ros_types import one_line
 
 CALL_TIMEOUT_S: Final = 5.0

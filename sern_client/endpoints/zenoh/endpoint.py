@@ -23,9 +23,9 @@ from sern_client.endpoints.zenoh import names
 from sern_client.endpoints.zenoh.names import Entity, Kind, Qos
 from sern_client.endpoints.zenoh.services import Services
 from sern_client.endpoints.zenoh.session import MAX_WAITING_BYTES, SessionOptions, ZenohSession
-from sern_core.errors import ConfigError, UsageError, WireError
-from sern_core.message import TopicInfo
-from sern_core.types import DropReason, Encoding, TopicName
+from sern_core.vocabulary.errors import ConfigError, UsageError, WireError
+from sern_core.vocabulary.message import TopicInfo
+from sern_core.vocabulary.types import DropReason, Encoding, TopicName
 from sern_runtime import clock, ros_types
 from sern_runtime.outages import Outages
 from sern_runtime.ros_files import TypeFiles

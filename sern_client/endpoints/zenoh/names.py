@@ -16,9 +16,9 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final, NamedTuple
 
-from sern_core.errors import WireError
-from sern_core.rules import name_problem
-from sern_core.types import TopicName
+from sern_core.vocabulary.errors import WireError
+from sern_core.vocabulary.names import name_problem
+from sern_core.vocabulary.types import TopicName
 
 SPACE: Final = "@ros2_lv"
 GID_BYTES: Final = 16

@@ -12,8 +12,8 @@ from sern_client.endpoints.base import ServiceEvents, ServiceHandler, ServiceInf
 from sern_client.endpoints.zenoh import names
 from sern_client.endpoints.zenoh.names import Entity, Kind, Qos
 from sern_client.endpoints.zenoh.presence import Presence
-from sern_core.errors import ConfigError, ServiceError, WireError
-from sern_core.types import Encoding, TopicName
+from sern_core.vocabulary.errors import ConfigError, ServiceError, WireError
+from sern_core.vocabulary.types import Encoding, TopicName
 
 if TYPE_CHECKING:
     from sern_client.endpoints.zenoh.endpoint import ZenohOptions

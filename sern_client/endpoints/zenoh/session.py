@@ -18,7 +18,7 @@ from types import ModuleType
 from typing import Any, Final
 
 from sern_client.endpoints.handover import Handover
-from sern_core.errors import ConfigError
+from sern_core.vocabulary.errors import ConfigError
 from sern_runtime.config.endpoints import installing
 from sern_runtime.ros_types import one_line
 

@@ -15,8 +15,8 @@ from rosbags.typesys import Stores, get_typestore
 from sern_client.conversion import converted
 from sern_client.daemon import ClientDaemon
 from sern_client.endpoints.dds.endpoint import DdsEndpoint
-from sern_core.message import TopicInfo
-from sern_core.types import Encoding, TopicName
+from sern_core.vocabulary.message import TopicInfo
+from sern_core.vocabulary.types import Encoding, TopicName
 from sern_runtime import ros_types
 from sern_runtime.ros_types import topic_info
 from tests.daemons import HOST, RELIABLE, Lab, endpoint_of, recording, write_bag

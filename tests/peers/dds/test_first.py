@@ -5,8 +5,8 @@ from collections.abc import Callable
 import pytest
 
 from sern_client.endpoints import first
-from sern_core.message import TopicInfo
-from sern_core.types import DropReason, Encoding
+from sern_core.vocabulary.message import TopicInfo
+from sern_core.vocabulary.types import DropReason, Encoding
 from sern_runtime.ros_types import topic_info
 from tests.peers.dds.conftest import MakeEndpoint, MakePeer
 from tests.peers.dds.test_topics import STAMP_NS, STRING, body_of, same

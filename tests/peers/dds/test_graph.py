@@ -7,8 +7,8 @@ import pytest
 
 from sern_client.endpoints.dds import node_info
 from sern_client.endpoints.dds.node_info import Node
-from sern_core.errors import ConfigError
-from sern_core.types import Encoding, TopicName
+from sern_core.vocabulary.errors import ConfigError
+from sern_core.vocabulary.types import Encoding, TopicName
 from sern_runtime.ros_types import topic_info
 from tests.peers.dds.conftest import MakeEndpoint, MakePeer
 from tests.support import until

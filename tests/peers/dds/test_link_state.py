@@ -3,8 +3,8 @@
 from rosbags.typesys import Stores, get_typestore
 
 from sern_client.link_topics import STATUS_TYPE, LinkTopics, LinkView
-from sern_core.peers import PeerStatus
-from sern_core.types import Encoding
+from sern_core.site.peers import PeerStatus
+from sern_core.vocabulary.types import Encoding
 from tests.peers.dds.conftest import MakeEndpoint, MakePeer
 from tests.support import until
 

@@ -9,8 +9,8 @@ import pytest
 from sern_client.endpoints.base import ServiceInfo
 from sern_client.endpoints.dds import services
 from sern_client.endpoints.dds.services import Wrapped
-from sern_core.errors import ConfigError, ServiceError
-from sern_core.types import DropReason, Encoding, TopicName
+from sern_core.vocabulary.errors import ConfigError, ServiceError
+from sern_core.vocabulary.types import DropReason, Encoding, TopicName
 from sern_runtime import ros_services
 from tests.peers.dds.conftest import MakeEndpoint, MakePeer
 from tests.support import DEADLINE_S, until

@@ -9,9 +9,9 @@ from random import Random
 
 import pytest
 
-from sern_core.errors import ConfigError, UsageError
-from sern_core.message import TopicInfo
-from sern_core.types import DropReason, Encoding, TopicName
+from sern_core.vocabulary.errors import ConfigError, UsageError
+from sern_core.vocabulary.message import TopicInfo
+from sern_core.vocabulary.types import DropReason, Encoding, TopicName
 from sern_runtime import ros_types
 from sern_runtime.ros_types import topic_info
 from tests.peers.dds.conftest import MakeEndpoint, MakePeer, Recorder

@@ -9,7 +9,7 @@ from typing import Any
 
 from rosbags.rosbag1 import Reader
 
-from sern_core.types import Encoding
+from sern_core.vocabulary.types import Encoding
 from sern_runtime import ros_types
 from tests.daemons import HOST, Lab, bodies, recording
 from tests.peers.ros1.lab import GEOMETRY_MSGS, SUBSCRIBER, RosLab, need, publisher

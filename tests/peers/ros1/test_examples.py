@@ -6,7 +6,7 @@ from typing import Any, Final
 
 from ruamel.yaml import YAML
 
-from sern_core.types import Encoding
+from sern_core.vocabulary.types import Encoding
 from sern_runtime import ros_types
 from sern_tools.ports import free_ports
 from tests.daemons import HOST, Lab

@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from sern_client.endpoints.base import ServiceInfo
-from sern_core.errors import ConfigError, ServiceError
-from sern_core.types import Encoding, TopicName
+from sern_core.vocabulary.errors import ConfigError, ServiceError
+from sern_core.vocabulary.types import Encoding, TopicName
 from tests.peers.ros1.lab import RosLab, need
 from tests.support import until
 

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from sern_client.endpoints.ros1 import Ros1Endpoint
-from sern_core.errors import ConfigError
-from sern_core.types import DropReason, Encoding, TopicName
+from sern_core.vocabulary.errors import ConfigError
+from sern_core.vocabulary.types import DropReason, Encoding, TopicName
 from sern_runtime import ros_types
 from tests.daemons import bodies, recording
 from tests.peers.ros1.lab import GEOMETRY_MSGS, SUBSCRIBER, RosLab, need, publisher

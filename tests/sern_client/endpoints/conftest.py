@@ -10,7 +10,7 @@ from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 
-from sern_core.types import Encoding
+from sern_core.vocabulary.types import Encoding
 from sern_runtime import ros_types
 from tests import support
 from tests.support import Events

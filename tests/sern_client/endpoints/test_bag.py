@@ -12,8 +12,8 @@ import pytest
 
 from sern_client.endpoints.bag import BagEndpoint, BagOptions
 from sern_client.endpoints.bag_faults import why
-from sern_core.errors import ConfigError, UsageError
-from sern_core.types import Encoding, TopicName
+from sern_core.vocabulary.errors import ConfigError, UsageError
+from sern_core.vocabulary.types import Encoding, TopicName
 from sern_runtime.ros_types import hash_of, topic_info
 
 Make = Callable[..., Path]

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from sern_client.endpoints.clouds import CLOUD_TYPE, CloudSource, cloud_body, read_ply
-from sern_core.errors import ConfigError
-from sern_core.types import Encoding
+from sern_core.vocabulary.errors import ConfigError
+from sern_core.vocabulary.types import Encoding
 from sern_runtime import ros_types
 
 HEAD = "ply\nformat {kind} 1.0\ncomment made for a test\nelement vertex {count}\n"

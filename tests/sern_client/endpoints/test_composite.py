@@ -23,9 +23,9 @@ from sern_client.endpoints.base import (
 from sern_client.endpoints.composite import CompositeEndpoint
 from sern_client.endpoints.record import RecordEndpoint, RecordOptions
 from sern_client.endpoints.synthetic import SyntheticEndpoint, SyntheticOptions
-from sern_core.errors import ConfigError, ServiceError, UsageError
-from sern_core.message import TopicInfo
-from sern_core.types import DropReason, Encoding, TopicName
+from sern_core.vocabulary.errors import ConfigError, ServiceError, UsageError
+from sern_core.vocabulary.message import TopicInfo
+from sern_core.vocabulary.types import DropReason, Encoding, TopicName
 from sern_runtime.ros_types import topic_info
 from tests.fake_services import Services
 

@@ -33,9 +33,9 @@ from sern_client.endpoints.dds.qos import (
 )
 from sern_client.endpoints.dds.raw import INFINITE_NS
 from sern_client.endpoints.dds.services import new_service_id
-from sern_core.errors import ConfigError
-from sern_core.message import TopicInfo
-from sern_core.types import Encoding, TopicName
+from sern_core.vocabulary.errors import ConfigError
+from sern_core.vocabulary.message import TopicInfo
+from sern_core.vocabulary.types import Encoding, TopicName
 from sern_runtime.ros_types import topic_info
 from tests.exploring import cases
 

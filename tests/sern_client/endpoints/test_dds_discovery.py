@@ -29,7 +29,7 @@ from sern_client.endpoints.dds.endpoint import DdsEndpoint, DdsOptions
 from sern_client.endpoints.dds.graph import Participant, Remote
 from sern_client.endpoints.dds.idl import TypeMaker
 from sern_client.endpoints.dds.raw import INFINITE_NS, Announced, Change, DiscoveryReader
-from sern_core.types import Encoding
+from sern_core.vocabulary.types import Encoding
 from sern_runtime import ros_types
 from tests.peers.dds.peer import free_domain
 from tests.support import Events, until

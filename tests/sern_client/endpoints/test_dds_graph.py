@@ -17,7 +17,7 @@ from sern_client.endpoints.dds.graph import MAX_EARLY_NODES, MAX_IGNORED_BEFORE,
 from sern_client.endpoints.dds.names import RosName
 from sern_client.endpoints.dds.node_info import Node
 from sern_client.endpoints.dds.qos import EndpointQos
-from sern_core.types import Encoding, TopicName
+from sern_core.vocabulary.types import Encoding, TopicName
 from sern_runtime import ros_types
 from tests.exploring import cases
 from tests.steps import steps

@@ -18,8 +18,8 @@ from sern_client.endpoints.dds.endpoint import DdsEndpoint, DdsOptions
 from sern_client.endpoints.dds.graph import Remote
 from sern_client.endpoints.dds.qos import EndpointQos, mismatches, reader_for, within_reach
 from sern_client.endpoints.dds.stream import Stream
-from sern_core.errors import ConfigError
-from sern_core.types import DropReason, Encoding, TopicName
+from sern_core.vocabulary.errors import ConfigError
+from sern_core.vocabulary.types import DropReason, Encoding, TopicName
 from sern_runtime.ros_types import topic_info
 from tests.peers.dds.peer import free_domain
 from tests.support import DEADLINE_S, Events, until

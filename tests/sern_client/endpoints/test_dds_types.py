@@ -9,7 +9,7 @@ import pytest
 pytest.importorskip("cyclonedds")
 
 from sern_client.endpoints.dds.idl import KEPT_TYPES, TypeMaker
-from sern_core.types import Encoding
+from sern_core.vocabulary.types import Encoding
 from sern_runtime import ros_types
 from sern_runtime.ros_types import ResolvedType
 

@@ -22,7 +22,7 @@ from sern_client.endpoints.dds.endpoint import DdsEndpoint, DdsOptions
 from sern_client.endpoints.dds.idl import TypeMaker
 from sern_client.endpoints.dds.qos import EndpointQos
 from sern_client.endpoints.dds.worker import MAX_FOUND, READER_HISTORY, SAME_S, SERVE_S, Arrived, Inbox, Sample, Worker
-from sern_core.types import DropReason, Encoding
+from sern_core.vocabulary.types import DropReason, Encoding
 from sern_runtime import ros_types
 from tests.peers.dds.peer import free_domain
 from tests.support import DEADLINE_S, Events, until

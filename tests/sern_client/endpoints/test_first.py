@@ -7,7 +7,7 @@ import pytest
 
 from sern_client.endpoints import first
 from sern_client.endpoints.first import FirstMessages, Readers
-from sern_core.types import DropReason
+from sern_core.vocabulary.types import DropReason
 from tests.support import until
 
 

@@ -14,8 +14,8 @@ from sern_client.endpoints.bag import BagEndpoint, BagOptions
 from sern_client.endpoints.bag_files import BagFile, McapFile, RecordFile
 from sern_client.endpoints.leftovers import finish, in_use, lock
 from sern_client.endpoints.record import RecordEndpoint, RecordOptions
-from sern_core.errors import ConfigError
-from sern_core.types import DropReason, Encoding
+from sern_core.vocabulary.errors import ConfigError
+from sern_core.vocabulary.types import DropReason, Encoding
 from sern_runtime.ros_types import topic_info
 from tests.support import until
 
@@ -297,7 +297,7 @@ import asyncio, sys
 from pathlib import Path
 from sern_client.endpoints.record import RecordEndpoint, RecordOptions
 from sern_runtime.ros_types import topic_info
-from sern_core.types import Encoding
+from sern_core.vocabulary.types import Encoding
 
 async def main():
     recorder = RecordEndpoint(RecordOptions(Path(sys.argv[1]), flush_s=0.02))

@@ -14,9 +14,9 @@ import pytest
 
 from sern_client.endpoints.base import Endpoint, Held
 from sern_client.endpoints.rclpy import RclpyEndpoint, RclpyOptions
-from sern_core.errors import ConfigError, UsageError
-from sern_core.message import TopicInfo
-from sern_core.types import Encoding, TopicName
+from sern_core.vocabulary.errors import ConfigError, UsageError
+from sern_core.vocabulary.message import TopicInfo
+from sern_core.vocabulary.types import Encoding, TopicName
 from sern_runtime import ros_types
 from tests.support import Events, until
 

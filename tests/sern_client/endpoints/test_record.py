@@ -23,9 +23,9 @@ from sern_client.endpoints.bag_files import BagFile, McapFile, RecordFile, activ
 from sern_client.endpoints.leftovers import finish
 from sern_client.endpoints.record import RecordEndpoint, RecordOptions
 from sern_client.factory import make_section
-from sern_core.errors import ConfigError, UsageError
-from sern_core.message import TopicInfo
-from sern_core.types import DropReason, Encoding, TopicName
+from sern_core.vocabulary.errors import ConfigError, UsageError
+from sern_core.vocabulary.message import TopicInfo
+from sern_core.vocabulary.types import DropReason, Encoding, TopicName
 from sern_runtime import ros_types
 from sern_runtime.config import endpoints as sections
 from sern_runtime.ros_types import topic_info
@@ -447,7 +447,7 @@ import asyncio, os, signal, sys
 from pathlib import Path
 from sern_client.endpoints.record import RecordEndpoint, RecordOptions
 from sern_runtime.ros_types import topic_info
-from sern_core.types import Encoding
+from sern_core.vocabulary.types import Encoding
 
 async def main(stop):
     recorder = RecordEndpoint(RecordOptions(Path(sys.argv[1])))

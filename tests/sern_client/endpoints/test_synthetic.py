@@ -10,9 +10,9 @@ import pytest
 
 from sern_client.endpoints.jackal import JACKAL
 from sern_client.endpoints.synthetic import SyntheticEndpoint, SyntheticOptions
-from sern_core.errors import ConfigError, UsageError
-from sern_core.message import TopicInfo
-from sern_core.types import Encoding, TopicName
+from sern_core.vocabulary.errors import ConfigError, UsageError
+from sern_core.vocabulary.message import TopicInfo
+from sern_core.vocabulary.types import Encoding, TopicName
 from sern_runtime import ros_types
 from sern_runtime.ros_types import topic_info
 

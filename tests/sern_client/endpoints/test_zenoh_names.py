@@ -4,8 +4,8 @@ import pytest
 
 from sern_client.endpoints.zenoh import names
 from sern_client.endpoints.zenoh.names import Kind, Qos
-from sern_core.errors import WireError
-from sern_core.types import TopicName
+from sern_core.vocabulary.errors import WireError
+from sern_core.vocabulary.types import TopicName
 
 TOKEN = (
     "@ros2_lv/0/aac3178e146ba6f1fc6e6a4085e77f21/0/10/MP/%/%robot/talker/%robot%chatter/"

@@ -18,8 +18,8 @@ from sern_client.endpoints.zenoh import session as module
 from sern_client.endpoints.zenoh.endpoint import ZenohEndpoint, ZenohOptions
 from sern_client.endpoints.zenoh.session import SessionOptions, load_zenoh, make_config
 from sern_client.factory import make_section
-from sern_core.errors import ConfigError, ServiceError
-from sern_core.types import DropReason, Encoding, TopicName
+from sern_core.vocabulary.errors import ConfigError, ServiceError
+from sern_core.vocabulary.types import DropReason, Encoding, TopicName
 from sern_runtime import ros_types
 from sern_runtime.config import endpoints as sections
 from sern_tools.ports import free_ports

@@ -13,12 +13,12 @@ from hypothesis.extra import numpy as arrays
 from numpy.typing import NDArray
 
 from sern_client.endpoints.clouds import read_ply
-from sern_core.errors import BodyError, UsageError
 from sern_core.summaries.clouds import read_cloud
 from sern_core.summaries.mask import MaskMaker, MaskParams
 from sern_core.summaries.obstacles import Band, ObstacleFinder, fit_ground
 from sern_core.summaries.scan import ScanMaker, ScanParams, nearest_ranges
-from sern_core.types import Encoding
+from sern_core.vocabulary.errors import BodyError, UsageError
+from sern_core.vocabulary.types import Encoding
 from tests.daemons import recording
 from tests.sern_core.summaries import scenes
 

@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 from numpy.typing import NDArray
 
-from sern_core.errors import BodyError
 from sern_core.summaries.grids import read_grid, read_update, write_grid, write_update
 from sern_core.summaries.patches import (
     MAX_RECTANGLES,
@@ -21,7 +20,8 @@ from sern_core.summaries.patches import (
     Rectangle,
     changed_rectangles,
 )
-from sern_core.types import Encoding
+from sern_core.vocabulary.errors import BodyError
+from sern_core.vocabulary.types import Encoding
 from sern_runtime import ros_types
 from tests.exploring import cases
 from tests.sern_core.summaries import scenes

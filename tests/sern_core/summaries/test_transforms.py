@@ -6,9 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sern_core.errors import BodyError
 from sern_core.summaries.transforms import StaticTransforms, TransformMerger, read_transforms, write_transforms
-from sern_core.types import Encoding
+from sern_core.vocabulary.errors import BodyError
+from sern_core.vocabulary.types import Encoding
 from sern_runtime import ros_types
 from tests.sern_core.summaries import scenes
 

@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from sern_client.endpoints.clouds import read_ply
-from sern_core.errors import BodyError, UsageError
 from sern_core.summaries.clouds import read_cloud, write_cloud
 from sern_core.summaries.voxel import VoxelPoint, thin_cloud, thin_rows
-from sern_core.types import Encoding
+from sern_core.vocabulary.errors import BodyError, UsageError
+from sern_core.vocabulary.types import Encoding
 from sern_runtime import ros_types
 from tests.daemons import recording
 from tests.sern_core.summaries import scenes

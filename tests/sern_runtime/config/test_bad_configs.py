@@ -5,7 +5,7 @@ from typing import Final, NamedTuple
 
 import pytest
 
-from sern_core.errors import ConfigError
+from sern_core.vocabulary.errors import ConfigError
 from sern_runtime.config.base import FileModel
 from sern_runtime.config.client import ClientFile, load_client
 from sern_runtime.config.load import check_bytes

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from sern_core.access import AccessTable
-from sern_core.message import TopicInfo
-from sern_core.params import LinkParams, SchedulerParams, WindowAlgorithm
-from sern_core.rules import Direction, DiscoveryMode, Lease, LossAction
-from sern_core.types import ClientName, Encoding, Ordering, PriorityClass, Reliability, TopicName
+from sern_core.relay.access import AccessTable
+from sern_core.topics.rules import Direction, DiscoveryMode, Lease, LossAction
+from sern_core.vocabulary.message import TopicInfo
+from sern_core.vocabulary.params import LinkParams, SchedulerParams, WindowAlgorithm
+from sern_core.vocabulary.types import ClientName, Encoding, Ordering, PriorityClass, Reliability, TopicName
 from sern_runtime import keys
 from sern_runtime.config import base as config_base
 from sern_runtime.config.base import FileModel, is_local

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from sern_core.errors import ConfigError
+from sern_core.vocabulary.errors import ConfigError
 from sern_runtime.config import yaml
 from sern_runtime.config.yaml import Data, Document, parse_document, read_document
 

@@ -9,7 +9,7 @@ from sern_client.endpoints.ros1 import Ros1Endpoint, Ros1Options
 from sern_client.endpoints.ros1.frames import LENGTH
 from sern_client.endpoints.ros1.header import decode_header, encode_header
 from sern_client.endpoints.ros1.xmlrpc import XmlRpcServer
-from sern_core.types import Encoding, TopicName
+from sern_core.vocabulary.types import Encoding, TopicName
 from sern_runtime import ros_types
 from tests.support import Events, until
 

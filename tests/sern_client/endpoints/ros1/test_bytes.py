@@ -11,7 +11,7 @@ from sern_client.endpoints.ros1.frames import SCRATCH_BYTES, Frames
 from sern_client.endpoints.ros1.header import MAX_HEADER_BYTES, decode_header, encode_header
 from sern_client.endpoints.ros1.http import HttpMessage, HttpReader
 from sern_client.endpoints.ros1.xmlrpc import CallError, decode_call, split_uri, value_of
-from sern_core.errors import WireError
+from sern_core.vocabulary.errors import WireError
 from tests.exploring import cases
 
 NAMES = st.text(st.characters(codec="utf-8", exclude_characters="="), min_size=1, max_size=20)

@@ -12,8 +12,8 @@ from sern_client.endpoints.ros1 import Ros1Endpoint, Ros1Options
 from sern_client.endpoints.ros1.frames import LENGTH
 from sern_client.endpoints.ros1.header import BRIDGE_FIELD, encode_header
 from sern_client.endpoints.ros1.xmlrpc import CallError, UnreachableError, XmlRpcClient, XmlRpcServer
-from sern_core.errors import ConfigError, ServiceError, UsageError
-from sern_core.types import DropReason, Encoding, TopicName
+from sern_core.vocabulary.errors import ConfigError, ServiceError, UsageError
+from sern_core.vocabulary.types import DropReason, Encoding, TopicName
 from sern_runtime import ros_types
 from tests.sern_client.endpoints.ros1.fakes import (
     HOST,

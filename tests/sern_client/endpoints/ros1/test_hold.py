@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 
 from sern_client.endpoints.ros1 import hold
-from sern_core.types import DropReason
+from sern_core.vocabulary.types import DropReason
 from tests.sern_client.endpoints.ros1.fakes import STRING, FakeMaster, listening, running, text
 from tests.support import until
 

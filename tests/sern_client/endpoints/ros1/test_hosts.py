@@ -14,8 +14,8 @@ from sern_client.endpoints.ros1.header import encode_header
 from sern_client.endpoints.ros1.services import Provider
 from sern_client.endpoints.ros1.subscription import Source
 from sern_client.endpoints.ros1.xmlrpc import CallError, split_uri
-from sern_core.errors import ConfigError, ServiceError
-from sern_core.types import TopicName
+from sern_core.vocabulary.errors import ConfigError, ServiceError
+from sern_core.vocabulary.types import TopicName
 from tests.sern_client.endpoints.ros1.fakes import HOST, FakeMaster, FakePublisher, collect, frame, running, text
 from tests.steps import steps
 from tests.support import until

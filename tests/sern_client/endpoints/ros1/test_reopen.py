@@ -6,8 +6,8 @@ import pytest
 
 from sern_client.endpoints.base import Difference, Held
 from sern_client.endpoints.ros1 import graph
-from sern_core.errors import ConfigError
-from sern_core.types import DropReason, Encoding, TopicName
+from sern_core.vocabulary.errors import ConfigError
+from sern_core.vocabulary.types import DropReason, Encoding, TopicName
 from sern_runtime import ros_types
 from tests.sern_client.endpoints.ros1.fakes import STRING, FakeMaster, listening, running, text
 from tests.support import until

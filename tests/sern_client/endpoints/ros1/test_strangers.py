@@ -10,7 +10,7 @@ from sern_client.endpoints.base import ServiceInfo
 from sern_client.endpoints.ros1 import graph, server, xmlrpc
 from sern_client.endpoints.ros1.frames import LENGTH
 from sern_client.endpoints.ros1.xmlrpc import CallError, UnreachableError, XmlRpcClient, XmlRpcServer
-from sern_core.types import Encoding, TopicName
+from sern_core.vocabulary.types import Encoding, TopicName
 from tests.sern_client.endpoints.ros1.fakes import HOST, STRING, FakeMaster, FakePublisher, frame, listening, running
 from tests.sern_client.endpoints.ros1.fakes import text as string
 from tests.support import until

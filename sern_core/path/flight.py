@@ -1,0 +1,234 @@
+"""Sent and not yet acknowledged: the accounting of one lane in one direction.
+
+The sender numbers every acknowledgement-eliciting datagram from 1. A packet is lost when one that is three numbers
+later, and not more urgent, has been acknowledged (a network that heeds marks lets the urgent overtake), or when it is
+older than max(100 ms, 2 srtt + 30 ms, RTO); on a stream lane (TCP) nothing is lost while
+the connection lasts. A round trip is measured from every acknowledgement that names a newer packet, whether or not
+that packet was given up meanwhile: else a path slower than the first guess would never be measured.
+The receiver's half says what to acknowledge and when: every second datagram (large ones of a stream lane
+at most once in `ACK_SPACING_S`), at once on a gap or on class control, else within `ACK_DELAY_S`.
+"""
+
+from collections.abc import Callable
+from math import inf
+from typing import Any, Final
+
+from sern_core.path.clocksync import RttEstimator
+from sern_core.vocabulary.types import CLASSES, PriorityClass
+
+REORDER_THRESHOLD: Final = 3
+MIN_LOSS_TIMEOUT_S: Final = 0.100
+FIRST_LOSS_TIMEOUT_S: Final = 2.0
+"""Before any round trip was measured: a path of 1 s and its first queue must not look like loss."""
+STALL_MIN_S: Final = 0.5
+STALL_RTTS: Final = 4.0
+FIRST_STALL_S: Final = 3.0
+"""No acknowledgement for so long: the path is gone; the last one before any round trip was measured."""
+ACK_DELAY_S: Final = 0.010
+ACK_SPACING_S: Final = 0.001
+"""Least time between two acknowledgements of a stream, where nobody waits to learn what is lost. Below 1 Gbit/s two
+full fragments take longer; above it each acknowledgement cost each end as much as half a message of 64 kB
+(measured)."""
+SPACED_BYTES: Final = 16 * 1024
+"""Smaller datagrams are those of a slow link, or of one whose rate its sender is about to find out."""
+SACK_BITS: Final = 64
+SACK_MASK: Final = (1 << SACK_BITS) - 1
+
+Items = list[Any]
+"""What a packet carried, opaque here: handed back when the packet is acknowledged or lost."""
+
+
+class Packet:
+    """One packet in flight."""
+
+    __slots__ = ("app_limited", "items", "nbytes", "number", "priority", "sent_s")
+
+    def __init__(
+        self, number: int, sent_s: float, nbytes: int, items: Items, app_limited: bool, priority: PriorityClass
+    ) -> None:
+        self.number = number
+        self.sent_s = sent_s
+        self.nbytes = nbytes
+        self.items = items
+        self.app_limited = app_limited
+        self.priority = priority
+
+
+class Flight:
+    """The sender's half. `lossless` is True on stream lanes."""
+
+    def __init__(self, *, lossless: bool) -> None:
+        self.lossless = lossless
+        self.inflight_bytes = 0
+        self.packets: dict[int, Packet] = {}  # in order of number, which dicts keep
+        self.next_number = 1
+        self.highest_acked = 0
+        self._heard = [0] * len(CLASSES)
+        """The highest number that was acknowledged of a packet of a class, or of a less urgent one, by class."""
+        self.rtt = RttEstimator()
+        self.waiting_since_s: float | None = None  # last acknowledgement, or the first packet since nothing is owed
+
+    def sent(
+        self,
+        *,
+        now: float,
+        nbytes: int,
+        items: Items,
+        app_limited: bool,
+        priority: PriorityClass = PriorityClass.STATE,
+    ) -> None:
+        """`priority`: the class by which the network knows the packet."""
+        number = self.next_number
+        if self.waiting_since_s is None:
+            self.waiting_since_s = now
+        self.packets[number] = Packet(number, now, nbytes, items, app_limited, priority)
+        self.inflight_bytes += nbytes
+        self.next_number = number + 1
+
+    def acked(self, highest: int, sack: int, *, now: float) -> list[Packet]:
+        """Packets that this acknowledgement newly covers, oldest first. Unknown numbers are old news."""
+        if highest > self.highest_acked:
+            self.highest_acked = highest
+            self.waiting_since_s = now
+        packets = self.packets
+        result: list[Packet] = []
+        if self.lossless:
+            # A stream delivers in order: everything up to `highest` has arrived.
+            for number, packet in packets.items():
+                if number > highest:
+                    break
+                result.append(packet)
+        else:
+            for number, packet in packets.items():
+                if number >= highest:
+                    if number == highest:
+                        result.append(packet)
+                    break
+                behind = highest - number - 1
+                if behind < SACK_BITS and sack >> behind & 1:
+                    result.append(packet)
+        heard = self._heard
+        for packet in result:
+            del packets[packet.number]
+            self.inflight_bytes -= packet.nbytes
+            for priority in range(packet.priority + 1):
+                if packet.number > heard[priority]:
+                    heard[priority] = packet.number
+        if not packets:
+            self.waiting_since_s = None
+        return result
+
+    def loss_timeout_s(self) -> float:
+        if not self.rtt.samples:
+            return FIRST_LOSS_TIMEOUT_S
+        return max(MIN_LOSS_TIMEOUT_S, 2 * self.rtt.srtt_s + 0.030, self.rtt.rto_s)
+
+    def stall_timeout_s(self) -> float:
+        return max(STALL_MIN_S, STALL_RTTS * self.rtt.srtt_s) if self.rtt.samples else FIRST_STALL_S
+
+    def lost(self, *, now: float) -> list[Packet]:
+        """Packets to give up, oldest first; they leave the flight."""
+        if self.lossless or not self.packets:
+            return []
+        sent_before_s = now - self.loss_timeout_s()
+        heard = self._heard
+        last = self.highest_acked - REORDER_THRESHOLD
+        gone = []
+        for packet in self.packets.values():
+            if packet.number <= heard[packet.priority] - REORDER_THRESHOLD or packet.sent_s <= sent_before_s:
+                gone.append(packet)
+            elif packet.number > last:
+                break
+        for packet in gone:
+            del self.packets[packet.number]
+            self.inflight_bytes -= packet.nbytes
+        return gone
+
+    def loss_deadline(self) -> float | None:
+        """When the oldest packet is lost by time alone; a hair late, so that `lost` agrees whatever the rounding."""
+        if self.lossless or not self.packets:
+            return None
+        return next(iter(self.packets.values())).sent_s + self.loss_timeout_s() + 1e-6
+
+    def abandon(self) -> list[Packet]:
+        """The transport is gone: everything in flight comes back, oldest first. Numbers go on."""
+        result = list(self.packets.values())
+        self.packets.clear()
+        self.inflight_bytes = 0
+        self.waiting_since_s = None
+        return result
+
+    def validate(self, check: Callable[[bool, str], None]) -> None:
+        check(self.inflight_bytes == sum(p.nbytes for p in self.packets.values()), "in-flight bytes do not add up")
+        numbers = list(self.packets)
+        check(numbers == sorted(numbers), "packets in flight are out of order")
+        check(not self.packets or self.waiting_since_s is not None, "nobody waits for what is in flight")
+
+
+class Arrivals:
+    """The receiver's half: which numbers have arrived, and when to say so."""
+
+    __slots__ = (
+        "cum_bytes",
+        "due",
+        "echo_us",
+        "flushed_s",
+        "highest",
+        "mask",
+        "received_us",
+        "since_s",
+        "spacing_s",
+        "unacked",
+    )
+
+    def __init__(self, *, lossless: bool = False) -> None:
+        self.spacing_s = ACK_SPACING_S if lossless else 0.0
+        self.highest = 0
+        self.mask = 0  # bit i: highest-1-i has arrived
+        self.echo_us = 0
+        self.received_us = 0
+        self.cum_bytes = 0
+        self.unacked = 0
+        self.due = False
+        self.since_s = 0.0
+        self.flushed_s = -inf  # when the last acknowledgement left
+
+    def arrived(self, number: int, stamp_us: int, nbytes: int, *, now: float) -> bool:
+        """Note one numbered datagram. False: seen before, a duplicate made by the network."""
+        ahead = number - self.highest
+        if ahead == 1:
+            self.mask = (self.mask << 1 | (1 if self.highest else 0)) & SACK_MASK
+        elif ahead > 0:
+            self.mask = (
+                (self.mask << ahead | 1 << (ahead - 1)) & SACK_MASK if self.highest and ahead <= SACK_BITS else 0
+            )
+            self.due = True  # a gap
+        else:
+            bit = -ahead - 1
+            if bit < 0 or (bit < SACK_BITS and self.mask >> bit & 1):
+                return False
+            if bit < SACK_BITS:
+                self.mask |= 1 << bit
+            self.due = True  # it fills a gap
+        if ahead > 0:
+            self.highest = number
+            self.echo_us = stamp_us
+            self.received_us = int(now * 1e6)
+        self.cum_bytes += nbytes
+        if not self.unacked:
+            self.since_s = now
+        self.unacked += 1
+        if self.unacked >= 2 and (nbytes < SPACED_BYTES or now >= self.flushed_s + self.spacing_s):
+            self.due = True
+        return True
+
+    def deadline_s(self) -> float:
+        """When what has arrived is to be acknowledged by time alone; something must have arrived."""
+        delayed_s = self.since_s + ACK_DELAY_S
+        return delayed_s if self.due or self.unacked < 2 else min(delayed_s, self.flushed_s + self.spacing_s)
+
+    def flushed(self, now: float) -> None:
+        """They are acknowledged now."""
+        self.unacked = 0
+        self.due = False
+        self.flushed_s = now

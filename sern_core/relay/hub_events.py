@@ -1,0 +1,116 @@
+"""What the relay's core tells its shell, and what it keeps of each stream."""
+
+from collections.abc import Callable
+from contextlib import suppress
+from typing import ParamSpec, Protocol
+
+from sern_core.link.link import Link
+from sern_core.stream.in_stream import InStream
+from sern_core.stream.latched import MAX_REPLAY_MESSAGES, LatchedCache, ReplayStore
+from sern_core.stream.out_channel import OutChannel
+from sern_core.vocabulary.message import Message, StreamInfo
+from sern_core.vocabulary.types import ClientName
+
+
+class HubEvents(Protocol):
+    """What the relay's shell is told."""
+
+    def client_up(self, client: ClientName, *, resumed: bool) -> None: ...
+
+    def client_down(self, client: ClientName, reason: str) -> None: ...
+
+    def stream_added(self, stream: StreamInfo) -> None: ...
+
+    def stream_removed(self, stream: StreamInfo) -> None: ...
+
+    def message(self, stream: StreamInfo, message: Message, *, now: float) -> None:
+        """A message passed; the plain feed takes it. Tombstones are not reported."""
+
+    def refused(self, client: ClientName, code: str, text: str) -> None: ...
+
+    def lane_asked(self, client: ClientName, ciphers: list[str]) -> None:
+        """A client would use a datagram lane: open a session for it and call `Hub.offer_lane`, or do nothing."""
+
+    def lane_closed(self, client: ClientName) -> None:
+        """The client's datagram lane ended with its session."""
+
+    def fault(self, client: ClientName | None, error: Exception) -> None:
+        """Something raised what nobody expects, in the core or in one of these methods: log it with its traceback and
+        count it. What it was about is given up, everything else goes on. `client`: on whose link, if on one's."""
+
+
+P = ParamSpec("P")
+
+
+class GuardedEvents:
+    """`HubEvents` whose errors do not come back: what the shell does with news stops nothing in the core."""
+
+    def __init__(self, shell: HubEvents) -> None:
+        self.shell = shell
+        self.faults = 0
+
+    def fault(self, client: ClientName | None, error: Exception) -> None:
+        self.faults += 1
+        with suppress(Exception):  # counted above; there is nobody left to tell
+            self.shell.fault(client, error)
+
+    def _tell(self, call: Callable[P, object], *args: P.args, **kwargs: P.kwargs) -> None:
+        try:
+            call(*args, **kwargs)
+        except Exception as error:  # noqa: BLE001  (the shell's, and no reason to leave our own work half done)
+            self.fault(None, error)
+
+    def client_up(self, client: ClientName, *, resumed: bool) -> None:
+        self._tell(self.shell.client_up, client, resumed=resumed)
+
+    def client_down(self, client: ClientName, reason: str) -> None:
+        self._tell(self.shell.client_down, client, reason)
+
+    def stream_added(self, stream: StreamInfo) -> None:
+        self._tell(self.shell.stream_added, stream)
+
+    def stream_removed(self, stream: StreamInfo) -> None:
+        self._tell(self.shell.stream_removed, stream)
+
+    def message(self, stream: StreamInfo, message: Message, *, now: float) -> None:
+        self._tell(self.shell.message, stream, message, now=now)
+
+    def refused(self, client: ClientName, code: str, text: str) -> None:
+        self._tell(self.shell.refused, client, code, text)
+
+    def lane_asked(self, client: ClientName, ciphers: list[str]) -> None:
+        self._tell(self.shell.lane_asked, client, ciphers)
+
+    def lane_closed(self, client: ClientName) -> None:
+        self._tell(self.shell.lane_closed, client)
+
+
+class Relayed:
+    """One stream at the relay: where it comes from (None: the relay itself), where it goes, what is kept of it."""
+
+    __slots__ = ("cache", "outs", "source", "stream", "unopened", "waiting")
+
+    def __init__(self, source: Link | None, stream: InStream, replays: ReplayStore) -> None:
+        self.source = source
+        self.stream = stream
+        self.outs: dict[ClientName, tuple[Link, OutChannel]] = {}
+        self.waiting: dict[ClientName, None] = {}  # subscribers that are still to be told of it, in their order
+        self.unopened: set[ClientName] = set()  # subscribers towards whom no channel could be opened; they were told
+        self.cache: LatchedCache | None = None
+        self.keep_latched(replays)
+
+    def owed(self) -> tuple[ClientName, ...]:
+        """Who gets the stream, and who is about to."""
+        return tuple(dict.fromkeys((*self.outs, *self.waiting)) if self.waiting else self.outs)
+
+    def keep_latched(self, replays: ReplayStore) -> None:
+        """Keep as many messages for late joiners as the stream's properties say by now."""
+        spec, old = self.stream.stream.spec, self.cache
+        if old is not None and spec.latched and old.depth == min(spec.depth, MAX_REPLAY_MESSAGES):
+            return
+        self.cache = replays.open(spec.depth) if spec.latched else None
+        if old is not None:
+            if self.cache is not None:
+                for message in old.replay():
+                    replays.add(self.cache, message)
+            replays.close(old)

@@ -1,0 +1,125 @@
+"""When the relay tells subscribers that a stream came or went: in slices, so that it holds nobody up. Pure.
+
+Every subscriber gets a channel of its own, so one small announcement may cost as much as thousands of messages. What it
+costs is charged to who announced it (`Reassembly.work_us`). Beyond a slice, subscribers wait: nothing more is read from
+that peer until they have been told, so that every one of them gets the stream from its first message on, and in the
+order in which the peer announced its streams. The first announcement of a process that was started anew ends all that
+the one before had: those channels are closed in slices too, and first.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Final
+
+from sern_core.link.link import Link
+from sern_core.relay.hub_events import Relayed
+from sern_core.stream.in_stream import SLICE_US
+from sern_core.stream.out_channel import OutChannel
+from sern_core.vocabulary.message import StreamId
+from sern_core.vocabulary.types import ClientName
+
+CHANNEL_US: Final = 80
+CLOSE_US: Final = 30
+"""What a peer is charged with for each channel that is opened or closed for it, in microseconds."""
+
+Ending = tuple[Link, OutChannel]
+
+
+class Fanout:
+    """Streams that some subscribers are still to be told of, by origin. Who they are is in `Relayed.waiting`, and only
+    there: whoever leaves, or wants the stream no more, is taken out of it.
+
+    `offer` opens a channel, in place of the one there may be; `told` is called after the last subscriber of a stream;
+    `end` closes the channel of a stream that has ended.
+    """
+
+    def __init__(
+        self,
+        offer: Callable[[ClientName, StreamId, float], None],
+        told: Callable[[Relayed, float], None],
+        end: Callable[[ClientName, Link, OutChannel, float], None],
+    ) -> None:
+        self._offer = offer
+        self._told = told
+        self._end = end
+        self._ending: dict[ClientName, dict[StreamId, dict[ClientName, Ending]]] = {}  # by origin
+        self._by_origin: dict[ClientName, dict[StreamId, Relayed]] = {}
+
+    def begin(self, relayed: Relayed, clients: Sequence[ClientName]) -> None:
+        """These subscribers are to be told of the stream; `go_on` does it."""
+        if clients:
+            relayed.waiting.update(dict.fromkeys(clients))
+            identity = relayed.stream.stream.id
+            self._by_origin.setdefault(identity.origin, {})[identity] = relayed
+
+    def go_on(self, link: Link, *, now: float) -> bool:
+        """One slice for the streams of a peer, as far as its account allows. True: nobody waits any more."""
+        reassembly = link.reassembly
+        ending = self._ending.get(link.peer)
+        while ending:
+            if reassembly.work_us > SLICE_US:
+                return False
+            reassembly.work_us += CLOSE_US
+            identity, outs = next(iter(ending.items()))
+            self.close(next(iter(outs)), identity, now=now)
+        streams = self._by_origin.get(link.peer)
+        while streams:
+            identity, relayed = next(iter(streams.items()))
+            while relayed.waiting:
+                if reassembly.work_us > SLICE_US:
+                    return False
+                reassembly.work_us += CHANNEL_US
+                client = next(iter(relayed.waiting))
+                del relayed.waiting[client]
+                self._offer(client, identity, now)
+            del streams[identity]
+            self._told(relayed, now)
+        self._by_origin.pop(link.peer, None)
+        return True
+
+    def close_later(self, relayed: Relayed) -> None:
+        """The stream has ended: its channels are closed in their turn, before anything that begins after it."""
+        identity = relayed.stream.stream.id
+        if relayed.outs:
+            self._ending.setdefault(identity.origin, {}).setdefault(identity, {}).update(relayed.outs)
+
+    def close(self, client: ClientName, identity: StreamId, *, now: float) -> None:
+        """Close the channel of an ended stream now, if it waits for that."""
+        ending = self._ending.get(identity.origin)
+        if ending is None or identity not in ending:
+            return
+        pair = ending[identity].pop(client, None)
+        if not ending[identity]:
+            del ending[identity]
+            if not ending:
+                del self._ending[identity.origin]
+        if pair is not None and pair[0].channels.get(pair[1].slot) is pair[1]:  # else the client has gone meanwhile
+            self._end(client, *pair, now)
+
+    def forget(self, origin: ClientName, *, now: float) -> None:
+        """The origin is gone for good, and nothing more is read from it: close now what waits."""
+        for identity, outs in list(self._ending.get(origin, {}).items()):
+            for client in list(outs):
+                self.close(client, identity, now=now)
+
+    def end(self, relayed: Relayed) -> None:
+        """The stream has ended: nobody is told of it any more."""
+        relayed.waiting.clear()
+        identity = relayed.stream.stream.id
+        streams = self._by_origin.get(identity.origin, {})
+        if streams.get(identity) is relayed:
+            del streams[identity]
+            if not streams:
+                del self._by_origin[identity.origin]
+
+    def origins(self) -> list[ClientName]:
+        return list(self._by_origin | self._ending)
+
+    def closing(self) -> set[int]:
+        """The identities of channels that wait to be closed; for tests."""
+        streams = [outs for ending in self._ending.values() for outs in ending.values()]
+        return {id(channel) for outs in streams for _link, channel in outs.values()}
+
+    def holds(self, relayed: Relayed) -> bool:
+        """Whether the stream has a turn; for tests."""
+        identity = relayed.stream.stream.id
+        return self._by_origin.get(identity.origin, {}).get(identity) is relayed

@@ -1,0 +1,140 @@
+"""The relay's end of one transport connection: what the lane below hands its datagrams to. Pure.
+
+A connection is not yet a client: who speaks is known from the key (or believed, without keys), a session exists after
+HELLO, and a newer connection of the same client takes the session over. `Hub` keeps the links; a port finds its own.
+"""
+
+import math
+from collections.abc import Container
+from typing import Final, Protocol
+
+from sern_core.link.link import Link
+from sern_core.link.sending import microseconds
+from sern_core.link.session import DISPLACED
+from sern_core.relay.hub_matching import Matching
+from sern_core.vocabulary.errors import RemoteError, VersionError
+from sern_core.vocabulary.types import ClientName
+from sern_core.wire import framing
+
+RESET_INTERVAL_S: Final = 0.5
+
+
+class PortHub(Protocol):
+    """What a port needs of the hub that keeps its link."""
+
+    port_of: "dict[ClientName, HubPort]"
+    """The connection that has the session of each client."""
+    matching: Matching
+
+    @property
+    def local_owners(self) -> Container[str]: ...
+
+    def greet(self, port: "HubPort", hello: framing.Envelope, header: framing.Header, *, now: float) -> None: ...
+
+    def left(self, client: ClientName, *, now: float) -> None: ...
+
+    def failed(self, client: ClientName, error: Exception, *, now: float) -> None: ...
+
+    def after(self) -> None: ...
+
+
+class HubPort:
+    """One transport connection of one client, as the lane below sees it. `client` is bound to the peer's key;
+    `address` is where it comes from, for people."""
+
+    def __init__(self, hub: PortHub, client: ClientName, address: str = "") -> None:
+        self.hub = hub
+        self.client = client
+        self.address = address
+        self.link: Link | None = None
+        self._out: list[bytes] = []
+        self._reset_due_s = -float("inf")
+
+    @property
+    def current(self) -> bool:
+        return self.link is not None and self.hub.port_of.get(self.client) is self
+
+    def connected(self, *, now: float) -> None:
+        """The client speaks first."""
+
+    def disconnected(self, *, now: float) -> None:
+        if self.current and self.link is not None:
+            del self.hub.port_of[self.client]
+            self.link.disconnected(now=now)
+        self.link = None
+
+    def receive(self, data: framing.Datagram, *, now: float) -> None:
+        """One datagram. Raises WireError or VersionError; the caller closes the connection."""
+        if self.link is not None and self.current and data[2:3] != b"\x01":
+            had_session = self.link.established
+            self.link.receive(data, now=now)
+            if had_session and data[2] == framing.Kind.CLOSE and not self.link.established:
+                self.hub.left(self.client, now=now)
+            return
+        try:
+            self._greeted(bytes(data), now)
+        except RemoteError:
+            raise
+        except Exception as error:  # noqa: BLE001  (of ours: this client has no session then, nobody else notices)
+            self.hub.failed(self.client, error, now=now)
+
+    def _greeted(self, data: bytes, now: float) -> None:
+        """What comes before a session."""
+        header = framing.decode_header(data)
+        if header.kind == framing.Kind.HELLO:
+            hello = framing.decode_handshake(data)
+            name = framing.take_str(hello, "name", max_length=64)
+            if name != self.client:
+                self._refuse(header.tag, "name", f"your key belongs to {self.client}, not to {name}", now)
+                return
+            if name in self.hub.local_owners:
+                self._refuse(header.tag, "name", f"{name} is the relay's own name for its feed; take another", now)
+                return
+            try:
+                self.hub.greet(self, hello, header, now=now)
+            except VersionError as error:
+                self._refuse(header.tag, "version", str(error), now)
+        elif header.kind == framing.Kind.DATA and now >= self._reset_due_s:
+            self._reset_due_s = now + RESET_INTERVAL_S
+            self._out.append(framing.encode_handshake(framing.Kind.RESET, header.tag, microseconds(now), {}))
+
+    def displace(self, tag: int, by: "HubPort", *, now: float) -> None:
+        """Another process has connected under the client's name: say so to the one whose session `tag` was here."""
+        where = f" from {by.address}" if by.address else ""
+        text = f"another process connected as {self.client}{where}; one name has one connection: end one of the two, "
+        self._refuse(tag, DISPLACED, text + "or give it a name and a key of its own", now)
+
+    def _refuse(self, tag: int, code: str, text: str, now: float) -> None:
+        self._out.clear()
+        self._out.append(
+            framing.encode_handshake(framing.Kind.REFUSE, tag, microseconds(now), {"code": code, "why": text})
+        )
+
+    def next_datagram(self, *, now: float) -> bytes | None:
+        if self._out:
+            return self._out.pop(0)
+        return self.link.next_datagram(now=now) if self.link is not None and self.current else None
+
+    def next_deadline(self) -> float | None:
+        if self.link is None or not self.current:
+            return None
+        deadline_s, due_s = self.link.next_deadline(), self.hub.matching.due_s
+        if not due_s:
+            return deadline_s
+        match_s = due_s.get(self.client)
+        return deadline_s if match_s is None or (deadline_s is not None and deadline_s < match_s) else match_s
+
+    def handle_timeout(self, *, now: float) -> None:
+        if self.link is not None and self.current:
+            self.link.handle_timeout(now=now)
+            if now >= self.hub.matching.due_s.get(self.client, math.inf):
+                self.hub.matching.go_on(self.client, now=now)
+                self.hub.after()
+
+    @property
+    def dirty(self) -> bool:
+        if self._out:
+            return True
+        if self.link is None or not self.current:
+            return False
+        return self.link.dirty or self.client in self.hub.matching.due_s

@@ -1,0 +1,632 @@
+"""The registry of cross-reality objects (paper, "Distribution of ROS Data", idea 2).
+
+Topics, transforms, commands, node metadata and terrain patches are wrapped as objects with an owner, a type, its
+definition, attributes and a latest value, so that a twin, a remote ROS node and an operator's page read one thing.
+
+Theory of operation
+- `put`, `put_stream`, `delete` and `observe` each raise the registry's version by one and stamp the object with it.
+  `since(version)` lists what is newer: each changed object once, with its latest state, however often it changed.
+  Only deletions need a log; when it does not reach back far enough (or the reader comes from another epoch, that is
+  another run of the relay), the answer is the whole registry with `resync` set.
+- A value up to `max_value_bytes` is kept and shown. Of a larger one the object shows size and SHA-256: `observe` only
+  keeps a reference to the body, which costs the hot path nothing, and the hash is worked out when somebody asks. When
+  the references held reach `max_held_bytes`, further large bodies are not kept and show no hash.
+- A value that came encoded is decoded when somebody asks. Where that must not take long, the reader sets
+  `inline_bytes`, lets other threads do what `unread` gives, and asks then; a larger one that is still as it came shows
+  its size alone.
+- Topic objects are named `<topic>@<client>`; ids that end in `@<client>` are reserved for that client. Other ids
+  belong to whoever puts them first.
+"""
+
+import hashlib
+import re
+from collections import OrderedDict, deque
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Final
+
+from sern_core.bodies.codecs import Work, decode, raw_size
+from sern_core.relay.xr_object import ChangedIds, ObjectChanges, XrObject
+from sern_core.topics.rules import COMMAND_TYPES
+from sern_core.vocabulary.codec_names import Codec
+from sern_core.vocabulary.errors import CodecError, RefusedError
+from sern_core.vocabulary.message import StreamId, StreamInfo
+from sern_core.vocabulary.names import plain_type
+from sern_core.vocabulary.types import ClientName, ObjectKind, PriorityClass, TopicName
+
+COMMAND_OBJECT_TYPES: Final = COMMAND_TYPES | {
+    "ackermann_msgs/AckermannDrive",
+    "ackermann_msgs/AckermannDriveStamped",
+    "control_msgs/JointJog",
+    "trajectory_msgs/JointTrajectory",
+}
+"""A topic of class control with one of these types is an object of kind `command`."""
+TRANSFORM_TYPES: Final = frozenset({"tf2_msgs/TFMessage", "tf/tfMessage", "geometry_msgs/TransformStamped"})
+PATCH_TYPES: Final = frozenset({"map_msgs/OccupancyGridUpdate", "map_msgs/PointCloud2Update"})
+"""A topic with one of these types, which change part of a map, is an object of kind `patch`."""
+_RESERVED: Final = re.compile(r".*@([a-z][a-z0-9_]{0,62})", re.DOTALL)
+
+
+@dataclass(frozen=True, slots=True)
+class ObjectLimits:
+    """What the registry holds; beyond it an owner is refused by name."""
+
+    max_objects_per_owner: int = 4_096
+    max_bytes_per_owner: int = 8 * 2**20  # of an owner's objects, as in max_total_bytes
+    max_held_per_owner: int = 16 * 2**20  # of an owner's objects, as in max_held_bytes
+    max_total_bytes: int = 64 * 2**20  # ids, type names, definitions, attributes and kept values
+    max_held_bytes: int = 64 * 2**20  # references to larger values
+    max_value_bytes: int = 4_096
+    max_decoded_bytes: int = 16 * 2**20  # of a value that came encoded, when somebody asks for it
+    max_definition_bytes: int = 256 * 2**10
+    max_attributes: int = 64
+    max_attribute_bytes: int = 4_096
+    max_id_chars: int = 512
+    deletions: int = 4_096  # length of the deletion log
+
+
+class _Entry:
+    """An object at rest; the hot path writes its value fields only."""
+
+    __slots__ = (
+        "attributes",
+        "body",
+        "codec",
+        "created_s",
+        "definition",
+        "definition_hash",
+        "fixed_bytes",
+        "id",
+        "kind",
+        "owner",
+        "ros_stamp_ns",
+        "seq",
+        "sha256",
+        "share",
+        "stream",
+        "type_name",
+        "updated_s",
+        "value_bytes",
+        "version",
+        "wall_ns",
+    )
+
+    def __init__(self, object_id: str, owner: ClientName, share: list[int], now: float) -> None:
+        self.id = object_id
+        self.owner = owner
+        self.share = share  # of the owner, in the registry's total and held bytes
+        self.kind = ObjectKind.TOPIC
+        self.type_name = ""
+        self.definition = ""
+        self.definition_hash = ""
+        self.attributes: Mapping[str, str] = MappingProxyType({})
+        self.body: bytes | None = None  # the value, or a reference to a large one that nobody has hashed yet
+        self.codec = 0  # of the body, until somebody asks for the value
+        self.value_bytes = -1
+        self.sha256: str | None = None
+        self.fixed_bytes = 0
+        self.seq = 0
+        self.ros_stamp_ns: int | None = None
+        self.wall_ns = 0
+        self.created_s = now
+        self.updated_s = now
+        self.version = 0
+        self.stream: StreamId | None = None
+
+
+def text_hash(definition: str) -> str:
+    """SHA-256 of a definition, hex; empty when there is none."""
+    return hashlib.sha256(_utf8(definition)).hexdigest() if definition else ""
+
+
+class ValueRequest(Work):
+    """One large value that another thread is to decode or to hash."""
+
+    def __init__(self, registry: "ObjectRegistry", entry: _Entry, body: bytes) -> None:
+        self.entry = entry
+        self.body = body
+        self.codec = entry.codec
+        self.raw: bytes | None = body
+        self.sha256: str | None = None
+        self._registry = registry
+
+    def run(self) -> None:
+        limits = self._registry.limits
+        if self.codec:
+            try:
+                self.raw = decode(self.codec, self.body, max_bytes=limits.max_decoded_bytes)
+            except CodecError:
+                self.raw = None
+        if self.raw is not None and len(self.raw) > limits.max_value_bytes:
+            self.sha256 = hashlib.sha256(self.raw).hexdigest()
+
+    def done(self, *, now: float) -> None:
+        self._registry.have_read(self)
+
+
+class ObjectRegistry:
+    """See the module's text. `epoch` is this run's random number; a reader of another epoch is told to start over."""
+
+    def __init__(self, *, epoch: int = 0, limits: ObjectLimits | None = None) -> None:
+        self.epoch = epoch
+        self.limits = limits or ObjectLimits()
+        self.inline_bytes: int | None = None
+        """The largest value that is decoded where it is asked for; None: any."""
+        self._version = 0
+        self._entries: OrderedDict[str, _Entry] = OrderedDict()  # least recently changed first
+        self._by_stream: dict[StreamId, _Entry] = {}
+        self._owned: dict[ClientName, set[str]] = {}
+        self._deletions: deque[tuple[int, str]] = deque(maxlen=self.limits.deletions)
+        self._forgotten_version = 0  # deletions up to this version may have left the log
+        self._total_bytes = 0
+        self._held_bytes = 0
+        self._bytes_of: dict[ClientName, list[int]] = {}  # of owners: their share of total and held bytes
+
+    # Writing ---------------------------------------------------------------------------------------------------------
+
+    def put(
+        self,
+        object_id: str,
+        *,
+        owner: ClientName,
+        kind: ObjectKind,
+        type_name: str,
+        definition: str = "",
+        definition_hash: str = "",
+        attributes: Mapping[str, str] | None = None,
+        value: bytes | None = None,
+        seq: int = 0,
+        ros_stamp_ns: int | None = None,
+        wall_ns: int,
+        now: float,
+    ) -> XrObject:
+        """Create or replace an object; `value` None keeps the value that is there.
+
+        Raises RefusedError with code `not_owner`, `bad_id`, `too_large`, `too_many_objects` or `registry_full`, and
+        then changes nothing.
+        """
+        fields = dict(attributes or {})
+        definition_bytes = _size_bytes(definition)
+        attribute_bytes = sum(_size_bytes(key) + _size_bytes(text) for key, text in fields.items())
+        texts_bytes = _size_bytes(object_id) + _size_bytes(type_name) + _size_bytes(definition_hash)
+        fixed_bytes = texts_bytes + definition_bytes + attribute_bytes
+        self._check(object_id, owner, definition_bytes, len(fields), attribute_bytes)
+        entry = self._entries.get(object_id)
+        old_bytes = 0 if entry is None else entry.fixed_bytes + (0 if value is None else self._kept_bytes(entry))
+        kept_bytes = 0 if value is None or len(value) > self.limits.max_value_bytes else len(value)
+        own_bytes = self._bytes_of.get(owner, (0, 0))[0]
+        for what, held_bytes, limit_bytes in (
+            (f"{owner}'s objects hold", own_bytes, self.limits.max_bytes_per_owner),
+            ("the registry holds", self._total_bytes, self.limits.max_total_bytes),
+        ):
+            if held_bytes - old_bytes + fixed_bytes + kept_bytes > limit_bytes:
+                raise RefusedError(
+                    "registry_full",
+                    f"{owner} may not put {object_id}: {what} {held_bytes} of {limit_bytes} bytes; "
+                    "delete objects or shorten definitions",
+                )
+        if entry is None:
+            entry = _Entry(object_id, owner, self._bytes_of.setdefault(owner, [0, 0]), now)
+            self._entries[object_id] = entry
+            self._owned.setdefault(owner, set()).add(object_id)
+        self._count(entry, fixed_bytes - entry.fixed_bytes)
+        entry.fixed_bytes = fixed_bytes
+        entry.kind = kind
+        entry.type_name = type_name
+        entry.definition = definition
+        entry.definition_hash = definition_hash or text_hash(definition)
+        entry.attributes = MappingProxyType(fields)
+        if value is not None:
+            self._set_value(entry, value)
+            entry.seq = seq
+            entry.ros_stamp_ns = ros_stamp_ns
+        entry.wall_ns = wall_ns
+        self._touch(entry, now)
+        return self._seen(entry)
+
+    def put_stream(self, stream: StreamInfo, *, wall_ns: int, now: float) -> XrObject:
+        """Create or update the object of an announced stream; another boot of its origin starts over, at seq 0
+        and without a value.
+
+        Raises RefusedError like `put`.
+        """
+        spec, info = stream.spec, stream.info
+        object_id = topic_object_id(stream.id)
+        seen = self.put(
+            object_id,
+            owner=stream.id.origin,
+            kind=kind_of(stream),
+            type_name=info.type_name,
+            definition=info.definition,
+            definition_hash=info.type_hash,
+            attributes={
+                **stream.attributes,
+                "topic": stream.id.topic,
+                "class": spec.priority.name.lower(),
+                "reliability": spec.reliability.value,
+                "durability": spec.durability.value,
+                "encoding": info.encoding.value,
+            },
+            wall_ns=wall_ns,
+            now=now,
+        )
+        entry = self._entries[object_id]
+        if entry.stream != stream.id:
+            if entry.stream is not None:
+                del self._by_stream[entry.stream]
+                self._forget_value(entry)
+            entry.stream = stream.id
+            entry.seq = 0
+            self._by_stream[stream.id] = entry
+            return self._seen(entry)
+        return seen
+
+    def observe(
+        self,
+        stream: StreamId,
+        seq: int,
+        body: bytes,
+        *,
+        wall_ns: int,
+        now: float,
+        ros_stamp_ns: int | None = None,
+        codec: int = Codec.NONE,
+    ) -> bool:
+        """A message of an announced stream went by: keep it as the latest value. Never copies, decodes or raises.
+
+        False when it was not taken: the stream has no object (`put_stream` was refused or not called, or a newer
+        boot replaced it), or `seq` is not newer than the value there.
+        """
+        entry = self._by_stream.get(stream)
+        if entry is None or seq <= entry.seq:
+            return False
+        entry.seq = seq
+        entry.wall_ns = wall_ns
+        entry.ros_stamp_ns = ros_stamp_ns
+        if entry.value_bytes == len(body) and entry.body is not None and not (codec or entry.codec):
+            entry.body, entry.sha256 = body, None  # of the same size: what the budgets hold stays
+        else:
+            self._set_value(entry, body, codec)
+        self._touch(entry, now)
+        return True
+
+    def delete(self, object_id: str, *, owner: ClientName) -> bool:
+        """Delete an object; False when there is none. Raises RefusedError(`not_owner`) for another owner's."""
+        entry = self._entries.get(object_id)
+        if entry is None:
+            return False
+        if entry.owner != owner:
+            raise RefusedError("not_owner", f"{owner} may not delete {object_id}: {entry.owner} owns it")
+        self._delete(entry)
+        return True
+
+    def delete_stream(self, stream: StreamId) -> bool:
+        """Delete the object of a withdrawn stream; False when it has none (or a newer boot has taken it over)."""
+        entry = self._by_stream.get(stream)
+        if entry is None:
+            return False
+        self._delete(entry)
+        return True
+
+    def delete_owned(self, owner: ClientName) -> tuple[str, ...]:
+        """Delete everything of an owner that is gone for good; the ids, sorted."""
+        ids = tuple(sorted(self._owned.get(owner, ())))
+        for object_id in ids:
+            self._delete(self._entries[object_id])
+        return ids
+
+    # Reading ---------------------------------------------------------------------------------------------------------
+
+    @property
+    def version(self) -> int:
+        return self._version
+
+    @property
+    def total_bytes(self) -> int:
+        """Bytes that count against `max_total_bytes`."""
+        return self._total_bytes
+
+    @property
+    def held_bytes(self) -> int:
+        """Bytes of large values that are only referenced."""
+        return self._held_bytes
+
+    def __len__(self) -> int:
+        return len(self._entries)
+
+    def get(self, object_id: str) -> XrObject | None:
+        entry = self._entries.get(object_id)
+        return self._seen(entry) if entry is not None else None
+
+    def select(self, *, kind: ObjectKind | None = None, owner: ClientName | None = None) -> tuple[XrObject, ...]:
+        """Objects of a kind and an owner (None: any), by id."""
+        ids = self._entries.keys() if owner is None else self._owned.get(owner, set())
+        return tuple(
+            self._seen(self._entries[object_id])
+            for object_id in sorted(ids)
+            if kind is None or self._entries[object_id].kind is kind
+        )
+
+    def named(self, *, owner: ClientName | None = None, topic: TopicName | None = None) -> list[str]:
+        """Ids of the objects of an owner, and of those of a topic (None: any)."""
+        if topic is None:
+            return list(self._entries if owner is None else self._owned.get(owner, ()))
+        owners = self._owned if owner is None else (owner,)
+        return [object_id for name in owners if (object_id := f"{topic}@{name}") in self._entries]
+
+    def about(self, object_id: str) -> tuple[ObjectKind, ClientName, StreamId | None] | None:
+        """Kind, owner and the stream an object stands for, if any; None: there is no such object."""
+        entry = self._entries.get(object_id)
+        return None if entry is None else (entry.kind, entry.owner, entry.stream)
+
+    def unread(
+        self,
+        *,
+        kind: ObjectKind | None = None,
+        owner: ClientName | None = None,
+        topic: TopicName | None = None,
+        version: int = 0,
+    ) -> list[ValueRequest]:
+        """What has to be done before the values of these objects, changed after `version`, can be told. Nothing while
+        `inline_bytes` is None."""
+        found: list[ValueRequest] = []
+        entries: Iterable[_Entry] = reversed(self._entries.values())
+        if topic is not None:
+            of_topic = [self._entries[object_id] for object_id in self.named(owner=owner, topic=topic)]
+            entries = sorted(of_topic, key=lambda entry: -entry.version)
+        for entry in entries:
+            if entry.version <= version:
+                break
+            wanted = kind in (None, entry.kind) and owner in (None, entry.owner)
+            if wanted and entry.body is not None and entry.sha256 is None and self._is_long(entry):
+                found.append(ValueRequest(self, entry, entry.body))
+        return found
+
+    def have_read(self, request: ValueRequest) -> None:
+        """Take what a request found out, unless the object has another value by now, or is gone."""
+        entry = request.entry
+        if entry.body is not request.body or self._entries.get(entry.id) is not entry:
+            return
+        self._forget_value(entry)
+        if request.raw is None:
+            return
+        if request.sha256 is None:
+            self._set_value(entry, request.raw)
+        else:
+            entry.value_bytes, entry.sha256 = len(request.raw), request.sha256
+
+    def since(self, version: int, *, epoch: int | None = None) -> ObjectChanges:
+        """What changed after `version`; start with 0. `epoch` None: the reader knows that it is this run."""
+        changed = self.changed(version, epoch=epoch)
+        return ObjectChanges(
+            changed.epoch,
+            changed.version,
+            changed.resync,
+            tuple(self._seen(self._entries[object_id]) for object_id in changed.updated),
+            changed.deleted,
+        )
+
+    def changed(self, version: int, *, epoch: int | None = None) -> ChangedIds:
+        """`since` for who looks at the objects one by one later on. One that is gone by then is among those deleted
+        after the version given here; one that has changed is told again."""
+        foreign = version < 0 or version > self._version or (epoch is not None and epoch != self.epoch)
+        if foreign or (version and version < self._forgotten_version):
+            return ChangedIds(self.epoch, self._version, True, tuple(self._entries), ())
+        updated: list[str] = []
+        for entry in reversed(self._entries.values()):
+            if entry.version <= version:
+                break
+            updated.append(entry.id)
+        gone = dict.fromkeys(object_id for at, object_id in self._deletions if at > version and version)
+        deleted = tuple(object_id for object_id in gone if object_id not in self._entries)
+        return ChangedIds(self.epoch, self._version, False, tuple(reversed(updated)), deleted)
+
+    def validate(self) -> None:
+        """Check counts, sums and orders against the objects; raises AssertionError."""
+        entries = self._entries
+        small = sum(self._kept_bytes(entry) for entry in entries.values())
+        large = sum(self._referenced_bytes(entry) for entry in entries.values())
+        fixed = sum(entry.fixed_bytes for entry in entries.values())
+        assert self._total_bytes == fixed + small <= self.limits.max_total_bytes, "total bytes"
+        assert self._held_bytes == large <= self.limits.max_held_bytes, "held bytes"
+        for owner, (own_bytes, own_held_bytes) in self._bytes_of.items():
+            mine = [entry for entry in entries.values() if entry.owner == owner]
+            assert own_bytes == sum(entry.fixed_bytes + self._kept_bytes(entry) for entry in mine), "bytes of an owner"
+            assert own_held_bytes == sum(map(self._referenced_bytes, mine)), "held bytes of an owner"
+            assert own_bytes <= self.limits.max_bytes_per_owner, "an owner has too much"
+            assert own_held_bytes <= self.limits.max_held_per_owner, "an owner holds too much"
+        assert self._bytes_of.keys() == self._owned.keys(), "owners by bytes"
+        versions = [entry.version for entry in entries.values()]
+        assert versions == sorted(set(versions)), "the order of changes"
+        assert not versions or versions[-1] <= self._version, "a version from the future"
+        assert {entry.id for entry in entries.values()} == set().union(*self._owned.values()), "owners"
+        assert all(self._owned.values()), "an owner of nothing"
+        assert {entry.stream: entry for entry in entries.values() if entry.stream} == self._by_stream, "streams"
+
+    # Internals -------------------------------------------------------------------------------------------------------
+
+    def _check(
+        self, object_id: str, owner: ClientName, definition_bytes: int, attributes: int, attribute_bytes: int
+    ) -> None:
+        limits = self.limits
+        entry = self._entries.get(object_id)
+        if entry is not None and entry.owner != owner:
+            raise RefusedError(
+                "not_owner", f"{owner} may not put {object_id[:80]}: {entry.owner} owns it; choose another id"
+            )
+        if not object_id or len(object_id) > limits.max_id_chars or not object_id.isprintable():
+            raise RefusedError(
+                "bad_id",
+                f"{owner} may not put {object_id[:80]!r}: an id has 1 to {limits.max_id_chars} printable characters",
+            )
+        reserved = _RESERVED.fullmatch(object_id)
+        if reserved is not None and reserved[1] != owner:
+            raise RefusedError(
+                "not_owner",
+                f"{owner} may not put {object_id[:80]}: ids that end in @{reserved[1]} belong to {reserved[1]}; "
+                "choose another id",
+            )
+        for what, size, limit in (
+            ("bytes of definition", definition_bytes, limits.max_definition_bytes),
+            ("attributes", attributes, limits.max_attributes),
+            ("bytes of attributes", attribute_bytes, limits.max_attribute_bytes),
+        ):
+            if size > limit:
+                raise RefusedError(
+                    "too_large", f"{owner} may not put {object_id[:80]}: {size} {what}; at most {limit} are taken"
+                )
+        if entry is None and len(self._owned.get(owner, ())) >= limits.max_objects_per_owner:
+            raise RefusedError(
+                "too_many_objects",
+                f"{owner} may not put {object_id[:80]}: it has {limits.max_objects_per_owner} objects, which is the "
+                "limit; delete some",
+            )
+
+    def _set_value(self, entry: _Entry, body: bytes, codec: int = Codec.NONE) -> None:
+        """Store a value, a reference, or only its size, whichever the budgets allow."""
+        limits = self.limits
+        self._forget_value(entry)
+        size = len(body)
+        own_bytes, own_held_bytes = share = entry.share
+        if size <= limits.max_value_bytes and not codec:
+            entry.value_bytes = size
+            if self._total_bytes + size <= limits.max_total_bytes and own_bytes + size <= limits.max_bytes_per_owner:
+                self._total_bytes += size  # `_count`, for every message
+                share[0] = own_bytes + size
+                entry.body = body
+            return
+        if not codec:
+            entry.value_bytes = size
+        if self._held_bytes + size <= limits.max_held_bytes and own_held_bytes + size <= limits.max_held_per_owner:
+            self._count_held(entry, size)
+            entry.body, entry.codec = body, codec
+
+    def _count(self, entry: _Entry, nbytes: int) -> None:
+        self._total_bytes += nbytes
+        entry.share[0] += nbytes
+
+    def _count_held(self, entry: _Entry, nbytes: int) -> None:
+        self._held_bytes += nbytes
+        entry.share[1] += nbytes
+
+    def _forget_value(self, entry: _Entry) -> None:
+        old = entry.body
+        if old is not None:
+            size = len(old)
+            if not entry.codec and size <= self.limits.max_value_bytes:
+                self._total_bytes -= size  # `_count`, for every message
+                entry.share[0] -= size
+            else:
+                self._count_held(entry, -size)
+            entry.body = None
+        entry.codec = 0
+        entry.value_bytes = -1
+        entry.sha256 = None
+
+    def _touch(self, entry: _Entry, now: float) -> None:
+        self._version += 1
+        entry.version = self._version
+        entry.updated_s = now
+        self._entries.move_to_end(entry.id)
+
+    def _delete(self, entry: _Entry) -> None:
+        self._forget_value(entry)
+        self._count(entry, -entry.fixed_bytes)
+        if entry.stream is not None:
+            del self._by_stream[entry.stream]
+        del self._entries[entry.id]
+        owned = self._owned[entry.owner]
+        owned.discard(entry.id)
+        if not owned:
+            del self._owned[entry.owner], self._bytes_of[entry.owner]
+        self._version += 1
+        if len(self._deletions) == self._deletions.maxlen:
+            self._forgotten_version = self._deletions[0][0] if self._deletions else self._version
+        self._deletions.append((self._version, entry.id))
+
+    def _kept_bytes(self, entry: _Entry) -> int:
+        return len(entry.body) if entry.body is not None and not self._is_reference(entry) else 0
+
+    def _referenced_bytes(self, entry: _Entry) -> int:
+        return len(entry.body) if entry.body is not None and self._is_reference(entry) else 0
+
+    def _is_reference(self, entry: _Entry) -> bool:
+        return bool(entry.codec) or entry.value_bytes > self.limits.max_value_bytes
+
+    def _decode(self, entry: _Entry) -> None:
+        """Somebody asks for a value that came encoded; what cannot be decoded has no value."""
+        body, codec = entry.body, entry.codec
+        self._forget_value(entry)
+        if body is not None:
+            try:
+                raw = decode(codec, body, max_bytes=self.limits.max_decoded_bytes)
+            except CodecError:
+                return
+            self._set_value(entry, raw)
+
+    def _claimed_bytes(self, entry: _Entry) -> int:
+        """How large the value is, or says it is; -1 for none."""
+        try:
+            return -1 if entry.body is None else raw_size(entry.codec, entry.body)
+        except CodecError:
+            return -1
+
+    def _is_long(self, entry: _Entry) -> bool:
+        """Whether telling the value takes longer than it may where somebody asks."""
+        return self.inline_bytes is not None and self._claimed_bytes(entry) > self.inline_bytes
+
+    def _seen(self, entry: _Entry) -> XrObject:
+        long = self._is_long(entry)
+        if entry.codec and not long:
+            self._decode(entry)
+        if entry.body is not None and entry.sha256 is None and not long:
+            entry.sha256 = hashlib.sha256(entry.body).hexdigest()
+            if entry.value_bytes > self.limits.max_value_bytes:
+                # Hashed once, when first asked for; after that the body is no longer needed.
+                self._count_held(entry, -entry.value_bytes)
+                entry.body = None
+        return XrObject(
+            id=entry.id,
+            owner=entry.owner,
+            kind=entry.kind,
+            type_name=entry.type_name,
+            definition=entry.definition,
+            definition_hash=entry.definition_hash,
+            attributes=entry.attributes,
+            value=None if long else entry.body,
+            value_bytes=self._claimed_bytes(entry) if long else entry.value_bytes,
+            value_sha256=entry.sha256,
+            seq=entry.seq,
+            ros_stamp_ns=entry.ros_stamp_ns,
+            wall_ns=entry.wall_ns,
+            created_s=entry.created_s,
+            updated_s=entry.updated_s,
+            version=entry.version,
+        )
+
+
+def _utf8(text: str) -> bytes:
+    return text.encode("utf-8", "surrogatepass")
+
+
+def _size_bytes(text: str) -> int:
+    return len(_utf8(text))
+
+
+def topic_object_id(stream: StreamId) -> str:
+    """The id of a stream's object: one per (client, topic), the same for every boot."""
+    return f"{stream.topic}@{stream.origin}"
+
+
+def kind_of(stream: StreamInfo) -> ObjectKind:
+    """`command` for class control topics of command types, `transform` for tf, `patch` for parts of maps, `topic`
+    otherwise."""
+    type_name = plain_type(stream.info.type_name)
+    if stream.spec.priority is PriorityClass.CONTROL and type_name in COMMAND_OBJECT_TYPES:
+        return ObjectKind.COMMAND
+    if type_name in TRANSFORM_TYPES:
+        return ObjectKind.TRANSFORM
+    if type_name in PATCH_TYPES:
+        return ObjectKind.PATCH
+    return ObjectKind.TOPIC

@@ -1,0 +1,275 @@
+"""Whether the clients whose streams a client takes can be reached now: the relay's half. Pure.
+
+A client that asked (`peers` in its `subscribe`) is told of each of these, its *peers*: whether it is connected and
+answers, for how long that has been so, over which lane, and how long a round trip takes between it and the relay.
+`sern_core/site/peers.py` is the client's half. Of who takes its own streams a client is not told: a robot on a thin
+link would pay for every curious onlooker.
+
+A peer whose last stream has ended is one no more. The client is told whether it is *here*, which is whether it has a
+session: a robot that is gone is given up, one that is here has nothing for the client any more. Of those that were not
+here it is told once they are, and it may ask of those that it knows from an earlier session.
+
+What is told travels as control messages, so that bulk cannot hold it up, and is bounded by what there is to know: of
+each peer only its latest state waits, and nothing is said before the client has acknowledged what was said last.
+"""
+
+from collections import Counter
+from collections.abc import Callable, Container, Iterable, Mapping
+from functools import partial
+from math import ceil
+from typing import Final, NamedTuple, Protocol
+
+from sern_core.path.lanes import Lane
+from sern_core.vocabulary.types import ClientName
+from sern_core.wire import framing
+from sern_core.wire.announce import MAX_ASKED
+
+MAX_TOLD: Final = 24
+"""Peers in one message: an envelope holds 4 KiB."""
+TOLD_AT_ONCE: Final = 500
+"""Messages in one turn of the loop: some milliseconds."""
+BACK_PAUSE_S: Final = 5.0
+"""A client that is here again has so long to say what it has, before a client that looks for it is told that it has
+nothing there: that one would end what it shows of it, and begin again."""
+RTT_CHANGE: Final = 0.25
+RTT_CHANGE_S: Final = 0.005
+RTT_PAUSE_S: Final = 2.0
+"""A round trip is told anew when it has changed by more than this share and so many seconds, and no sooner than after
+this pause: for people, who do not read milliseconds."""
+
+
+class PeerLink(Protocol):
+    """What is looked at of a client's link, and how the client is told."""
+
+    lane: Lane
+
+    @property
+    def established(self) -> bool: ...
+
+    @property
+    def control_heard(self) -> int: ...
+
+    def send_control(self, envelope: framing.Envelope, attachment: bytes = b"", *, now: float) -> int: ...
+
+
+class _State(NamedTuple):
+    """A client as the relay sees it; `rtt_s` is the one that was told last, and when."""
+
+    up: bool
+    since_s: float
+    lane: str
+    rtt_s: float | None
+    rtt_at_s: float
+
+
+class _Watcher:
+    """A client that asked, and the peers of which it is still to be told something. `seq`: of what it was told last.
+    `missing`: who was not here when it looked for it, the latest last; `back`: who of them is, and since when."""
+
+    __slots__ = ("back", "due", "missing", "seq")
+
+    def __init__(self) -> None:
+        self.due: set[ClientName] = set()
+        self.missing: dict[ClientName, None] = {}
+        self.back: dict[ClientName, float] = {}
+        self.seq = 0
+
+    def miss(self, peer: ClientName) -> None:
+        while len(self.missing) >= MAX_ASKED:
+            self.found(next(iter(self.missing)))
+        self.missing[peer] = None
+
+    def found(self, peer: ClientName) -> None:
+        self.missing.pop(peer, None)
+        self.back.pop(peer, None)
+
+
+class Presence:
+    """`links` is the relay's table, `local` the names under which the relay itself publishes, which are nobody's peers.
+    `matching` has the clients of whom it is not known yet what they take. `attempt` does something about a client so
+    that its failure is that client's; `after` is called when something was said."""
+
+    def __init__(
+        self,
+        links: Mapping[ClientName, PeerLink],
+        local: Container[ClientName],
+        matching: Container[ClientName],
+        attempt: Callable[[ClientName, float, Callable[[], object]], None],
+        after: Callable[[], None],
+    ) -> None:
+        self._links = links
+        self._local = local
+        self._matching = matching
+        self._attempt = attempt
+        self._after = after
+        self._taken: dict[ClientName, Counter[ClientName]] = {}  # streams that a client takes, by origin
+        self._takers: dict[ClientName, set[ClientName]] = {}  # the same the other way round
+        self._states: dict[ClientName, _State] = {}  # of those in `_takers`, as they were looked at last
+        self._watchers: dict[ClientName, _Watcher] = {}
+        self._asked: dict[ClientName, set[ClientName]] = {}  # of whom a client asked, until it is known what it takes
+
+    # --- who takes whose streams ----------------------------------------------------------------------------------
+
+    def joined(self, origin: ClientName, taker: ClientName) -> None:
+        """One more stream of `origin` goes to `taker`."""
+        if origin in self._local:
+            return
+        origins = self._taken.setdefault(taker, Counter())
+        origins[origin] += 1
+        if origins[origin] == 1:
+            self._takers.setdefault(origin, set()).add(taker)
+            self._due(taker, origin)
+
+    def parted(self, origin: ClientName, taker: ClientName) -> None:
+        """One stream less."""
+        if origin in self._local:
+            return
+        origins = self._taken[taker]
+        origins[origin] -= 1
+        if origins[origin]:
+            return
+        del origins[origin]
+        if not origins:
+            del self._taken[taker]
+        takers = self._takers[origin]
+        takers.remove(taker)
+        if not takers:
+            del self._takers[origin]
+            self._states.pop(origin, None)
+        self._due(taker, origin)
+
+    def _due(self, watcher: ClientName, peer: ClientName) -> None:
+        watching = self._watchers.get(watcher)
+        if watching is not None:
+            watching.due.add(peer)
+
+    # --- who is told ----------------------------------------------------------------------------------------------
+
+    def watch(self, client: ClientName, *, now: float) -> None:
+        """A client asked, in the session it has: it is told everything, and then what changes."""
+        if client not in self._watchers:
+            watching = self._watchers[client] = _Watcher()
+            watching.due.update(self._taken.get(client, ()))
+            self._tell(client, now)
+
+    def ask(self, client: ClientName, names: Iterable[ClientName]) -> None:
+        """A client asks whether these are here, its peers or not. Those above MAX_ASKED are left out, and the relay's
+        own names: it has no session with itself."""
+        asked = self._asked.setdefault(client, set())
+        asked.update([name for name in names if name not in self._local][: MAX_ASKED - len(asked)])
+
+    def changed(self, client: ClientName, *, now: float) -> None:
+        """The client's session has begun or ended: nobody waits for `sweep`."""
+        self._watchers.pop(client, None)  # what it was told was of the session before
+        self._asked.pop(client, None)
+        for watching in self._watchers.values():
+            if client in watching.missing:
+                if self._here(client):
+                    watching.back[client] = now
+                else:
+                    watching.back.pop(client, None)
+        if client in self._takers:
+            self._look(client, now)
+            for taker in self._takers[client]:
+                self._tell(taker, now)
+
+    def sweep(self, *, now: float) -> None:
+        """See whose path has fallen silent or answers again, and say what is due. Call about once a second, and then
+        `tell`."""
+        for client in self._takers:
+            self._look(client, now)
+        self.tell(now=now)
+
+    def tell(self, *, now: float) -> bool:
+        """Say what is due. True: there may be more; call again in another turn."""
+        room = TOLD_AT_ONCE
+        for client, watching in list(self._watchers.items()):
+            if client in self._asked and client not in self._matching:
+                self._look_for(client, watching, now)
+            for peer in [peer for peer, since_s in watching.back.items() if now - since_s >= BACK_PAUSE_S]:
+                watching.found(peer)
+                watching.due.add(peer)
+            room -= self._tell(client, now)
+            if room <= 0:
+                return True
+        return False
+
+    def _look_for(self, client: ClientName, watching: _Watcher, now: float) -> None:
+        """It is known what a client takes: see of whom it asked."""
+        taken = self._taken.get(client, ())
+        for peer in self._asked.pop(client):
+            if peer in taken or not self._here(peer):
+                watching.due.add(peer)
+            else:
+                watching.miss(peer)
+                watching.back[peer] = now
+
+    def _look(self, client: ClientName, now: float) -> None:
+        link = self._links.get(client)
+        old = self._states.get(client)
+        up = link is not None and link.established and not link.lane.stalled
+        since_s = now if old is None or old.up != up else old.since_s
+        lane, rtt_s, rtt_at_s = ("", None, now) if old is None else (old.lane, old.rtt_s, old.rtt_at_s)
+        if link is not None and up:
+            lane = link.lane.name
+            rtt = link.lane.flight.rtt
+            if rtt.samples and _differs(rtt_s, rtt.srtt_s) and (rtt_s is None or now - rtt_at_s >= RTT_PAUSE_S):
+                rtt_s, rtt_at_s = rtt.srtt_s, now
+        state = _State(up, since_s, lane, rtt_s, rtt_at_s)
+        if state != old:
+            self._states[client] = state
+            for taker in self._takers[client]:
+                self._due(taker, client)
+
+    def _tell(self, client: ClientName, now: float) -> int:
+        """Returns how many messages it took."""
+        watching, link = self._watchers.get(client), self._links.get(client)
+        if watching is None or link is None or not watching.due or not link.established:
+            return 0
+        if link.control_heard < watching.seq:
+            return 0  # it is told the latest once it has heard of what was said before
+        count = ceil(len(watching.due) / MAX_TOLD)
+        self._attempt(client, now, partial(self._say, client, watching, link, now))
+        return count
+
+    def _say(self, client: ClientName, watching: _Watcher, link: PeerLink, now: float) -> None:
+        due = sorted(watching.due)
+        for start in range(0, len(due), MAX_TOLD):
+            items = [self._item(client, watching, peer, now) for peer in due[start : start + MAX_TOLD]]
+            watching.seq = link.send_control({"t": "peers", "peers": items}, now=now)
+        watching.due.clear()
+        self._after()
+
+    def _here(self, client: ClientName) -> bool:
+        link = self._links.get(client)
+        return link is not None and link.established
+
+    def _item(self, client: ClientName, watching: _Watcher, peer: ClientName, now: float) -> framing.Envelope:
+        watching.found(peer)
+        if peer not in self._taken.get(client, ()):
+            here = self._here(peer)
+            if not here:
+                watching.miss(peer)
+            return {"name": peer, "here": here}
+        if peer not in self._states:
+            self._look(peer, now)
+        state = self._states[peer]
+        item: framing.Envelope = {"name": peer, "up": state.up, "for": max(0.0, now - state.since_s)}
+        if state.lane:
+            item["lane"] = state.lane
+        if state.rtt_s is not None:
+            item["rtt"] = state.rtt_s
+        return item
+
+    def validate(self, taken: Mapping[ClientName, Counter[ClientName]]) -> None:
+        """Internal consistency, for tests: `taken` is how many streams each client takes of each, counted anew."""
+        assert self._taken == taken, f"streams are taken {self._taken} but routes say {taken}"
+        takers = {(origin, taker) for origin, some in self._takers.items() for taker in some}
+        assert takers == {(origin, taker) for taker, origins in taken.items() for origin in origins}
+        assert self._states.keys() <= self._takers.keys(), "states of clients of whom nobody takes anything"
+        assert self._watchers.keys() <= self._links.keys(), "clients are told that are gone"
+        assert self._asked.keys() <= self._links.keys(), "clients ask that are gone"
+
+
+def _differs(told_s: float | None, rtt_s: float) -> bool:
+    return told_s is None or abs(rtt_s - told_s) > max(RTT_CHANGE * told_s, RTT_CHANGE_S)

@@ -1,0 +1,574 @@
+"""The relay's table of streams and interests: who gets what, who owns which global name.
+
+Theory of operation
+- A client announces its streams and says what it wants as patterns and exact names. A *match* is a (client, stream)
+  pair for which the client wants the stream's global name, may subscribe to it, and is not its origin.
+- Every change of streams, interests or access rules comes back as a `RouteChange`: the caller opens and closes channels
+  from it and tells origins whether anybody listens. Per message there is only `subscribers(stream)`, one look-up.
+- Patterns are matched once per (client, global name), whatever the number of streams and messages under that name, and
+  only against names that the client may subscribe to.
+- A new stream is matched at once: it costs at most `MAX_CLIENT_PROGRAM` steps a character and client. A new interest,
+  which has all names before it, is worked out in slices of `SLICE_UNITS`: while `unfinished`, call `go_on`. Until a
+  name's turn has come it stays as it was; what a client may no longer have is taken away at once.
+
+Names
+- A global name has one owner, the first client that announces it, until the owner withdraws it or is dropped.
+  Only when every owner declares it `many_writers` may several clients hold it (`/tf`).
+- A client lives in one boot at a time. Announcing under another boot replaces all that it had; boots are drawn at
+  random, so "newer" means "announced later", and a boot that was replaced comes back only with a session (`returned`):
+  of two processes with one name each may.
+
+Who announces is the caller's business: `StreamInfo.id.origin` must be the name bound to the peer's key.
+"""
+
+from bisect import bisect_left
+from collections import deque
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+from sern_core.relay.access import AccessTable
+from sern_core.topics.patterns import MAX_CLIENT_PROGRAM, PatternError, PatternSet
+from sern_core.vocabulary.errors import RefusedError
+from sern_core.vocabulary.message import StreamId, StreamInfo, TopicInfo
+from sern_core.vocabulary.names import name_problem, plain_type
+from sern_core.vocabulary.types import ClientName, TopicName
+
+RETIRED_BOOTS: Final = 8
+"""Replaced boots remembered per client, against announcements that were still under way."""
+UNIT_S: Final = 4e-9
+"""What one instruction of a pattern's program costs for one character at most, roughly: the unit of what follows."""
+SLICE_UNITS: Final = 2_000_000
+"""Matching that is done in one go."""
+NAME_UNITS: Final = 500
+"""A look at one name, access included."""
+ROUTE_UNITS: Final = 20_000
+"""What follows from a route that comes or goes: a channel, its announcement, an answer to the origin."""
+COMPILE_UNITS: Final = 200
+"""Compiling, for each instruction of the program and each character of a pattern."""
+
+
+class BadPatternError(RefusedError):
+    """A client subscribes to something that is no pattern."""
+
+    def __init__(self, pattern: str, problem: str) -> None:
+        super().__init__("bad_pattern", f"pattern {pattern[:80]!r} {problem}")
+        self.pattern = pattern
+
+
+@dataclass(frozen=True, slots=True)
+class RoutingLimits:
+    """What one client may hold in the table; beyond it the client is refused by name."""
+
+    max_streams: int = 2_000
+    max_patterns: int = 256
+    max_exact: int = 4_096
+    max_program: int = MAX_CLIENT_PROGRAM
+    """What all patterns of a client may need together, in instructions of RE2."""
+    max_all_streams: int = 60_000
+    """What all clients may have together: what fits into the channel numbers of one that takes everything."""
+
+
+class Match(NamedTuple):
+    """The client receives the stream."""
+
+    client: ClientName
+    stream: StreamId
+
+
+class Denied(NamedTuple):
+    """The client named the topic, and the access rules forbid it. Of what it has only patterns for, nothing is said:
+    it would learn what it may not see."""
+
+    client: ClientName
+    topic: TopicName
+
+
+@dataclass(frozen=True, slots=True)
+class RouteChange:
+    """What one call changed; every tuple is sorted and without duplicates.
+
+    `updated` streams kept their id and got other properties: announce them again to their subscribers.
+    `wanted` streams have a first subscriber, `unwanted` ones lost the last (removed streams are not listed there).
+    """
+
+    added: tuple[StreamId, ...] = ()
+    updated: tuple[StreamId, ...] = ()
+    removed: tuple[StreamId, ...] = ()
+    matched: tuple[Match, ...] = ()
+    unmatched: tuple[Match, ...] = ()
+    wanted: tuple[StreamId, ...] = ()
+    unwanted: tuple[StreamId, ...] = ()
+    denied: tuple[Denied, ...] = ()
+
+    def __bool__(self) -> bool:
+        """True when the caller has anything to do."""
+        return self != NO_CHANGE
+
+
+NO_CHANGE: Final = RouteChange()
+
+
+class _Interest:
+    """What one client wants; `topics` are the known global names that it wants and may have.
+
+    `left` are names that have not been looked at since the interest or the access rules changed.
+    """
+
+    __slots__ = ("exact", "left", "patterns", "topics")
+
+    def __init__(self, patterns: PatternSet, exact: set[TopicName]) -> None:
+        self.patterns = patterns
+        self.exact = exact
+        self.topics: set[TopicName] = set()
+        self.left: deque[TopicName] = deque()
+
+    def wants(self, topic: TopicName) -> bool:
+        return topic in self.exact or self.patterns.fullmatch(topic)
+
+
+class _Topic:
+    """One global name: its streams by origin, and the clients that want it and may have it, origins included."""
+
+    __slots__ = ("streams", "takers")
+
+    def __init__(self) -> None:
+        self.streams: dict[ClientName, StreamId] = {}
+        self.takers: set[ClientName] = set()
+
+
+class RoutingTable:
+    """See the module's text. Not thread-safe; every call either works or raises and changes nothing."""
+
+    def __init__(self, access: AccessTable, *, limits: RoutingLimits | None = None) -> None:
+        self._access = access
+        self._limits = limits or RoutingLimits()
+        self._infos: dict[StreamId, StreamInfo] = {}
+        self._routes: dict[StreamId, tuple[ClientName, ...]] = {}
+        self._topics: dict[TopicName, _Topic] = {}
+        self._by_client: dict[ClientName, dict[TopicName, StreamId]] = {}
+        self._boots: dict[ClientName, int] = {}
+        self._retired: dict[ClientName, deque[int]] = {}
+        self._interests: dict[ClientName, _Interest] = {}
+        self.spent_units = 0
+        """What the last `announce`, `subscribe`, `go_on` or `set_access` has cost."""
+        self.route_units: Callable[[StreamId], int] = lambda _stream: 0
+        """What a new route of a stream costs beside `ROUTE_UNITS`; set by the owner."""
+
+    # Look-ups --------------------------------------------------------------------------------------------------------
+
+    def subscribers(self, stream: StreamId) -> tuple[ClientName, ...]:
+        """Clients to forward the stream's messages to, sorted; empty for an unknown stream."""
+        return self._routes.get(stream, ())
+
+    def wanted(self, stream: StreamId) -> bool:
+        return bool(self._routes.get(stream))
+
+    def known(self, stream: StreamId) -> bool:
+        return stream in self._infos
+
+    def info(self, stream: StreamId) -> StreamInfo | None:
+        return self._infos.get(stream)
+
+    def infos(self) -> tuple[StreamInfo, ...]:
+        return tuple(self._infos.values())
+
+    def streams_of(self, client: ClientName) -> tuple[StreamId, ...]:
+        """The streams that the client announced, in that order."""
+        return tuple(self._by_client.get(client, {}).values())
+
+    def received_by(self, client: ClientName) -> tuple[StreamId, ...]:
+        """The streams that the client receives, sorted."""
+        interest = self._interests.get(client)
+        topics = interest.topics if interest is not None else set()
+        return tuple(
+            sorted(
+                stream for topic in topics for origin, stream in self._topics[topic].streams.items() if origin != client
+            )
+        )
+
+    def takes(self, client: ClientName, topic: TopicName) -> bool:
+        """Whether the client wants the global name and may have it, whether or not there is such a stream."""
+        interest = self._interests.get(client)
+        return interest is not None and self._access.may_subscribe(client, topic) and interest.wants(topic)
+
+    def owners(self, topic: TopicName) -> tuple[ClientName, ...]:
+        """The clients that hold the global name, first come first."""
+        entry = self._topics.get(topic)
+        return tuple(entry.streams) if entry is not None else ()
+
+    def pairs(self) -> tuple[tuple[ClientName, TopicName], ...]:
+        """Every (client, topic) that uses an access right now; for `AccessTable.replaced`."""
+        used = {(stream.origin, stream.topic) for stream in self._infos}
+        used.update((client, topic) for client, interest in self._interests.items() for topic in interest.topics)
+        return tuple(sorted(used))
+
+    def unfinished(self, client: ClientName) -> bool:
+        """Whether there are names that the client's interest was not matched with yet: call `go_on`."""
+        interest = self._interests.get(client)
+        return interest is not None and bool(interest.left)
+
+    # Changes ---------------------------------------------------------------------------------------------------------
+
+    def announce(self, stream: StreamInfo) -> RouteChange:
+        """A client offers a stream, or offers it again with other properties.
+
+        Raises RefusedError with code `bad_name`, `forbidden`, `name_taken`, `type_mismatch`, `old_boot` or
+        `too_many_streams`.
+        """
+        self.spent_units = 0
+        origin, boot, _ = stream.id
+        known = self._infos.get(stream.id)
+        if known is not None and _same(known, stream):
+            return NO_CHANGE
+        reboot = self._boots.get(origin, boot) != boot
+        self._check(stream, reboot=reboot)
+        if known is not None:
+            self._infos[stream.id] = stream
+            return RouteChange(updated=(stream.id,))
+        change = _Collector()
+        if reboot:
+            for old in tuple(self._by_client[origin].values()):
+                self._remove(old, change)
+            self._retired.setdefault(origin, deque(maxlen=RETIRED_BOOTS)).append(self._boots[origin])
+        self._boots[origin] = boot
+        self._add(stream, change)
+        return change.result(self._routes)
+
+    def withdraw(self, stream: StreamId) -> RouteChange:
+        """The origin no longer offers the stream; nothing happens when it is unknown."""
+        if stream not in self._infos:
+            return NO_CHANGE
+        change = _Collector()
+        self._remove(stream, change)
+        return change.result(self._routes)
+
+    def subscribe(
+        self, client: ClientName, patterns: Iterable[str] = (), *, exact: Iterable[TopicName] = ()
+    ) -> RouteChange:
+        """Replace what the client wants: full-match patterns on global names, and exact names. See `unfinished`.
+
+        Raises RefusedError with code `bad_pattern` or `too_many_patterns`; then the earlier interest stays.
+        """
+        self.spent_units = NAME_UNITS
+        texts = tuple(dict.fromkeys(patterns))
+        names = set(exact)
+        if len(texts) > self._limits.max_patterns or len(names) > self._limits.max_exact:
+            raise RefusedError(
+                "too_many_patterns",
+                f"{client} asks for {len(texts)} patterns and {len(names)} names; at most {self._limits.max_patterns} "
+                f"and {self._limits.max_exact} are taken; join patterns with '|'",
+            )
+        old = self._interests.get(client)
+        denied = [Denied(client, name) for name in names if not self._access.may_subscribe(client, name)]
+        if old is not None and old.patterns.texts == texts and old.exact == names:
+            return RouteChange(denied=tuple(sorted(denied)))  # said again: it may be another process that asks
+        self.spent_units += COMPILE_UNITS * sum(map(len, texts))
+        try:
+            wanted = PatternSet(texts, max_program=self._limits.max_program)
+        except PatternError as error:
+            raise _refused(error, client) from None
+        self.spent_units += COMPILE_UNITS * wanted.program
+        change = _Collector()
+        change.denied.update(denied)
+        self._set_interest(client, _Interest(wanted, names), change)
+        return change.result(self._routes)
+
+    def also(self, client: ClientName, topic: TopicName) -> RouteChange:
+        """The client wants one more name beside what it wants: that costs one look, whatever it has.
+
+        Raises RefusedError with code `too_many_patterns`.
+        """
+        self.spent_units = NAME_UNITS
+        interest = self._interests.get(client)
+        exact: set[TopicName] = set() if interest is None else interest.exact
+        if topic not in exact and len(exact) >= self._limits.max_exact:
+            raise RefusedError(
+                "too_many_patterns", f"{client} has {len(exact)} names already, which is the limit; use a pattern"
+            )
+        if interest is None:
+            interest = self._interests[client] = _Interest(PatternSet(()), exact)
+        exact.add(topic)
+        change = _Collector()
+        if not self._access.may_subscribe(client, topic):
+            change.denied.add(Denied(client, topic))
+        elif topic in self._topics and topic not in interest.topics:
+            interest.topics.add(topic)
+            self._set_taker(client, topic, change, takes=True)
+        return change.result(self._routes)
+
+    def go_on(self, client: ClientName) -> RouteChange:
+        """Match the client's interest with some more of the names that are left; nothing happens when none is."""
+        self.spent_units = 0
+        change = _Collector()
+        interest = self._interests.get(client)
+        if interest is not None:
+            self._match_some(client, interest, change)
+        return change.result(self._routes)
+
+    def returned(self, client: ClientName, boot: int) -> None:
+        """The process that was replaced is not gone: it has the client's session again, and may announce."""
+        retired = self._retired.get(client)
+        if retired is not None and boot in retired:
+            retired.remove(boot)
+
+    def drop_client(self, client: ClientName) -> RouteChange:
+        """The client is gone for good: its streams, its names and its interest go. It may come back under any boot."""
+        change = _Collector()
+        self._set_interest(client, None, change)
+        for stream in tuple(self._by_client.get(client, {}).values()):
+            self._remove(stream, change)
+        self._by_client.pop(client, None)
+        self._boots.pop(client, None)
+        self._retired.pop(client, None)
+        return change.result(self._routes)
+
+    def set_access(self, access: AccessTable) -> RouteChange:
+        """New access rules are in force: `removed` streams and `unmatched` pairs have lost their right, others may
+        have gained one (see `unfinished`). A name that a client asked for and just lost is listed in `denied`."""
+        before, self._access = self._access, access
+        self.spent_units = 0
+        change = _Collector()
+        for stream in tuple(self._infos):
+            if not access.may_publish(stream.origin, stream.topic):
+                self._remove(stream, change)
+        for client, interest in list(self._interests.items()):
+            change.denied.update(
+                Denied(client, name)
+                for name in interest.exact
+                if before.may_subscribe(client, name) and not access.may_subscribe(client, name)
+            )
+            for name in sorted(interest.topics):
+                if not access.may_subscribe(client, name):
+                    interest.topics.discard(name)
+                    self._set_taker(client, name, change, takes=False)
+            interest.left = self._to_look_at(interest)
+            self._match_some(client, interest, change)
+        return change.result(self._routes)
+
+    # Internals -------------------------------------------------------------------------------------------------------
+
+    def _check(self, stream: StreamInfo, *, reboot: bool) -> None:
+        origin, boot, topic = stream.id
+        problem = name_problem(topic)
+        if problem is not None:
+            raise RefusedError("bad_name", f"{origin} may not publish {topic[:80]!r}: the name {problem}")
+        if boot in self._retired.get(origin, ()):
+            raise RefusedError(
+                "old_boot", f"{origin} announced {topic} for a run that it has since replaced; ignore it"
+            )
+        if not self._access.may_publish(origin, topic):
+            raise RefusedError(
+                "forbidden", f"{origin} may not publish {topic}: no access rule grants it; add it under access.publish"
+            )
+        full = not reboot and len(self._by_client.get(origin, ())) >= self._limits.max_streams
+        if full and stream.id not in self._infos:
+            raise RefusedError(
+                "too_many_streams",
+                f"{origin} may not publish {topic}: it has {self._limits.max_streams} streams, which is the limit; "
+                "deny some topics in its discovery",
+            )
+        if stream.id not in self._infos and len(self._infos) >= self._limits.max_all_streams:
+            raise RefusedError(
+                "too_many_streams",
+                f"{origin} may not publish {topic}: the relay has {self._limits.max_all_streams} streams, which is the "
+                "limit; deny some topics in the discovery of the clients",
+            )
+        entry = self._topics.get(topic)
+        for other, held in entry.streams.items() if entry is not None else ():
+            if other == origin:
+                continue
+            theirs = self._infos[held]
+            if not (stream.spec.many_writers and theirs.spec.many_writers):
+                raise RefusedError(
+                    "name_taken",
+                    f"{origin} may not publish {topic}: {other} owns that name; give {origin} a namespace, remap the "
+                    "topic, or declare it many_writers at both clients",
+                )
+            problem = type_problem(stream.info, theirs.info)
+            if problem is not None:
+                raise RefusedError(
+                    "type_mismatch",
+                    f"{origin} may not publish {topic}: {problem} at {other}; use one definition at both clients",
+                )
+
+    def _add(self, stream: StreamInfo, change: "_Collector") -> None:
+        origin, _, name = stream.id
+        self._infos[stream.id] = stream
+        self._by_client.setdefault(origin, {})[name] = stream.id
+        change.added.add(stream.id)
+        topic = self._topics.get(name)
+        if topic is None:
+            topic = self._topics[name] = _Topic()
+            for client, interest in self._interests.items():
+                if self._takes(client, interest, name):
+                    interest.topics.add(name)
+                    topic.takers.add(client)
+        topic.streams[origin] = stream.id
+        change.before.setdefault(stream.id, ())
+        self._routes[stream.id] = tuple(sorted(topic.takers - {origin}))
+
+    def _remove(self, stream: StreamId, change: "_Collector") -> None:
+        change.removed.add(stream)
+        change.before.setdefault(stream, self._routes.pop(stream))
+        del self._infos[stream]
+        del self._by_client[stream.origin][stream.topic]
+        topic = self._topics[stream.topic]
+        del topic.streams[stream.origin]
+        if not topic.streams:
+            for client in topic.takers:
+                self._interests[client].topics.discard(stream.topic)
+            del self._topics[stream.topic]
+
+    def _set_interest(self, client: ClientName, interest: _Interest | None, change: "_Collector") -> None:
+        old = self._interests.pop(client, None)
+        if interest is not None:
+            interest.topics = old.topics if old is not None else set()
+            self._interests[client] = interest
+            interest.left = self._to_look_at(interest)
+            self._match_some(client, interest, change)
+        elif old is not None:
+            for name in old.topics:
+                self._set_taker(client, name, change, takes=False)
+
+    def _to_look_at(self, interest: _Interest) -> deque[TopicName]:
+        """The names that may come to the interest or leave it, those that it names itself first."""
+        if interest.patterns.texts:
+            return deque(self._topics)
+        named = interest.exact & self._topics.keys()
+        return deque((*sorted(named - interest.topics), *sorted(interest.topics - named)))
+
+    def _takes(self, client: ClientName, interest: _Interest, name: TopicName) -> bool:
+        """Whether the client wants the name and may have it. What may take long is asked last."""
+        steps = interest.patterns.steps(name)
+        if steps:
+            if not self._access.may_subscribe(client, name):
+                return False
+            self.spent_units += steps * len(name)
+            return interest.wants(name)
+        return interest.wants(name) and self._access.may_subscribe(client, name)
+
+    def _match_some(self, client: ClientName, interest: _Interest, change: "_Collector") -> None:
+        """Match names that are left against the client's rights and interest, one slice of them at least by one."""
+        left = interest.left
+        while left:
+            name = left.popleft()
+            self.spent_units += NAME_UNITS
+            if name not in self._topics:
+                continue  # gone meanwhile
+            takes = self._takes(client, interest, name)
+            if takes != (name in interest.topics):
+                (interest.topics.add if takes else interest.topics.discard)(name)
+                self._set_taker(client, name, change, takes=takes)
+                self.spent_units += ROUTE_UNITS
+                if takes:
+                    self.spent_units += sum(map(self.route_units, self._topics[name].streams.values()))
+            if self.spent_units >= SLICE_UNITS:
+                return
+        if not interest.patterns.texts and not interest.exact:
+            del self._interests[client]
+
+    def _set_taker(self, client: ClientName, name: TopicName, change: "_Collector", *, takes: bool) -> None:
+        topic = self._topics[name]
+        (topic.takers.add if takes else topic.takers.discard)(client)
+        for stream in topic.streams.values():
+            if stream.origin != client:
+                route = self._routes[stream]
+                change.before.setdefault(stream, route)
+                at = bisect_left(route, client)
+                self._routes[stream] = (*route[:at], client, *route[at:]) if takes else route[:at] + route[at + 1 :]
+
+    def validate(self) -> None:
+        """Check the tables against each other and against brute force; raises AssertionError."""
+        for stream, info in self._infos.items():
+            name = stream.topic
+            route = self._routes[stream]
+            expected = tuple(
+                sorted(
+                    client
+                    for client, interest in self._interests.items()
+                    if client != stream.origin
+                    and self._access.may_subscribe(client, name)
+                    and (client in route if name in interest.left else interest.wants(name))
+                )
+            )
+            assert info.id == stream, f"{stream} is filed under another id"
+            assert route == expected, f"{stream}: routes {route}, expected {expected}"
+            assert self._boots[stream.origin] == stream.boot, f"{stream} is of a retired boot"
+            assert self._topics[name].streams[stream.origin] == stream, f"{stream} does not hold its name"
+            assert self._by_client[stream.origin][name] == stream, f"{stream} is not among its origin's streams"
+            assert self._access.may_publish(stream.origin, name), f"{stream} may not be published"
+        assert self._routes.keys() == self._infos.keys(), "routes of unknown streams"
+        assert sum(map(len, self._by_client.values())) == len(self._infos), "streams by client differ"
+        assert sum(len(topic.streams) for topic in self._topics.values()) == len(self._infos), "names differ"
+        for name, topic in self._topics.items():
+            assert topic.streams, f"{name} has no stream"
+            alone = len(topic.streams) == 1
+            assert alone or all(self._infos[held].spec.many_writers for held in topic.streams.values()), name
+            takers = {client for client, interest in self._interests.items() if name in interest.topics}
+            assert topic.takers == takers, f"{name}: takers differ"
+        for interest in self._interests.values():
+            assert interest.topics <= self._topics.keys(), "interest in unknown names"
+
+
+class _Collector:
+    """Gathers one call's changes: routes are compared with how they were `before` it, so detours do not show."""
+
+    def __init__(self) -> None:
+        self.added: set[StreamId] = set()
+        self.removed: set[StreamId] = set()
+        self.denied: set[Denied] = set()
+        self.before: dict[StreamId, tuple[ClientName, ...]] = {}
+
+    def result(self, routes: dict[StreamId, tuple[ClientName, ...]]) -> RouteChange:
+        matched: list[Match] = []
+        unmatched: list[Match] = []
+        wanted: list[StreamId] = []
+        unwanted: list[StreamId] = []
+        for stream, before in sorted(self.before.items()):
+            after = routes.get(stream, ())
+            if before == after:
+                continue
+            matched += [Match(client, stream) for client in set(after).difference(before)]
+            unmatched += [Match(client, stream) for client in set(before).difference(after)]
+            if not before:
+                wanted.append(stream)
+            elif not after and stream not in self.removed:
+                unwanted.append(stream)
+        return RouteChange(
+            added=tuple(sorted(self.added)),
+            removed=tuple(sorted(self.removed)),
+            matched=tuple(sorted(matched)),
+            unmatched=tuple(sorted(unmatched)),
+            wanted=tuple(wanted),
+            unwanted=tuple(unwanted),
+            denied=tuple(sorted(self.denied)),
+        )
+
+
+def type_problem(mine: TopicInfo, theirs: TopicInfo) -> str | None:
+    """How two descriptions of one topic contradict each other, as a phrase that names both, or None.
+
+    Hashes of different encodings (ROS 1 md5, ROS 2 RIHS01) cannot be compared, nor can empty ones.
+    """
+    if plain_type(mine.type_name) != plain_type(theirs.type_name):
+        return f"its type is {mine.type_name}, and {theirs.type_name}"
+    comparable = mine.encoding is theirs.encoding and mine.type_hash and theirs.type_hash
+    if comparable and mine.type_hash != theirs.type_hash:
+        return f"its {mine.type_name} has hash {mine.type_hash}, and {theirs.type_hash}"
+    return None
+
+
+def _refused(error: PatternError, client: ClientName) -> RefusedError:
+    if error.text is not None:
+        return BadPatternError(error.text, str(error))
+    return RefusedError("too_many_patterns", f"{client}: {error}")
+
+
+def _same(one: StreamInfo, other: StreamInfo) -> bool:
+    return (
+        one.info == other.info
+        and one.spec == other.spec
+        and one.attributes == other.attributes
+        and one.definition_hash == other.definition_hash
+    )

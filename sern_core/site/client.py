@@ -1,0 +1,519 @@
+"""The client daemon's core: one link to the relay, what this site publishes, what it receives. Pure.
+
+The shell (sern_client) feeds it endpoint messages and lane bytes, and is told through `ClientEvents` which streams
+appear and which messages have their turn. Everything about bandwidth, order, replay and loss is in the link below.
+"""
+
+from collections.abc import Callable, Collection, Sequence
+from contextlib import suppress
+from dataclasses import replace
+from typing import Final, ParamSpec, Protocol
+
+from sern_core.bodies.codecs import CodecProfile, Coder
+from sern_core.link.definitions import DefinitionStore
+from sern_core.link.link import Link
+from sern_core.site.peers import Peers, PeerView
+from sern_core.stream.decoding import Decoder
+from sern_core.stream.in_stream import InStream
+from sern_core.stream.latched import LatchedCache
+from sern_core.stream.out_channel import OutChannel
+from sern_core.stream.out_message import OutMessage, in_sequence
+from sern_core.vocabulary.codec_names import Compression
+from sern_core.vocabulary.errors import ConfigError, WireError
+from sern_core.vocabulary.ledger import MAX_TOPICS, ReceiveLedger
+from sern_core.vocabulary.message import Message, StreamId, StreamInfo, TopicInfo, TopicSpec
+from sern_core.vocabulary.params import LinkParams, SchedulerParams
+from sern_core.vocabulary.trace import DecisionTrace, TraceEvent
+from sern_core.vocabulary.types import ClientName, DropReason, ObjectKind, TopicName
+from sern_core.wire import framing
+from sern_core.wire.announce import MAX_STRINGS, Announcement, check_stream
+from sern_core.wire.numbering import Numbering
+
+P = ParamSpec("P")
+
+RELAY_NAME = ClientName("relay")
+"""What the relay is called until its WELCOME says its own name."""
+
+MAX_RUNS_TOLD: Final = 1_000
+"""Runs of messages that are told of one by one: each is a line in a log."""
+
+
+class ClientEvents(Protocol):
+    """What the shell is told."""
+
+    def link_up(self, *, resumed: bool) -> None: ...
+
+    def link_down(self, reason: str) -> None: ...
+
+    def rejected(self, code: str, text: str) -> None:
+        """The relay refused the session."""
+
+    def lane_offered(self, parameters: framing.Envelope) -> None:
+        """The relay has opened a datagram session for us; open the socket, then call `ClientCore.link.open_lane`."""
+
+    def lane_closed(self) -> None:
+        """The datagram lane ended with its session: close its socket."""
+
+    def stream_opened(self, stream: StreamInfo) -> None:
+        """A stream from elsewhere, definition included. Raises ConfigError if this site cannot publish it."""
+
+    def stream_closed(self, stream: StreamInfo) -> None: ...
+
+    def message(self, stream: StreamInfo, message: Message, *, now: float) -> None: ...
+
+    def expired(self, stream: StreamInfo, seq: int, reason: DropReason) -> None:
+        """A reliable message of a stream from elsewhere was dropped on its way; it is reported in its turn."""
+
+    def skipped(self, stream: StreamInfo, count: int) -> None:
+        """`count` messages of a reliable stream were given up before this site was told of it again."""
+
+    def send_dropped(self, stream: StreamInfo, first: int, count: int, reason: DropReason, where: str) -> None:
+        """Messages of ours, `count` from seq `first` on, were dropped: here (`where` is empty), or further on for the
+        client `where`. There may be 100,000 of them: nothing is to be done for each. Where they lie in very
+        many runs, one run has them all, and what lies between them, which was told before."""
+
+    def wanted(self, stream: StreamInfo, wanted: bool) -> None:
+        """Whether anybody at the far side wants a stream of ours; said again after every change."""
+
+    def publication_refused(self, stream: StreamInfo, code: str, text: str) -> None: ...
+
+    def subscription_refused(self, code: str, text: str) -> None:
+        """Something that this site named is not ours to have, or the relay takes none of our patterns."""
+
+    def undecodable(self, stream: StreamInfo, problem: str) -> None:
+        """The body of a message could not be decoded: it is dropped. Said once for each topic."""
+
+    def fault(self, error: Exception) -> None:
+        """Something raised what nobody expects, in the core or in one of these methods: log it with its traceback and
+        count it. What it was about is given up, everything else goes on."""
+
+
+def _announced(stream: StreamInfo) -> StreamInfo:
+    """What its origin says of a stream, without what is filled in here."""
+    return replace(stream, info=replace(stream.info, definition=""), definition_hash="")
+
+
+class ClientCore:
+    """One client. `boot` is a random 63-bit number of this process, `now` any monotonic time in seconds.
+
+    With a `coder` what is published is compressed as each topic's spec says; without one it is sent as it comes.
+    """
+
+    def __init__(
+        self,
+        *,
+        name: ClientName,
+        boot: int,
+        events: ClientEvents,
+        link: LinkParams,
+        scheduler: SchedulerParams,
+        trace: DecisionTrace | None = None,
+        now: float,
+        lossless: bool = True,
+        coder: Coder | None = None,
+    ) -> None:
+        self.name = name
+        self.boot = boot
+        self.events = events
+        self.trace = trace or DecisionTrace(enabled=False)
+        self.definitions = DefinitionStore()
+        self.received = ReceiveLedger()
+        """Counters of what arrives, by topic: delivered, and dropped on arrival for a reason."""
+        self.faults = 0
+        """Errors of ours so far that nobody expects."""
+        self.peers = Peers()
+        """The clients whose streams this one takes, and whether they are there."""
+        self.patterns: tuple[str, ...] = ()
+        self.attributes: dict[str, str] = {}
+        """Metadata of this node, for the object registry."""
+        self._numbering = Numbering()  # of topics that were offered before
+        self._latched: dict[StreamId, LatchedCache] = {}  # for a relay that comes back with nothing
+        self._open: dict[StreamId, StreamInfo] = {}  # as they were announced
+        self._refused: set[StreamId] = set()  # announced, but this site could not publish them
+        self._undecodable: set[TopicName] = set()
+        self._held: dict[StreamId, dict[int, None]] = {}  # handed on, and not to be confirmed yet
+        self.coder = coder or Coder(max_bytes=link.max_message_bytes)
+        self._decoder = Decoder[InStream](
+            self.coder, lambda stream: stream.stream, self._handle, self._failed, self._settled, fault=self.fault
+        )
+        self.link = Link(
+            name=name,
+            boot=boot,
+            peer=RELAY_NAME,
+            initiator=True,
+            handler=self,
+            definitions=self.definitions,
+            link=link,
+            scheduler=scheduler,
+            trace=self.trace,
+            now=now,
+            lossless=lossless,
+        )
+        self.link.on_tidy = self._tidy
+        self.link.on_stray = self.received.stray
+        if coder is not None:
+            self.link.encode_with(coder)
+
+    def _tidy(self, now: float) -> None:
+        """Fold the counters of topics that ended long ago, and forget their numbers."""
+        self.received.tidy({stream.topic for stream in self.link.streams}, now=now)
+        self._numbering.tidy(now=now)
+
+    # --- publishing -----------------------------------------------------------------------------------------------
+
+    def publish(
+        self,
+        info: TopicInfo,
+        spec: TopicSpec,
+        *,
+        attributes: dict[str, str] | None = None,
+        owed: tuple[ClientName, ...] = (),
+        now: float,
+    ) -> OutChannel:
+        """Offer a topic under its global name. Offering it again after `unpublish` goes on counting where it ended.
+        `attributes` travel with its announcement. `owed`: of a reliable topic, clients that it is for: a relay that has
+        not heard of them yet keeps it for them.
+
+        Raises UsageError if it is offered already, or no relay would accept it.
+        """
+        identity = StreamId(self.name, self.boot, info.name)
+        first = self._numbering.last(identity) + 1
+        stream = StreamInfo(identity, info, spec, dict(attributes or {}))
+        check_stream(stream)
+        channel = self.link.open_channel(stream, first=first, owed=owed, now=now)
+        if spec.latched:
+            self._latched[identity] = LatchedCache(spec.depth, spec.max_queue_bytes)
+        return channel
+
+    def unpublish(self, channel: OutChannel, *, now: float) -> None:
+        self._numbering.ended(channel.stream.id, channel.next_seq - 1, now=now)
+        self._latched.pop(channel.stream.id, None)
+        self.link.close_channel(channel, DropReason.SHUTDOWN, now=now)
+
+    def send(self, channel: OutChannel, body: bytes, stamp_ns: int, *, born_s: float | None = None, now: float) -> bool:
+        """Offer one message. False: refused, the reliable queue is full; offer it again later or count it lost.
+        `born_s`: when it was taken, if that was before `now`."""
+        message = Message(channel.stream.id, channel.next_seq, body, stamp_ns, now if born_s is None else born_s)
+        accepted = self.link.submit(channel, message, now=now)
+        if accepted and channel.spec.latched:
+            self._latched[channel.stream.id].add(message)
+        return accepted
+
+    def set_compression(self, channel: OutChannel, setting: Compression | None, *, now: float) -> None:
+        """Compress what leaves this channel from the next message on with another mode; None: `auto`."""
+        self.link.set_compression(channel, setting, now=now)
+
+    def codec_profiles(self, channel: OutChannel) -> dict[Compression, CodecProfile]:
+        """What each mode makes of this channel's messages, as measured so far."""
+        return {} if channel.codec is None else dict(channel.codec.profiles)
+
+    def drop(self, channel: OutChannel, size_bytes: int, reason: DropReason, *, now: float) -> None:
+        """Count a message of this channel that was given up before it was offered to the link."""
+        channel.counters.offer(size_bytes)
+        channel.counters.drop(reason, size_bytes)
+        self.trace.record(now, channel.stream.id.topic, TraceEvent.DROPPED, reason=reason)
+
+    # --- receiving ------------------------------------------------------------------------------------------------
+
+    def subscribe(self, patterns: tuple[str, ...], *, now: float) -> None:
+        """Full-match patterns of the global names this site wants; replaces the earlier ones."""
+        self.patterns = patterns
+        self._tell(self.peers.subscribed, patterns, now=now)
+        if self.link.established:
+            self._send_subscription(now)
+
+    def _send_subscription(self, now: float, known: Sequence[ClientName] = ()) -> None:
+        """`known`: of whom the relay is asked whether they are here."""
+        for start in range(0, len(known), MAX_STRINGS):
+            names = list(known[start : start + MAX_STRINGS])
+            self.link.send_control({"t": "subscribe", "patterns": [], "more": True, "known": names}, now=now)
+        parts = [self.patterns[i : i + MAX_STRINGS] for i in range(0, len(self.patterns), MAX_STRINGS)] or [()]
+        batch: list[str] = []
+        for part in parts:
+            for pattern in part:
+                # An envelope holds 4 KiB: long patterns travel in more parts.
+                if sum(len(item) + 4 for item in batch) + len(pattern) > framing.MAX_ENVELOPE_BYTES // 2:
+                    self.link.send_control({"t": "subscribe", "patterns": batch, "more": True}, now=now)
+                    batch = []
+                batch.append(pattern)
+            if part is not parts[-1]:
+                self.link.send_control({"t": "subscribe", "patterns": batch, "more": True}, now=now)
+                batch = []
+        self.link.send_control({"t": "subscribe", "patterns": batch, "more": False, "peers": True}, now=now)
+
+    def look_at_peers(self, *, now: float) -> list[PeerView]:
+        """Who is there of those whose streams we take, by name. Call about once a second: that the own link has fallen
+        silent is found here."""
+        self.peers.reached(self.link.established and not self.link.lane.stalled, now=now)
+        return self.peers.look(now=now)
+
+    def put_object(
+        self,
+        object_id: str,
+        kind: ObjectKind,
+        type_name: str,
+        *,
+        attributes: dict[str, str] | None = None,
+        value: bytes = b"",
+        wall_ns: int,
+        now: float,
+    ) -> None:
+        """Create or replace a cross-reality object of ours at the relay (node metadata, a transform, a patch)."""
+        envelope: framing.Envelope = {
+            "t": "object",
+            "op": "put",
+            "id": object_id,
+            "kind": str(kind),
+            "type": type_name,
+            "attr": dict(attributes or {}),
+            "wall": wall_ns,
+        }
+        self.link.send_control(envelope, value, now=now)
+
+    def delete_object(self, object_id: str, *, now: float) -> None:
+        self.link.send_control({"t": "object", "op": "delete", "id": object_id}, now=now)
+
+    # --- errors of ours -------------------------------------------------------------------------------------------
+
+    def fault(self, error: Exception) -> None:
+        """Tell the shell of an error that nobody expects."""
+        self.faults += 1
+        with suppress(Exception):  # counted above; there is nobody left to tell
+            self.events.fault(error)
+
+    def _tell(self, call: Callable[P, object], *args: P.args, **kwargs: P.kwargs) -> None:
+        """Tell the shell; what it raises stops nothing here."""
+        try:
+            call(*args, **kwargs)
+        except Exception as error:  # noqa: BLE001  (the shell's, and no reason to leave our own work half done)
+            self.fault(error)
+
+    # --- LinkHandler ----------------------------------------------------------------------------------------------
+
+    def on_fault(self, link: Link, error: Exception, *, now: float) -> None:
+        self.fault(error)
+
+    def on_up(self, link: Link, *, resumed: bool, now: float) -> None:
+        if not resumed:
+            for identity, cache in self._latched.items():
+                link.by_stream[identity].prime(cache.replay(), now=now)
+        self.peers.session_began(now=now)
+        self._send_subscription(now, self.peers.asked())
+        self._tell(self.events.link_up, resumed=resumed)
+
+    def on_down(self, link: Link, reason: str, *, now: float) -> None:
+        self._tell(self.events.link_down, reason)
+        self._tell(self.peers.session_ended, now=now)
+
+    def on_lane_closed(self, link: Link) -> None:
+        self._tell(self.events.lane_closed)
+
+    def on_rejected(self, link: Link, code: str, text: str, *, now: float) -> None:
+        self._tell(self.events.rejected, code, text)
+
+    def on_announce(self, link: Link, announcement: Announcement, *, now: float) -> bool | None:
+        stream = link.streams[announcement.stream.id]
+        digest = announcement.definition_hash
+        identity = stream.stream.id
+        link.outlived(identity.origin, identity.boot, now=now)
+        opened = self._open.get(identity)
+        if opened is not None and opened != _announced(announcement.stream):
+            # Its origin ended it and began it anew while we were away, as something else.
+            self._close_stream(stream, now)
+            stream.stream = replace(announcement.stream, attributes={**announcement.stream.attributes})
+            stream.stream.definition_hash = digest
+        if digest and digest not in self.definitions:
+            return None  # asked for; answered when it is here
+        return self._open_stream(stream)
+
+    def _open_stream(self, stream: InStream) -> bool:
+        identity = stream.stream.id
+        if identity.origin == self.name:
+            return False  # our own, come back through somebody else
+        if identity not in self._open:
+            info = stream.stream.info
+            digest = stream.stream.definition_hash
+            complete = TopicInfo(
+                info.name,
+                info.type_name,
+                info.encoding,
+                info.type_hash,
+                self.definitions.get(digest),
+                info.latched,
+                info.reliable,
+            )
+            announced = _announced(stream.stream)
+            stream.stream = replace(stream.stream, info=complete)
+            if not self._opened(stream.stream):
+                self._refused.add(identity)
+                return False
+            self._refused.discard(identity)
+            self._open[identity] = announced
+            self._tell(self.peers.opened, identity.origin, now=self.link.now)
+        return True
+
+    def _opened(self, stream: StreamInfo) -> bool:
+        """Whether the shell can publish this stream."""
+        for _ in range(2):
+            try:
+                self.events.stream_opened(stream)
+            except ConfigError:
+                return False  # the shell has logged it; nothing else stops
+            except Exception as error:  # noqa: BLE001  (of one stream, whatever its definition holds; it may pass)
+                self.fault(error)
+                self._tell(self.events.stream_closed, stream)  # as far as it had come
+            else:
+                return True
+        return False
+
+    def reconsider(self, *, now: float) -> None:
+        """Open what this site could not publish when it was announced, if it can now: another stream may have been in
+        its way, which has ended."""
+        for stream in list(self.link.incoming.values()):
+            if stream.stream.id in self._refused and self._open_stream(stream):
+                self.link.answer(stream, True, now=now)
+
+    @property
+    def refused(self) -> Collection[StreamId]:
+        """The streams from elsewhere that there are, and that this site could not publish."""
+        return self._refused
+
+    @property
+    def opened(self) -> Collection[StreamId]:
+        """The streams from elsewhere that are open here."""
+        return self._open.keys()
+
+    def _close_stream(self, stream: InStream, now: float) -> None:
+        self._decoder.forget(stream.stream.id, now=now)
+        self._held.pop(stream.stream.id, None)
+        del self._open[stream.stream.id]
+        self._tell(self.peers.closed, stream.stream.id.origin, stream.stream.id.topic, now=now)
+        self._tell(self.events.stream_closed, stream.stream)
+
+    def on_definition(self, link: Link, digest: str, *, now: float) -> None:
+        for stream in list(link.incoming.values()):
+            if stream.stream.definition_hash == digest:
+                link.answer(stream, self._open_stream(stream), now=now)
+
+    def on_retract(self, link: Link, stream: InStream, *, now: float) -> None:
+        self._refused.discard(stream.stream.id)
+        if stream.stream.id in self._open:
+            self._close_stream(stream, now)
+
+    def on_message(self, link: Link, stream: InStream, message: Message, *, now: float) -> None:
+        decoder = self._decoder
+        decoder.message(stream, message, now=now)
+        stream.unhandled = self._oldest(message.stream) if decoder.running or self._held else 0
+
+    def _handle(self, stream: InStream, message: Message, now: float) -> None:
+        """A message has had its turn and is decoded."""
+        lifespan_s = stream.lifespan_s
+        if stream.unhandled and not stream.reliable and lifespan_s is not None and message.age_s(now) > lifespan_s:
+            self._failed(stream, message, DropReason.LIFESPAN, "", now)  # while it was decoded
+            return
+        if message.tombstone:
+            reason = message.drop_reason
+            self.received.of(stream.stream).drop_arrived(reason)
+            self._tell(self.events.expired, stream.stream, message.seq, reason)
+            return
+        try:
+            self.events.message(stream.stream, message, now=now)
+        except Exception as error:  # noqa: BLE001  (of one message: the stream goes on, whatever its bodies do)
+            self.fault(error)
+            self._failed(stream, message, DropReason.FAULT, "", now)
+        else:
+            self.received.of(stream.stream).arrived(len(message.body), now - message.born_s, now)
+            if not message.replay:  # which is the relay's
+                self.peers.arrived(message.stream.origin, now=now)
+
+    def _failed(self, stream: InStream, message: Message, reason: DropReason, problem: str, now: float) -> None:
+        """A message has had its turn and cannot be handed on."""
+        topic = stream.stream.id.topic
+        self.received.of(stream.stream).drop_arrived(reason)
+        self.trace.record(now, topic, TraceEvent.DROPPED, seq=message.seq, reason=reason, peer=self.link.peer)
+        if self.link.fates is not None and (not stream.reliable or reason is DropReason.DISCONNECTED):
+            self.link.fates.discarded(stream.stream, message.seq, reason, self.link.peer)
+        told = self._undecodable
+        if reason is DropReason.UNDECODABLE and topic not in told and len(told) < MAX_TOPICS:
+            told.add(topic)
+            self._tell(self.events.undecodable, stream.stream, problem)
+        if stream.reliable and reason is not DropReason.DISCONNECTED:
+            self.link.report_drop(stream, message.seq, reason, self.name, now=now)
+            self._tell(self.events.expired, stream.stream, message.seq, reason)
+
+    def _settled(self, stream: InStream) -> None:
+        """A body is decoded, or dropped: the peer may be told how far the stream has come."""
+        identity = stream.stream.id
+        current = self.link.streams.get(identity)
+        if current is not None:
+            self.link.handled(current, self._oldest(identity))
+
+    def _oldest(self, identity: StreamId) -> int:
+        """The seq of the oldest message of a stream that has had its turn and is not dealt with, 0: none."""
+        decoding = self._decoder.oldest(identity)
+        if not self._held:
+            return decoding
+        held = next(iter(self._held.get(identity, ())), 0)
+        return min(decoding, held) if decoding and held else decoding or held
+
+    def hold(self, identity: StreamId, seq: int) -> None:
+        """Called for the reliable message that is just being handed on: it is not confirmed before `release`."""
+        self._held.setdefault(identity, {})[seq] = None
+
+    def release(self, identity: StreamId, seq: int, *, lost: DropReason | None = None, now: float) -> None:
+        """A message that was held has been dealt with, or was `lost` after all; then its origin is told."""
+        held = self._held.get(identity)
+        if held is None or seq not in held:
+            return  # the stream has ended
+        del held[seq]
+        if not held:
+            del self._held[identity]
+        stream = self.link.streams.get(identity)
+        if stream is None:
+            return
+        if lost is not None:
+            self.trace.record(now, identity.topic, TraceEvent.DROPPED, seq=seq, reason=lost, peer=self.link.peer)
+            self.link.report_drop(stream, seq, lost, self.name, now=now)
+            self.events.expired(stream.stream, seq, lost)
+        self._settled(stream)
+
+    def on_in_drop(self, link: Link, stream: InStream, reason: DropReason, nbytes: int, count: int) -> None:
+        self.received.of(stream.stream).drop_arrived(reason, count)
+        self.trace.record(link.now, stream.stream.id.topic, TraceEvent.DROPPED, reason=reason, peer=link.peer)
+
+    def on_out_drop(self, link: Link, channel: OutChannel, outs: Sequence[OutMessage], reason: DropReason) -> None:
+        runs = list(in_sequence(outs))
+        if channel.reliable and len(runs) > MAX_RUNS_TOLD:
+            runs = [outs]  # what lies between was told before
+        for run in runs:
+            first, count = run[0], run[-1].seq - run[0].seq + 1
+            self._tell(self.events.send_dropped, channel.stream, first.seq, count, reason, first.lost_to)
+
+    def on_delivered(self, link: Link, channel: OutChannel, *, now: float) -> None:
+        """The ledger has counted it."""
+
+    def on_wanted(self, link: Link, channel: OutChannel, *, now: float) -> None:
+        self._tell(self.events.wanted, channel.stream, bool(channel.wanted))
+
+    def on_refused(self, link: Link, channel: OutChannel, code: str, text: str, *, now: float) -> None:
+        self._tell(self.events.publication_refused, channel.stream, code, text)
+
+    def on_skipped(self, link: Link, stream: InStream, count: int, *, now: float) -> None:
+        if stream.known and stream.stream.id in self._open:
+            self._tell(self.events.skipped, stream.stream, count)
+
+    def on_control(self, link: Link, envelope: framing.Envelope, attachment: bytes, *, now: float) -> None:
+        kind = envelope["t"]
+        if kind == "lane":
+            self.events.lane_offered(envelope)
+        elif kind == "denied":
+            code, why = framing.take_str(envelope, "code", max_length=64), framing.take_str(envelope, "why")
+            self._tell(self.events.subscription_refused, code, why)
+        elif kind == "peers":
+            self.peers.told(envelope, now=now)
+        else:
+            raise WireError(f"unknown control message {kind!r}")
+
+    def ask_lane(self, ciphers: Sequence[str], *, now: float) -> None:
+        """Ask the relay for a datagram session; `ClientEvents.lane_offered` has the answer, if it has one."""
+        self.link.send_control({"t": "lane_ask", "ciphers": list(ciphers)}, now=now)

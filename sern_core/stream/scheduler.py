@@ -1,0 +1,513 @@
+"""Which topic may send its next fragment: the paper's eq. (priority_score) and Alg. prioritize, made to hold a link.
+
+The scheduler holds no messages. The link names each topic by a small integer, its *slot*, says what is pending there
+(`offer`, `withdraw`), asks whose turn it is each time the link can take one more fragment (`pick`), and says what went
+out (`charge`). A choice is late and cheap: P is evaluated at every fragment, so a newcomer preempts within one.
+
+Ordering `class` (the reading of "priority first" that delivers it; P alone divides by size and starves a large
+urgent message) serves by (class, −P). A class is served ahead of a backlogged more urgent one only
+- from its floor: each charged byte earns every backlogged lower class `floor` bytes of credit (deficit round robin);
+  a class whose credit reaches a quantum goes next, and pays with the bytes it sends;
+- when the token bucket of class 0 is spent: class 0 may take `class0_share` of the link while others wait;
+- while the more urgent message is being encoded.
+
+Ordering `paper` is Alg. prioritize as printed: once per interval all pending messages are sorted by P, classes mixed;
+those that fit the interval's budget B·Δt are sent whole, the others wait, and a stale one of the lowest class is
+reported for dropping. A message larger than the budget is therefore never sent. A message that was marked and not
+finished within its interval stays marked, for the algorithm has handed it to the transport.
+
+In both orderings only class 0 within its bucket passes a closed window, and every class-0 byte counts in the bucket.
+"""
+
+from dataclasses import dataclass
+from enum import StrEnum
+from math import floor
+from typing import Final, NamedTuple
+
+from sern_core.stream.pending import PendingClass
+from sern_core.vocabulary.errors import UsageError
+from sern_core.vocabulary.params import SchedulerParams
+from sern_core.vocabulary.types import CLASSES, Ordering, PriorityClass
+
+DEFAULT_QUANTUM_BYTES: Final = 1200
+"""Credit that lets a lower class go next: one fragment of the UDP lane."""
+CREDIT_QUANTA: Final = 4
+"""Most credit a class can save up, in quanta: what it may send in a row when the window opens again."""
+BURST_BYTES: Final = 4096
+"""Least size of the class-0 bucket: a handful of poses and commands at once, on any link."""
+BURST_S: Final = 0.05
+"""Size of the class-0 bucket on faster links: what its rate delivers in this time."""
+_MIN_RATE: Final = 1.0  # bytes/s; keeps the bucket's arithmetic finite while the link is stalled at 0
+_INF: Final = float("inf")
+
+
+class WaitReason(StrEnum):
+    """Why a pending message is not the next one."""
+
+    OUTRANKED = "outranked"  # another message of its class has a higher score
+    CLASS = "class"  # a more urgent class goes first
+    FLOOR = "floor"  # a less urgent class is served from its floor
+    BUCKET = "bucket"  # the token bucket of class 0 is spent
+    WINDOW = "window"  # the window is closed to its class
+    INTERVAL = "interval"  # ordering `paper`: did not fit this interval's budget
+    ENCODING = "encoding"  # withdrawn while it is encoded
+
+
+@dataclass(frozen=True, slots=True)
+class Standing:
+    """What the scheduler thinks of one slot at one time, for people and for the decision log.
+
+    `score` is P in 1/bytes with the clipped age; `age_s` is not clipped. `rank` counts the pending messages that go
+    before it: by (class, −P), or by −P in ordering `paper`. `waits_for` is None when this slot is the next one.
+    """
+
+    slot: int
+    priority: PriorityClass
+    weight: float
+    age_s: float
+    size_bytes: float
+    score: float
+    rank: int
+    waits_for: WaitReason | None
+
+
+class _Entry(NamedTuple):
+    priority: PriorityClass
+    weight: float
+    size_bytes: float
+    since_s: float
+    stale_after_s: float | None
+
+
+_new_entry = tuple.__new__  # builds an _Entry in half the time of its constructor; one is built per offer
+
+
+class _Bucket:
+    """Token bucket of class 0, kept as the time at which it is no longer spent: asking is one comparison.
+
+    Tokens at `now` are (now − ready_s) / s_per_byte, at most the burst and at least minus the burst.
+    """
+
+    __slots__ = ("_burst_s", "_s_per_byte", "_share", "ready_s")
+
+    def __init__(self, share: float, now: float) -> None:
+        self._share = share
+        self._s_per_byte = 0.0  # 0: no known rate, never spent
+        self._burst_s = 0.0  # time that refills an empty bucket
+        self.ready_s = now
+
+    def set_rate(self, rate_bps: float | None, now: float) -> None:
+        if rate_bps is None:
+            self._s_per_byte = self._burst_s = 0.0
+            self.ready_s = now
+            return
+        rate = max(self._share * rate_bps / 8.0, _MIN_RATE)  # bytes/s
+        burst_bytes = max(float(BURST_BYTES), BURST_S * rate)
+        tokens = min(max(self.tokens_bytes(now), -burst_bytes), burst_bytes)
+        self._s_per_byte = 1.0 / rate
+        self._burst_s = burst_bytes / rate
+        self.ready_s = now - tokens / rate
+
+    def take(self, nbytes: float, now: float) -> None:
+        burst_s = self._burst_s
+        ready_s = self.ready_s
+        if ready_s < now - burst_s:
+            ready_s = now - burst_s
+        ready_s += nbytes * self._s_per_byte
+        self.ready_s = ready_s if ready_s < now + burst_s else now + burst_s
+
+    def tokens_bytes(self, now: float) -> float:
+        """Bytes class 0 may still send ahead of others; infinite without a known rate, negative in debt."""
+        if not self._s_per_byte:
+            return _INF
+        return min(now - self.ready_s, self._burst_s) / self._s_per_byte
+
+
+class _Interval:
+    """Alg. prioritize: the messages marked for sending, and the stale ones, as of the last interval boundary."""
+
+    __slots__ = ("_next_s", "_params", "_start_s", "budget_bytes", "marked", "stale")
+
+    def __init__(self, params: SchedulerParams, now: float) -> None:
+        self._params = params
+        self._start_s = now
+        self._next_s = now
+        self.budget_bytes = _INF  # B·Δt
+        self.marked: dict[int, None] = {}  # in the order of sending
+        self.stale: dict[int, None] = {}
+
+    @property
+    def next_s(self) -> float:
+        return self._next_s
+
+    def advance(self, entries: dict[int, _Entry], now: float) -> None:
+        """Run the algorithm if an interval boundary has passed. Marked messages have left the list M already."""
+        if now < self._next_s:
+            return
+        interval_s = self._params.interval_s
+        self._next_s = self._start_s + (floor((now - self._start_s) / interval_s) + 1) * interval_s
+        if self._next_s <= now:  # the quotient was rounded down across a boundary
+            self._next_s = now + interval_s
+        waiting = [
+            (-score(entry, now, self._params), slot, entry)
+            for slot, entry in entries.items()
+            if slot not in self.marked
+        ]
+        waiting.sort()
+        used_bytes = 0.0
+        for _, slot, entry in waiting:
+            if used_bytes + entry.size_bytes <= self.budget_bytes:
+                self.marked[slot] = None
+                self.stale.pop(slot, None)
+                used_bytes += entry.size_bytes
+            elif (
+                entry.priority == PriorityClass.BULK
+                and entry.stale_after_s is not None
+                and now - entry.since_s > entry.stale_after_s
+            ):
+                self.stale[slot] = None
+
+    def offered(self, slot: int, old: _Entry | None, new: _Entry, *, encoded: bool) -> None:
+        self.stale.pop(slot, None)
+        if slot in self.marked and not encoded:
+            same_message = old is not None and old.since_s == new.since_s and new.size_bytes <= old.size_bytes
+            if not same_message:
+                del self.marked[slot]
+
+    def withdrawn(self, slot: int, *, encoding: bool) -> None:
+        self.stale.pop(slot, None)
+        if not encoding:
+            self.marked.pop(slot, None)
+
+
+def score(entry: _Entry, now: float, params: SchedulerParams) -> float:
+    """P(m) of the paper's eq. (priority_score), age clipped at a_max; 1/bytes."""
+    age_s = min(now - entry.since_s, params.a_max_s)
+    return entry.weight / (entry.size_bytes + params.epsilon_bytes) * (1.0 + params.eta * age_s)
+
+
+class Scheduler:
+    """Decides which slot sends next. Times are seconds on one monotonic clock; `now` must not go back.
+
+    `quantum_bytes` is the credit that lets a lower class go next; a lane with larger fragments may raise it.
+    """
+
+    def __init__(self, params: SchedulerParams, *, now: float, quantum_bytes: float = DEFAULT_QUANTUM_BYTES) -> None:
+        if not 0.0 < quantum_bytes < _INF:
+            raise UsageError(f"Scheduler: quantum_bytes = {quantum_bytes!r} must be above 0")
+        self.params = params
+        self._epsilon_bytes = params.epsilon_bytes
+        self._floor = params.floor
+        self._quantum_bytes = quantum_bytes
+        self._credit_max = CREDIT_QUANTA * quantum_bytes
+        self._tables = tuple(PendingClass(eta=params.eta, a_max_s=params.a_max_s, origin_s=now) for _ in CLASSES)
+        self._control, self._state, self._bulk = self._tables
+        self._entries: dict[int, _Entry] = {}
+        self._encoding: dict[int, _Entry] = {}  # withdrawn while encoded: not served, but still backlog of its class
+        self._held = [0] * len(CLASSES)  # how many of `_encoding` there are, per class
+        self._state_credit = 0.0  # bytes that class 1 may send ahead of class 0; negative after a large fragment
+        self._bulk_credit = 0.0
+        self._bucket = _Bucket(params.class0_share, now)
+        self._interval = _Interval(params, now) if params.ordering is Ordering.PAPER else None
+
+    # What is pending
+
+    def offer(
+        self,
+        slot: int,
+        *,
+        priority: PriorityClass,
+        weight: float,
+        size_bytes: float,
+        since_s: float,
+        stale_after_s: float | None = None,
+    ) -> None:
+        """The slot has a pending message: a new head, or less of the same one left to send.
+
+        `weight` is κ(t), `size_bytes` the remaining size s(m) (an estimate will do). Age counts from `since_s`: the
+        message's birth, or for a coalesced topic the time the topic was last sent; not later than the next `pick`.
+        `stale_after_s` (ordering `paper`) is the age above which a message of class bulk may be reported as stale.
+        In ordering `paper` an offer with the same `since_s` and no larger size continues the same message.
+
+        Raises UsageError if `weight` is not above 0, `size_bytes` is negative, or a value is not finite.
+        """
+        gain = weight / (size_bytes + self._epsilon_bytes) if size_bytes >= 0.0 else 0.0
+        if not (0.0 < gain < _INF and -_INF < since_s < _INF):
+            raise UsageError(
+                f"Scheduler.offer: slot {slot}: weight = {weight!r} must be above 0, size_bytes = {size_bytes!r} not "
+                f"negative, since_s = {since_s!r} finite"
+            )
+        entries = self._entries
+        old = entries.get(slot)
+        entries[slot] = entry = _new_entry(_Entry, (priority, weight, size_bytes, since_s, stale_after_s))
+        if old is not None and old[0] is not priority:
+            self._remove(slot, old[0])
+        self._tables[priority].put(slot, gain, since_s)
+        if self._encoding or self._interval is not None:
+            encoded = self._release(slot)
+            if encoded is not None and encoded.priority is not priority:
+                self._settle_credit(encoded.priority)
+            if self._interval is not None:
+                self._interval.offered(slot, old, entry, encoded=encoded is not None)
+
+    def withdraw(self, slot: int, *, encoding: bool = False) -> None:
+        """Nothing of the slot can be sent now. Idempotent.
+
+        With `encoding` the message will be back: meanwhile others are served, its class keeps the credit of its floor,
+        and (ordering `paper`) it keeps its place in the interval. Without it, a class that has nothing else pending
+        loses its credit.
+        """
+        entry = self._entries.pop(slot, None)
+        if encoding and entry is not None:
+            self._encoding[slot] = entry
+            self._held[entry.priority] += 1
+        elif self._encoding and not encoding:
+            held = self._release(slot)
+            if held is not None:
+                self._settle_credit(held.priority)
+        if entry is not None:
+            self._remove(slot, entry[0])
+        if self._interval is not None:
+            self._interval.withdrawn(slot, encoding=encoding)
+
+    def _remove(self, slot: int, priority: PriorityClass) -> None:
+        table = self._tables[priority]
+        table.remove(slot)
+        if not table.slots:
+            self._settle_credit(priority)
+
+    def _release(self, slot: int) -> _Entry | None:
+        """The message is no longer being encoded."""
+        entry = self._encoding.pop(slot, None)
+        if entry is not None:
+            self._held[entry.priority] -= 1
+        return entry
+
+    def _settle_credit(self, priority: PriorityClass) -> None:
+        """Credit is for backlog only: a class without any starts from nothing (debts stay)."""
+        if not self._tables[priority].slots and not self._held[priority]:
+            if priority == 1:
+                self._state_credit = min(self._state_credit, 0.0)
+            elif priority == 2:
+                self._bulk_credit = min(self._bulk_credit, 0.0)
+
+    def pending(self, priority: PriorityClass) -> int:
+        """Slots of the class that could be served; those being encoded are not counted."""
+        return len(self._tables[priority].slots)
+
+    # Whose turn it is
+
+    def pick(self, *, now: float, window_open: bool = True) -> int | None:
+        """The slot to serve next, or None. Asking changes nothing: it may be asked again, or not be followed."""
+        if self._interval is not None:
+            return self._pick_marked(self._interval, now, window_open=window_open)
+        control = self._control
+        if control.slots and now >= self._bucket.ready_s:
+            if not window_open:
+                return control.best(now)
+            if self._state_credit >= self._quantum_bytes and self._state.slots:
+                return self._state.best(now)
+            if self._bulk_credit >= self._quantum_bytes and self._bulk.slots:
+                return self._bulk.best(now)
+            return control.best(now)
+        if not window_open:
+            return None
+        bulk = self._bulk
+        if self._state.slots:
+            if self._bulk_credit >= self._quantum_bytes and bulk.slots:
+                return bulk.best(now)
+            return self._state.best(now)
+        if bulk.slots:
+            return bulk.best(now)
+        return control.best(now) if control.slots else None  # spent, but nobody else wants the link
+
+    def pick_control(self, *, now: float, window_open: bool) -> int | None:
+        """The slot of class control to serve next on a connection of its own: beyond its share of the link it goes by
+        the window, and only where nobody else wants the link.
+
+        Ordering `class` only, like `pick_rest`.
+        """
+        control = self._control
+        if control.slots and (
+            now >= self._bucket.ready_s or (window_open and not (self._state.slots or self._bulk.slots))
+        ):
+            return control.best(now)
+        return None
+
+    def control_deadline(self) -> float | None:
+        """When `pick_control`, None by now with the window closed, can name a slot by time alone."""
+        return self._bucket.ready_s if self._control.slots else None
+
+    def within_share(self, now: float) -> bool:
+        """Whether class 0 has something left of its share of the link."""
+        return now >= self._bucket.ready_s
+
+    def pick_rest(self, *, now: float) -> int | None:
+        """The slot to serve next when class control has a connection of its own."""
+        state, bulk = self._state, self._bulk
+        if bulk.slots and (not state.slots or self._bulk_credit >= self._quantum_bytes):
+            return bulk.best(now)
+        return state.best(now) if state.slots else None
+
+    def _pick_marked(self, interval: _Interval, now: float, *, window_open: bool) -> int | None:
+        interval.advance(self._entries, now)
+        for slot in interval.marked:
+            entry = self._entries.get(slot)
+            if entry is None:
+                continue  # being encoded
+            if window_open or (entry.priority == 0 and now >= self._bucket.ready_s):
+                return slot
+        return None
+
+    def best(self, priority: PriorityClass, *, now: float) -> int | None:
+        """The slot of the class with the highest score, or None; neither window nor bucket nor floors are asked.
+
+        For a link that probes a stalled path with single fresh messages.
+        """
+        table = self._tables[priority]
+        return table.best(now) if table.slots else None
+
+    def charge(self, slot_priority: PriorityClass, nbytes: int, *, now: float) -> None:
+        """`nbytes` of that class were put on the wire, overhead included, whether or not `pick` had named it."""
+        bucket = self._bucket
+        if slot_priority == 0:
+            urgent_waits = True
+            bucket.take(nbytes, now)
+        else:
+            urgent_waits = bool(self._control.slots) and now >= bucket.ready_s
+        earned = self._floor * nbytes
+        # Served in its own right, a class pays nothing and saves nothing; served from its floor, it pays. What a
+        # fragment larger than the credit left as a debt is paid off by later traffic, backlog or not: else a class
+        # of single large messages would get more than its floor.
+        held = self._held
+        credit = self._state_credit + earned
+        limit = self._credit_max if self._state.slots or held[1] else 0.0
+        if slot_priority == 1:
+            if urgent_waits:
+                credit -= nbytes
+            else:
+                limit = 0.0
+        self._state_credit = credit if credit < limit else limit
+        credit = self._bulk_credit + earned
+        limit = self._credit_max if self._bulk.slots or held[2] else 0.0
+        if slot_priority == 2:
+            if urgent_waits or self._state.slots:
+                credit -= nbytes
+            else:
+                limit = 0.0
+        self._bulk_credit = credit if credit < limit else limit
+
+    def set_rate(self, rate_bps: float | None, *, now: float, full: bool = True) -> None:
+        """The link's capacity B; None when unknown, which leaves class 0 and the interval's budget unlimited.
+
+        `full` False: it carries that much, and there was never enough to send to see more. Class 0's share is of what
+        is known; the interval's budget is no limit then, or little traffic would keep it little.
+
+        Raises UsageError if it is negative or not finite.
+        """
+        if rate_bps is not None and not 0.0 <= rate_bps < _INF:
+            raise UsageError(f"Scheduler.set_rate: rate_bps = {rate_bps!r} must be 0 or above, or None")
+        self._bucket.set_rate(rate_bps, now)
+        if self._interval is not None:
+            self._interval.budget_bytes = (
+                _INF if rate_bps is None or not full else rate_bps * self.params.interval_s / 8.0
+            )
+
+    def class0_tokens_bytes(self, *, now: float) -> float:
+        """Bytes class 0 may send ahead of others; infinite while the capacity is unknown, negative in debt."""
+        return self._bucket.tokens_bytes(now)
+
+    def next_deadline(self, *, now: float, window_open: bool) -> float | None:
+        """When `pick`, None by now, can name a slot by time alone; None if only another call can change that."""
+        if self.pick(now=now, window_open=window_open) is not None:
+            return None
+        interval = self._interval
+        if interval is None:
+            return self._bucket.ready_s if self._control.slots else None
+        deadline = None
+        if any(slot not in interval.marked for slot in self._entries):
+            deadline = interval.next_s
+        if any(self._entries[slot].priority == 0 for slot in interval.marked if slot in self._entries):
+            deadline = self._bucket.ready_s if deadline is None else min(deadline, self._bucket.ready_s)
+        return deadline
+
+    def take_stale(self, now: float) -> list[int]:
+        """Ordering `paper`: the slots whose message the last interval found stale, of class bulk, and not fitting.
+
+        Each is named once per interval; the caller drops the message (reason `stale`) and withdraws or offers anew.
+        """
+        if self._interval is None:
+            return []
+        self._interval.advance(self._entries, now)
+        stale = list(self._interval.stale)
+        self._interval.stale.clear()
+        return stale
+
+    # For people and tests
+
+    def explain(self, slot: int, now: float, *, window_open: bool = True) -> Standing | None:
+        """How the slot stands at `now`, and what it waits for; None when nothing of it is pending. O(n)."""
+        entry = self._entries.get(slot) or self._encoding.get(slot)
+        if entry is None:
+            return None
+        return Standing(
+            slot=slot,
+            priority=entry.priority,
+            weight=entry.weight,
+            age_s=now - entry.since_s,
+            size_bytes=entry.size_bytes,
+            score=score(entry, now, self.params),
+            rank=self._rank(slot, entry, now),
+            waits_for=self._waits_for(slot, entry, now, window_open=window_open),
+        )
+
+    def _rank(self, slot: int, entry: _Entry, now: float) -> int:
+        by_class = self._interval is None
+        own = score(entry, now, self.params)
+        return sum(
+            (by_class and other.priority < entry.priority)
+            or ((not by_class or other.priority == entry.priority) and score(other, now, self.params) > own)
+            for other_slot, other in self._entries.items()
+            if other_slot != slot
+        )
+
+    def _waits_for(self, slot: int, entry: _Entry, now: float, *, window_open: bool) -> WaitReason | None:
+        if slot not in self._entries:
+            return WaitReason.ENCODING
+        chosen = self.pick(now=now, window_open=window_open)
+        if chosen == slot:
+            return None
+        if self._interval is not None and slot not in self._interval.marked:
+            return WaitReason.INTERVAL
+        spent = entry.priority == 0 and now < self._bucket.ready_s
+        if chosen is None:
+            return WaitReason.BUCKET if spent else WaitReason.WINDOW
+        if self._interval is not None:
+            return WaitReason.OUTRANKED if window_open or entry.priority == 0 else WaitReason.WINDOW
+        served = self._entries[chosen].priority
+        if served == entry.priority:
+            return WaitReason.OUTRANKED
+        if not window_open and entry.priority != 0:
+            return WaitReason.WINDOW
+        if served < entry.priority:
+            return WaitReason.CLASS
+        return WaitReason.BUCKET if spent else WaitReason.FLOOR
+
+    def validate(self) -> None:
+        """Raise AssertionError unless the parts agree; for test teardown."""
+        for table in self._tables:
+            table.validate()
+        assert not self._entries.keys() & self._encoding.keys()
+        assert self._held == [sum(entry.priority == c for entry in self._encoding.values()) for c in CLASSES]
+        assert sum(len(table.slots) for table in self._tables) == len(self._entries)
+        for slot, entry in self._entries.items():
+            assert slot in self._tables[entry.priority].slots, f"slot {slot} is not in the table of its class"
+        for priority, credit in ((PriorityClass.STATE, self._state_credit), (PriorityClass.BULK, self._bulk_credit)):
+            assert credit <= self._credit_max
+            backlog = self._tables[priority].slots or self._held[priority]
+            assert credit <= 0.0 or backlog, f"class {priority} has credit without backlog"
+        if self._interval is not None:
+            known = self._entries.keys() | self._encoding.keys()
+            assert self._interval.marked.keys() <= known
+            assert self._interval.stale.keys() <= self._entries.keys()
+            assert not self._interval.stale.keys() & self._interval.marked.keys()

@@ -1,0 +1,250 @@
+"""The express lane: class control on connections of its own, beside the stream that carries the rest."""
+
+import pytest
+
+from sern_core.link.lane_port import LanePort
+from sern_core.link.link import Link
+from sern_core.path.lanes import LANE_EXPRESS, LANE_ZMQ
+from sern_core.site.client import ClientCore
+from sern_core.vocabulary.errors import WireError
+from sern_core.vocabulary.types import ClientName, PriorityClass
+from sern_core.wire import framing
+from sern_sim.models import LinkModel, Window
+from sern_sim.network import Hop
+from tests.world import World, spec
+
+RATE_BPS = 4e6
+ROBOT = ClientName("robot")
+
+
+def stream(*blackouts: Window) -> LinkModel:
+    return LinkModel(rate_bps=RATE_BPS, delay_s=0.025, blackouts=blackouts).as_stream()
+
+
+def uses_express(link: Link) -> bool:
+    return link.express is not None
+
+
+class Express:
+    """A robot with a second connection to the relay, and a site beside the relay."""
+
+    def __init__(self, *, second: LinkModel, main: LinkModel | None = None, join_at_s: float = 1.0) -> None:
+        self.world = World()
+        self.robot = self.world.client("robot", main or stream())
+        self.site = self.world.client("site", patterns=["/robot/.*"])
+        near = LanePort(self.core.link, LANE_EXPRESS)
+        far = LanePort(self.world.relay.hub._link(ROBOT, self.world.now), LANE_EXPRESS)
+        self.robot.more_ports.append(near)
+        self.world.relay.more_ports.append(far)
+        self.hop: Hop = self.world.network.join(near, self.robot, far, self.world.relay, second, second, name="express")
+        self.pose = self.robot.publish("/robot/pose", spec(PriorityClass.CONTROL))
+        self.command = self.robot.publish("/robot/command", spec(PriorityClass.CONTROL, reliable=True))
+        self.cloud = self.robot.publish("/robot/points", spec(PriorityClass.BULK))
+        self.commands = 0
+        every = self.world.network.every
+        every(0.02, lambda now: self.core.send(self.pose, b"p" * 100, 0, now=now), node=self.robot)
+        every(0.1, lambda now: self.core.send(self.cloud, b"c" * 100_000, 0, now=now), node=self.robot)
+        every(0.1, self._command, node=self.robot)
+        self.world.network.at(join_at_s, lambda _now: self.join())
+
+    @property
+    def core(self) -> ClientCore:
+        return self.robot.core
+
+    @property
+    def far(self) -> Link:
+        return self.world.relay.hub.links[ROBOT]
+
+    def used(self) -> bool:
+        """Whether the robot's class control goes there."""
+        return uses_express(self.core.link)
+
+    def _command(self, now: float) -> None:
+        self.commands += 1
+        assert self.core.send(self.command, b"%d" % self.commands, 0, now=now)
+
+    def join(self) -> bool:
+        now = self.robot.now
+        said = self.core.link.join(now=now)
+        if said is None or not self.world.relay.hub.join(ROBOT, said, now=self.world.relay.now):
+            return False
+        self.core.link.open_lane(now=now, lane_id=LANE_EXPRESS)
+        return True
+
+    def run(self, seconds: float) -> None:
+        self.world.run(seconds)
+        self.world.validate()
+
+    def check(self, *, way_s: float = 0.1) -> None:
+        """Commands once, in order and complete; poses at most once and in order."""
+        bodies = [got.body for got in self.site.on("/robot/command")]
+        assert bodies == [b"%d" % n for n in range(1, len(bodies) + 1)]
+        assert self.commands - len(bodies) <= 2 + way_s / 0.1
+        seqs = [got.seq for got in self.site.on("/robot/pose")]
+        assert seqs == sorted(set(seqs))
+
+
+def test_class_control_moves_there_and_the_rest_stays() -> None:
+    express = Express(second=stream())
+    express.run(0.9)
+    assert not express.used()
+    express.run(9.1)
+    assert express.core.link.express is express.core.link.lanes[LANE_EXPRESS]
+    assert express.core.link.lane.id == LANE_ZMQ
+    sent = express.hop.forward.stats
+    assert sent.delivered_bytes < 0.05 * 10 * RATE_BPS / 8  # poses, commands, acknowledgements: no cloud
+    assert len(express.site.on("/robot/pose")) > 450
+    assert len(express.site.on("/robot/points")) > 20
+    express.check()
+
+
+@pytest.mark.parametrize("rtt_s", [0.005, 0.3, 1.0])
+def test_it_takes_over_whatever_the_round_trip(rtt_s: float) -> None:
+    path = LinkModel(rate_bps=RATE_BPS, delay_s=rtt_s / 2).as_stream()
+    express = Express(second=path, main=path, join_at_s=4.0)
+    express.run(12.0)
+    assert express.used()
+    start_s = express.world.network.start_s
+    late = [got for got in express.site.on("/robot/pose") if got.at_s - start_s > 9.0]
+    assert len(late) > 120
+    assert max(got.age_s for got in late) < rtt_s / 2 + 0.05
+    express.check(way_s=rtt_s / 2)
+
+
+def test_it_does_not_wait_for_a_stalled_stream() -> None:
+    express = Express(second=stream(), main=stream(Window(5.0, 7.0)))
+    express.run(10.0)
+    start_s = express.world.network.start_s
+    during = [got for got in express.site.on("/robot/pose") if 5.1 < got.at_s - start_s < 6.9]
+    assert len(during) > 85
+    express.check()
+
+
+def test_a_connection_that_answers_nothing_is_not_used() -> None:
+    express = Express(second=stream(Window(0.0, 1000.0)))
+    express.run(5.0)
+    assert not express.used()
+    assert len(express.site.on("/robot/pose")) > 200
+    express.check()
+
+
+def test_it_falls_back_when_its_connection_stalls_and_returns() -> None:
+    express = Express(second=stream(Window(5.0, 8.0)))
+    express.run(7.0)
+    assert not express.used()
+    express.run(6.0)
+    assert express.used()
+    express.check()
+
+
+def test_a_lost_connection_loses_no_command() -> None:
+    express = Express(second=stream())
+    express.run(5.0)
+    for link, now in ((express.core.link, express.robot.now), (express.far, express.world.relay.now)):
+        link.close_lane(now=now, lane_id=LANE_EXPRESS)
+    assert not express.used()
+    assert not uses_express(express.far)
+    express.run(5.0)
+    express.check()
+    assert express.join()
+    express.run(5.0)
+    assert express.used()
+    express.check()
+
+
+def test_both_lanes_of_the_path_share_one_window() -> None:
+    express = Express(second=stream())
+    express.run(5.0)
+    link = express.core.link
+    zmq, fast = link.lanes[LANE_ZMQ], link.lanes[LANE_EXPRESS]
+    assert fast.estimator is zmq.estimator
+    assert fast.pacer is zmq.pacer
+    assert zmq.under_way_bytes == fast.under_way_bytes == zmq.flight.inflight_bytes + fast.flight.inflight_bytes > 0
+    window_bytes = zmq.estimator.window_bytes
+    link.close_lane(now=express.robot.now, lane_id=LANE_EXPRESS)
+    assert zmq.beside is None
+    assert zmq.under_way_bytes == zmq.flight.inflight_bytes
+    assert zmq.estimator.window_bytes == window_bytes  # the path is the same
+    express.far.close_lane(now=express.world.relay.now, lane_id=LANE_EXPRESS)
+    express.run(2.0)
+    express.check()
+
+
+def test_a_stalled_stream_neither_fills_the_window_nor_makes_the_path_unknown() -> None:
+    express = Express(second=stream(), main=stream(Window(5.0, 7.0)))
+    express.run(6.8)
+    zmq = express.core.link.lanes[LANE_ZMQ]
+    fast = express.core.link.lanes[LANE_EXPRESS]
+    assert zmq.stalled
+    assert not fast.stalled
+    assert zmq.flight.inflight_bytes > 0
+    assert fast.under_way_bytes == fast.flight.inflight_bytes
+    assert fast.window_open
+    assert fast.estimator.bound_bps is not None
+    express.run(3.0)
+    express.check()
+
+
+def test_copies_are_sent_only_where_they_keep_nobody_waiting() -> None:
+    express = Express(second=stream())
+    express.run(5.0)
+    link = express.core.link
+    assert link.may_copy(200)  # poses and commands are within their share
+    flood = express.robot.publish("/robot/flood", spec(PriorityClass.CONTROL))
+    express.run(1.0)
+    answers: list[bool] = []
+    every = express.world.network.every
+    every(0.001, lambda now: express.core.send(flood, b"f" * 1000, 0, now=now), node=express.robot)
+    every(0.001, lambda _now: answers.append(link.express is not None and link.express.spare))
+    express.run(3.0)
+    assert sum(answers[1000:]) < 0.7 * len(answers[1000:])
+    before_bytes = link.scheduler.class0_tokens_bytes(now=express.robot.now)
+    if link.may_copy(200):  # and then they count
+        assert link.scheduler.class0_tokens_bytes(now=express.robot.now) < before_bytes
+    express.check()
+
+
+def test_a_new_session_must_be_joined_anew() -> None:
+    express = Express(second=stream())
+    express.run(5.0)
+    old = express.core.link.join(now=express.robot.now)
+    express.world.restart_relay()
+    express.run(5.0)
+    assert LANE_EXPRESS not in express.core.link.lanes
+    hub = express.world.relay.hub
+    assert old is not None
+    assert not hub.join(ROBOT, old, now=express.world.relay.now)  # of the relay before
+    express.check()
+
+
+def test_only_its_own_client_joins_a_session() -> None:
+    express = Express(second=stream())
+    express.run(5.0)
+    hub, now = express.world.relay.hub, express.world.relay.now
+    said = express.core.link.join(now=express.robot.now)
+    assert said is not None
+    assert not hub.join(ClientName("site"), said, now=now)  # another's key, whatever it has overheard
+    assert not hub.join(ClientName("nobody"), said, now=now)
+    header = framing.decode_header(said)
+    envelope = framing.decode_handshake(said)
+    for key in ("boot", "relay"):
+        changed = framing.encode_handshake(framing.Kind.JOIN, header.tag, 0, {**envelope, key: envelope[key] ^ 1})
+        assert not hub.join(ROBOT, changed, now=now)
+    assert not hub.join(ROBOT, framing.encode_handshake(framing.Kind.JOIN, header.tag % 255 + 1, 0, envelope), now=now)
+    with pytest.raises(WireError):
+        hub.join(ROBOT, framing.encode_handshake(framing.Kind.JOIN, header.tag, 0, {"name": "robot"}), now=now)
+    assert hub.join(ROBOT, said, now=now)
+
+
+def test_thirteen_times_as_much_class_control_as_the_path_carries_leaves_a_way_for_what_must_be_said() -> None:
+    express = Express(second=stream())
+    flood = express.robot.publish("/robot/flood", spec(PriorityClass.CONTROL, depth=10))
+    express.robot.every(1000 * 8 / (13 * RATE_BPS), flood, b"f" * 1000, first_s=2.0)
+    express.world.until(express.used)
+    express.run(10.0)
+    assert express.used()
+    opened = len(express.site.opened)
+    express.robot.publish("/robot/chat", spec(reliable=True), definition="string data")
+    express.world.until(lambda: len(express.site.opened) > opened, within_s=2.0, what="the site hears of a new stream")
+    assert express.used()
+    express.world.validate()

@@ -1,0 +1,186 @@
+"""What is in flight, what has arrived, and when either is given up or acknowledged."""
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sern_core.path.flight import (
+    ACK_DELAY_S,
+    ACK_SPACING_S,
+    FIRST_LOSS_TIMEOUT_S,
+    SACK_BITS,
+    SPACED_BYTES,
+    Arrivals,
+    Flight,
+)
+from sern_core.vocabulary.types import PriorityClass
+from tests.exploring import cases
+
+CONTROL, STATE, BULK = PriorityClass
+
+
+def flight(count: int, *, lossless: bool = False, rtt_s: float | None = 0.1) -> Flight:
+    result = Flight(lossless=lossless)
+    if rtt_s is not None:
+        result.rtt.sample(rtt_s, now=0.0)
+    for number in range(count):
+        result.sent(now=0.01 * number, nbytes=100, items=[number], app_limited=False)
+    return result
+
+
+def valid(subject: Flight) -> None:
+    def check(ok: bool, text: str) -> None:
+        assert ok, text
+
+    subject.validate(check)
+
+
+def test_a_stream_acknowledges_everything_up_to_the_highest() -> None:
+    subject = flight(5, lossless=True)
+    assert [p.number for p in subject.acked(3, 0, now=1.0)] == [1, 2, 3]
+    assert subject.inflight_bytes == 200 and subject.lost(now=100.0) == [] and subject.loss_deadline() is None
+    valid(subject)
+
+
+def test_datagrams_acknowledge_what_the_map_says() -> None:
+    subject = flight(6)
+    assert [p.number for p in subject.acked(5, 0b0101, now=0.1)] == [2, 4, 5]
+    assert [p.number for p in subject.acked(5, 0b0101, now=0.1)] == []
+    assert list(subject.packets) == [1, 3, 6]
+    valid(subject)
+
+
+def test_lost_when_three_later_ones_have_arrived() -> None:
+    subject = flight(6)
+    subject.acked(4, 0b11, now=0.05)  # 4, 3, 2
+    assert [p.number for p in subject.lost(now=0.05)] == [1]
+    assert list(subject.packets) == [5, 6]
+
+
+def test_a_more_urgent_packet_that_overtakes_shows_no_loss() -> None:
+    """A network that heeds the marks of the classes lets class control pass; what waits there is not lost."""
+    subject = flight(0)
+    for number, priority in enumerate((BULK, BULK, CONTROL, CONTROL, CONTROL, STATE, BULK, BULK)):
+        subject.sent(now=0.001 * number, nbytes=100, items=[], app_limited=False, priority=priority)
+    subject.acked(6, 0b111, now=0.05)  # 6, 5, 4, 3: two of class bulk wait
+    assert subject.lost(now=0.05) == []
+    subject.acked(8, 0b11110, now=0.06)  # a later one of their own class
+    assert [p.number for p in subject.lost(now=0.06)] == [1, 2]
+    assert list(subject.packets) == [7]
+
+
+def test_a_less_urgent_packet_that_arrives_first_shows_a_loss() -> None:
+    subject = flight(0)
+    for priority in (CONTROL, BULK, BULK, BULK):
+        subject.sent(now=0.0, nbytes=100, items=[], app_limited=False, priority=priority)
+    subject.acked(4, 0b11, now=0.05)
+    assert [p.number for p in subject.lost(now=0.05)] == [1]
+
+
+def test_lost_when_older_than_the_timeout_and_not_before() -> None:
+    subject = flight(2, rtt_s=0.1)
+    timeout_s = subject.loss_timeout_s()
+    assert timeout_s >= 0.23
+    due_s = subject.loss_deadline()
+    assert due_s is not None and subject.lost(now=due_s - 2e-6) == []
+    assert [p.number for p in subject.lost(now=due_s)] == [1]
+
+
+def test_a_path_slower_than_the_first_guess_is_measured_all_the_same() -> None:
+    """Its packets are given up before their acknowledgements come; those still tell that something arrives."""
+    subject = flight(3, rtt_s=None)
+    assert subject.loss_timeout_s() == FIRST_LOSS_TIMEOUT_S
+    assert len(subject.lost(now=10.0)) == 3
+    assert subject.waiting_since_s is not None, "still nothing has been heard"
+    subject.acked(3, 0b11, now=10.5)
+    assert subject.highest_acked == 3 and subject.waiting_since_s is None
+
+
+def test_a_stall_is_counted_from_the_first_unanswered_packet() -> None:
+    subject = Flight(lossless=False)
+    subject.sent(now=0.0, nbytes=10, items=[], app_limited=True)
+    for at_s in (5.0, 10.0, 15.0):  # lost one by one, so that nothing is in flight in between
+        assert subject.lost(now=at_s)
+        subject.sent(now=at_s, nbytes=10, items=[], app_limited=True)
+    assert subject.waiting_since_s == 0.0
+    subject.acked(4, 0, now=16.0)
+    assert subject.waiting_since_s is None
+
+
+def test_abandoned_packets_come_back_in_order_and_numbers_go_on() -> None:
+    subject = flight(3)
+    assert [p.items for p in subject.abandon()] == [[0], [1], [2]]
+    assert subject.next_number == 4 and subject.inflight_bytes == 0
+    valid(subject)
+
+
+def test_acknowledged_at_once_on_a_gap_and_every_second_time_else() -> None:
+    arrivals = Arrivals()
+    told = []
+    for at, number in enumerate((1, 2, 4, 3)):
+        assert arrivals.arrived(number, 10 * number, 100, now=float(at))
+        told.append((arrivals.due, arrivals.highest, arrivals.mask, arrivals.echo_us, arrivals.cum_bytes))
+        if arrivals.due:
+            arrivals.flushed(float(at))
+    assert told == [
+        (False, 1, 0, 10, 100),
+        (True, 2, 0b1, 20, 200),
+        (True, 4, 0b110, 40, 300),
+        (True, 4, 0b111, 40, 400),
+    ]
+
+
+def test_large_datagrams_of_a_fast_stream_are_acknowledged_together() -> None:
+    arrivals = Arrivals(lossless=True)
+    told = []
+    for number in range(1, 13):
+        now = 0.0002 * number
+        arrivals.arrived(number, 0, SPACED_BYTES, now=now)
+        if arrivals.due:
+            told.append(number)
+            arrivals.flushed(now)
+        elif told:
+            deadlines = (now + ACK_DELAY_S, 0.0002 * told[-1] + ACK_SPACING_S)
+            assert arrivals.deadline_s() == pytest.approx(deadlines[arrivals.unacked > 1])
+    assert told == [2, 7, 12]
+    for number in (13, 14):  # small ones are of a link that is slow, or not known yet
+        arrivals.arrived(number, 0, SPACED_BYTES - 1, now=0.0002 * 12)
+    assert arrivals.due
+
+
+def test_no_acknowledgement_of_datagrams_that_may_be_lost_waits() -> None:
+    arrivals = Arrivals(lossless=False)
+    for number in range(1, 9):
+        arrivals.arrived(number, 0, SPACED_BYTES, now=0.0)
+        assert arrivals.due is (number % 2 == 0)
+        if arrivals.due:
+            arrivals.flushed(0.0)
+
+
+def test_a_far_jump_of_numbers_costs_nothing() -> None:
+    arrivals = Arrivals()
+    arrivals.arrived(1, 0, 1, now=0.0)
+    assert arrivals.arrived(0xFFFFFFFF, 0, 1, now=0.0)
+    assert arrivals.mask == 0 and arrivals.highest == 0xFFFFFFFF
+
+
+@settings(max_examples=cases(200))
+@given(
+    st.lists(st.integers(1, 40), max_size=60),
+    st.integers(0, 2**16),
+)
+def test_the_map_says_what_has_arrived(numbers: list[int], seed: int) -> None:
+    arrivals = Arrivals()
+    seen: set[int] = set()
+    for number in numbers:
+        assert arrivals.arrived(number, number, 10, now=0.0) is (number not in seen)
+        seen.add(number)
+    if not seen:
+        return
+    assert arrivals.highest == max(seen) and arrivals.cum_bytes == 10 * len(seen)
+    told = {arrivals.highest} | {arrivals.highest - 1 - bit for bit in range(SACK_BITS) if arrivals.mask >> bit & 1}
+    assert told == seen
+    sender = Flight(lossless=False)
+    for _ in range(40):
+        sender.sent(now=0.0, nbytes=1, items=[], app_limited=False)
+    assert {packet.number for packet in sender.acked(arrivals.highest, arrivals.mask, now=0.0)} == seen
