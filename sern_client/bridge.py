@@ -34,7 +34,7 @@ from sern_client.tf_merge import LatchedTransforms, MergedTransforms
 from sern_client.udp import ClientLane
 from sern_client.update_topics import UpdateTopics
 from sern_client.withdrawal import Kept, Withdrawable, Withdrawal
-from sern_core.link.session import DISPLACED
+from sern_core.link.handshake import DISPLACED
 from sern_core.site.client import ClientCore
 from sern_core.site.lease import CommandLease
 from sern_core.site.services import parse as parse_service
@@ -639,7 +639,7 @@ class Bridge:
         found += [
             Difference(name, "it is offered to nobody: its channel is closed")
             for name, outgoing in self._outgoing.items()
-            if outgoing.channel.stream.id not in self.core.link.by_stream
+            if outgoing.channel.stream.id not in self.core.link.outgoing.by_stream
         ]
         publishers = Counter(incoming.local for incoming in self._incoming.values() if incoming.publisher is not None)
         if self.link_state is not None:

@@ -28,7 +28,7 @@ from sern_client.summarise import register_summaries
 from sern_client.transport import RelayTransport
 from sern_client.udp import ClientLane
 from sern_core.bodies.lossy import missing
-from sern_core.link.session import NEW_SESSION
+from sern_core.link.handshake import NEW_SESSION
 from sern_core.site.client import ClientCore
 from sern_core.topics.patterns import compile_pattern
 from sern_core.vocabulary.errors import ConfigError
@@ -127,7 +127,7 @@ class ClientDaemon:
             coder=make_coder(model.link.params(), self.codecs),
         )
         if self.message_log is not None:
-            self.core.link.fates = LoggedFates(self.message_log, self.parts)
+            self.core.link.outgoing.fates = LoggedFates(self.message_log, self.parts)
         self.bridge.attach(self.core)
         self.bridge.guard = self.guard = Guard.of(loaded)
         self.check = TableCheck(self.bridge, now=now)
@@ -159,7 +159,7 @@ class ClientDaemon:
         self.datagrams = DatagramWatch(
             lambda: [self.core.link],
             lambda link, within_s: self._lane.problem(link, within_s) if self._lane is not None else None,
-            lambda link: link.name,
+            lambda link: link.end.name,
         )
         self._express: ClientExpress | None = None
         self._http: HttpServer | None = None
@@ -171,7 +171,7 @@ class ClientDaemon:
         section = self.loaded.model.adaptation
         if section is None:
             return None
-        coder = self.core.coder if self.core.link.encoder is not None else None
+        coder = self.core.coder if self.core.link.sender.encoder is not None else None
         with blamed_on(self.loaded.path, "adaptation"):
             return Adaptation(
                 section,
@@ -327,7 +327,7 @@ class ClientDaemon:
         if not link.established:
             return
         relay, now = self.loaded.model.relay.endpoint, clock.now()
-        if self._said and link.transport_up:  # a session that outlived its connection has another now
+        if self._said and link.handshake.transport_up:  # a session that outlived its connection has another now
             self._said.clear()
             _log.warning("%s: the connection is there again, after %.0f s", relay, now - self._down_since_s)
         self._outages.look(
@@ -355,7 +355,7 @@ class ClientDaemon:
             attributes={
                 "namespace": model.namespace,
                 "endpoints": ",".join(section.kind for section in model.endpoints),
-                "topics": str(len(self.core.link.channels)),
+                "topics": str(len(self.core.link.sender.channels)),
             },
             wall_ns=time.time_ns(),
             now=clock.now(),
@@ -510,19 +510,19 @@ class ClientDaemon:
         progress = Progress()
         give_up_s = now + self.loaded.model.link.drain_s
         while now < give_up_s:
-            channels = [channel for channel in link.channels.values() if channel.wanted is not False]
+            channels = [channel for channel in link.sender.channels.values() if channel.wanted is not False]
             unsent = sum(len(c.queue) + len(c.flying) + (c.newest is not None) for c in channels) + self.bridge.pending
             unconfirmed = sum(len(channel.retained) for channel in channels)
             if not unconfirmed and (not unsent or not link.established or link.lane.stalled):
                 break
-            left = (unsent, unconfirmed, sum(nbytes for _messages, nbytes in link.queued().values()))
+            left = (unsent, unconfirmed, sum(nbytes for _messages, nbytes in link.sender.queued().values()))
             patience_s = STALL_PATIENCE_S if unsent and link.established else PATIENCE_S
             if progress.still_s(left, now=now) > patience_s + PATIENCE_RTTS * link.lane.flight.rtt.srtt_s:
                 break
             self._kick()
             await asyncio.sleep(0.02)
             now = clock.now()
-        unconfirmed = sum(len(channel.retained) for channel in link.channels.values())
+        unconfirmed = sum(len(channel.retained) for channel in link.sender.channels.values())
         if unconfirmed:
             _log.warning("stopping with %d reliable messages that not everyone has confirmed", unconfirmed)
         if self.bridge.keeping:
@@ -539,7 +539,7 @@ class ClientDaemon:
         """Have what was recorded flushed, so that all of it is confirmed before we say goodbye, and read nothing more:
         what comes now the next process gets."""
         keeping = self.bridge.keeping
-        self.core.link.reads = False
+        self.core.link.handshake.reads = False
         keeping.flush()
         give_up_s = clock.now() + PATIENCE_S
         while keeping.pending and clock.now() < give_up_s:  # noqa: ASYNC110  (its thread tells the loop)
@@ -548,8 +548,8 @@ class ClientDaemon:
     def _give_up(self) -> None:
         """Count what is left, so that every message has a fate."""
         link = self.core.link
-        for channel in list(link.channels.values()):
-            link.close_channel(channel, DropReason.SHUTDOWN, now=clock.now())
+        for channel in list(link.sender.channels.values()):
+            link.outgoing.close(channel, DropReason.SHUTDOWN, now=clock.now())
 
     async def stop(self) -> None:
         """Ends whatever was started, the last first, also when a part of it fails."""

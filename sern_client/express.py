@@ -41,7 +41,7 @@ class ClientExpress:
     ) -> None:
         self.core = core
         self.bad_frames = 0
-        self.paths: ExpressPaths[_Connection] = ExpressPaths(redundancy, core.link.may_copy)
+        self.paths: ExpressPaths[_Connection] = ExpressPaths(redundancy, core.link.plane.may_copy)
         self._transport = transport
         self._wait_s = DATAGRAMS_FIRST_S if datagrams else 0.0
         self._kick = kick
@@ -104,7 +104,7 @@ class ClientExpress:
     def joined(self, connection: "_Connection", handle: TcpHandle | None) -> None:
         self.paths.add(connection, connection.dialer.send, handle)
         link = self.core.link
-        if LANE_EXPRESS not in link.lanes:
+        if LANE_EXPRESS not in link.lanes.by_id:
             if self._pump is not None:
                 self._pump.reset()
             link.open_lane(now=clock.now(), lane_id=LANE_EXPRESS)
@@ -116,7 +116,7 @@ class ClientExpress:
             self.core.link.close_lane(now=clock.now(), lane_id=LANE_EXPRESS)
         self._failures = 0 if answered else self._failures + 1
         link = self.core.link
-        if self._failures >= ATTEMPTS * CONNECTIONS and link.established and link.express is None:
+        if self._failures >= ATTEMPTS * CONNECTIONS and link.established and link.lanes.express is None:
             self._failures = 0
             _log.warning("the relay takes no connection for class control alone; asking again in %g s", ASK_AGAIN_S)
             self._said()
@@ -124,7 +124,7 @@ class ClientExpress:
         self._kick()
 
     def received(self, connection: "_Connection", data: framing.Datagram) -> None:
-        if not self.core.link.reads:
+        if not self.core.link.handshake.reads:
             return
         try:
             self.core.link.receive(data, now=clock.now(), lane=LANE_EXPRESS)
@@ -153,7 +153,7 @@ class _Connection:
 
     def join(self) -> None:
         """Say whose connection this is; without a session, when there is one."""
-        said = self._lane.core.link.join(now=clock.now())
+        said = self._lane.core.link.handshake.join(clock.now())
         if self._up and said is not None and self.dialer.send(said):
             self._lane.joined(self, self._handle)
 

@@ -335,7 +335,7 @@ class ServiceBridge:
         except asyncio.CancelledError:
             if not used.gone:  # its caller is gone: if the call still waits here, it is not made
                 used.numbers.pop(seq, None)
-                self._core.link.abandon(calls, seq, DropReason.UNWANTED, now=clock.now())
+                self._core.link.sender.abandon(calls, seq, DropReason.UNWANTED, now=clock.now())
             raise
         finally:
             used.waiting.pop(number, None)
@@ -464,7 +464,7 @@ class ServiceBridge:
         self._answer(caller, number, response, failed=failed)
 
     def _answer(self, caller: _Caller, number: int, response: bytes, *, failed: bool) -> None:
-        limit_bytes = self._core.link.params.max_message_bytes - REPLY.size
+        limit_bytes = self._core.link.end.params.max_message_bytes - REPLY.size
         if len(response) > limit_bytes:
             failed = True
             response = (

@@ -270,7 +270,7 @@ class RelayTransport:
         self.link.disconnected(now=clock.now(), reason=reason)
 
     def received(self, data: framing.Datagram) -> None:
-        if not self.link.reads:
+        if not self.link.handshake.reads:
             return
         try:
             self.link.receive(data, now=clock.now())

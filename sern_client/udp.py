@@ -121,13 +121,13 @@ class ClientLane:
         now = clock.now()
         if self._ask_s is not None and now >= self._ask_s and self.core.link.established:
             self.ask()
-        lane = self.core.link.lanes.get(LANE_UDP)
+        lane = self.core.link.lanes.by_id.get(LANE_UDP)
         if self._socket is None or lane is None:
             return
         if lane.answered and not lane.stalled:
             self._ask_s = None
             self._pause_s = ASK_AGAIN_S[0]
-        elif self._ask_s is None and self.core.link.lanes[LANE_ZMQ].usable:
+        elif self._ask_s is None and self.core.link.lanes.by_id[LANE_ZMQ].usable:
             self._ask_later()  # a blackout takes both: then there is nobody to ask
         if self._socket.rekey_due and now >= self._asked_s + ANSWER_S:
             self.ask()
@@ -136,7 +136,7 @@ class ClientLane:
             self._socket.rebind()
 
     def _received(self, data: bytes, now: float) -> None:
-        if not self.core.link.reads:
+        if not self.core.link.handshake.reads:
             return
         try:
             self.core.link.receive(data, now=now, lane=LANE_UDP)

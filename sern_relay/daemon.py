@@ -503,7 +503,7 @@ class RelayDaemon:
         owed = [
             (link, channel, channel.next_seq - 1)
             for link in self.hub.links.values()
-            for channel in link.channels.values()
+            for channel in link.sender.channels.values()
             if channel.retained
         ]
         while now < give_up_s:
@@ -512,7 +512,7 @@ class RelayDaemon:
                 break
             left = (
                 sum(len(channel.retained) for _link, channel, _last in owed),
-                sum(nbytes for link in self.hub.links.values() for _messages, nbytes in link.queued().values()),
+                sum(nbytes for link in self.hub.links.values() for _messages, nbytes in link.sender.queued().values()),
             )
             if progress.still_s(left, now=now) > PATIENCE_S:
                 break

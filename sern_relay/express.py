@@ -77,7 +77,7 @@ class RelayExpress:
         lane = self._lanes.get(joined.client)
         if lane is None or lane.link is not link:
             self._drop(joined.client)
-            paths: ExpressPaths[bytes] = ExpressPaths(self._redundancy, link.may_copy)
+            paths: ExpressPaths[bytes] = ExpressPaths(self._redundancy, link.plane.may_copy)
             pump = Pump(LanePort(link, LANE_EXPRESS), paths.send, on_gone=lambda: None)
             lane = self._lanes[joined.client] = _Lane(link, paths, pump)
         older = None

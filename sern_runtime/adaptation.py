@@ -95,7 +95,7 @@ class Adaptation:
                 link, self._make_policy(), self._params, coder=self._coder, now=now, summaries=self._summaries
             )
             self._adapters[link] = adapter
-            link.on_arrived = self._guarded(adapter)
+            link.plane.on_arrived = self._guarded(adapter)
         adapter.sample()
         if step:
             self._step(adapter, now)
@@ -115,7 +115,7 @@ class Adaptation:
         """Give a link's topics back what their rules say."""
         self._history.pop(link, None)
         adapter = self._adapters.pop(link, None)
-        link.on_arrived = None
+        link.plane.on_arrived = None
         if adapter is not None:
             adapter.close()
 

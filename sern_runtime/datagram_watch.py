@@ -20,7 +20,7 @@ _log = logging.getLogger(__name__)
 
 def datagrams_pass(link: Link) -> bool:
     """Whether the peer answers over the datagram lane."""
-    lane = link.lanes.get(LANE_UDP)
+    lane = link.lanes.by_id.get(LANE_UDP)
     return lane is not None and lane.usable and lane.answered
 
 
@@ -66,7 +66,7 @@ class DatagramWatch:
             return
         if not link.established:
             self._passed.discard(peer)
-        if not link.established or link.lane.stalled or not link.lanes[LANE_ZMQ].usable:
+        if not link.established or link.lane.stalled or not link.lanes.by_id[LANE_ZMQ].usable:
             if peer not in self._said:  # nothing passes: that is not the datagrams' fault
                 self._without_since_s.pop(peer, None)
             return

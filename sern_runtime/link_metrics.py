@@ -59,7 +59,7 @@ def register_links(metrics: Metrics, links: Callable[[], Collection[Link]]) -> N
         def collect() -> list[tuple[Labels, float]]:
             rows: list[tuple[Labels, float]] = []
             for link in links():
-                for label, cell in link.queued().items():
+                for label, cell in link.sender.queued().items():
                     rows.append(((link.peer, label), float(cell[index])))
             return rows
 
@@ -71,7 +71,7 @@ def register_links(metrics: Metrics, links: Callable[[], Collection[Link]]) -> N
             for link in tuple(links()):
                 yield from [
                     ((link.peer, counters.topic, CLASS_LABELS[counters.priority]), float(getattr(counters, read)))
-                    for counters in link.ledger.topics.values()
+                    for counters in link.sender.ledger.topics.values()
                 ]
 
         return collect
@@ -80,7 +80,7 @@ def register_links(metrics: Metrics, links: Callable[[], Collection[Link]]) -> N
         for link in tuple(links()):
             yield from [
                 ((link.peer, counters.topic, CLASS_LABELS[counters.priority], reason), count)
-                for counters in link.ledger.topics.values()
+                for counters in link.sender.ledger.topics.values()
                 for reason, count in _by_reason(counters.by_reason, LOSSES)
             ]
 
@@ -99,9 +99,9 @@ def register_links(metrics: Metrics, links: Callable[[], Collection[Link]]) -> N
     gauge("sern_link_rtprop_seconds", "Round-trip time of the empty path.", peer,
           per_link(lambda link: link.lane.estimator.rtprop_s))  # fmt: skip
     gauge("sern_link_clock_offset_seconds", "Peer's monotonic clock minus ours.", peer,
-          per_link(lambda link: link.clock.offset_s))  # fmt: skip
+          per_link(lambda link: link.lanes.clock.offset_s))  # fmt: skip
     gauge("sern_link_clock_error_seconds", "Bound of the error of the clock offset.", peer,
-          per_link(lambda link: link.clock.error_s))  # fmt: skip
+          per_link(lambda link: link.lanes.clock.error_s))  # fmt: skip
     gauge("sern_link_queue_messages", "Messages waiting for the link, by class.", ("peer", "class"), per_class(0))
     gauge("sern_link_queue_bytes", "Bytes waiting for the link, by class.", ("peer", "class"), per_class(1))
     topic = ("peer", "topic", "class")
@@ -116,7 +116,7 @@ def register_links(metrics: Metrics, links: Callable[[], Collection[Link]]) -> N
     counter("sern_bytes_delivered_total", "Bytes that the peer has.", topic, per_topic("delivered_bytes"))
     counter("sern_messages_dropped_total", "Messages dropped, by reason.", (*topic, "reason"), drops)
     counter("sern_stray_fragments_total", "Fragments of streams that were not announced.", peer,
-            per_link(lambda link: float(link.strays)))  # fmt: skip
+            per_link(lambda link: float(link.receiver.strays)))  # fmt: skip
 
 
 def register_codecs(metrics: Metrics, coder: Coder) -> None:

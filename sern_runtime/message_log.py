@@ -122,6 +122,6 @@ class LoggedFates:
     def all_held(self, links: Iterable[Link]) -> None:
         """What waits on these links now."""
         for link in links:
-            for channel in link.channels.values():
+            for channel in link.sender.channels.values():
                 for out in channel.undelivered():
                     self.held(channel.stream, out.seq, link.peer, exposed=out.exposed)

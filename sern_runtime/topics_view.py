@@ -18,15 +18,15 @@ def link_summary(link: Link, *, direction: str) -> dict[str, TopicView]:
     """What was offered to a link and what became of it: offered = delivered + dropped + in_queue + in_flight."""
     held: dict[str, list[int]] = {}
     wanted: dict[str, bool] = {}
-    codecs = {channel.stream.id.topic: channel.codec for channel in link.channels.values()}
-    for channel in link.channels.values():
+    codecs = {channel.stream.id.topic: channel.codec for channel in link.sender.channels.values()}
+    for channel in link.sender.channels.values():
         cell = held.setdefault(channel.stream.id.topic, [0, 0])
         queued, _queued_bytes, flying, _flying_bytes = channel.held()
         cell[0] += queued
         cell[1] += flying
         wanted[channel.stream.id.topic] = wanted.get(channel.stream.id.topic, False) or bool(channel.wanted)
     result: dict[str, TopicView] = {}
-    for topic, counters in link.ledger.topics.items():
+    for topic, counters in link.sender.ledger.topics.items():
         in_queue, in_flight = held.get(topic, (0, 0))
         result[topic] = {
             "class": CLASS_LABELS[counters.priority],
@@ -100,7 +100,7 @@ def both_ways(link: Link, received: ReceiveLedger, *, now: float) -> dict[str, T
             topics[topic] = arrived
     types: dict[str, str] = {}
     owners: dict[str, set[str]] = {}
-    for side in (link.channels, link.streams):
+    for side in (link.sender.channels, link.taking.streams):
         for item in side.values():
             stream = item.stream
             types.setdefault(stream.id.topic, stream.info.type_name)

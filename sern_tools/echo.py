@@ -29,7 +29,7 @@ import zmq
 from pydantic import ValidationError
 
 from sern_client.transport import RelayTransport
-from sern_core.link.session import DISPLACED, NEW_SESSION
+from sern_core.link.handshake import DISPLACED, NEW_SESSION
 from sern_core.site.client import ClientCore
 from sern_core.vocabulary.errors import ConfigError, RefusedError, SernError, UsageError
 from sern_core.vocabulary.message import Message, StreamId, StreamInfo

@@ -162,7 +162,7 @@ def replay(
             "delivered": counters.delivered,
             "dropped": {str(reason): count for reason, count in counters.by_reason.items() if count},
         }
-        for name, counters in world.robot.link.ledger.topics.items()
+        for name, counters in world.robot.link.sender.ledger.topics.items()
     }
     if not steps:
         raise UsageError(f"--duration {duration_s:g} is shorter than one interval ({params.interval_s:g} s)")

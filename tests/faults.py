@@ -7,6 +7,7 @@ from typing import Any
 from unittest.mock import patch
 
 from sern_core.link.link import Link, LinkHandler
+from sern_core.link.streams_out import StreamsOut
 from sern_core.path.congestion.hybrid import HybridWindow
 from sern_core.path.flight import Flight
 from sern_core.relay.hub import Hub
@@ -63,7 +64,7 @@ INSIDE: list[Place] = [
     (Scheduler, "pick"),
     (Scheduler, "charge"),
     (Link, "_handle_control"),
-    (Link, "_control_sent"),
+    (StreamsOut, "control_sent"),
     (Link, "_sweep"),
     (OutChannel, "submit"),
     (ObjectRegistry, "observe"),

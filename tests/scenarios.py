@@ -247,10 +247,10 @@ class Run:
         """What a run leaves behind is bounded by what is open."""
         streams = len(self.channels)
         for link in self.world.links():
-            assert len(link.streams) <= streams and len(link.channels) <= streams
+            assert len(link.taking.streams) <= streams and len(link.sender.channels) <= streams
             assert link.reassembly.held_bytes == 0
-            assert not any(stream.reports for stream in link.streams.values())
-            assert not any(channel.gaps for channel in link.channels.values() if not channel.retained)
+            assert not any(stream.reports for stream in link.taking.streams.values())
+            assert not any(channel.gaps for channel in link.sender.channels.values() if not channel.retained)
         assert not self.world.relay.hub._draining
 
 

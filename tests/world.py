@@ -10,8 +10,8 @@ from random import Random
 from typing import NamedTuple
 
 from sern_core.bodies.codecs import Coder, Work, raw_size
+from sern_core.link.datagram import SentPing
 from sern_core.link.link import Link
-from sern_core.link.sending import SentPing
 from sern_core.relay.access import AccessRule, AccessTable
 from sern_core.relay.hub import Hub, HubParams
 from sern_core.relay.hub_port import HubPort
@@ -530,11 +530,11 @@ class World:
     def quiet(self) -> bool:
         """Everybody is connected, and nothing is left to send, to acknowledge or to confirm."""
         for link in self.links():
-            if not link.established or link._control.retained:
+            if not link.established or link.control.out.retained:
                 return False
             if any(type(item) is not SentPing for packet in link.lane.flight.packets.values() for item in packet.items):
                 return False
-            for channel in link.channels.values():
+            for channel in link.sender.channels.values():
                 if channel.retained or (channel.wanted is not False and (channel.queue or channel.flying)):
                     return False
         return True

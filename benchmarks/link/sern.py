@@ -87,7 +87,7 @@ class End:
         if self.spec.system == "sern-one":
             return link.established
         if self._lane is None:
-            return link.established and link.express is not None
+            return link.established and link.lanes.express is not None
         return link.established and link.lane.name == "udp"
 
     async def tick(self) -> None:

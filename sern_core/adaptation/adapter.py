@@ -153,21 +153,21 @@ class HopAdapter:
         self._probe = RawProbe(params.interval_s)
         self._trial = CapacityTrial(params.interval_s, assumed_min_bps=params.ranges.bandwidth_max_bps)
         self._since_s = now
-        self._wire_bytes = link.wire_bytes
+        self._wire_bytes = link.lanes.wire_bytes
         self._encode_s = self._coder_s()
         self._topics: dict[TopicName, _TopicStats] = {}
         self._arrived: dict[PriorityClass, _ClassCount] = {priority: _ClassCount() for priority in CLASSES}
         self._samples: deque[float] = deque(maxlen=SAMPLES)
         self._measured: Measurement | None = None
-        link.on_arrived = self.note_arrival
+        link.plane.on_arrived = self.note_arrival
 
     def close(self) -> None:
         """Give every topic back what its rule says."""
-        self.link.on_arrived = None
-        for channel in self.link.channels.values():
+        self.link.plane.on_arrived = None
+        for channel in self.link.sender.channels.values():
             channel.adapt(share=1.0, depth_max=channel.spec.depth)
         apply_levels(self._summaries(), Configuration())
-        for lane in self.link.lanes.values():
+        for lane in self.link.lanes.by_id.values():
             lane.copies_wanted = None
 
     # --- measuring ------------------------------------------------------------------------------------------------
@@ -223,7 +223,7 @@ class HopAdapter:
 
     def _channels(self) -> list[OutChannel]:
         """Those that somebody wants."""
-        return [channel for channel in self.link.channels.values() if channel.wanted and channel.ready]
+        return [channel for channel in self.link.sender.channels.values() if channel.wanted and channel.ready]
 
     def _count(self, channels: Iterable[OutChannel]) -> dict[PriorityClass, _ClassCount]:
         """What the interval brought, by class; the arrivals since the last call are in it."""
@@ -233,7 +233,7 @@ class HopAdapter:
             by_topic.setdefault(channel.counters.topic, []).append(channel)
         for gone in self._topics.keys() - by_topic.keys():
             self._topics[gone].history.clear()
-            if gone not in self.link.ledger.topics:
+            if gone not in self.link.sender.ledger.topics:
                 del self._topics[gone]
         for topic, mine in by_topic.items():
             counters, count = mine[0].counters, counts[mine[0].spec.priority]
@@ -343,7 +343,7 @@ class HopAdapter:
             levels if items else {},
         )
         self._measured = measurement
-        self._since_s, self._wire_bytes, self._encode_s = now, link.wire_bytes, self._coder_s()
+        self._since_s, self._wire_bytes, self._encode_s = now, link.lanes.wire_bytes, self._coder_s()
         self._samples.clear()
         foreseen = self.last.decision.prediction if self.last is not None else None
         self.prediction_error = None if value is None or foreseen is None else value - foreseen.cost
@@ -361,7 +361,7 @@ class HopAdapter:
     def _measure(
         self, counts: dict[PriorityClass, _ClassCount], demands: tuple[ClassDemand, ...], elapsed_s: float
     ) -> Measurement:
-        wire_bytes = self.link.wire_bytes - self._wire_bytes
+        wire_bytes = self.link.lanes.wire_bytes - self._wire_bytes
         cpu_s = self._coder_s() - self._encode_s + SERIALISE_S * sum(count.admitted for count in counts.values())
         return measure(
             demands,
@@ -392,14 +392,14 @@ class HopAdapter:
     def apply(self, configuration: Configuration, *, now: float) -> None:
         """Bring every channel and lane in line. Idempotent; what waits or is under way is left as it is."""
         link = self.link
-        for channel in link.channels.values():
+        for channel in link.sender.channels.values():
             priority = channel.spec.priority
             channel.adapt(share=configuration.rates[priority], depth_max=configuration.queues[priority])
             if self._coder is not None and channel.codec is not None:
                 mode = channel_mode(channel, configuration.codec)
                 if channel.codec.setting is not mode:
-                    link.set_compression(channel, mode, now=now)
-        for lane in link.lanes.values():
+                    link.sender.set_compression(channel, mode, now=now)
+        for lane in link.lanes.by_id.values():
             lane.copies_wanted = bool(configuration.redundancy)
 
 

@@ -20,7 +20,7 @@ class LanePort:
     @property
     def priority(self) -> PriorityClass:
         """The most urgent class in the latest datagram that this port gave."""
-        lane = self.link.lanes.get(self.lane)
+        lane = self.link.lanes.by_id.get(self.lane)
         return PriorityClass.STATE if lane is None else lane.priority
 
     def next_deadline(self) -> float | None:

@@ -49,23 +49,23 @@ class QueueBound:
         size = len(message.body) + CLIENT_OVERHEAD_BYTES
         if self._at_most_bytes + size <= self.max_bytes:
             self._at_most_bytes += size
-            link.submit(channel, message, now=now, forced=True)
+            link.sender.submit(channel, message, now=now, forced=True)
         elif self._makes_room(link, channel, size, now, shed=not message.tombstone):
-            link.submit(channel, message, now=now, forced=True)
+            link.sender.submit(channel, message, now=now, forced=True)
         elif not channel.reliable or (
             not message.tombstone and self._makes_room(link, channel, TOMBSTONE_BYTES, now, shed=False)
         ):
-            link.reject(channel, message, DropReason.QUEUE_FULL, now=now)
+            link.sender.reject(channel, message, DropReason.QUEUE_FULL, now=now)
         else:
-            link.leave_out(channel, message, DropReason.QUEUE_FULL, now=now)
+            link.outgoing.leave_out(channel, message, DropReason.QUEUE_FULL, now=now)
         return self._work_us
 
     def _makes_room(self, link: Link, channel: OutChannel, size: int, now: float, *, shed: bool) -> bool:
         priority = channel.spec.priority
         if now < self._full_until_s[priority] and size >= self._full_bytes[priority]:
             return False
-        self._work_us += len(link.channels) // ADDED_UP_PER_US
-        excess_bytes = sum(other.kept_bytes for other in link.channels.values()) + size - self.max_bytes
+        self._work_us += len(link.sender.channels) // ADDED_UP_PER_US
+        excess_bytes = sum(other.kept_bytes for other in link.sender.channels.values()) + size - self.max_bytes
         if _takes_the_place(channel):
             excess_bytes -= channel.unbegun_bytes + channel.unbegun * CLIENT_OVERHEAD_BYTES
         if excess_bytes > 0 and shed:
@@ -81,7 +81,9 @@ class QueueBound:
     def _shed(self, link: Link, incoming: OutChannel, excess_bytes: int, now: float) -> int:
         """Drop what waits until the excess is gone; returns what is left of it."""
         priority = incoming.spec.priority
-        waiting = [c for c in link.channels.values() if c.unbegun and not (c is incoming and _takes_the_place(c))]
+        waiting = [
+            c for c in link.sender.channels.values() if c.unbegun and not (c is incoming and _takes_the_place(c))
+        ]
         for lowest in reversed(CLASSES[priority:]):
             rows = [channel for channel in waiting if channel.spec.priority is lowest]
             for reliable in (False, True):
@@ -93,7 +95,7 @@ class QueueBound:
                     if excess_bytes <= 0:
                         return excess_bytes
                     kept = channel.kept
-                    excess_bytes -= link.shed(channel, excess_bytes, DropReason.QUEUE_FULL, now=now)
+                    excess_bytes -= link.sender.shed(channel, excess_bytes, DropReason.QUEUE_FULL, now=now)
                     self._work_us += GIVEN_UP_US + (kept - channel.kept) // CLEARED_PER_US
         return excess_bytes
 

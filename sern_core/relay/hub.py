@@ -17,8 +17,8 @@ from functools import partial
 from typing import Final
 
 from sern_core.link.definitions import DefinitionStore
+from sern_core.link.handshake import DISPLACED
 from sern_core.link.link import TIDY_S, Link
-from sern_core.link.session import DISPLACED
 from sern_core.path.lanes import LANE_EXPRESS
 from sern_core.relay.access import AccessTable, RateGuard
 from sern_core.relay.bound import QueueBound
@@ -146,7 +146,7 @@ class Hub(LocalStreams):
         link = self._link(port.client, now)
         older = self.port_of.get(port.client)
         another = older is not port
-        tag, rival = link.tag, link.established and framing.take_int(hello, "boot") != link.peer_boot
+        tag, rival = link.end.tag, link.established and framing.take_int(hello, "boot") != link.end.peer_boot
         if not link.accept(hello, header.tag, header.stamp_us, now=now, another_connection=another):
             return
         if older is not None and older is not port:
@@ -178,9 +178,9 @@ class Hub(LocalStreams):
                 lossless=self._lossless,
                 auto_confirm=False,
             )
-            link.on_stray = self.received.stray
-            link.fates = self.fates
-            link.on_read = self._was_read
+            link.receiver.on_stray = self.received.stray
+            link.outgoing.fates = self.fates
+            link.reading.on_read = self._was_read
             link.finish = self._finish
             self._limit(client, now)
             self._absent_since[client] = now
@@ -233,7 +233,7 @@ class Hub(LocalStreams):
             if client not in self.port_of and link.established:  # only its datagram lane is left
                 link.handle_timeout(now=now)
                 waiting_s = link.lane.flight.waiting_since_s
-                patience_s = ORPHAN_S if link.cut_off else link.params.heartbeat_timeout_s
+                patience_s = ORPHAN_S if link.handshake.cut_off else link.end.params.heartbeat_timeout_s
                 if link.lane.stalled and waiting_s is not None and now - waiting_s > patience_s:
                     silent_s = now - waiting_s
                     link.close_lane(now=now, reason=f"its connection is gone and no datagram came for {silent_s:.0f} s")
@@ -250,7 +250,7 @@ class Hub(LocalStreams):
         self.matching.sweep(now=now)
         for client in self._fanout.origins():  # those who read on when it is due have done so
             link = self.links[client]
-            if link.read_due_s is None:
+            if link.reading.due_s is None:
                 link.reassembly.work_us = 0
                 self._fanout.go_on(link, now=now)
         self.presence.sweep(now=now)
@@ -263,9 +263,9 @@ class Hub(LocalStreams):
             link = self.links[client]
             if link.established:
                 continue
-            lapsed = link.lapsed
+            lapsed = link.sender.lapsed
             link.handle_timeout(now=now)
-            room -= link.lapsed - lapsed
+            room -= link.sender.lapsed - lapsed
             if room <= 0:
                 return True
         return self.presence.tell(now=now)
@@ -274,7 +274,9 @@ class Hub(LocalStreams):
         """A client has said goodbye. One that has streams, or wants reliable ones, may come back to them (a daemon that
         is started anew), and is waited for like any other; the others are forgotten."""
         link = self.links[client]
-        if not self.routing.streams_of(client) and not any(channel.reliable for channel in link.channels.values()):
+        if not self.routing.streams_of(client) and not any(
+            channel.reliable for channel in link.sender.channels.values()
+        ):
             self._forget(client, now)
 
     def end_session(self, client: ClientName, reason: str, *, now: float) -> None:
@@ -294,8 +296,8 @@ class Hub(LocalStreams):
         link = self.links[client]
         self._fanout.forget(client, now=now)
         self._apply(self.routing.drop_client(client), now, reason=reason)
-        for channel in list(link.channels.values()):
-            link.close_channel(channel, reason, now=now)
+        for channel in list(link.sender.channels.values()):
+            link.outgoing.close(channel, reason, now=now)
         self._draining.forget(client)
         if reason is DropReason.FORBIDDEN:
             self._draining.keep(lambda _client, stream: stream.origin != client, reason, now=now)
@@ -324,7 +326,7 @@ class Hub(LocalStreams):
             relayed = self.relayed[identity]
             if relayed.source is not None:
                 text = f"{identity.origin} may no longer publish {identity.topic}: the access rules have changed"
-                relayed.source.refuse(relayed.stream, "forbidden", text, now=now)
+                relayed.source.taking.refuse(relayed.stream, "forbidden", text, now=now)
                 self.events.refused(identity.origin, "forbidden", text)
         self._apply(change, now, reason=DropReason.FORBIDDEN)
         self._draining.keep(self._may_drain, DropReason.FORBIDDEN, now=now)
@@ -406,13 +408,13 @@ class Hub(LocalStreams):
         if source is not None:
             owed = relayed.owed()
             wanted = self._wanted(relayed)
-            self._for(source.peer, now, partial(source.answer, relayed.stream, wanted, now=now, owed=owed))
+            self._for(source.peer, now, partial(source.answers.answer, relayed.stream, wanted, now=now, owed=owed))
 
     def _tell(self, client: ClientName, envelope: framing.Envelope, now: float) -> None:
         """Say something to a client, if it is there; whoever comes later says what it wants anew, and is told then."""
         link = self.links.get(client)
         if link is not None:
-            self._for(client, now, partial(link.send_control, envelope, now=now))
+            self._for(client, now, partial(link.control.send, envelope, now=now))
 
     def _close(self, client: ClientName, identity: StreamId, reason: DropReason, now: float) -> None:
         relayed = self.relayed.get(identity)
@@ -428,7 +430,7 @@ class Hub(LocalStreams):
             self._unsubscribed = None
 
     def _end_channel(self, client: ClientName, link: Link, channel: OutChannel, reason: DropReason, now: float) -> None:
-        self._for(client, now, partial(link.close_channel, channel, reason, now=now))
+        self._for(client, now, partial(link.outgoing.close, channel, reason, now=now))
 
     def _wanted(self, relayed: Relayed) -> bool:
         return bool(relayed.outs or relayed.waiting) or relayed.cache is not None or self.tap(relayed.stream.stream)
@@ -459,7 +461,7 @@ class Hub(LocalStreams):
             self.presence.joined(identity.origin, client)
             return
         try:
-            channel = link.open_channel(
+            channel = link.outgoing.open(
                 stream,
                 first=first,
                 now=now,
@@ -493,11 +495,11 @@ class Hub(LocalStreams):
         bound.recount()
         if self._room is None or self._room[:2] != (client, now):
             # Adding up is too dear to be done for each of the streams that a client subscribes to at once.
-            held_bytes = sum(channel.kept_bytes for channel in link.channels.values())
+            held_bytes = sum(channel.kept_bytes for channel in link.sender.channels.values())
             self._room = client, now, bound.max_bytes - held_bytes
         room_bytes = self._room[2]
         start = len(messages) - newest_that_fit(messages, room_bytes)
-        counters = link.ledger.topic(stream.id.topic, stream.spec.priority)
+        counters = link.sender.ledger.topic(stream.id.topic, stream.spec.priority)
         for message in messages[:start]:
             counters.offer(len(message.body))
             counters.drop(DropReason.QUEUE_FULL, len(message.body))
@@ -553,7 +555,7 @@ class Hub(LocalStreams):
         delivered = stream.delivered
         for _link, channel in relayed.outs.values():
             delivered = min(delivered, channel.watermark)
-        source.confirm(stream, delivered)
+        source.taking.confirm(stream, delivered)
 
     # --- LinkHandler ----------------------------------------------------------------------------------------------
 
@@ -562,8 +564,8 @@ class Hub(LocalStreams):
 
     def on_up(self, link: Link, *, resumed: bool, now: float) -> None:
         self._absent_since.pop(link.peer, None)
-        if link.peer_boot is not None:
-            self.routing.returned(link.peer, link.peer_boot)
+        if link.end.peer_boot is not None:
+            self.routing.returned(link.peer, link.end.peer_boot)
         self._subscriptions.pop(link.peer, None)  # half of one that was said in an earlier session
         if not resumed:
             for relayed in self.relayed.values():
@@ -584,7 +586,7 @@ class Hub(LocalStreams):
     def offer_lane(self, client: ClientName, parameters: framing.Envelope, *, now: float) -> None:
         """Tell a client the keys of its datagram session (inside CURVE), and use that lane when it works."""
         link = self.links[client]
-        link.send_control(
+        link.control.send(
             {
                 "t": "lane",
                 "sid": parameters["sid"],
@@ -604,9 +606,9 @@ class Hub(LocalStreams):
         link = self.links.get(client)
         if link is None or framing.take_str(envelope, "name", max_length=64) != client:
             return False
-        if not link.joins(envelope, header.tag):
+        if not link.handshake.joins(envelope, header.tag):
             return False
-        if LANE_EXPRESS not in link.lanes:
+        if LANE_EXPRESS not in link.lanes.by_id:
             link.open_lane(now=now, lane_id=LANE_EXPRESS)
         return True
 
@@ -615,9 +617,9 @@ class Hub(LocalStreams):
         raise WireError("REFUSE is not for a relay")
 
     def on_announce(self, link: Link, announcement: Announcement, *, now: float) -> bool | None:
-        stream = link.streams[announcement.stream.id]
+        stream = link.taking.streams[announcement.stream.id]
         identity = stream.stream.id
-        if identity.origin != link.peer or identity.boot != link.peer_boot:
+        if identity.origin != link.peer or identity.boot != link.end.peer_boot:
             raise RefusedError("origin", f"{link.peer} announced a stream of {identity.origin}")
         try:
             relayed = self._take(link, stream, now)
@@ -628,7 +630,7 @@ class Hub(LocalStreams):
             relayed.source = None  # one answer for all who are awaited
             self._await(announcement.owed, identity, link, now)
         relayed.source = link
-        link.answer(stream, self._wanted(relayed), now=now, owed=relayed.owed())
+        link.answers.answer(stream, self._wanted(relayed), now=now, owed=relayed.owed())
         return None
 
     def _take(self, source: Link | None, stream: InStream, now: float) -> Relayed:
@@ -724,7 +726,7 @@ class Hub(LocalStreams):
                 return
             code = DROP_CODES[DropReason.RATE_CAP]
             message = Message(message.stream, message.seq, bytes([code]), message.stamp_ns, message.born_s, code)
-            link.report_drop(stream, message.seq, DropReason.RATE_CAP, self.name, now=now)
+            link.answers.report(stream, message.seq, DropReason.RATE_CAP, self.name)
         elif message.tombstone:
             self._discarded(link, stream, message.seq, message.drop_reason)
         else:
@@ -760,10 +762,12 @@ class Hub(LocalStreams):
                         self.received.of(stream.stream).drop_arrived(DropReason.DUPLICATE)  # it has gone that way
                         continue
                     if stream.reliable:
-                        out_link.skip(channel, message.seq, now=now)  # what lies between was given up before that
+                        out_link.outgoing.skip(
+                            channel, message.seq, now=now
+                        )  # what lies between was given up before that
                 bound = self._bounds.get(client)
                 if bound is None:
-                    out_link.submit(channel, message, now=now, forced=True)
+                    out_link.sender.submit(channel, message, now=now, forced=True)
                 else:
                     spent_us = bound.submit(out_link, channel, message, now=now)
                     if relayed.source is not None:
@@ -791,11 +795,11 @@ class Hub(LocalStreams):
         if channel.next_seq > message.seq:
             return
         try:
-            link.reject(channel, message, DropReason.FAULT, now=now)
+            link.sender.reject(channel, message, DropReason.FAULT, now=now)
         except Exception as again:  # noqa: BLE001
             link.fault(again)
             if channel.reliable and relayed.source is not None:
-                relayed.source.report_drop(relayed.stream, message.seq, DropReason.FAULT, link.peer, now=now)
+                relayed.source.answers.report(relayed.stream, message.seq, DropReason.FAULT, link.peer)
 
     def on_in_drop(self, link: Link, stream: InStream, reason: DropReason, nbytes: int, count: int) -> None:
         self.received.of(stream.stream).drop_arrived(reason, count)
@@ -810,7 +814,7 @@ class Hub(LocalStreams):
             return  # it is owed nothing any more, also of what was sent whole, and others may have the message
         now, source = link.now, relayed.source
         first, last = outs[0].seq, outs[-1].seq  # the origin counts what it has not counted of them
-        report = partial(source.report_drop, relayed.stream, first, reason, link.peer, now=now, count=last - first + 1)
+        report = partial(source.answers.report, relayed.stream, first, reason, link.peer, last - first + 1)
         self._for(source.peer, now, report)
 
     def on_delivered(self, link: Link, channel: OutChannel, *, now: float) -> None:
@@ -828,7 +832,7 @@ class Hub(LocalStreams):
         if relayed is None or not stream.reliable:
             return
         for client, (out_link, channel) in relayed.outs.items():
-            skip = partial(out_link.skip, channel, stream.delivered + 1, now=now, silent=stream.paused)
+            skip = partial(out_link.outgoing.skip, channel, stream.delivered + 1, now=now, silent=stream.paused)
             self._for(client, now, skip)
 
     def on_wanted(self, link: Link, channel: OutChannel, *, now: float) -> None:
@@ -908,7 +912,9 @@ class Hub(LocalStreams):
             assert (relayed.cache is not None) == latched, f"{identity.topic}: its cache does not fit its spec"
             for client, (link, channel) in relayed.outs.items():
                 assert self.links.get(client) is link, f"{identity.topic} goes to a link of {client} that is gone"
-                assert link.by_stream.get(identity) is channel, f"{identity.topic}: a closed channel to {client}"
+                assert link.outgoing.by_stream.get(identity) is channel, (
+                    f"{identity.topic}: a closed channel to {client}"
+                )
         for origin in self._fanout.origins():
             assert origin in self.links, f"streams of {origin}, who is gone, are to be told of"
         taken: dict[ClientName, Counter[ClientName]] = defaultdict(Counter)
@@ -922,7 +928,7 @@ class Hub(LocalStreams):
         held_channels |= self._fanout.closing()
         held_channels |= self._draining.validate(self.links)
         for client, link in self.links.items():
-            for channel in link.channels.values():
+            for channel in link.sender.channels.values():
                 assert id(channel) in held_channels, f"{channel.stream.id.topic}: nobody's channel to {client}"
         for table in (self._absent_since, self._awaited, self._bounds, self._heard):
             assert set(table) <= set(self.links), "something is kept for clients that are forgotten"

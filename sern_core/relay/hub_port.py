@@ -8,9 +8,9 @@ import math
 from collections.abc import Container
 from typing import Final, Protocol
 
+from sern_core.link.end import microseconds
+from sern_core.link.handshake import DISPLACED
 from sern_core.link.link import Link
-from sern_core.link.sending import microseconds
-from sern_core.link.session import DISPLACED
 from sern_core.relay.hub_matching import Matching
 from sern_core.vocabulary.errors import RemoteError, VersionError
 from sern_core.vocabulary.types import ClientName

@@ -38,18 +38,27 @@ RTT_PAUSE_S: Final = 2.0
 this pause: for people, who do not read milliseconds."""
 
 
+class PeerControl(Protocol):
+    """The control messages to a client."""
+
+    @property
+    def heard(self) -> int:
+        """The number of the last one up to which the client has acknowledged all."""
+
+    def send(self, envelope: framing.Envelope, attachment: bytes = b"", *, now: float) -> int: ...
+
+
 class PeerLink(Protocol):
     """What is looked at of a client's link, and how the client is told."""
 
-    lane: Lane
+    @property
+    def lane(self) -> Lane: ...
 
     @property
     def established(self) -> bool: ...
 
     @property
-    def control_heard(self) -> int: ...
-
-    def send_control(self, envelope: framing.Envelope, attachment: bytes = b"", *, now: float) -> int: ...
+    def control(self) -> PeerControl: ...
 
 
 class _State(NamedTuple):
@@ -226,7 +235,7 @@ class Presence:
         watching, link = self._watchers.get(client), self._links.get(client)
         if watching is None or link is None or not watching.due or not link.established:
             return 0
-        if link.control_heard < watching.seq:
+        if link.control.heard < watching.seq:
             return 0  # it is told the latest once it has heard of what was said before
         count = ceil(len(watching.due) / MAX_TOLD)
         self._attempt(client, now, partial(self._say, client, watching, link, now))
@@ -236,7 +245,7 @@ class Presence:
         due = sorted(watching.due)
         for start in range(0, len(due), MAX_TOLD):
             items = [self._item(client, watching, peer, now) for peer in due[start : start + MAX_TOLD]]
-            watching.seq = link.send_control({"t": "peers", "peers": items}, now=now)
+            watching.seq = link.control.send({"t": "peers", "peers": items}, now=now)
         watching.due.clear()
         self._after()
 

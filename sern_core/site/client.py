@@ -150,13 +150,13 @@ class ClientCore:
             lossless=lossless,
         )
         self.link.on_tidy = self._tidy
-        self.link.on_stray = self.received.stray
+        self.link.receiver.on_stray = self.received.stray
         if coder is not None:
             self.link.encode_with(coder)
 
     def _tidy(self, now: float) -> None:
         """Fold the counters of topics that ended long ago, and forget their numbers."""
-        self.received.tidy({stream.topic for stream in self.link.streams}, now=now)
+        self.received.tidy({stream.topic for stream in self.link.taking.streams}, now=now)
         self._numbering.tidy(now=now)
 
     # --- publishing -----------------------------------------------------------------------------------------------
@@ -180,7 +180,7 @@ class ClientCore:
         first = self._numbering.last(identity) + 1
         stream = StreamInfo(identity, info, spec, dict(attributes or {}))
         check_stream(stream)
-        channel = self.link.open_channel(stream, first=first, owed=owed, now=now)
+        channel = self.link.outgoing.open(stream, first=first, owed=owed, now=now)
         if spec.latched:
             self._latched[identity] = LatchedCache(spec.depth, spec.max_queue_bytes)
         return channel
@@ -188,20 +188,20 @@ class ClientCore:
     def unpublish(self, channel: OutChannel, *, now: float) -> None:
         self._numbering.ended(channel.stream.id, channel.next_seq - 1, now=now)
         self._latched.pop(channel.stream.id, None)
-        self.link.close_channel(channel, DropReason.SHUTDOWN, now=now)
+        self.link.outgoing.close(channel, DropReason.SHUTDOWN, now=now)
 
     def send(self, channel: OutChannel, body: bytes, stamp_ns: int, *, born_s: float | None = None, now: float) -> bool:
         """Offer one message. False: refused, the reliable queue is full; offer it again later or count it lost.
         `born_s`: when it was taken, if that was before `now`."""
         message = Message(channel.stream.id, channel.next_seq, body, stamp_ns, now if born_s is None else born_s)
-        accepted = self.link.submit(channel, message, now=now)
+        accepted = self.link.sender.submit(channel, message, now=now)
         if accepted and channel.spec.latched:
             self._latched[channel.stream.id].add(message)
         return accepted
 
     def set_compression(self, channel: OutChannel, setting: Compression | None, *, now: float) -> None:
         """Compress what leaves this channel from the next message on with another mode; None: `auto`."""
-        self.link.set_compression(channel, setting, now=now)
+        self.link.sender.set_compression(channel, setting, now=now)
 
     def codec_profiles(self, channel: OutChannel) -> dict[Compression, CodecProfile]:
         """What each mode makes of this channel's messages, as measured so far."""
@@ -226,20 +226,20 @@ class ClientCore:
         """`known`: of whom the relay is asked whether they are here."""
         for start in range(0, len(known), MAX_STRINGS):
             names = list(known[start : start + MAX_STRINGS])
-            self.link.send_control({"t": "subscribe", "patterns": [], "more": True, "known": names}, now=now)
+            self.link.control.send({"t": "subscribe", "patterns": [], "more": True, "known": names}, now=now)
         parts = [self.patterns[i : i + MAX_STRINGS] for i in range(0, len(self.patterns), MAX_STRINGS)] or [()]
         batch: list[str] = []
         for part in parts:
             for pattern in part:
                 # An envelope holds 4 KiB: long patterns travel in more parts.
                 if sum(len(item) + 4 for item in batch) + len(pattern) > framing.MAX_ENVELOPE_BYTES // 2:
-                    self.link.send_control({"t": "subscribe", "patterns": batch, "more": True}, now=now)
+                    self.link.control.send({"t": "subscribe", "patterns": batch, "more": True}, now=now)
                     batch = []
                 batch.append(pattern)
             if part is not parts[-1]:
-                self.link.send_control({"t": "subscribe", "patterns": batch, "more": True}, now=now)
+                self.link.control.send({"t": "subscribe", "patterns": batch, "more": True}, now=now)
                 batch = []
-        self.link.send_control({"t": "subscribe", "patterns": batch, "more": False, "peers": True}, now=now)
+        self.link.control.send({"t": "subscribe", "patterns": batch, "more": False, "peers": True}, now=now)
 
     def look_at_peers(self, *, now: float) -> list[PeerView]:
         """Who is there of those whose streams we take, by name. Call about once a second: that the own link has fallen
@@ -268,10 +268,10 @@ class ClientCore:
             "attr": dict(attributes or {}),
             "wall": wall_ns,
         }
-        self.link.send_control(envelope, value, now=now)
+        self.link.control.send(envelope, value, now=now)
 
     def delete_object(self, object_id: str, *, now: float) -> None:
-        self.link.send_control({"t": "object", "op": "delete", "id": object_id}, now=now)
+        self.link.control.send({"t": "object", "op": "delete", "id": object_id}, now=now)
 
     # --- errors of ours -------------------------------------------------------------------------------------------
 
@@ -296,7 +296,7 @@ class ClientCore:
     def on_up(self, link: Link, *, resumed: bool, now: float) -> None:
         if not resumed:
             for identity, cache in self._latched.items():
-                link.by_stream[identity].prime(cache.replay(), now=now)
+                link.outgoing.by_stream[identity].prime(cache.replay(), now=now)
         self.peers.session_began(now=now)
         self._send_subscription(now, self.peers.asked())
         self._tell(self.events.link_up, resumed=resumed)
@@ -312,10 +312,10 @@ class ClientCore:
         self._tell(self.events.rejected, code, text)
 
     def on_announce(self, link: Link, announcement: Announcement, *, now: float) -> bool | None:
-        stream = link.streams[announcement.stream.id]
+        stream = link.taking.streams[announcement.stream.id]
         digest = announcement.definition_hash
         identity = stream.stream.id
-        link.outlived(identity.origin, identity.boot, now=now)
+        link.taking.outlived(identity.origin, identity.boot, now=now)
         opened = self._open.get(identity)
         if opened is not None and opened != _announced(announcement.stream):
             # Its origin ended it and began it anew while we were away, as something else.
@@ -369,9 +369,9 @@ class ClientCore:
     def reconsider(self, *, now: float) -> None:
         """Open what this site could not publish when it was announced, if it can now: another stream may have been in
         its way, which has ended."""
-        for stream in list(self.link.incoming.values()):
+        for stream in list(self.link.taking.incoming.values()):
             if stream.stream.id in self._refused and self._open_stream(stream):
-                self.link.answer(stream, True, now=now)
+                self.link.answers.answer(stream, True, now=now)
 
     @property
     def refused(self) -> Collection[StreamId]:
@@ -391,9 +391,9 @@ class ClientCore:
         self._tell(self.events.stream_closed, stream.stream)
 
     def on_definition(self, link: Link, digest: str, *, now: float) -> None:
-        for stream in list(link.incoming.values()):
+        for stream in list(link.taking.incoming.values()):
             if stream.stream.definition_hash == digest:
-                link.answer(stream, self._open_stream(stream), now=now)
+                link.answers.answer(stream, self._open_stream(stream), now=now)
 
     def on_retract(self, link: Link, stream: InStream, *, now: float) -> None:
         self._refused.discard(stream.stream.id)
@@ -431,22 +431,22 @@ class ClientCore:
         topic = stream.stream.id.topic
         self.received.of(stream.stream).drop_arrived(reason)
         self.trace.record(now, topic, TraceEvent.DROPPED, seq=message.seq, reason=reason, peer=self.link.peer)
-        if self.link.fates is not None and (not stream.reliable or reason is DropReason.DISCONNECTED):
-            self.link.fates.discarded(stream.stream, message.seq, reason, self.link.peer)
+        if self.link.outgoing.fates is not None and (not stream.reliable or reason is DropReason.DISCONNECTED):
+            self.link.outgoing.fates.discarded(stream.stream, message.seq, reason, self.link.peer)
         told = self._undecodable
         if reason is DropReason.UNDECODABLE and topic not in told and len(told) < MAX_TOPICS:
             told.add(topic)
             self._tell(self.events.undecodable, stream.stream, problem)
         if stream.reliable and reason is not DropReason.DISCONNECTED:
-            self.link.report_drop(stream, message.seq, reason, self.name, now=now)
+            self.link.answers.report(stream, message.seq, reason, self.name)
             self._tell(self.events.expired, stream.stream, message.seq, reason)
 
     def _settled(self, stream: InStream) -> None:
         """A body is decoded, or dropped: the peer may be told how far the stream has come."""
         identity = stream.stream.id
-        current = self.link.streams.get(identity)
+        current = self.link.taking.streams.get(identity)
         if current is not None:
-            self.link.handled(current, self._oldest(identity))
+            self.link.taking.processed_below(current, self._oldest(identity))
 
     def _oldest(self, identity: StreamId) -> int:
         """The seq of the oldest message of a stream that has had its turn and is not dealt with, 0: none."""
@@ -468,12 +468,12 @@ class ClientCore:
         del held[seq]
         if not held:
             del self._held[identity]
-        stream = self.link.streams.get(identity)
+        stream = self.link.taking.streams.get(identity)
         if stream is None:
             return
         if lost is not None:
             self.trace.record(now, identity.topic, TraceEvent.DROPPED, seq=seq, reason=lost, peer=self.link.peer)
-            self.link.report_drop(stream, seq, lost, self.name, now=now)
+            self.link.answers.report(stream, seq, lost, self.name)
             self.events.expired(stream.stream, seq, lost)
         self._settled(stream)
 
@@ -516,4 +516,4 @@ class ClientCore:
 
     def ask_lane(self, ciphers: Sequence[str], *, now: float) -> None:
         """Ask the relay for a datagram session; `ClientEvents.lane_offered` has the answer, if it has one."""
-        self.link.send_control({"t": "lane_ask", "ciphers": list(ciphers)}, now=now)
+        self.link.control.send({"t": "lane_ask", "ciphers": list(ciphers)}, now=now)

@@ -9,7 +9,7 @@ import pytest
 from sern_client import latest
 from sern_client.endpoints import first
 from sern_client.endpoints.ros1 import Ros1Options, hold
-from sern_core.link import answering, definitions, link
+from sern_core.link import control_stream, definitions, owed_lists
 from sern_core.relay import access, draining, hub, routing
 from sern_core.relay.objects import ObjectLimits
 from sern_core.site import peers
@@ -50,7 +50,7 @@ BOUNDS: Final[dict[str, tuple[str, ...]]] = {
     "patterns and names subscribed to": (f"{ROUTING.max_patterns} and {ROUTING.max_exact:,}",),
     "parts of an unfinished subscription": (
         f"{ROUTING.max_exact:,} patterns",
-        f"{answering.MAX_OWED:,} names",
+        f"{owed_lists.MAX_OWED:,} names",
     ),
     "definitions (": (
         nbytes(definitions.MAX_PEER_DEFINITION_BYTES),
@@ -64,8 +64,8 @@ BOUNDS: Final[dict[str, tuple[str, ...]]] = {
         f"for {drop_reports.UNREAD_S:g} s",
     ),
     "control messages to a client": (
-        f"{link.MAX_UNHEARD:,} answers",
-        f"{nbytes(link.MAX_TOLD_BYTES)} + {nbytes(link.MAX_TOLD_CHANNEL_BYTES)} a channel",
+        f"{control_stream.MAX_UNHEARD:,} answers",
+        f"{nbytes(control_stream.MAX_TOLD_BYTES)} + {nbytes(control_stream.MAX_TOLD_CHANNEL_BYTES)} a channel",
     ),
     "objects (": (
         f"{OBJECTS.max_objects_per_owner:,};",

@@ -201,7 +201,7 @@ class Duet:
 
 DUET: Final = Duet()
 SAID: Final = DUET.said
-TAG: Final = DUET.link.tag
+TAG: Final = DUET.link.end.tag
 
 
 def assert_in_order_after(datagrams: list[bytes], *, to_relay: bool) -> None:
@@ -336,7 +336,7 @@ CONTROL_VALUES: Final[dict[str, st.SearchStrategy[Any]]] = {
 def test_control_messages_with_any_values(said: list[tuple[Any, Any, bytes]], to_relay: bool) -> None:
     duet = DUET
     mine = duet.link if to_relay else duet.hub.links[duet.robot.name]
-    first = mine._control.next_seq
+    first = mine.control.out.next_seq
     datagrams = []
     for index, (envelope, changes, attachment) in enumerate(said):
         body = framing.encode_control({key: changes.get(key, value) for key, value in envelope.items()}, attachment)

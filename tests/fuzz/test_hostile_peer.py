@@ -7,8 +7,7 @@ from typing import Any, Final
 
 import pytest
 
-from sern_core.link import definitions, session
-from sern_core.link import link as hop_end
+from sern_core.link import control_stream, definitions, handshake
 from sern_core.relay import hub as relay_core
 from sern_core.vocabulary.errors import WireError
 from sern_core.vocabulary.message import StreamId, StreamInfo, TopicInfo
@@ -330,7 +329,7 @@ ALLOWED_BYTES: Final = 18 * 2**20
 
 @pytest.mark.parametrize("name", ATTACKS)
 def test_state_stays_bounded(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(hop_end, "MAX_UNHEARD", 300)
+    monkeypatch.setattr(control_stream, "MAX_UNHEARD", 300)
     monkeypatch.setattr(definitions, "MAX_PEER_DEFINITION_BYTES", 2 * 2**20)
     peer = Hostile()
     gc.collect()
@@ -372,18 +371,18 @@ def test_sessions_begin_no_faster_than_their_price_allows() -> None:
         peer.now = max(peer.now, *peer.hub.matching.due_s.values())
         peer.port.handle_timeout(now=peer.now)
     link = peer.hub.links[peer.name]
-    assert len(link.channels) == 300
+    assert len(link.sender.channels) == 300
     begun = 0
     for index in range(1000):  # in a second
         peer.now += 0.001
-        tag = link.tag
+        tag = link.end.tag
         peer.boot = 100 + index
         peer.hello(tag=index % 250 + 2)
-        begun += link.tag != tag
+        begun += link.end.tag != tag
     assert 2 <= begun < 150
-    peer.now += session.HELLO_INTERVAL_S
+    peer.now += handshake.HELLO_INTERVAL_S
     peer.hello(tag=254)
-    assert link.tag == 254, "its next HELLO has its session"
+    assert link.end.tag == 254, "its next HELLO has its session"
     peer.hub.validate()
 
 
@@ -395,7 +394,7 @@ def test_a_client_that_connects_again_and_again_has_its_session_each_time() -> N
         peer.port.disconnected(now=peer.now)
         peer.port = peer.world.relay.port(peer.name)
         peer.hello(tag=index + 2)
-        assert link.tag == index + 2 and link.established
+        assert link.end.tag == index + 2 and link.established
 
 
 def test_origins_cannot_have_any_number_of_streams_kept_for_an_absent_client(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -410,7 +409,7 @@ def test_origins_cannot_have_any_number_of_streams_kept_for_an_absent_client(mon
 
 def test_an_honest_peer_is_not_taken_for_a_hostile_one(monkeypatch: pytest.MonkeyPatch) -> None:
     """One that reads what it is told may ask for ever."""
-    monkeypatch.setattr(hop_end, "MAX_UNHEARD", 10)
+    monkeypatch.setattr(control_stream, "MAX_UNHEARD", 10)
     duet = Duet()
     for index in range(100):
         duet.site.core.subscribe((".*",) if index % 2 else (), now=duet.now)

@@ -54,7 +54,7 @@ def connection_that_ends() -> Input:
     reader.now += 0.001
     while reader.port.next_datagram(now=reader.now) is not None:
         pass
-    (channel,) = link.channels.values()
+    (channel,) = link.sender.channels.values()
     assert len(channel.flying) > IN_FLIGHT
 
     def take() -> None:
@@ -75,7 +75,7 @@ def messages_that_need_room() -> Input:
         AccessTable([AccessRule(client=".*", publish=(".*",), subscribe=(".*",), max_queue_bytes=BOUND_BYTES)]),
         now=origin.now,
     )
-    channels = hub.links[reader.name].channels
+    channels = hub.links[reader.name].sender.channels
     waits = BOUND_BYTES // (CLIENT_OVERHEAD_BYTES + 2)
     for first in range(1, waits, 1_000):
         said(origin, *(_whole(1, seq, b"yy") for seq in range(first, min(first + 1_000, waits + 1))))
@@ -123,7 +123,7 @@ def filled_backlog(count: int, frame: Callable[[int], bytes] = plain) -> tuple[H
     origin, reader = origin_and_reader()
     for first in range(1, count, 1_600):
         said(origin, *(frame(seq) for seq in range(first, first + 1_600)))
-    (channel,) = reader.hub.links[reader.name].channels.values()
+    (channel,) = reader.hub.links[reader.name].sender.channels.values()
     assert channel.kept == count
     return origin, reader, channel
 
@@ -137,7 +137,7 @@ def backlog_with_gaps(count: int) -> tuple[Hostile, Hostile, OutChannel]:
             first = framing.encode_control({"t": "first", "ch": 1, "seq": 3 + 2 * index})
             frames += [_whole(1, 1 + 2 * index), control(origin, first)]
         said(origin, *frames)
-    (channel,) = reader.hub.links[reader.name].channels.values()
+    (channel,) = reader.hub.links[reader.name].sender.channels.values()
     assert channel.kept == count and len(channel.gaps) >= count - 1
     return origin, reader, channel
 
@@ -183,7 +183,7 @@ def backlog_that_lapses() -> Input:
         reader.port.handle_timeout(now=reader.now)
 
     def rest() -> bool:
-        more = link._sweep_due_s <= reader.now
+        more = link.plane.sweep_due_s <= reader.now
         if more:
             sweep()
         else:

@@ -57,7 +57,7 @@ class Robot:
                 self.port.receive(data, now=self.now)
             self.hear()
         self.relay = world.relay.hub.links[self.core.name]
-        (self.channel,) = self.core.link.channels.values()
+        (self.channel,) = self.core.link.sender.channels.values()
         assert self.channel.wanted and self.channel.reliable
 
     def hear(self) -> None:
@@ -67,7 +67,7 @@ class Robot:
             self.core.link.receive(data, now=self.now)
 
     def one_more_slice(self) -> bool:
-        due_s = self.core.link.read_due_s
+        due_s = self.core.link.reading.due_s
         if due_s is None:
             return False
         self.now = max(self.now, due_s)
@@ -85,7 +85,7 @@ def told(name: str, **envelope: object) -> Make:
     def make() -> Input:
         robot = Robot()
         robot.keeps(BACKLOG)
-        robot.relay.send_control({"t": name, "ch": robot.channel.slot, **envelope}, now=robot.now)
+        robot.relay.control.send({"t": name, "ch": robot.channel.slot, **envelope}, now=robot.now)
 
         def rest() -> bool:
             more = robot.one_more_slice()
@@ -103,9 +103,9 @@ def told_that_a_client_is_forgotten() -> Input:
     """The only one who was to get them is forgotten: they are dropped for it, and then confirmed."""
     robot = Robot()
     robot.keeps(BACKLOG)
-    (stream,) = robot.relay.streams.values()
+    (stream,) = robot.relay.taking.streams.values()
     dropped = {"t": "dropped", "ch": robot.channel.slot, "seq": 1, "code": LOST, "to": "site", "n": BACKLOG}
-    robot.relay.send_control(dropped, now=robot.now)
+    robot.relay.control.send(dropped, now=robot.now)
 
     def rest() -> bool:
         if robot.one_more_slice():
@@ -113,7 +113,7 @@ def told_that_a_client_is_forgotten() -> Input:
         if not robot.channel.retained:
             return False
         assert all(out.counted for out in robot.channel.retained)
-        robot.relay.confirm(stream, BACKLOG)
+        robot.relay.taking.confirm(stream, BACKLOG)
         robot.hear()
         return True
 
@@ -147,7 +147,7 @@ async def test_the_log_has_a_line_for_a_run(
     robot = Robot()
     robot.keeps(10)
     dropped = {"t": "dropped", "ch": robot.channel.slot, "seq": first, "code": LOST, "to": "site", "n": count}
-    robot.relay.send_control(dropped, now=robot.now)
+    robot.relay.control.send(dropped, now=robot.now)
     caplog.clear()
     with caplog.at_level(logging.WARNING):
         robot.hear()

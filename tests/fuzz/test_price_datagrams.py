@@ -30,7 +30,7 @@ FEW: Final = 8
 
 def one_more_slice(peer: Hostile) -> bool:
     """What the relay goes on with for this client when its time comes."""
-    due_s = peer.hub.links[peer.name].read_due_s
+    due_s = peer.hub.links[peer.name].reading.due_s
     match_s = peer.hub.matching.due_s.get(peer.name)
     times = [at for at in (due_s, match_s) if at is not None]
     if not times:
@@ -288,7 +288,7 @@ def hello_after_long_lists() -> Input:
     rows = [names[start : start + 48] for start in range(0, len(names), 48)]
     for row in rows[:-1]:
         said(peer, control(peer, framing.encode_control({"t": "want", "ch": 1, "on": True, "owed": row, "more": True})))
-    runs = [2, len(peer.hub.links[peer.name].channels)]
+    runs = [2, len(peer.hub.links[peer.name].sender.channels)]
     said(peer, control(peer, framing.encode_control({"t": "want", "ch": 1, "on": True, "owed": rows[-1], "chs": runs})))
     said(peer, control(peer, framing.encode_control({"t": "want", "ch": 1, "on": True, "add": ["x"], "chs": runs})))
     return Input(peer.said_bytes, partial(peer.hello, 2))

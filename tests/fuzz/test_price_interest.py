@@ -60,7 +60,7 @@ class Robot:
         self.bridge.topic_added(topic.announced)
 
     def stream(self, name: str) -> StreamInfo:
-        return next(each.stream for each in self.core.link.channels.values() if each.stream.id.topic == name)
+        return next(each.stream for each in self.core.link.sender.channels.values() if each.stream.id.topic == name)
 
     def interested(self) -> dict[str, bool]:
         return {topic.local: topic._interest for topic in self.endpoint._topics.values()}
@@ -162,7 +162,7 @@ async def test_a_topic_that_has_ended_is_not_wanted_and_begins_anew() -> None:
     robot.bridge.wanted(summary.channel.stream, False)
     robot.bridge.send_dropped(summary.channel.stream, 1, 1, DropReason.UNWANTED, "")
     assert robot.interested() == before and robot.bridge._by_stream.keys() == {
-        channel.stream.id for channel in robot.core.link.channels.values()
+        channel.stream.id for channel in robot.core.link.sender.channels.values()
     }
     assert cloud.announced is not None
     robot.bridge.topic_added(cloud.announced)

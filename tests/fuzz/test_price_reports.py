@@ -26,8 +26,8 @@ def crowded(*, first: int = FIRST) -> tuple[Hostile, Hostile, DropReports]:
         said(origin, *(_whole(1, seq) for seq in range(start, start + 1_600)))
     origin.port.disconnected(now=origin.now)
     link = origin.hub.links[origin.name]
-    (stream,) = link.streams.values()
-    (channel,) = reader.hub.links[reader.name].channels.values()
+    (stream,) = link.taking.streams.values()
+    (channel,) = reader.hub.links[reader.name].sender.channels.values()
     assert channel.kept == BACKLOG
     for seq in range(2, FIRST, 2):
         stream.reports.add(seq, DropReason.LOST, "site")
@@ -47,7 +47,7 @@ def of_one_each() -> Input:
 
     frames = filled(dropped)
     assert 500 < len(frames) < BACKLOG // 2
-    (channel,) = reader.hub.links[reader.name].channels.values()
+    (channel,) = reader.hub.links[reader.name].sender.channels.values()
 
     def rest() -> bool:
         more = one_more_slice(reader)

@@ -96,7 +96,7 @@ async def test_a_client_has_its_lanes_where_it_reaches_the_relay(
         for name, robot in revoked.items():
             await until(partial(refused, robot), f"{name} has no session, and knows why")
         for robot in stay.values():
-            assert robot.core.link.established and LANE_UDP not in robot.core.link.lanes
+            assert robot.core.link.established and LANE_UDP not in robot.core.link.lanes.by_id
         assert "::ffff:" not in caplog.text, "an IPv4 client is one in the logs"
         for robot in (*revoked.values(), *stay.values()):
             await lab.end(robot)
@@ -134,6 +134,6 @@ async def test_over_ipc_there_is_no_datagram_lane(tmp_path: Path, caplog: pytest
         lanes.asked(name, offered_ciphers())
         assert "robot1 gets no datagram lane: it has no TCP connection to this relay" in caplog.text
         for link in (relay.hub.links[name], robot.core.link):
-            assert link.established and LANE_UDP not in link.lanes
+            assert link.established and LANE_UDP not in link.lanes.by_id
         for daemon in (robot, relay):
             await lab.end(daemon)

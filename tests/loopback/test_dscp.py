@@ -215,7 +215,7 @@ async def marks_by_class(robot: ClientDaemon, relay: RelayDaemon, tap: Tap | Cap
     def quiet() -> bool:
         """Whether nothing of the class before is still to come."""
         links = (robot.core.link, hub.links[ClientName("robot1")])
-        mine = [channel for link in links for channel in link.channels.values()]
+        mine = [channel for link in links for channel in link.sender.channels.values()]
         return not any(channel.queue or channel.flying for channel in mine)
 
     seen: Seen = {}

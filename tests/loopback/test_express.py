@@ -26,7 +26,7 @@ def player(lab: Lab, bag: Path, **relay: object) -> Path:
 
 def uses_express(robot: ClientDaemon, relay: RelayDaemon) -> bool:
     link = relay.hub.links.get(ROBOT)
-    return robot.core.link.express is not None and link is not None and link.express is not None
+    return robot.core.link.lanes.express is not None and link is not None and link.lanes.express is not None
 
 
 def arrived(site: ClientDaemon) -> int:
@@ -54,7 +54,7 @@ async def test_commands_arrive_over_it_whatever_becomes_of_its_connections(tmp_p
             connection = server.connections.by_fd(fd)
             assert connection is not None and connection.handle is not None and connection.user == ROBOT
             connection.handle.cut()
-        await until(lambda: joined(relay) == [] or robot.core.link.express is None, "the connections are lost")
+        await until(lambda: joined(relay) == [] or robot.core.link.lanes.express is None, "the connections are lost")
         await until(lambda: uses_express(robot, relay) and len(joined(relay)) == CONNECTIONS, "they come back")
         await until(lambda: arrived(site) == COUNT, "every command arrives")
         assert robot.core.link.established

@@ -46,7 +46,7 @@ def reload(lab: Lab, relay: RelayDaemon, *roles: dict[str, Any]) -> None:
 
 def sends(robot: ClientDaemon) -> bool | None:
     """Whether the relay has said that somebody wants the robot's odometry; None: it has not said anything yet."""
-    for channel in robot.core.link.channels.values():
+    for channel in robot.core.link.sender.channels.values():
         if channel.stream.id.topic == ODOMETRY:
             return channel.wanted
     return None

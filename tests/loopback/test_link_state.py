@@ -213,7 +213,7 @@ async def test_a_link_with_thirteen_times_what_it_carries_tells_of_a_lost_robot(
             site = await lab.connected(site_file(lab, relay={"endpoint": f"tcp://{host}:{port}", "udp": False}))
             proxy.start()
             await until(lambda: level(site, "robot1") == level(site, "robot2") == 0, "it has both")
-            ledger = relay.hub.links[ClientName("site")].ledger
+            ledger = relay.hub.links[ClientName("site")].sender.ledger
 
             def overloaded() -> bool:
                 topics = ledger.topics.values()

@@ -76,7 +76,7 @@ async def test_a_lane_whose_keys_run_out_is_there_again(
             return len(seen) >= 3
 
         await until(another, "three sets of keys were used up", deadline_s=60.0)
-        assert len(site.core.link.channels) >= 1 and site.core.link.established
+        assert len(site.core.link.sender.channels) >= 1 and site.core.link.established
         assert not [record for record in caplog.records if record.levelname == "ERROR"]
         await lab.end(site)
         await lab.end(relay)

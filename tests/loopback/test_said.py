@@ -11,7 +11,7 @@ import zmq
 from sern_client import relay_name
 from sern_client.daemon import SILENT
 from sern_client.relay_name import UnresolvedError
-from sern_core.link.session import NEW_SESSION
+from sern_core.link.handshake import NEW_SESSION
 from sern_core.path.lanes import LANE_UDP
 from sern_core.vocabulary.message import TopicInfo
 from sern_core.vocabulary.types import Encoding, TopicName
@@ -100,7 +100,7 @@ async def test_two_processes_with_one_name_are_told_of_each_other(
         # One line for each time that it is displaced, and one at the relay.
         await lab.end(second)
         await until(lambda: first._ready().ok, "goes on alone")
-        await until(lambda: len(relay.hub.relayed) == len(first.core.link.channels) > 0, "has its topics again")
+        await until(lambda: len(relay.hub.relayed) == len(first.core.link.sender.channels) > 0, "has its topics again")
         assert first.bridge.refusals == 0
         own = [record for record in caplog.records if said in record.getMessage()]
         assert {record.name for record in own} == {"sern_client.daemon", "sern_relay.daemon"}

@@ -198,7 +198,7 @@ async def test_nobody_joins_the_session_of_another(tmp_path: Path, caplog: pytes
     async with bystanders(tmp_path, caplog) as world:
         server = world.relay.server
         assert server is not None
-        said = world.robot.core.link.join(now=0.0)  # as if it had been overheard
+        said = world.robot.core.link.handshake.join(0.0)  # as if it had been overheard
         assert said is not None
         envelope = framing.decode_handshake(said) | {"name": "robot2"}
         own_name = framing.encode_handshake(framing.Kind.JOIN, framing.decode_header(said).tag, 0, envelope)

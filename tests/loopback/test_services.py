@@ -269,7 +269,9 @@ async def test_only_what_a_rule_names_is_offered_and_used(tmp_path: Path, monkey
         handler = await sites.served()
         assert await handler(b"") == b"re: "
         expected = {"/robot1/set_speed/_service", "/robot1/set_mode/_service", "/robot1/set_mode/_reply/site"}
-        await until(lambda: {stream.topic for stream in robot.core.link.by_stream} == expected, "offered and answered")
+        await until(
+            lambda: {stream.topic for stream in robot.core.link.outgoing.by_stream} == expected, "offered and answered"
+        )
         assert list(sites.site.served) == [GLOBAL]
 
 
@@ -305,7 +307,7 @@ async def test_nobody_calls_in_the_name_of_another_site(tmp_path: Path, monkeypa
         rogue.core.send(own, CALL.pack(2) + b"own", 0, now=clock.now())
         await until(lambda: (SERVICE, b"own") in sites.robot.calls, "its own call is executed")
         assert (SERVICE, b"forged") not in sites.robot.calls
-        assert [stream.topic for stream in robot.core.link.by_stream] == [
+        assert [stream.topic for stream in robot.core.link.outgoing.by_stream] == [
             "/robot1/set_mode/_service",
             "/robot1/set_mode/_reply/rogue",
         ]
@@ -463,7 +465,10 @@ async def test_services_that_come_and_go_leave_nothing_behind(tmp_path: Path, mo
             assert await handler(b"%d" % number) == b"re: %d" % number
             sites.robot.events.service_removed(SERVICE)
             await until(lambda: not sites.site.served, "withdrawn")
-        await until(lambda: not robot.core.link.by_stream and not site.core.link.by_stream, "no streams are left")
+        await until(
+            lambda: not robot.core.link.outgoing.by_stream and not site.core.link.outgoing.by_stream,
+            "no streams are left",
+        )
         for services in (bridge(robot), bridge(site)):
             assert not services.offered
             assert not services.used
@@ -483,10 +488,10 @@ async def test_many_services_cost_a_stream_each_until_they_are_called(
         for number in range(count):
             sites.robot.events.service_added(replace(INFO, name=TopicName(f"/set_{number}")))
         await until(lambda: len(sites.site.served) == count, "all are served")
-        assert (len(robot.core.link.by_stream), len(site.core.link.by_stream)) == (count, 0)
+        assert (len(robot.core.link.outgoing.by_stream), len(site.core.link.outgoing.by_stream)) == (count, 0)
         handler = sites.site.served[TopicName("/robot1/set_7")].handler
         assert await handler(b"seven") == b"re: seven"
-        assert (len(robot.core.link.by_stream), len(site.core.link.by_stream)) == (count + 1, 1)
+        assert (len(robot.core.link.outgoing.by_stream), len(site.core.link.outgoing.by_stream)) == (count + 1, 1)
 
 
 async def test_a_site_serves_only_so_many(
@@ -501,7 +506,7 @@ async def test_a_site_serves_only_so_many(
         assert sites.robot.events is not None
         for number in range(6):
             sites.robot.events.service_added(replace(INFO, name=TopicName(f"/set_{number}")))
-        await until(lambda: len(site.core.link.streams) == 6 and len(sites.site.served) == 3, "all are known")
+        await until(lambda: len(site.core.link.taking.streams) == 6 and len(sites.site.served) == 3, "all are known")
         assert len(sites.site.served) == 3
         assert caplog.text.count("name those that are needed in services.use") == 1
 

@@ -72,7 +72,7 @@ async def test_clouds_arrive_as_thin_clouds_scans_and_masks(tmp_path: Path, enco
         names = [TopicName(f"/robot1/points/{kind}") for kind in ("thin", "scan", "mask")]
         await until(lambda: all(name in arrived and arrived[name].delivered >= 3 for name in names))
         assert TopicName("/robot1/points") not in arrived
-        streams = {stream.stream.id.topic: stream.stream for stream in site.core.link.streams.values()}
+        streams = {stream.stream.id.topic: stream.stream for stream in site.core.link.taking.streams.values()}
         assert streams[names[1]].attributes.items() >= {"summary": "scan", "summary_of": "/robot1/points"}.items()
         assert streams[names[0]].spec.priority == 2 and streams[names[1]].spec.priority == 1
         for summary in robot.bridge.summaries.topics:
@@ -150,7 +150,7 @@ async def test_patches_arrive_as_whole_grids(tmp_path: Path, late: bool) -> None
         site = None if late else await lab.connected(lab.recorder_file("site", "/robot1/map"))
         robot = await lab.connected(lab.client_file("robot1", play, topics=[rule]))
         await until(lambda: endpoint_of(robot, BagEndpoint).exhausted and not robot.bridge.pending)
-        updates = robot.core.link.ledger.topics[TopicName("/robot1/map_updates")]
+        updates = robot.core.link.sender.ledger.topics[TopicName("/robot1/map_updates")]
         await until(lambda: updates.offered and updates.delivered == updates.offered, "updates are delivered")
         if site is None:
             site = await lab.connected(lab.recorder_file("site", "/robot1/map"))
@@ -158,7 +158,7 @@ async def test_patches_arrive_as_whole_grids(tmp_path: Path, late: bool) -> None
         updates_topic = TopicName("/robot1/map_updates")
         if late:  # what came after the last whole grid, which is the one at which the map grew
             await delivered(site, topic, 1)
-            owed = relay.hub.links[ClientName("site")].ledger.topics
+            owed = relay.hub.links[ClientName("site")].sender.ledger.topics
 
             def caught_up() -> bool:
                 counters = owed.get(updates_topic)
@@ -168,7 +168,7 @@ async def test_patches_arrive_as_whole_grids(tmp_path: Path, late: bool) -> None
         else:
             await delivered(site, updates_topic, updates.offered)
         assert rebuilds.gaps == rebuilds.undecodable == 0
-        sent = robot.core.link.ledger.topics
+        sent = robot.core.link.sender.ledger.topics
         wire_bytes = sent[topic].delivered_bytes + updates.delivered_bytes
         assert wire_bytes < sum(len(body) for body in grids) / 5
         assert balance(robot.topics()) == []
@@ -201,7 +201,7 @@ async def test_transforms_of_many_nodes_become_one_message(tmp_path: Path) -> No
         await until(lambda: endpoint_of(robot, BagEndpoint).exhausted and not robot.bridge.pending)
         late = await lab.connected(lab.recorder_file("late", "/tf_static"))
         arrived = site.core.received.topics
-        sent = robot.core.link.ledger.topics[TopicName("/tf")]
+        sent = robot.core.link.sender.ledger.topics[TopicName("/tf")]
         await until(lambda: TopicName("/tf_static") in late.core.received.topics)
         await until(lambda: sent.offered and TopicName("/tf") in arrived)
         await until(lambda: arrived[TopicName("/tf")].delivered == sent.offered)

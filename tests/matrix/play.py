@@ -199,9 +199,9 @@ class Play:
                 return True
             self.world.run(STEP_S)
         waiting = [
-            f"{link.name}>{link.peer} {channel.stream.id.topic}: {len(channel.retained) or len(channel.queue)}"
+            f"{link.end.name}>{link.peer} {channel.stream.id.topic}: {len(channel.retained) or len(channel.queue)}"
             for link in self.world.links()
-            for channel in link.channels.values()
+            for channel in link.sender.channels.values()
             if channel.retained or channel.queue or channel.flying
         ]
         self.broken.append(f"not drained {DRAIN_S:g} s after the load: {waiting}")
@@ -264,7 +264,7 @@ class Play:
 
 
 def _audit(link: Link, now: float) -> Audited:
-    link.scheduler = audited = Audited(now=now)
+    link.sender.scheduler = audited = Audited(now=now)
     return audited
 
 

@@ -85,7 +85,7 @@ class Flood:
     def _open(self, lane_id: int) -> None:
         link, hub = self.robot.core.link, self.world.relay.hub
         if lane_id == LANE_EXPRESS:
-            said = link.join(now=self.robot.now)
+            said = link.handshake.join(self.robot.now)
             assert said is not None
             assert hub.join(ROBOT, said, now=self.world.relay.now)
         else:
@@ -95,7 +95,7 @@ class Flood:
     def play(self) -> "Flood":
         world, link = self.world, self.robot.core.link
         world.run(SETTLE_S)
-        assert (link.express is not None) is (self.cell.lanes is Lanes.EXPRESS)
+        assert (link.lanes.express is not None) is (self.cell.lanes is Lanes.EXPRESS)
         assert (link.lane.id == LANE_UDP) is (self.cell.lanes is Lanes.DATAGRAM)
         world.watch(0.5)
         stops = [

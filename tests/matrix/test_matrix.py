@@ -63,7 +63,7 @@ def test_a_lifespan_below_the_floor_of_the_path_is_counted_not_silent(profile: s
     world.run(5.0)
     assert site.got == []
     hub = world.relay.hub
-    onwards = hub.links[site.name].ledger.topics.get(command.stream.id.topic)
+    onwards = hub.links[site.name].sender.ledger.topics.get(command.stream.id.topic)
     too_old = sum(
         counters.by_reason[DropReason.LIFESPAN]
         for counters in (

@@ -143,7 +143,7 @@ async def test_changes_of_a_grid_have_the_same_patience_as_the_grid() -> None:
     bridge.attach(core)
 
     def channels() -> dict[str, OutChannel]:
-        return {channel.stream.id.topic: channel for channel in core.link.channels.values()}
+        return {channel.stream.id.topic: channel for channel in core.link.sender.channels.values()}
 
     names = {"/robot/map", "/robot/map_updates"}
     info = ros_types.topic_info(MAP, "nav_msgs/msg/OccupancyGrid", Encoding.CDR)

@@ -241,11 +241,11 @@ class Site:
             reason=lambda: "connection lost",
             parts=self.parts,
         )
-        self.core.link.established = True
+        self.core.link.end.established = True
         self.core.peers.session_began(now=clock.now())
 
     def lose_link(self) -> None:
-        self.core.link.established = False
+        self.core.link.end.established = False
         self.core.peers.session_ended(now=clock.now())
 
     def told(self, name: str, *, up: bool, for_s: float = 0.0, rtt_s: float | None = None) -> None:
@@ -268,7 +268,7 @@ async def test_a_change_is_published_at_once_and_logged_once(caplog: pytest.LogC
     await until(lambda: decoded(opened).level == 0, "it is back")
     site.lose_link()
     await until(lambda: decoded(opened).level == 3, "nobody knows")
-    site.core.link.established = True
+    site.core.link.end.established = True
     site.core.peers.session_began(now=clock.now())
     site.told("jackal1", up=True)
     await until(lambda: decoded(opened).level == 0, "it was there all the while, which is no news")

@@ -69,7 +69,7 @@ def test_a_lost_message_of_any_of_fifty_clients_and_a_hundred_topics_has_its_nam
         key: n for key, n in scene.rows("sern_messages_dropped_total").items() if re.fullmatch(alerting(), key[2])
     }
     assert len(before) == 50 * 100 * 3 and not any(before.values())
-    scene.links[49].ledger.topics["/r/t99"].drop(DropReason.RETENTION, 100)
+    scene.links[49].sender.ledger.topics["/r/t99"].drop(DropReason.RETENTION, 100)
     after = {key: n for key, n in scene.rows("sern_messages_dropped_total").items() if re.fullmatch(alerting(), key[2])}
     assert {key: n for key, n in after.items() if n != before[key]} == {("site49", "/r/t99", "retention"): 1.0}
 
@@ -77,8 +77,8 @@ def test_a_lost_message_of_any_of_fifty_clients_and_a_hundred_topics_has_its_nam
 def test_a_topic_too_many_keeps_its_reason(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "MAX_LABEL_SETS", 10)
     scene = Scene(3, 10)
-    scene.links[2].ledger.topics["/r/t9"].drop(DropReason.RETENTION, 100)
-    scene.links[2].ledger.topics["/r/t9"].drop(DropReason.LIFESPAN, 100)
+    scene.links[2].sender.ledger.topics["/r/t9"].drop(DropReason.RETENTION, 100)
+    scene.links[2].sender.ledger.topics["/r/t9"].drop(DropReason.LIFESPAN, 100)
     rows = scene.rows("sern_messages_dropped_total")
     assert rows["other", "other", "retention"] == rows["other", "other", "lifespan"] == 1
     assert len(rows) == 11 * 3 + 1
@@ -97,7 +97,7 @@ def test_rows_under_other_stay_there_and_do_not_fall_when_a_link_is_forgotten(mo
         assert rows["other", "other", "retention"] == 2
     del scene.links[0]
     assert scene.rows("sern_messages_dropped_total")["other", "other", "retention"] == 2
-    scene.links[0].ledger.topics["/r/t0"].drop(DropReason.RETENTION, 100)
+    scene.links[0].sender.ledger.topics["/r/t0"].drop(DropReason.RETENTION, 100)
     assert scene.rows("sern_messages_dropped_total")["other", "other", "retention"] == 3
     scene.links.append(link("new", 10))
     assert scene.rows("sern_messages_dropped_total")["new", "/r/t0", "retention"] == 0

@@ -21,7 +21,7 @@ from hypothesis import strategies as st
 from ruamel.yaml import YAML
 from typer.testing import CliRunner
 
-from sern_core.link.session import NEW_SESSION
+from sern_core.link.handshake import NEW_SESSION
 from sern_core.vocabulary.errors import ConfigError, RefusedError, SernError, UsageError
 from sern_core.vocabulary.message import Message, StreamId, StreamInfo, TopicInfo, TopicSpec
 from sern_core.vocabulary.types import ClientName, DropReason, Encoding, TopicName

@@ -69,7 +69,7 @@ class Stage:
         self.robot = self.world.client("robot", model)
         self.site = self.world.client("site", model, patterns=[".*"])
         for client in (self.robot, self.site):
-            client.core.link.fates = Recorder(self.log, client.name)
+            client.core.link.outgoing.fates = Recorder(self.log, client.name)
         self.channel = self.robot.publish(
             TOPIC, spec(PriorityClass.BULK, reliable=reliable, lifespan_s=lifespan_s, depth=depth)
         )
@@ -89,7 +89,7 @@ class Stage:
         world.run(2.0)
         world.validate()
         for link in world.relay.hub.links.values():
-            for channel in link.channels.values():
+            for channel in link.sender.channels.values():
                 for out in channel.undelivered():
                     Recorder(self.log, "relay").held(channel.stream, out.seq, link.peer, exposed=out.exposed)
         return self.fates()

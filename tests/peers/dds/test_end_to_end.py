@@ -170,7 +170,7 @@ async def test_two_ros2_sites(tmp_path: Path, domain: int, make_peer: MakePeer) 
         await site.do(f"sub odom rt/robot1/odom {ODOMETRY} reliable transient_local")
         await site.line("got odom ")
         assert same(site.got("odom")[0], body)
-        offered = {channel.stream.id.topic for channel in daemon.core.link.channels.values()}
+        offered = {channel.stream.id.topic for channel in daemon.core.link.sender.channels.values()}
         assert not any(name.endswith("/odom") for name in offered)  # nothing goes back
 
 

@@ -104,9 +104,9 @@ def test_only_texts_of_ones_own_streams_are_told() -> None:
     peer.control({"t": "define", "dh": definition_hash(text)}, text.encode())
     other = Hostile(peer.world, "other")
     link = peer.hub.links[other.name]
-    said = link._control.next_seq
+    said = link.control.out.next_seq
     other.control({"t": "need", "dh": definition_hash(text)})
-    assert link._control.next_seq == said
+    assert link.control.out.next_seq == said
 
 
 def test_a_text_that_comes_too_late_is_not_kept() -> None:

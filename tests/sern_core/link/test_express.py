@@ -22,7 +22,7 @@ def stream(*blackouts: Window) -> LinkModel:
 
 
 def uses_express(link: Link) -> bool:
-    return link.express is not None
+    return link.lanes.express is not None
 
 
 class Express:
@@ -65,7 +65,7 @@ class Express:
 
     def join(self) -> bool:
         now = self.robot.now
-        said = self.core.link.join(now=now)
+        said = self.core.link.handshake.join(now)
         if said is None or not self.world.relay.hub.join(ROBOT, said, now=self.world.relay.now):
             return False
         self.core.link.open_lane(now=now, lane_id=LANE_EXPRESS)
@@ -89,7 +89,7 @@ def test_class_control_moves_there_and_the_rest_stays() -> None:
     express.run(0.9)
     assert not express.used()
     express.run(9.1)
-    assert express.core.link.express is express.core.link.lanes[LANE_EXPRESS]
+    assert express.core.link.lanes.express is express.core.link.lanes.by_id[LANE_EXPRESS]
     assert express.core.link.lane.id == LANE_ZMQ
     sent = express.hop.forward.stats
     assert sent.delivered_bytes < 0.05 * 10 * RATE_BPS / 8  # poses, commands, acknowledgements: no cloud
@@ -156,7 +156,7 @@ def test_both_lanes_of_the_path_share_one_window() -> None:
     express = Express(second=stream())
     express.run(5.0)
     link = express.core.link
-    zmq, fast = link.lanes[LANE_ZMQ], link.lanes[LANE_EXPRESS]
+    zmq, fast = link.lanes.by_id[LANE_ZMQ], link.lanes.by_id[LANE_EXPRESS]
     assert fast.estimator is zmq.estimator
     assert fast.pacer is zmq.pacer
     assert zmq.under_way_bytes == fast.under_way_bytes == zmq.flight.inflight_bytes + fast.flight.inflight_bytes > 0
@@ -173,8 +173,8 @@ def test_both_lanes_of_the_path_share_one_window() -> None:
 def test_a_stalled_stream_neither_fills_the_window_nor_makes_the_path_unknown() -> None:
     express = Express(second=stream(), main=stream(Window(5.0, 7.0)))
     express.run(6.8)
-    zmq = express.core.link.lanes[LANE_ZMQ]
-    fast = express.core.link.lanes[LANE_EXPRESS]
+    zmq = express.core.link.lanes.by_id[LANE_ZMQ]
+    fast = express.core.link.lanes.by_id[LANE_EXPRESS]
     assert zmq.stalled
     assert not fast.stalled
     assert zmq.flight.inflight_bytes > 0
@@ -189,28 +189,28 @@ def test_copies_are_sent_only_where_they_keep_nobody_waiting() -> None:
     express = Express(second=stream())
     express.run(5.0)
     link = express.core.link
-    assert link.may_copy(200)  # poses and commands are within their share
+    assert link.plane.may_copy(200)  # poses and commands are within their share
     flood = express.robot.publish("/robot/flood", spec(PriorityClass.CONTROL))
     express.run(1.0)
     answers: list[bool] = []
     every = express.world.network.every
     every(0.001, lambda now: express.core.send(flood, b"f" * 1000, 0, now=now), node=express.robot)
-    every(0.001, lambda _now: answers.append(link.express is not None and link.express.spare))
+    every(0.001, lambda _now: answers.append(link.lanes.express is not None and link.lanes.express.spare))
     express.run(3.0)
     assert sum(answers[1000:]) < 0.7 * len(answers[1000:])
-    before_bytes = link.scheduler.class0_tokens_bytes(now=express.robot.now)
-    if link.may_copy(200):  # and then they count
-        assert link.scheduler.class0_tokens_bytes(now=express.robot.now) < before_bytes
+    before_bytes = link.sender.scheduler.class0_tokens_bytes(now=express.robot.now)
+    if link.plane.may_copy(200):  # and then they count
+        assert link.sender.scheduler.class0_tokens_bytes(now=express.robot.now) < before_bytes
     express.check()
 
 
 def test_a_new_session_must_be_joined_anew() -> None:
     express = Express(second=stream())
     express.run(5.0)
-    old = express.core.link.join(now=express.robot.now)
+    old = express.core.link.handshake.join(express.robot.now)
     express.world.restart_relay()
     express.run(5.0)
-    assert LANE_EXPRESS not in express.core.link.lanes
+    assert LANE_EXPRESS not in express.core.link.lanes.by_id
     hub = express.world.relay.hub
     assert old is not None
     assert not hub.join(ROBOT, old, now=express.world.relay.now)  # of the relay before
@@ -221,7 +221,7 @@ def test_only_its_own_client_joins_a_session() -> None:
     express = Express(second=stream())
     express.run(5.0)
     hub, now = express.world.relay.hub, express.world.relay.now
-    said = express.core.link.join(now=express.robot.now)
+    said = express.core.link.handshake.join(express.robot.now)
     assert said is not None
     assert not hub.join(ClientName("site"), said, now=now)  # another's key, whatever it has overheard
     assert not hub.join(ClientName("nobody"), said, now=now)

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from sern_core.link import answering
+from sern_core.link import owed_lists
 from sern_core.link.interest import PAUSE_MAX_S, Interest
 from sern_core.stream.in_stream import InStream, Reassembly
 from sern_core.vocabulary.errors import WireError
@@ -79,7 +79,9 @@ def test_a_hundred_plain_subscribers_cost_a_robot_next_to_nothing(every_s: float
     world.run(20.0)
     assert all(not c.patterns for c in (client.core for client in world.clients.values()) if c.name.startswith("site"))
     assert control.nbytes < ROBOT_BYTES, control.kinds
-    assert all(channel.wanted and channel.owed in ((), ("operator",)) for channel in robot.core.link.channels.values())
+    assert all(
+        channel.wanted and channel.owed in ((), ("operator",)) for channel in robot.core.link.sender.channels.values()
+    )
     assert len(operator.opened) == 30
 
 
@@ -169,7 +171,7 @@ def test_a_peer_that_does_not_read_is_told_nothing_more() -> None:
         robot.port.next_datagram(now=robot.now)
         while (data := site.port.next_datagram(now=site.now)) is not None:
             site.say(framing.encode_ack(0, framing.decode_header(data).number, 2**64 - 1, 0, 0, 10**6))
-    assert len(world.relay.hub.links[robot.name]._control.retained) < 250
+    assert len(world.relay.hub.links[robot.name].control.out.retained) < 250
 
 
 def test_what_an_answer_may_name_has_an_end() -> None:
@@ -184,7 +186,7 @@ def test_what_an_answer_may_name_has_an_end() -> None:
     peer.now = 1.0
     peer.control(envelope)
     link = peer.hub.links[peer.name]
-    assert all(channel.wanted for channel in link.channels.values()) and len(link.channels) == 100
+    assert all(channel.wanted for channel in link.sender.channels.values()) and len(link.sender.channels) == 100
 
     def again_and_again() -> None:
         for _ in range(10):
@@ -197,7 +199,7 @@ def test_what_an_answer_may_name_has_an_end() -> None:
 
 def test_a_relay_keeps_no_names_that_a_subscriber_says_it_owes() -> None:
     peer = subscriber_of(3)
-    channels = peer.hub.links[peer.name].channels.values()
+    channels = peer.hub.links[peer.name].sender.channels.values()
     for _ in range(300):  # without end
         peer.control({"t": "want", "ch": 1, "on": True, "owed": ["x"] * 48, "more": True})
     peer.control({"t": "want", "ch": 1, "on": True, "owed": ["y"], "chs": [2, 3]})
@@ -214,7 +216,7 @@ def told_robot(topics: int) -> tuple[SimClient, Callable[[framing.Envelope], Non
     world.run(2.0)
 
     def tell(envelope: framing.Envelope) -> None:
-        world.relay.hub.links[robot.name].send_control(envelope, now=world.now)
+        world.relay.hub.links[robot.name].control.send(envelope, now=world.now)
         world.run(2.0)
 
     return robot, tell
@@ -222,7 +224,7 @@ def told_robot(topics: int) -> tuple[SimClient, Callable[[framing.Envelope], Non
 
 def test_channels_that_are_owed_alike_share_one_list() -> None:
     robot, tell = told_robot(50)
-    channels = list(robot.core.link.channels.values())
+    channels = list(robot.core.link.sender.channels.values())
     slots = sorted(channel.slot for channel in channels)
     runs = [slots[0] + 1, slots[-1]]
     tell({"t": "want", "ch": slots[0], "on": True, "chs": runs, "owed": ["site1", "site2"]})
@@ -232,9 +234,9 @@ def test_channels_that_are_owed_alike_share_one_list() -> None:
 
 
 def test_lists_that_are_finished_leave_room_for_others(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(answering, "MAX_OWED", 10)
+    monkeypatch.setattr(owed_lists, "MAX_OWED", 10)
     robot, tell = told_robot(1)
-    channel = next(iter(robot.core.link.channels.values()))
+    channel = next(iter(robot.core.link.sender.channels.values()))
     for row in range(5):
         names = [f"site{row}{index}" for index in range(6)]
         tell({"t": "want", "ch": channel.slot, "on": True, "owed": names[:5], "more": True})

@@ -109,7 +109,7 @@ def test_a_session_outlives_the_stream_and_a_fresh_pose_is_there_at_once() -> No
     lanes.run(36.0)
     assert lanes.robot.ups == [False]  # one session all along
     assert lanes.first_pose_after(24.0) <= 0.3
-    assert lanes.core.link.lanes[LANE_ZMQ].up
+    assert lanes.core.link.lanes.by_id[LANE_ZMQ].up
     lanes.check_log()
 
 
@@ -118,7 +118,7 @@ def test_packet_numbers_of_the_datagram_lane_that_run_out_begin_another_session(
     lanes = TwoLanes(stream=models()[0], datagrams=models()[1])
     lanes.run(5.0)
     link = lanes.core.link if end == "robot" else lanes.world.relay.hub.links[ClientName("robot")]
-    link.lanes[LANE_UDP].flight.next_number = framing.MAX_PACKET_NUMBER - 5
+    link.lanes.by_id[LANE_UDP].flight.next_number = framing.MAX_PACKET_NUMBER - 5
     lanes.run(5.0)
     assert lanes.robot.ups == [False, True]
     lanes._open(lanes.world.network.now)
@@ -145,7 +145,7 @@ def test_a_client_in_a_blackout_is_waited_for() -> None:
     lanes = TwoLanes(stream=stream, datagrams=datagrams)
     link = lanes.world.relay.hub._link(ClientName("robot"), 0.0)
     lanes.run(20.0)
-    assert not link.lanes[LANE_ZMQ].up, "the connection did not survive it"
+    assert not link.lanes.by_id[LANE_ZMQ].up, "the connection did not survive it"
     lanes.run(29.0)
     assert link.established
     lanes.run(6.0)
@@ -168,7 +168,7 @@ def test_the_lane_closes_with_its_session() -> None:
     lanes.run(3.0)
     lanes.world.restart_relay()
     lanes.run(10.0)
-    assert LANE_UDP not in lanes.core.link.lanes
+    assert LANE_UDP not in lanes.core.link.lanes.by_id
     assert lanes.robot.lanes_closed == 1
     lanes.check_log()
 
@@ -255,8 +255,8 @@ def test_a_datagram_has_the_class_of_the_most_urgent_message_in_it(monkeypatch: 
 
     def noted(port: LanePort, *, now: float) -> bytes | None:
         datagram = port.link.next_datagram(now=now, lane=port.lane)
-        if datagram is not None and port.link.name == "robot":
-            slots.update((c.slot, c.spec.priority.name) for c in port.link.channels.values())
+        if datagram is not None and port.link.end.name == "robot":
+            slots.update((c.slot, c.spec.priority.name) for c in port.link.sender.channels.values())
             carried = frozenset(slots[slot] for slot in _Carried(datagram).channels)
             seen.setdefault(carried, set()).add(port.priority)
         return datagram
@@ -267,7 +267,7 @@ def test_a_datagram_has_the_class_of_the_most_urgent_message_in_it(monkeypatch: 
     for number in range(20):
         lanes.core.subscribe((f"/site/{number}",), now=lanes.world.now)
         lanes.run(0.1)
-    assert lanes.core.link.lanes[LANE_UDP].redundant, "second copies were sent"
+    assert lanes.core.link.lanes.by_id[LANE_UDP].redundant, "second copies were sent"
     for carried, priorities in seen.items():
         if "CONTROL" in carried:
             assert priorities == {PriorityClass.CONTROL}, carried

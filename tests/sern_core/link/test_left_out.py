@@ -2,7 +2,7 @@
 
 import pytest
 
-from sern_core.link import hop, link, session
+from sern_core.link import reading, receiver, streams_in
 from sern_core.link.link import Link
 from sern_core.stream import in_stream
 from sern_core.stream.in_stream import InStream
@@ -14,7 +14,7 @@ from tests.sern_core.system.test_reports import said
 def test_a_stream_that_nobody_wants_is_not_told_of_again_as_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
     """What is left out is told once it is done. A stream that is forgotten meanwhile has nothing left to be told of,
     also when it goes on in slices the next time."""
-    for module in (in_stream, hop, link, session):
+    for module in (in_stream, reading, receiver, streams_in):
         monkeypatch.setattr(module, "SLICE_US", 5)
     peer = Hostile()
     told: list[int] = []
@@ -25,13 +25,13 @@ def test_a_stream_that_nobody_wants_is_not_told_of_again_as_left_out(monkeypatch
     monkeypatch.setattr(peer.hub, "on_skipped", on_skipped)
 
     def read_on() -> None:
-        while (due_s := end.read_due_s) is not None:
+        while (due_s := end.reading.due_s) is not None:
             peer.now = max(peer.now, due_s)
             peer.port.handle_timeout(now=peer.now)
 
     peer.announce(1, "/robot/a", reliable=True)
     end = peer.hub.links[peer.name]
-    (stream,) = end.streams.values()
+    (stream,) = end.taking.streams.values()
     peer.now = 5.0
     peer.port.handle_timeout(now=peer.now)  # the next sweep is some time away
     for seq in range(2, 60):

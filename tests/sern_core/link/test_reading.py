@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from sern_core.link import session
+from sern_core.link import reading
 from sern_core.link.link import Link
 from sern_core.vocabulary.errors import WireError
 from sern_core.vocabulary.message import StreamId, StreamInfo, TopicInfo
@@ -44,7 +44,7 @@ def announced(peer: Hostile, count: int = STREAMS, *, reliable: bool = False) ->
 
 
 def one_slice(peer: Hostile) -> None:
-    due_s = link_of(peer).read_due_s
+    due_s = link_of(peer).reading.due_s
     assert due_s is not None
     peer.now = max(peer.now, due_s)
     peer.port.handle_timeout(now=peer.now)
@@ -52,7 +52,7 @@ def one_slice(peer: Hostile) -> None:
 
 def read_all(peer: Hostile) -> int:
     slices = 0
-    while link_of(peer).read_due_s is not None:
+    while link_of(peer).reading.due_s is not None:
         one_slice(peer)
         slices += 1
     return slices
@@ -99,7 +99,7 @@ def test_a_datagram_that_costs_much_is_read_in_slices_and_in_order(monkeypatch: 
     peer.say(_whole(1, 2))  # it came later: its turn is later, too
     assert read_all(peer) > 3
     assert got == [*((f"/robot/t{slot}", 1) for slot in range(1, STREAMS + 1)), ("/robot/t1", 2)]
-    assert link_of(peer).strays == 0
+    assert link_of(peer).receiver.strays == 0
     peer.hub.validate()
 
 
@@ -111,7 +111,7 @@ def test_others_have_their_turn_in_between(monkeypatch: pytest.MonkeyPatch) -> N
     peer.say(announced(peer))
     other.say(_whole(1, 1))
     assert got[-1] == ("/other/a", 1)
-    assert link_of(peer).read_due_s is not None
+    assert link_of(peer).reading.due_s is not None
 
 
 def test_nothing_of_it_is_acknowledged_before_it_is_read() -> None:
@@ -120,7 +120,7 @@ def test_nothing_of_it_is_acknowledged_before_it_is_read() -> None:
     peer.say(announced(peer))
     peer.say(_whole(1, 2))
     peer.now += 1e-3
-    while link_of(peer)._half_read:
+    while link_of(peer).end.half_read:
         assert not acknowledges(peer)
         one_slice(peer)
     read_all(peer)
@@ -135,7 +135,7 @@ def test_a_session_that_ends_meanwhile_loses_nothing(monkeypatch: pytest.MonkeyP
     before = len(got)
     assert before < STREAMS
     peer.hello(2)
-    assert not link_of(peer)._unread
+    assert not link_of(peer).reading._unread
     peer.tag, peer.control_seq, peer.number = 2, 0, 0
     peer.say(announced(peer, reliable=True))
     read_all(peer)
@@ -153,7 +153,7 @@ def test_bytes_of_no_honest_peer_that_are_read_later_end_the_session() -> None:
 
 
 def test_what_waits_to_be_read_has_a_bound(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(session, "MAX_UNREAD_BYTES", 500_000)
+    monkeypatch.setattr(reading, "MAX_UNREAD_BYTES", 500_000)
     peer = robot_and_readers()
     peer.say(announced(peer))
 
@@ -164,7 +164,7 @@ def test_what_waits_to_be_read_has_a_bound(monkeypatch: pytest.MonkeyPatch) -> N
     with pytest.raises(WireError, match="wait to be read"):
         send_on()
     assert not link_of(peer).established
-    assert link_of(peer)._unread_bytes == 0
+    assert link_of(peer).reading._unread_bytes == 0
 
 
 WAITING = 4000
@@ -219,7 +219,7 @@ def test_what_is_released_goes_on_when_the_session_has_ended(
     read_all(peer)
     assert [seq for _, seq in got] == sorted({seq for _, seq in got})
     assert len(got) == WAITING + (step == 1)
-    stream = link_of(peer).incoming[1]
+    stream = link_of(peer).taking.incoming[1]
     assert stream.delivered == (1 + WAITING if step == 1 else 1 + 2 * WAITING)
     peer.hub.validate()
 
@@ -256,7 +256,7 @@ def test_what_ends_many_messages_at_once_is_charged_with_them(what: str, each_us
     for first in range(1, count, 1_000):
         origin.say(*(_whole(1, seq) for seq in range(first, first + 1_000)))
         read_all(origin)
-    (channel,) = link_of(reader).channels.values()
+    (channel,) = link_of(reader).sender.channels.values()
     assert channel.kept == count
     control: dict[str, Any] = {
         "want": {"t": "want", "ch": 1, "on": False},
@@ -271,5 +271,5 @@ def test_what_ends_many_messages_at_once_is_charged_with_them(what: str, each_us
     assert sum(not out.counted for out in channel.retained) == 0
     charged_us = link_of(reader).reassembly.work_us
     assert each_us * count <= charged_us <= 2 * each_us * count
-    assert link_of(reader).read_due_s == pytest.approx(said_s + 1e-6 * charged_us)
+    assert link_of(reader).reading.due_s == pytest.approx(said_s + 1e-6 * charged_us)
     reader.hub.validate()

@@ -53,11 +53,11 @@ def test_an_old_hello_that_comes_late_does_not_end_the_session() -> None:
     world.hops["robot"].break_connection(reconnect_s=0.1)
     world.run(1.0)
     port = inner(world, client)
-    tag = port.link.tag if port.link is not None else -1
-    assert len(hellos) == 2 and tag == client.core.link.tag
+    tag = port.link.end.tag if port.link is not None else -1
+    assert len(hellos) == 2 and tag == client.core.link.end.tag
     world.network.after(0.1, lambda now: port.receive(hellos[0], now=now))
     world.run(3.0)
-    assert port.link is not None and port.link.tag == tag and port.link.established
+    assert port.link is not None and port.link.end.tag == tag and port.link.established
     assert client.ups == [False, True]
 
 
@@ -179,14 +179,16 @@ def test_bytes_of_no_honest_peer_are_an_error_and_hurt_nobody_else() -> None:
             (None, b"junk" * 10, WireError),
             (framing.VERSION_MAX, b"\xff", WireError),
             (9, b"", VersionError),
-            (None, framing.encode_handshake(framing.Kind.WELCOME, port.link.tag, 0, {}), WireError),
+            (None, framing.encode_handshake(framing.Kind.WELCOME, port.link.end.tag, 0, {}), WireError),
             (framing.VERSION_MAX, framing.encode_ack(0, 10**6, 0, 0, 0, 0), WireError),
             (framing.VERSION_MAX, framing.encode_ack(9, 1, 0, 0, 0, 0), WireError),
         ),
         start=1,
     ):
         assert client.name in world.up() and len(client.ups) == sessions
-        header = b"" if kind is None else framing.encode_header(framing.Kind.DATA, port.link.tag, 0, 0, version=kind)
+        header = (
+            b"" if kind is None else framing.encode_header(framing.Kind.DATA, port.link.end.tag, 0, 0, version=kind)
+        )
         with pytest.raises(error):
             port.receive(header + payload, now=world.now)
         assert client.name not in world.up(), "the session goes on over what could not be read"
@@ -200,8 +202,8 @@ def test_a_stranger_announced_by_a_client_is_refused() -> None:
     client = world.client("robot")
     world.run(1.0)
     link = client.core.link
-    link.name = world.client("other").name  # announce in another's name
-    client.core.name = link.name
+    link.end.name = world.client("other").name  # announce in another's name
+    client.core.name = link.end.name
     channel = client.publish("/other/odom", spec())
     world.run(1.0)
     assert channel.wanted is False

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
-from sern_core.link import hop
+from sern_core.link import sender
 from sern_core.relay import hub as hub_module
 from sern_core.relay.access import AccessRule, AccessTable
 from sern_core.relay.hub import HubParams
@@ -60,7 +60,7 @@ def test_what_ends_is_what_waited_and_nothing_else(actions: list[str], end: str,
         elif action == "lapse":  # gives up what it sends meanwhile: a gap for all
             world.hops["robot"].break_connection(reconnect_s=1.0)
             assert robot.send(log, b"x")
-            robot.core.link.shed(log, 1, DropReason.QUEUE_FULL, now=robot.now)
+            robot.core.link.sender.shed(log, 1, DropReason.QUEUE_FULL, now=robot.now)
             world.run(1.5)
         elif action == "joins" and not joined:
             joined = here = True
@@ -74,7 +74,7 @@ def test_what_ends_is_what_waited_and_nothing_else(actions: list[str], end: str,
         world.network.crash_node(world.clients["away"])
     world.until(lambda: not log.queue and not log.flying, what="the relay has all of it")
     world.run(0.5)
-    channels = hub.links[ClientName("away")].channels.values() if joined else ()
+    channels = hub.links[ClientName("away")].sender.channels.values() if joined else ()
     waiting = {out.seq for channel in channels for out in channel.retained if not out.counted}
     open_at_origin = {out.seq for out in log.retained if not out.counted}
     lost_before = [drop.seq for drop in robot.dropped_out]
@@ -106,7 +106,7 @@ def test_what_ends_is_what_waited_and_nothing_else(actions: list[str], end: str,
 def test_what_lapses_in_many_sweeps_is_reported_once_and_never_sent(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where 500 messages lapse at a time and a sweep is for 3: the next one is due at once, and what lies between two
     sweeps sends none of them."""
-    monkeypatch.setattr(hop, "LAPSED_A_SWEEP", 3)
+    monkeypatch.setattr(sender, "LAPSED_A_SWEEP", 3)
     sent: list[bool] = []
     take = OutChannel.take
 
@@ -129,7 +129,7 @@ def test_what_lapses_in_many_sweeps_is_reported_once_and_never_sent(monkeypatch:
     assert got == list(range(1, len(got) + 1)) and 20 < len(got) < 400
     assert len(lost) == len(set(lost)) and set(lost) >= set(range(len(got) + 1, 501))
     assert sent and not any(sent), "what has lapsed is sent"
-    (channel,) = world.relay.hub.links[site.name].channels.values()
+    (channel,) = world.relay.hub.links[site.name].sender.channels.values()
     assert channel.counters.by_reason[DropReason.RETENTION] >= 500 - len(got)
     assert log.counters.offered == log.counters.delivered + log.counters.dropped == 500
 
@@ -139,7 +139,7 @@ def test_what_lapses_for_clients_that_are_away_goes_in_many_turns(
     count: int, kept: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Also of several clients: one turn is not for all that wait for all of them, however little it is of each."""
-    for module in (hop, hub_module):
+    for module in (sender, hub_module):
         monkeypatch.setattr(module, "LAPSED_A_SWEEP", 3)
     world = World(hub_params=HubParams(resume_s=1e6))
     robot = world.client("robot")
@@ -153,7 +153,7 @@ def test_what_lapses_for_clients_that_are_away_goes_in_many_turns(
         assert robot.send(log, b"x")
     world.run(20.0)
     hub = world.relay.hub
-    channels = [channel for site in sites for channel in hub.links[site.name].channels.values()]
+    channels = [channel for site in sites for channel in hub.links[site.name].sender.channels.values()]
     assert [channel.kept for channel in channels] == [count] * 3
     now = world.relay.now + 60.0
     hub.sweep(now=now)

@@ -38,11 +38,11 @@ def to_site(world: World) -> Link:
 
 
 def waiting(world: World) -> int:
-    return sum(channel.kept_bytes for channel in to_site(world).channels.values())
+    return sum(channel.kept_bytes for channel in to_site(world).sender.channels.values())
 
 
 def queue_full(world: World, topic: str) -> int:
-    return sum(c.by_reason[DropReason.QUEUE_FULL] for t, c in to_site(world).ledger.topics.items() if t == topic)
+    return sum(c.by_reason[DropReason.QUEUE_FULL] for t, c in to_site(world).sender.ledger.topics.items() if t == topic)
 
 
 def bounded_world(*, checked: bool = True) -> World:
@@ -196,7 +196,7 @@ def test_new_access_rules_lift_the_bound() -> None:
 
 def thinned(world: World, topic: str) -> OutChannel:
     """The channel of a topic, which the adaptation leaves most messages of out."""
-    channel = next(c for c in to_site(world).channels.values() if c.stream.id.topic == topic)
+    channel = next(c for c in to_site(world).sender.channels.values() if c.stream.id.topic == topic)
     channel.adapt(share=0.05, depth_max=channel.spec.depth)
     return channel
 
@@ -256,7 +256,7 @@ def test_whatever_comes_the_bound_holds_and_nothing_is_lost_silently(seed: int) 
 
     def send(_now: float) -> None:
         robot.send(random.choice(channels), b"x" * random.choice([10, 1_000, 9_000, 30_000]))
-        for channel in to_site(world).channels.values():
+        for channel in to_site(world).sender.channels.values():
             if random.random() < 0.02:
                 channel.adapt(share=random.choice([0.1, 0.5, 1.0]), depth_max=channel.spec.depth)
 
@@ -291,8 +291,8 @@ def test_a_client_that_is_away_holds_no_more_than_its_bound_whatever_comes() -> 
         while (data := peer.port.next_datagram(now=peer.now)) is not None:
             peer.say(framing.encode_ack(0, framing.decode_header(data).number, 2**64 - 1, 0, 0, 10**6))
         assert waiting(world) <= LIMIT_BYTES
-        assert sum(len(channel.gaps) + len(channel.retained) for channel in link.channels.values()) < 500
-    assert all(channel.next_seq == 3000 for channel in link.channels.values())
+        assert sum(len(channel.gaps) + len(channel.retained) for channel in link.sender.channels.values()) < 500
+    assert all(channel.next_seq == 3000 for channel in link.sender.channels.values())
     world.relay.hub.validate()
 
 
@@ -341,7 +341,7 @@ def test_a_full_queue_is_not_added_up_for_each_message() -> None:
             looked += 1
             return super().values()
 
-    link.channels = Counted(link.channels)
+    link.sender.channels = Counted(link.sender.channels)
     for seq in range(1, 40):
         peer.say(*(_whole(channel + 1, seq, b"x" * 30) for channel in range(200)))
         peer.now -= 1e-4  # all in one instant
@@ -361,13 +361,13 @@ def test_a_message_counts_for_what_it_takes() -> None:
         pass
     site.say(framing.encode_ack(0, link.lane.flight.next_number - 1, 0, 0, int(site.now * 1e6), 100))
     site.control({"t": "want", "ch": 1, "on": True})
-    (channel,) = link.channels.values()
+    (channel,) = link.sender.channels.values()
     tracemalloc.start()
     try:
         before_bytes = tracemalloc.get_traced_memory()[0]
         for first in range(1, count, 500):
             robot.say(*(_whole(1, seq, bytes((seq & 255, seq >> 8))) for seq in range(first, first + 500)))
-            while (due_s := robot.hub.links[robot.name].read_due_s) is not None:
+            while (due_s := robot.hub.links[robot.name].reading.due_s) is not None:
                 robot.now = max(robot.now, due_s)
                 robot.port.handle_timeout(now=robot.now)
         site.now = robot.now

@@ -37,7 +37,7 @@ class Ended:
 
     def dropped(self, reason: DropReason) -> int:
         link = self.world.relay.hub.links[self.site.name]
-        return sum(counters.by_reason[reason] for counters in link.ledger.topics.values())
+        return sum(counters.by_reason[reason] for counters in link.sender.ledger.topics.values())
 
 
 def test_what_was_owed_of_an_ended_stream_is_delivered() -> None:
@@ -149,7 +149,7 @@ def test_nor_to_a_client_that_does_not_want_it_any_more() -> None:
     site.control({"t": "subscribe", "patterns": ["/robot/l.*"], "more": False})
     assert len(hub._draining) == 1
     site.control({"t": "subscribe", "patterns": ["/other/.*"], "more": False})
-    assert not hub._draining and not hub.links[site.name].channels
+    assert not hub._draining and not hub.links[site.name].sender.channels
     hub.validate()
 
 
@@ -172,10 +172,10 @@ def test_there_is_a_bound_for_each_client(monkeypatch: pytest.MonkeyPatch) -> No
         peer.control({"t": "retract", "ch": 1})
         world.relay.hub.validate()
     link = world.relay.hub.links[ClientName("site")]
-    assert len(world.relay.hub._draining) == len(link.channels) == 50
-    dropped = sum(counters.by_reason[DropReason.QUEUE_FULL] for counters in link.ledger.topics.values())
+    assert len(world.relay.hub._draining) == len(link.sender.channels) == 50
+    dropped = sum(counters.by_reason[DropReason.QUEUE_FULL] for counters in link.sender.ledger.topics.values())
     assert dropped == 150
-    newest = {channel.stream.id.topic for channel in link.channels.values()}
+    newest = {channel.stream.id.topic for channel in link.sender.channels.values()}
     assert newest == {f"/mallory/t{index}" for index in range(150, 200)}
 
 
@@ -222,7 +222,7 @@ def test_messages_kept_for_late_joiners_follow_the_properties_of_their_stream() 
     link, stream = robot.core.link, channel.stream
     for depth, latched in ((3, True), (3, False)):
         channel.stream = StreamInfo(stream.id, stream.info, spec(latched=latched, depth=depth), stream.attributes)
-        link._announce(channel, world.now)
+        link.outgoing.announce(channel, world.now)
         world.run(1.0)
         (relayed,) = world.relay.hub.relayed.values()
         assert relayed.stream.stream.spec.depth == depth

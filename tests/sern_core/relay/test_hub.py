@@ -134,7 +134,7 @@ def test_a_revoked_name_is_forgotten_and_what_it_was_owed_is_reported() -> None:
     for _ in range(3):
         robot.send(log, b"x")
     world.run(0.2)
-    assert hub.links[site.name].by_stream[log.stream.id].retained
+    assert hub.links[site.name].outgoing.by_stream[log.stream.id].retained
     hub.forget(site.name, "the name is revoked", now=world.relay.now)
     assert site.name not in hub.links and not hub.routing.known(own.stream.id)
     world.until(lambda: len(robot.dropped_out) == 3, within_s=0.8)

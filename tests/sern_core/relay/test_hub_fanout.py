@@ -30,7 +30,7 @@ def wants(reader: Hostile, *patterns: str) -> None:
 
 def due_s(peer: Hostile) -> float | None:
     link = peer.hub.links.get(peer.name)
-    times = (None if link is None else link.read_due_s, peer.hub.matching.due_s.get(peer.name))
+    times = (None if link is None else link.reading.due_s, peer.hub.matching.due_s.get(peer.name))
     return min((at_s for at_s in times if at_s is not None), default=None)
 
 
@@ -104,11 +104,11 @@ def test_the_origin_is_told_at_once_who_is_owed() -> None:
     peer.announce(1, "/robot/a", reliable=True)
     relayed = stream_of(peer, "/robot/a")
     assert relayed.waiting and relayed.stream.wanted
-    (change,) = peer.hub.links[peer.name]._interest._changes.values()
+    (change,) = peer.hub.links[peer.name].answers._interest._changes.values()
     assert len(change.answer.owed) == READERS
     while due_s(peer) is not None:
         turn(peer)
-    (change,) = peer.hub.links[peer.name]._interest._changes.values()
+    (change,) = peer.hub.links[peer.name].answers._interest._changes.values()
     assert change.answer.owed == tuple(relayed.outs)
 
 
@@ -218,7 +218,7 @@ def test_a_message_that_is_read_all_the_same_reaches_all() -> None:
     peer.announce(1, "/robot/a", reliable=True)
     relayed = stream_of(peer, "/robot/a")
     assert relayed.waiting
-    peer.hub.links[peer.name].read_due_s = None
+    peer.hub.links[peer.name].reading.due_s = None
     peer.say(_whole(1, 1))
     assert all(held(relayed, reader) == [1] for reader in readers)
     peer.hub.sweep(now=peer.now)
@@ -240,21 +240,23 @@ def test_the_streams_of_a_process_that_was_started_anew_end_in_slices() -> None:
     peer.hello(2)
     peer.announce(1, "/robot/t1", reliable=True)
     assert {identity.boot for identity in hub.relayed} == {78}
-    left = [sum(len(link.channels) for link in links)]
+    left = [sum(len(link.sender.channels) for link in links)]
     while due_s(peer) is not None:
         hub.validate()
         assert left[-1] <= 20 or not stream_of(peer, "/robot/t1").outs, "a new stream is told before the old ones end"
         turn(peer)
-        left.append(sum(len(link.channels) for link in links))
+        left.append(sum(len(link.sender.channels) for link in links))
         assert left[-2] - left[-1] <= SLICE_US // hub_fanout.CLOSE_US + 1
         if len(left) == 2:
             hub.forget(readers[0].name, "revoked", now=peer.now)
             links.pop(0)
-            left[-1] = sum(len(link.channels) for link in links)
+            left[-1] = sum(len(link.sender.channels) for link in links)
     hub.validate()
     assert len(left) > 3
     identity = owed.stream.stream.id
-    assert all(len(link.channels) == 2 and link.by_stream[identity].retained for link in links), "what is owed is kept"
+    assert all(len(link.sender.channels) == 2 and link.outgoing.by_stream[identity].retained for link in links), (
+        "what is owed is kept"
+    )
 
 
 class Party:
@@ -370,7 +372,7 @@ def test_whatever_happens_everybody_gets_all_they_want(seed: int, monkeypatch: p
                 assert relayed.outs[reader.name][1].next_seq == party.sent[topic] + 1
                 missing = set(range(1, party.sent[topic] + 1)) - set(held(relayed, reader))
                 assert not missing or reader not in party.loyal
-    channels = [list(party.hub.links[reader.name].by_stream) for reader in party.loyal]
+    channels = [list(party.hub.links[reader.name].outgoing.by_stream) for reader in party.loyal]
     assert all(streams == channels[0] for streams in channels), "told in another order"
 
 

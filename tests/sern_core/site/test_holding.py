@@ -41,7 +41,7 @@ def held_world(count: int = 5) -> tuple[World, SimClient, SimClient, Keeper]:
 
 
 def delivered(robot: SimClient) -> int:
-    return next(iter(robot.core.link.channels.values())).counters.delivered
+    return next(iter(robot.core.link.sender.channels.values())).counters.delivered
 
 
 def test_what_is_held_is_not_confirmed_and_what_is_below_it_is() -> None:
@@ -101,7 +101,7 @@ def test_a_session_that_ends_confirms_nothing_by_itself() -> None:
 
 def test_a_release_after_the_end_of_the_stream_is_nothing() -> None:
     world, robot, site, keeper = held_world()
-    robot.core.unpublish(next(iter(robot.core.link.channels.values())), now=robot.now)
+    robot.core.unpublish(next(iter(robot.core.link.sender.channels.values())), now=robot.now)
     world.run(5.0)
     keeper.release(1)
     world.run(1.0)

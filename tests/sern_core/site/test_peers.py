@@ -120,17 +120,17 @@ def test_a_client_that_does_not_ask_is_told_nothing() -> None:
     site = world.client("site")
     robot.publish("/robot/odom", spec())
     world.run(0.5)
-    site.core.link.send_control({"t": "subscribe", "patterns": ["/robot/.*"], "more": False}, now=site.now)
+    site.core.link.control.send({"t": "subscribe", "patterns": ["/robot/.*"], "more": False}, now=site.now)
     told: list[str] = []
     link = world.relay.hub.links[site.name]
-    send = link.send_control
+    send = link.control.send
 
     def watched(envelope: framing.Envelope, attachment: bytes = b"", *, now: float) -> int:
         told.append(envelope["t"])
         return send(envelope, attachment, now=now)
 
     world.relay.hub.presence._watchers.clear()
-    link.send_control = watched  # type: ignore[method-assign]
+    link.control.send = watched  # type: ignore[method-assign]
     world.until(lambda: site.opened)
     world.run(5.0)
     assert "announce" in told and "peers" not in told
@@ -470,14 +470,14 @@ def test_what_flaps_is_told_as_it_is_when_the_site_has_heard_of_what_was_said_be
     world.until(lambda: statuses(site) == {"robot": CONNECTED})
     link = world.relay.hub.links[site.name]
     most = 0
-    told_before = link._control.next_seq
+    told_before = link.control.out.next_seq
     for _ in range(40):
         world.hops["robot"].break_connection()
         world.run(0.3)
-        waiting = len(link._control.retained)
+        waiting = len(link.control.out.retained)
         most = max(most, waiting)
     assert most <= 3
-    assert link._control.next_seq - told_before < 40
+    assert link.control.out.next_seq - told_before < 40
     world.run(10.0)
     assert statuses(site) == {"robot": CONNECTED}
 
@@ -637,13 +637,14 @@ class Told:
     """A client's link, as far as `Presence` looks at it."""
 
     established = True
-    control_heard = 1_000_000
+    heard = 1_000_000
     lane = Lane(0, LinkParams(), lossless=True)
 
     def __init__(self) -> None:
         self.items: list[framing.Envelope] = []
+        self.control = self
 
-    def send_control(self, envelope: framing.Envelope, attachment: bytes = b"", *, now: float) -> int:
+    def send(self, envelope: framing.Envelope, attachment: bytes = b"", *, now: float) -> int:
         self.items += envelope["peers"]
         return 0
 
@@ -760,7 +761,7 @@ def test_of_what_is_no_name_of_a_client_nothing_is_said() -> None:
     for start in (0, 12):
         names = ["robot", *(chr(0x10000 + start + number) * 64 for number in range(12))]
         envelope = {"t": "subscribe", "patterns": [], "more": start == 0, "peers": True, "known": names}
-        asking.core.link.send_control(envelope, now=asking.now)
+        asking.core.link.control.send(envelope, now=asking.now)
     world.run(3.0)
     assert [item for envelope in told for item in envelope["peers"]] == [{"name": "robot", "here": False}]
     world.check_faults()

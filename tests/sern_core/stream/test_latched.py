@@ -140,7 +140,7 @@ def test_a_late_joiner_gets_the_newest_that_may_wait_for_it(
 
     def primed(channel: OutChannel, replays: Sequence[Message], *, now: float) -> None:
         prime(channel, replays, now=now)
-        opened.append(sum(other.kept_bytes for other in {channel, *hub.links[LATE].channels.values()}))
+        opened.append(sum(other.kept_bytes for other in {channel, *hub.links[LATE].sender.channels.values()}))
 
     monkeypatch.setattr(OutChannel, "prime", primed)
     late = world.client(LATE, patterns=[".*"])
@@ -152,7 +152,7 @@ def test_a_late_joiner_gets_the_newest_that_may_wait_for_it(
     assert sorted(map(len, got.values())) == [10, 20]
     assert all(seqs == list(range(21 - len(seqs), 21)) for seqs in got.values()), "the newest are among them"
     assert 0 < max(opened) <= room_bytes
-    counters = hub.links[LATE].ledger.topics.values()
+    counters = hub.links[LATE].sender.ledger.topics.values()
     assert sum(each.by_reason[DropReason.QUEUE_FULL] for each in counters) == (20 if restarts else 10)
     world.validate()
 

@@ -182,7 +182,7 @@ def test_what_expires_while_it_is_encoded_is_dropped_and_counted() -> None:
     for channel in (cloud, log):
         assert channel.counters.by_reason[DropReason.LIFESPAN] == 1
         assert channel.counters.delivered == 1
-    encoder = robot.core.link.encoder
+    encoder = robot.core.link.sender.encoder
     assert encoder is not None and encoder.running == 0
 
 
@@ -203,7 +203,7 @@ def test_a_channel_that_closes_while_it_is_encoded_leaves_nothing_behind() -> No
         robot.core.unpublish(cloud, now=robot.now)
     world.run(10.0)
     assert sorted(got.topic for got in site.got) == ["/robot/points0", "/robot/points3"]
-    encoder = robot.core.link.encoder
+    encoder = robot.core.link.sender.encoder
     assert encoder is not None and encoder.running == 0
 
 
@@ -244,7 +244,7 @@ def test_profiles_are_measured_for_every_mode() -> None:
 def forge(robot: SimClient, channel: OutChannel, codec: int, body: bytes) -> None:
     """Send a body as no honest client would."""
     message = Message(channel.stream.id, channel.next_seq, body, 0, robot.now, codec=codec)
-    robot.core.link.submit(channel, message, now=robot.now)
+    robot.core.link.sender.submit(channel, message, now=robot.now)
 
 
 def bomb() -> bytes:

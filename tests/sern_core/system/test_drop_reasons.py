@@ -73,4 +73,4 @@ def test_a_message_of_no_stream_is_counted_as_such() -> None:
     peer.say(_whole(77, 1), _piece(77, 2, 0, 2), _piece(77, 2, 1, 2))
     received = world.relay.hub.received.topics[OTHER_TOPIC]
     assert received.by_reason[DropReason.UNKNOWN_CHANNEL] == 2 and received.delivered == 0
-    assert world.relay.hub.links[peer.name].strays == 3
+    assert world.relay.hub.links[peer.name].receiver.strays == 3

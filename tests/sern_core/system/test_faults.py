@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from sern_core.bodies.codecs import Coder
 from sern_core.link.link import Link
+from sern_core.link.sender import Sender
 from sern_core.path.lanes import LANE_UDP, LANE_ZMQ
 from sern_core.stream.in_stream import Partial
 from sern_core.stream.out_channel import OutChannel
@@ -290,15 +291,15 @@ def test_what_fails_towards_one_client_costs_that_one_its_session_and_nobody_a_m
     robot.send(channel, b"1")
     world.run(1.0)
     link = world.relay.hub.links[far.name]
-    with Faults(((Link, "submit"), 1))([(Link, "submit")]) as faults:
-        plain = Link.submit
+    with Faults(((Sender, "submit"), 1))([(Sender, "submit")]) as faults:
+        plain = Sender.submit
 
-        def submit(self: Link, *args: object, **kwargs: object) -> bool:
-            faults.armed = self is link
+        def submit(self: Sender, *args: object, **kwargs: object) -> bool:
+            faults.armed = self is link.sender
             return plain(self, *args, **kwargs)  # type: ignore[arg-type]
 
-        link.submit = submit.__get__(link)  # type: ignore[method-assign]
-        world.relay.hub.links[near.name].submit = submit.__get__(world.relay.hub.links[near.name])  # type: ignore[method-assign]
+        for sender in (link.sender, world.relay.hub.links[near.name].sender):
+            sender.submit = submit.__get__(sender)  # type: ignore[method-assign]
         faults.armed = False
         robot.send(channel, b"2")
         world.run(1.0)
@@ -323,7 +324,7 @@ def test_a_full_table_of_channels_refuses_one_subscriber_and_not_the_origin(monk
     def open_channel(*_args: object, **_kwargs: object) -> OutChannel:
         raise UsageError("all 65535 channels towards far are in use")
 
-    monkeypatch.setattr(link, "open_channel", open_channel)
+    monkeypatch.setattr(link.outgoing, "open", open_channel)
     channel = robot.publish("/robot/log", spec(reliable=True))
     world.run(1.0)
     robot.send(channel, b"1")
@@ -397,7 +398,7 @@ def test_a_control_message_that_nobody_knows_does_not_hold_up_what_came_before_i
     link.receive = receive.__get__(link)  # type: ignore[method-assign]
     lanes.run(3.0)
     assert lanes.core.link.lane.id == LANE_UDP
-    lanes.core.link.send_control({"t": "nonsense"}, now=lanes.robot.now)
+    lanes.core.link.control.send({"t": "nonsense"}, now=lanes.robot.now)
     lanes.run(0.02)
     fresh = lanes.robot.publish("/robot/fresh", spec(reliable=True), "int32 x\n")
     lanes.run(5.0)

@@ -79,7 +79,7 @@ def test_of_two_with_one_name_neither_flaps_for_ever() -> None:
     link.disconnected(now=100.0)
     cores.pop()
     run(100.0, 115.0)
-    assert cores[0].link.established and hub.links[ClientName("site")].peer_boot == 0
+    assert cores[0].link.established and hub.links[ClientName("site")].end.peer_boot == 0
     ups = events[0].calls["link_up"]
     run(115.0, 130.0)
     assert events[0].calls["link_up"] == ups

@@ -165,9 +165,9 @@ def test_a_command_that_becomes_too_old_in_the_last_turn_is_not_obeyed() -> None
     world.run(2.0)
     assert channel.wanted
     link, now = robot.core.link, robot.now
-    stream = next(iter(link.incoming.values()))
+    stream = next(iter(link.taking.incoming.values()))
     for seq, age_s in ((1, 0.1), (2, LIFESPAN_S - 0.01)):
-        link._deliver(stream, Message(channel.stream.id, seq, b"go", 0, now - age_s))
+        link.taking._deliver(stream, Message(channel.stream.id, seq, b"go", 0, now - age_s))
     link.next_datagram(now=now + 0.02)
     assert [got.seq for got in robot.on("/op/cmd")] == [1]
     assert robot.core.received.topics[TopicName("/op/cmd")].by_reason[DropReason.LIFESPAN] == 1

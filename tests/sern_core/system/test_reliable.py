@@ -129,7 +129,7 @@ def test_a_drop_on_the_second_hop_is_reported_before_the_watermark() -> None:
     by_reason = log.counters.by_reason  # the relay does not know of one that it had sent whole
     assert by_reason[DropReason.LIFESPAN] + by_reason[DropReason.UNCONFIRMED] == log.counters.dropped == len(missing)
     assert log.counters.delivered == 5 - len(missing)
-    assert not any(stream.reports for link in world.links() for stream in link.streams.values())
+    assert not any(stream.reports for link in world.links() for stream in link.taking.streams.values())
 
 
 def test_reports_survive_a_broken_session() -> None:
@@ -265,8 +265,8 @@ def test_a_message_on_its_way_to_a_subscriber_that_leaves_is_no_loss_either() ->
     world.run(0.8)
     send(robot, log, 1)
     link = world.relay.hub.links[guest.name]
-    world.until(lambda: any(channel.flying for channel in link.channels.values()), within_s=0.5)
-    world.until(lambda: not link.channels, within_s=1.0)
+    world.until(lambda: any(channel.flying for channel in link.sender.channels.values()), within_s=0.5)
+    world.until(lambda: not link.sender.channels, within_s=1.0)
     world.until(lambda: not log.retained)
     assert robot.dropped_out == [] and log.counters.delivered == 1
 
@@ -335,7 +335,7 @@ def test_replay_needs_its_right() -> None:
 def test_a_message_too_large_for_the_origin_or_the_relay_is_reported_and_passed_over() -> None:
     world = World(link=LinkParams(max_message_bytes=10_000)).watch()
     robot, site = pair(world)
-    robot.core.link.params = LinkParams(max_message_bytes=50_000)
+    robot.core.link.end.params = LinkParams(max_message_bytes=50_000)
     log = robot.publish("/robot/log", spec(reliable=True))
     best = robot.publish("/robot/cloud", spec())
     world.run(2.0)

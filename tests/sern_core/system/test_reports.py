@@ -2,7 +2,7 @@
 
 import pytest
 
-from sern_core.link.link import SEVERAL
+from sern_core.link.streams_out import SEVERAL
 from sern_core.relay.access import AccessRule, AccessTable
 from sern_core.stream import drop_reports
 from sern_core.stream.out_channel import CLIENT_OVERHEAD_BYTES
@@ -73,8 +73,8 @@ def test_a_peer_that_never_reads_has_no_more_kept_for_it_in_any_session(
             cuts += 1
             seq -= 1
         link = peer.hub.links[peer.name]
-        assert sum(len(each.reports) for each in link.streams.values()) <= 800
-        assert len(link._control.retained) < 200
+        assert sum(len(each.reports) for each in link.taking.streams.values()) <= 800
+        assert len(link.control.out.retained) < 200
         peer.port.disconnected(now=peer.now)
         peer.port = world.relay.port(peer.name)
         peer.tag, peer.number, peer.control_seq = peer.tag + 1, 0, 0
@@ -112,7 +112,7 @@ def test_what_others_report_does_not_end_the_session_of_an_origin(monkeypatch: p
     robot = world.client("robot", LinkModel(delay_s=0.025).as_stream())
     site = world.client("site", patterns=["/robot/.*"])
     other = world.client("other", patterns=["/robot/log"])
-    other.core.link.auto_confirm = False
+    other.core.link.taking.auto_confirm = False
     log = robot.publish("/robot/log", spec(reliable=True))
     pose = robot.publish("/robot/pose", spec())
     world.run(1.0)
@@ -122,11 +122,11 @@ def test_what_others_report_does_not_end_the_session_of_an_origin(monkeypatch: p
     last = log.next_seq - 1
     world.hops["robot"].break_connection(reconnect_s=20.0)
     world.run(1.0)
-    (stream,) = other.core.link.streams.values()
+    (stream,) = other.core.link.taking.streams.values()
     given_up = set(range(last - 5, 0, -2))
     for seq in sorted(given_up, reverse=True):
         envelope = {"t": "dropped", "ch": stream.channel_id, "seq": seq, "code": 1, "to": "other"}
-        other.core.link.send_control(envelope, now=other.now)
+        other.core.link.control.send(envelope, now=other.now)
     world.run(15.0)
     unheard = world.relay.hub.links[robot.name].reassembly.unheard
     assert unheard.reports == len(given_up) > 2 * drop_reports.MAX_REPORTS
@@ -162,9 +162,9 @@ def test_what_makes_room_newest_first_is_one_run() -> None:
     for seq in range(1, 201):
         urgent.say(_whole(1, seq))
         urgent.now += 0.02
-    (log,) = (each for each in hub.links[reader.name].channels.values() if each.stream.id.topic == "/robot/log")
+    (log,) = (each for each in hub.links[reader.name].sender.channels.values() if each.stream.id.topic == "/robot/log")
     assert log.kept == 100
-    (stream,) = hub.links[robot.name].streams.values()
+    (stream,) = hub.links[robot.name].taking.streams.values()
     assert len(stream.reports) == 1
     report = stream.reports.first(runs=True)
     assert report is not None
@@ -178,7 +178,7 @@ def test_what_several_will_not_get_is_reported_once_above_the_limit(monkeypatch:
     robot = world.client("robot", LinkModel(delay_s=0.025).as_stream())
     sites = [world.client(f"site{number}", patterns=["/robot/log"]) for number in range(3)]
     for site in sites:
-        site.core.link.auto_confirm = False
+        site.core.link.taking.auto_confirm = False
     log = robot.publish("/robot/log", spec(reliable=True))
     world.run(1.0)
     for _ in range(200):
@@ -187,10 +187,10 @@ def test_what_several_will_not_get_is_reported_once_above_the_limit(monkeypatch:
     world.hops["robot"].break_connection(reconnect_s=20.0)
     world.run(1.0)
     for number, site in enumerate(sites):
-        (stream,) = site.core.link.streams.values()
+        (stream,) = site.core.link.taking.streams.values()
         for seq in range(1 + number, 201, len(sites)):
             envelope = {"t": "dropped", "ch": stream.channel_id, "seq": seq, "code": 1, "to": site.name}
-            site.core.link.send_control(envelope, now=site.now)
+            site.core.link.control.send(envelope, now=site.now)
         world.run(1.0)
     unheard = world.relay.hub.links[robot.name].reassembly.unheard
     assert unheard.reports < 10 + len(sites)

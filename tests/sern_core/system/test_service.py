@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import pytest
 
+from sern_core.link.control_stream import CONTROL_CHANNEL
 from sern_core.link.link import Link
-from sern_core.link.sending import CONTROL_CHANNEL
 from sern_core.relay.access import AccessRule, AccessTable
 from sern_core.stream.out_channel import OutChannel
 from sern_core.vocabulary.params import SchedulerParams
@@ -395,7 +395,7 @@ def test_nothing_grows_while_clients_come_and_go() -> None:
     world.run(10.0)
     assert len(site.opened) == 4
     for link in links_of(world):
-        assert len(link.streams) <= 4 and len(link.channels) <= 4 and len(link.definitions) <= 1
+        assert len(link.taking.streams) <= 4 and len(link.sender.channels) <= 4 and len(link.definitions) <= 1
         assert link.lane.flight.inflight_bytes < 100_000 and len(link.lane.flight.packets) < 500
-        assert all(len(channel.retained) < 200 for channel in link.channels.values())
+        assert all(len(channel.retained) < 200 for channel in link.sender.channels.values())
     assert len(world.relay.hub.links) == 2 and not world.relay.hub._draining

@@ -23,14 +23,15 @@ CORE = [
     ROOT / "sern_core" / name
     for name in (
         "wire/announce.py",
-        "link/answering.py",
+        "link/answers.py",
         "site/client.py",
-        "link/hop.py",
+        "link/streams_in.py",
+        "link/streams_out.py",
         "relay/hub.py",
         "relay/hub_port.py",
         "link/link.py",
         "relay/presence.py",
-        "link/session.py",
+        "link/handshake.py",
     )
 ]  # fmt: skip
 
@@ -215,7 +216,7 @@ def test_handshakes_have_the_documented_keys() -> None:
     note(port.next_datagram(now=0.0))
     port.receive(hello, now=0.0)
     link.receive(note(port.next_datagram(now=0.0)), now=0.0)
-    note(link.join(now=0.0))
+    note(link.handshake.join(0.0))
     link.close("done", now=0.0)
     note(link.next_datagram(now=0.0))
     assert set(said) == {kind.name for kind in framing.Kind if kind is not framing.Kind.DATA}

@@ -161,7 +161,7 @@ def test_a_link_takes_any_acknowledgement(
         echo_us = now_us - 50_000 if echo is None else echo
         stamp_us = now_us if stamp is None else stamp
         received_us = stamp_us if received is None else received
-        head = framing.encode_header(framing.Kind.DATA, link.tag, 0, stamp_us)
+        head = framing.encode_header(framing.Kind.DATA, link.end.tag, 0, stamp_us)
         ack = framing.encode_ack(link.lane.id, highest, sack, echo_us, received_us, cum_bytes)
         try:
             link.receive(head + ack, now=robot.now)

@@ -1,0 +1,72 @@
+"""What all parts of one end of a hop share: who it is, what the session agreed on, and the call under way. Pure."""
+
+from sern_core.vocabulary.params import LinkParams
+from sern_core.vocabulary.trace import DecisionTrace
+from sern_core.vocabulary.types import ClientName
+from sern_core.wire import framing
+
+
+def microseconds(now: float) -> int:
+    """The time stamp of a datagram."""
+    return int(now * 1e6)
+
+
+class End:
+    """One end of a hop. `boot` is this process's random 63-bit number."""
+
+    __slots__ = (
+        "boot",
+        "dirty",
+        "established",
+        "half_read",
+        "initiator",
+        "name",
+        "now",
+        "params",
+        "peer",
+        "peer_boot",
+        "resumed",
+        "tag",
+        "trace",
+        "up_since_s",
+        "version",
+    )
+
+    def __init__(
+        self,
+        *,
+        name: ClientName,
+        boot: int,
+        peer: ClientName,
+        initiator: bool,
+        params: LinkParams,
+        trace: DecisionTrace,
+        now: float,
+    ) -> None:
+        self.name = name
+        self.boot = boot
+        self.peer = peer
+        self.peer_boot: int | None = None
+        """The peer's process, of this session or the latest; None: there was none, or the next is to count as new."""
+        self.initiator = initiator
+        """The client's end: it says HELLO."""
+        self.params = params
+        self.trace = trace
+        self.established = False
+        """There is a session."""
+        self.half_read = False
+        """A datagram of the session is read in part; nothing may be acknowledged until all of it is."""
+        self.resumed = False
+        """The session is with the same process as the one before."""
+        self.version = framing.VERSION_MAX
+        self.tag = boot % 255
+        """The session's number. The first follows from the boot: what an earlier process was sent is none of ours."""
+        self.up_since_s = now
+        self.now = now
+        """The time of the call under way."""
+        self.dirty = False
+        """Something may be sendable: the owner should poll `next_datagram`. Set by every call that changes anything."""
+
+    def header(self, number: int, now: float) -> bytes:
+        """The header of a datagram of the session; number 0: it carries nothing that is to be acknowledged."""
+        return framing.encode_header(framing.Kind.DATA, self.tag, number, microseconds(now), version=self.version)

@@ -1,0 +1,354 @@
+"""The streams that the peer has for this end: announced, delivered, confirmed, skipped, gone. Pure."""
+
+from collections import deque
+from collections.abc import Callable, Sequence
+from typing import Final
+
+from sern_core.link.answers import Answers
+from sern_core.link.control_stream import ControlStream
+from sern_core.link.definitions import PeerDefinitions
+from sern_core.link.end import End
+from sern_core.link.events import Events
+from sern_core.link.lane_set import LaneSet
+from sern_core.stream.in_stream import SLICE_US, InStream, Reassembly
+from sern_core.vocabulary.errors import RefusedError, RemoteError, WireError
+from sern_core.vocabulary.message import Message, StreamId, StreamInfo
+from sern_core.vocabulary.types import ClientName, DropReason
+from sern_core.wire.announce import Announcement
+
+WHY_CHARS: Final = 400
+"""The most of a reason that a refusal carries."""
+
+
+class StreamsIn:
+    """`auto_confirm`: what had its turn here is delivered; a relay confirms by hand, when its subscribers have.
+
+    `answered(count)` is told of what the peer made us say; `finish(now)` says whether all that came of what was read
+    before is done.
+    """
+
+    def __init__(
+        self,
+        end: End,
+        control: ControlStream,
+        answers: Answers,
+        texts: PeerDefinitions,
+        reassembly: Reassembly,
+        lanes: LaneSet,
+        events: Events,
+        *,
+        auto_confirm: bool,
+        answered: Callable[[int], None],
+        finished: Callable[[float], bool],
+    ) -> None:
+        self._end = end
+        self._control = control
+        self._answers = answers
+        self._texts = texts
+        self._reassembly = reassembly
+        self._lanes = lanes
+        self._events = events
+        self.auto_confirm = auto_confirm
+        self._answered = answered
+        self._finished = finished
+        self.streams: dict[StreamId, InStream] = {}
+        """All of them, across sessions."""
+        self.incoming: dict[int, InStream] = {}
+        """Streams of the session by the peer's channel number."""
+        self.watermarks: dict[int, int] = {}
+        """Up to where a channel is delivered, where the peer is still to be told."""
+        self._gone: deque[InStream] = deque()  # streams that the peer no longer has, to be retracted
+        self._skipping: dict[InStream, None] = {}  # streams that leave messages out, and go on in a while
+        self._missing: dict[StreamId, float] = {}  # not announced by a new peer, and since when
+        self._fresh: deque[tuple[InStream, Message, int]] = deque()
+        """Messages of class control that were young enough, with the number of steps that the clock estimate had seen:
+        what arrives in the same turn may tell that our clock stood still while they lay here."""
+
+    # --- sessions -------------------------------------------------------------------------------------------------
+
+    def begin(self, *, resumed: bool, now: float) -> None:
+        """A session has begun."""
+        if self._end.initiator and not resumed:  # a new relay has yet to learn of them
+            for identity in self.streams:
+                self._missing.setdefault(identity, now)
+
+    def leave(self) -> None:
+        """The session is over: channels have no streams."""
+        for stream in self.incoming.values():
+            stream.channel_id = None
+            stream.known = True
+            stream.pause_seq = 0
+            stream.reports.unsay()
+        self.incoming.clear()
+        self.watermarks.clear()
+
+    def forget_gone(self) -> None:
+        """What the peer did not announce in a session that has ended is announced in the next, or gone then."""
+        self._gone.clear()
+
+    def close(self) -> None:
+        """The link is given up: its incoming streams are gone for good."""
+        for stream in self.streams.values():
+            stream.close()
+        self.streams.clear()
+        self._skipping.clear()
+        self.incoming.clear()
+        self._missing.clear()
+
+    # --- announced, refused, gone ---------------------------------------------------------------------------------
+
+    def announced(self, announcement: Announcement, now: float) -> None:
+        """The peer has a stream. Raises WireError where that cannot be."""
+        identity = announcement.stream.id
+        slot = announcement.channel
+        stream = self.streams.get(identity)
+        if self.incoming.get(slot, stream) is not stream or (stream and stream.channel_id not in (None, slot)):
+            raise WireError(f"channel {slot} or its stream {identity.topic!r} is announced twice")
+        if stream is not None and not _same_type(stream.stream, announcement):
+            self.retract(stream, now)  # the name came back with another type: that is another stream
+            stream = None
+        if stream is None or stream.stream.spec != announcement.stream.spec:
+            replaced = stream
+            stream = InStream(
+                announcement.stream, self._reassembly, self._deliver, self._in_drop, first=announcement.first
+            )
+            if replaced is not None:  # the origin was configured anew: what was delivered stays delivered
+                stream.delivered, stream.confirmed = replaced.delivered, replaced.confirmed
+                stream.unhandled = replaced.unhandled
+                replaced.close()
+            self.streams[identity] = stream
+        self._missing.pop(identity, None)
+        stream.channel_id = slot
+        self.incoming[slot] = stream
+        self._answers.expect(stream, slot)
+        digest = stream.stream.definition_hash = announcement.definition_hash
+        self._texts.use_incoming(identity, digest)
+        if digest and self._texts.lacks(digest):
+            self._control.send({"t": "need", "dh": digest}, now=now)
+        try:
+            wanted = self._offer(stream, announcement, now)
+        except RefusedError as refusal:
+            self.incoming.pop(slot, None)
+            self.streams.pop(identity, None)
+            self._answers.forget(stream)
+            self._texts.use_incoming(identity, "")
+            self.watermarks.pop(slot, None)
+            stream.channel_id = None
+            stream.close()
+            self._say_refused(slot, refusal.code, str(refusal), now)
+            return
+        self.skip(stream, announcement.first, now)
+        if stream.reliable and stream.confirmed >= announcement.first:
+            self.watermarks[slot] = stream.confirmed  # it may not know: ours was lost with the session
+        if wanted is not None:
+            self._answers.answer(stream, wanted, now=now)
+
+    def _offer(self, stream: InStream, announcement: Announcement, now: float) -> bool | None:
+        """The owner's answer to an announcement. Raises RefusedError, also when it fails twice."""
+        for last in (False, True):
+            try:
+                return self._events.announce(announcement, now=now)
+            except RemoteError:
+                raise
+            except Exception as error:
+                self._events.fault(error)
+                if last:
+                    self._events.retract(stream, now=now)
+                    name, topic = self._end.name, announcement.stream.id.topic
+                    text = f"{name} cannot take {topic}: an error of its own; see its log"
+                    raise RefusedError("internal_error", text) from error
+        return None
+
+    def refuse(self, stream: InStream, code: str, text: str, *, now: float) -> None:
+        """Take back what was allowed when the stream was announced (an access rule changed)."""
+        if self._end.established and stream.channel_id is not None:
+            self._answers.forget(stream)
+            self._say_refused(stream.channel_id, code, text, now)
+
+    def _say_refused(self, slot: int, code: str, text: str, now: float) -> None:
+        self._control.send({"t": "refuse", "ch": slot, "code": code, "why": text[:WHY_CHARS]}, now=now)
+
+    def synced(self, now: float) -> None:
+        """The peer has announced all it has. What it left out is gone, unless it is a relay that is still learning:
+        a stream it has not been told of yet keeps its delivered count here, so that "once" survives its restart."""
+        for identity, stream in self.streams.items():
+            if stream.channel_id is None and identity not in self._missing:
+                self._gone.append(stream)
+        self.go_on(now)
+
+    def outlived(self, origin: ClientName, boot: int, *, now: float) -> None:
+        """A process of `origin` is there, `boot`: what a new relay has not been told of the ones before is gone."""
+        for identity in [each for each in self._missing if each.origin == origin and each.boot != boot]:
+            self.retract(self.streams[identity], now)
+
+    def retract(self, stream: InStream, now: float) -> None:
+        """The peer no longer has the stream."""
+        self.hand_on(now)
+        self.streams.pop(stream.stream.id, None)
+        self._missing.pop(stream.stream.id, None)
+        self._texts.use_incoming(stream.stream.id, "")
+        if stream.channel_id is not None:
+            self.incoming.pop(stream.channel_id, None)
+            self.watermarks.pop(stream.channel_id, None)
+        self._answers.forget(stream)
+        self._skipping.pop(stream, None)
+        self._events.retract(stream, now=now)
+        stream.close()
+        stream.channel_id = None
+
+    # --- messages -------------------------------------------------------------------------------------------------
+
+    @property
+    def fresh(self) -> bool:
+        """Whether messages wait for `hand_on`."""
+        return bool(self._fresh)
+
+    def _deliver(self, stream: InStream, message: Message) -> None:
+        end = self._end
+        if end.initiator and stream.perishable:  # at the relay the next hop sees that the relay's clock stood still
+            self._fresh.append((stream, message, self._lanes.clock.steps))
+            end.dirty = True
+            return
+        try:
+            self._events.message(stream, message, now=end.now)
+        except Exception as error:  # noqa: BLE001  (of one message: the stream goes on, whatever its bodies do)
+            self._undelivered(stream, message, error)
+        if stream.reliable:
+            self._confirm_own(stream)
+
+    def hand_on(self, now: float) -> None:
+        """Deliver commands and poses: everything that had arrived with them has been looked at."""
+        self._end.now = now
+        while self._fresh:
+            stream, message, steps = self._fresh.popleft()
+            lifespan_s = stream.lifespan_s
+            aged = lifespan_s is not None and now - message.born_s + message.error_s > lifespan_s  # while it lay here
+            if aged or steps != self._lanes.clock.steps:
+                self._in_drop(stream, DropReason.LIFESPAN, len(message.body), (message.seq,), reported=False)
+                continue
+            try:
+                self._events.message(stream, message, now=now)
+            except Exception as error:  # noqa: BLE001  (as in `_deliver`)
+                self._undelivered(stream, message, error)
+
+    def _undelivered(self, stream: InStream, message: Message, error: Exception) -> None:
+        """The owner failed at a message: it is given up, and its tombstone has the turn."""
+        self._events.fault(error)
+        if message.tombstone:
+            lost = message
+        elif stream.reliable:
+            self._in_drop(stream, DropReason.FAULT, len(message.body), (message.seq,), reported=True)
+            lost = stream.tombstone(message.seq, DropReason.FAULT, message.stamp_ns, message.born_s)
+        else:
+            self._in_drop(stream, DropReason.FAULT, len(message.body), (message.seq,), reported=False)
+            return
+        try:
+            self._events.message(stream, lost, now=self._end.now)
+        except Exception as again:  # noqa: BLE001
+            self._events.fault(again)
+
+    def _in_drop(self, stream: InStream, reason: DropReason, nbytes: int, seqs: Sequence[int], reported: bool) -> None:
+        if reported:
+            for seq in seqs:
+                self._answers.report(stream, seq, reason, self._end.name)  # its tombstone tells the owner
+                self._answered(1)
+        else:
+            self._events.discarded(stream, reason, nbytes, seqs)
+
+    # --- how far a stream is --------------------------------------------------------------------------------------
+
+    def skip(self, stream: InStream, first: int, now: float) -> None:
+        """Nothing of the stream below seq `first` will come any more."""
+        stream.skip_to(first, now)
+        if stream in self._reassembly.behind:
+            self._skipping[stream] = None
+        else:
+            self._skipped(stream, now)
+
+    def _skipped(self, stream: InStream, now: float) -> None:
+        if stream.left_out:
+            self._events.skipped(stream, stream.left_out, now=now)
+            self._confirm_own(stream)
+        if stream.wanted:
+            stream.paused = False
+
+    def confirm(self, stream: InStream, delivered: int) -> None:
+        """Tell the peer that its reliable stream is delivered up to `delivered`; remembered while it is away."""
+        if delivered > stream.confirmed:
+            stream.confirmed = delivered
+            if stream.channel_id is not None:
+                self.watermarks[stream.channel_id] = delivered
+                self._end.dirty = True
+
+    def _confirm_own(self, stream: InStream) -> None:
+        if self.auto_confirm and stream.reliable:
+            self.confirm(stream, min(stream.delivered, stream.unhandled - 1) if stream.unhandled else stream.delivered)
+
+    def processed_below(self, stream: InStream, oldest: int) -> None:
+        """Confirm delivered messages below seq `oldest`; 0 confirms all."""
+        stream.unhandled = oldest
+        self._confirm_own(stream)
+
+    def take_watermarks(self, limit: int, *, heard: int) -> list[tuple[int, int]]:
+        """Up to `limit` of (channel, delivered) to be told. `heard`: the number of the last control message that the
+        peer has acknowledged."""
+        slots = list(self.watermarks)[:limit]
+        # Of drops first: else it would take them for delivered.
+        return [(slot, self.watermarks.pop(slot)) for slot in slots if self.incoming[slot].reports.heard(heard)]
+
+    def tell_again(self, slot: int) -> None:
+        """The watermark of a channel was lost on the way."""
+        if slot in self.incoming:
+            self.watermarks[slot] = self.incoming[slot].confirmed
+
+    # --- in slices, and by time -----------------------------------------------------------------------------------
+
+    def go_on(self, now: float) -> bool:
+        """Do more of what has to be done before the next frame is read. True: all of it is done."""
+        reassembly = self._reassembly
+        if not self._finished(now):
+            return False
+        while reassembly.behind:
+            stream = next(iter(reassembly.behind))
+            stream.go_on(now)
+            if stream in reassembly.behind:
+                return False
+            self._confirm_own(stream)
+            if stream in self._skipping:
+                del self._skipping[stream]
+                self._skipped(stream, now)
+        while self._gone:
+            if reassembly.work_us > SLICE_US:
+                return False
+            self.retract(self._gone.popleft(), now)
+        return self._finished(now)
+
+    def sweep_heard(self) -> None:
+        """Let go of reports, and of what is half received of streams that are not wanted, once the peer knows."""
+        heard = self._control.heard
+        for stream in self.incoming.values():
+            stream.reports.heard(heard)
+            if 0 < stream.pause_seq <= heard:
+                stream.forget(DropReason.UNWANTED)  # the peer has given up what is half received or waits here
+                self._skipping.pop(stream, None)  # it is where it was to go on, and nobody is to hear of it later
+
+    def sweep(self, now: float) -> None:
+        """Give up what has been half received for too long, and streams that a new relay never learnt of."""
+        end = self._end
+        if end.established:
+            for stream in self.streams.values():
+                stream.sweep(now, end.up_since_s)
+        for identity, since_s in list(self._missing.items()):
+            if now - since_s > end.params.retention_s:
+                self.retract(self.streams[identity], now)
+
+
+def _same_type(known: StreamInfo, announced: Announcement) -> bool:
+    """Whether bodies of both are to be read in the same way."""
+    one, other = known.info, announced.stream.info
+    return (
+        one.type_name == other.type_name
+        and one.encoding is other.encoding
+        and one.type_hash == other.type_hash
+        and known.definition_hash == announced.definition_hash
+    )

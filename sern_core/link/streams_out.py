@@ -1,0 +1,294 @@
+"""The streams that one end of a hop has for the other: announced, wanted or not, refused, gone. Pure."""
+
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Final
+
+from sern_core.link.control_stream import ControlStream
+from sern_core.link.definitions import PeerDefinitions
+from sern_core.link.end import End
+from sern_core.link.events import Events
+from sern_core.link.owed_lists import MAX_OWED, OwedLists
+from sern_core.link.sender import Sender
+from sern_core.stream.in_stream import Reassembly
+from sern_core.stream.out_channel import OutChannel
+from sern_core.stream.out_message import OutMessage
+from sern_core.vocabulary.errors import UsageError, WireError
+from sern_core.vocabulary.fates import Fates
+from sern_core.vocabulary.message import Message, StreamId, StreamInfo
+from sern_core.vocabulary.trace import TraceEvent
+from sern_core.vocabulary.types import DROP_REASONS, DropReason
+from sern_core.wire import framing
+from sern_core.wire.announce import Announcement, Want, announcement_parts, definition_hash
+
+MAX_NAMED: Final = 0x10000
+"""Price of the answers of one datagram, beside that of one for each open channel: a few bytes name many channels."""
+ANSWER_PRICE: Final = 16
+"""What an answer about an open channel costs, next to one about a channel that is closed."""
+NAMED_PER_US: Final = 16
+ANSWER_US: Final = 6
+OWED_PER_US: Final = 16
+"""What naming channels, answers about open ones, and lists of names are charged with (`Reassembly.work_us`)."""
+RETAINED_PER_US: Final = 16
+"""What a report of drops is charged with, for what it looks through."""
+ANNOUNCE_US: Final = 12
+"""What a session that begins is charged with for each stream that is announced in it."""
+MAX_TRACED: Final = 100
+"""The most of one run of dropped messages that the trace of decisions has."""
+SEVERAL: Final = "several clients"
+"""Who will not get a message when the report of its drop names nobody; it is no client's name."""
+
+
+class StreamsOut:
+    """`at_once(channel)` says whether data may follow an announcement without waiting for the answer."""
+
+    def __init__(
+        self,
+        end: End,
+        control: ControlStream,
+        sender: Sender,
+        texts: PeerDefinitions,
+        owed_lists: OwedLists,
+        reassembly: Reassembly,
+        events: Events,
+        *,
+        at_once: Callable[[OutChannel], bool],
+    ) -> None:
+        self._end = end
+        self._control = control
+        self._sender = sender
+        self._texts = texts
+        self._owed_lists = owed_lists
+        self._reassembly = reassembly
+        self._events = events
+        self._at_once = at_once
+        self.by_stream: dict[StreamId, OutChannel] = {}
+        self.fates: Fates | None = None
+        """Told what becomes of each message here; set before the first channel is opened."""
+        self._next_channel = 1
+        self._on_dropped = self._dropped  # one for all channels
+        self._announcing: deque[tuple[int, OutChannel]] = deque()  # may send once that control message is on its way
+        self._price = self._priced_us = 0  # of the answers that came at this time
+
+    # --- our streams ----------------------------------------------------------------------------------------------
+
+    def begin(self, now: float) -> None:
+        """A session has begun: announce everything."""
+        channels = self._sender.channels
+        self._reassembly.work_us += ANNOUNCE_US * len(channels)
+        for channel in list(channels.values()):
+            self.announce(channel, now)
+
+    def forget_announced(self) -> None:
+        """What was announced in an earlier session is none of the one that begins."""
+        self._announcing.clear()
+
+    def open(
+        self,
+        stream: StreamInfo,
+        *,
+        first: int,
+        now: float,
+        owed: tuple[str, ...] = (),
+        wanted: bool | None = None,
+        replays: Sequence[Message] = (),
+    ) -> OutChannel:
+        """Announce a stream to the peer; its messages start at seq `first`, after the latched `replays`, oldest first.
+
+        Raises UsageError if it is open already, or cannot be announced at all.
+        """
+        peer, channels = self._end.peer, self._sender.channels
+        if stream.id in self.by_stream:
+            raise UsageError(f"stream {stream.id.topic} of {stream.id.origin} is already open towards {peer}")
+        if len(stream.info.definition.encode()) > framing.MAX_ATTACHMENT_BYTES:
+            raise UsageError(f"the definition of {stream.id.topic} exceeds {framing.MAX_ATTACHMENT_BYTES} bytes")
+        if len(channels) >= 0xFFFF:
+            raise UsageError(f"all 65535 channels towards {peer} are in use")
+        slot = self._next_channel
+        while slot in channels:
+            slot = slot % 0xFFFF + 1
+        self._next_channel = slot % 0xFFFF + 1
+        counters = self._sender.ledger.topic(stream.id.topic, stream.spec.priority)
+        channel = OutChannel(slot, stream, counters, self._on_dropped, first=first)
+        channel.owed = owed
+        channel.wanted = wanted
+        channel.codec = self._sender.new_codec(stream)
+        if self.fates is not None:
+            channel.on_count = partial(self._counted, self.fates, stream)
+        channel.prime(replays, now=now)
+        channels[slot] = channel
+        self.by_stream[stream.id] = channel
+        self._texts.use_outgoing(slot, _digest(stream), stream.info.definition)
+        if self._end.established:
+            self.announce(channel, now)
+        return channel
+
+    def _counted(self, fates: Fates, stream: StreamInfo, seq: int, reason: DropReason) -> None:
+        fates.dropped(stream, seq, reason, self._end.peer)
+
+    def _dropped(self, channel: OutChannel, outs: Sequence[OutMessage], reason: DropReason) -> None:
+        if self._sender.channels.get(channel.slot) is channel:
+            end, topic = self._end, channel.stream.id.topic
+            for out in outs[:MAX_TRACED]:
+                end.trace.record(end.now, topic, TraceEvent.DROPPED, seq=out.seq, reason=reason, peer=end.peer)
+            self._events.dropped(channel, outs, reason)
+
+    def close(self, channel: OutChannel, reason: DropReason, *, now: float) -> None:
+        """The stream is gone: tell the peer, drop what is left for `reason`."""
+        self._end.now = now
+        channel.clear(reason)
+        channel.ready = False
+        self._sender.refresh(channel, now)
+        self._sender.channels.pop(channel.slot, None)
+        self._sender.cadences.forget(channel.slot)
+        if self.by_stream.get(channel.stream.id) is channel:
+            del self.by_stream[channel.stream.id]
+        self._texts.use_outgoing(channel.slot, "")
+        self._control.send({"t": "retract", "ch": channel.slot}, now=now)
+
+    def announce(self, channel: OutChannel, now: float) -> None:
+        """Say in this session that the stream is there, on its channel."""
+        stream = channel.stream
+        digest = _digest(stream)
+        self._texts.use_outgoing(channel.slot, digest)  # in another session its origin may say another
+        owed = channel.owed if channel.reliable else ()
+        announcement = Announcement(channel.slot, stream, digest, channel.first_seq, owed)
+        channel.ready = False
+        seq = 0
+        for envelope in announcement_parts(announcement):
+            seq = self._control.send(envelope, now=now)
+        if self._at_once(channel):
+            self._announcing.append((seq, channel))
+        self._sender.refresh(channel, now)
+
+    def control_sent(self, seq: int) -> None:
+        """Control message `seq` is on the wire."""
+        while self._announcing and self._announcing[0][0] <= seq:
+            channel = self._announcing.popleft()[1]
+            if self._sender.channels.get(channel.slot) is channel:
+                channel.ready = True
+                self._sender.refresh(channel, self._end.now)
+
+    # --- gaps -----------------------------------------------------------------------------------------------------
+
+    def skip(self, channel: OutChannel, first: int, *, now: float, silent: bool = False) -> None:
+        """The stream goes on at seq `first`: what lies between will not come, and the peer must not wait for it.
+
+        `silent`: it was sent before anybody behind the peer wanted it, so there is nothing to report.
+        """
+        if silent and not channel.retained:
+            channel.start_at(first)
+            if self._end.established:
+                self.announce(channel, now)
+            return
+        channel.skip_to(first)
+        self._tell_gap(channel, now)
+
+    def leave_out(self, channel: OutChannel, message: Message, reason: DropReason, *, now: float) -> None:
+        """Drop a reliable message that cannot be kept at all; the peer is told where the stream goes on."""
+        self._end.now = now
+        channel.leave_out(message, reason)
+        self._tell_gap(channel, now)
+
+    def _tell_gap(self, channel: OutChannel, now: float) -> None:
+        first = channel.next_gap()
+        if first is not None:
+            self._control.send({"t": "first", "ch": channel.slot, "seq": first}, now=now)
+
+    def delivered(self, channel: OutChannel) -> None:
+        """The peer's watermark of a channel has moved."""
+        now = self._end.now
+        if channel.gaps:
+            self._tell_gap(channel, now)
+        self._events.delivered(channel, now=now)
+
+    # --- what the peer says of them -------------------------------------------------------------------------------
+
+    def answered(self, want: Want, now: float) -> None:
+        """The peer has said whether it wants streams of ours. Raises WireError for more answers than questions."""
+        end, reassembly = self._end, self._reassembly
+        if not end.initiator:
+            # Who is owed is for origins to remember: a client that takes a stream is owed it itself, and no more.
+            want = replace(want, owed=(), add=(), drop=())
+            if want.more:
+                return
+        first = want.runs[0][0]
+        if want.more:
+            self._owed_lists.add(("want", first), want.owed or (), more=True, peer=end.peer)
+            return
+        owed = None
+        if want.owed is not None:
+            owed = self._owed_lists.add(("want", first), want.owed, more=False, peer=end.peer)
+        changed: dict[int, tuple[tuple[str, ...], tuple[str, ...]]] = {}  # by identity: what was owed, what is now
+        for first, last in want.runs:
+            self._charge(last - first + 1, now)
+            reassembly.work_us += (last - first + 1) // NAMED_PER_US
+            for slot in range(first, last + 1):
+                channel = self._sender.channels.get(slot)
+                if channel is not None:  # else closed meanwhile
+                    self._charge(ANSWER_PRICE, now)
+                    reassembly.work_us += ANSWER_US
+                    if owed is None:
+                        before = channel.owed
+                        if id(before) not in changed:  # channels that are owed alike share one list
+                            changed[id(before)] = before, self._changed(before, want)
+                        channel.owed = changed[id(before)][1]
+                    else:
+                        channel.owed = owed
+                    self._answer_came(channel, want, now)
+
+    def _changed(self, before: tuple[str, ...], want: Want) -> tuple[str, ...]:
+        """What an answer by difference makes of a list of names."""
+        self._reassembly.work_us += len(before) // OWED_PER_US
+        names = dict.fromkeys(before) | dict.fromkeys(want.add)
+        for name in want.drop:
+            names.pop(name, None)
+        if len(names) > MAX_OWED:
+            raise WireError(f"{self._end.peer} owes a stream to more than {MAX_OWED} names")
+        return tuple(names)
+
+    def _charge(self, price: int, now: float) -> None:
+        """Raises WireError if the peer answers more in one datagram than there is to be answered."""
+        now_us = int(now * 1e6)
+        if now_us != self._priced_us:
+            self._price, self._priced_us = 0, now_us
+        self._price += price
+        channels = len(self._sender.channels)
+        if self._price > MAX_NAMED + 2 * ANSWER_PRICE * channels:
+            raise WireError(f"{self._end.peer} answers the announcements of {channels} channels again and again")
+
+    def _answer_came(self, channel: OutChannel, want: Want, now: float) -> None:
+        if want.on and channel.wanted is False and channel.reliable:
+            self._control.send({"t": "first", "ch": channel.slot, "seq": channel.first_seq}, now=now)
+        self._set_wanted(channel, want.on, DropReason.UNWANTED)
+        channel.ready = True
+        self._sender.refresh(channel, now)
+        self._events.wanted(channel, now=now)
+
+    def _set_wanted(self, channel: OutChannel, wanted: bool, reason: DropReason) -> None:
+        watermark = channel.watermark
+        self._reassembly.work_us += channel.set_wanted(wanted, reason)
+        if channel.watermark > watermark:
+            self.delivered(channel)
+
+    def reported(self, channel: OutChannel, envelope: framing.Envelope) -> None:
+        """The peer reports drops of a stream of ours. Raises WireError."""
+        reason = DROP_REASONS.get(framing.take_int(envelope, "code"), DropReason.LOST)
+        where = framing.take_str(envelope, "to", max_length=64, default="") or SEVERAL
+        self._reassembly.work_us += len(channel.retained) // RETAINED_PER_US
+        count = framing.take_int(envelope, "n", low=1, high=framing.MAX_SEQ, default=1)
+        self._reassembly.work_us += channel.reported(framing.take_int(envelope, "seq"), reason, where, count)
+
+    def refused(self, channel: OutChannel, envelope: framing.Envelope, now: float) -> None:
+        """The peer refuses a stream of ours. Raises WireError."""
+        code, why = framing.take_str(envelope, "code", max_length=64), framing.take_str(envelope, "why")
+        self._set_wanted(channel, False, DropReason.FORBIDDEN if code == "forbidden" else DropReason.UNWANTED)
+        self._sender.refresh(channel, now)
+        self._events.refused(channel, code, why, now=now)
+
+
+def _digest(stream: StreamInfo) -> str:
+    """What the stream's definition is called; empty for none."""
+    return stream.definition_hash or definition_hash(stream.info.definition)
