@@ -92,7 +92,7 @@ TIMES: Final = {
         f"`poll_hz`, {1 / Ros1Options('http://localhost:1', 'localhost', 'x').poll_hz:g} s",
     ),
     "docs/operations.md": (
-        f"`latched.resume_s`, {default(ReplaySection, 'resume_s') // 60} minutes",
+        f"`replay.resume_s`, {default(ReplaySection, 'resume_s') // 60} minutes",
         f"of more than {peers.MAX_GIVEN_UP} such clients",
         f"than {draining.MAX_DRAINING} of them or {nbytes(draining.MAX_DRAINING_BYTES)}",
     ),

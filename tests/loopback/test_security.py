@@ -524,7 +524,7 @@ async def test_a_rule_taken_away_ends_the_stream_and_given_back_restores_it(
 
 def test_every_refusal_of_the_core_has_a_counter() -> None:
     core = Path(sern_core.__file__ or "").parent
-    codes = {code for file in core.glob("*.py") for code in re.findall(r'RefusedError\(\s*"(\w+)"', file.read_text())}
+    codes = {code for file in core.rglob("*.py") for code in re.findall(r'RefusedError\(\s*"(\w+)"', file.read_text())}
     assert codes <= REFUSAL_CODES
     assert "forbidden" in codes
 
