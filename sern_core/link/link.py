@@ -78,7 +78,7 @@ class LinkHandler(Protocol):
         """The peer refused the session itself."""
 
     def on_announce(self, link: "Link", announcement: Announcement, *, now: float) -> bool | None:
-        """The peer has a stream: is it wanted? None: `Link.answer` says so later. Raises RefusedError to refuse."""
+        """The peer has a stream: is it wanted? None: `Link.answers` is told later. Raises RefusedError to refuse."""
 
     def on_retract(self, link: "Link", stream: InStream, *, now: float) -> None: ...
 

@@ -214,7 +214,7 @@ class InStream:
         self.perishable = control and not self.reliable and self.lifespan_s is not None
         """A command or a pose: nobody shall have it too late."""
         self.delivered = first - 1
-        self.confirmed = first - 1  # what the peer was told (`Hop.confirm`)
+        self.confirmed = first - 1  # what the peer was told (`StreamsIn.confirm`)
         self.unhandled = 0  # the first seq that had its turn and is still being decoded; 0: none
         self.channel_id: int | None = None  # in the session
         self.wanted = True  # what the peer was told
