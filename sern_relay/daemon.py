@@ -121,7 +121,7 @@ class RelayDaemon:
         self.message_log = MessageLog(loaded.resolve(model.message_log)) if model.message_log else None
         self.fates: LoggedFates | None = None
         if self.message_log is not None:
-            self.fates = self.hub.fates = LoggedFates(self.message_log, self.parts)
+            self.fates = self.hub.forwarding.fates = LoggedFates(self.message_log, self.parts)
         self.codecs = CodecPool(after=self._after, parts=self.parts)
         self.coder = make_coder(model.link.params(), self.codecs)
         self._decoder = Decoder[StreamInfo](
@@ -259,7 +259,7 @@ class RelayDaemon:
         self.server.cut_unbound()
         for client in lapsed:
             _log.warning("%s lost a key; %d connections cut", client, self.server.cut_client(client))
-            self.hub.end_session(client, "the key no longer holds", now=clock.now())
+            self.hub.clients.end_session(client, "the key no longer holds", now=clock.now())
 
     def _after(self) -> None:
         """Something came in: before the loop comes round again, whoever has something to send sends it."""
@@ -404,9 +404,9 @@ class RelayDaemon:
         metrics.counter("sern_relay_connections_refused_total", "Connections or messages refused, by reason.",
                         ("reason",), self._refused_connections)  # fmt: skip
         metrics.counter("sern_relay_replay_evicted_total", "Latched messages let go because of their bounds.",
-                        read=lambda: [((), float(self.hub.replays.evicted))])  # fmt: skip
+                        read=lambda: [((), float(self.hub.streams.replays.evicted))])  # fmt: skip
         metrics.gauge("sern_relay_replay_bytes", "Latched messages kept for late joiners, bytes.",
-                      read=lambda: [((), float(self.hub.replays.held_bytes))])  # fmt: skip
+                      read=lambda: [((), float(self.hub.streams.replays.held_bytes))])  # fmt: skip
         metrics.counter("sern_relay_transforms_refused_total", "Transforms not taken as objects, by client and reason.",
                         ("client", "code"), self._transforms_refused)  # fmt: skip
         metrics.counter("sern_feed_messages_total", "Messages of the plain feed, by role and what became of them.",
@@ -489,7 +489,7 @@ class RelayDaemon:
         """Counters by client link and topic, and of what arrived; and what is announced, whether taken or not."""
         now = clock.now()
         return {
-            "announced": announced_summary(self.hub.announced()),
+            "announced": announced_summary(self.hub.streams.announced()),
             "links": {name: link_summary(link, direction="send") for name, link in self.hub.links.items()},
             "received": received_summary(self.hub.received, now=now),
         }

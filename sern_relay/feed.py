@@ -93,13 +93,13 @@ class RelayFeed:
         self.counters: dict[str, InjectCounters] = {role.name: InjectCounters() for role in roles}
         hub.local_owners.update(role.owner for role in roles if role.ingest_endpoint is not None)
         self.feed = Feed(ctx, roles, on_publish=self._published, on_interest=self._interest, accept=self._may_own)
-        hub.tap = self._wants
+        hub.streams.tap = self._wants
 
     def close(self) -> None:
         if self._going_on is not None:
             self._going_on.cancel()
             self._going_on = None
-        self._hub.tap = lambda _stream: False
+        self._hub.streams.tap = lambda _stream: False
         self.feed.close()
 
     def open_missing(self) -> bool:
@@ -122,7 +122,7 @@ class RelayFeed:
         for (role_name, name), source in self._sources.items():
             current = known.get(role_name)
             if current is None or current.topic(name) != source.topic:
-                self._hub.close_local(source.handle, now=now)  # with its next message it opens anew, if it may
+                self._hub.local.close(source.handle, now=now)  # with its next message it opens anew, if it may
         try:
             self.feed.update(roles)
         finally:
@@ -163,8 +163,8 @@ class RelayFeed:
         """Give back the names of topics that have gone quiet. Call about once a second."""
         for key, source in list(self._sources.items()):
             if not source.latched and now - source.last_s > IDLE_S:
-                self._hub.close_local(source.handle, now=now)
-            if not self._hub.is_open(source.handle):
+                self._hub.local.close(source.handle, now=now)
+            if not self._hub.local.is_open(source.handle):
                 self._sources.pop(key, None)
 
     def _wants(self, stream: StreamInfo) -> bool:
@@ -186,7 +186,7 @@ class RelayFeed:
             self._untold = list(self._hub.relayed)
         loop = asyncio.get_running_loop()
         self._going_on = loop.call_later(INTEREST_REST_S, self._tell_origins) if self._untold else None
-        self._hub.refresh_interest(told, now=self._clock())
+        self._hub.streams.refresh_interest(told, now=self._clock())
         self._after()
 
     def _may_own(self, role: FeedRole, name: TopicName) -> bool:
@@ -205,14 +205,14 @@ class RelayFeed:
         """The stream of this topic, opened when there is none; None: refused."""
         key = (role.name, name)
         source = self._sources.get(key)
-        if source is not None and self._hub.is_open(source.handle):
+        if source is not None and self._hub.local.is_open(source.handle):
             return source
         latched = topic.rule.durability is Durability.TRANSIENT_LOCAL
         info = ros_types.topic_info(name, topic.type_name, topic.encoding, latched=latched)
         spec = RuleSet((topic.rule,)).resolve(info, local_name=name).spec
         now = self._clock()
         try:
-            handle = self._hub.open_local(info, spec, role.owner, now=now)
+            handle = self._hub.local.open(info, spec, role.owner, now=now)
         except RefusedError as refusal:
             self._refuse(role, name, refusal.code, str(refusal))
             return None
@@ -253,7 +253,7 @@ class RelayFeed:
             age_s = max(age_s, (wall_ns - header.stamp_ns) * 1e-9)
         source.last_s = now
         stamp_ns = header.stamp_ns if header.stamp_ns > 0 else wall_ns
-        if self._hub.inject(source.handle, body, stamp_ns, now=now, age_s=age_s):
+        if self._hub.local.inject(source.handle, body, stamp_ns, now=now, age_s=age_s):
             counters.injected += 1
             self._after()
             return

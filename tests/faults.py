@@ -10,6 +10,7 @@ from sern_core.link.link import Link, LinkHandler
 from sern_core.link.streams_out import StreamsOut
 from sern_core.path.congestion.hybrid import HybridWindow
 from sern_core.path.flight import Flight
+from sern_core.relay.forwarding import Forwarding
 from sern_core.relay.hub import Hub
 from sern_core.relay.objects import ObjectRegistry
 from sern_core.site.client import ClientCore
@@ -56,7 +57,7 @@ RECORDS: list[Place] = [(SimClient, "send_dropped"), (SimClient, "expired"), (Si
 """Where the tests learn what was reported: these raise only after they have taken it down."""
 """Where the core calls its owner, and the owner its shell."""
 INSIDE: list[Place] = [
-    (Hub, "_forward"),
+    (Forwarding, "forward"),
     (InStream, "fragment"),
     (HybridWindow, "on_ack"),
     (HybridWindow, "on_sent"),

@@ -251,7 +251,7 @@ class Run:
             assert link.reassembly.held_bytes == 0
             assert not any(stream.reports for stream in link.taking.streams.values())
             assert not any(channel.gaps for channel in link.sender.channels.values() if not channel.retained)
-        assert not self.world.relay.hub._draining
+        assert not self.world.relay.hub.streams.draining
 
 
 def _body(size: int, seq: int) -> bytes:

@@ -19,21 +19,29 @@ from sern_core.wire import framing
 RESET_INTERVAL_S: Final = 0.5
 
 
-class PortHub(Protocol):
-    """What a port needs of the hub that keeps its link."""
+class PortClients(Protocol):
+    """What a port needs of the clients that there are."""
 
     port_of: "dict[ClientName, HubPort]"
     """The connection that has the session of each client."""
+
+    def greet(self, port: "HubPort", hello: framing.Envelope, header: framing.Header, *, now: float) -> None: ...
+
+    def failed(self, client: ClientName, error: Exception, *, now: float) -> None: ...
+
+
+class PortHub(Protocol):
+    """What a port needs of the hub that keeps its link."""
+
     matching: Matching
+
+    @property
+    def clients(self) -> PortClients: ...
 
     @property
     def local_owners(self) -> Container[str]: ...
 
-    def greet(self, port: "HubPort", hello: framing.Envelope, header: framing.Header, *, now: float) -> None: ...
-
     def left(self, client: ClientName, *, now: float) -> None: ...
-
-    def failed(self, client: ClientName, error: Exception, *, now: float) -> None: ...
 
     def after(self) -> None: ...
 
@@ -52,14 +60,14 @@ class HubPort:
 
     @property
     def current(self) -> bool:
-        return self.link is not None and self.hub.port_of.get(self.client) is self
+        return self.link is not None and self.hub.clients.port_of.get(self.client) is self
 
     def connected(self, *, now: float) -> None:
         """The client speaks first."""
 
     def disconnected(self, *, now: float) -> None:
         if self.current and self.link is not None:
-            del self.hub.port_of[self.client]
+            del self.hub.clients.port_of[self.client]
             self.link.disconnected(now=now)
         self.link = None
 
@@ -76,7 +84,7 @@ class HubPort:
         except RemoteError:
             raise
         except Exception as error:  # noqa: BLE001  (of ours: this client has no session then, nobody else notices)
-            self.hub.failed(self.client, error, now=now)
+            self.hub.clients.failed(self.client, error, now=now)
 
     def _greeted(self, data: bytes, now: float) -> None:
         """What comes before a session."""
@@ -91,7 +99,7 @@ class HubPort:
                 self._refuse(header.tag, "name", f"{name} is the relay's own name for its feed; take another", now)
                 return
             try:
-                self.hub.greet(self, hello, header, now=now)
+                self.hub.clients.greet(self, hello, header, now=now)
             except VersionError as error:
                 self._refuse(header.tag, "version", str(error), now)
         elif header.kind == framing.Kind.DATA and now >= self._reset_due_s:

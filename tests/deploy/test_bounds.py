@@ -10,7 +10,7 @@ from sern_client import latest
 from sern_client.endpoints import first
 from sern_client.endpoints.ros1 import Ros1Options, hold
 from sern_core.link import control_stream, definitions, owed_lists
-from sern_core.relay import access, draining, hub, routing
+from sern_core.relay import access, awaited, draining, routing
 from sern_core.relay.objects import ObjectLimits
 from sern_core.site import peers
 from sern_core.stream import decoding, drop_reports, in_stream, latched, out_channel
@@ -73,7 +73,7 @@ BOUNDS: Final[dict[str, tuple[str, ...]]] = {
     ),
     "large values of objects": (f"{nbytes(OBJECTS.max_held_per_owner)}, of {nbytes(OBJECTS.max_held_bytes)} in all",),
     "transforms as objects": (f"{transforms.MAX_PAIRS:,} pairs", f"{transforms.MAX_WAITING} messages"),
-    "clients that are waited for": (f"{hub.MAX_AWAITED_CLIENTS:,};", f"{hub.MAX_AWAITED_TOPICS:,} each"),
+    "clients that are waited for": (f"{awaited.MAX_AWAITED_CLIENTS:,};", f"{awaited.MAX_AWAITED_TOPICS:,} each"),
     "boots of a client": (f"| {routing.RETIRED_BOOTS} |",),
     "numbers of streams": (f"{numbering.MAX_ENDED:,},",),
     "counters by topic": (f"{ledger.MAX_TOPICS:,} ",),

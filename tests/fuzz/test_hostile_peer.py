@@ -8,7 +8,7 @@ from typing import Any, Final
 import pytest
 
 from sern_core.link import control_stream, definitions, handshake
-from sern_core.relay import hub as relay_core
+from sern_core.relay import awaited
 from sern_core.vocabulary.errors import WireError
 from sern_core.vocabulary.message import StreamId, StreamInfo, TopicInfo
 from sern_core.vocabulary.types import ClientName, Encoding, PriorityClass, TopicName
@@ -398,12 +398,12 @@ def test_a_client_that_connects_again_and_again_has_its_session_each_time() -> N
 
 
 def test_origins_cannot_have_any_number_of_streams_kept_for_an_absent_client(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(relay_core, "MAX_AWAITED_TOPICS", 50)
+    monkeypatch.setattr(awaited, "MAX_AWAITED_TOPICS", 50)
     peer = Hostile()
     for index in range(100):
         peer.announce(1, f"/robot/t{index}", reliable=True, owed=("absent",))
         peer.control({"t": "retract", "ch": 1})
-    assert len(peer.hub._awaited[ClientName("absent")]) <= 50
+    assert len(peer.hub.awaited._topics[ClientName("absent")]) <= 50
     peer.hub.validate()
 
 

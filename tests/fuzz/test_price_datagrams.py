@@ -300,7 +300,7 @@ INPUTS["datagram: HELLO after long lists"] = FEWER["datagram: HELLO after long l
 def streams_owed_to_absent_clients() -> Input:
     """An origin says of each of its streams that clients are owed it that have not come back yet."""
     peer = Hostile()
-    peer.hub.known = lambda _client: True
+    peer.hub.awaited.known = lambda _client: True
     peer.hub.links[peer.name].reassembly.limit_bytes = 64 * 2**20
     absent = tuple(f"site{number}" for number in range(48))
 

@@ -180,16 +180,16 @@ async def marks_by_class(robot: ClientDaemon, relay: RelayDaemon, tap: Tap | Cap
     bytes, class control sends messages of 300 bytes: the sizes tell them apart."""
     await until(lambda: robot.core.link.lane.id == LANE_UDP, "datagrams are used")
     hub = relay.hub
-    hub.tap = lambda _stream: True
+    hub.streams.tap = lambda _stream: True
     now = clock.now()
     channels = {}
     for priority in PriorityClass:
         info = TopicInfo(TopicName(f"/robot1/{priority.name.lower()}"), "std_msgs/msg/String", Encoding.CDR)
         channels[priority] = robot.core.publish(info, TopicSpec(priority, depth=1000), now=now)
-    hub.refresh_interest(now=now)
+    hub.streams.refresh_interest(now=now)
     robot.core.subscribe(("/feed/.*",), now=now)
     down = {
-        priority: hub.open_local(
+        priority: hub.local.open(
             TopicInfo(TopicName(f"/feed/{priority.name.lower()}"), "std_msgs/msg/String", Encoding.CDR),
             TopicSpec(priority, depth=1000),
             ClientName("feed_x"),
@@ -207,7 +207,7 @@ async def marks_by_class(robot: ClientDaemon, relay: RelayDaemon, tap: Tap | Cap
         """Sends one message each way; whether 40 datagrams that must hold such came through, each way."""
         body = b"x" * nbytes
         robot.core.send(channels[priority], body, 0, now=clock.now())
-        hub.inject(down[priority], body, 0, now=clock.now())
+        hub.local.inject(down[priority], body, 0, now=clock.now())
         robot._kick()
         relay._after()
         return all(sum(size > least for _, size in way) >= 40 for way in (tap.up, tap.down))

@@ -247,7 +247,7 @@ async def test_a_quiet_topic_gives_its_name_back_and_latched_state_does_not(tmp_
         assert len(relay.hub.relayed) == 2
         feed_of(relay).sweep(now=last_s + 31.0)
         assert [identity.topic for identity in relay.hub.relayed] == ["/jackal1/goal"]
-        assert relay.hub.replays.held_bytes == len(goal) + MESSAGE_OVERHEAD_BYTES
+        assert relay.hub.streams.replays.held_bytes == len(goal) + MESSAGE_OVERHEAD_BYTES
         send(publisher, CMD, TWIST.pack(*[0.0] * 6))
         await until(lambda: counters(relay).injected == 3, "and it may speak again")
         assert len(relay.hub.relayed) == 2

@@ -141,7 +141,7 @@ async def test_over_ipv6_everything_answers(tmp_path: Path) -> None:
         relay = await lab.relay(lab.relay_file(http={"listen": addresses[0]}))
         endpoint = {"kind": "synthetic", "role": "robot", "topics": 1}
         robot = await lab.connected(lab.client_file("robot1", endpoint, http={"listen": addresses[1]}))
-        await until(lambda: len(list(relay.hub.announced())) == 1, "the relay knows the robot's topic")
+        await until(lambda: len(list(relay.hub.streams.announced())) == 1, "the relay knows the robot's topic")
         daemons: tuple[RelayDaemon | ClientDaemon, ...] = (relay, robot)
         for daemon, address in zip(daemons, addresses, strict=True):
             assert await get(daemon, "/healthz") == (200, "running\n")

@@ -35,11 +35,11 @@ class Traffic:
         self._channel: OutChannel | None = None
         if down:
             site.core.subscribe((".*",), now=now)
-            self._handle = relay.hub.open_local(info, spec, ClientName("feed_x"), now=now)
+            self._handle = relay.hub.local.open(info, spec, ClientName("feed_x"), now=now)
         else:
             self._channel = site.core.publish(info, spec, now=now)
-            relay.hub.tap = lambda _stream: True
-            relay.hub.refresh_interest(now=now)
+            relay.hub.streams.tap = lambda _stream: True
+            relay.hub.streams.refresh_interest(now=now)
 
     def send(self) -> None:
         now = clock.now()
@@ -47,7 +47,7 @@ class Traffic:
             if self._channel is not None:
                 self.site.core.send(self._channel, BODY, 0, now=now)
             else:
-                self.relay.hub.inject(self._handle, BODY, 0, now=now)
+                self.relay.hub.local.inject(self._handle, BODY, 0, now=now)
         self.relay._after()
         self.site._kick()
 

@@ -176,7 +176,7 @@ async def test_a_name_that_is_not_the_keys_is_refused_to_the_client(
             assert framing.decode_header(impostor.received[0]).kind == framing.Kind.REFUSE
             answer = framing.decode_handshake(impostor.received[0])
             assert answer == {"code": "name", "why": "your key belongs to robot2, not to robot1"}
-        assert "robot2" not in world.relay.hub.port_of
+        assert "robot2" not in world.relay.hub.clients.port_of
 
 
 async def test_a_claimed_routing_id_is_never_heard(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -410,7 +410,7 @@ async def test_a_revoked_key_is_cut_off_both_ways_and_comes_back_when_allowed(
         content = json.loads(config.read_text())
         content["endpoint"] = [content["endpoint"], {"kind": "record", "path": "robot2"}]
         config.write_text(json.dumps(content))
-        relay.hub.tap = lambda _stream: True
+        relay.hub.streams.tap = lambda _stream: True
         second = await lab.connected(config)
         heard, topic = relay.hub.received.topics, TopicName("/robot2/count")
         await until(lambda: topic in heard and heard[topic].delivered > 50)

@@ -78,7 +78,7 @@ class Play:
         up, down = self.path.up.as_stream(), self.path.down.as_stream()
         self.robot = self.world.client("robot", up, down, clock=CLOCKS["robot"], patterns=["/site/.*"])
         self.site = self.world.client("site", clock=CLOCKS["site"], patterns=["/robot/.*"])
-        self.far = self.world.relay.hub._link(ClientName("robot"), self.world.relay.now)
+        self.far = self.world.relay.hub.clients.link(ClientName("robot"), self.world.relay.now)
         self.audits = [("robot", _audit(self.robot.core.link, self.robot.now))]
         self.audits.append(("relay", _audit(self.far, self.world.relay.now)))
         if cell.lanes is Lanes.BOTH:

@@ -65,7 +65,7 @@ class Flood:
         stream = PATH.as_stream()
         self.robot = world.client("robot", stream)
         self.site = world.client("site", patterns=["/robot/.*"])
-        self.far = world.relay.hub._link(ROBOT, world.relay.now)
+        self.far = world.relay.hub.clients.link(ROBOT, world.relay.now)
         if cell.lanes is not Lanes.STREAM:
             self._join(LANE_EXPRESS if cell.lanes is Lanes.EXPRESS else LANE_UDP)
         self.flood = self.robot.publish(FLOOD, spec(PriorityClass.CONTROL, lifespan_s=1.0))

@@ -64,7 +64,7 @@ class Stage:
         self.log = TopicLog(TOPIC, "bulk", "robot")
         self.reliable = reliable
         self.world = World(seed=seed, lossless=False)
-        self.world.relay.hub.fates = Recorder(self.log, "relay")
+        self.world.relay.hub.forwarding.fates = Recorder(self.log, "relay")
         model = LinkModel(rate_bps=rate_bps, delay_s=0.02, jitter_s=0.005, loss=loss)
         self.robot = self.world.client("robot", model)
         self.site = self.world.client("site", model, patterns=[".*"])

@@ -33,7 +33,7 @@ class Express:
         self.robot = self.world.client("robot", main or stream())
         self.site = self.world.client("site", patterns=["/robot/.*"])
         near = LanePort(self.core.link, LANE_EXPRESS)
-        far = LanePort(self.world.relay.hub._link(ROBOT, self.world.now), LANE_EXPRESS)
+        far = LanePort(self.world.relay.hub.clients.link(ROBOT, self.world.now), LANE_EXPRESS)
         self.robot.more_ports.append(near)
         self.world.relay.more_ports.append(far)
         self.hop: Hop = self.world.network.join(near, self.robot, far, self.world.relay, second, second, name="express")

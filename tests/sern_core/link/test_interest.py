@@ -114,14 +114,14 @@ def test_the_feed_tells_only_what_changes() -> None:
     hub = world.relay.hub
     control = ControlBytes().watch(world, robot)
     for _ in range(100):
-        hub.refresh_interest(now=world.relay.now)
+        hub.streams.refresh_interest(now=world.relay.now)
         world.run(0.01)
     assert control.nbytes == 0
     wanted: set[str] = set()
-    hub.tap = lambda stream: stream.id.topic in wanted
+    hub.streams.tap = lambda stream: stream.id.topic in wanted
     for index in range(100):
         wanted.add(f"/robot/t{index}")
-        hub.refresh_interest(now=world.relay.now)
+        hub.streams.refresh_interest(now=world.relay.now)
     world.run(1.0)
     assert 0 < control.nbytes < 200
     assert [bool(channel.wanted) for channel in channels] == [True] * 100 + [False] * 100

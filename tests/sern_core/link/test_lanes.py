@@ -51,7 +51,7 @@ class TwoLanes:
     def _join(self, robot: SimClient, datagrams: LinkModel) -> Hop:
         hub = self.world.relay.hub
         near = LanePort(robot.core.link, LANE_UDP)
-        far = LanePort(hub._link(ClientName("robot"), self.world.now), LANE_UDP)
+        far = LanePort(hub.clients.link(ClientName("robot"), self.world.now), LANE_UDP)
         robot.more_ports.append(near)
         self.world.relay.more_ports.append(far)
         return self.world.network.join(near, robot, far, self.world.relay, datagrams, datagrams, name="udp")
@@ -143,7 +143,7 @@ def test_a_client_that_was_killed_is_away_after_the_heartbeat() -> None:
 def test_a_client_in_a_blackout_is_waited_for() -> None:
     stream, datagrams = models(Window(5.0, 50.0))
     lanes = TwoLanes(stream=stream, datagrams=datagrams)
-    link = lanes.world.relay.hub._link(ClientName("robot"), 0.0)
+    link = lanes.world.relay.hub.clients.link(ClientName("robot"), 0.0)
     lanes.run(20.0)
     assert not link.lanes.by_id[LANE_ZMQ].up, "the connection did not survive it"
     lanes.run(29.0)
@@ -156,7 +156,7 @@ def test_a_client_in_a_blackout_is_waited_for() -> None:
 def test_a_client_that_ends_in_a_blackout_is_away_in_the_end() -> None:
     stream, datagrams = models(Window(5.0, 500.0))
     lanes = TwoLanes(stream=stream, datagrams=datagrams)
-    link = lanes.world.relay.hub._link(ClientName("robot"), 0.0)
+    link = lanes.world.relay.hub.clients.link(ClientName("robot"), 0.0)
     lanes.run(60.0)
     assert link.established
     lanes.run(15.0)

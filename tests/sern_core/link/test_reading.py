@@ -61,13 +61,13 @@ def read_all(peer: Hostile) -> int:
 def taken(peer: Hostile, monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, int]]:
     """What the relay hands on of this peer, in its order."""
     got: list[tuple[str, int]] = []
-    forward = peer.hub._forward
+    forward = peer.hub.forwarding.forward
 
     def watched(relayed: object, message: object, now: float) -> bool:
         got.append((message.stream.topic, message.seq))  # type: ignore[attr-defined]
         return forward(relayed, message, now)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(peer.hub, "_forward", watched)
+    monkeypatch.setattr(peer.hub.forwarding, "forward", watched)
     return got
 
 

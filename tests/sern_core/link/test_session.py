@@ -116,7 +116,7 @@ def test_a_newer_connection_retires_the_older() -> None:
     hello = link.next_datagram(now=now)
     assert hello is not None
     newer.receive(hello, now=now)
-    assert newer.current and not older.current and hub.port_of[client.name] is newer
+    assert newer.current and not older.current and hub.clients.port_of[client.name] is newer
     assert older.next_datagram(now=now) is None and older.next_deadline() is None
     older.disconnected(now=now)
     assert newer.current and hub.links[client.name].established, "the end of the older one is not ours"

@@ -5,7 +5,7 @@ from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
 from sern_core.link import sender
-from sern_core.relay import hub as hub_module
+from sern_core.relay import clients
 from sern_core.relay.access import AccessRule, AccessTable
 from sern_core.relay.hub import HubParams
 from sern_core.site import client
@@ -139,7 +139,7 @@ def test_what_lapses_for_clients_that_are_away_goes_in_many_turns(
     count: int, kept: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Also of several clients: one turn is not for all that wait for all of them, however little it is of each."""
-    for module in (sender, hub_module):
+    for module in (sender, clients):
         monkeypatch.setattr(module, "LAPSED_A_SWEEP", 3)
     world = World(hub_params=HubParams(resume_s=1e6))
     robot = world.client("robot")

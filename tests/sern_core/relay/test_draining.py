@@ -30,7 +30,7 @@ class Ended:
         self.world.run(0.5)
         self.robot.core.unpublish(self.channel, now=self.robot.now)
         self.world.run(0.5)
-        assert len(self.world.relay.hub._draining) == 1
+        assert len(self.world.relay.hub.streams.draining) == 1
 
     def bodies(self) -> list[bytes]:
         return [got.body for got in self.site.got]
@@ -44,7 +44,7 @@ def test_what_was_owed_of_an_ended_stream_is_delivered() -> None:
     case = Ended()
     case.world.run(20.0)
     assert case.bodies() == [b"last", b"words"]
-    assert not case.world.relay.hub._draining and len(case.site.closed) == 1
+    assert not case.world.relay.hub.streams.draining and len(case.site.closed) == 1
 
 
 def test_the_same_stream_goes_on_where_it_ended() -> None:
@@ -52,7 +52,7 @@ def test_the_same_stream_goes_on_where_it_ended() -> None:
     again = case.robot.publish("/robot/log", spec(reliable=True), "int32 x\n")
     case.world.run(0.5)
     case.robot.send(again, b"back")
-    assert not case.world.relay.hub._draining
+    assert not case.world.relay.hub.streams.draining
     case.world.run(20.0)
     assert case.bodies() == [b"last", b"words", b"back"]
 
@@ -74,7 +74,7 @@ def test_another_stream_of_the_name_does_not_go_on_in_its_channel(again: Again) 
     channel = again(case.robot)
     case.world.run(0.5)
     case.robot.send(channel, b"new")
-    assert not case.world.relay.hub._draining
+    assert not case.world.relay.hub.streams.draining
     case.world.run(20.0)
     assert case.bodies() == [b"new"], "messages of two streams in one"
     assert case.dropped(DropReason.UNCONFIRMED) + case.dropped(DropReason.DISCONNECTED) == 2
@@ -112,7 +112,7 @@ NO_ROBOT = AccessTable([AccessRule(client="site", subscribe=(".*",))])
 def test_it_is_not_delivered_after_the_right_to_it_was_taken_away(access: AccessTable) -> None:
     case = Ended()
     case.world.relay.hub.revoke(access, now=case.world.relay.now)
-    assert not case.world.relay.hub._draining
+    assert not case.world.relay.hub.streams.draining
     assert case.dropped(DropReason.FORBIDDEN) == 2
     case.world.run(20.0)
     assert not case.site.got
@@ -125,7 +125,7 @@ def test_a_stream_whose_publisher_loses_the_right_does_not_drain() -> None:
     case.robot.send(channel, b"map")
     case.world.run(0.5)
     case.world.relay.hub.revoke(NO_ROBOT, now=case.world.relay.now)
-    assert not case.world.relay.hub._draining
+    assert not case.world.relay.hub.streams.draining
     case.world.run(20.0)
     assert not case.site.got
 
@@ -133,7 +133,7 @@ def test_a_stream_whose_publisher_loses_the_right_does_not_drain() -> None:
 def test_nor_after_the_name_of_its_publisher_was_revoked() -> None:
     case = Ended()
     case.world.relay.hub.forget(case.robot.name, "the name is revoked", now=case.world.relay.now)
-    assert not case.world.relay.hub._draining
+    assert not case.world.relay.hub.streams.draining
     case.world.run(20.0)
     assert not case.site.got
 
@@ -145,18 +145,18 @@ def test_nor_to_a_client_that_does_not_want_it_any_more() -> None:
     robot.announce(1, "/robot/log", reliable=True)
     robot.say(_whole(1, 1, b"x"))
     robot.control({"t": "retract", "ch": 1})
-    assert len(hub._draining) == 1
+    assert len(hub.streams.draining) == 1
     site.control({"t": "subscribe", "patterns": ["/robot/l.*"], "more": False})
-    assert len(hub._draining) == 1
+    assert len(hub.streams.draining) == 1
     site.control({"t": "subscribe", "patterns": ["/other/.*"], "more": False})
-    assert not hub._draining and not hub.links[site.name].sender.channels
+    assert not hub.streams.draining and not hub.links[site.name].sender.channels
     hub.validate()
 
 
 def test_a_client_that_stays_away_takes_it_along() -> None:
     case = Ended(reconnect_s=500.0)
     case.world.run(100.0)
-    assert not case.world.relay.hub._draining and ClientName("site") not in case.world.relay.hub.links
+    assert not case.world.relay.hub.streams.draining and ClientName("site") not in case.world.relay.hub.links
 
 
 def test_there_is_a_bound_for_each_client(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -172,7 +172,7 @@ def test_there_is_a_bound_for_each_client(monkeypatch: pytest.MonkeyPatch) -> No
         peer.control({"t": "retract", "ch": 1})
         world.relay.hub.validate()
     link = world.relay.hub.links[ClientName("site")]
-    assert len(world.relay.hub._draining) == len(link.sender.channels) == 50
+    assert len(world.relay.hub.streams.draining) == len(link.sender.channels) == 50
     dropped = sum(counters.by_reason[DropReason.QUEUE_FULL] for counters in link.sender.ledger.topics.values())
     assert dropped == 150
     newest = {channel.stream.id.topic for channel in link.sender.channels.values()}
@@ -186,7 +186,7 @@ def test_a_limit_of_the_access_rules_holds_for_it() -> None:
         AccessRule(client="site", subscribe=(".*",), max_queue_bytes=100),
     ]
     case.world.relay.hub.revoke(AccessTable(rules), now=case.world.relay.now)
-    assert not case.world.relay.hub._draining
+    assert not case.world.relay.hub.streams.draining
     assert case.dropped(DropReason.QUEUE_FULL) == 2
 
 

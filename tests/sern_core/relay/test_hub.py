@@ -1,7 +1,7 @@
 """What the relay's core promises its clients beside delivery: answers, and that they are let go."""
 
 from sern_core.relay.access import AccessRule, AccessTable
-from sern_core.relay.hub import MAX_DENIED
+from sern_core.relay.relayed_streams import MAX_DENIED
 from sern_core.stream.out_channel import MESSAGE_OVERHEAD_BYTES
 from sern_core.vocabulary.types import DropReason
 from sern_sim.models import LinkModel, Window
@@ -89,7 +89,7 @@ def test_a_client_that_says_goodbye_and_is_owed_nothing_is_forgotten_at_once() -
     site.core.link.close("client stops", now=site.now)
     world.until(lambda: site.name not in world.relay.hub.links, within_s=0.5)
     assert not world.relay.hub.routing.subscribers(channel.stream.id)
-    assert site.name not in world.relay.hub.port_of
+    assert site.name not in world.relay.hub.clients.port_of
     world.until(lambda: channel.wanted is False, within_s=0.5)
     world.hops["site"].break_connection()
     world.until(lambda: len(site.ups) == 2)  # it may change its mind

@@ -75,7 +75,7 @@ def test_one_announcement_for_many_is_told_in_slices() -> None:
 
 def test_clients_that_have_not_come_back_are_awaited_in_slices() -> None:
     peer = Hostile()
-    peer.hub.known = lambda _client: True
+    peer.hub.awaited.known = lambda _client: True
     absent = tuple(f"site{number:02}" for number in range(48))
     for slot in range(1, 11):
         peer.announce(slot, f"/robot/t{slot}", reliable=True, owed=absent)

@@ -28,11 +28,11 @@ def info(name: str = CMD, type_name: str = "geometry_msgs/msg/Twist") -> TopicIn
 
 def opened(world: World, topic_spec: TopicSpec | None = None, name: str = CMD) -> Relayed:
     hub = world.relay.hub
-    return hub.open_local(info(name), topic_spec or spec(PriorityClass.CONTROL), OWNER, now=world.relay.now)
+    return hub.local.open(info(name), topic_spec or spec(PriorityClass.CONTROL), OWNER, now=world.relay.now)
 
 
 def inject(world: World, handle: Relayed, body: bytes, age_s: float = 0.0) -> bool:
-    return world.relay.hub.inject(handle, body, 77, now=world.relay.now, age_s=age_s)
+    return world.relay.hub.local.inject(handle, body, 77, now=world.relay.now, age_s=age_s)
 
 
 def drops(world: World, name: str, reason: DropReason) -> int:
@@ -66,8 +66,8 @@ def test_opening_twice_is_one_stream_and_closing_ends_it() -> None:
     world.run(1.0)
     assert inject(world, handle, b"2")
     world.run(1.0)
-    world.relay.hub.close_local(handle, now=world.relay.now)
-    world.relay.hub.close_local(handle, now=world.relay.now)
+    world.relay.hub.local.close(handle, now=world.relay.now)
+    world.relay.hub.local.close(handle, now=world.relay.now)
     assert not inject(world, handle, b"nowhere")
     world.run(1.0)
     assert len(robot.closed) == 1
@@ -92,7 +92,7 @@ def test_a_name_has_one_owner_whoever_comes_first() -> None:
     site.publish(CMD, spec(PriorityClass.CONTROL))
     world.run(1.0)
     assert [code for code, _text in site.refusals] == ["name_taken"]
-    world.relay.hub.close_local(handle, now=world.relay.now)
+    world.relay.hub.local.close(handle, now=world.relay.now)
 
 
 def test_access_rules_hold_for_it_and_end_it() -> None:
@@ -106,7 +106,7 @@ def test_access_rules_hold_for_it_and_end_it() -> None:
     handle = opened(world)
     world.run(1.0)
     world.relay.hub.revoke(AccessTable([AccessRule(client="jackal1", subscribe=(".*",))]), now=world.relay.now)
-    assert not world.relay.hub.is_open(handle)
+    assert not world.relay.hub.local.is_open(handle)
     assert not inject(world, handle, b"go")
     world.run(1.0)
     assert len(robot.closed) == 1
@@ -160,7 +160,7 @@ def test_several_may_write_tf() -> None:
     robot.publish("/tf", spec(PriorityClass.STATE, many_writers=True))
     world.run(1.0)
     topic_info = TopicInfo(TopicName("/tf"), "std_msgs/msg/String", Encoding.CDR, "RIHS01_0")
-    handle = world.relay.hub.open_local(
+    handle = world.relay.hub.local.open(
         topic_info, spec(PriorityClass.STATE, many_writers=True), OWNER, now=world.relay.now
     )
     world.run(1.0)

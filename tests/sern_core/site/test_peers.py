@@ -98,16 +98,16 @@ def test_what_the_relay_itself_publishes_is_nobodys() -> None:
     site = world.client("site", patterns=["/scene/.*"])
     world.run(1.0)
     info = TopicInfo(TopicName("/scene/pose"), "std_msgs/msg/String", Encoding.CDR)
-    handle = world.relay.hub.open_local(info, spec(), ClientName("feed_scene"), now=world.relay.now)
+    handle = world.relay.hub.local.open(info, spec(), ClientName("feed_scene"), now=world.relay.now)
     world.run(1.0)
-    world.relay.hub.inject(handle, b"1", 0, now=world.relay.now)
+    world.relay.hub.local.inject(handle, b"1", 0, now=world.relay.now)
     world.until(lambda: site.seqs("/scene/pose") == [1])
     world.run(2.0)
     told = [name for name in statuses(site) if name != "feed_scene"]
     assert told == [] and GONE not in statuses(site).values()
     world.hops["site"].break_connection(reconnect_s=1.0)
     world.run(LET_GO_S)
-    world.relay.hub.inject(handle, b"2", 0, now=world.relay.now)
+    world.relay.hub.local.inject(handle, b"2", 0, now=world.relay.now)
     world.run(LET_GO_S)
     assert site.seqs("/scene/pose") == [1, 2]
     assert GONE not in statuses(site).values(), "the site has asked of it in its new session"

@@ -7,7 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sern_core.relay.access import AccessRule, AccessTable
-from sern_core.relay.hub import REPLAY_US, HubParams
+from sern_core.relay.hub import HubParams
+from sern_core.relay.relayed_streams import REPLAY_US
 from sern_core.relay.routing import SLICE_UNITS, UNIT_S
 from sern_core.stream.latched import MAX_REPLAY_MESSAGES, LatchedCache, ReplayStore
 from sern_core.stream.out_channel import CLIENT_OVERHEAD_BYTES, MESSAGE_OVERHEAD_BYTES, OutChannel
@@ -97,7 +98,7 @@ def test_the_relay_keeps_no_more_than_it_may(cache_bytes: int, expected: set[str
     late = world.client("late", patterns=[".*"])
     world.run(2.0)
     assert {got.topic for got in late.got} == expected
-    assert world.relay.hub.replays.held_bytes == (1_000 + UNIT) * len(expected)
+    assert world.relay.hub.streams.replays.held_bytes == (1_000 + UNIT) * len(expected)
     world.validate()
 
 

@@ -349,7 +349,7 @@ def test_a_full_table_of_channels_refuses_one_subscriber_and_not_the_origin(monk
 def test_nothing_that_a_bad_datagram_carried_is_lost_on_any_lane(lane: int, front: bool) -> None:
     """The relay's shell closes the lane that it came over; the session must not go on as if it had been read."""
     lanes = TwoLanes(stream=models()[0], datagrams=models()[1])
-    link = lanes.world.relay.hub._link(ClientName("robot"), lanes.world.now)
+    link = lanes.world.relay.hub.clients.link(ClientName("robot"), lanes.world.now)
     bad: list[int] = []
 
     def receive(self: Link, data: framing.Datagram, *, now: float, lane: int = LANE_ZMQ) -> None:
@@ -380,7 +380,7 @@ def test_nothing_that_a_bad_datagram_carried_is_lost_on_any_lane(lane: int, fron
 def test_a_control_message_that_nobody_knows_does_not_hold_up_what_came_before_it() -> None:
     """Datagrams overtake each other: what waits behind such a message was acknowledged before."""
     lanes = TwoLanes(stream=models()[0], datagrams=models()[1])
-    link = lanes.world.relay.hub._link(ClientName("robot"), lanes.world.now)
+    link = lanes.world.relay.hub.clients.link(ClientName("robot"), lanes.world.now)
     late: list[bytes] = []
 
     def receive(self: Link, data: bytes, *, now: float, lane: int = LANE_ZMQ) -> None:

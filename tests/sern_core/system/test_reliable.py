@@ -364,7 +364,7 @@ def test_a_topic_withdrawn_with_messages_still_owed_is_delivered_first() -> None
     world.run(20.0)
     assert site.seqs("/robot/log") == [1, 2, 3, 4, 5]
     assert [stream.id for stream in site.closed] == [log.stream.id]
-    assert not world.relay.hub._draining
+    assert not world.relay.hub.streams.draining
 
 
 def test_publishing_again_goes_on_counting() -> None:

@@ -398,4 +398,4 @@ def test_nothing_grows_while_clients_come_and_go() -> None:
         assert len(link.taking.streams) <= 4 and len(link.sender.channels) <= 4 and len(link.definitions) <= 1
         assert link.lane.flight.inflight_bytes < 100_000 and len(link.lane.flight.packets) < 500
         assert all(len(channel.retained) < 200 for channel in link.sender.channels.values())
-    assert len(world.relay.hub.links) == 2 and not world.relay.hub._draining
+    assert len(world.relay.hub.links) == 2 and not world.relay.hub.streams.draining

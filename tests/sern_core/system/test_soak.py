@@ -142,10 +142,10 @@ class Visits:
         info = TopicInfo(
             TopicName(f"/shared/feed{self.day}"), "a/b", Encoding.CDR, definition=f"uint8 feed{self.day}\n"
         )
-        handle = hub.open_local(info, spec(reliable=True), ClientName("feed"), now=now)
-        hub.inject(handle, b"x", 0, now=now)
+        handle = hub.local.open(info, spec(reliable=True), ClientName("feed"), now=now)
+        hub.local.inject(handle, b"x", 0, now=now)
         self.world.run(0.1)
-        hub.close_local(handle, now=self.world.relay.now)
+        hub.local.close(handle, now=self.world.relay.now)
 
 
 def test_tables_end_as_small_as_they_began() -> None:
