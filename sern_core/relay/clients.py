@@ -34,7 +34,8 @@ class Clients:
         self.access = access
         self._events = events
         self._make_link = make_link
-        self._resume_s = resume_s
+        self.resume_s = resume_s
+        """How long an absent client is waited for."""
         self.links: dict[ClientName, Link] = {}
         """Of all clients that are remembered, connected or not."""
         self.port_of: dict[ClientName, HubPort] = {}
@@ -173,7 +174,7 @@ class Clients:
     def gone(self, now: float) -> list[ClientName]:
         """Those that have stayed away for too long."""
         away = self._absent_since.items()
-        return [c for c, since_s in away if not self.links[c].established and now - since_s > self._resume_s]
+        return [c for c, since_s in away if not self.links[c].established and now - since_s > self.resume_s]
 
     def sweep_orphans(self, now: float) -> None:
         """End sessions of which only a silent datagram lane is left."""

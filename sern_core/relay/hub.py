@@ -222,8 +222,14 @@ class Hub:
     def offer_lane(self, client: ClientName, parameters: framing.Envelope, *, now: float) -> None:
         """Tell a client the keys of its datagram session (inside CURVE), and use that lane when it works."""
         link = self.links[client]
-        named = {key: parameters[key] for key in ("sid", "secret", "cipher", "port")}
-        link.control.send({"t": "lane", **named}, now=now)
+        lane = {
+            "t": "lane",
+            "sid": parameters["sid"],
+            "secret": parameters["secret"],
+            "cipher": parameters["cipher"],
+            "port": parameters["port"],
+        }
+        link.control.send(lane, now=now)
         link.open_lane(now=now)
 
     def join(self, client: ClientName, data: bytes, *, now: float) -> bool:

@@ -1,7 +1,6 @@
 """What one event costs the relay while a lot is under way or waits: `price.py` says how it is measured."""
 
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 from typing import Final
 
@@ -196,7 +195,7 @@ def backlog_that_lapses() -> Input:
 def backlog_that_lapses_while_its_reader_is_away() -> Input:
     _origin, reader, channel = filled_backlog(BACKLOG)
     reader.port.disconnected(now=reader.now)
-    reader.hub.params = replace(reader.hub.params, resume_s=1e9)
+    reader.hub.clients.resume_s = 1e9
 
     now = reader.now + channel.spec.retention_s + 1
 

@@ -292,6 +292,7 @@ class Streams:
     def __init__(self, count: int) -> None:
         self.relayed = dict.fromkeys(range(count))
         self.local_owners: set[str] = set()
+        self.streams = self
         self.tap: object = None
         self.told: list[list[int]] = []
 

@@ -207,23 +207,18 @@ class Link:
     """A session over the stream lane, as the express lane sees it."""
 
     def __init__(self) -> None:
-        self.established = self.reads = True
+        self.established = True
         self.dirty = False
-        self.express: object = None
+        self.handshake = SimpleNamespace(reads=True, join=lambda _now: b"join")
+        self.plane = SimpleNamespace(may_copy=lambda _nbytes: False)
         self.lane = SimpleNamespace(id=LANE_ZMQ)
-        self.lanes: set[int] = {LANE_ZMQ}
-
-    def may_copy(self, nbytes: int) -> bool:
-        return False
-
-    def join(self, *, now: float) -> bytes:
-        return b"join"
+        self.lanes = SimpleNamespace(by_id={LANE_ZMQ}, express=None)
 
     def open_lane(self, *, now: float, lane_id: int) -> None:
-        self.lanes.add(lane_id)
+        self.lanes.by_id.add(lane_id)
 
     def close_lane(self, *, now: float, lane_id: int) -> None:
-        self.lanes.discard(lane_id)
+        self.lanes.by_id.discard(lane_id)
 
     def receive(self, data: bytes, *, now: float, lane: int) -> None:
         assert lane == LANE_EXPRESS
@@ -272,7 +267,7 @@ async def _express(scene: Scene, lose: Callable[[Transport], None]) -> None:
                 connection.up(None)
                 connection.down("closed")
         await asyncio.sleep(0)  # it gives up outside their calls
-    assert not link.lanes & {LANE_EXPRESS}
+    assert LANE_EXPRESS not in link.lanes.by_id
     transport.problem = ""
     transport.made.clear()
     now.go_on(express.ASK_AGAIN_S)
@@ -361,7 +356,9 @@ async def name_of_the_relay(scene: Scene) -> None:
 async def datagrams(scene: Scene) -> None:
     now = scene.clock()
     lane = SimpleNamespace(id=LANE_ZMQ, stalled=False, usable=True)
-    link: Any = SimpleNamespace(peer="relay", established=True, lane=lane, lanes={LANE_ZMQ: lane})
+    link: Any = SimpleNamespace(
+        peer="relay", established=True, lane=lane, lanes=SimpleNamespace(by_id={LANE_ZMQ: lane})
+    )
     passes = iter((False, False, True))
     scene.patch.setattr(datagram_watch, "datagrams_pass", lambda _link: next(passes))
     watched = DatagramWatch(lambda: [link], lambda _link, _within_s: "no datagram gets through", lambda _link: "relay")
@@ -394,12 +391,12 @@ async def link(scene: Scene) -> None:
 async def silent_relay(scene: Scene) -> None:
     now = scene.clock()
     async with _client(scene) as daemon:
-        daemon.core.link.established = True
+        daemon.core.link.end.established = True
         for stalled in (False, True, True, False, False):
             daemon.core.link.lane.stalled = stalled
             daemon._look_at_link()
             now.go_on()
-        daemon.core.link.established = False
+        daemon.core.link.end.established = False
 
 
 @asynccontextmanager

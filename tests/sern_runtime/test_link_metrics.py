@@ -26,12 +26,11 @@ def link(peer: str, topics: int) -> Any:
     flight = SimpleNamespace(inflight_bytes=0, rtt=SimpleNamespace(srtt_s=None))
     return SimpleNamespace(
         peer=peer,
-        ledger=SimpleNamespace(topics={c.topic: c for c in counters}),
-        queued=dict,
+        sender=SimpleNamespace(ledger=SimpleNamespace(topics={c.topic: c for c in counters}), queued=dict),
         established=True,
-        strays=0,
+        receiver=SimpleNamespace(strays=0),
         lane=SimpleNamespace(stalled=False, estimator=estimator, flight=flight),
-        clock=SimpleNamespace(offset_s=None, error_s=None),
+        lanes=SimpleNamespace(clock=SimpleNamespace(offset_s=None, error_s=None)),
     )
 
 
@@ -88,7 +87,7 @@ def test_rows_under_other_stay_there_and_do_not_fall_when_a_link_is_forgotten(mo
     monkeypatch.setattr(module, "MAX_LABEL_SETS", 10)
     scene = Scene(3, 10)
     for at in scene.links:
-        at.ledger.topics["/r/t0"].drop(DropReason.RETENTION, 100)
+        at.sender.ledger.topics["/r/t0"].drop(DropReason.RETENTION, 100)
     assert scene.rows("sern_messages_dropped_total")["other", "other", "retention"] == 2
     del scene.links[0]  # its ten names are free
     for _ in range(3):
@@ -121,7 +120,7 @@ def test_links_and_topics_may_go_while_a_scrape_is_made(monkeypatch: pytest.Monk
         if not part and number % 4 == 0:
             scene.links.append(link(f"new{number}", 20))
             for at in scene.links[:-1]:
-                at.ledger.topics.pop(f"/r/t{number % 20}", None)
+                at.sender.ledger.topics.pop(f"/r/t{number % 20}", None)
             del scene.links[number % len(scene.links)]
     assert parts.count(b"") > 20
     text = b"".join(parts).decode()

@@ -26,9 +26,9 @@ VISITS = 10
 PAUSE_S = 2 * 24 * 3600.0
 STATIC = frozenset(
     {
-        ".access._cache",  # decisions, at most CACHE_ENTRIES
-        ".access._grants",
-        ".access._grants[][]._exact",
+        ".routing._access._cache",  # decisions, at most CACHE_ENTRIES
+        ".routing._access._grants",
+        ".routing._access._grants[][]._exact",
         ".objects._deletions",  # a ring
         ".presence._watchers[].missing",  # those that a client shows as gone, in its session: at most MAX_ASKED
         ".peers._ended",  # those of whom is shown that they are gone: at most MAX_GIVEN_UP, with MAX_ENDED topics each

@@ -29,6 +29,7 @@ CORE = [
         "link/streams_out.py",
         "relay/hub.py",
         "relay/hub_port.py",
+        "relay/relayed_streams.py",
         "link/link.py",
         "relay/presence.py",
         "link/handshake.py",
