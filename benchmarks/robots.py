@@ -42,8 +42,8 @@ from sern_core.vocabulary.params import LinkParams, SchedulerParams
 from sern_core.vocabulary.types import CLASS_LABELS, ClientName, Encoding, PriorityClass, TopicName
 from sern_relay.daemon import RelayDaemon
 from sern_runtime import clock, logs
+from sern_runtime.config.keys import load_public, load_secret
 from sern_runtime.config.relay import load_relay
-from sern_runtime.keys import load_public, load_secret
 from sern_runtime.loop import Shutdown, run
 from sern_tools.keygen import make_keys
 from sern_tools.ports import free_ports

@@ -9,7 +9,6 @@ from math import inf
 from typing import Final
 
 from sern_client.actions import GoalWatch
-from sern_client.conversion import Converter
 from sern_client.endpoints.base import (
     Difference,
     Endpoint,
@@ -21,6 +20,7 @@ from sern_client.endpoints.base import (
     publisher_within,
 )
 from sern_client.endpoints.composite import CompositeEndpoint
+from sern_client.endpoints.conversion import Converter
 from sern_client.frames import FramePrefixer, Rewrite
 from sern_client.guard import Guard
 from sern_client.keeping import Keeping

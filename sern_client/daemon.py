@@ -40,13 +40,13 @@ from sern_runtime.codec_pool import CodecPool, make_coder
 from sern_runtime.collector import CollectorWatch
 from sern_runtime.config.base import split_tcp
 from sern_runtime.config.client import ClientFile, ServicesSection, load_client
+from sern_runtime.config.keys import load_secret, load_server_keys
 from sern_runtime.config.load import Loaded
 from sern_runtime.datagram_watch import DatagramWatch
 from sern_runtime.draining import Progress
 from sern_runtime.entry import blamed_on, end_tasks, log_warnings, serve
 from sern_runtime.http import Health, HttpServer
 from sern_runtime.internal_errors import InternalErrors
-from sern_runtime.keys import load_secret, load_server_keys
 from sern_runtime.link_metrics import register_codecs, register_links, register_received
 from sern_runtime.loop import Shutdown
 from sern_runtime.message_log import LoggedFates, MessageLog

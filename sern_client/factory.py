@@ -12,7 +12,8 @@ from sern_client.endpoints.rclpy import RclpyEndpoint, RclpyOptions
 from sern_client.endpoints.record import RecordEndpoint, RecordOptions
 from sern_client.endpoints.ros1 import Ros1Endpoint, Ros1Options
 from sern_client.endpoints.synthetic import SyntheticEndpoint, SyntheticOptions
-from sern_client.endpoints.zenoh.endpoint import ZenohEndpoint, ZenohOptions
+from sern_client.endpoints.zenoh.endpoint import ZenohEndpoint
+from sern_client.endpoints.zenoh.options import ZenohOptions
 from sern_client.endpoints.zenoh.session import SessionOptions
 from sern_client.link_topics import LinkTopics
 from sern_core.vocabulary.errors import ConfigError, UsageError

@@ -34,9 +34,9 @@ from typing import Any, Final
 import uvloop
 from pydantic import TypeAdapter
 
-from sern_client.conversion import Converter
 from sern_client.endpoints.base import Endpoint, Publisher
 from sern_client.endpoints.composite import CompositeEndpoint
+from sern_client.endpoints.conversion import Converter
 from sern_client.endpoints.ros1 import Ros1Endpoint
 from sern_client.factory import make_section
 from sern_core.site.lease import GuardLease

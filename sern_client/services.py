@@ -15,8 +15,8 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Final
 
-from sern_client import conversion
 from sern_client.actions import cancel_request, refusal
+from sern_client.endpoints import conversion
 from sern_client.endpoints.base import ServiceEndpoint, ServiceInfo, ServiceServer
 from sern_core.site.client import ClientCore
 from sern_core.site.services import (

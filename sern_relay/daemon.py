@@ -31,6 +31,7 @@ from sern_runtime import clock, ros_types
 from sern_runtime.adaptation import Adaptation
 from sern_runtime.codec_pool import CodecPool, make_coder
 from sern_runtime.collector import CollectorWatch
+from sern_runtime.config.keys import KeyDirectory, KeyStatus, clock_says, load_secret, user_id
 from sern_runtime.config.load import Loaded
 from sern_runtime.config.relay import RelayFile, load_relay
 from sern_runtime.datagram_watch import DatagramWatch
@@ -38,7 +39,6 @@ from sern_runtime.draining import Progress
 from sern_runtime.entry import blamed_on, end_tasks, log_warnings, serve
 from sern_runtime.http import Health, HttpServer
 from sern_runtime.internal_errors import InternalErrors
-from sern_runtime.keys import KeyDirectory, KeyStatus, clock_says, load_secret, user_id
 from sern_runtime.link_metrics import AgeHistograms, register_codecs, register_links, register_received
 from sern_runtime.loop import Shutdown
 from sern_runtime.message_log import LoggedFates, MessageLog

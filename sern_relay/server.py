@@ -15,9 +15,9 @@ from sern_core.vocabulary.types import ClientName
 from sern_core.wire import framing
 from sern_relay.express import JOIN, Joined, RelayExpress
 from sern_runtime import clock
+from sern_runtime.config.keys import KeyStatus, parse_user_id
 from sern_runtime.dscp import Marks
 from sern_runtime.inflow import Inflow
-from sern_runtime.keys import KeyStatus, parse_user_id
 from sern_runtime.monitor import Connection, ConnectionTable, TcpHandle
 from sern_runtime.pump import LANE_MESSAGE_BYTES, Pump
 from sern_runtime.zmq_socket import CurvePair, RouterSocket, SendResult, make_server

@@ -16,7 +16,7 @@ from rich.text import Text
 from sern_client.relay_name import UnresolvedError, name_in, resolve
 from sern_core.vocabulary.errors import ConfigError
 from sern_core.vocabulary.types import ClientName
-from sern_runtime import keys
+from sern_runtime.config import keys
 from sern_runtime.config.base import FileModel
 from sern_runtime.config.client import ClientFile
 from sern_runtime.config.load import Checked, Loaded, check_document

@@ -7,7 +7,7 @@ import typer
 
 from sern_core.vocabulary.errors import ConfigError, SernError
 from sern_core.vocabulary.names import client_name
-from sern_runtime import keys
+from sern_runtime.config import keys
 
 EXIT_USER_ERROR = 2
 

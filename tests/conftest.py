@@ -18,7 +18,7 @@ import uvloop
 import zmq
 
 from sern_core.vocabulary.types import ClientName
-from sern_runtime.keys import SecretKey, generate
+from sern_runtime.config.keys import SecretKey, generate
 from sern_runtime.loop import raise_open_files
 from sern_tools.ports import release_claims
 from tests.exploring import load_profile

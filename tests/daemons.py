@@ -27,8 +27,8 @@ from sern_client.endpoints.base import Endpoint
 from sern_core.vocabulary.types import ClientName
 from sern_relay.daemon import RelayDaemon
 from sern_runtime.config.client import load_client
+from sern_runtime.config.keys import PublicKey, PublicKeys, SecretKey, generate, write_public, write_secret
 from sern_runtime.config.relay import load_relay
-from sern_runtime.keys import PublicKey, PublicKeys, SecretKey, generate, write_public, write_secret
 from sern_tools.ports import free_ports
 from tests.support import DEADLINE_S, until
 

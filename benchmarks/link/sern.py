@@ -20,7 +20,7 @@ from sern_core.vocabulary.params import LinkParams, SchedulerParams
 from sern_core.vocabulary.types import ClientName, DropReason, Encoding, PriorityClass, TopicName
 from sern_core.wire import framing
 from sern_runtime import clock, logs
-from sern_runtime.keys import load_public, load_secret
+from sern_runtime.config.keys import load_public, load_secret
 from sern_runtime.topics_view import both_ways
 
 RELAY_PORT: Final = 5555

@@ -9,7 +9,6 @@ from dataclasses import dataclass, field
 from math import inf
 from typing import Final
 
-from sern_client.conversion import Converter, serve
 from sern_client.endpoints.base import (
     CountingEndpoint,
     Difference,
@@ -28,6 +27,7 @@ from sern_client.endpoints.base import (
     TopicEvents,
     publisher_within,
 )
+from sern_client.endpoints.conversion import Converter, serve
 from sern_core.vocabulary.errors import ConfigError, ServiceError, UsageError
 from sern_core.vocabulary.message import TopicInfo
 from sern_core.vocabulary.types import DropReason, TopicName

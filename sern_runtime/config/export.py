@@ -15,9 +15,9 @@ from pydantic import TypeAdapter
 
 from sern_runtime.config.base import FileModel, Section
 from sern_runtime.config.client import ClientFile
+from sern_runtime.config.keys import PublicKeyFile, SecretKeyFile
 from sern_runtime.config.load import models_in
 from sern_runtime.config.relay import RelayFile
-from sern_runtime.keys import PublicKeyFile, SecretKeyFile
 
 DIALECT: Final = "https://json-schema.org/draft/2020-12/schema"
 Json = dict[str, Any]

@@ -40,6 +40,7 @@ from sern_runtime.config.base import (
     resolve,
     socket_problems,
 )
+from sern_runtime.config.keys import KeyDirectory
 from sern_runtime.config.load import Loaded, load
 from sern_runtime.config.shared import (
     ClassWord,
@@ -50,7 +51,6 @@ from sern_runtime.config.shared import (
     secret_key_problems,
 )
 from sern_runtime.config.yaml import Data
-from sern_runtime.keys import KeyDirectory
 
 DEFAULT_HTTP_LISTEN = "127.0.0.1:5580"
 _SOCKETS = ("publish_endpoint", "ingest_endpoint")

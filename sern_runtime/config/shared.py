@@ -25,9 +25,9 @@ from sern_runtime.config.base import (
     unit_makes,
     unit_problems,
 )
+from sern_runtime.config.keys import PUBLIC_SUFFIX, load_public, load_secret, load_server_keys, secret_warning
 from sern_runtime.config.yaml import Loc
 from sern_runtime.dscp import DSCP_NAMES, Marks
-from sern_runtime.keys import PUBLIC_SUFFIX, load_public, load_secret, load_server_keys, secret_warning
 
 ClassWord = Literal["control", "state", "bulk"]
 DscpName = Literal[

@@ -19,8 +19,8 @@ from benchmarks.endpoints.ros1_roles import figures
 from benchmarks.endpoints.shared import ALONE, CHAIN, DIRECT, ROBOT, SITE, Rounds
 from sern_core.vocabulary.errors import SernError
 from sern_runtime.config.client import load_client
+from sern_runtime.config.keys import load_public
 from sern_runtime.config.relay import load_relay
-from sern_runtime.keys import load_public
 from sern_tools.processes import Child, Children
 from tests.support import DEADLINE_S
 

@@ -7,7 +7,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from sern_core.vocabulary.errors import ConfigError
-from sern_runtime import keys
+from sern_runtime.config import keys
 from sern_runtime.config.base import FileModel
 from sern_runtime.config.client import ClientFile
 from sern_runtime.config.load import accepted_keys, check_bytes, models_in

@@ -7,7 +7,8 @@ from typing import Final
 
 import pytest
 
-from sern_client import actions, conversion
+from sern_client import actions
+from sern_client.endpoints import conversion
 from sern_client.frames import FramePrefixer
 from sern_client.tf_latch import TfLatch
 from sern_core.summaries import transforms

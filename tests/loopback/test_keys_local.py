@@ -6,7 +6,7 @@ import pytest
 import zmq
 
 from sern_core.vocabulary.types import ClientName
-from sern_runtime.keys import PublicKey, PublicKeys, load_public, load_secret, write_public
+from sern_runtime.config.keys import PublicKey, PublicKeys, load_public, load_secret, write_public
 from sern_runtime.monitor import ConnectionTable
 from tests.daemons import Lab
 from tests.loopback.test_security import DEAD_ENDS, Stranger, hello

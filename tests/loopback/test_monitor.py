@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import zmq
 
-from sern_runtime.keys import SecretKey
+from sern_runtime.config.keys import SecretKey
 from sern_runtime.monitor import (
     HANDSHAKE_GRACE_S,
     ConnectionTable,

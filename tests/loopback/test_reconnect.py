@@ -9,7 +9,7 @@ import pytest
 from sern_client.daemon import ClientDaemon
 from sern_core.path.lanes import LANE_UDP
 from sern_core.vocabulary.types import ClientName, TopicName
-from sern_runtime.keys import PublicKey, PublicKeys, load_public, write_public
+from sern_runtime.config.keys import PublicKey, PublicKeys, load_public, write_public
 from tests.daemons import Lab, Process, bodies, under, write_bag
 from tests.support import until
 

@@ -26,7 +26,15 @@ from sern_core.vocabulary.types import ClientName, TopicName
 from sern_core.wire import framing
 from sern_relay.daemon import REFUSAL_CODES, RelayDaemon
 from sern_relay.server import MAX_PORTS
-from sern_runtime.keys import PublicKey, PublicKeys, SecretKey, generate, load_public, load_secret, write_public
+from sern_runtime.config.keys import (
+    PublicKey,
+    PublicKeys,
+    SecretKey,
+    generate,
+    load_public,
+    load_secret,
+    write_public,
+)
 from sern_runtime.monitor import SocketMonitor
 from sern_runtime.udp import UdpSession
 from sern_runtime.zmq_socket import DealerSocket, make_client

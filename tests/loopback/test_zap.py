@@ -7,7 +7,7 @@ import pytest
 import zmq
 
 from sern_core.vocabulary.errors import SernError, UsageError
-from sern_runtime.keys import SecretKey
+from sern_runtime.config.keys import SecretKey
 from sern_runtime.monitor import EventKind, MonitorEvent, SocketMonitor
 from sern_runtime.transport_watch import TransportWatch
 from sern_runtime.zap import Refusal, TemporaryRefusal, ZapHandler, reachable, self_test

@@ -11,7 +11,7 @@ import zmq
 
 from sern_core.vocabulary.errors import ConfigError, UsageError
 from sern_runtime import zmq_socket
-from sern_runtime.keys import SecretKey
+from sern_runtime.config.keys import SecretKey
 from sern_runtime.zap import ZapHandler
 from sern_runtime.zmq_socket import (
     BATCH,

@@ -11,7 +11,8 @@ from typing import Any, Final
 import pytest
 
 from sern_client.endpoints.base import ServiceInfo
-from sern_client.endpoints.zenoh.endpoint import ZenohEndpoint, ZenohOptions
+from sern_client.endpoints.zenoh.endpoint import ZenohEndpoint
+from sern_client.endpoints.zenoh.options import ZenohOptions
 from sern_core.vocabulary.message import TopicInfo
 from sern_core.vocabulary.types import Encoding, TopicName
 from tests.daemons import Lab

@@ -5,7 +5,8 @@ import pytest
 from sern_client.endpoints.base import Endpoint
 from sern_client.endpoints.dds.domain import DomainOptions
 from sern_client.endpoints.dds.endpoint import DdsEndpoint, DdsOptions
-from sern_client.endpoints.zenoh.endpoint import ZenohEndpoint, ZenohOptions
+from sern_client.endpoints.zenoh.endpoint import ZenohEndpoint
+from sern_client.endpoints.zenoh.options import ZenohOptions
 from sern_client.endpoints.zenoh.session import SessionOptions
 from sern_core.vocabulary.types import Encoding
 from sern_tools.ports import free_ports

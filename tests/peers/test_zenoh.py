@@ -11,7 +11,8 @@ import pytest
 
 from sern_client.endpoints.base import Endpoint, Held, ServiceEndpoint, ServiceInfo
 from sern_client.endpoints.zenoh import names
-from sern_client.endpoints.zenoh.endpoint import ZenohEndpoint, ZenohOptions
+from sern_client.endpoints.zenoh.endpoint import ZenohEndpoint
+from sern_client.endpoints.zenoh.options import ZenohOptions
 from sern_client.endpoints.zenoh.services import _Server
 from sern_client.endpoints.zenoh.session import SessionOptions
 from sern_core.vocabulary.errors import ConfigError, ServiceError, UsageError

@@ -317,12 +317,13 @@ async def watchdog(scene: Scene) -> None:
 async def zenoh_router(scene: Scene) -> None:
     pytest.importorskip("zenoh", reason="the library eclipse-zenoh is missing: pip install 'sern[zenoh]'")
     from sern_client.endpoints.zenoh import endpoint as module
+    from sern_client.endpoints.zenoh.options import ZenohOptions
     from sern_client.endpoints.zenoh.session import SessionOptions, ZenohSession
 
     scene.patch.setattr(module, "ROUTER_WAIT_S", 0.0)
     scene.patch.setattr(module, "LOOK_S", 0.02)
     there = f"tcp/127.0.0.1:{free_ports(1)[0]}"
-    zenoh = module.ZenohEndpoint(module.ZenohOptions(SessionOptions(connect=(there,))))
+    zenoh = module.ZenohEndpoint(ZenohOptions(SessionOptions(connect=(there,))))
     await zenoh.start(Events())
     try:
         await scene.until_said("nobody answers at")

@@ -10,7 +10,7 @@ from rosbags.interfaces import Nodetype
 from rosbags.interfaces.typing import FieldDesc
 from rosbags.typesys.store import Typestore
 
-from sern_client import conversion
+from sern_client.endpoints import conversion
 from sern_client.frames import FramePrefixer
 from sern_core.vocabulary.errors import BodyError, ConfigError
 from sern_core.vocabulary.message import TopicInfo

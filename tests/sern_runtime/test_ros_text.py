@@ -7,7 +7,7 @@ from types import FrameType
 import pytest
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from sern_client import conversion
+from sern_client.endpoints import conversion
 from sern_client.frames import FramePrefixer
 from sern_core.vocabulary.errors import ConfigError
 from sern_core.vocabulary.message import TopicInfo

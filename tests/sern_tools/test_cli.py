@@ -20,7 +20,7 @@ main()
 
 
 def test_ctrl_c_during_the_imports_is_an_end_without_a_traceback() -> None:
-    for module in ("sern_tools.commands", "sern_runtime.keys"):
+    for module in ("sern_tools.commands", "sern_runtime.config.keys"):
         program = INTERRUPTED_AT.replace("MODULE", module)
         done = subprocess.run(
             [sys.executable, "-P", "-c", program], capture_output=True, text=True, timeout=120, check=False

@@ -7,7 +7,7 @@ import typer
 from typer.testing import CliRunner
 
 from sern_core.vocabulary.errors import ConfigError, UsageError
-from sern_runtime import keys
+from sern_runtime.config import keys
 from sern_tools import keygen
 
 

@@ -33,6 +33,7 @@ from sern_client.endpoints.base import (
     TopicEvents,
 )
 from sern_client.endpoints.dds import names, node_info
+from sern_client.endpoints.dds.counters import DdsCounters
 from sern_client.endpoints.dds.definitions import Definitions
 from sern_client.endpoints.dds.domain import DomainOptions, close_domain, open_domain
 from sern_client.endpoints.dds.entities import Reader, Subscription, Writer
@@ -82,24 +83,6 @@ class DdsOptions:
     max_buffer_bytes: int = 64 * 2**20
     offer_lifespan: bool = False
     heed_sern: bool = False
-
-
-@dataclass(slots=True)
-class DdsCounters:
-    """Messages by fate. Dropped: the event loop was too slow (`overrun`), slow reliable readers left a writer no room
-    (`blocked`), too many calls of a service were under way (`calls`), or what came was no call, or too long to be about
-    nodes (`unreadable`). What the link did not take (`refused`), the link counts. `closed`: given to a writer that is
-    no more. `faults` of the thread that waits for DDS are of those that were; `DdsEndpoint.faults` has all."""
-
-    received: int = 0
-    overrun: int = 0
-    refused: int = 0
-    written: int = 0
-    blocked: int = 0
-    calls: int = 0
-    unreadable: int = 0
-    closed: int = 0
-    faults: int = 0
 
 
 @dataclass(slots=True)

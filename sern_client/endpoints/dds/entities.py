@@ -1,7 +1,8 @@
 """A topic on its way to the link, and the readers and writers in use."""
 
+from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 from uuid import UUID
 
 from cyclonedds.pub import DataWriter
@@ -9,6 +10,8 @@ from cyclonedds.sub import DataReader
 
 from sern_client.endpoints.base import Sink
 from sern_client.endpoints.dds import names, raw
+from sern_client.endpoints.dds.counters import DdsCounters
+from sern_client.endpoints.dds.graph import Graph
 from sern_client.endpoints.dds.qos import EndpointQos, mismatches, reader_for, within_reach
 from sern_client.endpoints.dds.worker import Inbox, Sample
 from sern_client.endpoints.first import Readers
@@ -16,14 +19,35 @@ from sern_core.vocabulary.message import TopicInfo
 from sern_core.vocabulary.types import Encoding
 from sern_runtime import ros_types
 
-if TYPE_CHECKING:
-    from sern_client.endpoints.dds.endpoint import DdsEndpoint
+
+class EntityOwner(Protocol):
+    """What readers and writers need of the endpoint that has them."""
+
+    graph: Graph
+    counters: DdsCounters
+
+    def open_reader(
+        self,
+        topic: str,
+        resolved: ros_types.ResolvedType,
+        qos: EndpointQos,
+        deliver: Callable[[Sample], None],
+        *,
+        before: "Reader | None" = None,
+    ) -> "Reader":
+        """`before` is closed as soon as there is the new one. ConfigError where DDS gives none."""
+
+    def forget(self, subscription: "Subscription") -> None: ...
+
+    def close_reader(self, reader: "Reader", number: int) -> None: ...
+
+    def close_writer(self, writer: "Writer", kept: list[DataWriter[Any]]) -> None: ...
 
 
 class Subscription:
     """One topic on its way to the link. The reader is made anew when writers appear that it would not match."""
 
-    def __init__(self, endpoint: "DdsEndpoint", info: TopicInfo, dds_topic: str, sink: Sink) -> None:
+    def __init__(self, endpoint: EntityOwner, info: TopicInfo, dds_topic: str, sink: Sink) -> None:
         self._endpoint = endpoint
         self.info = info
         self.dds_topic = dds_topic
@@ -88,7 +112,7 @@ class Reader:
     """A reader in use: its samples come to `deliver` on the event loop until it is closed."""
 
     def __init__(
-        self, endpoint: "DdsEndpoint", entity: DataReader[Any], qos: EndpointQos, inbox: Inbox, number: int
+        self, endpoint: EntityOwner, entity: DataReader[Any], qos: EndpointQos, inbox: Inbox, number: int
     ) -> None:
         self._endpoint = endpoint
         self._entity: DataReader[Any] | None = entity
@@ -116,7 +140,7 @@ class Reader:
 class Writer:
     """A writer in use."""
 
-    def __init__(self, endpoint: "DdsEndpoint", writer: DataWriter[Any], guid: UUID, *, stamped: bool) -> None:
+    def __init__(self, endpoint: EntityOwner, writer: DataWriter[Any], guid: UUID, *, stamped: bool) -> None:
         self._endpoint = endpoint
         self._writer: DataWriter[Any] | None = writer
         self.guid = guid

@@ -10,23 +10,24 @@ import asyncio
 import logging
 import secrets
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import Final, Protocol
 
 from sern_client.endpoints.base import ServiceEvents, ServiceHandler, ServiceInfo
 from sern_client.endpoints.dds import names
-from sern_client.endpoints.dds.graph import Remote, puts_header
+from sern_client.endpoints.dds.counters import DdsCounters
+from sern_client.endpoints.dds.definitions import Definitions
+from sern_client.endpoints.dds.entities import Reader, Writer
+from sern_client.endpoints.dds.graph import Graph, Remote, puts_header
 from sern_client.endpoints.dds.names import Role
 from sern_client.endpoints.dds.qos import EndpointQos
 from sern_client.endpoints.dds.worker import Sample
 from sern_core.vocabulary.errors import ConfigError, ServiceError, UsageError
 from sern_core.vocabulary.types import Encoding, TopicName
 from sern_runtime import ros_services
-
-if TYPE_CHECKING:
-    from sern_client.endpoints.dds.endpoint import DdsEndpoint
+from sern_runtime.ros_types import ResolvedType
 
 DEPTH: Final = 10
 """History of requests and replies: what ROS 2 has by default for services."""
@@ -136,10 +137,45 @@ class _Server:
             task.cancel()
 
 
+class ServiceOwner(Protocol):
+    """What services need of the endpoint that has them."""
+
+    graph: Graph
+    counters: DdsCounters
+    types: Definitions
+
+    def open_reader(
+        self,
+        topic: str,
+        resolved: ResolvedType,
+        qos: EndpointQos,
+        deliver: Callable[[Sample], None],
+        *,
+        header: bool = False,
+        id_key: str = "clientid",
+    ) -> Reader:
+        """With `header`, of requests or replies. ConfigError where DDS gives none."""
+
+    def open_writer(
+        self,
+        topic: str,
+        resolved: ResolvedType,
+        qos: EndpointQos,
+        *,
+        depth: int,
+        header: bool = False,
+        id_key: str = "clientid",
+    ) -> Writer:
+        """ConfigError as `open_reader`."""
+
+    def say_once(self, line: str | Callable[[], str], *about: Hashable) -> None:
+        """What a person has to know and do something about."""
+
+
 class DdsServices:
     """The services of one endpoint."""
 
-    def __init__(self, endpoint: "DdsEndpoint") -> None:
+    def __init__(self, endpoint: ServiceOwner) -> None:
         self._endpoint = endpoint
         self._events: ServiceEvents | None = None
         self._known: dict[TopicName, ServiceInfo] = {}

@@ -12,9 +12,9 @@ from collections import deque
 from collections.abc import Callable, Iterable
 from functools import partial
 from math import inf
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
-from sern_client.endpoints.ros1.frames import LENGTH
+from sern_client.endpoints.ros1.frames import LENGTH, Frames
 from sern_client.endpoints.ros1.header import BRIDGE_FIELD, shown
 from sern_client.endpoints.ros1.hold import Hold
 from sern_client.tf_latch import TfLatch, is_static_tf
@@ -22,9 +22,6 @@ from sern_core.vocabulary.errors import ConfigError
 from sern_core.vocabulary.message import TopicInfo
 from sern_core.vocabulary.types import DropReason, Encoding
 from sern_runtime import ros_types
-
-if TYPE_CHECKING:
-    from sern_client.endpoints.ros1.server import Inbound
 
 JOIN_BYTES: Final = 32 * 1024
 """Up to this size a message and its length are joined: one copy is cheaper than two writes."""
@@ -40,7 +37,7 @@ _log = logging.getLogger(__name__)
 class Feed:
     """The sending half of one subscriber's connection."""
 
-    def __init__(self, link: "Inbound", publication: "Publication", caller: str, number: int) -> None:
+    def __init__(self, link: Frames, publication: "Publication", caller: str, number: int) -> None:
         assert link.transport is not None
         self.caller = caller
         self.number = number

@@ -14,15 +14,15 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from math import inf
-from pathlib import Path
 from typing import Any, Final
 
 from sern_client.endpoints.base import GUARD_SUFFIX, Difference, Held, Publisher, Sink, Subscription, TopicEvents
 from sern_client.endpoints.first import LEARN_S, FirstMessages, Readers
 from sern_client.endpoints.zenoh import names
 from sern_client.endpoints.zenoh.names import Entity, Kind, Qos
+from sern_client.endpoints.zenoh.options import ZenohOptions
 from sern_client.endpoints.zenoh.services import Services
-from sern_client.endpoints.zenoh.session import MAX_WAITING_BYTES, SessionOptions, ZenohSession
+from sern_client.endpoints.zenoh.session import MAX_WAITING_BYTES, ZenohSession
 from sern_core.vocabulary.errors import ConfigError, UsageError, WireError
 from sern_core.vocabulary.message import TopicInfo
 from sern_core.vocabulary.types import DropReason, Encoding, TopicName
@@ -40,16 +40,6 @@ FIRST_MESSAGES: Final = 100
 """Messages of a reliable topic that may wait for its first subscribers."""
 
 _log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True, slots=True)
-class ZenohOptions:
-    """`domain` is ROS_DOMAIN_ID, `node_name` how we appear in `ros2 node list`."""
-
-    session: SessionOptions = field(default_factory=SessionOptions)
-    domain: int = 0
-    node_name: str = "sern"
-    type_paths: tuple[Path, ...] = ()
 
 
 @dataclass(slots=True, eq=False)

@@ -6,19 +6,17 @@ import logging
 import secrets
 import time
 from abc import ABC, abstractmethod
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 from sern_client.endpoints.base import ServiceEvents, ServiceHandler, ServiceInfo, ServiceServer
 from sern_client.endpoints.zenoh import names
 from sern_client.endpoints.zenoh.names import Entity, Kind, Qos
+from sern_client.endpoints.zenoh.options import ZenohOptions
 from sern_client.endpoints.zenoh.presence import Presence
+from sern_client.endpoints.zenoh.session import ZenohSession
 from sern_core.vocabulary.errors import ConfigError, ServiceError, WireError
 from sern_core.vocabulary.types import Encoding, TopicName
-
-if TYPE_CHECKING:
-    from sern_client.endpoints.zenoh.endpoint import ZenohOptions
-    from sern_client.endpoints.zenoh.session import ZenohSession
-    from sern_runtime.ros_files import TypeFiles
+from sern_runtime.ros_files import TypeFiles
 
 CDR: Final = "application/cdr"
 BEHIND: Final = "the bridge is behind with what has arrived"
@@ -31,9 +29,9 @@ _log = logging.getLogger(__name__)
 class Services(ABC):
     """The half of the endpoint that knows services."""
 
-    options: "ZenohOptions"
-    session: "ZenohSession"
-    types: "TypeFiles"
+    options: ZenohOptions
+    session: ZenohSession
+    types: TypeFiles
     _loop: asyncio.AbstractEventLoop
 
     def __init__(self) -> None:

@@ -12,8 +12,8 @@ from rosbags.highlevel import AnyReader
 from rosbags.rosbag1 import Reader, Writer
 from rosbags.typesys import Stores, get_typestore
 
-from sern_client.conversion import converted
 from sern_client.daemon import ClientDaemon
+from sern_client.endpoints.conversion import converted
 from sern_client.endpoints.dds.endpoint import DdsEndpoint
 from sern_core.vocabulary.message import TopicInfo
 from sern_core.vocabulary.types import Encoding, TopicName

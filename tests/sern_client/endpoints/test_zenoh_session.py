@@ -15,7 +15,8 @@ from sern_client.endpoints.base import ServiceInfo
 from sern_client.endpoints.handover import ITEM_BYTES
 from sern_client.endpoints.zenoh import names
 from sern_client.endpoints.zenoh import session as module
-from sern_client.endpoints.zenoh.endpoint import ZenohEndpoint, ZenohOptions
+from sern_client.endpoints.zenoh.endpoint import ZenohEndpoint
+from sern_client.endpoints.zenoh.options import ZenohOptions
 from sern_client.endpoints.zenoh.session import SessionOptions, load_zenoh, make_config
 from sern_client.factory import make_section
 from sern_core.vocabulary.errors import ConfigError, ServiceError

@@ -12,8 +12,8 @@ from sern_core.topics.rules import Direction, DiscoveryMode, Lease, LossAction
 from sern_core.vocabulary.message import TopicInfo
 from sern_core.vocabulary.params import LinkParams, SchedulerParams, WindowAlgorithm
 from sern_core.vocabulary.types import ClientName, Encoding, Ordering, PriorityClass, Reliability, TopicName
-from sern_runtime import keys
 from sern_runtime.config import base as config_base
+from sern_runtime.config import keys
 from sern_runtime.config.base import FileModel, is_local
 from sern_runtime.config.client import ClientFile, load_client
 from sern_runtime.config.endpoints import BagEndpoint, RecordEndpoint, SyntheticEndpoint

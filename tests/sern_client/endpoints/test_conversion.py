@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
-from sern_client.conversion import Converter, converted, converted_service
 from sern_client.endpoints.base import Difference, Held, Publisher, ServiceInfo, Sink, Subscription, TopicEvents
+from sern_client.endpoints.conversion import Converter, converted, converted_service
 from sern_core.vocabulary.errors import ConfigError, UsageError
 from sern_core.vocabulary.message import TopicInfo
 from sern_core.vocabulary.types import Encoding, TopicName

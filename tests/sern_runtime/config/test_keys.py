@@ -9,8 +9,8 @@ from zmq.utils import z85
 
 from sern_core.vocabulary.errors import ConfigError, UsageError
 from sern_core.vocabulary.types import ClientName
-from sern_runtime import keys
-from sern_runtime.keys import KeyDirectory, KeyMatch, KeyStatus, PublicKey, PublicKeys
+from sern_runtime.config import keys
+from sern_runtime.config.keys import KeyDirectory, KeyMatch, KeyStatus, PublicKey, PublicKeys
 
 NAME = ClientName("jackal1")
 GOOD = "W/<tzpy]p5MX1kPs3?Jw<H7{823Ycpi0%*{ujHp."
