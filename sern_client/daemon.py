@@ -127,7 +127,7 @@ class ClientDaemon:
             coder=make_coder(model.link.params(), self.codecs),
         )
         if self.message_log is not None:
-            self.core.link.outgoing.fates = LoggedFates(self.message_log, self.parts)
+            self.core.link.end.fates = LoggedFates(self.message_log, self.parts)
         self.bridge.attach(self.core)
         self.bridge.guard = self.guard = Guard.of(loaded)
         self.check = TableCheck(self.bridge, now=now)

@@ -6,7 +6,8 @@ from contextlib import ExitStack, contextmanager
 from typing import Any
 from unittest.mock import patch
 
-from sern_core.link.link import Link, LinkHandler
+from sern_core.link.handler import LinkHandler
+from sern_core.link.link import Link
 from sern_core.link.streams_out import StreamsOut
 from sern_core.path.congestion.hybrid import HybridWindow
 from sern_core.path.flight import Flight

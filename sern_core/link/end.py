@@ -1,5 +1,6 @@
 """What all parts of one end of a hop share: who it is, what the session agreed on, and the call under way. Pure."""
 
+from sern_core.vocabulary.fates import Fates
 from sern_core.vocabulary.params import LinkParams
 from sern_core.vocabulary.trace import DecisionTrace
 from sern_core.vocabulary.types import ClientName
@@ -18,6 +19,7 @@ class End:
         "boot",
         "dirty",
         "established",
+        "fates",
         "half_read",
         "initiator",
         "name",
@@ -52,6 +54,8 @@ class End:
         """The client's end: it says HELLO."""
         self.params = params
         self.trace = trace
+        self.fates: Fates | None = None
+        """Told what becomes of each message here; set before the first channel is opened."""
         self.established = False
         """There is a session."""
         self.half_read = False

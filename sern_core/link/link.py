@@ -17,10 +17,9 @@ streams through `answers` and `taking`.
 """
 
 import struct
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Callable
 from dataclasses import replace
-from typing import Final, ParamSpec, Protocol
+from typing import Final
 
 from sern_core.bodies.codecs import Coder
 from sern_core.link.answers import Answers
@@ -29,6 +28,7 @@ from sern_core.link.control_stream import ControlStream
 from sern_core.link.data_plane import DataPlane
 from sern_core.link.definitions import DefinitionStore, PeerDefinitions
 from sern_core.link.end import End
+from sern_core.link.handler import LinkHandler, Owner
 from sern_core.link.handshake import Handshake
 from sern_core.link.lane_set import LaneSet
 from sern_core.link.owed_lists import OwedLists
@@ -38,149 +38,18 @@ from sern_core.link.sender import Sender
 from sern_core.link.streams_in import StreamsIn
 from sern_core.link.streams_out import StreamsOut
 from sern_core.path.lanes import LANE_UDP, LANE_ZMQ, Lane
-from sern_core.stream.in_stream import InStream, Reassembly
+from sern_core.stream.in_stream import Reassembly
 from sern_core.stream.out_channel import OutChannel
-from sern_core.stream.out_message import OutMessage
 from sern_core.vocabulary.errors import RemoteError, WireError
 from sern_core.vocabulary.message import Message
 from sern_core.vocabulary.params import LinkParams, SchedulerParams
 from sern_core.vocabulary.trace import LINK, DecisionTrace, TraceEvent
-from sern_core.vocabulary.types import ClientName, DropReason, PriorityClass
+from sern_core.vocabulary.types import ClientName, PriorityClass
 from sern_core.wire import framing
-from sern_core.wire.announce import Announcement, decode_announcement, decode_want
+from sern_core.wire.announce import decode_announcement, decode_want
 
 TIDY_S: Final = 60.0
 NUMBER_AND_STAMP: Final = struct.Struct("!IQ")
-
-P = ParamSpec("P")
-
-
-class LinkHandler(Protocol):
-    """What the owner of a link is told. Calls happen inside `receive`, `submit` and `handle_timeout`.
-
-    What they raise unexpectedly goes to `on_fault` and stops nothing that is under way here. News is told once more, as
-    it does not come again; a message is given up (`fault`), counted and, of a reliable stream, reported; a stream that
-    cannot be announced is refused. Only `on_up` and `on_control` end the session, for the next one tells it all anew.
-    """
-
-    def on_fault(self, link: "Link", error: Exception, *, now: float) -> None:
-        """Something raised what nobody expects, here or in the owner: to be logged with its traceback, and counted."""
-
-    def on_up(self, link: "Link", *, resumed: bool, now: float) -> None:
-        """A session exists. `resumed`: the peer is the same process as before."""
-
-    def on_down(self, link: "Link", reason: str, *, now: float) -> None: ...
-
-    def on_lane_closed(self, link: "Link") -> None:
-        """The datagram lane ended with the session: close its transport; its keys are of no more use."""
-
-    def on_rejected(self, link: "Link", code: str, text: str, *, now: float) -> None:
-        """The peer refused the session itself."""
-
-    def on_announce(self, link: "Link", announcement: Announcement, *, now: float) -> bool | None:
-        """The peer has a stream: is it wanted? None: `Link.answers` is told later. Raises RefusedError to refuse."""
-
-    def on_retract(self, link: "Link", stream: InStream, *, now: float) -> None: ...
-
-    def on_message(self, link: "Link", stream: InStream, message: Message, *, now: float) -> None:
-        """A message (or tombstone) has its turn."""
-
-    def on_in_drop(self, link: "Link", stream: InStream, reason: DropReason, nbytes: int, count: int) -> None: ...
-
-    def on_out_drop(self, link: "Link", channel: OutChannel, outs: Sequence[OutMessage], reason: DropReason) -> None:
-        """These messages are dropped, in the order of their seqs. Of a reliable stream what lies between two of them
-        was dropped before, or never comes."""
-
-    def on_delivered(self, link: "Link", channel: OutChannel, *, now: float) -> None:
-        """The peer's watermark of a reliable channel moved to `channel.watermark`."""
-
-    def on_wanted(self, link: "Link", channel: OutChannel, *, now: float) -> None:
-        """The peer has said whether it wants the stream: `channel.wanted`. Said again after every change."""
-
-    def on_refused(self, link: "Link", channel: OutChannel, code: str, text: str, *, now: float) -> None: ...
-
-    def on_skipped(self, link: "Link", stream: InStream, count: int, *, now: float) -> None:
-        """`count` messages of the stream will not come; they were reported where they were dropped."""
-
-    def on_definition(self, link: "Link", digest: str, *, now: float) -> None:
-        """`Link.definitions` has a new text."""
-
-    def on_control(self, link: "Link", envelope: framing.Envelope, attachment: bytes, *, now: float) -> None:
-        """A control message that is not the link's own business. Raises WireError if it is nobody's."""
-
-
-class _Owner:
-    """Tells the owner of a link (`Events`). What it raises goes no further, but where `Events` says so."""
-
-    def __init__(self, link: "Link") -> None:
-        self._link = link
-
-    def _tell(self, call: Callable[P, object], *args: P.args, **kwargs: P.kwargs) -> None:
-        """Tell the owner what it is not told again: once more if that raises."""
-        try:
-            call(*args, **kwargs)
-        except Exception as error:  # noqa: BLE001  (the owner's, and no reason to leave our own work half done)
-            self.fault(error)
-            try:
-                call(*args, **kwargs)
-            except Exception as again:  # noqa: BLE001
-                self.fault(again)
-
-    def fault(self, error: Exception) -> None:
-        link = self._link
-        link.faults += 1
-        with suppress(Exception):  # counted above; there is nobody left to tell
-            link.handler.on_fault(link, error, now=link.end.now)
-
-    def up(self, *, now: float) -> None:
-        self._link.handler.on_up(self._link, resumed=self._link.end.resumed, now=now)
-
-    def down(self, reason: str, *, now: float) -> None:
-        self._tell(self._link.handler.on_down, self._link, reason, now=now)
-
-    def lane_closed(self) -> None:
-        self._tell(self._link.handler.on_lane_closed, self._link)
-
-    def rejected(self, code: str, text: str, *, now: float) -> None:
-        self._tell(self._link.handler.on_rejected, self._link, code, text, now=now)
-
-    def announce(self, announcement: Announcement, *, now: float) -> bool | None:
-        return self._link.handler.on_announce(self._link, announcement, now=now)
-
-    def retract(self, stream: InStream, *, now: float) -> None:
-        self._tell(self._link.handler.on_retract, self._link, stream, now=now)
-
-    def message(self, stream: InStream, message: Message, *, now: float) -> None:
-        self._link.handler.on_message(self._link, stream, message, now=now)
-
-    def discarded(self, stream: InStream, reason: DropReason, nbytes: int, seqs: Sequence[int]) -> None:
-        link = self._link
-        self._tell(link.handler.on_in_drop, link, stream, reason, nbytes, len(seqs))
-        fates = link.outgoing.fates
-        if fates is not None and reason is not DropReason.DUPLICATE:
-            for seq in seqs:
-                fates.discarded(stream.stream, seq, reason, link.end.peer)
-
-    def skipped(self, stream: InStream, count: int, *, now: float) -> None:
-        self._tell(self._link.handler.on_skipped, self._link, stream, count, now=now)
-
-    def dropped(self, channel: OutChannel, outs: Sequence[OutMessage], reason: DropReason) -> None:
-        self._tell(self._link.handler.on_out_drop, self._link, channel, outs, reason)
-
-    def delivered(self, channel: OutChannel, *, now: float) -> None:
-        self._tell(self._link.handler.on_delivered, self._link, channel, now=now)
-
-    def wanted(self, channel: OutChannel, *, now: float) -> None:
-        self._tell(self._link.handler.on_wanted, self._link, channel, now=now)
-
-    def refused(self, channel: OutChannel, code: str, text: str, *, now: float) -> None:
-        self._tell(self._link.handler.on_refused, self._link, channel, code, text, now=now)
-
-    def definition(self, digest: str, *, now: float) -> None:
-        self._tell(self._link.handler.on_definition, self._link, digest, now=now)
-
-    def control(self, envelope: framing.Envelope, attachment: bytes, *, now: float) -> None:
-        self._link.handler.on_control(self._link, envelope, attachment, now=now)
 
 
 class Link:
@@ -197,7 +66,7 @@ class Link:
         boot: int,
         peer: ClientName,
         initiator: bool,
-        handler: LinkHandler,
+        handler: LinkHandler["Link"],
         definitions: DefinitionStore,
         link: LinkParams,
         scheduler: SchedulerParams,
@@ -206,19 +75,16 @@ class Link:
         lossless: bool = True,
         auto_confirm: bool = True,
     ) -> None:
-        self.handler = handler
         self.definitions = definitions
         self.on_tidy: Callable[[float], None] | None = None
         """Called now and then, with the time, for the owner to let go of what nobody needs any more."""
         self.finish: Callable[[Link, float], bool] | None = None
         """Called before more is read: whether all that came of what was read before is done by now."""
-        self.faults = 0
-        """Errors of ours on this link so far."""
         self._tidy_due_s = now + TIDY_S
         self._data_prefix = b""  # how a data datagram of the session begins
         self._unreadable: RemoteError | None = None  # found at a time when nobody could be told
-        self._owner = owner = _Owner(self)
         end = self.end = End(name=name, boot=boot, peer=peer, initiator=initiator, params=link, trace=trace, now=now)
+        owner = self._owner = Owner(self, handler, end)
         self.texts = PeerDefinitions(definitions, peer)
         reassembly = self.reassembly = Reassembly(max(64 * 2**20, 2 * link.max_message_bytes))
         control = self.control = ControlStream(end, reassembly, self._control_message)

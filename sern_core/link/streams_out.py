@@ -65,8 +65,6 @@ class StreamsOut:
         self._events = events
         self._at_once = at_once
         self.by_stream: dict[StreamId, OutChannel] = {}
-        self.fates: Fates | None = None
-        """Told what becomes of each message here; set before the first channel is opened."""
         self._next_channel = 1
         self._on_dropped = self._dropped  # one for all channels
         self._announcing: deque[tuple[int, OutChannel]] = deque()  # may send once that control message is on its way
@@ -115,8 +113,8 @@ class StreamsOut:
         channel.owed = owed
         channel.wanted = wanted
         channel.codec = self._sender.new_codec(stream)
-        if self.fates is not None:
-            channel.on_count = partial(self._counted, self.fates, stream)
+        if self._end.fates is not None:
+            channel.on_count = partial(self._counted, self._end.fates, stream)
         channel.prime(replays, now=now)
         channels[slot] = channel
         self.by_stream[stream.id] = channel

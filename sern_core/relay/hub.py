@@ -139,7 +139,7 @@ class Hub:
             auto_confirm=False,
         )
         link.receiver.on_stray = self.received.stray
-        link.outgoing.fates = self.forwarding.fates
+        link.end.fates = self.forwarding.fates
         link.reading.on_read = self._was_read
         link.finish = self._finish
         return link

@@ -431,8 +431,8 @@ class ClientCore:
         topic = stream.stream.id.topic
         self.received.of(stream.stream).drop_arrived(reason)
         self.trace.record(now, topic, TraceEvent.DROPPED, seq=message.seq, reason=reason, peer=self.link.peer)
-        if self.link.outgoing.fates is not None and (not stream.reliable or reason is DropReason.DISCONNECTED):
-            self.link.outgoing.fates.discarded(stream.stream, message.seq, reason, self.link.peer)
+        if self.link.end.fates is not None and (not stream.reliable or reason is DropReason.DISCONNECTED):
+            self.link.end.fates.discarded(stream.stream, message.seq, reason, self.link.peer)
         told = self._undecodable
         if reason is DropReason.UNDECODABLE and topic not in told and len(told) < MAX_TOPICS:
             told.add(topic)

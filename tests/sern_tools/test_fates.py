@@ -69,7 +69,7 @@ class Stage:
         self.robot = self.world.client("robot", model)
         self.site = self.world.client("site", model, patterns=[".*"])
         for client in (self.robot, self.site):
-            client.core.link.outgoing.fates = Recorder(self.log, client.name)
+            client.core.link.end.fates = Recorder(self.log, client.name)
         self.channel = self.robot.publish(
             TOPIC, spec(PriorityClass.BULK, reliable=reliable, lifespan_s=lifespan_s, depth=depth)
         )
