@@ -14,7 +14,7 @@ from sern_core.wire.announce import Announcement
 
 class Events(Protocol):
     """`LinkHandler`, of one link. Only `announce`, `message`, `up` and `control` raise; the others report what was
-    raised, and go on."""
+    raised, and go on. (`Fates` do not raise.)"""
 
     def fault(self, error: Exception) -> None:
         """Something raised what nobody expects. What it was about is given up by the caller."""

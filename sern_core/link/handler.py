@@ -20,7 +20,7 @@ L_contra = TypeVar("L_contra", contravariant=True)
 
 
 class LinkHandler(Protocol[L_contra]):
-    """What the owner of a link is told. Calls happen inside `receive`, `submit` and `handle_timeout`.
+    """What the owner of a link is told. Calls happen inside whatever the owner calls on the link or its parts.
 
     What they raise unexpectedly goes to `on_fault` and stops nothing that is under way here. News is told once more, as
     it does not come again; a message is given up (`fault`), counted and, of a reliable stream, reported; a stream that

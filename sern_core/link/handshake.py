@@ -122,7 +122,7 @@ class Handshake:
         """When to say HELLO."""
         return self._hello_due_s
 
-    def established(self) -> None:
+    def greeted(self) -> None:
         """There is a session: no HELLO."""
         self._hello_due_s = None
 

@@ -230,7 +230,7 @@ class Link:
         end.peer_boot = peer_boot
         end.established = True
         self._data_prefix = bytes((framing.MAGIC, end.version, framing.Kind.DATA, end.tag))
-        self.handshake.established()
+        self.handshake.greeted()
         lanes.begin(now)
         end.up_since_s = now
         self.taking.watermarks.clear()

@@ -1,7 +1,7 @@
 """The streams that the peer has for this end: announced, delivered, confirmed, skipped, gone. Pure."""
 
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Final
 
 from sern_core.link.answers import Answers
@@ -289,12 +289,12 @@ class StreamsIn:
         stream.unhandled = oldest
         self._confirm_own(stream)
 
-    def take_watermarks(self, limit: int, *, heard: int) -> list[tuple[int, int]]:
-        """Up to `limit` of (channel, delivered) to be told. `heard`: the number of the last control message that the
-        peer has acknowledged."""
-        slots = list(self.watermarks)[:limit]
-        # Of drops first: else it would take them for delivered.
-        return [(slot, self.watermarks.pop(slot)) for slot in slots if self.incoming[slot].reports.heard(heard)]
+    def take_watermarks(self, limit: int, *, heard: int) -> Iterator[tuple[int, int]]:
+        """Up to `limit` of (channel, delivered) to be told, each taken when it is asked for. `heard`: the number of
+        the last control message that the peer has acknowledged."""
+        for slot in list(self.watermarks)[:limit]:
+            if self.incoming[slot].reports.heard(heard):  # of drops first: else it would take them for delivered
+                yield slot, self.watermarks.pop(slot)
 
     def tell_again(self, slot: int) -> None:
         """The watermark of a channel was lost on the way."""

@@ -21,7 +21,7 @@ is the client's process that ended, and the heartbeat's time is enough."""
 
 
 class Clients:
-    """`make_link` makes the relay's end of a client's link; `forget` lets go of a client that stays away."""
+    """`make_link` makes the relay's end of a client's link."""
 
     def __init__(
         self,
@@ -91,7 +91,7 @@ class Clients:
             link.disconnected(now=now)
 
     def forget(self, client: ClientName) -> None:
-        """The client is given up."""
+        """The last step of giving a client up (`Hub.forget`): nothing of it is relayed any more."""
         del self.links[client]
         port = self.port_of.pop(client, None)
         if port is not None:

@@ -81,7 +81,7 @@ class Hub:
     ) -> None:
         self.name = name
         self.boot = boot
-        self.params = params or HubParams()
+        params = params or HubParams()
         self.trace = trace or DecisionTrace(enabled=False)
         self._link_params = link
         self._scheduler_params = scheduler
@@ -99,17 +99,16 @@ class Hub:
         self.matching = Matching(self.routing, self._subscribed, self._apply)
         self.local_owners: set[ClientName] = set()
         """Names under which the relay itself publishes; no client may have one of them."""
-        clients = self.clients = Clients(access, self.events, self._make_link, resume_s=self.params.resume_s)
+        clients = self.clients = Clients(access, self.events, self._make_link, resume_s=params.resume_s)
         self.links = clients.links
         self.presence = Presence(clients.links, self.local_owners, self.matching.due_s, clients.attempt, self._was_read)
         streams = self.streams = RelayedStreams(
-            access,
             clients,
             self.routing,
             self.presence,
             self.objects,
             self.events,
-            cache_bytes=self.params.cache_bytes,
+            cache_bytes=params.cache_bytes,
             wall_ns=wall_ns,
             ended=self._own_ended,
         )
@@ -215,7 +214,7 @@ class Hub:
     def revoke(self, access: AccessTable, *, now: float) -> None:
         """New access rules: what they no longer allow ends now."""
         self.clients.limit(access, now)
-        self.streams.revoke(access, self.routing.set_access(access), now)
+        self.streams.revoke(access, now)
         for client in self.links:
             self.matching.look(client, now=now)
 

@@ -92,9 +92,8 @@ class Fanout:
             del ending[identity]
             if not ending:
                 del self._ending[identity.origin]
-        if (
-            pair is not None and pair[0].sender.channels.get(pair[1].slot) is pair[1]
-        ):  # else the client has gone meanwhile
+        open_still = pair is not None and pair[0].sender.channels.get(pair[1].slot) is pair[1]
+        if pair is not None and open_still:  # else the client has gone meanwhile
             self._end(client, *pair, now)
 
     def forget(self, origin: ClientName, *, now: float) -> None:

@@ -33,7 +33,6 @@ class RelayedStreams:
 
     def __init__(
         self,
-        access: AccessTable,
         clients: Clients,
         routing: RoutingTable,
         presence: Presence,
@@ -44,7 +43,6 @@ class RelayedStreams:
         wall_ns: Callable[[float], int],
         ended: Callable[[Relayed, float], None],
     ) -> None:
-        self.access = access
         self._clients = clients
         self._routing = routing
         self._presence = presence
@@ -169,11 +167,11 @@ class RelayedStreams:
         self._objects.delete_stream(identity)
         self._events.stream_removed(relayed.stream.stream)
 
-    def revoke(self, access: AccessTable, change: RouteChange, now: float) -> None:
-        """There are new access rules: what they no longer allow ends now."""
-        self.access = access
+    def revoke(self, access: AccessTable, now: float) -> None:
+        """There are new access rules, and clients have their limits: what they no longer allow ends now."""
         for client in self._clients.links:
             self.draining.limit(client, self._clients.max_queue_bytes(client), now=now)
+        change = self._routing.set_access(access)
         for identity in change.removed:
             relayed = self.by_id[identity]
             if relayed.source is not None:
@@ -196,7 +194,7 @@ class RelayedStreams:
 
     def _may_drain(self, client: ClientName, stream: StreamId) -> bool:
         """Whether the rules allow what an ended stream left behind."""
-        access = self.access
+        access = self._clients.access
         return access.may_subscribe(client, stream.topic) and access.may_publish(stream.origin, stream.topic)
 
     # --- to subscribers -------------------------------------------------------------------------------------------
@@ -278,7 +276,7 @@ class RelayedStreams:
         """The latched messages that a late joiner may have before `first`: of those that are not too many for what may
         wait for it the newest, the others are counted as `queue_full`."""
         client, stream, cache = link.peer, relayed.stream.stream, relayed.cache
-        if cache is None or cache.empty or not self.access.may_replay(client, stream.id.topic):
+        if cache is None or cache.empty or not self._clients.access.may_replay(client, stream.id.topic):
             return []
         messages = self.replays.below(cache, first)
         for payer in (link, relayed.source):  # whoever of them is being read has set it off, and it counts there

@@ -14,7 +14,7 @@ from sern_core.vocabulary.errors import WireError
 from sern_core.vocabulary.message import StreamId, StreamInfo, TopicInfo
 from sern_core.vocabulary.types import ClientName, Encoding, TopicName
 from sern_core.wire import framing
-from sern_core.wire.announce import decode_want
+from sern_core.wire.announce import MAX_STRINGS, decode_want
 from tests.exploring import seeds
 from tests.fuzz.test_hostile_peer import Hostile, subscriber_of
 from tests.make_vectors import Frames
@@ -246,6 +246,17 @@ def test_lists_that_are_finished_leave_room_for_others(monkeypatch: pytest.Monke
         tell({"t": "want", "ch": slot, "on": True, "owed": ["a"] * 5, "more": True})
     with pytest.raises(WireError, match="unfinished"):
         tell({"t": "want", "ch": 3, "on": True, "owed": ["a"], "more": True})
+
+
+def test_a_stream_is_owed_to_no_more_names_than_fit() -> None:
+    robot, tell = told_robot(1)
+    channel = next(iter(robot.core.link.sender.channels.values()))
+    names = [f"site{index}" for index in range(owed_lists.MAX_OWED)]
+    for start in range(0, len(names), MAX_STRINGS):
+        tell({"t": "want", "ch": channel.slot, "on": True, "add": names[start : start + MAX_STRINGS]})
+    assert len(channel.owed) == owed_lists.MAX_OWED
+    with pytest.raises(WireError, match="owes a stream to more than"):
+        tell({"t": "want", "ch": channel.slot, "on": True, "add": ["one_more"]})
 
 
 @pytest.mark.parametrize("bad", [[1], [3, 2], [1, 1], [5, 6, 6, 7], [2, 70_000], ["2", "3"], [True, True], 7, None])
