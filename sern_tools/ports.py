@@ -20,13 +20,13 @@ OUTGOING: Final = Path("/proc/sys/net/ipv4/ip_local_port_range")
 USUAL: Final = range(15_000, 32_000)
 """Ports below those, unless it was told otherwise."""
 DDS_PORTS: Final = 100
-"""Of every 250 ports from 7400 on, so many at the beginning are those of a DDS domain (DDSI-RTPS, 9.6.1.1) with up to
-44 participants on this host. They are taken whenever a node starts."""
+"""The first so many of every 250 ports from 7400 on are those of a DDS domain (DDSI-RTPS, 9.6.1.1) with up to 44
+participants on this host. They are taken whenever a node starts."""
 
 
 def own_ports(outgoing: Path = OUTGOING) -> list[int]:
-    """Those of USUAL that neither DDS nor outgoing connections take. Those of outgoing ones too where that leaves none,
-    or cannot be read."""
+    """The ports of USUAL that neither DDS nor outgoing connections take. Also those of outgoing connections where that
+    leaves none, or cannot be read."""
     ports = [port for port in USUAL if (port - 7400) % 250 >= DDS_PORTS]
     try:
         first, last = map(int, outgoing.read_text().split())

@@ -24,7 +24,7 @@ class ProcessorTime:
 
     @classmethod
     def parse(cls, stat: str, own_s: float, ticks_hz: float) -> Self:
-        """Of the text of /proc/stat. Raises ValueError when it is none."""
+        """Read the text of /proc/stat. Raises ValueError when it is none."""
         words = stat.partition("\n")[0].split()
         numbers = words[1:]
         if words[:1] != ["cpu"] or len(numbers) < _COUNTED:

@@ -49,7 +49,7 @@ class End:
         self.boot = boot
         self.peer = peer
         self.peer_boot: int | None = None
-        """The peer's process, of this session or the latest; None: there was none, or the next is to count as new."""
+        """The peer's process, now or when there was a session last; None: the next counts as new."""
         self.initiator = initiator
         """The client's end: it says HELLO."""
         self.params = params

@@ -147,7 +147,7 @@ class StreamsOut:
         self._control.send({"t": "retract", "ch": channel.slot}, now=now)
 
     def announce(self, channel: OutChannel, now: float) -> None:
-        """Say in this session that the stream is there, on its channel."""
+        """Tell the peer that the stream is there, on its channel."""
         stream = channel.stream
         digest = _digest(stream)
         self._texts.use_outgoing(channel.slot, digest)  # in another session its origin may say another

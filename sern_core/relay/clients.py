@@ -37,7 +37,7 @@ class Clients:
         self.resume_s = resume_s
         """How long an absent client is waited for."""
         self.links: dict[ClientName, Link] = {}
-        """Of all clients that are remembered, connected or not."""
+        """The links of all clients that are remembered, connected or not."""
         self.port_of: dict[ClientName, HubPort] = {}
         """The connection that has the session of each client."""
         self._guards: dict[ClientName, RateGuard] = {}

@@ -92,9 +92,11 @@ class Fanout:
             del ending[identity]
             if not ending:
                 del self._ending[identity.origin]
-        open_still = pair is not None and pair[0].sender.channels.get(pair[1].slot) is pair[1]
-        if pair is not None and open_still:  # else the client has gone meanwhile
-            self._end(client, *pair, now)
+        if pair is None:
+            return
+        link, channel = pair
+        if link.sender.channels.get(channel.slot) is channel:  # else the client has gone meanwhile
+            self._end(client, link, channel, now)
 
     def forget(self, origin: ClientName, *, now: float) -> None:
         """The origin is gone for good, and nothing more is read from it: close now what waits."""

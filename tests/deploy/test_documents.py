@@ -105,7 +105,7 @@ def test_links_to_a_title_lead_somewhere(guide: str) -> None:
 
 @pytest.mark.parametrize("guide", GUIDES)
 def test_what_is_to_be_typed_is_marked_as_such(guide: str) -> None:
-    """So that the tests below read it."""
+    """The tests below read nothing else."""
     assert [block for block in blocks(guide, "") if _TYPED.search(block)] == []
 
 

@@ -25,7 +25,7 @@ from tests.world import World
 LOST = DROP_CODES[DropReason.LOST]
 LOG = TopicName("/robot/log")
 BACKLOG = DEFAULT_RELIABLE_QUEUE_BYTES // (MESSAGE_OVERHEAD_BYTES + 1)
-"""As many one-byte messages as a reliable stream keeps by default."""
+"""The most one-byte messages that a reliable stream keeps by default."""
 
 
 class Robot:

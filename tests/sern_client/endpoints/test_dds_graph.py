@@ -108,7 +108,7 @@ NAMES = st.text(st.characters(exclude_characters="\0", exclude_categories=["Cs"]
 def test_what_others_say_of_their_nodes(
     participant: UUID, nodes: list[tuple[str, str, list[UUID], list[UUID]]]
 ) -> None:
-    """As the serialiser writes it."""
+    """Bytes of the serialiser are read back."""
 
     def new(name: str, **fields: Any) -> Any:
         return ros_types.new(f"rmw_dds_common/msg/{name}", Encoding.CDR, **fields)
