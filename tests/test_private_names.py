@@ -50,13 +50,13 @@ def _defined(tree: ast.AST) -> Iterator[str]:
             if isinstance(target, ast.Name):
                 yield target.id
                 if target.id == "__slots__" and isinstance(node, ast.Assign):
-                    yield from (each.value for each in ast.walk(node.value) if _is_text(each))
+                    yield from filter(None, map(_text, ast.walk(node.value)))
             elif isinstance(target, ast.Attribute) and _is_own(target.value):
                 yield target.attr
 
 
-def _is_text(node: ast.AST) -> bool:
-    return isinstance(node, ast.Constant) and isinstance(node.value, str)
+def _text(node: ast.AST) -> str:
+    return node.value if isinstance(node, ast.Constant) and isinstance(node.value, str) else ""
 
 
 def _used(tree: ast.AST) -> Iterator[tuple[int, str]]:
@@ -67,9 +67,7 @@ def _used(tree: ast.AST) -> Iterator[tuple[int, str]]:
         elif isinstance(node, ast.ImportFrom):
             yield from ((node.lineno, alias.name) for alias in node.names)
         elif isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in ("getattr", "setattr"):
-            name = node.args[1]
-            if isinstance(name, ast.Constant) and isinstance(name.value, str):
-                yield node.lineno, name.value
+            yield node.lineno, _text(node.args[1])
 
 
 def strangers(text: str) -> list[tuple[int, str]]:

@@ -13,15 +13,17 @@ and what had its turn is known. A lane alone would not do: what was said after i
 
 The owner calls `receive`, `next_datagram`, `next_deadline` and `handle_timeout`, each with the time, and is told what
 happens through its `LinkHandler`. Messages and streams out go through `sender` and `outgoing`, answers to the peer's
-streams through `answers` and `taking`.
+streams through `answers` and `taking`. Whoever only watches the link, or adapts it, has `observe`, `topics` and `apply`
+for a door and looks at no part.
 """
 
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from typing import Final
 
 from sern_core.bodies.codecs import Coder
+from sern_core.link import view
 from sern_core.link.answers import Answers
 from sern_core.link.composer import Composer
 from sern_core.link.control_stream import ControlStream
@@ -37,14 +39,16 @@ from sern_core.link.receiver import Receiver
 from sern_core.link.sender import Sender
 from sern_core.link.streams_in import StreamsIn
 from sern_core.link.streams_out import StreamsOut
+from sern_core.link.view import Held, LinkSettings, LinkView, TopicView, Undelivered
 from sern_core.path.lanes import LANE_UDP, LANE_ZMQ, Lane
 from sern_core.stream.in_stream import Reassembly
 from sern_core.stream.out_channel import OutChannel
 from sern_core.vocabulary.errors import RemoteError, WireError
-from sern_core.vocabulary.message import Message
+from sern_core.vocabulary.ledger import SendCounters
+from sern_core.vocabulary.message import Message, StreamInfo, TopicSpec
 from sern_core.vocabulary.params import LinkParams, SchedulerParams
 from sern_core.vocabulary.trace import LINK, DecisionTrace, TraceEvent
-from sern_core.vocabulary.types import ClientName, PriorityClass
+from sern_core.vocabulary.types import ClientName, PriorityClass, TopicName
 from sern_core.wire import framing
 from sern_core.wire.announce import decode_announcement, decode_want
 
@@ -485,23 +489,55 @@ class Link:
         """Whether more waits to be told than any peer leaves behind that reads what it is told."""
         return self.control.deaf(len(self.sender.channels))
 
+    def observe(self, *, now: float) -> LinkView:
+        """The link as it is now. Costs the same however many streams there are."""
+        return view.observe(self.end, self.lanes, self.receiver, now)
+
+    def topics(self) -> tuple[TopicView, ...]:
+        """Every stream that is open towards the peer."""
+        return view.topics(self.sender.channels.values())
+
+    @property
+    def counters(self) -> Mapping[TopicName, SendCounters]:
+        """What was offered and what became of it, by topic. Counters go on counting: do not write to them."""
+        return self.sender.ledger.topics
+
+    def queued(self) -> dict[str, tuple[int, int]]:
+        """Messages and bytes that wait for the lane, by class label. Looks at every stream."""
+        return self.sender.queued()
+
+    def held(self) -> dict[TopicName, Held]:
+        """Messages that wait and that are in flight, by the topic of the stream. Looks at every message."""
+        return view.held(self.sender.channels.values())
+
+    def undelivered(self) -> Iterator[Undelivered]:
+        """Every message that the peer is not known to have."""
+        return view.undelivered(self.sender.channels.values())
+
+    def arriving(self) -> list[StreamInfo]:
+        """The peer's streams, as far as they are known here."""
+        return [incoming.stream for incoming in self.taking.streams.values()]
+
+    @property
+    def rtt_s(self) -> float:
+        """The round trip of the empty path where it is known, else the smoothed one; 0: neither is."""
+        return view.rtt_s(self.lanes)
+
+    def apply(self, settings: LinkSettings, *, now: float) -> None:
+        """Set what may be set while the link runs. Idempotent; what waits or is under way is left as it is."""
+        view.apply(settings, self.sender, self.lanes, now)
+
+    def watch_arrivals(self, told: Callable[[TopicSpec, Message, float], None] | None) -> None:
+        """Have `told` called when the peer has a message whole, with what holds for its topic and with the time. It is
+        called while a datagram is read. None: nobody."""
+        self.plane.on_arrived = told
+
     def snapshot(self) -> dict[str, object]:
         """State for /api/link; None where a value is not known yet."""
-        lane, clock = self.lanes.lane, self.lanes.clock
-        flight = lane.flight
         return {
-            "peer": self.end.peer,
-            "lane": lane.name,
-            "up": self.end.established and not lane.stalled,
-            "stalled": lane.stalled,
-            "version": self.end.version,
-            "inflight_bytes": flight.inflight_bytes,
-            "srtt_s": flight.rtt.srtt_s,
-            "fragment_bytes": lane.fragment_bytes,
-            "clock_offset_s": clock.offset_s,
-            "clock_error_s": clock.error_s if clock.ready else None,
-            **lane.estimator.snapshot(),
-            "queue": {label: {"messages": cell[0], "bytes": cell[1]} for label, cell in self.sender.queued().items()},
+            **self.observe(now=self.end.now).to_json(),
+            **self.lanes.lane.estimator.snapshot(),
+            "queue": {label: {"messages": cell[0], "bytes": cell[1]} for label, cell in self.queued().items()},
         }
 
     def validate(self) -> None:
