@@ -19,13 +19,13 @@ for a door and looks at no part.
 
 import struct
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import replace
 from typing import Final
 
 from sern_core.bodies.codecs import Coder
 from sern_core.link import view
 from sern_core.link.answers import Answers
 from sern_core.link.composer import Composer
+from sern_core.link.control_reader import ControlReader
 from sern_core.link.control_stream import ControlStream
 from sern_core.link.data_plane import DataPlane
 from sern_core.link.definitions import DefinitionStore, PeerDefinitions
@@ -50,7 +50,6 @@ from sern_core.vocabulary.params import LinkParams, SchedulerParams
 from sern_core.vocabulary.trace import LINK, DecisionTrace, TraceEvent
 from sern_core.vocabulary.types import ClientName, PriorityClass, TopicName
 from sern_core.wire import framing
-from sern_core.wire.announce import decode_announcement, decode_want
 
 TIDY_S: Final = 60.0
 NUMBER_AND_STAMP: Final = struct.Struct("!IQ")
@@ -91,7 +90,7 @@ class Link:
         owner = self._owner = Owner(self, handler, end)
         self.texts = PeerDefinitions(definitions, peer)
         reassembly = self.reassembly = Reassembly(max(64 * 2**20, 2 * link.max_message_bytes))
-        control = self.control = ControlStream(end, reassembly, self._control_message)
+        control = self.control = ControlStream(end, reassembly, self._read_control)
         sender = self.sender = Sender(end, scheduler, delivered=self._delivered, now=now)
         lanes = self.lanes = LaneSet(
             end,
@@ -119,6 +118,18 @@ class Link:
             answered=self._answered,
             finished=self._finished,
         )
+        self._control_reader = ControlReader(
+            end,
+            control,
+            sender,
+            self.outgoing,
+            taking,
+            answers,
+            self.texts,
+            self._owed_lists,
+            owner,
+            answered=self._answered,
+        )
         composer = Composer(end, lanes, control, sender, taking, self.outgoing.control_sent)
         plane = self.plane = DataPlane(
             end, lanes, control, sender, taking, answers, composer, sweep=self._sweep, now=now
@@ -128,6 +139,9 @@ class Link:
         self.handshake = Handshake(end, lanes, reassembly, self)
 
     # --- how the parts hang together ------------------------------------------------------------------------------
+
+    def _read_control(self, message: Message) -> None:
+        self._control_reader.read(message)
 
     def _settled(self) -> bool:
         return self.control.settled
@@ -388,65 +402,9 @@ class Link:
             self.failed(error, now=now)
         end.dirty = True
 
-    # --- control messages -----------------------------------------------------------------------------------------
-
-    def _control_message(self, message: Message) -> None:
-        now = self.end.now
-        envelope, attachment = self.control.decode(message, now)
-        kind = framing.take_str(envelope, "t", max_length=16)
-        before = self.control.out.next_seq
-        self._handle_control(kind, envelope, attachment, now)
-        said = self.control.out.next_seq - before
-        # Reports of drops are repeated at an announcement: ours to say, not an answer, which comes later.
-        self._answered(1 if kind == "announce" else said)
-
-    def _handle_control(self, kind: str, envelope: framing.Envelope, attachment: bytes, now: float) -> None:
-        if kind == "announce":
-            announcement = decode_announcement(envelope)
-            key = ("announce", announcement.channel)
-            owed = self._owed_lists.add(key, announcement.owed, more=announcement.more, peer=self.end.peer)
-            if owed is not None:
-                self.taking.announced(replace(announcement, owed=owed), now)
-        elif kind == "want":
-            self.outgoing.answered(decode_want(envelope), now)
-        elif kind in ("refuse", "dropped"):
-            channel = self.sender.channels.get(framing.take_int(envelope, "ch", high=0xFFFF))
-            if channel is None:
-                return  # closed meanwhile
-            if kind == "dropped":
-                self.outgoing.reported(channel, envelope)
-            else:
-                self.outgoing.refused(channel, envelope, now)
-        elif kind in ("first", "retract"):
-            slot = framing.take_int(envelope, "ch", high=0xFFFF)
-            incoming = self.taking.incoming.get(slot)
-            if incoming is None:
-                return
-            if kind == "first":
-                incoming.known = True  # had it been nobody's before, it would have been announced again
-                self.taking.skip(incoming, framing.take_int(envelope, "seq", low=1, high=framing.MAX_SEQ), now)
-            else:
-                self.taking.retract(incoming, now)
-        elif kind == "synced":
-            self.answers.batches(framing.take_bool(envelope, "batch"))
-            self.taking.synced(now)
-        elif kind == "need":
-            digest = framing.take_str(envelope, "dh", max_length=64)
-            self._define(digest, self.texts.asked(digest), now)
-        elif kind == "define":
-            digest = framing.take_str(envelope, "dh", max_length=64)
-            if self.texts.came(digest, attachment):
-                self._owner.definition(digest, now=now)
-        else:
-            self._owner.control(envelope, attachment, now=now)
-
-    def _define(self, digest: str, text: str | None, now: float) -> None:
-        if text is not None:
-            self.control.send({"t": "define", "dh": digest}, text.encode(), now=now)
-
     def definition_known(self, digest: str, *, now: float) -> None:
         """A text arrived from elsewhere: pass it on if this peer is waiting for it."""
-        self._define(digest, self.texts.known(digest), now)
+        self._control_reader.definition_known(digest, now)
 
     # --- views ----------------------------------------------------------------------------------------------------
 
@@ -542,26 +500,14 @@ class Link:
 
     def validate(self) -> None:
         """Internal consistency, for tests. Raises AssertionError with what does not add up."""
-        channels, streams = self.sender.channels, self.taking.streams
 
         def check(ok: bool, text: str) -> None:
             assert ok, f"{self.end.name}->{self.end.peer}: {text}"
 
-        for channel in channels.values():
-            channel.validate(check)
-            waits = bool(channel.ready and channel.wanted and (channel.active or channel.queue))
-            check(waits == channel.offered, f"{channel.stream.id.topic}: the scheduler does not know what waits")
-        self.sender.ledger.validate([(channel.counters, *channel.held()) for channel in channels.values()], check)
-        held_bytes = sum(stream.held_bytes for stream in streams.values()) + self.control.incoming.held_bytes
-        check(self.reassembly.held_bytes == held_bytes, "reassembly bytes do not add up")
-        for stream in streams.values():
-            stream.validate(check)
-        unheard, reports = self.reassembly.unheard, [stream.reports for stream in streams.values()]
-        check(unheard.reports == sum(map(len, reports)), "reports of drops do not add up")
-        check(unheard.said == sum(each.said for each in reports), "reports of drops that were said do not add up")
-        for lane in self.lanes.by_id.values():
-            lane.flight.validate(check)
-        self.sender.scheduler.validate()
-        check(len(self.outgoing.by_stream) == len(channels), "channel tables differ")
+        self.sender.validate(check)
+        self.taking.validate(check)
+        self.lanes.validate(check)
         self.texts.validate()
-        check(self.taking.watermarks.keys() <= self.taking.incoming.keys(), "watermarks of streams that are gone")
+        held_bytes = self.taking.held_bytes + self.control.incoming.held_bytes
+        check(self.reassembly.held_bytes == held_bytes, "reassembly bytes do not add up")
+        check(len(self.outgoing.by_stream) == len(self.sender.channels), "channel tables differ")
