@@ -83,7 +83,7 @@ def run(load: Load, link: LinkProfile, section: AdaptationSection, duration_s: f
     policy = section.make_policy(encodes=True)()
     adapter = HopAdapter(world.robot.link, policy, params, coder=coder, now=world.network.now)
     steps: list[Step] = []
-    world.every(params.interval_s / SAMPLES, lambda _now: adapter.sample())
+    world.every(params.interval_s / SAMPLES, lambda now: adapter.sample(now=now))
     world.every(params.interval_s, lambda now: steps.append(adapter.step(now=now)))
     world.feed((SETTLE_S + at_s, channels[topic], body) for at_s, topic, body in load.messages)
     world.run(SETTLE_S + duration_s)
@@ -224,7 +224,7 @@ def reconfigure() -> Reconfiguration:
     # Off the beat of the intervals, as robots are.
     came_s, went_s = APPEARS_S + 0.31, LEAVES_S + 0.31
     world.network.at(came_s, lambda _now: appear("/robot3", came_s + 0.01, went_s), node=world.robot_node)
-    world.every(params.interval_s / SAMPLES, lambda _now: adapter.sample())
+    world.every(params.interval_s / SAMPLES, lambda now: adapter.sample(now=now))
     world.every(params.interval_s, lambda now: steps.append(adapter.step(now=now)))
     world.run(END_S)
     start_s = world.network.start_s

@@ -248,3 +248,8 @@ class LaneSet:
         self._end.trace.record(now, LINK, TraceEvent.LINK_DOWN, peer=self._end.peer, reason=reason)
         if len(self.by_id) > 1:
             self.choose(now)
+
+    def validate(self, check: Callable[[bool, str], None]) -> None:
+        """Internal consistency, for tests."""
+        for lane in self.by_id.values():
+            lane.flight.validate(check)

@@ -261,6 +261,16 @@ class Sender:
         if self.channels.get(channel.slot) is channel:
             self.refresh(channel, now)
 
+    def validate(self, check: Callable[[bool, str], None]) -> None:
+        """Internal consistency, for tests."""
+        channels = self.channels.values()
+        for channel in channels:
+            channel.validate(check)
+            waits = bool(channel.ready and channel.wanted and (channel.active or channel.queue))
+            check(waits == channel.offered, f"{channel.stream.id.topic}: the scheduler does not know what waits")
+        self.ledger.validate([(channel.counters, *channel.held()) for channel in channels], check)
+        self.scheduler.validate()
+
 
 def _why_capped(channel: OutChannel, thinned: bool) -> str:
     return f"the adaptation lets {channel.share:.0%} of the messages in" if thinned else "max_rate_hz"

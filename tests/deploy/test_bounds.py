@@ -11,7 +11,7 @@ from sern_client.endpoints import first
 from sern_client.endpoints.ros1 import Ros1Options, hold
 from sern_core.link import control_stream, definitions, owed_lists
 from sern_core.relay import access, awaited, draining, routing
-from sern_core.relay.objects import ObjectLimits
+from sern_core.relay.object_values import ObjectLimits
 from sern_core.site import peers
 from sern_core.stream import decoding, drop_reports, in_stream, latched, out_channel
 from sern_core.vocabulary import ledger

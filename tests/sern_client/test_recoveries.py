@@ -42,6 +42,7 @@ from tests.sern_client.endpoints.ros1.fakes import HOST, FakeMaster, FakePublish
 from tests.sern_client.test_checks import ODOM, Tables
 from tests.sern_client.test_link_state import STAMP_NS, VIEWS, Endpoint, Site, Stream, _close
 from tests.support import Events, until
+from tests.views import IDLE
 
 Said = Callable[[str], list[logging.LogRecord]]
 
@@ -356,10 +357,7 @@ async def name_of_the_relay(scene: Scene) -> None:
 
 async def datagrams(scene: Scene) -> None:
     now = scene.clock()
-    lane = SimpleNamespace(id=LANE_ZMQ, stalled=False, usable=True)
-    link: Any = SimpleNamespace(
-        peer="relay", established=True, lane=lane, lanes=SimpleNamespace(by_id={LANE_ZMQ: lane})
-    )
+    link: Any = SimpleNamespace(peer="relay", observe=lambda *, now: IDLE)
     passes = iter((False, False, True))
     scene.patch.setattr(datagram_watch, "datagrams_pass", lambda _link: next(passes))
     watched = DatagramWatch(lambda: [link], lambda _link, _within_s: "no datagram gets through", lambda _link: "relay")
