@@ -31,7 +31,7 @@ from rosbags.rosbag2 import Reader as Reader2
 from sern_client.endpoints.bag_faults import why
 from sern_client.endpoints.base import Difference, Held, Publisher, Sink, TopicEvents
 from sern_client.endpoints.clock import Clock, SystemClock
-from sern_client.endpoints.held import HeldSubscription
+from sern_client.endpoints.common.held import HeldSubscription
 from sern_client.endpoints.leftovers import ACTIVE
 from sern_core.topics.patterns import PatternError, PatternSet
 from sern_core.vocabulary.errors import ConfigError, UsageError

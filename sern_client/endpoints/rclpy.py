@@ -14,7 +14,7 @@ from threading import Thread
 from typing import TYPE_CHECKING, Final
 
 from sern_client.endpoints.base import GUARD_SUFFIX, Difference, Held, Publisher, Sink, Subscription, TopicEvents
-from sern_client.endpoints.handover import Handover
+from sern_client.endpoints.common.handover import Handover
 from sern_core.vocabulary.errors import ConfigError, UsageError
 from sern_core.vocabulary.message import TopicInfo
 from sern_core.vocabulary.types import DropReason, Encoding, TopicName

@@ -16,7 +16,7 @@ from typing import Any, Final, Literal
 
 from sern_client.endpoints.base import Difference, Held, Sink, TopicEvents
 from sern_client.endpoints.clock import Clock, SystemClock
-from sern_client.endpoints.held import HeldSubscription
+from sern_client.endpoints.common.held import HeldSubscription
 from sern_client.endpoints.jackal import JACKAL, JackalSource, OperatorSource, Plan, Sizes
 from sern_core.vocabulary.errors import ConfigError, UsageError
 from sern_core.vocabulary.message import TopicInfo

@@ -32,6 +32,7 @@ from sern_client.endpoints.base import (
     Sink,
     TopicEvents,
 )
+from sern_client.endpoints.common.first import LEARN_S, FirstMessages
 from sern_client.endpoints.dds import names, node_info
 from sern_client.endpoints.dds.counters import DdsCounters
 from sern_client.endpoints.dds.definitions import Definitions
@@ -52,7 +53,6 @@ from sern_client.endpoints.dds.raw import INFINITE_NS
 from sern_client.endpoints.dds.services import DdsServices
 from sern_client.endpoints.dds.stream import Stream
 from sern_client.endpoints.dds.worker import Inbox, Sample, Worker
-from sern_client.endpoints.first import LEARN_S, FirstMessages
 from sern_core.vocabulary.errors import ConfigError, UsageError
 from sern_core.vocabulary.message import TopicInfo
 from sern_core.vocabulary.types import DropReason, Encoding, TopicName

@@ -9,12 +9,12 @@ from cyclonedds.pub import DataWriter
 from cyclonedds.sub import DataReader
 
 from sern_client.endpoints.base import Sink
+from sern_client.endpoints.common.first import Readers
 from sern_client.endpoints.dds import names, raw
 from sern_client.endpoints.dds.counters import DdsCounters
 from sern_client.endpoints.dds.graph import Graph
 from sern_client.endpoints.dds.qos import EndpointQos, mismatches, reader_for, within_reach
 from sern_client.endpoints.dds.worker import Inbox, Sample
-from sern_client.endpoints.first import Readers
 from sern_core.vocabulary.message import TopicInfo
 from sern_core.vocabulary.types import Encoding
 from sern_runtime import ros_types

@@ -5,7 +5,7 @@ from math import inf
 from typing import Protocol
 from uuid import UUID
 
-from sern_client.endpoints.first import FirstMessages
+from sern_client.endpoints.common.first import FirstMessages
 from sern_core.vocabulary.types import TopicName
 
 

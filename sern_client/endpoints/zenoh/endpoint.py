@@ -17,7 +17,7 @@ from math import inf
 from typing import Any, Final
 
 from sern_client.endpoints.base import GUARD_SUFFIX, Difference, Held, Publisher, Sink, Subscription, TopicEvents
-from sern_client.endpoints.first import LEARN_S, FirstMessages, Readers
+from sern_client.endpoints.common.first import LEARN_S, FirstMessages, Readers
 from sern_client.endpoints.zenoh import names
 from sern_client.endpoints.zenoh.names import Entity, Kind, Qos
 from sern_client.endpoints.zenoh.options import ZenohOptions

@@ -12,7 +12,7 @@ import pytest
 pytest.importorskip("zenoh", reason="the library eclipse-zenoh is missing: pip install 'sern[zenoh]'")
 
 from sern_client.endpoints.base import ServiceInfo
-from sern_client.endpoints.handover import ITEM_BYTES
+from sern_client.endpoints.common.handover import ITEM_BYTES
 from sern_client.endpoints.zenoh import names
 from sern_client.endpoints.zenoh import session as module
 from sern_client.endpoints.zenoh.endpoint import ZenohEndpoint

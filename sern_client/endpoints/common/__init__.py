@@ -1,0 +1,1 @@
+"""What the endpoint families share: the way from a thread to the loop, calls, interest, first messages, complaints."""
