@@ -3,15 +3,16 @@
 import asyncio
 import json
 import sys
+from collections import Counter
 from collections.abc import AsyncIterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import pytest
 
 pytest.importorskip("zenoh", reason="the library eclipse-zenoh is missing: pip install 'sern[zenoh]'")
 
-from sern_client.endpoints.base import ServiceInfo
+from sern_client.endpoints.base import Held, ServiceInfo
 from sern_client.endpoints.common.handover import ITEM_BYTES
 from sern_client.endpoints.zenoh import names
 from sern_client.endpoints.zenoh import session as module
@@ -161,27 +162,36 @@ async def test_the_router_of_the_file_is_the_one_that_is_said_to_be_missing(
         await endpoint.stop()
 
 
+class Two(NamedTuple):
+    """Endpoints that reach each other, and what each of them announces."""
+
+    one: ZenohEndpoint
+    other: ZenohEndpoint
+    events: Events
+    other_events: Events
+
+
 @pytest.fixture
-async def two() -> AsyncIterator[tuple[ZenohEndpoint, ZenohEndpoint]]:
+async def two() -> AsyncIterator[Two]:
     """One that listens, and one that comes to it."""
     (port,) = free_ports(1)
     here, there = f"tcp/127.0.0.1:{port}", "tcp/127.0.0.1:0"
     one = ZenohEndpoint(ZenohOptions(SessionOptions(connect=(), listen=(here,))))
     other = ZenohEndpoint(ZenohOptions(SessionOptions(connect=(here,), listen=(there,))))
-    await one.start(Events())
-    await other.start(Events())
-    yield one, other
+    made = Two(one, other, Events(), Events())
+    await one.start(made.events)
+    other.watch_services(made.other_events)
+    await other.start(made.other_events)
+    yield made
     await other.stop()
     await one.stop()
 
 
-async def test_an_attachment_counts_for_what_waits(
-    two: tuple[ZenohEndpoint, ZenohEndpoint], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    here, there = two
+async def test_an_attachment_counts_for_what_waits(two: Two, monkeypatch: pytest.MonkeyPatch) -> None:
+    here, there = two.one, two.other
     info = ros_types.topic_info("/chat", "std_msgs/msg/String", Encoding.CDR)
     there.advertise(info)
-    await until(lambda: info.name in here._topics)
+    await until(lambda: info.name in two.events.infos)
     got: list[bytes] = []
 
     def sink(body: bytes, _stamp_ns: int) -> bool:
@@ -204,18 +214,16 @@ async def test_an_attachment_counts_for_what_waits(
     assert b"" in got
 
 
-async def test_a_request_that_is_dropped_is_refused(
-    two: tuple[ZenohEndpoint, ZenohEndpoint], monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_a_request_that_is_dropped_is_refused(two: Two, monkeypatch: pytest.MonkeyPatch) -> None:
     """More have arrived than the loop serves: the oldest is told at once, and does not wait for its timeout."""
-    server, caller = two
+    server, caller = two.one, two.other
     lamp = ServiceInfo(TopicName("/lamp"), "std_srvs/srv/SetBool", Encoding.CDR, "RIHS01_" + "5" * 64)
 
     async def echo(request: bytes) -> bytes:
         return request
 
     server.serve(lamp, echo)
-    await until(lambda: lamp.name in caller._servers)
+    await until(lambda: lamp.name in two.other_events.services)
     assert await caller.call(lamp.name, b"first", timeout_s=DEADLINE_S) == b"first"
     handover = server.session.handover
     monkeypatch.setattr(handover, "_max_bytes", 1)
@@ -229,3 +237,60 @@ async def test_a_request_that_is_dropped_is_refused(
     assert not calls[1].done() and server.drops == {DropReason.QUEUE_FULL: 1}
     handover._run()
     assert await calls[1] == b"two"
+
+
+async def test_what_nobody_wants_is_not_taken_from_the_session(two: Two) -> None:
+    here, there = two.one, two.other
+    info = ros_types.topic_info("/chat", "std_msgs/msg/String", Encoding.CDR)
+    kind = names.dds_type(info.type_name), info.type_hash
+    publisher = there.advertise(info)
+    await until(lambda: info.name in two.events.infos)
+    got: list[bytes] = []
+
+    def sink(body: bytes, _stamp_ns: int) -> bool:
+        got.append(body)
+        return True
+
+    subscription = here.subscribe(info.name, sink)
+    matching = there.session.opened.declare_publisher(here.node.key(info.name, *kind))
+    await until(lambda: there.readers(info.name, *kind) == 1 and matching.matching_status.matching)
+    publisher.publish(b"wanted", 1)
+    await until(lambda: got == [b"wanted"])
+
+    here.interest(info.name, False)
+    await until(lambda: there.readers(info.name, *kind) == 0 and not matching.matching_status.matching)
+    publisher.publish(b"unwanted", 2)
+    held = Held(subscriptions=Counter([info.name]))
+    assert here.validate(held) == [] and info.name in two.events.infos, "it is offered all the same"
+
+    here.interest(info.name, True)
+    await until(lambda: there.readers(info.name, *kind) == 1 and matching.matching_status.matching)
+    publisher.publish(b"again", 3)
+    await until(lambda: len(got) == 2)
+    assert got == [b"wanted", b"again"]
+    subscription.close()
+    await until(lambda: there.readers(info.name, *kind) == 0)
+    assert here.validate(Held()) == []
+
+
+async def test_what_is_latched_is_there_when_it_is_wanted_again(two: Two) -> None:
+    here, there = two.one, two.other
+    info = ros_types.topic_info("/map", "std_msgs/msg/String", Encoding.CDR, latched=True)
+    publisher = there.advertise(info)
+    publisher.publish(b"one", 1)
+    await until(lambda: info.name in two.events.infos)
+    got: list[bytes] = []
+
+    def sink(body: bytes, _stamp_ns: int) -> bool:
+        got.append(body)
+        return True
+
+    here.subscribe(info.name, sink)
+    here.interest(info.name, False)
+    await until(lambda: got == [b"one"])
+    publisher.publish(b"two", 2)
+    await until(lambda: got == [b"one", b"two"], "what is latched is taken for whoever comes")
+    here.interest(info.name, True)
+    publisher.publish(b"three", 3)
+    await until(lambda: len(got) == 3)
+    assert got == [b"one", b"two", b"three"], "each once"
