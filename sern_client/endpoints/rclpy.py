@@ -8,13 +8,16 @@ import asyncio
 import logging
 import time
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from threading import Thread
 from typing import TYPE_CHECKING, Final
 
-from sern_client.endpoints.base import GUARD_SUFFIX, Difference, Held, Publisher, Sink, Subscription, TopicEvents
+from sern_client.endpoints.base import GUARD_SUFFIX, Difference, Held, Publisher, Sink, TopicEvents
 from sern_client.endpoints.common.handover import Handover
+from sern_client.endpoints.common.interest import Subscriptions
+from sern_client.endpoints.common.saying import SayOnce
 from sern_core.vocabulary.errors import ConfigError, UsageError
 from sern_core.vocabulary.message import TopicInfo
 from sern_core.vocabulary.types import DropReason, Encoding, TopicName
@@ -26,7 +29,6 @@ if TYPE_CHECKING:
     from rclpy.node import Node
     from rclpy.publisher import Publisher as RosPublisher
     from rclpy.qos import QoSProfile
-    from rclpy.subscription import Subscription as RosSubscription
 
 DEPTH: Final = 100
 """The depth of our subscriptions: what may wait while the executor's thread is behind."""
@@ -51,12 +53,12 @@ class RclpyEndpoint:
     def __init__(self, options: RclpyOptions) -> None:
         self.options = options
         self.types = TypeFiles(options.type_paths)
-        self._announced: dict[TopicName, str] = {}  # to its type
+        self._say_once = SayOnce(_log)
+        self._subscriptions: Subscriptions[_Subscription] = Subscriptions(self._say_once)
+        self._announced: dict[TopicName, TopicInfo] = {}
         self._publishers: list[_Publisher] = []
-        self._subscriptions: list[_Subscription] = []
         self._handover: Handover | None = None
         self._closed_drops = 0
-        self._said: set[str] = set()
 
     @property
     def encoding(self) -> Encoding | None:
@@ -99,6 +101,7 @@ class RclpyEndpoint:
 
     async def stop(self) -> None:
         await end_tasks([self._task])
+        self._subscriptions.close()
         import rclpy
 
         self._executor.shutdown()
@@ -109,26 +112,14 @@ class RclpyEndpoint:
         self._node.destroy_node()
 
     def interest(self, name: TopicName, wanted: bool) -> None:
-        """A subscription is made when the topic is offered, wanted or not."""
+        """Nobody wants it: the node has no subscription of it, unless the topic is latched."""
+        self._subscriptions.interest(name, wanted)
 
-    def subscribe(self, name: TopicName, sink: Sink) -> Subscription:
-        type_name = self._announced.get(name)
-        if type_name is None:
+    def subscribe(self, name: TopicName, sink: Sink) -> "_Subscription":
+        info = self._announced.get(name)
+        if info is None:
             raise UsageError(f"{name}: no such topic was announced")
-        handover = self._handover
-        assert handover is not None, "a topic was announced, so we were started"
-
-        def arrived(body: bytes) -> None:
-            stamp_ns = time.time_ns()
-            handover.put(lambda: None if opened.closed else _offer(sink, body, stamp_ns), len(body))
-
-        message_type = self._message_type(name, type_name)
-        qos = self._qos(name)
-        opened = _Subscription(
-            self, name, self._node, self._node.create_subscription(message_type, name, arrived, qos, raw=True)
-        )
-        self._subscriptions.append(opened)
-        return opened
+        return self._subscriptions.add(_Subscription(self, info, sink))
 
     def advertise(self, info: TopicInfo) -> Publisher:
         message_type = self._message_type(info.name, info.type_name)
@@ -139,12 +130,8 @@ class RclpyEndpoint:
 
     def validate(self, held: Held) -> list[Difference]:
         """Without the thread that spins nothing is received: that is a difference of every topic."""
-        found = held.differences(
-            Held(
-                Counter(publisher.name for publisher in self._publishers),
-                Counter(subscription.name for subscription in self._subscriptions),
-            )
-        )
+        publishers = Counter(publisher.name for publisher in self._publishers)
+        found = held.differences(Held(publishers, self._subscriptions.names)) + self._subscriptions.differences()
         if not self._thread.is_alive():
             found.append(Difference(TopicName(""), "the thread of rclpy has ended; start the client again"))
         if self._task.done():
@@ -157,6 +144,19 @@ class RclpyEndpoint:
             self._publishers.remove(part)
         else:
             self._subscriptions.remove(part)
+
+    def receive(self, info: TopicInfo, arrived: Callable[[bytes, int], None]) -> Callable[[], None]:
+        """Have `arrived` called on the event loop with what is published, until what is returned is called."""
+        node, handover = self._node, self._handover
+        assert handover is not None, "a topic was announced, so we were started"
+
+        def came(body: bytes) -> None:  # in the thread that spins
+            stamp_ns = time.time_ns()
+            handover.put(lambda: arrived(body, stamp_ns), len(body))
+
+        message_type = self._message_type(info.name, info.type_name)
+        opened = node.create_subscription(message_type, info.name, came, self._qos(info.name), raw=True)
+        return lambda: node.destroy_subscription(opened)
 
     def dropped(self) -> None:
         """A message came to a publisher that is closed."""
@@ -200,7 +200,7 @@ class RclpyEndpoint:
             try:
                 self._poll()
             except Exception as error:  # noqa: BLE001  (of this look; the next may succeed)
-                self._say_once(f"the graph could not be looked at: {ros_types.one_line(error)}", error)
+                self._say_once(f"the graph could not be looked at: {ros_types.one_line(error)}", error=error)
 
     def _poll(self) -> None:
         """Announce what appeared, retract what went. A topic that cannot be looked at stays as it was."""
@@ -210,7 +210,7 @@ class RclpyEndpoint:
             try:
                 there = self._look_at(name, type_names)
             except Exception as error:  # noqa: BLE001  (a fault of one topic)
-                self._say_once(f"{name} could not be looked at: {ros_types.one_line(error)}", error)
+                self._say_once(f"{name} could not be looked at: {ros_types.one_line(error)}", error=error)
                 there = True
             if there:
                 found.add(name)
@@ -235,9 +235,10 @@ class RclpyEndpoint:
         if len(type_names) > 1:
             self._say_once(f"{name} is published with several types ({', '.join(type_names)}); left out")
             return False
-        if self._announced.get(name) == type_names[0]:
+        known = self._announced.get(name)
+        if known is not None and known.type_name == type_names[0]:
             return True
-        if name in self._announced:  # with another type: that is another topic
+        if known is not None:  # with another type: that is another topic
             del self._announced[name]
             self._events.topic_removed(name)
         try:
@@ -252,7 +253,7 @@ class RclpyEndpoint:
             latched=first.durability is DurabilityPolicy.TRANSIENT_LOCAL,
             reliable=first.reliability is ReliabilityPolicy.RELIABLE,
         )
-        self._announced[name] = type_names[0]
+        self._announced[name] = info
         self._events.topic_added(info)
         return True
 
@@ -268,26 +269,46 @@ class RclpyEndpoint:
             self._say_once(str(error))
         return TopicInfo(name, type_name, Encoding.CDR, type_hash, definition, latched, reliable)
 
-    def _say_once(self, text: str, error: Exception | None = None) -> None:
-        """`error`: one that nobody expects, shown with where it came from."""
-        if text not in self._said:
-            self._said.add(text)
-            _log.log(logging.WARNING if error is None else logging.ERROR, "%s", text, exc_info=error)
-
 
 class _Subscription:
-    def __init__(self, owner: RclpyEndpoint, name: TopicName, node: "Node", subscription: "RosSubscription") -> None:
-        self.closed = False
-        self.name = name
+    """One topic on its way to the link."""
+
+    def __init__(self, owner: RclpyEndpoint, info: TopicInfo, sink: Sink) -> None:
+        self.name = info.name
+        self.wanted = True
         self._owner = owner
-        self._node = node
-        self._subscription = subscription
+        self._info = info
+        self._sink = sink
+        self._closed = False
+        self._end: Callable[[], None] | None = None
+        """Ends what the node has for it; None: it has nothing."""
+
+    def refresh(self) -> None:
+        if self._closed:
+            return
+        if not (self.wanted or self._info.latched):
+            self._drop()
+        elif self._end is None:
+            end = self._end = self._owner.receive(self._info, lambda body, stamp_ns: self._take(end, body, stamp_ns))
+
+    @property
+    def lacking(self) -> bool:
+        return self._end is None and (self.wanted or self._info.latched)
 
     def close(self) -> None:
-        if not self.closed:
-            self.closed = True
+        if not self._closed:
+            self._closed = True
+            self._drop()
             self._owner.closed(self)
-            self._node.destroy_subscription(self._subscription)
+
+    def _drop(self) -> None:
+        end, self._end = self._end, None
+        if end is not None:
+            end()
+
+    def _take(self, end: Callable[[], None], body: bytes, stamp_ns: int) -> None:
+        if self._end is end:  # not what came before nobody wanted it
+            self._sink(body, stamp_ns)
 
 
 class _Publisher:
@@ -309,10 +330,6 @@ class _Publisher:
         if publisher is not None:
             self._owner.closed(self)
             self._node.destroy_publisher(publisher)
-
-
-def _offer(sink: Sink, body: bytes, stamp_ns: int) -> None:
-    sink(body, stamp_ns)
 
 
 def _profile(*, reliable: bool, latched: bool, depth: int) -> "QoSProfile":
