@@ -156,7 +156,11 @@ class RclpyEndpoint:
 
         message_type = self._message_type(info.name, info.type_name)
         opened = node.create_subscription(message_type, info.name, came, self._qos(info.name), raw=True)
-        return lambda: node.destroy_subscription(opened)
+
+        def end() -> None:
+            node.destroy_subscription(opened)
+
+        return end
 
     def dropped(self) -> None:
         """A message came to a publisher that is closed."""

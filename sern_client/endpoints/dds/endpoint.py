@@ -33,12 +33,14 @@ from sern_client.endpoints.base import (
     TopicEvents,
 )
 from sern_client.endpoints.common.first import LEARN_S, FirstMessages
+from sern_client.endpoints.common.interest import Subscriptions
+from sern_client.endpoints.common.saying import SayOnce
 from sern_client.endpoints.dds import names, node_info
 from sern_client.endpoints.dds.counters import DdsCounters
 from sern_client.endpoints.dds.definitions import Definitions
 from sern_client.endpoints.dds.domain import DomainOptions, close_domain, open_domain
 from sern_client.endpoints.dds.entities import Reader, Subscription, Writer
-from sern_client.endpoints.dds.graph import MAX_COMPLAINTS, Graph, Local, Participant, Remote
+from sern_client.endpoints.dds.graph import Graph, Local, Participant, Remote
 from sern_client.endpoints.dds.idl import TypeMaker
 from sern_client.endpoints.dds.names import DISCOVERY_TOPIC, SERN_KEY, RosName, user_data
 from sern_client.endpoints.dds.qos import (
@@ -63,8 +65,6 @@ _INFO_QOS: Final = EndpointQos(reliable=True, durability=1)
 _INFO_DEPTH: Final = 64
 RELIABLE_DEPTH: Final = 10
 """How many messages a writer keeps for its slow readers where the stream names no depth, as ROS 2 does."""
-RETRY_S: Final = 1.0
-"""A reader that DDS refused is asked for again after so long."""
 
 _log = logging.getLogger(__name__)
 
@@ -105,12 +105,13 @@ class DdsEndpoint:
         self.graph.own_guard = options.node_name + GUARD_SUFFIX
         self.types = Definitions(options.type_paths)
         self.services = DdsServices(self)
+        self.say_once = SayOnce(_log, logging.ERROR)
+        self.subscriptions: Subscriptions[Subscription] = Subscriptions(self.say_once)
         self._events: TopicEvents | None = None
         self._maker = TypeMaker()
         self._joined: _Joined | None = None
         self._topics: WeakValueDictionary[str, Topic[Any]] = WeakValueDictionary()
         self._announced: dict[TopicName, TopicInfo] = {}
-        self._subscriptions: dict[TopicName, list[Subscription]] = {}
         self._readers: dict[UUID, Reader] = {}
         self._leaving: dict[UUID, Reader] = {}
         """Readers that are closed and have not ended."""
@@ -123,7 +124,6 @@ class DdsEndpoint:
         self._info_due = False
         self._changed: dict[Hashable, Callable[[], None]] = {}
         """What is to be done for topics and services that are not as they were."""
-        self._said: set[int] = set()
 
     # Life cycle
 
@@ -156,9 +156,7 @@ class DdsEndpoint:
         if self._joined is None:
             return
         await self.services.stop()
-        for subscriptions in list(self._subscriptions.values()):
-            for subscription in list(subscriptions):
-                subscription.close()
+        self.subscriptions.close()
         for reader in list(self._readers.values()):
             reader.close()
         for stream in list(self._streams):
@@ -195,10 +193,7 @@ class DdsEndpoint:
         info = self._announced.get(name)
         if info is None:
             raise UsageError(f"{name}: no such topic was announced")
-        subscription = Subscription(self, info, names.to_dds(name), sink)
-        self._subscriptions.setdefault(name, []).append(subscription)
-        self._refresh(subscription)
-        return subscription
+        return self.subscriptions.add(Subscription(self, info, names.to_dds(name), sink))
 
     def advertise(self, info: TopicInfo) -> Stream:
         """ConfigError for another encoding than CDR, a type nobody defines, or one with another hash than here."""
@@ -256,43 +251,18 @@ class DdsEndpoint:
     def validate(self, held: Held) -> list[Difference]:
         """A wanted topic without a reader differs too. Without the thread that waits for DDS nothing is received: that
         is a difference of every topic."""
-        here = Held(subscriptions=Counter(name for name, them in self._subscriptions.items() for _ in them))
-        here.publishers.update(stream.name for stream in self._streams if stream.writer.guid in self._writers)
-        found = held.differences(here)
-        found += [
-            Difference(name, "no reader in this domain takes it")
-            for name, subscriptions in self._subscriptions.items()
-            if any(subscription.lacks_reader for subscription in subscriptions)
-        ]
+        publishers = Counter(stream.name for stream in self._streams if stream.writer.guid in self._writers)
+        found = held.differences(Held(publishers, self.subscriptions.names)) + self.subscriptions.differences()
         if self._joined is not None and not self._joined.worker.alive:
             found.append(Difference(TopicName(""), "the thread that waits for DDS has ended; start the client again"))
         return found
 
     def interest(self, name: TopicName, wanted: bool) -> None:
         """Nobody wants it: nothing is received either, unless the topic is latched."""
-        for subscription in self._subscriptions.get(name, ()):
-            subscription.wanted = wanted
-            self._refresh(subscription)
-
-    def _refresh(self, subscription: Subscription) -> None:
-        try:
-            subscription.refresh()
-        except ConfigError as error:
-            self.say_once(f"{subscription.info.name} is not taken: {error}")
-            # Some of what DDS refuses it accepts a moment later: a reader right after the one before it was closed.
-            if not subscription.asks_again:
-                subscription.asks_again = True
-                asyncio.get_running_loop().call_later(RETRY_S, self._refresh_again, subscription)
-
-    def _refresh_again(self, subscription: Subscription) -> None:
-        subscription.asks_again = False
-        if self._joined is not None and subscription in self._subscriptions.get(subscription.info.name, ()):
-            self._refresh(subscription)
+        self.subscriptions.interest(name, wanted)
 
     def forget(self, subscription: Subscription) -> None:
-        found = self._subscriptions.get(subscription.info.name, [])
-        if subscription in found:
-            found.remove(subscription)
+        self.subscriptions.remove(subscription)
 
     # Services
 
@@ -455,13 +425,6 @@ class DdsEndpoint:
             reader.dropped for readers in (self._readers, self._leaving) for reader in readers.values()
         )
 
-    def say_once(self, line: str | Callable[[], str], *about: Hashable) -> None:
-        """What a person has to know and do something about: once for each line, or for what it is `about`."""
-        said = hash(about or line)
-        if said not in self._said and len(self._said) < MAX_COMPLAINTS:
-            self._said.add(said)
-            _log.error("%s", line if isinstance(line, str) else line())
-
     # Discovery: told by the worker
 
     def participant_added(self, participant: Participant) -> None:
@@ -508,8 +471,7 @@ class DdsEndpoint:
                 self._announced[name.name] = info
                 self._events.topic_added(info)
             return
-        for subscription in self._subscriptions.get(name.name, ()):
-            self._refresh(subscription)
+        self.subscriptions.refresh(name.name)
 
     def _describe(self, name: TopicName, writers: list[Remote]) -> TopicInfo | None:
         """The topic as the first of its writers has it whose type is known here."""

@@ -49,14 +49,13 @@ class Subscription:
 
     def __init__(self, endpoint: EntityOwner, info: TopicInfo, dds_topic: str, sink: Sink) -> None:
         self._endpoint = endpoint
+        self.name = info.name
         self.info = info
         self.dds_topic = dds_topic
         self._sink = sink
         self._reader: Reader | None = None
         self.closed = False
         self.wanted = True
-        self.asks_again = False
-        """DDS gave no reader, and is asked once more in a moment."""
 
     def refresh(self) -> None:
         """Have a reader that matches all writers there are now that it can, or none while nobody wants the topic.
@@ -80,8 +79,8 @@ class Subscription:
         self._reader = self._endpoint.open_reader(self.dds_topic, resolved, asked, self._deliver, before=self._reader)
 
     @property
-    def lacks_reader(self) -> bool:
-        """It is to have one and has none."""
+    def lacking(self) -> bool:
+        """Whether it is to have a reader and has none."""
         return self._reader is None and (self.wanted or self.info.latched)
 
     @property

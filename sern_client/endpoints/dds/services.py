@@ -10,12 +10,14 @@ import asyncio
 import logging
 import secrets
 import struct
-from collections.abc import Callable, Hashable
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import Final, Protocol
 
 from sern_client.endpoints.base import ServiceEvents, ServiceHandler, ServiceInfo
+from sern_client.endpoints.common.calls import PendingCalls, Tasks, within
+from sern_client.endpoints.common.saying import SayOnce
 from sern_client.endpoints.dds import names
 from sern_client.endpoints.dds.counters import DdsCounters
 from sern_client.endpoints.dds.definitions import Definitions
@@ -96,16 +98,14 @@ class _Client:
     ident: int
     writer: _Out
     reader: _Side
-    waiting: dict[int, asyncio.Future[bytes]]
+    pending: PendingCalls
     number: int = 0
     met_s: float | None = None
 
     def close(self) -> None:
         self.writer.close()
         self.reader.close()
-        for future in self.waiting.values():
-            if not future.done():
-                future.set_exception(ServiceError(f"{self.info.name}: the service is gone"))
+        self.pending.fail_all(f"{self.info.name}: the service is gone")
 
 
 @dataclass(slots=True, eq=False)
@@ -118,7 +118,7 @@ class _Server:
     closed: bool = False
     writer: _Out | None = None
     reader: _Side | None = None
-    tasks: set[asyncio.Task[None]] = field(default_factory=set)
+    tasks: Tasks = field(default_factory=lambda: Tasks(MAX_CALLS))
 
     def close(self) -> None:
         if self.closed:
@@ -133,8 +133,7 @@ class _Server:
     def _end(self) -> None:
         if self.writer is not None:
             self.writer.close()
-        for task in self.tasks:
-            task.cancel()
+        self.tasks.cancel()
 
 
 class ServiceOwner(Protocol):
@@ -143,6 +142,8 @@ class ServiceOwner(Protocol):
     graph: Graph
     counters: DdsCounters
     types: Definitions
+    say_once: SayOnce
+    """What a person has to know and do something about."""
 
     def open_reader(
         self,
@@ -168,9 +169,6 @@ class ServiceOwner(Protocol):
     ) -> Writer:
         """ConfigError as `open_reader`."""
 
-    def say_once(self, line: str | Callable[[], str], *about: Hashable) -> None:
-        """What a person has to know and do something about."""
-
 
 class DdsServices:
     """The services of one endpoint."""
@@ -188,13 +186,14 @@ class DdsServices:
             events.service_added(info)
 
     async def stop(self) -> None:
-        tasks = [task for server in self._servers for task in server.tasks]
-        for server in list(self._servers):
+        servers = list(self._servers)
+        for server in servers:
             server.close()
         for client in self._clients.values():
             client.close()
         self._clients.clear()
-        await asyncio.gather(*tasks, return_exceptions=True)
+        for server in servers:
+            await server.tasks.ended()
 
     def forget(self, server: _Server) -> None:
         if server in self._servers:
@@ -271,17 +270,11 @@ class DdsServices:
             client = self._clients[name] = self._open(info)
         client.number += 1
         number = client.number
-        future: asyncio.Future[bytes] = asyncio.get_running_loop().create_future()
-        client.waiting[number] = future
-        try:
-            async with asyncio.timeout(timeout_s):
+        with client.pending.call(number) as answer:
+            async with within(timeout_s, f"{name}: no answer within {timeout_s:g} s"):
                 await self._met(client)
                 client.writer.publish(Wrapped.join(request, client.ident, number), 0)
-                return await future
-        except TimeoutError:
-            raise ServiceError(f"{name}: no answer within {timeout_s:g} s") from None
-        finally:
-            client.waiting.pop(number, None)
+                return await answer
 
     async def _met(self, client: _Client) -> None:
         """Wait until a new client and its server know each other.
@@ -298,7 +291,7 @@ class DdsServices:
 
     def _open(self, info: ServiceInfo) -> _Client:
         client_id = secrets.randbits(64)
-        waiting: dict[int, asyncio.Future[bytes]] = {}
+        pending = PendingCalls()
 
         def deliver(sample: Sample) -> None:
             try:
@@ -306,15 +299,14 @@ class DdsServices:
             except ValueError:
                 self._endpoint.counters.unreadable += 1
                 return
-            future = waiting.get(number)
-            if client == client_id and future is not None and not future.done():
-                future.set_result(body)
+            if client == client_id:
+                pending.answer(number, body)
 
         try:
             writer, reader = self._pair(info, deliver, new_service_id(), serve=False)
         except ConfigError as error:
             raise ServiceError(str(error)) from None
-        return _Client(info, client_id, writer, reader, waiting)
+        return _Client(info, client_id, writer, reader, pending)
 
     def _pair(
         self, info: ServiceInfo, deliver: Callable[[Sample], None], ident: str, *, serve: bool
@@ -365,13 +357,11 @@ class DdsServices:
             self._endpoint.counters.unreadable += 1
             self._endpoint.say_once(f"service {server.info.name}: {error}")
             return
-        if len(server.tasks) >= MAX_CALLS:
+        if server.tasks.full:
             self._endpoint.counters.calls += 1
             self._endpoint.say_once(f"service {server.info.name}: more than {MAX_CALLS} calls at a time; some fail")
             return
-        task = asyncio.get_running_loop().create_task(self._answer(server, request, client, number))
-        server.tasks.add(task)
-        task.add_done_callback(server.tasks.discard)
+        server.tasks.begin(self._answer(server, request, client, number))
 
     async def _answer(self, server: _Server, request: bytes, client: int, number: int) -> None:
         try:
