@@ -35,6 +35,7 @@ from sern_client.endpoints.base import (
 from sern_client.endpoints.common.first import LEARN_S, FirstMessages
 from sern_client.endpoints.common.interest import Subscriptions
 from sern_client.endpoints.common.saying import SayOnce
+from sern_client.endpoints.common.stream import Stream
 from sern_client.endpoints.dds import names, node_info
 from sern_client.endpoints.dds.counters import DdsCounters
 from sern_client.endpoints.dds.definitions import Definitions
@@ -53,7 +54,6 @@ from sern_client.endpoints.dds.qos import (
 )
 from sern_client.endpoints.dds.raw import INFINITE_NS
 from sern_client.endpoints.dds.services import DdsServices
-from sern_client.endpoints.dds.stream import Stream
 from sern_client.endpoints.dds.worker import Inbox, Sample, Worker
 from sern_core.vocabulary.errors import ConfigError, UsageError
 from sern_core.vocabulary.message import TopicInfo

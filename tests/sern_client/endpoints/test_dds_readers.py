@@ -12,12 +12,12 @@ import pytest
 
 pytest.importorskip("cyclonedds", reason="the dds endpoint needs cyclonedds: pip install cyclonedds==11.0.1")
 
+from sern_client.endpoints.common.stream import Stream
 from sern_client.endpoints.dds import endpoint as module
 from sern_client.endpoints.dds.domain import DomainOptions
 from sern_client.endpoints.dds.endpoint import DdsEndpoint, DdsOptions
 from sern_client.endpoints.dds.graph import Remote
 from sern_client.endpoints.dds.qos import EndpointQos, mismatches, reader_for, within_reach
-from sern_client.endpoints.dds.stream import Stream
 from sern_core.vocabulary.errors import ConfigError
 from sern_core.vocabulary.types import DropReason, Encoding, TopicName
 from sern_runtime.ros_types import topic_info
