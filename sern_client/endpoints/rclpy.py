@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Final
 
 from sern_client.endpoints.base import GUARD_SUFFIX, Difference, Held, Publisher, Sink, TopicEvents
 from sern_client.endpoints.common.handover import Handover
-from sern_client.endpoints.common.interest import Subscriptions
+from sern_client.endpoints.common.interest import OnDemand, Subscriptions
 from sern_client.endpoints.common.saying import SayOnce
 from sern_core.vocabulary.errors import ConfigError, UsageError
 from sern_core.vocabulary.message import TopicInfo
@@ -54,7 +54,7 @@ class RclpyEndpoint:
         self.options = options
         self.types = TypeFiles(options.type_paths)
         self._say_once = SayOnce(_log)
-        self._subscriptions: Subscriptions[_Subscription] = Subscriptions(self._say_once)
+        self._subscriptions: Subscriptions[OnDemand] = Subscriptions(self._say_once)
         self._announced: dict[TopicName, TopicInfo] = {}
         self._publishers: list[_Publisher] = []
         self._handover: Handover | None = None
@@ -115,11 +115,11 @@ class RclpyEndpoint:
         """Nobody wants it: the node has no subscription of it, unless the topic is latched."""
         self._subscriptions.interest(name, wanted)
 
-    def subscribe(self, name: TopicName, sink: Sink) -> "_Subscription":
+    def subscribe(self, name: TopicName, sink: Sink) -> OnDemand:
         info = self._announced.get(name)
         if info is None:
             raise UsageError(f"{name}: no such topic was announced")
-        return self._subscriptions.add(_Subscription(self, info, sink))
+        return self._subscriptions.add(OnDemand(info, sink, self._receive, self._subscriptions.remove))
 
     def advertise(self, info: TopicInfo) -> Publisher:
         message_type = self._message_type(info.name, info.type_name)
@@ -138,15 +138,11 @@ class RclpyEndpoint:
             found.append(Difference(TopicName(""), "nobody looks at the graph any more; start the client again"))
         return found
 
-    def closed(self, part: "_Publisher | _Subscription") -> None:
-        """A publisher or subscription of ours is no more."""
-        if isinstance(part, _Publisher):
-            self._publishers.remove(part)
-        else:
-            self._subscriptions.remove(part)
+    def closed(self, publisher: "_Publisher") -> None:
+        """A publisher of ours is no more."""
+        self._publishers.remove(publisher)
 
-    def receive(self, info: TopicInfo, arrived: Callable[[bytes, int], None]) -> Callable[[], None]:
-        """Have `arrived` called on the event loop with what is published, until what is returned is called."""
+    def _receive(self, info: TopicInfo, arrived: Callable[[bytes, int], None]) -> Callable[[], None]:
         node, handover = self._node, self._handover
         assert handover is not None, "a topic was announced, so we were started"
 
@@ -272,47 +268,6 @@ class RclpyEndpoint:
         except ConfigError as error:
             self._say_once(str(error))
         return TopicInfo(name, type_name, Encoding.CDR, type_hash, definition, latched, reliable)
-
-
-class _Subscription:
-    """One topic on its way to the link."""
-
-    def __init__(self, owner: RclpyEndpoint, info: TopicInfo, sink: Sink) -> None:
-        self.name = info.name
-        self.wanted = True
-        self._owner = owner
-        self._info = info
-        self._sink = sink
-        self._closed = False
-        self._end: Callable[[], None] | None = None
-        """Ends what the node has for it; None: it has nothing."""
-
-    def refresh(self) -> None:
-        if self._closed:
-            return
-        if not (self.wanted or self._info.latched):
-            self._drop()
-        elif self._end is None:
-            end = self._end = self._owner.receive(self._info, lambda body, stamp_ns: self._take(end, body, stamp_ns))
-
-    @property
-    def lacking(self) -> bool:
-        return self._end is None and (self.wanted or self._info.latched)
-
-    def close(self) -> None:
-        if not self._closed:
-            self._closed = True
-            self._drop()
-            self._owner.closed(self)
-
-    def _drop(self) -> None:
-        end, self._end = self._end, None
-        if end is not None:
-            end()
-
-    def _take(self, end: Callable[[], None], body: bytes, stamp_ns: int) -> None:
-        if self._end is end:  # not what came before nobody wanted it
-            self._sink(body, stamp_ns)
 
 
 class _Publisher:

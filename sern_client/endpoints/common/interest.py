@@ -6,13 +6,14 @@ at its middleware, unless it is latched: the last messages of such a topic must 
 
 import asyncio
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from itertools import chain
 from typing import Final, Generic, Protocol, TypeVar
 
-from sern_client.endpoints.base import Difference
+from sern_client.endpoints.base import Difference, Sink
 from sern_client.endpoints.common.saying import SayOnce
 from sern_core.vocabulary.errors import ConfigError
+from sern_core.vocabulary.message import TopicInfo
 from sern_core.vocabulary.types import TopicName
 
 RETRY_S: Final = 1.0
@@ -35,6 +36,47 @@ class Taking(Protocol):
         ...
 
     def close(self) -> None: ...
+
+
+Receive = Callable[[TopicInfo, Callable[[bytes, int], None]], Callable[[], None]]
+"""`end = receive(info, arrived)`: have `arrived(body, stamp_ns)` called on the event loop with what is published, until
+`end()`. ConfigError where the middleware refuses."""
+
+
+class OnDemand:
+    """A subscription that receives while its topic is wanted, or latched."""
+
+    def __init__(self, info: TopicInfo, sink: Sink, receive: Receive, closed: "Callable[[OnDemand], None]") -> None:
+        self.name = info.name
+        self.wanted = True
+        self._info = info
+        self._sink = sink
+        self._receive = receive
+        self._on_close = closed
+        self._closed = False
+        self._end: Callable[[], None] | None = None
+
+    def refresh(self) -> None:
+        if not (self.wanted or self._info.latched) or self._closed:
+            end, self._end = self._end, None
+            if end is not None:
+                end()
+        elif self._end is None:
+            end = self._end = self._receive(self._info, lambda body, stamp_ns: self._take(end, body, stamp_ns))
+
+    @property
+    def lacking(self) -> bool:
+        return self._end is None and (self.wanted or self._info.latched)
+
+    def close(self) -> None:
+        if not self._closed:
+            self._closed = True
+            self.refresh()
+            self._on_close(self)
+
+    def _take(self, end: Callable[[], None] | None, body: bytes, stamp_ns: int) -> None:
+        if self._end is end:  # not what came before nobody wanted it
+            self._sink(body, stamp_ns)
 
 
 S = TypeVar("S", bound=Taking)

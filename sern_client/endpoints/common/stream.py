@@ -1,9 +1,9 @@
-"""A stream that comes in, on its way to the readers of a domain."""
+"""Streams that come in, on their way to the readers of a middleware where first messages wait for those."""
 
+from collections import Counter
 from collections.abc import Callable
 from math import inf
-from typing import Protocol
-from uuid import UUID
+from typing import Generic, Protocol, TypeVar
 
 from sern_client.endpoints.common.first import FirstMessages
 from sern_core.vocabulary.types import TopicName
@@ -12,52 +12,85 @@ from sern_core.vocabulary.types import TopicName
 class Writer(Protocol):
     """What a stream is written with."""
 
-    @property
-    def guid(self) -> UUID: ...
-
-    @property
-    def matched(self) -> int:
-        """How many readers it has."""
-        ...
-
     def publish(self, body: bytes, stamp_ns: int) -> None: ...
 
     def close(self) -> None: ...
 
 
-class Stream:
-    """The `AgingPublisher` of a stream that comes in: a writer, and what waits for its first readers."""
+W = TypeVar("W", bound=Writer)
+
+
+class Stream(Generic[W]):
+    """The `AgingPublisher` of a stream: a writer, and what waits for its first readers, if anything does.
+
+    `late` counts a message that comes after `close`; `ended` is told when the writer is closed.
+    """
 
     def __init__(
-        self, name: TopicName, writer: Writer, first: FirstMessages, closed: "Callable[[Stream], None]"
-    ) -> None:
+        self, name: TopicName, writer: W, first: FirstMessages | None, *, late: Callable[[], None],
+        ended: "Callable[[Stream[W]], None]",
+    ) -> None:  # fmt: skip
         self.name = name
         self.writer = writer
-        self.first = first
         self.closed = False
-        self._closed = closed
+        """It takes no more; its writer lasts until the first messages are written."""
+        self._first = first
+        self._late = late
+        self._ended = ended
 
     @property
-    def guid(self) -> UUID:
-        return self.writer.guid
-
-    @property
-    def matched(self) -> int:
-        """How many readers it has."""
-        return self.writer.matched
+    def waits(self) -> bool:
+        """Whether its first messages wait."""
+        return self._first is not None and not self._first.over
 
     def publish(self, body: bytes, stamp_ns: int) -> None:
         self.publish_within(body, stamp_ns, inf)
 
     def publish_within(self, body: bytes, stamp_ns: int, left_s: float) -> None:
-        if self.first.over or self.closed:
+        if self.closed:
+            self._late()
+        elif self._first is None or self._first.over:
             self.writer.publish(body, stamp_ns)
         else:
-            self.first.publish(body, stamp_ns, left_s)
+            self._first.publish(body, stamp_ns, left_s)
 
     def close(self) -> None:
         """What was published before is still written: the last of it may be a stop command."""
         if not self.closed:
             self.closed = True
-            self._closed(self)
-            self.first.end(self.writer.close)
+            if self._first is None:
+                self._end()
+            else:
+                self._first.end(self._end)
+
+    def _end(self) -> None:
+        self.writer.close()
+        self._ended(self)
+
+    def hurry(self) -> None:
+        """Write the first messages now."""
+        if self._first is not None:
+            self._first.close()
+
+
+class Streams(Generic[W]):
+    """Those of an endpoint whose writers are open."""
+
+    def __init__(self) -> None:
+        self._open: list[Stream[W]] = []
+
+    def open(self, name: TopicName, writer: W, first: FirstMessages | None, late: Callable[[], None]) -> Stream[W]:
+        stream = Stream(name, writer, first, late=late, ended=self._open.remove)
+        self._open.append(stream)
+        return stream
+
+    @property
+    def names(self) -> Counter[TopicName]:
+        """How many take messages, by topic."""
+        return Counter(stream.name for stream in self._open if not stream.closed)
+
+    def close(self) -> None:
+        """Close all, and wait for no reader."""
+        for stream in list(self._open):
+            stream.close()
+            stream.hurry()

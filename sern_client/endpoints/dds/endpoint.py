@@ -35,7 +35,7 @@ from sern_client.endpoints.base import (
 from sern_client.endpoints.common.first import LEARN_S, FirstMessages
 from sern_client.endpoints.common.interest import Subscriptions
 from sern_client.endpoints.common.saying import SayOnce
-from sern_client.endpoints.common.stream import Stream
+from sern_client.endpoints.common.stream import Stream, Streams
 from sern_client.endpoints.dds import names, node_info
 from sern_client.endpoints.dds.counters import DdsCounters
 from sern_client.endpoints.dds.definitions import Definitions
@@ -116,8 +116,7 @@ class DdsEndpoint:
         self._leaving: dict[UUID, Reader] = {}
         """Readers that are closed and have not ended."""
         self._writers: dict[UUID, Writer] = {}
-        self._streams: list[Stream] = []
-        self._ending: list[FirstMessages] = []  # of streams that are closed
+        self._streams: Streams[Writer] = Streams()
         self._first_dropped: Counter[DropReason] = Counter()
         self._started_s = 0.0
         self._info_writer: Writer | None = None
@@ -159,10 +158,7 @@ class DdsEndpoint:
         self.subscriptions.close()
         for reader in list(self._readers.values()):
             reader.close()
-        for stream in list(self._streams):
-            stream.close()
-        for first in list(self._ending):
-            first.close()
+        self._streams.close()
         for writer in list(self._writers.values()):
             writer.close()
         self._events = None
@@ -195,7 +191,7 @@ class DdsEndpoint:
             raise UsageError(f"{name}: no such topic was announced")
         return self.subscriptions.add(Subscription(self, info, names.to_dds(name), sink))
 
-    def advertise(self, info: TopicInfo) -> Stream:
+    def advertise(self, info: TopicInfo) -> Stream[Writer]:
         """ConfigError for another encoding than CDR, a type nobody defines, or one with another hash than here."""
         resolved = self._resolve(info)
         offered = replace(writer_for(info, lifespan=self.options.offer_lifespan), type_hash=resolved.text.type_hash)
@@ -212,15 +208,7 @@ class DdsEndpoint:
             overflow=DropReason.QUEUE_FULL if offered.reliable else DropReason.SUPERSEDED,
             learning_s=self._started_s + LEARN_S - asyncio.get_running_loop().time(),
         )
-        stream = Stream(info.name, writer, first, self._stream_closed)
-        self._streams.append(stream)
-        return stream
-
-    def _stream_closed(self, stream: Stream) -> None:
-        """It takes no more; its writer lasts until its first messages are written."""
-        self._streams.remove(stream)
-        if len(stream.first):
-            self._ending = [first for first in self._ending if not first.over] + [stream.first]
+        return self._streams.open(info.name, writer, first, self.counters.late)
 
     def _drop_first(self, why: DropReason) -> None:
         self._first_dropped[why] += 1
@@ -251,8 +239,8 @@ class DdsEndpoint:
     def validate(self, held: Held) -> list[Difference]:
         """A wanted topic without a reader differs too. Without the thread that waits for DDS nothing is received: that
         is a difference of every topic."""
-        publishers = Counter(stream.name for stream in self._streams if stream.writer.guid in self._writers)
-        found = held.differences(Held(publishers, self.subscriptions.names)) + self.subscriptions.differences()
+        found = held.differences(Held(self._streams.names, self.subscriptions.names))
+        found += self.subscriptions.differences()
         if self._joined is not None and not self._joined.worker.alive:
             found.append(Difference(TopicName(""), "the thread that waits for DDS has ended; start the client again"))
         return found

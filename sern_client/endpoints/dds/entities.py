@@ -157,7 +157,7 @@ class Writer:
 
     def publish(self, body: bytes, stamp_ns: int) -> None:
         if self._writer is None:
-            self._endpoint.counters.closed += 1
+            self._endpoint.counters.late()
             return
         # A lifespan is judged by the time stamp: only one of this host says how old a sample is here.
         result = raw.write(self._writer, body, stamp_ns if self._stamped else None)

@@ -8,6 +8,7 @@ Publishers whose type or hash differs from the topic's first one are left out, w
 import asyncio
 import logging
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -21,16 +22,17 @@ from sern_client.endpoints.base import (
     Sink,
     TopicEvents,
 )
-from sern_client.endpoints.common.first import LEARN_S
-from sern_client.endpoints.common.interest import Subscriptions
+from sern_client.endpoints.common.first import LEARN_S, FirstMessages
+from sern_client.endpoints.common.interest import OnDemand, Subscriptions
 from sern_client.endpoints.common.saying import SayOnce
+from sern_client.endpoints.common.stream import Stream, Streams
 from sern_client.endpoints.zenoh import names
-from sern_client.endpoints.zenoh.entities import Publisher, Subscription
+from sern_client.endpoints.zenoh.entities import Writer, receive
 from sern_client.endpoints.zenoh.names import Entity, Kind, Qos
 from sern_client.endpoints.zenoh.node import Node
 from sern_client.endpoints.zenoh.options import ZenohOptions
 from sern_client.endpoints.zenoh.services import Services
-from sern_client.endpoints.zenoh.session import ZenohSession
+from sern_client.endpoints.zenoh.session import MAX_WAITING_BYTES, ZenohSession
 from sern_core.vocabulary.errors import ConfigError, UsageError, WireError
 from sern_core.vocabulary.message import TopicInfo
 from sern_core.vocabulary.types import DropReason, Encoding, TopicName
@@ -43,6 +45,8 @@ ROUTER_WAIT_S: Final = 3.0
 LOOK_S: Final = 1.0
 """How often it is looked whether there is one."""
 MAX_COMPLAINTS: Final = 256
+FIRST_MESSAGES: Final = 100
+"""Messages of a reliable topic that may wait for its first subscribers."""
 
 _log = logging.getLogger(__name__)
 
@@ -67,14 +71,14 @@ class ZenohEndpoint:
         self.node = Node(self.session, options.domain, options.node_name)
         self.services = Services(self.node, self.types)
         self.say_once = SayOnce(_log, most=MAX_COMPLAINTS)
-        self.subscriptions: Subscriptions[Subscription] = Subscriptions(self.say_once)
+        self.subscriptions: Subscriptions[OnDemand] = Subscriptions(self.say_once)
         self._events: TopicEvents | None = None
         self._topics: dict[TopicName, _Topic] = {}
         self._left_out: dict[TopicName, dict[str, Entity]] = {}  # publishers of another type, by their key
         self._subscribers: dict[TopicName, dict[str, tuple[str, str]]] = {}  # of others: their types by their keys
         self._first_dropped: Counter[DropReason] = Counter()
         self._started_s = 0.0
-        self._publishers: list[Publisher] = []
+        self._streams: Streams[Writer] = Streams()
         self._look_again: asyncio.TimerHandle | None = None
         self._outages = Outages(_log, logging.WARNING, after_s=ROUTER_WAIT_S)
 
@@ -127,25 +131,36 @@ class ZenohEndpoint:
         if self._look_again is not None:
             self._look_again.cancel()
         self.subscriptions.close()
-        for publisher in list(self._publishers):
-            publisher.close()
-            publisher.hurry()
+        self._streams.close()
         await self.services.stop()
         await self.session.close()
 
     # --- topics of others -------------------------------------------------------------------------------------------
 
-    def subscribe(self, name: TopicName, sink: Sink) -> Subscription:
+    def subscribe(self, name: TopicName, sink: Sink) -> OnDemand:
         topic = self._topics.get(name)
         if topic is None or topic.info is None:
             raise UsageError(f"{name}: no such topic was announced")
-        return self.subscriptions.add(Subscription(self, topic.info, sink))
+        return self.subscriptions.add(OnDemand(topic.info, sink, self._receive, self.subscriptions.remove))
+
+    def _receive(self, info: TopicInfo, arrived: Callable[[bytes, int], None]) -> Callable[[], None]:
+        return receive(self.node, info, self._asked(info.name), self.say_once, arrived)
+
+    def _asked(self, name: TopicName) -> Qos:
+        """What to ask for: what any of the publishers offers."""
+        topic = self._topics.get(name)
+        offers = () if topic is None else topic.publishers.values()
+        return Qos(
+            any(qos.reliable for qos in offers),
+            any(qos.transient_local for qos in offers),
+            max((qos.depth for qos in offers), default=names.DEFAULT_DEPTH),
+        )
 
     def interest(self, name: TopicName, wanted: bool) -> None:
         """Nobody wants it: no subscriber of ours is in the session, unless the topic is latched."""
         self.subscriptions.interest(name, wanted)
 
-    def advertise(self, info: TopicInfo) -> Publisher:
+    def advertise(self, info: TopicInfo) -> Stream[Writer]:
         dds_name = names.dds_type(ros_types.canonical(info.type_name))
         type_hash = info.type_hash or self._hash_of(info)
         known = self._topics.get(info.name)
@@ -154,9 +169,24 @@ class ZenohEndpoint:
                 f"{info.name}: what comes is {info.type_name} {type_hash}, "
                 f"nodes here publish {names.ros_type(known.dds_type)} {known.type_hash}"
             )
-        publisher = Publisher(self, info, type_hash, lambda: self.readers(info.name, dds_name, type_hash))
-        self._publishers.append(publisher)
-        return publisher
+        writer = Writer(self.node, info, type_hash, lambda: self.readers(info.name, dds_name, type_hash))
+        best_effort = info.reliable is False
+        first: FirstMessages | None = None
+        if not info.latched:  # else whoever comes later gets what it has missed from a cache
+            first = FirstMessages(
+                info.name,
+                readers=writer.readers,
+                write=writer.publish,
+                dropped=self._drop_first,
+                max_messages=(info.depth or 1) if best_effort else FIRST_MESSAGES,
+                max_bytes=MAX_WAITING_BYTES,
+                overflow=DropReason.SUPERSEDED if best_effort else DropReason.QUEUE_FULL,
+                learning_s=max(0.0, self._started_s + LEARN_S - self._loop.time()),
+            )
+        return self._streams.open(info.name, writer, first, self.session.refused)
+
+    def _drop_first(self, why: DropReason) -> None:
+        self._first_dropped[why] += 1
 
     def readers(self, name: TopicName, dds_name: str, type_hash: str) -> int:
         """How many subscribers of others the graph knows."""
@@ -164,10 +194,8 @@ class ZenohEndpoint:
 
     def validate(self, held: Held) -> list[Difference]:
         """Without the thread that writes nothing is published: that is a difference of every topic."""
-        # A publisher that is ending lasts until its first messages are written.
-        publishers = Counter(publisher.name for publisher in self._publishers if not publisher.ending)
-        here = Held(publishers, self.subscriptions.names)
-        found = held.differences(here) + self.subscriptions.differences()
+        found = held.differences(Held(self._streams.names, self.subscriptions.names))
+        found += self.subscriptions.differences()
         if (problem := self.session.problem) is not None:
             found.append(Difference(TopicName(""), problem))
         return found
@@ -281,30 +309,3 @@ class ZenohEndpoint:
 
     def serve(self, info: ServiceInfo, handler: ServiceHandler) -> ServiceServer:
         return self.services.serve(info, handler)
-
-    # --- for the parts of this package ------------------------------------------------------------------------------
-
-    def asks(self, info: TopicInfo) -> Qos:
-        """What to ask for: what any of the publishers offers."""
-        topic = self._topics.get(info.name)
-        offers = () if topic is None else topic.publishers.values()
-        return Qos(
-            any(qos.reliable for qos in offers),
-            any(qos.transient_local for qos in offers),
-            max((qos.depth for qos in offers), default=names.DEFAULT_DEPTH),
-        )
-
-    @property
-    def learning_s(self) -> float:
-        """How much longer the graph may be incomplete."""
-        return max(0.0, self._started_s + LEARN_S - self._loop.time())
-
-    def drop_first(self, why: DropReason) -> None:
-        """Count a message that waited for its first subscribers in vain."""
-        self._first_dropped[why] += 1
-
-    def forget(self, subscription: Subscription) -> None:
-        self.subscriptions.remove(subscription)
-
-    def ended(self, publisher: Publisher) -> None:
-        self._publishers.remove(publisher)

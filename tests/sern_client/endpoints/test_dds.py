@@ -296,9 +296,9 @@ async def test_a_loop_that_is_too_slow_loses_the_oldest(domain_id: int, monkeypa
             return True
 
         subscription = two.subscribe(info.name, sink)
-        await until(lambda: publisher.matched == 1)
+        await until(lambda: publisher.writer.matched == 1)
         bodies = [b"\0\x01\0\0\x04\0\0\0" + b"%03d\0" % number for number in range(100)]
-        assert publisher.first.over  # what is published goes out at once
+        assert not publisher.waits  # what is published goes out at once
         for body in bodies:
             publisher.publish(body, 1)
         patience = Patience()

@@ -91,8 +91,8 @@ class Pair:
         publisher = self.one.advertise(replace(info, depth=500))
         await until(lambda: self.two.graph.writers("rt/chat"))
         self.two.subscribe(TopicName("/chat"), self.sink)
-        await until(lambda: publisher.matched == 1)
-        assert publisher.first.over and len(self.opened) == 1
+        await until(lambda: publisher.writer.matched == 1)
+        assert not publisher.waits and len(self.opened) == 1
         return publisher
 
 
@@ -187,7 +187,7 @@ class Held:
 async def in_the_end(pair: Pair, publisher: Stream) -> list[bytes]:
     """All that came, when what is written last has come and no reader is being let go."""
     last = body(9999)
-    await until(lambda: publisher.matched == 1 and not pair.two._leaving, "the end of the readers before")
+    await until(lambda: publisher.writer.matched == 1 and not pair.two._leaving, "the end of the readers before")
     publisher.publish(last, 1)
     await until(lambda: last in pair.got, "the last message")
     return pair.got[:-1]
