@@ -27,6 +27,9 @@ class PendingCalls:
     def __len__(self) -> int:
         return len(self._waiting)
 
+    def __iter__(self) -> Iterator[int]:
+        return iter(self._waiting)
+
     @contextmanager
     def call(self, number: int) -> Iterator[asyncio.Future[bytes]]:
         """The answer of a call that waits inside; it may raise ServiceError."""
