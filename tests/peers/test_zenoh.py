@@ -105,10 +105,10 @@ class Peer:
         assert answer["done"], f"the peer ended with {self.process.returncode}"
         return answer
 
-    async def sees(self, kind: str, name: str) -> None:
-        """Wait until the peer's own graph has it: it asks for what is latched, and calls services, only once."""
+    async def sees(self, kind: str, name: str, *, there: bool = True) -> None:
+        """Wait until the peer's own graph has it, or not: it asks for what is latched, and calls services, once."""
         async with asyncio.timeout(60):
-            while not (await self.do("sees", kind=kind, name=name.replace("/", "%")))["sees"]:
+            while (await self.do("sees", kind=kind, name=name.replace("/", "%")))["sees"] is not there:
                 pass
 
     async def kill(self) -> None:
@@ -180,6 +180,35 @@ async def test_a_node_is_heard_while_it_publishes(endpoint: tuple[ZenohEndpoint,
     subscription.close()
     await peer.do("close", thing="pub" + CHAT)
     await until(lambda: CHAT not in events.infos, "the topic has ended")
+
+
+async def test_a_topic_that_nobody_wants_has_no_subscriber(endpoint: tuple[ZenohEndpoint, Events], peer: Peer) -> None:
+    ours, events = endpoint
+    await peer.do("publisher", name=CHAT)
+    await until(lambda: CHAT in events.infos, "the topic is announced")
+    got: list[bytes] = []
+
+    def take(body: bytes, _stamp_ns: int) -> bool:
+        got.append(body)
+        return True
+
+    ours.subscribe(CHAT, take)
+    await peer.sees("MS", CHAT)
+    ours.interest(CHAT, False)
+    await peer.sees("MS", CHAT, there=False)
+    await peer.do("publish", name=CHAT, data="unwanted")
+    await peer.do("publisher", name="/later")
+    await until(lambda: "/later" in events.infos, "told after what was published")
+    assert CHAT in events.infos and got == []
+    ours.interest(CHAT, True)
+    await peer.sees("MS", CHAT)
+
+    async def heard() -> None:
+        while not got:  # until the subscriber has reached the peer
+            await peer.do("publish", name=CHAT, data="wanted")
+
+    await asyncio.wait_for(heard(), DEADLINE_S)
+    assert set(got) == {text("wanted")}
 
 
 async def test_what_is_published_here_reaches_a_node(endpoint: tuple[ZenohEndpoint, Events], peer: Peer) -> None:

@@ -16,6 +16,7 @@ from sern_client.endpoints.common.stream import Stream
 from sern_client.endpoints.dds import endpoint as module
 from sern_client.endpoints.dds.domain import DomainOptions
 from sern_client.endpoints.dds.endpoint import DdsEndpoint, DdsOptions
+from sern_client.endpoints.dds.entities import Writer
 from sern_client.endpoints.dds.graph import Remote
 from sern_client.endpoints.dds.qos import EndpointQos, mismatches, reader_for, within_reach
 from sern_core.vocabulary.errors import ConfigError
@@ -85,7 +86,7 @@ class Pair:
         self.two.remote_added(remote)
         settle(self.two)
 
-    async def connect(self) -> Stream:
+    async def connect(self) -> Stream[Writer]:
         """Take /chat of `one` at `two`."""
         info = topic_info("/chat", "std_msgs/msg/String", Encoding.CDR, reliable=True)
         publisher = self.one.advertise(replace(info, depth=500))
@@ -184,7 +185,7 @@ class Held:
         self._end.set()
 
 
-async def in_the_end(pair: Pair, publisher: Stream) -> list[bytes]:
+async def in_the_end(pair: Pair, publisher: Stream[Writer]) -> list[bytes]:
     """All that came, when what is written last has come and no reader is being let go."""
     last = body(9999)
     await until(lambda: publisher.writer.matched == 1 and not pair.two._leaving, "the end of the readers before")

@@ -80,7 +80,7 @@ def test_options_are_those_of_the_section() -> None:
 
 @pytest.mark.parametrize(("section", "options"), PAIRS, ids=lambda item: item.__name__)
 def test_every_key_of_a_section_reaches_the_options(section: type[EndpointBase], options: type[Any]) -> None:
-    values = {name: f"value of {name}" for name in section.model_fields}
+    values: dict[str, Any] = {name: f"value of {name}" for name in section.model_fields}
     made = options_of(options, section.model_construct(**values), Path)
     found = asdict(made)
     found |= {key: value for inner in found.values() if isinstance(inner, dict) for key, value in inner.items()}
