@@ -261,11 +261,10 @@ class CompositeEndpoint:
     @property
     def drops(self) -> dict[DropReason, int]:
         """Those of all members."""
-        total: dict[DropReason, int] = {}
+        total: Counter[DropReason] = Counter()
         for member in self._members:
             if isinstance(member, CountingEndpoint):
-                for reason, count in member.drops.items():
-                    total[reason] = total.get(reason, 0) + count
+                total.update(member.drops)
         return total
 
     @property

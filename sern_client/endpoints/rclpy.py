@@ -7,17 +7,17 @@ stub of rclpy's interface (`stubs/rclpy`) and a stand-in in the tests, not again
 import asyncio
 import logging
 import time
-from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from threading import Thread
 from typing import TYPE_CHECKING, Final
 
-from sern_client.endpoints.base import GUARD_SUFFIX, Difference, Held, Publisher, Sink, TopicEvents
+from sern_client.endpoints.base import GUARD_SUFFIX, Difference, Held, Sink, TopicEvents
 from sern_client.endpoints.common.handover import Handover
 from sern_client.endpoints.common.interest import OnDemand, Subscriptions
 from sern_client.endpoints.common.saying import SayOnce
+from sern_client.endpoints.common.stream import Stream, Streams
 from sern_core.vocabulary.errors import ConfigError, UsageError
 from sern_core.vocabulary.message import TopicInfo
 from sern_core.vocabulary.types import DropReason, Encoding, TopicName
@@ -56,7 +56,7 @@ class RclpyEndpoint:
         self._say_once = SayOnce(_log)
         self._subscriptions: Subscriptions[OnDemand] = Subscriptions(self._say_once)
         self._announced: dict[TopicName, TopicInfo] = {}
-        self._publishers: list[_Publisher] = []
+        self._streams: Streams[_Writer] = Streams()
         self._handover: Handover | None = None
         self._closed_drops = 0
 
@@ -121,26 +121,21 @@ class RclpyEndpoint:
             raise UsageError(f"{name}: no such topic was announced")
         return self._subscriptions.add(OnDemand(info, sink, self._receive, self._subscriptions.remove))
 
-    def advertise(self, info: TopicInfo) -> Publisher:
+    def advertise(self, info: TopicInfo) -> "Stream[_Writer]":
         message_type = self._message_type(info.name, info.type_name)
         profile = _profile(reliable=info.reliable is not False, latched=info.latched, depth=LATCHED_DEPTH)
-        opened = _Publisher(self, info.name, self._node, self._node.create_publisher(message_type, info.name, profile))
-        self._publishers.append(opened)
-        return opened
+        writer = _Writer(self._node, self._node.create_publisher(message_type, info.name, profile))
+        return self._streams.open(info.name, writer, None, self._late)
 
     def validate(self, held: Held) -> list[Difference]:
         """Without the thread that spins nothing is received: that is a difference of every topic."""
-        publishers = Counter(publisher.name for publisher in self._publishers)
-        found = held.differences(Held(publishers, self._subscriptions.names)) + self._subscriptions.differences()
+        found = held.differences(Held(self._streams.names, self._subscriptions.names))
+        found += self._subscriptions.differences()
         if not self._thread.is_alive():
             found.append(Difference(TopicName(""), "the thread of rclpy has ended; start the client again"))
         if self._task.done():
             found.append(Difference(TopicName(""), "nobody looks at the graph any more; start the client again"))
         return found
-
-    def closed(self, publisher: "_Publisher") -> None:
-        """A publisher of ours is no more."""
-        self._publishers.remove(publisher)
 
     def _receive(self, info: TopicInfo, arrived: Callable[[bytes, int], None]) -> Callable[[], None]:
         node, handover = self._node, self._handover
@@ -158,7 +153,7 @@ class RclpyEndpoint:
 
         return end
 
-    def dropped(self) -> None:
+    def _late(self) -> None:
         """A message came to a publisher that is closed."""
         self._closed_drops += 1
 
@@ -270,25 +265,17 @@ class RclpyEndpoint:
         return TopicInfo(name, type_name, Encoding.CDR, type_hash, definition, latched, reliable)
 
 
-class _Publisher:
-    def __init__(self, owner: RclpyEndpoint, name: TopicName, node: "Node", publisher: "RosPublisher") -> None:
-        self.name = name
-        self._owner = owner
+class _Writer:
+    def __init__(self, node: "Node", publisher: "RosPublisher") -> None:
         self._node = node
-        self._publisher: RosPublisher | None = publisher
+        self._publisher = publisher
 
     def publish(self, body: bytes, stamp_ns: int) -> None:
         del stamp_ns  # rclpy stamps what it publishes itself
-        if self._publisher is None:
-            self._owner.dropped()
-        else:
-            self._publisher.publish(body)
+        self._publisher.publish(body)
 
     def close(self) -> None:
-        publisher, self._publisher = self._publisher, None
-        if publisher is not None:
-            self._owner.closed(self)
-            self._node.destroy_publisher(publisher)
+        self._node.destroy_publisher(self._publisher)
 
 
 def _profile(*, reliable: bool, latched: bool, depth: int) -> "QoSProfile":

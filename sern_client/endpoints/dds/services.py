@@ -19,17 +19,15 @@ from sern_client.endpoints.base import ServiceEvents, ServiceHandler, ServiceInf
 from sern_client.endpoints.common.calls import PendingCalls, Tasks, within
 from sern_client.endpoints.common.saying import SayOnce
 from sern_client.endpoints.dds import names
-from sern_client.endpoints.dds.counters import DdsCounters
 from sern_client.endpoints.dds.definitions import Definitions
-from sern_client.endpoints.dds.entities import Reader, Writer
-from sern_client.endpoints.dds.graph import Graph, Remote, puts_header
+from sern_client.endpoints.dds.entities import Entities
+from sern_client.endpoints.dds.graph import Remote, puts_header
 from sern_client.endpoints.dds.names import Role
 from sern_client.endpoints.dds.qos import EndpointQos
 from sern_client.endpoints.dds.worker import Sample
 from sern_core.vocabulary.errors import ConfigError, ServiceError, UsageError
 from sern_core.vocabulary.types import Encoding, TopicName
 from sern_runtime import ros_services
-from sern_runtime.ros_types import ResolvedType
 
 DEPTH: Final = 10
 """History of requests and replies: what ROS 2 has by default for services."""
@@ -136,45 +134,13 @@ class _Server:
         self.tasks.cancel()
 
 
-class ServiceOwner(Protocol):
-    """What services need of the endpoint that has them."""
-
-    graph: Graph
-    counters: DdsCounters
-    types: Definitions
-    say_once: SayOnce
-    """What a person has to know and do something about."""
-
-    def open_reader(
-        self,
-        topic: str,
-        resolved: ResolvedType,
-        qos: EndpointQos,
-        deliver: Callable[[Sample], None],
-        *,
-        header: bool = False,
-        id_key: str = "clientid",
-    ) -> Reader:
-        """With `header`, of requests or replies. ConfigError where DDS gives none."""
-
-    def open_writer(
-        self,
-        topic: str,
-        resolved: ResolvedType,
-        qos: EndpointQos,
-        *,
-        depth: int,
-        header: bool = False,
-        id_key: str = "clientid",
-    ) -> Writer:
-        """ConfigError as `open_reader`."""
-
-
 class DdsServices:
     """The services of one endpoint."""
 
-    def __init__(self, endpoint: ServiceOwner) -> None:
-        self._endpoint = endpoint
+    def __init__(self, entities: Entities, types: Definitions, say_once: SayOnce) -> None:
+        self._entities = entities
+        self._types = types
+        self._say_once = say_once
         self._events: ServiceEvents | None = None
         self._known: dict[TopicName, ServiceInfo] = {}
         self._clients: dict[TopicName, _Client] = {}
@@ -221,7 +187,7 @@ class DdsServices:
 
     def _find(self, name: TopicName) -> ServiceInfo | None:
         """A service is there when one participant reads its requests and writes its replies."""
-        graph = self._endpoint.graph
+        graph = self._entities.graph
         repliers = {writer.participant for writer in graph.writers(names.to_dds(name, Role.REPLY))}
         unknown: set[tuple[str, str]] = set()
         for reader in graph.readers(names.to_dds(name, Role.REQUEST)):
@@ -237,12 +203,10 @@ class DdsServices:
             if kind in unknown:
                 continue
             try:
-                text = self._endpoint.types.service(*kind)
+                text = self._types.service(*kind)
             except ConfigError as error:
                 unknown.add(kind)
-                self._endpoint.say_once(
-                    f"service {name} of {graph.owner(reader)} is left alone: {names.cut(str(error), 600)}"
-                )
+                self._say_once(f"service {name} of {graph.owner(reader)} is left alone: {names.cut(str(error), 600)}")
                 continue
             return ServiceInfo(name, type_name, Encoding.CDR, text.type_hash, text.definition)
         return None
@@ -250,8 +214,8 @@ class DdsServices:
     def _understood(self, name: TopicName, remote: Remote) -> bool:
         if puts_header(remote):
             return True
-        self._endpoint.say_once(
-            f"service {name}: {self._endpoint.graph.owner(remote)} uses rmw_fastrtps, whose calls Cyclone DDS cannot "
+        self._say_once(
+            f"service {name}: {self._entities.graph.owner(remote)} uses rmw_fastrtps, whose calls Cyclone DDS cannot "
             "carry; run that node with RMW_IMPLEMENTATION=rmw_cyclonedds_cpp to have its services bridged"
         )
         return False
@@ -297,7 +261,7 @@ class DdsServices:
             try:
                 body, client, number = Wrapped.split(sample.body)
             except ValueError:
-                self._endpoint.counters.unreadable += 1
+                self._entities.counters.unreadable += 1
                 return
             if client == client_id:
                 pending.answer(number, body)
@@ -318,10 +282,10 @@ class DdsServices:
         (out_topic, out_type), (in_topic, in_type) = (reply, request) if serve else (request, reply)
         key = "serviceid" if serve else "clientid"
         qos = EndpointQos(reliable=True, type_hash=in_type.text.type_hash, service_id=ident)
-        reader = self._endpoint.open_reader(in_topic, in_type, qos, deliver, header=True, id_key=key)
+        reader = self._entities.open_reader(in_topic, in_type, qos, deliver, header=True, id_key=key)
         qos = replace(qos, type_hash=out_type.text.type_hash)
         try:
-            writer = self._endpoint.open_writer(out_topic, out_type, qos, depth=DEPTH, header=True, id_key=key)
+            writer = self._entities.open_writer(out_topic, out_type, qos, depth=DEPTH, header=True, id_key=key)
         except ConfigError:
             reader.close()
             raise
@@ -335,7 +299,7 @@ class DdsServices:
             raise ConfigError(f"service {info.name}: {info.encoding} bodies cannot be served in ROS 2")
         if any(server.info.name == info.name for server in self._servers):
             raise UsageError(f"service {info.name} is served already")
-        text = self._endpoint.types.service(info.type_name) if not info.definition else None
+        text = self._types.service(info.type_name) if not info.definition else None
         if text is not None:
             info = ServiceInfo(info.name, info.type_name, info.encoding, text.type_hash, text.definition)
         server = _Server(self, info, handler)
@@ -348,18 +312,18 @@ class DdsServices:
         return server
 
     def _asked(self, server: _Server, sample: Sample) -> None:
-        caller = self._endpoint.graph.writer(sample.handle)
+        caller = self._entities.graph.writer(sample.handle)
         if caller is not None and not self._understood(server.info.name, caller):
             return
         try:
             request, client, number = Wrapped.split(sample.body)
         except ValueError as error:
-            self._endpoint.counters.unreadable += 1
-            self._endpoint.say_once(f"service {server.info.name}: {error}")
+            self._entities.counters.unreadable += 1
+            self._say_once(f"service {server.info.name}: {error}")
             return
         if server.tasks.full:
-            self._endpoint.counters.calls += 1
-            self._endpoint.say_once(f"service {server.info.name}: more than {MAX_CALLS} calls at a time; some fail")
+            self._entities.counters.calls += 1
+            self._say_once(f"service {server.info.name}: more than {MAX_CALLS} calls at a time; some fail")
             return
         server.tasks.begin(self._answer(server, request, client, number))
 

@@ -8,7 +8,7 @@ messages wait for the subscribers that there are (`hold`), also when the far sid
 
 import asyncio
 import logging
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterable
 from functools import partial
 from math import inf
@@ -121,10 +121,10 @@ class Limits:
     def __init__(self, messages: int, size_bytes: int) -> None:
         self.messages = messages
         self.bytes = size_bytes
-        self.dropped: dict[DropReason, int] = {}
+        self.dropped: Counter[DropReason] = Counter()
 
     def drop(self, why: DropReason, count: int = 1) -> None:
-        self.dropped[why] = self.dropped.get(why, 0) + count
+        self.dropped[why] += count
 
 
 class Publication:

@@ -8,6 +8,7 @@ SERN endpoint is never a source: its messages came over a link.
 import asyncio
 import logging
 import time
+from collections import Counter
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -40,12 +41,12 @@ class ReceiveCounters:
     accepted: int = 0
     refused: int = 0
     """Offered to the link, which counts them, and answered with no."""
-    dropped: dict[DropReason, int] = field(default_factory=dict)
+    dropped: Counter[DropReason] = field(default_factory=Counter)
     mismatches: int = 0
     """Publishers that were refused because they mean another type."""
 
     def drop(self, why: DropReason) -> None:
-        self.dropped[why] = self.dropped.get(why, 0) + 1
+        self.dropped[why] += 1
 
 
 class Owner(Protocol):

@@ -81,7 +81,7 @@ async def test_from_ros2_to_the_link(
         await until(partial(_has, recorder, number))
     assert strangers([got for got, _ in recorder.got], bodies) == {}
     assert all(stamp_ns > STAMP_NS for _, stamp_ns in recorder.got)
-    assert endpoint.counters.received == len(bodies) and endpoint.overruns() == 0
+    assert endpoint.counters.received == len(bodies) and endpoint.entities.overruns() == 0
     subscription.close()
     await peer.line("matched a 0")
     await peer.do("close a")
