@@ -56,7 +56,7 @@ async def test_a_loop_that_is_behind_counts_what_it_drops(monkeypatch: pytest.Mo
     endpoint = ZenohEndpoint(ZenohOptions(SessionOptions(connect=(), listen=("tcp/127.0.0.1:0",))))
     await endpoint.start(Events())
     try:
-        monkeypatch.setattr(endpoint.session.handover, "_max_bytes", 115)
+        monkeypatch.setattr(endpoint.session.handover.messages, "max_bytes", 115)
         for _ in range(3):
             endpoint.session.handover.put(lambda: None, 10)
         await asyncio.sleep(0)
@@ -206,10 +206,10 @@ async def test_an_attachment_counts_for_what_waits(two: Two, monkeypatch: pytest
     def arrived() -> bool:
         """Until the two have met, what is published is for nobody: again and again."""
         there.session.opened.put(key, b"", attachment=bytes(60_000))
-        return bool(handover._messages)
+        return bool(handover.messages)
 
     await until(arrived)
-    assert handover._nbytes >= 60_000 and handover._messages[0].nbytes == 60_000 + ITEM_BYTES
+    assert handover.messages.nbytes == len(handover.messages) * (60_000 + ITEM_BYTES)
     handover._run()
     assert b"" in got
 
@@ -226,12 +226,12 @@ async def test_a_request_that_is_dropped_is_refused(two: Two, monkeypatch: pytes
     await until(lambda: lamp.name in two.other_events.services)
     assert await caller.call(lamp.name, b"first", timeout_s=DEADLINE_S) == b"first"
     handover = server.session.handover
-    monkeypatch.setattr(handover, "_max_bytes", 1)
+    monkeypatch.setattr(handover.messages, "max_bytes", 1)
     monkeypatch.setattr(handover, "_wakes", lambda: False)  # the loop is busy
     calls = list[asyncio.Task[bytes]]()
     for word in (b"one", b"two"):
         calls.append(asyncio.create_task(caller.call(lamp.name, word, timeout_s=DEADLINE_S)))
-        await until(lambda: handover._messages and handover.dropped == len(calls) - 1)
+        await until(lambda: handover.messages and handover.dropped == len(calls) - 1)
     with pytest.raises(ServiceError, match="/lamp: the bridge is behind"):
         await calls[0]
     assert not calls[1].done() and server.drops == {DropReason.QUEUE_FULL: 1}
