@@ -1,5 +1,6 @@
 """What is said of others' mistakes: once each, and no more of them than a log can do with."""
 
+import asyncio
 import logging
 from collections.abc import Callable, Hashable
 from typing import Final
@@ -8,6 +9,8 @@ from sern_runtime import clock
 
 MAX_SAID: Final = 1000
 """Lines of one endpoint: anybody on its network can give reason for another one."""
+
+_log = logging.getLogger(__name__)
 
 
 class SayOnce:
@@ -35,8 +38,9 @@ class SayOnce:
 class Trouble:
     """What is wrong with one peer: said once until it is something else, and its end too."""
 
-    def __init__(self, log: logging.Logger) -> None:
+    def __init__(self, log: logging.Logger, who: str) -> None:
         self._log = log
+        self._who = who
         self._problem = ""
         self._lost_s: float | None = None
 
@@ -46,29 +50,29 @@ class Trouble:
         return new
 
     def say(
-        self,
-        who: str,
-        problem: str,
-        level: int = logging.WARNING,
-        error: Exception | None = None,
-        *,
-        lost: bool = False,
+        self, problem: str, level: int = logging.WARNING, error: Exception | None = None, *, lost: bool = False
     ) -> bool:
         """Log a problem if it is new. `lost`: the peer is of no use until `over`. `error`: shown with its traceback."""
         if not self.is_new(problem):
             return False
         if lost and self._lost_s is None:
             self._lost_s = clock.now()
-        self._log.log(level, "%s: %s", who, problem, exc_info=error)
+        self._log.log(level, "%s: %s", self._who, problem, exc_info=error)
         return True
 
-    def over(self, who: str) -> None:
+    def over(self) -> None:
         """The peer answers. Whoever was told that it was lost is told so."""
         lost_s, self._lost_s = self._lost_s, None
         if lost_s is not None:
             self._problem = ""
-            self._log.warning("%s answers again, after %.0f s", who, clock.now() - lost_s)
+            self._log.warning("%s answers again, after %.0f s", self._who, clock.now() - lost_s)
 
     def forget(self) -> None:
         """All is well: the same problem would be news."""
         self._problem = ""
+
+
+def say_failure(task: asyncio.Task[None]) -> None:
+    """Log why a task ended that nobody waits for; for `add_done_callback`."""
+    if not task.cancelled() and (error := task.exception()) is not None:
+        _log.error("%s ended", task.get_name(), exc_info=error)

@@ -13,14 +13,14 @@ import struct
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from typing import Final, Protocol
+from typing import Final
 
 from sern_client.endpoints.base import ServiceEvents, ServiceHandler, ServiceInfo
 from sern_client.endpoints.common.calls import PendingCalls, Tasks, within
 from sern_client.endpoints.common.saying import SayOnce
 from sern_client.endpoints.dds import names
 from sern_client.endpoints.dds.definitions import Definitions
-from sern_client.endpoints.dds.entities import Entities
+from sern_client.endpoints.dds.entities import Entities, Reader, Writer
 from sern_client.endpoints.dds.graph import Remote, puts_header
 from sern_client.endpoints.dds.names import Role
 from sern_client.endpoints.dds.qos import EndpointQos
@@ -71,31 +71,18 @@ def new_service_id() -> str:
     return ".".join(f"{byte:x}" for byte in secrets.token_bytes(16))
 
 
-async def _matched(side: "_Side") -> None:
+async def _matched(side: Reader | Writer) -> None:
     """Wait until a writer has a reader, or a reader a writer."""
     while not side.matched:  # noqa: ASYNC110  DDS says so by status only
         await asyncio.sleep(MATCH_POLL_S)
-
-
-class _Side(Protocol):
-    """A reader or writer, as far as it matters here. `matched`: how many of others it is connected with."""
-
-    @property
-    def matched(self) -> int: ...
-
-    def close(self) -> None: ...
-
-
-class _Out(_Side, Protocol):
-    def publish(self, body: bytes, stamp_ns: int) -> None: ...
 
 
 @dataclass(slots=True)
 class _Client:
     info: ServiceInfo
     ident: int
-    writer: _Out
-    reader: _Side
+    writer: Writer
+    reader: Reader
     pending: PendingCalls
     number: int = 0
     met_s: float | None = None
@@ -114,8 +101,8 @@ class _Server:
     info: ServiceInfo
     handler: ServiceHandler
     closed: bool = False
-    writer: _Out | None = None
-    reader: _Side | None = None
+    writer: Writer | None = None
+    reader: Reader | None = None
     tasks: Tasks = field(default_factory=lambda: Tasks(MAX_CALLS))
 
     def close(self) -> None:
@@ -274,7 +261,7 @@ class DdsServices:
 
     def _pair(
         self, info: ServiceInfo, deliver: Callable[[Sample], None], ident: str, *, serve: bool
-    ) -> tuple[_Out, _Side]:
+    ) -> tuple[Writer, Reader]:
         """Writer and reader of one side of a service."""
         resolved = ros_services.resolve(info.type_name, info.definition, Encoding.CDR)
         request = names.to_dds(info.name, Role.REQUEST), resolved.request

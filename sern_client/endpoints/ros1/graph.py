@@ -98,7 +98,7 @@ class Node:
         self.alive = False
         self.members: list[Member] = []
         self._master = master
-        self._trouble = Trouble(_log)
+        self._trouble = Trouble(_log, name)
         self._look = asyncio.Event()
         self._transport: asyncio.BaseTransport | None = None
         self._task = asyncio.create_task(self._run(), name=f"ros1 node {name}")

@@ -71,7 +71,7 @@ class Provider:
         self.info: ServiceInfo | None = None
         self._owner = owner
         self._task: asyncio.Task[None] | None = None
-        self._trouble = Trouble(_log)
+        self._trouble = Trouble(_log, f"{service}: service of {node_name}")
 
     def up(self, uri: str) -> None:
         del uri  # its own address is looked up, because it is not its node's
@@ -87,7 +87,7 @@ class Provider:
             self._owner.withdraw(self)
 
     async def _run(self) -> None:
-        pause_s, who = PROBE_AGAIN_S[0], f"{self.service}: service of {self.node_name}"
+        pause_s = PROBE_AGAIN_S[0]
         while True:
             unexpected: Exception | None = None
             try:
@@ -96,7 +96,7 @@ class Provider:
                 if BRIDGE_FIELD not in fields or self._owner.heed_sern:
                     self.info = self._describe(fields)
                     self._owner.announce(self)
-                self._trouble.over(who)
+                self._trouble.over()
                 return
             except (CallError, WireError, OSError, asyncio.IncompleteReadError, ConfigError) as error:
                 problem = reason(error)
@@ -105,7 +105,7 @@ class Provider:
             except Exception as error:  # noqa: BLE001  an error of ours must not be the end of a service
                 problem, unexpected = f"internal error: {reason(error)}", error
             level = logging.WARNING if unexpected is None else logging.ERROR
-            self._trouble.say(who, problem, level, unexpected, lost=True)
+            self._trouble.say(problem, level, unexpected, lost=True)
             await asyncio.sleep(pause_s)
             pause_s = min(pause_s * 2, PROBE_AGAIN_S[1])
 

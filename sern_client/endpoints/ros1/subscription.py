@@ -10,12 +10,11 @@ import logging
 import time
 from collections import Counter
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Final, Protocol
 
 from sern_client.endpoints.base import Sink
-from sern_client.endpoints.common.saying import Trouble
+from sern_client.endpoints.common.saying import Trouble, say_failure
 from sern_client.endpoints.ros1.frames import Frames
 from sern_client.endpoints.ros1.header import BRIDGE_FIELD, check_lengths, encode_header
 from sern_client.endpoints.ros1.master import ANY
@@ -133,7 +132,7 @@ class Source:
         self.wake = asyncio.Event()
         """Its messages are wanted now."""
         self._task: asyncio.Task[None] | None = None
-        self._trouble = Trouble(_log)
+        self._trouble = Trouble(_log, f"{topic.topic}: publisher {node_name}")
         self._too_large = False
 
     def up(self, uri: str) -> None:
@@ -143,7 +142,7 @@ class Source:
         self.down()
         self.uri = uri
         self._task = asyncio.create_task(self._run(), name=f"ros1 {self.topic.topic} from {self.node_name}")
-        self._task.add_done_callback(_log_failure)
+        self._task.add_done_callback(say_failure)
 
     def down(self) -> None:
         """Its node is dead, or no longer publishes this."""
@@ -222,7 +221,7 @@ class Source:
     def broke(self, error: WireError) -> None:
         """It broke the protocol after its header came, or with it."""
         if self.link is not None and self.link.open:
-            self._say(str(error))
+            self._trouble.say(str(error))
         else:
             self._failed(str(error))
         if self.fields is not None:
@@ -232,7 +231,7 @@ class Source:
     def _failed(self, problem: str, error: Exception | None = None) -> None:
         """There is no connection, or none that is of use. `error`: what nobody expected."""
         level = logging.WARNING if error is None else logging.ERROR
-        self._say(problem, level, error, lost=True)
+        self._trouble.say(problem, level, error, lost=True)
 
     def greet(self, link: _Link, fields: dict[str, str]) -> None:
         """Its header has come: decide whether to stay connected."""
@@ -244,7 +243,7 @@ class Source:
         self.fields = fields
         ours = BRIDGE_FIELD in fields and not self.topic.owner.heed_sern
         self.info = None if ours else self._describe(fields)
-        self._trouble.over(self._who)
+        self._trouble.over()
         self.topic.sources_changed()
         if not self.topic.connects(self):
             link.close()
@@ -271,10 +270,12 @@ class Source:
         try:
             computed = ros_types.hash_of(type_name, text, Encoding.ROS1)
         except ConfigError as error:
-            self._say(error.problem)
+            self._trouble.say(error.problem)
             return ""
         if computed != md5:
-            self._say(f"md5sum {md5} of {type_name} does not belong to the definition it sends, which has {computed}")
+            self._trouble.say(
+                f"md5sum {md5} of {type_name} does not belong to the definition it sends, which has {computed}"
+            )
             return ""
         return text
 
@@ -285,7 +286,7 @@ class Source:
             f"it publishes {self.info.type_name} with md5sum {self.info.type_hash}, others here "
             f"{announced.type_name} with {announced.type_hash}; not received, rebuild one of them"
         )
-        if self._say(problem, logging.ERROR):
+        if self._trouble.say(problem, logging.ERROR):
             self.topic.owner.counters.mismatches += 1
 
     def too_large(self, size_bytes: int, limit_bytes: int) -> None:
@@ -293,16 +294,7 @@ class Source:
         self.topic.owner.counters.drop(DropReason.TOO_LARGE)
         if not self._too_large:
             self._too_large = True
-            self._say(f"a message of {size_bytes} bytes is dropped, max_message_bytes is {limit_bytes}")
-
-    def _say(
-        self, problem: str, level: int = logging.WARNING, error: Exception | None = None, *, lost: bool = False
-    ) -> bool:
-        return self._trouble.say(self._who, problem, level, error, lost=lost)
-
-    @property
-    def _who(self) -> str:
-        return f"{self.topic.topic}: publisher {self.node_name}"
+            self._trouble.say(f"a message of {size_bytes} bytes is dropped, max_message_bytes is {limit_bytes}")
 
 
 class Topic:
@@ -435,9 +427,3 @@ def _same_type(one: TopicInfo | None, other: TopicInfo | None) -> bool:
     return (
         one is not None and other is not None and (one.type_name, one.type_hash) == (other.type_name, other.type_hash)
     )
-
-
-def _log_failure(task: asyncio.Task[None]) -> None:
-    with suppress(asyncio.CancelledError):
-        if (error := task.exception()) is not None:
-            _log.error("%s ended", task.get_name(), exc_info=error)

@@ -44,14 +44,14 @@ def test_what_nobody_expects_comes_with_its_traceback(caplog: pytest.LogCaptureF
 
 
 def test_a_trouble_is_said_until_it_is_another_and_its_end_with_it(caplog: pytest.LogCaptureFixture) -> None:
-    trouble = Trouble(LOG)
-    trouble.over("/talker")
+    trouble = Trouble(LOG, "/talker")
+    trouble.over()
     for problem in ("refused", "refused", "no answer", "refused"):
-        trouble.say("/talker", problem, lost=True)
-    trouble.over("/talker")
-    trouble.over("/talker")
-    assert trouble.say("/talker", "refused"), "again: it had answered"
-    trouble.over("/talker")
+        trouble.say(problem, lost=True)
+    trouble.over()
+    trouble.over()
+    assert trouble.say("refused"), "again: it had answered"
+    trouble.over()
     assert said(caplog) == [
         "/talker: refused", "/talker: no answer", "/talker: refused", "/talker answers again, after 0 s",
         "/talker: refused",
