@@ -38,6 +38,7 @@ from sern_core.vocabulary.errors import ConfigError, UsageError
 from sern_core.vocabulary.message import TopicInfo
 from sern_core.vocabulary.types import Encoding, TopicName
 from sern_runtime import ros_types
+from sern_runtime.entry import end_tasks
 from sern_runtime.ros_types import one_line
 
 BATCH_MESSAGES: Final = 512
@@ -153,10 +154,7 @@ class BagEndpoint:
         self._task.add_done_callback(self._play_done)
 
     async def stop(self) -> None:
-        task, self._task = self._task, None
-        if task is not None:
-            task.cancel()
-            await asyncio.wait([task])
+        await end_tasks([] if self._task is None else [self._task])
         for topic in self._topics.values():
             for subscription in list(topic.subscriptions):
                 subscription.close()

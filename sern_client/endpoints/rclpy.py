@@ -7,6 +7,7 @@ stub of rclpy's interface (`stubs/rclpy`) and a stand-in in the tests, not again
 import asyncio
 import logging
 import time
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -58,7 +59,6 @@ class RclpyEndpoint:
         self._announced: dict[TopicName, TopicInfo] = {}
         self._streams: Streams[_Writer] = Streams()
         self._handover: Handover | None = None
-        self._closed_drops = 0
 
     @property
     def encoding(self) -> Encoding | None:
@@ -72,8 +72,7 @@ class RclpyEndpoint:
     def drops(self) -> dict[DropReason, int]:
         """Messages dropped because the event loop was behind, or nobody can be reached any more."""
         behind = 0 if self._handover is None else self._handover.dropped
-        counted = {DropReason.QUEUE_FULL: behind, DropReason.DISCONNECTED: self._closed_drops}
-        return {reason: count for reason, count in counted.items() if count}
+        return Counter({DropReason.QUEUE_FULL: behind}) + self._streams.dropped
 
     async def start(self, events: TopicEvents) -> None:
         try:
@@ -125,7 +124,7 @@ class RclpyEndpoint:
         message_type = self._message_type(info.name, info.type_name)
         profile = _profile(reliable=info.reliable is not False, latched=info.latched, depth=LATCHED_DEPTH)
         writer = _Writer(self._node, self._node.create_publisher(message_type, info.name, profile))
-        return self._streams.open(info.name, writer, None, self._late)
+        return self._streams.open(info.name, writer, None)
 
     def validate(self, held: Held) -> list[Difference]:
         """Without the thread that spins nothing is received: that is a difference of every topic."""
@@ -152,10 +151,6 @@ class RclpyEndpoint:
             node.destroy_subscription(opened)
 
         return end
-
-    def _late(self) -> None:
-        """A message came to a publisher that is closed."""
-        self._closed_drops += 1
 
     def _message_type(self, name: TopicName, type_name: str) -> type[object]:
         from rosidl_runtime_py.utilities import get_message

@@ -23,6 +23,7 @@ from sern_core.vocabulary.errors import ConfigError, UsageError
 from sern_core.vocabulary.message import TopicInfo
 from sern_core.vocabulary.types import Encoding, TopicName
 from sern_runtime import ros_types
+from sern_runtime.entry import end_tasks
 from sern_sim.robot import STEP_S, RobotState
 
 COUNTER_RATE_HZ: Final = 5.0
@@ -176,10 +177,7 @@ class SyntheticEndpoint:
         self._task.add_done_callback(say_failure)
 
     async def stop(self) -> None:
-        task, self._task = self._task, None
-        if task is not None:
-            task.cancel()
-            await asyncio.wait([task])
+        await end_tasks([] if self._task is None else [self._task])
         for topic in self._topics.values():
             for subscription in list(topic.subscriptions):
                 subscription.close()

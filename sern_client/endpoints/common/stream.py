@@ -1,12 +1,11 @@
 """Streams that come in, on their way to the readers of a middleware where first messages wait for those."""
 
 from collections import Counter
-from collections.abc import Callable
 from math import inf
 from typing import Generic, Protocol, TypeVar
 
 from sern_client.endpoints.common.first import FirstMessages
-from sern_core.vocabulary.types import TopicName
+from sern_core.vocabulary.types import DropReason, TopicName
 
 
 class Writer(Protocol):
@@ -21,22 +20,15 @@ W = TypeVar("W", bound=Writer)
 
 
 class Stream(Generic[W]):
-    """The `AgingPublisher` of a stream: a writer, and what waits for its first readers, if anything does.
+    """The `AgingPublisher` of a stream: a writer, and what waits for its first readers, if anything does."""
 
-    `late` counts a message that comes after `close`; `ended` is told when the writer is closed.
-    """
-
-    def __init__(
-        self, name: TopicName, writer: W, first: FirstMessages | None, *, late: Callable[[], None],
-        ended: "Callable[[Stream[W]], None]",
-    ) -> None:  # fmt: skip
+    def __init__(self, name: TopicName, writer: W, first: FirstMessages | None, owner: "Streams[W]") -> None:
         self.name = name
         self.writer = writer
         self.closed = False
         """It takes no more; its writer lasts until the first messages are written."""
         self._first = first
-        self._late = late
-        self._ended = ended
+        self._owner = owner
 
     @property
     def waits(self) -> bool:
@@ -48,7 +40,7 @@ class Stream(Generic[W]):
 
     def publish_within(self, body: bytes, stamp_ns: int, left_s: float) -> None:
         if self.closed:
-            self._late()
+            self._owner.drop(DropReason.DISCONNECTED)
         elif self._first is None or self._first.over:
             self.writer.publish(body, stamp_ns)
         else:
@@ -65,7 +57,7 @@ class Stream(Generic[W]):
 
     def _end(self) -> None:
         self.writer.close()
-        self._ended(self)
+        self._owner.ended(self)
 
     def hurry(self) -> None:
         """Write the first messages now."""
@@ -77,12 +69,21 @@ class Streams(Generic[W]):
     """Those of an endpoint whose writers are open."""
 
     def __init__(self) -> None:
+        self.dropped: Counter[DropReason] = Counter()
+        """First messages that nobody got, and messages that came to a stream after its end."""
         self._open: list[Stream[W]] = []
 
-    def open(self, name: TopicName, writer: W, first: FirstMessages | None, late: Callable[[], None]) -> Stream[W]:
-        stream = Stream(name, writer, first, late=late, ended=self._open.remove)
+    def open(self, name: TopicName, writer: W, first: FirstMessages | None) -> Stream[W]:
+        stream = Stream(name, writer, first, self)
         self._open.append(stream)
         return stream
+
+    def ended(self, stream: Stream[W]) -> None:
+        """The writer of a stream is closed."""
+        self._open.remove(stream)
+
+    def drop(self, why: DropReason) -> None:
+        self.dropped[why] += 1
 
     @property
     def names(self) -> Counter[TopicName]:

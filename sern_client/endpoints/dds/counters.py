@@ -19,7 +19,3 @@ class DdsCounters:
     unreadable: int = 0
     closed: int = 0
     faults: int = 0
-
-    def late(self) -> None:
-        """Count a message that came to a writer that is no more."""
-        self.closed += 1

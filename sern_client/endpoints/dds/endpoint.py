@@ -34,7 +34,7 @@ from sern_client.endpoints.dds.counters import DdsCounters
 from sern_client.endpoints.dds.definitions import Definitions
 from sern_client.endpoints.dds.domain import DomainOptions
 from sern_client.endpoints.dds.entities import Entities, Writer
-from sern_client.endpoints.dds.graph import Graph, Participant, Remote
+from sern_client.endpoints.dds.graph import Graph, Remote
 from sern_client.endpoints.dds.names import RosName
 from sern_client.endpoints.dds.qos import (
     EndpointQos,
@@ -91,7 +91,6 @@ class DdsEndpoint:
         self._events: TopicEvents | None = None
         self._announced: dict[TopicName, TopicInfo] = {}
         self._streams: Streams[Writer] = Streams()
-        self._first_dropped: Counter[DropReason] = Counter()
         self._started_s = 0.0
         self._changed: dict[Hashable, Callable[[], None]] = {}
         """What is to be done for topics and services that are not as they were."""
@@ -100,7 +99,7 @@ class DdsEndpoint:
 
     async def start(self, events: TopicEvents) -> None:
         """ConfigError when the domain cannot be joined with these settings."""
-        self.entities.join(self, self.settle)
+        self.entities.join(self.settle)
         self._events = events
         self._started_s = asyncio.get_running_loop().time()
 
@@ -144,16 +143,13 @@ class DdsEndpoint:
             info.name,
             readers=lambda: writer.readers(self._waiting_readers(topic, names.type_to_dds(resolved.name), offered)),
             write=writer.publish,
-            dropped=self._drop_first,
+            dropped=self._streams.drop,
             max_messages=max(depth, self.options.queue_depth) if offered.reliable else depth,
             max_bytes=self.options.max_buffer_bytes,
             overflow=DropReason.QUEUE_FULL if offered.reliable else DropReason.SUPERSEDED,
             learning_s=self._started_s + LEARN_S - asyncio.get_running_loop().time(),
         )
-        return self._streams.open(info.name, writer, first, self.counters.late)
-
-    def _drop_first(self, why: DropReason) -> None:
-        self._first_dropped[why] += 1
+        return self._streams.open(info.name, writer, first)
 
     def _waiting_readers(self, topic: str, type_name: str, offered: EndpointQos) -> set[int]:
         """The readers of others that will match such a writer and get nothing that was written before, by handle."""
@@ -214,21 +210,7 @@ class DdsEndpoint:
             DropReason.UNDECODABLE: self.counters.unreadable + self.entities.faults,
             DropReason.DISCONNECTED: self.counters.closed,
         }
-        return {reason: count for reason, count in (Counter(counted) + self._first_dropped).items() if count}
-
-    # Discovery: told by the worker
-
-    def participant_added(self, participant: Participant) -> None:
-        self.graph.participant_added(participant)
-
-    def participant_removed(self, guid: UUID) -> None:
-        self.graph.participant_removed(guid)
-
-    def remote_added(self, remote: Remote) -> None:
-        self.graph.remote_added(remote)
-
-    def remote_removed(self, guid: UUID) -> None:
-        self.graph.remote_removed(guid)
+        return {reason: count for reason, count in (Counter(counted) + self._streams.dropped).items() if count}
 
     # Discovery: told by the graph
 

@@ -17,7 +17,6 @@ from cyclonedds.topic import Topic
 from sern_client.endpoints.common.first import Readers
 from sern_client.endpoints.dds import names, node_info, raw
 from sern_client.endpoints.dds.counters import DdsCounters
-from sern_client.endpoints.dds.discovery import DiscoveryEvents
 from sern_client.endpoints.dds.domain import DomainOptions, close_domain, open_domain
 from sern_client.endpoints.dds.graph import Graph, Local
 from sern_client.endpoints.dds.idl import TypeMaker
@@ -84,7 +83,7 @@ class Writer:
 
     def publish(self, body: bytes, stamp_ns: int) -> None:
         if self._writer is None:
-            self._owner.counters.late()
+            self._owner.counters.closed += 1
             return
         # A lifespan is judged by the time stamp: only one of this host says how old a sample is here.
         result = raw.write(self._writer, body, stamp_ns if self._stamped else None)
@@ -135,7 +134,7 @@ class Entities:
         self._info_writer: Writer | None = None
         self._info_due = False
 
-    def join(self, events: DiscoveryEvents, settle: Callable[[], bool]) -> None:
+    def join(self, settle: Callable[[], bool]) -> None:
         """ConfigError when the domain cannot be joined with these settings."""
         domain = self._domain.domain
         open_domain(self._domain)
@@ -149,7 +148,7 @@ class Entities:
                 "too many participants on this host, or no such interface"
             ) from None
         self.graph.own = participant.guid
-        worker = Worker(participant, events, settle, max_buffer_bytes=self._max_buffer_bytes)
+        worker = Worker(participant, self.graph, settle, max_buffer_bytes=self._max_buffer_bytes)
         self._joined = _Joined(participant, Publisher(participant), Subscriber(participant), worker)
         info = ros_types.resolve(node_info.TYPE, "", Encoding.CDR)
         self.open_reader(DISCOVERY_TOPIC, info, _INFO_QOS, self.heed_nodes, depth=_INFO_DEPTH)

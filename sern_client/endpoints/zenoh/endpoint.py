@@ -76,7 +76,6 @@ class ZenohEndpoint:
         self._topics: dict[TopicName, _Topic] = {}
         self._left_out: dict[TopicName, dict[str, Entity]] = {}  # publishers of another type, by their key
         self._subscribers: dict[TopicName, dict[str, tuple[str, str]]] = {}  # of others: their types by their keys
-        self._first_dropped: Counter[DropReason] = Counter()
         self._started_s = 0.0
         self._streams: Streams[Writer] = Streams()
         self._look_again: asyncio.TimerHandle | None = None
@@ -97,7 +96,7 @@ class ZenohEndpoint:
             DropReason.QUEUE_FULL: self.session.put_dropped + (self.session.handover.dropped if self._events else 0),
             DropReason.DISCONNECTED: self.session.put_failed,
         }
-        return {reason: count for reason, count in (Counter(counted) + self._first_dropped).items() if count}
+        return {reason: count for reason, count in (Counter(counted) + self._streams.dropped).items() if count}
 
     async def start(self, events: TopicEvents) -> None:
         """ConfigError when zenoh does not take the settings. A router that is not there yet is waited for."""
@@ -177,16 +176,13 @@ class ZenohEndpoint:
                 info.name,
                 readers=writer.readers,
                 write=writer.publish,
-                dropped=self._drop_first,
+                dropped=self._streams.drop,
                 max_messages=(info.depth or 1) if best_effort else FIRST_MESSAGES,
                 max_bytes=MAX_WAITING_BYTES,
                 overflow=DropReason.SUPERSEDED if best_effort else DropReason.QUEUE_FULL,
                 learning_s=max(0.0, self._started_s + LEARN_S - self._loop.time()),
             )
-        return self._streams.open(info.name, writer, first, self.session.refused)
-
-    def _drop_first(self, why: DropReason) -> None:
-        self._first_dropped[why] += 1
+        return self._streams.open(info.name, writer, first)
 
     def readers(self, name: TopicName, dds_name: str, type_hash: str) -> int:
         """How many subscribers of others the graph knows."""

@@ -83,7 +83,7 @@ class Pair:
 
     def add(self, remote: Remote) -> None:
         """A writer comes that `two` is told of."""
-        self.two.remote_added(remote)
+        self.two.graph.remote_added(remote)
         settle(self.two)
 
     async def connect(self) -> Stream[Writer]:
@@ -133,7 +133,7 @@ async def test_a_writer_that_never_matches_leaves_the_reader_alone(pair: Pair, c
     pair.add(writer(51, **changed))
     for number in range(60, 70):
         pair.add(writer(number))
-        pair.two.remote_removed(UUID(int=number))
+        pair.two.graph.remote_removed(UUID(int=number))
         settle(pair.two)
     assert len(pair.opened) == 1
     publisher.publish(body(1), 1)
@@ -315,15 +315,15 @@ def test_many_writers_of_unknown_types_are_looked_up_once(
     monkeypatch.setattr(endpoint.graph, "owner", named)
     unknown = [writer(k, type_name="x::msg::dds_::T_", qos=replace(RELIABLE, type_hash=str(k % 2))) for k in range(300)]
     for one in unknown[:200]:
-        endpoint.remote_added(one)
+        endpoint.graph.remote_added(one)
     assert not lookups and settle(endpoint) == 1
     assert lookups == [("x/msg/T", "0"), ("x/msg/T", "1")] and owners == unknown[:2]
     for one in unknown[200:]:
-        endpoint.remote_added(one)
-    endpoint.remote_added(writer(400, topic="rt/other", type_name="no type"))
+        endpoint.graph.remote_added(one)
+    endpoint.graph.remote_added(writer(400, topic="rt/other", type_name="no type"))
     assert settle(endpoint) == 2 and len(lookups) == 4 and len(owners) == 2 and heard.infos == {}
     assert len(caplog.messages) == 3 and caplog.messages[0].startswith("/chat of participant without a name")
-    endpoint.remote_added(writer(500))
+    endpoint.graph.remote_added(writer(500))
     settle(endpoint)
     assert list(heard.infos) == ["/chat"]
 
@@ -340,7 +340,9 @@ def test_many_readers_of_unknown_services_are_looked_up_once(monkeypatch: pytest
         return service(type_name, request_hash)
 
     monkeypatch.setattr(endpoint.types, "service", counted)
-    endpoint.remote_added(writer(0, topic="rr/addReply", type_name="x::srv::dds_::S_Response_"))
+    endpoint.graph.remote_added(writer(0, topic="rr/addReply", type_name="x::srv::dds_::S_Response_"))
     for k in range(200):
-        endpoint.remote_added(writer(k + 1, writer=False, topic="rq/addRequest", type_name="x::srv::dds_::S_Request_"))
+        endpoint.graph.remote_added(
+            writer(k + 1, writer=False, topic="rq/addRequest", type_name="x::srv::dds_::S_Request_")
+        )
     assert settle(endpoint) == 1 and lookups == ["x/srv/S"] and heard.services == {}
