@@ -7,7 +7,7 @@ from typing import Final
 import pytest
 
 from sern_client import latest
-from sern_client.endpoints import first
+from sern_client.endpoints.common import first
 from sern_client.endpoints.ros1 import Ros1Options, hold
 from sern_core.link import control_stream, definitions, owed_lists
 from sern_core.relay import access, awaited, draining, routing
