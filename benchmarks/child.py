@@ -19,7 +19,7 @@ from typing import Any, Final, TypeVar
 
 from sern_core.vocabulary.errors import SernError
 from sern_runtime import clock
-from sern_tools.processes import Children, failure
+from sern_tools.harness.processes import Children, failure
 
 ROOT: Final = Path(__file__).resolve().parents[1]
 LOOK_S: Final = 0.2

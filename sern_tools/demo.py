@@ -51,9 +51,9 @@ from sern_tools.demo_scenario import (
     Scenario,
     write_files,
 )
+from sern_tools.harness.processes import DRAIN_S, Child, Children, program, swept
 from sern_tools.message_log import TopicLog, read_logs
 from sern_tools.ports import free_ports
-from sern_tools.processes import DRAIN_S, Child, Children, program, swept
 from sern_tools.processors import ProcessorTime, crowded
 from sern_tools.shaping import RateSchedule
 from sern_tools.summary import RunFacts, analyse, judge

@@ -10,7 +10,7 @@ from typing import Any, Final
 from sern_core.vocabulary.errors import SernError
 from sern_tools.demo_report import Carried
 from sern_tools.demo_scenario import FAR_HOST
-from sern_tools.processes import Child, Children
+from sern_tools.harness.processes import Child, Children
 from sern_tools.proxy import address
 
 HOST: Final = "127.0.0.1"

@@ -32,8 +32,8 @@ from benchmarks.endpoints.shared import ALONE, CHAIN, DIRECT, HOST, START_S, Fig
 from sern_core.vocabulary.errors import SernError
 from sern_core.vocabulary.types import Encoding
 from sern_runtime import ros_types
+from sern_tools.harness.processes import Child, Children
 from sern_tools.ports import free_ports
-from sern_tools.processes import Child, Children
 from tests.peers.dds.peer import Peer, PeerError, build_peer, free_domain, missing_packages
 
 MEASURE_S: Final = 8.0

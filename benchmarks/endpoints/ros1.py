@@ -31,8 +31,8 @@ from benchmarks.endpoints.ros1_roles import CLOUD, ODOM, TYPES
 from benchmarks.endpoints.shared import ALONE, CHAIN, DIRECT, HOST, START_S, Figures, said, within
 from sern_client.endpoints.ros1.xmlrpc import CallError, XmlRpcClient
 from sern_core.vocabulary.errors import SernError
+from sern_tools.harness.processes import Child, Children
 from sern_tools.ports import free_ports
-from sern_tools.processes import Child, Children
 
 WARM_S: Final = 2.0
 MEASURE_S: Final = 8.0

@@ -14,9 +14,9 @@ from typing import Any, Final, TypeVar
 from benchmarks import child, common
 from benchmarks.common import MissingError
 from sern_core.vocabulary.errors import SernError
+from sern_tools.harness.processes import Child, Children
 from sern_tools.keygen import make_keys
 from sern_tools.ports import free_ports
-from sern_tools.processes import Child, Children
 
 HOST: Final = "127.0.0.1"
 START_S: Final = 60.0

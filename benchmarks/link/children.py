@@ -10,7 +10,7 @@ from typing import Final
 
 from benchmarks import child
 from sern_core.vocabulary.errors import SernError
-from sern_tools.processes import last_words
+from sern_tools.harness.processes import last_words
 
 STOP_S: Final = 20.0
 """Time for a process to end when it is told to."""

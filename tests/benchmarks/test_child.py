@@ -14,7 +14,7 @@ import pytest
 from benchmarks import child, common
 from benchmarks.child import Worker, await_workers
 from sern_core.vocabulary.errors import SernError
-from sern_tools.processes import Children
+from sern_tools.harness.processes import Children
 from tests.support import DEADLINE_S
 
 IMPORTS = "import json, benchmarks as a, sern_core as b; print(json.dumps({m.__name__: m.__file__ for m in (a, b)}))"

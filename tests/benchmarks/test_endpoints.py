@@ -21,7 +21,7 @@ from sern_core.vocabulary.errors import SernError
 from sern_runtime.config.client import load_client
 from sern_runtime.config.keys import load_public
 from sern_runtime.config.relay import load_relay
-from sern_tools.processes import Child, Children
+from sern_tools.harness.processes import Child, Children
 from tests.support import DEADLINE_S
 
 PYTHON = sys.executable

@@ -16,7 +16,7 @@ from benchmarks.link import runs
 from benchmarks.link.children import Running, environment
 from benchmarks.link.peers import send_datagram
 from sern_core.vocabulary.errors import SernError
-from sern_tools.processes import last_words
+from sern_tools.harness.processes import last_words
 from tests.support import Patience
 
 Start = Callable[[str, str], "subprocess.Popen[bytes]"]

@@ -19,8 +19,8 @@ from pathlib import Path
 from typing import Any, Final, Self
 
 from sern_core.vocabulary.errors import SernError
-from sern_tools import child as launcher
-from sern_tools import sweeper as sweeping
+from sern_tools.harness import launcher
+from sern_tools.harness import sweeper as sweeping
 
 DRAIN_S: Final = 45.0
 """How long a child may take to end after SIGTERM when all is well: a daemon drains first."""

@@ -10,9 +10,8 @@ from pathlib import Path
 import pytest
 
 from sern_core.vocabulary.errors import SernError
-from sern_tools import child as launcher
-from sern_tools import processes
-from sern_tools.processes import Child, Children, program
+from sern_tools.harness import launcher, processes
+from sern_tools.harness.processes import Child, Children, program
 from tests.support import Patience, ended, until
 
 ECHO = 'import sys\nfor line in sys.stdin: print(\'{"word": "%s"}\' % line.strip(), flush=True)'
@@ -173,7 +172,7 @@ async def test_a_program_that_is_not_there(tmp_path: Path) -> None:
 PARENT = """
 import asyncio, sys
 from pathlib import Path
-from sern_tools.processes import Children
+from sern_tools.harness.processes import Children
 
 async def main():
     async with Children(Path(sys.argv[1])) as children:
