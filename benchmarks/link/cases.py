@@ -1,6 +1,7 @@
 """The cases, what is measured in each, and which figure is held against which limit."""
 
 import argparse
+import asyncio
 import importlib.util
 import tempfile
 from collections.abc import Callable, Sequence
@@ -82,7 +83,11 @@ class Bench:
         self._runs += 1
         directory = self.newest = self.directory / f"{self._runs:02d}-{system}"
         directory.mkdir()
-        outcome = run(self.lab, system, model, load, duration_s, directory, script=script, warm_s=warm_s)
+        work = run(self.lab, system, model, load, duration_s, directory, script=script, warm_s=warm_s)
+        try:
+            outcome = asyncio.run(work)
+        except SernError as error:
+            raise SernError(f"{system}: {error}") from error
         self.busiest = max(self.busiest, outcome.busy)
         self.report.row(case, system, **figures.metrics(outcome), **extra(outcome))
         return outcome
