@@ -36,6 +36,7 @@ from sern_core.vocabulary.types import CLASS_LABELS, CLASSES, DropReason
 from sern_runtime.config.adaptation import AdaptationSection
 from sern_sim.models import LinkModel
 from sern_tools.api import get_json
+from sern_tools.harness.files import client_content, write
 from sern_tools.harness.processes import Children, killed
 from sern_tools.keygen import make_keys
 from sern_tools.lab.lab import Lab, Node
@@ -148,22 +149,16 @@ def client_file(
     directory: Path, name: str, address: str, endpoint: Sequence[Mapping[str, Any]], **sections: Any
 ) -> Path:
     """A client's configuration; `address` is the relay's."""
-    content = {
-        "client": {"name": name, **sections.pop("client", {})},
-        "relay": {
-            "endpoint": f"tcp://{address}:{RELAY_PORT}",
-            "server_key_file": "relay.pub",
-            "secret_key_file": f"{name}.key",
-        },
-        "endpoint": list(endpoint),
-        "message_log": f"{name}.csv",
-        "http": {"listen": None},
-        "log": {"level": "warning"},
+    sections = {"http": {"listen": None}, **sections}
+    content = client_content(
+        name,
+        f"tcp://{address}:{RELAY_PORT}",
+        list(endpoint),
+        message_log=f"{name}.csv",
+        log={"level": "warning"},
         **sections,
-    }
-    path = directory / f"{name}.yaml"
-    path.write_text(json.dumps(content, indent=1))  # JSON is YAML
-    return path
+    )
+    return write(directory, name, content)
 
 
 class Played(NamedTuple):

@@ -1,7 +1,6 @@
 """What the parts share: children of one run, the chain of SERN's daemons, a bridge over zenoh, and the rounds."""
 
 import importlib.util
-import json
 import statistics
 import tempfile
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
@@ -13,6 +12,7 @@ from typing import Any, Final
 from benchmarks import child, common
 from benchmarks.common import MissingError
 from sern_core.vocabulary.errors import SernError
+from sern_tools.harness.files import RELAY, client_content, relay_content, write
 from sern_tools.harness.processes import Child, Children, daemon, killed
 from sern_tools.keygen import make_keys
 from sern_tools.ports import free_ports
@@ -22,7 +22,7 @@ START_S: Final = 60.0
 """How long processes may take to start and to find each other; the machine may be busy."""
 ROUNDS: Final = 3
 DIRECT, CHAIN, ALONE = "direct", "sern-chain", "sern-in-process"
-RELAY, ROBOT, SITE = "relay", "robot1", "site"
+ROBOT, SITE = "robot1", "site"
 Environment = Mapping[str, str | None]
 Figures = dict[str, float]
 
@@ -46,28 +46,22 @@ async def start_chain(
     folder = children.directory
     make_keys(folder, RELAY, ROBOT, SITE)
     address = f"tcp://{HOST}:{free_ports(1)[0]}"
-    files: dict[str, dict[str, Any]] = {
-        RELAY: {
-            "relay": {"name": RELAY, "listen": [address], "secret_key_file": "relay.key", "clients_dir": "clients"},
-            "access": [{"client": ".*", "publish": [".*"], "subscribe": [".*"]}],
-        }
-    }
+    files = {RELAY: relay_content(address)}
     for name, endpoint in endpoints.items():
-        files[name] = {
-            "client": {"name": name, "namespace": "/"},
-            "relay": {"endpoint": address, "server_key_file": "relay.pub", "secret_key_file": f"{name}.key"},
-            "endpoint": dict(endpoint),
-            "topics": [
+        files[name] = client_content(
+            name,
+            address,
+            dict(endpoint),
+            client={"namespace": "/"},
+            topics=[
                 {"match": ".*/odom", "class": "control", "depth": 1000, **rule},
                 {"match": ".*/cloud", "class": "bulk", "depth": 10, **rule},
             ],
-            "subscribe": ["/bench/.*"] if name == SITE else [],
-        }
+            subscribe=["/bench/.*"] if name == SITE else [],
+        )
     daemons = []
     for name, content in files.items():
-        config = folder / f"{name}.yaml"
-        config.write_text(json.dumps(content))  # JSON is YAML
-        command = daemon("relay" if name == RELAY else "client", config)
+        command = daemon("relay" if name == RELAY else "client", write(folder, name, content))
         daemons.append(await children.start(name, command, environment={**environment, **child.environment()}))
     return daemons
 

@@ -18,6 +18,7 @@ from benchmarks.link.forwarder import FORWARDER, Hops
 from benchmarks.link.load import READY, Load, Records, Spec, read_log
 from benchmarks.link.sern import RELAY_PORT
 from sern_sim.models import LinkModel
+from sern_tools.harness.files import relay_content, write
 from sern_tools.harness.processes import Child, Children, daemon, killed, python
 from sern_tools.keygen import make_keys
 from sern_tools.lab.backends import DEVICE, NETWORK, PREFIX
@@ -142,21 +143,14 @@ async def run(
 
 async def start_relay(children: Children, node: Node, *, udp: bool) -> Child:
     """The daemon, as its user runs it."""
-    content = {
-        "relay": {
-            "name": "relay",
-            "listen": [f"tcp://*:{RELAY_PORT}"],
-            "secret_key_file": "relay.key",
-            "clients_dir": "clients",
-            "udp": udp,
-        },
-        "access": [{"client": ".*", "publish": [".*"], "subscribe": [".*"]}],
-        "http": {"listen": None},
-        "log": {"level": "warning"},
-        "summary": "relay.summary.json",
-    }
-    config = children.directory / "relay.yaml"
-    config.write_text(json.dumps(content))
+    content = relay_content(
+        f"tcp://*:{RELAY_PORT}",
+        relay={"udp": udp},
+        http={"listen": None},
+        log={"level": "warning"},
+        summary="relay.summary.json",
+    )
+    config = write(children.directory, "relay", content)
     return await start_daemon(children, node, "relay", config)
 
 
