@@ -66,7 +66,6 @@ class Outcome:
     wire_packets: int
     """What left the link from the robot to the relay while load was offered; `wire_bytes` with Ethernet headers."""
     wire_bytes: int
-    wire_dropped: int
     cpu_percent: dict[str, float]
     busy: float
     """Share of the machine's processors in use during the run, by everybody, 0 to 1."""
@@ -134,7 +133,6 @@ async def run(
         events,
         wire_after.packets - wire_before.packets,
         wire_after.bytes - wire_before.bytes,
-        wire_after.dropped - wire_before.dropped,
         {role: 100 * (cpu_after[role] - cpu_before[role]) / duration_s for role in cpu_after},
         busy / 100,
         warm_s,
