@@ -328,6 +328,17 @@ def endpoint_of(daemon: ClientDaemon, kind: type[Any]) -> Any:
     return cast("Any", endpoint)
 
 
+def delivered(site: ClientDaemon | Process, topic: str | None = None) -> int:
+    """How many messages a site has been given, of one topic or in all."""
+    counts: dict[str, int]
+    if isinstance(site, Process):
+        topics = site.json("/api/topics").items()
+        counts = {name: int(row["delivered"]) for name, row in topics if row["direction"] == "receive"}
+    else:
+        counts = {name: counters.delivered for name, counters in site.core.received.topics.items()}
+    return sum(counts.values()) if topic is None else counts.get(topic, 0)
+
+
 def rss_bytes(process: Process) -> int:
     """Resident memory of a daemon's process."""
     pages = int(Path(f"/proc/{process.process.pid}/statm").read_text().split()[1])
