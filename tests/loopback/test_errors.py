@@ -19,7 +19,7 @@ import sern_client.cli
 import sern_relay.cli
 from sern_runtime import logs
 from sern_runtime.transport_watch import CUT, ENDED
-from tests.daemons import HOST, START_NS, Lab, Process, balance, write_bag
+from tests.daemons import HOST, START_NS, Lab, Process, balance, delivered, write_bag
 from tests.support import until
 
 CONFIG_ERROR = 2
@@ -309,8 +309,3 @@ async def test_ctrl_c_twice_ends_at_once(tmp_path: Path) -> None:
         assert "SIGINT again: ending at once" in robot.text
         assert "Traceback" not in robot.text
         site.signal(signal.SIGCONT)
-
-
-def delivered(site: Process) -> int:
-    topics = site.json("/api/topics")
-    return sum(int(topic["delivered"]) for topic in topics.values() if topic["direction"] == "receive")

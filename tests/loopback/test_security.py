@@ -38,7 +38,8 @@ from sern_runtime.config.keys import (
 from sern_runtime.monitor import SocketMonitor
 from sern_runtime.udp import UdpSession
 from sern_runtime.zmq_socket import DealerSocket, make_client
-from tests.daemons import ALLOW_ALL, HOST, Lab, bodies, write_bag
+from sern_tools.harness.files import ALLOW_ALL
+from tests.daemons import HOST, Lab, bodies, write_bag
 from tests.support import until
 
 CLIENTS = ("robot1", "robot2", "site")
