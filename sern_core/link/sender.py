@@ -64,25 +64,25 @@ class Sender:
         if channel.spec.priority is PriorityClass.CONTROL and not message.replay:
             self.cadences.arrived(channel.slot, now=now)
         backlog = channel.offered
-        thinned = channel.thinned
+        gate = channel.gate
+        thinned = 0 if gate is None else gate.thinned
         accepted = channel.submit(message, now=now, forced=forced)
-        if channel.newest is not None:
+        if gate is not None and gate.newest is not None:
             self._held_back.add(channel.slot)
-            self.held_back_due_s = min(self.held_back_due_s, channel.newest_due_s)
+            self.held_back_due_s = min(self.held_back_due_s, gate.newest_due_s)
             end.dirty = True  # the owner looks at the deadline again
         trace = end.trace
         if trace.enabled:
             topic = message.stream.topic
-            if channel.left_out:
-                why = _why_capped(channel, channel.thinned > thinned)
-                trace.record(now, topic, TraceEvent.RATE_CAPPED, seq=channel.left_out, reason=why)
-            if channel.newest is not None:
-                why = _why_capped(channel, channel.newest_thinned)
+            if gate is not None and gate.left_out:
+                why = _why_capped(channel, gate.thinned > thinned)
+                trace.record(now, topic, TraceEvent.RATE_CAPPED, seq=gate.left_out, reason=why)
+            if gate is not None and gate.newest is not None:
+                why = _why_capped(channel, gate.newest_thinned)
                 trace.record(now, topic, TraceEvent.HELD, seq=message.seq, reason=why, peer=end.peer)
             else:
                 event = TraceEvent.QUEUED if accepted else TraceEvent.REFUSED
                 trace.record(now, topic, event, seq=message.seq, peer=end.peer)
-        channel.left_out = 0
         if not backlog or channel.coalesced:
             self.refresh(channel, now)
         return accepted

@@ -11,7 +11,7 @@ from sern_client.bridge import Bridge
 from sern_client.endpoints.ros1.endpoint import Ros1Endpoint, Ros1Options
 from sern_client.endpoints.ros1.subscription import Topic
 from sern_core.site.client import ClientCore
-from sern_core.stream.out_channel import MESSAGE_OVERHEAD_BYTES
+from sern_core.stream.prices import MESSAGE_OVERHEAD_BYTES
 from sern_core.topics.patterns import compile_pattern
 from sern_core.topics.rules import Discovery, DiscoveryMode, RuleSet, TopicRule
 from sern_core.vocabulary.message import DEFAULT_RELIABLE_QUEUE_BYTES
