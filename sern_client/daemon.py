@@ -5,7 +5,9 @@ import json
 import logging
 import secrets
 import time
+from collections.abc import Callable
 from contextlib import AsyncExitStack
+from functools import partial
 from pathlib import Path
 from random import Random
 from typing import Final
@@ -24,16 +26,19 @@ from sern_client.guard import Guard
 from sern_client.link_state import LinkState
 from sern_client.relay_name import RelayName, name_in
 from sern_client.services import ServiceBridge
+from sern_client.site import Site
 from sern_client.summarise import register_summaries
+from sern_client.tables import Tables
 from sern_client.transport import RelayTransport
 from sern_client.udp import ClientLane
 from sern_core.bodies.lossy import missing
 from sern_core.link.handshake import NEW_SESSION
-from sern_core.site.client import ClientCore
+from sern_core.site.client import ClientCore, ClientEvents
 from sern_core.topics.patterns import compile_pattern
 from sern_core.vocabulary.errors import ConfigError
 from sern_core.vocabulary.trace import DecisionTrace
 from sern_core.vocabulary.types import CLASS_LABELS, DropReason, ObjectKind
+from sern_core.wire import framing
 from sern_runtime import clock, ros_types
 from sern_runtime.adaptation import Adaptation
 from sern_runtime.codec_pool import CodecPool, make_coder
@@ -98,57 +103,47 @@ class ClientDaemon:
             "adaptation", "codecs", "frames", "http", "link_state", "message_log", "metrics", "summaries"
         )
         self.message_log = MessageLog(loaded.resolve(model.message_log)) if model.message_log else None
-        self.bridge = Bridge(
+        self.site = Site(
             endpoint,
             model.rules(),
-            model.discovery.filter(),
             model.namespace,
+            kick=self._kick,
             frame_prefix=model.client.frame_prefix,
             log=self.message_log,
-            kick=self._kick,
-            on_up=self._link_up,
-            on_down=self._link_down,
-            on_fault=self.errors.core,
             parts=self.parts,
         )
+        discovery = model.discovery.filter()
         now = clock.now()
         for index, section in enumerate(model.topics):
             for problem in filter(None, map(missing, section.lossy)):
                 raise ConfigError(problem, file=str(loaded.path), key=f"topics.{index}.lossy")
         self.codecs = CodecPool(after=self._kick, parts=self.parts)
-        self.core = ClientCore(
-            name=model.name,
-            boot=secrets.randbits(63),
-            events=self.bridge,
-            link=model.link.params(),
-            scheduler=model.scheduler.params(),
-            trace=DecisionTrace(),
-            now=now,
-            coder=make_coder(model.link.params(), self.codecs),
+        self.guard = Guard.of(loaded)
+        state = model.link_state
+        self.bridge = Bridge(
+            self.site,
+            self._make_core,
+            discovery,
+            self,
+            make_services=self._services(endpoint),
+            guard=self.guard,
+            goals=self._make_goals(),
+            withdraws=state.withdraw_after_s is not None,
         )
-        if self.message_log is not None:
-            self.core.link.end.fates = LoggedFates(self.message_log, self.parts)
-        self.bridge.attach(self.core)
-        self.bridge.guard = self.guard = Guard.of(loaded)
-        self.check = TableCheck(self.bridge, now=now)
+        self.core = self.bridge.core
         self.core.subscribe(model.subscribe_patterns(), now=now)
-        self._serve_services(endpoint)
-        if model.actions.use:
-            rules = tuple((compile_pattern(section.match), section.timeout_s) for section in model.actions.use)
-            self.bridge.goals = GoalWatch(rules, lambda info: self.bridge.converter.advertise(endpoint, info))
         self.adaptation = self._make_adaptation()
         self.reason = NOT_YET
-        state = model.link_state
-        self.bridge.withdrawal.used = state.withdraw_after_s is not None
-        self.bridge.link_state = self.link_state = LinkState(
+        self.link_state = LinkState(
             self.core,
-            make_link_topics(model, lambda info: self.bridge.converter.advertise(endpoint, info)),
-            self.bridge.withdrawal,
+            make_link_topics(model, self.site.advertise),
+            self.bridge.inbound.withdrawal,
             period_s=state.period_s,
             withdraw_after_s=state.withdraw_after_s,
             reason=self._why,
             parts=self.parts,
         )
+        self.check = TableCheck(Tables(self.bridge, self.link_state), now=now)
         self._said: set[str] = set()  # since the last session: an attempt that fails as before is no news
         self._down_since_s = now
         self._outages = Outages(_log, logging.WARNING)
@@ -167,6 +162,29 @@ class ClientDaemon:
         self._endpoint_started = False
         self._stopping = False
 
+    def _make_core(self, events: ClientEvents) -> ClientCore:
+        model = self.loaded.model
+        core = ClientCore(
+            name=model.name,
+            boot=secrets.randbits(63),
+            events=events,
+            link=model.link.params(),
+            scheduler=model.scheduler.params(),
+            trace=DecisionTrace(),
+            now=clock.now(),
+            coder=make_coder(model.link.params(), self.codecs),
+        )
+        if self.message_log is not None:
+            core.link.end.fates = LoggedFates(self.message_log, self.parts)
+        return core
+
+    def _make_goals(self) -> GoalWatch | None:
+        sections = self.loaded.model.actions.use
+        if not sections:
+            return None
+        rules = tuple((compile_pattern(section.match), section.timeout_s) for section in sections)
+        return GoalWatch(rules, self.site.advertise)
+
     def _make_adaptation(self) -> Adaptation | None:
         section = self.loaded.model.adaptation
         if section is None:
@@ -178,27 +196,27 @@ class ClientDaemon:
                 lambda: [self.core.link],
                 coder=coder,
                 kick=self._kick,
-                rules=self.bridge.rules.rules,
-                summaries=lambda: self.bridge.summaries.topics,
+                rules=self.site.rules.rules,
+                summaries=lambda: self.bridge.outbound.summaries.topics,
                 parts=self.parts,
             )
 
-    def _serve_services(self, endpoint: Endpoint) -> None:
-        """Where the file has service rules, an endpoint must know services."""
+    def _services(self, endpoint: Endpoint) -> Callable[[ClientCore], ServiceBridge] | None:
+        """What makes the bridge of services, where the file has rules for them; then an endpoint must know services."""
         model = self.loaded.model
         offer, use = model.offered_services(), model.used_services()
         if not offer and not use:
-            return
+            return None
         known = with_services(endpoint)
-        if known is None and model.services == ServicesSection():
-            return  # actions of ROS 1 are topics
-        with blamed_on(self.loaded.path, "services"):
-            if known is None:
-                kinds = " and ".join(dict.fromkeys(section.kind for section in model.endpoints))
-                raise ConfigError(f"an endpoint of kind {kinds} has no services; leave the section out")
-            self.bridge.services = ServiceBridge(
-                self.core, known, offer=offer, use=use, namespace=model.namespace, kick=self._kick
+        if known is not None:
+            return partial(
+                ServiceBridge, endpoint=known, offer=offer, use=use, namespace=model.namespace, kick=self._kick
             )
+        if model.services == ServicesSection():
+            return None  # actions of ROS 1 are topics
+        with blamed_on(self.loaded.path, "services"):
+            kinds = " and ".join(dict.fromkeys(section.kind for section in model.endpoints))
+            raise ConfigError(f"an endpoint of kind {kinds} has no services; leave the section out")
 
     async def start(self) -> None:
         self.errors.watch(asyncio.get_running_loop())
@@ -215,7 +233,7 @@ class ClientDaemon:
                 self._http = self._make_http(model.http.listen)
                 await self._http.start()
         # Before the transport: streams from the relay are advertised at the endpoint as soon as there is a session.
-        await self.bridge.endpoint.start(self.bridge)
+        await self.site.endpoint.start(self.bridge.outbound)
         self._endpoint_started = True
         self.link_state.start()
         if self.guard is not None:
@@ -231,7 +249,7 @@ class ClientDaemon:
                 heartbeat_timeout_s=model.link.heartbeat_timeout_s,
                 handshake_interval_s=relay.handshake_interval_s,
                 random=Random(secrets.randbits(64)),
-                on_reason=self._link_down,
+                on_reason=self.link_down,
                 after=self._kick,
                 marks=model.link.dscp.marks(),
             )
@@ -242,7 +260,6 @@ class ClientDaemon:
         address = split_tcp(relay.endpoint)
         if relay.udp and keys is not None and address is not None:
             self._lane = ClientLane(self.core, address[0], kick=self._kick, marks=model.link.dscp.marks())
-            self.bridge.lane = self._lane
         if relay.express and address is not None:
             self._express = ClientExpress(
                 self.core,
@@ -266,7 +283,9 @@ class ClientDaemon:
         if self._express is not None:
             self._express.kick()
 
-    def _link_down(self, reason: str) -> None:
+    # --- Shell: of the link
+
+    def link_down(self, reason: str) -> None:
         """Told by the transport and by the session on it, usually of the same thing."""
         self.reason = reason
         self.link_state.soon()
@@ -285,7 +304,7 @@ class ClientDaemon:
             then = "" if reason == NEW_SESSION else "; trying again until it works"
             _log.warning("%s: %s%s", self.loaded.model.relay.endpoint, reason, then)
 
-    def _link_up(self) -> None:
+    def link_up(self) -> None:
         if self._said:  # in the words and at the level of the loss
             down_s = clock.now() - self._down_since_s
             _log.warning("%s: the link is there again, after %.0f s", self.loaded.model.relay.endpoint, down_s)
@@ -296,6 +315,17 @@ class ClientDaemon:
             self._lane.ask()
         if self._express is not None:
             self._express.begin()
+
+    def lane_offered(self, parameters: framing.Envelope) -> None:
+        if self._lane is not None:
+            self._lane.offered(parameters)
+
+    def lane_closed(self) -> None:
+        if self._lane is not None:
+            self._lane.closed()
+
+    def fault(self, error: Exception) -> None:
+        self.errors.core(error)
 
     async def _tick(self) -> None:
         watchdog = Watchdog(self.notifier, {"loop": lambda: int(clock.now() * 1e3)})
@@ -312,7 +342,7 @@ class ClientDaemon:
                 self._express.tick()
             self.check.tick(now=clock.now())
             self.link_state.look()
-            self.bridge.leaving.look(now=clock.now())
+            self.bridge.outbound.leaving.look(now=clock.now())
             if watchdog.interval_s is not None:
                 watchdog.check()
             if self._name is not None:
@@ -367,18 +397,18 @@ class ClientDaemon:
         link = self.core.link
         register_links(metrics, lambda: [link])
         self.datagrams.register(metrics)
-        register_received(metrics, self.core.received, self.bridge.ages)
+        register_received(metrics, self.core.received, self.bridge.inbound.ages)
         register_codecs(metrics, self.core.coder)
         self.link_state.register(metrics)
         self.errors.register(metrics)
         self.collector.register(metrics)
-        register_summaries(metrics, self.bridge.summaries)
+        register_summaries(metrics, self.bridge.outbound.summaries)
         metrics.counter(
             "sern_patch_gaps_total",
             "Times a grid of patches could not go on, and waited for the next whole one.",
-            read=lambda: [((), float(self.bridge.rebuilds.gaps))],
+            read=lambda: [((), float(self.bridge.inbound.rebuilds.gaps))],
         )
-        endpoint = self.bridge.endpoint
+        endpoint = self.site.endpoint
 
         def endpoint_drops() -> list[tuple[tuple[str], float]]:
             drops = endpoint.drops if isinstance(endpoint, CountingEndpoint) else {}
@@ -407,7 +437,7 @@ class ClientDaemon:
         metrics.counter(
             "sern_command_lease_expired_total",
             "Times a command topic went quiet and the stop command was published.",
-            read=lambda: [((), float(self.bridge.leases_fired))],
+            read=lambda: [((), float(self.bridge.inbound.leases_fired))],
         )
         metrics.counter(
             "sern_command_guard_stops_total",
@@ -423,17 +453,17 @@ class ClientDaemon:
             "sern_deadline_missed_total",
             "Gaps between messages longer than the topic's deadline_s.",
             ("topic",),
-            lambda: [((topic,), float(count)) for topic, count in self.bridge.deadlines_missed.items()],
+            lambda: [((topic,), float(count)) for topic, count in self.bridge.inbound.deadlines_missed.items()],
         )
         metrics.counter(
             "sern_frame_ids_unread_total",
             "Messages whose frame ids stayed without frame_prefix because their type or bytes could not be read.",
-            read=lambda: [((), float(self.bridge.frames.unreadable))],
+            read=lambda: [((), float(self.site.frames.unreadable))],
         )
         metrics.counter(
             "sern_conversion_failures_total",
             "Messages dropped because they could not be converted between ROS 1 and ROS 2.",
-            read=lambda: [((), float(self.bridge.converter.failures))],
+            read=lambda: [((), float(self.site.converter.failures))],
         )
         metrics.counter(
             "sern_service_calls_total",
@@ -449,7 +479,7 @@ class ClientDaemon:
         metrics.counter(
             "sern_publish_failures_total",
             "Messages that arrived and could not be published here.",
-            read=lambda: [((), float(self.bridge.publish_failures))],
+            read=lambda: [((), float(self.bridge.inbound.publish_failures))],
         )
         metrics.counter(
             "sern_bad_frames_total",
@@ -471,7 +501,7 @@ class ClientDaemon:
                 "/api/peers": self.link_state.to_json,
                 "/api/topics": self.topics,
                 "/api/trace": self.core.trace.to_json,
-                "/api/values": self.bridge.values.view(),
+                "/api/values": self.site.values.view(),
                 **({} if adaptation is None else {"/api/mmcf": adaptation.to_json}),
             },
             parts=self.parts,
@@ -504,14 +534,15 @@ class ClientDaemon:
         because a subscriber that is away is the relay's to wait for.
         """
         self._stopping = True
-        self.bridge.stop_sources()
+        self.bridge.outbound.stop_sources()
         link = self.core.link
         now = clock.now()
         progress = Progress()
         give_up_s = now + self.loaded.model.link.drain_s
         while now < give_up_s:
             channels = [channel for channel in link.sender.channels.values() if channel.wanted is not False]
-            unsent = sum(len(c.queue) + len(c.flying) + (c.newest is not None) for c in channels) + self.bridge.pending
+            unsent = sum(len(c.queue) + len(c.flying) + (c.newest is not None) for c in channels)
+            unsent += self.bridge.outbound.pending
             unconfirmed = sum(len(channel.retained) for channel in channels)
             if not unconfirmed and (not unsent or not link.established or link.lane.stalled):
                 break
@@ -525,7 +556,7 @@ class ClientDaemon:
         unconfirmed = sum(len(channel.retained) for channel in link.sender.channels.values())
         if unconfirmed:
             _log.warning("stopping with %d reliable messages that not everyone has confirmed", unconfirmed)
-        if self.bridge.keeping:
+        if self.bridge.inbound.keeping:
             await self._keep()
         if self._transport is not None:
             self._kick()
@@ -538,7 +569,7 @@ class ClientDaemon:
     async def _keep(self) -> None:
         """Have what was recorded flushed, so that all of it is confirmed before we say goodbye, and read nothing more:
         what comes now the next process gets."""
-        keeping = self.bridge.keeping
+        keeping = self.bridge.inbound.keeping
         self.core.link.handshake.reads = False
         keeping.flush()
         give_up_s = clock.now() + PATIENCE_S
@@ -566,7 +597,7 @@ class ClientDaemon:
             if self._http is not None:
                 stack.push_async_callback(self._http.stop)
             if self._endpoint_started:
-                stack.push_async_callback(self.bridge.endpoint.stop)
+                stack.push_async_callback(self.site.endpoint.stop)
             if self.guard is not None:
                 stack.push_async_callback(self.guard.stop)
             stack.callback(self.bridge.close)

@@ -35,8 +35,8 @@ async def test_a_topic_that_no_rule_names_is_said_once(tmp_path: Path, caplog: p
         play = {"loop": True, "wait_for": []}
         robot = await lab.connected(lab.player_file("robot1", bag, play=play, topics=list(CHAT), discovery=discovery))
         again = TopicInfo(TopicName("/chta"), "std_msgs/msg/String", Encoding.ROS1)
-        robot.bridge.topic_removed(again.name)  # a node that comes and goes is no news
-        robot.bridge.topic_added(again)
+        robot.bridge.outbound.topic_removed(again.name)  # a node that comes and goes is no news
+        robot.bridge.outbound.topic_added(again)
         said = [message for message in caplog.messages if "stays here" in message]
         assert said == ["/chta (std_msgs/msg/String) stays here: no rule in `topics` names it (discovery.mode: manual)"]
 
@@ -101,7 +101,7 @@ async def test_two_processes_with_one_name_are_told_of_each_other(
         await lab.end(second)
         await until(lambda: first._ready().ok, "goes on alone")
         await until(lambda: len(relay.hub.relayed) == len(first.core.link.sender.channels) > 0, "has its topics again")
-        assert first.bridge.refusals == 0
+        assert first.bridge.outbound.refusals == 0
         own = [record for record in caplog.records if said in record.getMessage()]
         assert {record.name for record in own} == {"sern_client.daemon", "sern_relay.daemon"}
         at_relay = [record for record in own if record.name == "sern_relay.daemon"]
@@ -148,7 +148,7 @@ async def test_a_relay_that_goes_on_with_no_session_is_said_in_words(
     async with Lab(tmp_path, "robot1") as lab:
         await lab.relay()
         robot = await lab.connected(lab.client_file("robot1", ROBOT))
-        robot._link_down(NEW_SESSION)
+        robot.link_down(NEW_SESSION)
         assert caplog.messages[-1] == f"{lab.endpoint}: the session could not go on, and another begins"
 
 

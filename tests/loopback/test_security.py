@@ -372,7 +372,7 @@ async def test_access_rules_hold_and_name_what_they_refuse(tmp_path: Path, caplo
         relay = await lab.relay(lab.relay_file(access=rules))
         site = await lab.connected(lab.recorder_file("site", "/robot1/.*", "/robot2/.*"))
         robot = await lab.connected(lab.player_file("robot1", bag, play={"wait_for": ["/mine"]}))
-        await until(lambda: robot.bridge.refusals == 1)
+        await until(lambda: robot.bridge.outbound.refusals == 1)
         await until(lambda: sum(c.delivered for c in site.core.received.topics.values()) == 20)
         assert "the relay refuses /robot1/secret (forbidden): robot1 may not publish /robot1/secret" in caplog.text
         assert {code: count for code, count in relay.refusals.items() if count} == {"forbidden": 1}
@@ -381,7 +381,7 @@ async def test_access_rules_hold_and_name_what_they_refuse(tmp_path: Path, caplo
         assert summary["/robot1/secret"]["delivered"] == 0
         # Somebody whom no rule names may connect, and do nothing.
         other = await lab.connected(lab.player_file("robot2", bag, play={"wait_for": []}))
-        await until(lambda: other.bridge.refusals == 2)
+        await until(lambda: other.bridge.outbound.refusals == 2)
         for daemon in (other, site, relay):
             await lab.end(daemon)
     assert set(bodies(tmp_path / "site.bag")) == {"/robot1/mine"}
@@ -398,7 +398,7 @@ async def test_a_second_owner_of_a_global_name_is_refused_by_name(
         first = await lab.connected(lab.player_file("robot1", bag, **everywhere))
         await until(lambda: sum(c.delivered for c in site.core.received.topics.values()) == 20)
         second = await lab.connected(lab.player_file("robot2", bag, play={"wait_for": []}, **everywhere))
-        await until(lambda: second.bridge.refusals == 1)
+        await until(lambda: second.bridge.outbound.refusals == 1)
         [line] = [m for m in caplog.messages if m.startswith("the relay refuses /odom")]
         assert "robot1" in line
         for daemon in (second, first, site, relay):
@@ -523,7 +523,7 @@ async def test_a_rule_taken_away_ends_the_stream_and_given_back_restores_it(
         await until(lambda: counters and next(iter(counters.values())).delivered > 10)
         lab.relay_file(access=[{"client": "site", "subscribe": [".*"]}], http={"listen": None})
         relay.reload()
-        await until(lambda: robot.bridge.refusals == 1)
+        await until(lambda: robot.bridge.outbound.refusals == 1)
         assert "robot1 may no longer publish /robot1/count: the access rules have changed" in caplog.text
         assert robot.core.link.established and site.core.link.established
         for daemon in (robot, site, relay):

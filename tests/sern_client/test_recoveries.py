@@ -169,8 +169,7 @@ def _withdrawn(scene: Scene) -> tuple[Clock, Withdrawal, Any]:
         StreamId(ClientName("jackal1"), 1, TopicName(name)): Stream(endpoint, name)
         for name in ("/jackal1/a", "/jackal1/b")
     }
-    withdrawal = Withdrawal(streams, endpoint.advertise, _close)
-    withdrawal.used = True
+    withdrawal = Withdrawal(streams, endpoint.advertise, _close, used=True)
     withdrawal.withdraw(ClientName("jackal1"))
     now.go_on()
     return now, withdrawal, streams
@@ -382,11 +381,11 @@ async def _client(scene: Scene) -> Any:
 async def link(scene: Scene) -> None:
     now = scene.clock()
     async with _client(scene) as daemon:
-        daemon._link_up()
+        daemon.link_up()
         for _ in range(2):
-            daemon._link_down("the connection to the relay was lost")
+            daemon.link_down("the connection to the relay was lost")
         now.go_on()
-        daemon._link_up()
+        daemon.link_up()
 
 
 async def silent_relay(scene: Scene) -> None:
