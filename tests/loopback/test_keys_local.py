@@ -47,7 +47,7 @@ async def test_a_replaced_key_is_cut_off_over_ipc_and_comes_back_when_it_is_put_
         lab.make_keys("robot1")  # the new pair is at the relay; the client runs with the old one
         relay.reload()
         assert relay.server._sessions == {}
-        await until(lambda: "refused our key" in robot.reason)
+        await until(lambda: "refused our key" in robot.news.reason)
         refused = relay.zap.counters.unknown_key
         await until(lambda: relay.zap is not None and relay.zap.counters.unknown_key > refused, "it tries again")
         assert relay.server._sessions == {} and not robot.core.link.established

@@ -146,7 +146,7 @@ async def test_a_stranger_and_a_client_without_keys_are_counted_and_shut_out(
         (tmp_path / "plain").mkdir()
         async with Lab(tmp_path / "plain", secure=False, relay_port=world.lab.port) as plain:
             client = await plain.client(plain.client_file("robot2", DEAD_ENDS))
-            await until(lambda: "one side has keys configured and the other has not" in client.reason)
+            await until(lambda: "one side has keys configured and the other has not" in client.news.reason)
         await world.refused("handshake")
 
 
@@ -429,7 +429,7 @@ async def test_a_revoked_key_is_cut_off_both_ways_and_comes_back_when_allowed(
         relay.reload()
         assert [s.port.client for s in relay.server._sessions.values() if s.port.client == "robot2"] == []
         before = heard[topic].delivered
-        await until(lambda: "refused our key" in second.reason)
+        await until(lambda: "refused our key" in second.news.reason)
         refused = relay.zap.counters.unknown_key
         assert refused > 0
         taken = sum(c.delivered for c in second.core.received.topics.values())
@@ -453,7 +453,7 @@ async def test_a_rotated_key_ends_the_connections_of_the_old_one(
         robot = await lab.connected(lab.client_file("robot1", DEAD_ENDS))
         lab.make_keys("robot1")  # the new pair is at the relay; the client runs with the old one
         relay.reload()
-        await until(lambda: "refused our key" in robot.reason)
+        await until(lambda: "refused our key" in robot.news.reason)
         assert "robot1 lost a key; 1 connections cut" in caplog.text
         await lab.end(robot)
         robot = await lab.connected(tmp_path / "robot1.yaml")

@@ -16,11 +16,12 @@ import pytest
 
 from sern_client import express, guard, relay_name
 from sern_client.checks import CHECK_S, CONFIRM_S, TableCheck
-from sern_client.daemon import SILENT, ClientDaemon
+from sern_client.daemon import ClientDaemon
 from sern_client.endpoints.ros1 import services, subscription
 from sern_client.endpoints.ros1.header import encode_header
 from sern_client.express import ClientExpress
 from sern_client.guard import Guard
+from sern_client.link_news import SILENT
 from sern_client.link_topics import LinkTopics
 from sern_client.relay_name import RelayName, UnresolvedError
 from sern_client.withdrawal import Withdrawal
@@ -394,7 +395,7 @@ async def silent_relay(scene: Scene) -> None:
         daemon.core.link.end.established = True
         for stalled in (False, True, True, False, False):
             daemon.core.link.lane.stalled = stalled
-            daemon._look_at_link()
+            daemon.news.look()
             now.go_on()
         daemon.core.link.end.established = False
 
