@@ -36,7 +36,7 @@ def arrived(site: ClientDaemon) -> int:
 def joined(relay: RelayDaemon, client: str = ROBOT) -> list[int]:
     """File descriptors of the client's connections for class control."""
     assert relay.server is not None
-    return [each.fd for each in relay.server.express.joined.values() if each.client == client]
+    return [each.fd for each in relay.server.express.joined if each.client == client]
 
 
 @pytest.mark.parametrize("secure", [True, False], ids=["keys", "insecure"])

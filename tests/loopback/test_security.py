@@ -25,6 +25,7 @@ from sern_client.daemon import ClientDaemon
 from sern_core.vocabulary.types import ClientName, TopicName
 from sern_core.wire import framing
 from sern_relay.daemon import REFUSAL_CODES, RelayDaemon
+from sern_relay.relay_metrics import refused_connections
 from sern_relay.server import MAX_PORTS
 from sern_runtime.config.keys import (
     PublicKey,
@@ -104,7 +105,7 @@ class Bystanders:
         await until(lambda: self.arrived > count + 50, "the stream goes on")
 
     async def refused(self, reason: str) -> None:
-        await until(lambda: dict(self.relay._refused_connections())[reason,] > 0, f"the relay counts {reason}")
+        await until(lambda: dict(refused_connections(self.relay.server))[reason,] > 0, f"the relay counts {reason}")
 
 
 @asynccontextmanager
@@ -191,7 +192,7 @@ async def test_a_claimed_routing_id_is_never_heard(tmp_path: Path, caplog: pytes
     async with bystanders(tmp_path, caplog) as world:
         server = world.relay.server
         assert server is not None
-        [victim] = [rid for rid, session in server._sessions.items() if session.port.client == "robot1"]
+        [victim] = [each.routing_id for each, _served in server.clients.sessions() if each.client == "robot1"]
         keys = load_secret(world.lab.directory / "robot2.key")
         for identity in (b"robot1", victim + b"\0"):
             async with Stranger(world.lab, keys, identity=identity) as impostor:
@@ -218,7 +219,7 @@ async def test_nobody_joins_the_session_of_another(tmp_path: Path, caplog: pytes
                 assert impostor.received == []
             assert server.express.refused == number
         await world.refused("join")
-        assert not any(joined.client == "robot2" for joined in server.express.joined.values())
+        assert not any(joined.client == "robot2" for joined in server.express.joined)
 
 
 async def test_one_client_has_a_few_connections(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -268,7 +269,7 @@ async def test_connections_for_class_control_count_over_all_sessions(
                 await until(partial(joined, count), "it has joined")
             await lane.send(framing.encode_handshake(framing.Kind.CLOSE, tag, 0, {"code": "bye", "why": "bye"}))
             await until(lambda: "robot2" not in world.relay.hub.links, "it is forgotten")
-            assert sum(each.client == "robot2" for each in server.express.joined.values()) <= 2
+            assert sum(each.client == "robot2" for each in server.express.joined) <= 2
         assert server.express.refused == 0
 
 
@@ -427,7 +428,7 @@ async def test_a_revoked_key_is_cut_off_both_ways_and_comes_back_when_allowed(
         key = lab.clients_dir / "robot2.pub"
         away = key.rename(tmp_path / "robot2.pub")
         relay.reload()
-        assert [s.port.client for s in relay.server._sessions.values() if s.port.client == "robot2"] == []
+        assert [each for each, _served in relay.server.clients.sessions() if each.client == "robot2"] == []
         before = heard[topic].delivered
         await until(lambda: "refused our key" in second.news.reason)
         refused = relay.zap.counters.unknown_key
@@ -486,7 +487,7 @@ async def test_a_silent_connection_does_not_outlive_its_key(
             assert len(table) == 2 and not any(connection.ended for connection in table.values())
             relay._end_lapsed()
             assert all(connection.ended for connection in table.values())
-            assert relay.server._sessions == {}
+            assert list(relay.server.clients.sessions()) == []
             await loud.cut()
             await silent.cut()
             monkeypatch.undo()
