@@ -103,7 +103,7 @@ async def test_two_processes_with_one_name_are_told_of_each_other(
         await until(lambda: len(relay.hub.relayed) == len(first.core.link.sender.channels) > 0, "has its topics again")
         assert first.bridge.outbound.refusals == 0
         own = [record for record in caplog.records if said in record.getMessage()]
-        assert {record.name for record in own} == {"sern_client.daemon", "sern_relay.daemon"}
+        assert {record.name for record in own} == {"sern_client.link_news", "sern_relay.daemon"}
         at_relay = [record for record in own if record.name == "sern_relay.daemon"]
         assert relay.refusals["displaced"] == len(at_relay) >= 2
         assert at_relay[0].getMessage().endswith(" has no session any more")
