@@ -323,7 +323,7 @@ class Lab:
 
 def endpoint_of(daemon: ClientDaemon, kind: type[Any]) -> Any:
     """The endpoint of a client in this process, when it has one only."""
-    endpoint: Endpoint = daemon.bridge.endpoint
+    endpoint: Endpoint = daemon.site.endpoint
     assert isinstance(endpoint, kind)
     return cast("Any", endpoint)
 

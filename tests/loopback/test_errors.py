@@ -225,7 +225,7 @@ async def test_a_key_that_the_relay_knows_by_another_name_is_explained(
         await until(lambda: robot.bridge.rejected_reason)
         why = "your key belongs to robot2, not to robot1"
         assert f"the relay refuses us (name): {why}" in caplog.messages
-        assert robot._ready() == (False, why)
+        assert robot.readiness() == (False, why)
 
 
 def refused(relay: Process, reason: str) -> float:

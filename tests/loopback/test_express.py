@@ -32,7 +32,7 @@ def uses_express(robot: ClientDaemon, relay: RelayDaemon) -> bool:
 def joined(relay: RelayDaemon, client: str = ROBOT) -> list[int]:
     """File descriptors of the client's connections for class control."""
     assert relay.server is not None
-    return [each.fd for each in relay.server.express.joined.values() if each.client == client]
+    return [each.fd for each in relay.server.express.joined if each.client == client]
 
 
 @pytest.mark.parametrize("secure", [True, False], ids=["keys", "insecure"])
