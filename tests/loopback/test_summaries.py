@@ -193,7 +193,13 @@ async def test_transforms_of_many_nodes_become_one_message(tmp_path: Path) -> No
             messages.append(("/tf", scenes.TF, tf_message(move, encoding=ros1)))
     bag = bag_of(tmp_path / "tf.bag", messages, latched=("/tf_static",))
     play = {"kind": "bag", "path": str(bag), "rate": 4.0, "wait_for": ["/tf"], "start_delay_s": 0.2}
-    rule = {"match": "/tf|/tf_static", "class": "state", "reliability": "reliable", "max_rate_hz": 10.0}
+    rule = {
+        "match": "/tf|/tf_static",
+        "class": "state",
+        "reliability": "reliable",
+        "max_rate_hz": 10.0,
+        "merge_tf": True,
+    }
     async with Lab(tmp_path, "robot1", "site", "late") as lab:
         relay = await lab.relay()
         site = await lab.connected(lab.recorder_file("site", "/tf", "/tf_static"))

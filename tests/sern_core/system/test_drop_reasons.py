@@ -11,15 +11,13 @@ from tests.world import World
 
 ROOT: Final = Path(__file__).resolve().parents[3]
 PROOFS: Final = {
-    DropReason.LIFESPAN: "stream/test_out_channel.py::test_what_is_held_back_has_a_lifespan_and_an_end",
-    DropReason.SUPERSEDED: "stream/test_out_channel.py::test_keep_last_drops_the_oldest_that_has_not_begun",
+    DropReason.LIFESPAN: "stream/test_gate.py::test_what_is_held_back_has_a_lifespan_and_an_end",
+    DropReason.SUPERSEDED: "stream/test_keep_last.py::test_keep_last_drops_the_oldest_that_has_not_begun",
     DropReason.RATE_CAP: "system/test_rate_cap.py::test_the_last_value_arrives_within_a_period",
     DropReason.UNWANTED: "system/test_reliable.py",
     DropReason.REFUSED: "system/test_reliable.py",
     DropReason.FORBIDDEN: "relay/test_hub.py",
-    DropReason.RETENTION: (
-        "stream/test_out_channel.py::test_what_lapses_without_a_link_is_bounded_by_messages_not_by_runs"
-    ),
+    DropReason.RETENTION: ("stream/test_lapses.py::test_what_lapses_without_a_link_is_bounded_by_messages_not_by_runs"),
     DropReason.STALE: "system/test_service.py",
     DropReason.LOST: "stream/test_in_stream.py",
     DropReason.DUPLICATE: "stream/test_in_stream.py",
