@@ -685,7 +685,7 @@ class Bridge:
 
     def _leases_due(self) -> None:
         now = clock.now()
-        for incoming in self._incoming.values():
+        for stream, incoming in self._incoming.items():
             lease = incoming.lease
             if lease is None or incoming.stop is None:
                 continue
@@ -695,5 +695,6 @@ class Bridge:
                 self._tell_guard(incoming)
                 if first:
                     self.leases_fired += 1
+                    self.core.lease_expired(stream, lease.after_s, now=now)
                     _log.warning("%s: no fresh command; publishing the stop command", incoming.local)
         self._arm()

@@ -55,6 +55,7 @@ from sern_runtime.optional import OptionalParts
 from sern_runtime.outages import Outages
 from sern_runtime.sdnotify import Notifier, Watchdog
 from sern_runtime.topics_view import TopicView, both_ways
+from sern_runtime.trace_view import of_client, trace_view
 from sern_runtime.transport_watch import NOT_YET, WAITING
 
 PATIENCE_S: Final = 2.0
@@ -470,7 +471,7 @@ class ClientDaemon:
                 "/api/link": lambda: [link.snapshot()],
                 "/api/peers": self.link_state.to_json,
                 "/api/topics": self.topics,
-                "/api/trace": self.core.trace.to_json,
+                "/api/trace": trace_view(of_client(self.core.link, self.core.trace), clock.now),
                 "/api/values": self.bridge.values.view(),
                 **({} if adaptation is None else {"/api/mmcf": adaptation.to_json}),
             },

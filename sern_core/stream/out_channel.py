@@ -223,8 +223,9 @@ class OutChannel:
         self._keep(out)
         self.on_drop(self, (out,), reason)
 
-    def prime(self, replays: Sequence[Message], *, now: float) -> None:
-        """Put latched messages (oldest first, marked as replays) ahead of everything; nothing has been sent yet."""
+    def prime(self, replays: Sequence[Message], *, now: float) -> Sequence[OutMessage]:
+        """Put latched messages (oldest first, marked as replays) ahead of everything; nothing has been sent yet.
+        Returns those that are to be sent."""
         limit = self.retained[0].seq if self.retained else self.next_seq
         if not self.reliable:
             limit = self.queue[0].seq if self.queue else self.newest.seq if self.newest is not None else self.next_seq
@@ -233,7 +234,7 @@ class OutChannel:
         if not self.reliable:
             fresh = fresh[max(0, len(fresh) + len(self.queue) - self.spec.depth) :]
         if not fresh:
-            return
+            return fresh
         for out in fresh:
             out.retain_from_s = now
             self.counters.offer(out.offered_bytes)
@@ -250,6 +251,7 @@ class OutChannel:
             gaps = [(out.seq, seq) for out, seq in zip(fresh, after, strict=True) if seq > out.seq + 1]
             if gaps:
                 self.gaps = deque((*gaps, *self.gaps))
+        return fresh
 
     def _hold_back(self, message: Message, due_s: float, *, thinned: bool) -> None:
         self.newest = OutMessage(message)
