@@ -135,7 +135,10 @@ class Composer:
         """Append one fragment; returns by how many bytes the datagram grew."""
         started = out.started
         grown = datagram.fragment(channel, out, limit, now)
-        if self._end.trace.enabled and channel is not self._control.out:
-            self._sender.told.left(channel, out, started, now)
+        trace = self._end.trace
+        if trace.enabled and channel is not self._control.out:
             self.served = channel
+            told = self._sender.told
+            if trace.steps or channel.slot in told.holding:
+                told.left(channel, out, started, now)
         return grown

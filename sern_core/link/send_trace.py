@@ -24,19 +24,16 @@ MAX_TRACED: Final = 100
 
 
 class SendTrace:
-    """One link's. Ask `on` before calling where it is hot; `steps` for what happens to every message."""
+    """One link's. Where it is hot the caller asks first whether there is anything to tell."""
 
-    __slots__ = ("_end", "_holds", "_texts", "_told")
+    __slots__ = ("_end", "_texts", "_told", "holding")
 
     def __init__(self, end: End, texts: PeerDefinitions) -> None:
         self._end = end
         self._texts = texts
-        self._holds: dict[int, dict[HoldReason, float]] = {}  # by slot, since something of it was sent last: told when
+        self.holding: dict[int, dict[HoldReason, float]] = {}
+        """What was told of a channel, by slot, since something of it was sent last: why it waits, and when that was."""
         self._told: dict[tuple[int, str], float] = {}  # without steps: what was told of a slot, and when
-
-    @property
-    def on(self) -> bool:
-        return self._end.trace.enabled
 
     @property
     def steps(self) -> bool:
@@ -44,7 +41,7 @@ class SendTrace:
 
     def forget(self, channel: OutChannel) -> None:
         """The channel is closed."""
-        self._holds.pop(channel.slot, None)
+        self.holding.pop(channel.slot, None)
         for key in [key for key in self._told if key[0] == channel.slot]:
             del self._told[key]
 
@@ -113,7 +110,7 @@ class SendTrace:
     def left(self, channel: OutChannel, out: OutMessage, started: bool, now: float) -> None:
         """A fragment left, `started`: not the first. What was held is told of in any case."""
         if not out.has_unsent:
-            held = self._holds.pop(channel.slot, None)
+            held = self.holding.pop(channel.slot, None)
             if held or self.steps:
                 self._record(channel, TraceEvent.SENT, out.seq, now, size_bytes=out.size)
         elif not started and self.steps:
@@ -148,7 +145,7 @@ class SendTrace:
 
     def _news(self, channel: OutChannel, reason: HoldReason, now: float) -> bool:
         """Whether the reason is new since something of the channel was sent last, or was told long ago."""
-        told = self._holds.setdefault(channel.slot, {})
+        told = self.holding.setdefault(channel.slot, {})
         told_s = told.get(reason)
         if told_s is not None and now - told_s < AGAIN_S:
             return False

@@ -78,7 +78,10 @@ class Sender:
             self._held_back.add(channel.slot)
             self.held_back_due_s = min(self.held_back_due_s, channel.newest_due_s)
             end.dirty = True  # the owner looks at the deadline again
-        if end.trace.enabled:
+        trace = end.trace
+        if trace.enabled and (
+            trace.steps or not (accepted and channel.ready and channel.wanted and channel.newest is None)
+        ):
             self.told.submitted(channel, message, accepted, thinned=channel.thinned > thinned, now=now)
         channel.left_out = 0
         if not backlog or channel.coalesced:
