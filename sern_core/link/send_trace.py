@@ -33,7 +33,7 @@ class SendTrace:
         self._texts = texts
         self.holding: dict[int, dict[HoldReason, float]] = {}
         """What was told of a channel, by slot, since something of it was sent last: why it waits, and when that was."""
-        self._told: dict[tuple[int, str], float] = {}  # without steps: what was told of a slot, and when
+        self._told: dict[int, dict[str, float]] = {}  # without steps: what was told of a slot, and when
 
     @property
     def steps(self) -> bool:
@@ -42,8 +42,7 @@ class SendTrace:
     def forget(self, channel: OutChannel) -> None:
         """The channel is closed."""
         self.holding.pop(channel.slot, None)
-        for key in [key for key in self._told if key[0] == channel.slot]:
-            del self._told[key]
+        self._told.pop(channel.slot, None)
 
     # --- on the way in --------------------------------------------------------------------------------------------
 
@@ -71,8 +70,10 @@ class SendTrace:
     def queued(self, channel: OutChannel, seq: int, size_bytes: int, now: float) -> None:
         self._record(channel, TraceEvent.QUEUED, seq, now, size_bytes=size_bytes)
 
-    def unready(self, channel: OutChannel, now: float) -> None:
-        """Something waits in a channel of which nothing may be sent yet."""
+    def unready(self, channel: OutChannel, now: float, *, again: bool = True) -> None:
+        """Something may wait in a channel of which nothing may be sent yet. `again`: say it once more in time."""
+        if not again and self.unready_reason(channel) in self.holding.get(channel.slot, ()):
+            return
         out = channel.active[0] if channel.active else channel.queue[0] if channel.queue else None
         if out is not None:
             self.held(channel, out, self.unready_reason(channel), now)
@@ -154,11 +155,11 @@ class SendTrace:
 
     def _again(self, channel: OutChannel, what: str, now: float) -> bool:
         """Whether something of this kind may be told of the channel again."""
-        key = channel.slot, what
-        told_s = self._told.get(key)
+        told = self._told.setdefault(channel.slot, {})
+        told_s = told.get(what)
         if told_s is not None and now - told_s < AGAIN_S:
             return False
-        self._told[key] = now
+        told[what] = now
         return True
 
     def _record(self, channel: OutChannel, event: TraceEvent, seq: int, now: float, **fields: Field) -> None:

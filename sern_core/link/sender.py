@@ -155,7 +155,7 @@ class Sender:
             watermark = channel.watermark
             room -= channel.sweep(now, up=self._end.established, room=room)
             if self._end.trace.enabled and not channel.ready:
-                self.told.unready(channel, now)
+                self.told.unready(channel, now, again=False)
             if channel.offered or channel.active:
                 self.refresh(channel, now)
             if channel.watermark > watermark:

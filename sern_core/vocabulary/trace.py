@@ -192,7 +192,7 @@ class DecisionTrace:
         self, topic: TopicName, ring: deque[tuple[int, float, TopicName, TraceEvent, int, dict[str, Field]]]
     ) -> None:
         """Let go of the oldest record of a topic with more than its share: most often of the one just recorded."""
-        if len(ring) == 1 or len(ring) * len(self._rings) < self._max_records:
+        if len(ring) == 1 or len(ring) * len(self._rings) <= self._max_records:
             topic, ring = max(self._rings.items(), key=lambda item: len(item[1]))
         ring.popleft()
         self._size -= 1

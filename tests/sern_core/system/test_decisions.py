@@ -1,13 +1,14 @@
 """Every event of the decision trace, and every reason to hold a message, is made to happen in virtual time."""
 
 from collections.abc import Callable
-from functools import cache
+from functools import cache, partial
 from typing import Final
 
 import pytest
 
 from sern_core.link.holds import LOOK_S, LOOKED_AT
 from sern_core.site.lease import CommandLease
+from sern_core.stream.out_channel import OutChannel
 from sern_core.vocabulary.codec_names import Compression
 from sern_core.vocabulary.params import SchedulerParams
 from sern_core.vocabulary.trace import LINK, HoldReason, TraceEvent, TraceRecord
@@ -21,8 +22,10 @@ THIN = LinkModel(rate_bps=500e3, delay_s=0.02).as_stream()
 POSE, POINTS = TopicName("/robot/pose"), TopicName("/robot/points")
 
 
-def pair(world: World, robot: LinkModel | None = None, **named: SchedulerParams) -> tuple[SimClient, SimClient]:
-    return world.client("robot", robot, **named), world.client("site", patterns=["/robot/.*"])
+def pair(
+    world: World, robot: LinkModel | None = None, *, scheduler: SchedulerParams | None = None
+) -> tuple[SimClient, SimClient]:
+    return world.client("robot", robot, scheduler=scheduler), world.client("site", patterns=["/robot/.*"])
 
 
 def records(client: SimClient, topic: str = "") -> tuple[TraceRecord, ...]:
@@ -408,9 +411,13 @@ def test_a_look_is_bounded() -> None:
     world = World()
     robot, _site = pair(world, LinkModel(rate_bps=64e3, delay_s=0.02).as_stream())
     count = 5 * LOOKED_AT
+
+    def send(channel: OutChannel, _now: float) -> None:
+        assert robot.send(channel, bytes(5_000))
+
     for number in range(count):
         channel = robot.publish(f"/robot/topic{number}", spec(PriorityClass.BULK, reliable=True))
-        world.network.at(3.0, lambda _now, channel=channel: robot.send(channel, bytes(5_000)))
+        world.network.at(3.0, partial(send, channel))
     world.run(3.0 + 2 * LOOK_S)
     held = {each.topic for each in robot.core.trace.records() if each.event is TraceEvent.HELD}
     assert len(held) < count
