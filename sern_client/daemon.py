@@ -468,7 +468,7 @@ class ClientDaemon:
             health=lambda: Health(ok=True, reason="running"),
             ready=self._ready,
             json_routes={
-                "/api/link": lambda: [link.snapshot()],
+                "/api/link": lambda: [{**link.snapshot(), "now_s": clock.now()}],
                 "/api/peers": self.link_state.to_json,
                 "/api/topics": self.topics,
                 "/api/trace": trace_view(of_client(self.core.link, self.core.trace), clock.now),

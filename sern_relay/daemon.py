@@ -427,7 +427,7 @@ class RelayDaemon:
             health=lambda: Health(ok=True, reason="running"),
             ready=self._readiness,
             json_routes={
-                "/api/link": lambda: [link.snapshot() for link in self.hub.links.values()],
+                "/api/link": lambda: [{**link.snapshot(), "now_s": clock.now()} for link in self.hub.links.values()],
                 "/api/objects": objects_view(self.hub),
                 "/api/topics": self.topics,
                 "/api/trace": trace_view(of_hub(self.hub), clock.now),

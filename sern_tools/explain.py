@@ -22,8 +22,9 @@ from sern_core.vocabulary.errors import SernError, UsageError
 from sern_core.vocabulary.names import name_problem
 from sern_runtime.profiles import load_profile
 from sern_tools.api import LOCAL_APIS, NotFoundError, checked_api, drop_output, get_json, local_api, say
-from sern_tools.explain_replay import Clouds, Setup, replay
+from sern_tools.explain_replay import SETTLE_S, Clouds, Setup, replay
 from sern_tools.explain_story import Record, advice, held_because, in_short, lines, rate, size, span, verdict
+from sern_tools.recorded_link import is_recording, read_link
 
 CLIENTS_FIRST: Final = (*LOCAL_APIS[1:], LOCAL_APIS[0])
 """A client knows each step of its messages, a relay what is out of the ordinary."""
@@ -346,14 +347,20 @@ def explain(
         str | None,
         typer.Option("--api", help="HTTP address of a daemon (http.listen in its file) [default: this machine's]."),
     ] = None,
-    peer: Annotated[str | None, typer.Option("--peer", help="Of a relay: the link to this client.")] = None,
+    peer: Annotated[
+        str | None, typer.Option("--peer", help="Of a relay, or of what one answered: the link to this client.")
+    ] = None,
     last: Annotated[int, typer.Option("--last", "-n", min=1, help="Lines about messages of a topic.")] = LAST,
     bag: Annotated[
         Path | None, typer.Option("--bag", help="Replay a recording (.bag, .mcap, .db3) instead of asking a daemon.")
     ] = None,
     link: Annotated[
         str,
-        typer.Option("--link", help="Link for the replay: a profile's name (sern_runtime/profiles.yaml)."),
+        typer.Option(
+            "--link",
+            help="Link for the replay: a profile (sern_runtime/profiles.yaml) or a recorded one: a .csv with time_s,"
+            "rate_bps,delay_s,loss, answers of /api/link a line each (.jsonl), a lab's folder.",
+        ),
     ] = "step",
     config: Annotated[
         Path | None, typer.Option("--config", help="A client's file: its rules, link, scheduler and adaptation.")
@@ -373,13 +380,17 @@ def explain(
     it. Asks the daemon on this machine, a client before a relay; --api asks another. A client knows every step of its
     messages, a relay what is out of the ordinary.
 
+    With --bag: a recording is replayed through the real scheduler, over a link of a profile or one that was recorded.
+
     Exit code 0 when said, 1 when there is no daemon or no such topic, 2 for wrong usage or a file that cannot be used.
     """
+    records: Sequence[Record]
     try:
         _checked(topic, bag)
         if bag is not None:
             clouds = Clouds(tuple(cloud), cloud_hz) if cloud else None
-            done = replay(bag, load_profile(link), Setup.of(config), duration_s=duration_s, clouds=clouds)
+            profile = read_link(Path(link), peer=peer, after_s=SETTLE_S) if is_recording(link) else load_profile(link)
+            done = replay(bag, profile, Setup.of(config), duration_s=duration_s, clouds=clouds)
             steps, weights, records, topics = done.steps, done.weights, done.trace.to_json(), done.topics
         else:
             address = checked_api(api or local_api(CLIENTS_FIRST))

@@ -498,6 +498,7 @@ class Link:
             "version": self.end.version,
             "inflight_bytes": flight.inflight_bytes,
             "srtt_s": flight.rtt.srtt_s,
+            "loss": lane.loss,
             "fragment_bytes": lane.fragment_bytes,
             "clock_offset_s": clock.offset_s,
             "clock_error_s": clock.error_s if clock.ready else None,
