@@ -51,9 +51,10 @@ def checked_api(api: str) -> str:
     return api.rstrip("/")
 
 
-def local_api(apis: Sequence[str] = LOCAL_APIS) -> str:
-    """The daemon of this machine, at the first of `apis` that answers. One before it that hangs is named on
-    standard error. Raises SernError where none answers."""
+def local_api(apis: Sequence[str] | None = None) -> str:
+    """The daemon of this machine, at the first of `apis` that answers (None: `LOCAL_APIS`). One before it that hangs is
+    named on standard error. Raises SernError where none answers."""
+    apis = LOCAL_APIS if apis is None else apis
     silent: list[str] = []
     for api in apis:
         try:
