@@ -5,67 +5,29 @@ started and whatever is installed beside its interpreter. What a child writes on
 the last of it is in the benchmark's own error, in one line.
 """
 
-import asyncio
 import multiprocessing
 import os
-import sys
 import tempfile
 import time
-from collections.abc import Callable, Coroutine, Iterable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import Any, Final
 
 from sern_core.vocabulary.errors import SernError
 from sern_runtime import clock
-from sern_tools.processes import Children, failure
+from sern_tools.harness.processes import failure
 
 ROOT: Final = Path(__file__).resolve().parents[1]
-LOOK_S: Final = 0.2
-"""How often `beside` looks whether every child is there."""
 PATIENCE_S: Final = 2.0
 """How long a worker may take to end by itself, and after SIGTERM."""
-
-T = TypeVar("T")
-
-
-def python(*arguments: str) -> list[str]:
-    """A command of this interpreter, e.g. `python("-m", "benchmarks.NAME")`; it needs `environment()`.
-
-    `-P`: the folder it is started in does not say what is imported.
-    """
-    return [sys.executable, "-P", *arguments]
 
 
 def environment() -> dict[str, str]:
     """Variables for a child of this interpreter, on top of our own. Programs of another Python must not get them."""
     others = os.environ.get("PYTHONPATH")
     return {"PYTHONPATH": os.pathsep.join([str(ROOT), others] if others else [str(ROOT)])}
-
-
-def cpu_s(*pids: int) -> float:
-    """CPU time of these processes, all threads, those that have ended as well; also of who was not waited for yet.
-    OSError when one is no more.
-
-    The clock is that of clock_getcpuclockid(3): nanoseconds, where /proc/PID/stat has ticks of 10 ms.
-    """
-    return sum(time.clock_gettime((~pid << 3) | 2) for pid in pids)
-
-
-async def beside(children: Children, work: Coroutine[Any, Any, T]) -> T:
-    """What `work` comes to. As soon as a child ends that nobody told to, `work` is cancelled, and the SernError has the
-    child's last words."""
-    task = asyncio.ensure_future(work)
-    try:
-        while not (await asyncio.wait((task,), timeout=LOOK_S))[0]:
-            children.check()
-        if task.exception() is not None:
-            children.check()  # which may be why
-        return task.result()
-    finally:
-        task.cancel()
-        await asyncio.wait((task,))
 
 
 class Worker:

@@ -12,6 +12,7 @@ Missing one is printed plainly and is not an error: the exit code is non-zero on
 """
 
 import argparse
+import importlib
 import json
 import os
 import sys
@@ -22,12 +23,12 @@ from itertools import groupby
 from math import inf, sqrt
 from pathlib import Path
 from statistics import median, stdev
-from typing import Final, TypeVar
+from typing import Any, Final, TypeVar
 
 from rich.console import Console
 from rich.table import Table
 
-from sern_core.vocabulary.errors import SernError
+from sern_core.vocabulary.errors import ConfigError, SernError
 from sern_tools.checkout import commit
 
 REALTIME_PRIORITY = 10
@@ -188,9 +189,32 @@ def medians(runs: Sequence[Mapping[str, float]]) -> dict[str, float]:
     return {name: median(run[name] for run in runs) for name in runs[0] if all(name in run for run in runs)}
 
 
+def percentile(values: Sequence[float], share: float) -> float:
+    """Of sorted values the one that this share of them is below; inf of none."""
+    return values[min(len(values) - 1, int(share * len(values)))] if values else inf
+
+
 def spread(values: Sequence[float]) -> float:
     """How far apart the least and the largest are."""
     return max(values) - min(values)
+
+
+def pyplot(option: str) -> Any:
+    """The drawing module of matplotlib, without a window. ConfigError, naming the `option` that wants it, where it is
+    not installed."""
+    try:
+        import matplotlib
+    except ImportError as error:
+        raise ConfigError(f"{option} needs matplotlib: pip install matplotlib") from error
+    matplotlib.use("Agg")
+    return importlib.import_module("matplotlib.pyplot")
+
+
+def save(figure: Any, path: Path, dpi: int) -> None:
+    """Write a picture and forget it; its folder is made where there is none."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=dpi)
+    importlib.import_module("matplotlib.pyplot").close(figure)
 
 
 def positive(text: str) -> int:

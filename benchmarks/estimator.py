@@ -15,7 +15,7 @@ from math import inf
 from time import process_time
 from typing import Final
 
-from benchmarks.common import Report, interleaved, main
+from benchmarks.common import Report, interleaved, main, percentile
 from benchmarks.delay import DelayWindow
 from benchmarks.flows import (
     DATAGRAM_BYTES,
@@ -223,10 +223,6 @@ FIXED: Final[Maker] = lambda: FixedWindow(25_000)  # noqa: E731 - one of the mak
 
 def link(rate_bps: float, rtt_s: float, **more: object) -> LinkModel:
     return LinkModel(rate_bps=rate_bps, delay_s=rtt_s / 2, overhead_bytes=OVERHEAD_BYTES, **more)  # type: ignore[arg-type]
-
-
-def percentile(values: list[float], share: float) -> float:
-    return values[min(len(values) - 1, int(share * len(values)))] if values else inf
 
 
 def floor_ms(model: LinkModel) -> float:

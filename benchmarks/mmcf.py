@@ -238,7 +238,6 @@ def measure(options: argparse.Namespace, report: Report) -> None:
     if options.plots is not None:
         from benchmarks.mmcf_plots import draw
 
-        options.plots.mkdir(parents=True, exist_ok=True)
         for path in draw(options.plots, {(r.trace, r.profile): r.runs for r in reversed(results)}):
             report.note(f"wrote {path}")
 

@@ -8,6 +8,7 @@ beside the checkout their topics are made up (`benchmarks.recordings`), and a no
 """
 
 import argparse
+import asyncio
 import json
 import signal
 import sys
@@ -16,14 +17,14 @@ import time
 from bisect import bisect_right
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from benchmarks import recordings
 from benchmarks.common import Report, main, positive, try_realtime
-from benchmarks.link.children import Running
-from benchmarks.link.runs import DRAIN_S, START_S, sleep_until, start_daemon, start_relay
+from benchmarks.link.runs import DRAIN_S, START_S, STOP_S, sleep_until, start_daemon, start_relay
 from benchmarks.link.sern import RELAY_PORT
 from benchmarks.mmcf_replay import CLOUD_HZ, EVERY_NTH_POINT, recorded, tabulate
 from sern_core.adaptation.adapter import AdapterParams
@@ -35,6 +36,8 @@ from sern_core.vocabulary.types import CLASS_LABELS, CLASSES, DropReason
 from sern_runtime.config.adaptation import AdaptationSection
 from sern_sim.models import LinkModel
 from sern_tools.api import get_json
+from sern_tools.harness.files import client_content, write
+from sern_tools.harness.processes import Children, killed
 from sern_tools.keygen import make_keys
 from sern_tools.lab.lab import Lab, Node
 from sern_tools.message_log import TopicLog, read_logs
@@ -48,7 +51,6 @@ THIN_BPS: Final = 1e6
 RUN_S, QUICK_S = 36, 9
 WARM_S: Final = 3.0
 """Not counted: the load begins, and a controller finds out what the link carries."""
-POLL_S: Final = 0.1
 
 
 class Edge(NamedTuple):
@@ -147,22 +149,16 @@ def client_file(
     directory: Path, name: str, address: str, endpoint: Sequence[Mapping[str, Any]], **sections: Any
 ) -> Path:
     """A client's configuration; `address` is the relay's."""
-    content = {
-        "client": {"name": name, **sections.pop("client", {})},
-        "relay": {
-            "endpoint": f"tcp://{address}:{RELAY_PORT}",
-            "server_key_file": "relay.pub",
-            "secret_key_file": f"{name}.key",
-        },
-        "endpoint": list(endpoint),
-        "message_log": f"{name}.csv",
-        "http": {"listen": None},
-        "log": {"level": "warning"},
+    sections = {"http": {"listen": None}, **sections}
+    content = client_content(
+        name,
+        f"tcp://{address}:{RELAY_PORT}",
+        list(endpoint),
+        message_log=f"{name}.csv",
+        log={"level": "warning"},
         **sections,
-    }
-    path = directory / f"{name}.yaml"
-    path.write_text(json.dumps(content, indent=1))  # JSON is YAML
-    return path
+    )
+    return write(directory, name, content)
 
 
 class Played(NamedTuple):
@@ -227,7 +223,7 @@ def _ask(node: Node, path: str) -> Any:
     return node.inside(lambda: get_json(API, path))
 
 
-def _connected(robot: Node, topics: int) -> bool:
+async def _connected(robot: Node, topics: int) -> bool:
     """Over the datagram lane, and all of the topics have reached somebody."""
     try:
         link = _ask(robot, "/api/link")
@@ -239,30 +235,14 @@ def _connected(robot: Node, topics: int) -> bool:
     return lanes == ["udp"] and sum(entry["delivered"] > 0 for entry in sent) == topics
 
 
-def _await_connected(running: Running, robot: Node, topics: int) -> None:
-    give_up_s = time.monotonic() + START_S
-    while not _connected(robot, topics):
-        running.check()
-        if time.monotonic() > give_up_s:
-            raise SernError(f"not every topic of the robot got through within {START_S:g} s{running.said()}")
-        time.sleep(POLL_S)
-
-
-def _edge(lab: Lab, running: Running) -> Edge:
+def _edge(lab: Lab, children: Children) -> Edge:
     topics = _ask(lab.a, "/api/topics")
     left_out = {
         name: int(entry["dropped"].get(DropReason.RATE_CAP, 0))
         for name, entry in topics.items()
         if entry["direction"] == "send"
     }
-    return Edge(time.time_ns(), lab.traffic()[0].bytes, running.cpu_s()[ROBOT], left_out)
-
-
-def _stop(running: Running) -> None:
-    """The robot first, so that nothing is offered any more; then who listens, then the relay."""
-    for role in (ROBOT, SITE, "relay"):
-        running.ends[role].send_signal(signal.SIGTERM)
-        running.await_end(role)
+    return Edge(time.time_ns(), lab.traffic()[0].bytes, children.cpu_s()[ROBOT], left_out)
 
 
 def rates_bps(duration_s: int) -> list[float]:
@@ -279,30 +259,38 @@ def run(lab: Lab, directory: Path, section: AdaptationSection, played: Played, d
     specs = {name: spec for name, (_, spec) in load.specs.items()}
     robot = robot_file(directory, lab.b.address, specs, section, played)
     site = site_file(directory, lab.b.address)
-    lab.reset()
-    lab.link(LINK, LINK)
-    running = Running(directory)
-    try:
-        running.ends["relay"] = start_relay(lab, directory, udp=True)
-        running.ends[SITE] = start_daemon(lab, lab.b, "client", site)
-        running.ends[ROBOT] = start_daemon(lab, lab.a, "client", robot)
-        _await_connected(running, lab.a, len(specs))
-        start_ns = time.monotonic_ns() + int(WARM_S * 1e9)
-        capacities_bps = rates_bps(duration_s)
-        edges = []
-        for second in range(duration_s + 1):
-            sleep_until(start_ns + second * 1_000_000_000)
-            edges.append(_edge(lab, running))
-            if 0 < second < duration_s and capacities_bps[second] != capacities_bps[second - 1]:
-                lab.change(rate_bps=capacities_bps[second])
-        (directory / "mmcf.json").write_text(json.dumps(_ask(lab.a, "/api/mmcf")))
-        sleep_until(time.monotonic_ns() + int(DRAIN_S * 1e9))
-        _stop(running)
-    finally:
-        running.stop()
+    capacities_bps = rates_bps(duration_s)
+    edges = asyncio.run(_play(lab, directory, robot, site, len(specs), capacities_bps))
     params = section.params(encodes=True)
     logs = read_logs([(role, directory / f"{role}.csv") for role in (ROBOT, SITE)])
     return intervals(logs, edges, params, capacities_bps)
+
+
+async def _play(
+    lab: Lab, directory: Path, robot: Path, site: Path, topics: int, capacities_bps: Sequence[float]
+) -> list[Edge]:
+    lab.reset()
+    lab.link(LINK, LINK)
+    async with killed(directory) as children:
+        relay = await start_relay(children, lab.b, udp=True)
+        taker = await start_daemon(children, lab.b, "client", site)
+        giver = await start_daemon(children, lab.a, "client", robot)
+        problem = "not every topic of the robot got through"
+        await children.until(partial(_connected, lab.a, topics), START_S, problem)
+        start_ns = time.monotonic_ns() + int(WARM_S * 1e9)
+        edges: list[Edge] = []
+        for second in range(len(capacities_bps) + 1):
+            await sleep_until(start_ns + second * 1_000_000_000)
+            children.check()
+            edges.append(_edge(lab, children))
+            if 0 < second < len(capacities_bps) and capacities_bps[second] != capacities_bps[second - 1]:
+                lab.change(rate_bps=capacities_bps[second])
+        (directory / "mmcf.json").write_text(json.dumps(_ask(lab.a, "/api/mmcf")))
+        await sleep_until(time.monotonic_ns() + int(DRAIN_S * 1e9))
+        # The robot first, so that nothing is offered any more; then who listens, then the relay.
+        for daemon in (giver, taker, relay):
+            await children.end(daemon, within_s=STOP_S)
+    return edges
 
 
 def _runner(lab: Lab, directory: Path, duration_s: int) -> Callable[[AdaptationSection, int], list[Terms]]:

@@ -3,9 +3,7 @@
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
-import matplotlib as mpl
-from matplotlib import pyplot as plt
-
+from benchmarks.common import pyplot, save
 from benchmarks.mmcf_run import Run
 
 COLOURS = {
@@ -19,7 +17,7 @@ COLOURS = {
 
 def draw(folder: Path, runs: Mapping[tuple[str, str], Mapping[str, Run]]) -> Iterator[Path]:
     """Cost, bulk rate and terms over time, one picture a trace; yields the files."""
-    mpl.use("Agg")
+    plt = pyplot("--plots")
     for (trace, profile), mine in runs.items():
         if profile != "teleoperation":
             continue
@@ -44,6 +42,5 @@ def draw(folder: Path, runs: Mapping[tuple[str, str], Mapping[str, Run]]) -> Ite
             axes.legend(loc="upper right", fontsize=7, ncols=2)
         costs.set_title(f"{trace}, {profile}")
         path = folder / f"mmcf-{trace}.png"
-        figure.savefig(path, dpi=110)
-        plt.close(figure)
+        save(figure, path, dpi=110)
         yield path

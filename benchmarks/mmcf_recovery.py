@@ -137,7 +137,7 @@ def run(case: Case, seed: int) -> list[Arrival]:
     # Off the beat of the intervals, as sources are.
     count = int((END_S - 1.1) * case.cloud_hz)
     messages += [(1.053 + i / case.cloud_hz, channels[CLOUD], cloud) for i in range(count)]
-    world.every(params.interval_s / SAMPLES, lambda _now: adapter.sample())
+    world.every(params.interval_s / SAMPLES, lambda now: adapter.sample(now=now))
     world.every(params.interval_s, lambda now: adapter.step(now=now))
     world.feed(sorted(messages, key=lambda message: message[0]))
     world.run(END_S)

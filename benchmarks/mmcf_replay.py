@@ -21,7 +21,7 @@ from statistics import fmean
 from time import perf_counter
 
 from benchmarks import recordings
-from benchmarks.common import Report, half_width_95, main, positive
+from benchmarks.common import Report, half_width_95, main, positive, pyplot, save
 from sern_client.endpoints.clouds import CLOUD_TYPE, cloud_body
 from sern_core.adaptation.adapter import SAMPLES, HopAdapter, Step
 from sern_core.adaptation.cost import cost
@@ -83,7 +83,7 @@ def run(load: Load, link: LinkProfile, section: AdaptationSection, duration_s: f
     policy = section.make_policy(encodes=True)()
     adapter = HopAdapter(world.robot.link, policy, params, coder=coder, now=world.network.now)
     steps: list[Step] = []
-    world.every(params.interval_s / SAMPLES, lambda _now: adapter.sample())
+    world.every(params.interval_s / SAMPLES, lambda now: adapter.sample(now=now))
     world.every(params.interval_s, lambda now: steps.append(adapter.step(now=now)))
     world.feed((SETTLE_S + at_s, channels[topic], body) for at_s, topic, body in load.messages)
     world.run(SETTLE_S + duration_s)
@@ -224,7 +224,7 @@ def reconfigure() -> Reconfiguration:
     # Off the beat of the intervals, as robots are.
     came_s, went_s = APPEARS_S + 0.31, LEAVES_S + 0.31
     world.network.at(came_s, lambda _now: appear("/robot3", came_s + 0.01, went_s), node=world.robot_node)
-    world.every(params.interval_s / SAMPLES, lambda _now: adapter.sample())
+    world.every(params.interval_s / SAMPLES, lambda now: adapter.sample(now=now))
     world.every(params.interval_s, lambda now: steps.append(adapter.step(now=now)))
     world.run(END_S)
     start_s = world.network.start_s
@@ -253,12 +253,8 @@ def reconfigure() -> Reconfiguration:
 
 def draw(path: Path, found: Reconfiguration) -> None:
     """The paper's figure (runtime_reconfig_demo) from this run."""
-    import matplotlib as mpl
-    from matplotlib import pyplot as plt
-
-    mpl.use("Agg")
     times = [step.now - found.start_s for step in found.steps]
-    figure, (streams, load, ages) = plt.subplots(3, 1, figsize=(9, 7), sharex=True, layout="constrained")
+    figure, (streams, load, ages) = pyplot("--plots").subplots(3, 1, figsize=(9, 7), sharex=True, layout="constrained")
     counts = [sum(demand.topics for demand in step.situation.classes) for step in found.steps]
     streams.step(times, counts, where="post", ls=":", color="tab:purple", label="topics known to the adaptation")
     streams.set_ylabel("topics")
@@ -279,8 +275,7 @@ def draw(path: Path, found: Reconfiguration) -> None:
         for at_s in (APPEARS_S + 0.31, LEAVES_S + 0.31):
             axes.axvline(at_s, color="0.5", lw=0.8)
     streams.set_title("A third robot appears and leaves, 3 Mbit/s, 50 ms")
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
+    save(figure, path, dpi=110)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -305,7 +300,6 @@ def measure(options: argparse.Namespace, report: Report) -> None:
     report.reach("a robot that left is forgotten after, s", found.gone_s, 1.0)
     report.reach("longest gap between poses (50 ms apart) of the others, s", found.gap_s, 0.15)
     if options.plots is not None:
-        options.plots.mkdir(parents=True, exist_ok=True)
         draw(options.plots / "mmcf-reconfigure.png", found)
         report.note(f"wrote {options.plots / 'mmcf-reconfigure.png'}")
 

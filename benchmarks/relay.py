@@ -17,7 +17,6 @@ import asyncio
 import importlib.util
 import json
 import multiprocessing
-import random
 import signal
 import statistics
 import sys
@@ -32,27 +31,23 @@ from multiprocessing.sharedctypes import RawValue
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-import psutil
 import uvloop
 import zmq
 
 from benchmarks import common
 from benchmarks.child import Worker, await_workers
-from sern_client.transport import RelayTransport
+from benchmarks.loopback import IdleSite, connect, running, serve, watch
 from sern_core.site.client import ClientCore
 from sern_core.topics.patterns import compile_pattern
 from sern_core.topics.rules import FeedRole
 from sern_core.vocabulary.errors import SernError
 from sern_core.vocabulary.message import Message, StreamInfo, TopicInfo, TopicSpec
-from sern_core.vocabulary.params import LinkParams, SchedulerParams
-from sern_core.vocabulary.types import ClientName, DropReason, Encoding, PriorityClass, TopicName
-from sern_core.wire import framing
-from sern_relay.daemon import RelayDaemon
-from sern_runtime import clock, logs
-from sern_runtime.config.relay import load_relay
+from sern_core.vocabulary.types import ClientName, Encoding, PriorityClass, TopicName
+from sern_runtime import clock
 from sern_runtime.feed import Feed, FeedHeader, topic_frame
 from sern_runtime.loop import Shutdown, keep_freed_memory, run
 from sern_runtime.pump import Pump
+from sern_tools.harness.files import relay_content, write
 from sern_tools.ports import free_ports
 
 SIZES: Final = {"100 B": 100, "1 kB": 1000, "64 kB": 64_000, "1 MB": 1_000_000}
@@ -243,43 +238,6 @@ class Zenoh(System):
                 time.sleep(0.02)
 
 
-class IdleSite:
-    """The shell of a client core in a benchmark: it answers nothing."""
-
-    def link_up(self, *, resumed: bool) -> None: ...
-
-    def link_down(self, reason: str) -> None: ...
-
-    def lane_offered(self, parameters: framing.Envelope) -> None: ...
-
-    def lane_closed(self) -> None: ...
-
-    def rejected(self, code: str, text: str) -> None: ...
-
-    def stream_opened(self, stream: StreamInfo) -> None: ...
-
-    def stream_closed(self, stream: StreamInfo) -> None: ...
-
-    def message(self, stream: StreamInfo, message: Message, *, now: float) -> None: ...
-
-    def expired(self, stream: StreamInfo, seq: int, reason: DropReason) -> None: ...
-
-    def skipped(self, stream: StreamInfo, count: int) -> None: ...
-
-    def send_dropped(self, stream: StreamInfo, first: int, count: int, reason: DropReason, where: str) -> None: ...
-
-    def wanted(self, stream: StreamInfo, wanted: bool) -> None: ...
-
-    def publication_refused(self, stream: StreamInfo, code: str, text: str) -> None: ...
-
-    def undecodable(self, stream: StreamInfo, problem: str) -> None: ...
-
-    def fault(self, error: Exception) -> None:
-        raise SystemExit(f"an internal error: {error!r}")
-
-    def subscription_refused(self, code: str, text: str) -> None: ...
-
-
 class _Site(IdleSite):
     """Counts what arrives."""
 
@@ -304,51 +262,19 @@ class ScheduledLink(System):
     name = "sern"
 
     def relay(self, ports: Ports, ready: Callable[[], None]) -> None:
-        text = (
-            f"relay: {{name: relay, listen: [tcp://127.0.0.1:{ports.ingest}], insecure: true}}\n"
-            "access: [{client: '.*', publish: ['.*'], subscribe: ['.*']}]\n"
-            "http: {listen: null}\nlog: {level: error}\n"
+        content = relay_content(
+            f"tcp://127.0.0.1:{ports.ingest}", secure=False, http={"listen": None}, log={"level": "error"}
         )
-
-        async def main(shutdown: Shutdown) -> None:
-            with tempfile.TemporaryDirectory() as folder:
-                path = Path(folder) / "relay.yaml"
-                path.write_text(text)
-                daemon = RelayDaemon(load_relay(path))
-                try:
-                    await daemon.start()
-                    ready()
-                    await shutdown.wait()
-                finally:
-                    await daemon.stop()
-
-        logs.configure(level="ERROR")
-        run(main)
+        with tempfile.TemporaryDirectory() as folder:
+            serve(write(Path(folder), "relay", content), ready)
 
     async def _client(
         self, ports: Ports, flow: Flow, name: str, work: Callable[[ClientCore, Pump, _Site], Any]
     ) -> None:
         keep_freed_memory()  # as a daemon does
         site = _Site(flow)
-        core = ClientCore(
-            name=ClientName(name),
-            boot=random.getrandbits(63),
-            events=site,
-            link=LinkParams(),
-            scheduler=SchedulerParams(),
-            now=clock.now(),
-        )
         with zmq.Context() as context:
-            transport = RelayTransport(
-                context,
-                core.link,
-                f"tcp://127.0.0.1:{ports.ingest}",
-                None,
-                (),
-                heartbeat_timeout_s=5.0,
-                random=random.Random(1),
-                on_reason=lambda _reason: None,
-            )
+            core, transport = connect(context, ClientName(name), site, f"tcp://127.0.0.1:{ports.ingest}")
             try:
                 await work(core, transport.pump, site)
             finally:
@@ -412,35 +338,13 @@ def measure(system: System, size_bytes: int, duration_s: float) -> Sample:
     ports, flow, ready = Ports(*free_ports(2)), Flow(size_bytes), multiprocessing.get_context("spawn").Event()
     relay = Worker(f"{system.name}, relay", _relay_main, system, ports, ready)
     ends = [Worker(f"{system.name}, {end.__name__}", end, ports, flow) for end in (system.subscriber, system.publisher)]
-    workers = (relay, *ends)
-    try:
-        relay.start()
-        await_workers(ready.is_set, workers, f"the relay of {system.name} did not start", START_S)
-        for worker in ends:
-            worker.start()
+    with running(relay, ends, ready, flow.stopped, START_S) as workers:
         await_workers(lambda: flow.received.value >= 2 * BURST, workers, f"no messages through {system.name}", START_S)
         time.sleep(duration_s / 4)
-        watched = psutil.Process(relay.pid)
-        start_s, start, start_cpu_s = clock.now(), flow.received.value, cpu_s(watched)
-        time.sleep(duration_s)
-        for worker in workers:
-            worker.check()
-        end_s, end, end_cpu_s = clock.now(), flow.received.value, cpu_s(watched)
-    finally:
-        flow.stopped.value = True
-        for worker in ends:
-            worker.end(patient=True)
-        relay.end(patient=False)
-    messages = end - start
-    if not messages:
+        carried = watch(workers, flow.received, duration_s)
+    if not carried.messages:
         raise SernError(f"{system.name} carried nothing at {size_bytes} bytes")
-    rate_hz = messages / (end_s - start_s)
-    return Sample(rate_hz, rate_hz * size_bytes / 1e6, (end_cpu_s - start_cpu_s) / messages * 1e6)
-
-
-def cpu_s(process: psutil.Process) -> float:
-    times = process.cpu_times()
-    return float(times.user + times.system)
+    return Sample(carried.messages_hz, carried.messages_hz * size_bytes / 1e6, carried.cpu_us)
 
 
 def bench(options: argparse.Namespace, report: common.Report) -> None:

@@ -26,25 +26,21 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-import psutil
 import uvloop
 import zmq
 
 from benchmarks import common
 from benchmarks.child import Worker, await_workers
-from benchmarks.relay import IdleSite, cpu_s
+from benchmarks.loopback import IdleSite, connect, running, serve, watch
 from sern_client.transport import RelayTransport
 from sern_core.site.client import ClientCore
 from sern_core.stream.out_channel import OutChannel
-from sern_core.vocabulary.errors import ConfigError, SernError
+from sern_core.vocabulary.errors import SernError
 from sern_core.vocabulary.message import Message, StreamInfo, TopicInfo, TopicSpec
-from sern_core.vocabulary.params import LinkParams, SchedulerParams
 from sern_core.vocabulary.types import CLASS_LABELS, ClientName, Encoding, PriorityClass, TopicName
-from sern_relay.daemon import RelayDaemon
-from sern_runtime import clock, logs
+from sern_runtime import clock
 from sern_runtime.config.keys import load_public, load_secret
-from sern_runtime.config.relay import load_relay
-from sern_runtime.loop import Shutdown, run
+from sern_tools.harness.files import relay_content, write
 from sern_tools.keygen import make_keys
 from sern_tools.ports import free_ports
 
@@ -55,13 +51,6 @@ START_S: Final = 30.0
 STAMP: Final = struct.Struct("!d")
 LATENCY_LIMIT_MS: Final = 10.0
 CPU_RATIO_LIMIT: Final = 1.2
-
-RELAY: Final = """
-relay: {{name: relay, listen: [tcp://127.0.0.1:{port}], secret_key_file: relay.key, clients_dir: clients, udp: false}}
-access: [{{client: '.*', publish: ['.*'], subscribe: ['.*']}}]
-http: {{listen: null}}
-log: {{level: error}}
-"""
 
 
 class Kind(NamedTuple):
@@ -109,42 +98,12 @@ def robot_name(number: int) -> ClientName:
     return ClientName(f"robot{number}")
 
 
-def _relay(folder: Path, ready: Any) -> None:
-    async def main(shutdown: Shutdown) -> None:
-        daemon = RelayDaemon(load_relay(folder / "relay.yaml"))
-        try:
-            await daemon.start()
-            ready.set()
-            await shutdown.wait()
-        finally:
-            await daemon.stop()
-
-    logs.configure(level="ERROR")
-    run(main)
-
-
 def _client(
     context: "zmq.Context[zmq.Socket[bytes]]", folder: Path, port: int, name: ClientName, events: IdleSite
 ) -> tuple[ClientCore, RelayTransport]:
-    core = ClientCore(
-        name=name,
-        boot=random.getrandbits(63),
-        events=events,
-        link=LinkParams(),
-        scheduler=SchedulerParams(),
-        now=clock.now(),
-    )
-    transport = RelayTransport(
-        context,
-        core.link,
-        f"tcp://127.0.0.1:{port}",
-        load_secret(folder / f"{name}.key"),
-        [key.key for key in load_public(folder / "relay.pub").valid_at(time.time())],
-        heartbeat_timeout_s=5.0,
-        random=random.Random(1),
-        on_reason=lambda _reason: None,
-    )
-    return core, transport
+    key, relay = load_secret(folder / f"{name}.key"), load_public(folder / "relay.pub")
+    server_keys = [key.key for key in relay.valid_at(time.time())]
+    return connect(context, name, events, f"tcp://127.0.0.1:{port}", key, server_keys)
 
 
 class _Site(IdleSite):
@@ -214,9 +173,17 @@ def _robots(folder: Path, port: int, numbers: range, shared: Shared) -> None:
         runner.run(main())
 
 
-def _prepare(folder: Path, robots: int, port: int) -> None:
+def _prepare(folder: Path, robots: int, port: int) -> Path:
+    """The relay's file."""
     make_keys(folder, "relay", "site", *map(robot_name, range(robots)))
-    (folder / "relay.yaml").write_text(RELAY.format(port=port))
+    content = relay_content(
+        f"tcp://127.0.0.1:{port}", relay={"udp": False}, http={"listen": None}, log={"level": "error"}
+    )
+    return write(folder, "relay", content)
+
+
+def _relay(config: Path, ready: Any) -> None:
+    serve(config, ready.set)
 
 
 def measure(robots: int, duration_s: float) -> Sample:
@@ -226,8 +193,7 @@ def measure(robots: int, duration_s: float) -> Sample:
     ours, theirs = processes.Pipe(duplex=False)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        _prepare(folder, robots, port)
-        relay = Worker("relay", _relay, folder, ready)
+        relay = Worker("the relay", _relay, _prepare(folder, robots, port), ready)
         ends = [
             Worker("site", _site, folder, port, shared, theirs),
             *(
@@ -236,36 +202,19 @@ def measure(robots: int, duration_s: float) -> Sample:
                 if len(numbers := range(host * robots // HOSTS, (host + 1) * robots // HOSTS))
             ),
         ]
-        workers = (relay, *ends)
-        try:
-            relay.start()
-            await_workers(ready.is_set, workers, "the relay did not start", START_S)
-            for worker in ends:
-                worker.start()
+        with running(relay, ends, ready, shared.stopped, START_S) as workers:
             everybody = robots * TOPICS
             await_workers(
                 lambda: shared.opened.value == everybody, workers, f"{robots} robots were not all there", START_S
             )
             settled = shared.received.value + int(robots * RATE_HZ)
             await_workers(lambda: shared.received.value > settled, workers, "messages did not flow", START_S)
-            watched = psutil.Process(relay.pid)
-            start_s, start, start_cpu_s = clock.now(), shared.received.value, cpu_s(watched)
-            shared.measuring.value = True
-            time.sleep(duration_s)
-            shared.measuring.value = False
-            for worker in workers:
-                worker.check()
-            end_s, end, end_cpu_s = clock.now(), shared.received.value, cpu_s(watched)
+            carried = watch(workers, shared.received, duration_s, shared.measuring)
             shared.stopped.value = True
             if not ours.poll(START_S):
                 raise SernError("the site does not answer")
             ages_s = ours.recv()
-        finally:
-            shared.stopped.value = True
-            for worker in ends:
-                worker.end(patient=True)
-            relay.end(patient=False)
-    return Sample(robots, (end - start) / (end_s - start_s), (end_cpu_s - start_cpu_s) / (end - start) * 1e6, ages_s)
+    return Sample(robots, carried.messages_hz, carried.cpu_us, ages_s)
 
 
 def bench(options: argparse.Namespace, report: common.Report) -> None:
@@ -295,14 +244,7 @@ def bench(options: argparse.Namespace, report: common.Report) -> None:
 
 
 def _draw(path: Path, median: dict[int, dict[str, float]]) -> None:
-    try:
-        import matplotlib
-    except ImportError as error:
-        raise ConfigError("--figure needs matplotlib: pip install matplotlib") from error
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
-    figure, (left, right) = pyplot.subplots(1, 2, figsize=(9.0, 3.4))
+    figure, (left, right) = common.pyplot("--figure").subplots(1, 2, figsize=(9.0, 3.4))
     robots = sorted(median)
     for name, label in (
         ("control_p50_ms", "control, median"),
@@ -319,8 +261,7 @@ def _draw(path: Path, median: dict[int, dict[str, float]]) -> None:
         axes.set_xlabel(f"robots of {TOPICS} topics, {RATE_HZ:g} messages/s")
         axes.set_ylim(bottom=0)
     figure.tight_layout()
-    figure.savefig(path, dpi=150)
-    pyplot.close(figure)
+    common.save(figure, path, dpi=150)
 
 
 def _arguments(parser: argparse.ArgumentParser) -> None:

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks import recordings
-from benchmarks.common import Report, interleaved, main
+from benchmarks.common import Report, interleaved, main, pyplot, save
 from sern_client.endpoints.clouds import cloud_body, read_ply
 from sern_core.bodies.codecs import encode
 from sern_core.summaries.bodies import Header
@@ -187,18 +187,13 @@ def measure_transforms(report: Report, rounds: int) -> None:
 
 def plot(directory: Path, scan_name: str, cloud: bytes) -> None:
     """The cloud, a thinned one, its scan and its mask, to look at."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
     xyz = read_cloud(cloud, CDR).xyz()
     thin = read_cloud(thin_cloud(cloud, CDR, 0.2), CDR).xyz()
     maker = ScanMaker(ScanParams())
     ranges = np.frombuffer(maker.scan(cloud, CDR)[-4 - 4 * maker.params.beams : -4], "<f4")
     bearings = -np.pi + np.arange(len(ranges)) * (2 * np.pi / len(ranges))
     mask = read_grid(MaskMaker(MaskParams()).mask(cloud, CDR), CDR)
-    figure, axes = pyplot.subplots(1, 4, figsize=(20, 5.4))
+    figure, axes = pyplot("--plots").subplots(1, 4, figsize=(20, 5.4))
     for axis, points, title in (
         (axes[0], xyz, f"{scan_name}: {len(xyz):,} points"),
         (axes[1], thin, f"voxel 0.2 m: {len(thin):,} points"),
@@ -217,9 +212,7 @@ def plot(directory: Path, scan_name: str, cloud: bytes) -> None:
         axis.set_aspect("equal")
         axis.set_xlabel("x [m]")
     figure.tight_layout()
-    directory.mkdir(parents=True, exist_ok=True)
-    figure.savefig(directory / "summaries.png", dpi=70)
-    pyplot.close(figure)
+    save(figure, directory / "summaries.png", dpi=70)
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:

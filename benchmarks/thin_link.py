@@ -10,7 +10,7 @@ import sys
 from collections.abc import Sequence
 from typing import Final
 
-from benchmarks.common import Report, main
+from benchmarks.common import Report, main, percentile
 from benchmarks.link.figures import NEVER_S
 from tests.thin_link import (
     CLOUD,
@@ -43,8 +43,8 @@ def ages(found_s: Sequence[float], rate_hz: float) -> dict[str, float]:
     row: dict[str, float] = {"offered_count": round(rate_hz * COUNTED_S), "arrived_count": len(found_s)}
     if found_s:
         row |= {
-            "age_p50_s": found_s[len(found_s) // 2],
-            "age_p99_s": found_s[int(0.99 * len(found_s))],
+            "age_p50_s": percentile(found_s, 0.5),
+            "age_p99_s": percentile(found_s, 0.99),
             "age_most_s": found_s[-1],
         }
     return row

@@ -25,13 +25,23 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
 from multiprocessing.connection import Connection
-from typing import Final
+from typing import Any, Final, Self
 
 import uvloop
 from cryptography.hazmat.primitives.ciphers.aead import AESGCM, ChaCha20Poly1305
 
+from benchmarks import flood
 from benchmarks.child import Worker
-from benchmarks.common import Report, interleaved, main, medians, repetition_arguments, repetitions, try_realtime
+from benchmarks.common import (
+    Report,
+    interleaved,
+    main,
+    medians,
+    percentile,
+    repetition_arguments,
+    repetitions,
+    try_realtime,
+)
 from benchmarks.link.forwarder import Forwarder, Hops
 from sern_core.vocabulary.errors import SernError
 from sern_core.vocabulary.types import ClientName
@@ -50,7 +60,6 @@ from sern_runtime.seal import (
 )
 from sern_runtime.udp import INNER_BYTES, TYPE_CHALLENGE, TYPE_DATA, TYPE_RESPONSE, UdpServer, UdpSession
 
-JUNK_HZ: Final = 20_000
 FORWARD_HZ: Final = 2000
 JUNK: Final = {"junk, unknown": False, "junk, bad tag": True}
 """Whether its session is one that the server knows."""
@@ -98,12 +107,27 @@ def seal_us(cipher: Cipher, count: int) -> dict[str, float]:
     }
 
 
-# --- the bare forwarder -----------------------------------------------------------------------------------------------
+# --- servers in processes of their own --------------------------------------------------------------------------------
+
+
+async def _answer(control: Connection, usage: Callable[[], tuple[float, float, int]]) -> None:
+    """Answer each word on `control` with `usage`, until told to end."""
+    loop = asyncio.get_running_loop()
+    ended = asyncio.Event()
+
+    def asked() -> None:
+        if control.recv():
+            control.send(usage())
+        else:
+            ended.set()
+
+    loop.add_reader(control.fileno(), asked)
+    await ended.wait()
+    loop.remove_reader(control.fileno())
 
 
 def forward(control: Connection, hops: Hops, target: tuple[str, int]) -> None:
-    """Forward to `target`. Tells its own address first; each later word on `control` is answered with (process CPU s,
-    datagrams)."""
+    """The bare forwarder to `target`. Tells its own address first."""
     try_realtime()
 
     async def run() -> None:
@@ -116,65 +140,19 @@ def forward(control: Connection, hops: Hops, target: tuple[str, int]) -> None:
             outlet.connect(target)
             forwarder = Forwarder(hops, inlet, outlet)
             loop = asyncio.get_running_loop()
-            ended = asyncio.Event()
-
-            def asked() -> None:
-                if control.recv():
-                    control.send((time.process_time(), forwarder.forwarded))
-                else:
-                    ended.set()
-
-            loop.add_reader(control.fileno(), asked)
             loop.add_reader(inlet.fileno(), forwarder.step)
             control.send(inlet.getsockname())
-            await ended.wait()
+            await _answer(control, lambda: (time.process_time(), time.monotonic(), forwarder.forwarded))
             loop.remove_reader(inlet.fileno())
-            loop.remove_reader(control.fileno())
 
     uvloop.run(run())
 
 
-def forwarding(duration_s: float) -> dict[str, float]:
-    """Datagrams of the full size, FORWARD_HZ, as evenly as a process that sleeps in between can send them."""
-    hops = Hops.draw()
-    sealer = Sealer(hops.first, Side.CLIENT)
-    data = os.urandom(ROOM_BYTES)
-    ours, far = multiprocessing.Pipe()
-    with (
-        ours,
-        far,
-        socketlib.socket(socketlib.AF_INET, socketlib.SOCK_DGRAM) as sink,
-        socketlib.socket(socketlib.AF_INET, socketlib.SOCK_DGRAM) as source,
-    ):
-        sink.bind(("127.0.0.1", 0))
-        sink.settimeout(2.0)
-        process = multiprocessing.get_context("spawn").Process(
-            target=forward, args=(far, hops, sink.getsockname()), daemon=True
-        )
-        process.start()
-        source.connect(ours.recv())
-        ours.send(True)
-        cpu_s, before = ours.recv()
-        begun_s = time.monotonic()
-        for number in range(int(duration_s * FORWARD_HZ)):
-            time.sleep(max(0.0, begun_s + number / FORWARD_HZ - time.monotonic()))
-            source.send(sealer.seal(data))
-            sink.recv(UDP_PAYLOAD_BYTES)
-        ended_s = time.monotonic()
-        ours.send(True)
-        cpu_end_s, after = ours.recv()
-        ours.send(False)
-        process.join()
-    count = after - before
-    return {"datagrams_hz": count / (ended_s - begun_s), "server_cpu_us": (cpu_end_s - cpu_s) / count * 1e6}
+def serve(control: Connection, plain: bool) -> None:
+    """A server with one session, whose parameters it tells first; it sends back what it gets.
 
-
-# --- a server in a process of its own ---------------------------------------------------------------------------------
-
-
-def serve(control: Connection, plain: bool, echo: bool) -> None:
-    """A server with one session, whose parameters it tells; each later word on `control` is answered with
-    (process CPU s, wall s, datagrams of ours). `plain`: without the filter and the pause."""
+    `plain`: without the filter and the pause.
+    """
     try_realtime()
 
     async def run() -> None:
@@ -183,43 +161,32 @@ def serve(control: Connection, plain: bool, echo: bool) -> None:
         def datagram(session: UdpSession, data: bytes, _now: float) -> None:
             nonlocal received
             received += 1
-            if echo:
-                session.send(data)
+            session.send(data)
 
         if plain:
             udp_socket.MAX_FILTER_IDS = -1  # type: ignore[misc]  # the peer that the module's text compares with
             udp_socket.DatagramSocket._readable = udp_socket.DatagramSocket._take  # type: ignore[method-assign,assignment]
         server = UdpServer(["udp://127.0.0.1:*"], datagram)
         control.send(server.open_session(ROBOT, OFFERED).parameters)
-        loop = asyncio.get_running_loop()
-        ended = asyncio.Event()
-
-        def asked() -> None:
-            if control.recv():
-                control.send((time.process_time(), time.monotonic(), received))
-            else:
-                ended.set()
-
-        loop.add_reader(control.fileno(), asked)
-        await ended.wait()
-        loop.remove_reader(control.fileno())
+        await _answer(control, lambda: (time.process_time(), time.monotonic(), received))
         server.close()
 
     uvloop.run(run())
 
 
 class ServerProcess:
-    """Started on entry, ended on exit."""
+    """Started on entry, ended on exit. `told`: what it says first."""
 
-    def __init__(self, *, plain: bool = False, echo: bool = True) -> None:
+    def __init__(self, name: str, target: Callable[..., None], *arguments: object) -> None:
         self._control, self._far = multiprocessing.Pipe()
-        self._worker = Worker("the UDP server", serve, self._far, plain, echo)
+        self._worker = Worker(name, target, self._far, *arguments)
+        self.told: Any = None
 
-    def __enter__(self) -> "ServerProcess":
+    def __enter__(self) -> Self:
         try:
             self._worker.start()
             self._far.close()  # the server's copy alone keeps it open
-            self.parameters: SessionParameters = self._worker.hear(self._control)
+            self.told = self._worker.hear(self._control)
         except BaseException:
             self.__exit__()
             raise
@@ -235,6 +202,35 @@ class ServerProcess:
         """CPU and wall clock in seconds, and datagrams received, so far. SernError when the server has ended."""
         cpu_s, wall_s, received = self._worker.ask(self._control, True)
         return float(cpu_s), float(wall_s), int(received)
+
+
+def udp_server(*, plain: bool = False) -> ServerProcess:
+    return ServerProcess("the UDP server", serve, plain)
+
+
+def forwarding(duration_s: float) -> dict[str, float]:
+    """Datagrams of the full size, FORWARD_HZ, as evenly as a process that sleeps in between can send them."""
+    hops = Hops.draw()
+    sealer = Sealer(hops.first, Side.CLIENT)
+    data = os.urandom(ROOM_BYTES)
+    with (
+        socketlib.socket(socketlib.AF_INET, socketlib.SOCK_DGRAM) as sink,
+        socketlib.socket(socketlib.AF_INET, socketlib.SOCK_DGRAM) as source,
+    ):
+        sink.bind(("127.0.0.1", 0))
+        sink.settimeout(2.0)
+        with ServerProcess("the bare forwarder", forward, hops, sink.getsockname()) as server:
+            source.connect(server.told)
+            cpu_s, _, before = server.usage()
+            begun_s = time.monotonic()
+            for number in range(int(duration_s * FORWARD_HZ)):
+                time.sleep(max(0.0, begun_s + number / FORWARD_HZ - time.monotonic()))
+                source.send(sealer.seal(data))
+                sink.recv(UDP_PAYLOAD_BYTES)
+            ended_s = time.monotonic()
+            cpu_end_s, _, after = server.usage()
+    count = after - before
+    return {"datagrams_hz": count / (ended_s - begun_s), "server_cpu_us": (cpu_end_s - cpu_s) / count * 1e6}
 
 
 class Peer:
@@ -262,8 +258,8 @@ class Peer:
 
 def throughput(duration_s: float) -> dict[str, float]:
     """Datagrams of the full size there and back, WINDOW in flight."""
-    with ServerProcess() as server:
-        peer = Peer(server.parameters)
+    with udp_server() as server:
+        peer = Peer(server.told)
         data = bytes(INNER_BYTES)
         with peer.socket:
             with suppress(TimeoutError):  # the echo of "here" may have come before the validation, or after it
@@ -285,33 +281,25 @@ def throughput(duration_s: float) -> dict[str, float]:
 # --- junk -------------------------------------------------------------------------------------------------------------
 
 
-def flood(port: int, session_id: int, seconds: float, told: Connection) -> None:
-    """JUNK_HZ datagrams a second with random contents, as evenly as a busy loop can. Says when it is ready, begins when
-    it is told to, and tells the rate that it came to."""
-    target = socketlib.socket(socketlib.AF_INET, socketlib.SOCK_DGRAM)
-    target.connect(("127.0.0.1", port))
-    clear = [struct.pack("!IQ", session_id, 2**32 + number) for number in range(256)]
-    junk = [head + os.urandom(UDP_PAYLOAD_BYTES - len(head)) for head in clear]
-    told.send(True)
-    told.recv()
-    count = 0
-    begun_s = time.monotonic()
-    with target:
-        while (passed_s := time.monotonic() - begun_s) < seconds:
-            if count < passed_s * JUNK_HZ:
-                with suppress(OSError):
-                    target.send(junk[count & 0xFF])
-                count += 1
-    told.send(count / passed_s)
+def send_junk(port: int, session_id: int, seconds: float, told: Connection) -> None:
+    """Say when it is ready, begin when told to, and tell the rate that it came to."""
+    with socketlib.socket(socketlib.AF_INET, socketlib.SOCK_DGRAM) as target:
+        target.connect(("127.0.0.1", port))
+        datagrams = flood.junk(session_id)
+        told.send(True)
+        told.recv()
+        told.send(flood.send(target, datagrams, seconds))
 
 
 def under_junk(known_id: bool, plain: bool, duration_s: float) -> dict[str, float]:
-    with ServerProcess(plain=plain) as server:
-        parameters = server.parameters
+    with udp_server(plain=plain) as server:
+        parameters: SessionParameters = server.told
         peer = Peer(parameters)
         ours, far = multiprocessing.Pipe()
         session_id = parameters.id if known_id else parameters.id ^ 1
-        generator = Worker("the source of junk", flood, parameters.port, session_id, WARM_UP_S + duration_s + 0.3, far)
+        generator = Worker(
+            "the source of junk", send_junk, parameters.port, session_id, WARM_UP_S + duration_s + 0.3, far
+        )
         round_trips = []
         with ExitStack() as stack:
             stack.callback(generator.end, patient=True)
@@ -348,7 +336,7 @@ def under_junk(known_id: bool, plain: bool, duration_s: float) -> dict[str, floa
         "cpu_percent": 100 * (cpu_end_s - cpu_s) / (end_s - begun_s),
         "junk_hz": float(rate_hz),
         "echo_p50_ms": 1000 * statistics.median(round_trips),
-        "echo_p99_ms": 1000 * round_trips[int(0.99 * len(round_trips))],
+        "echo_p99_ms": 1000 * percentile(round_trips, 0.99),
         "echo_lost_count": float(lost),
     }
 

@@ -17,7 +17,7 @@ _log = logging.getLogger(__name__)
 
 
 class Comparable(Protocol):
-    """What is checked: the bridge."""
+    """What is checked: `Tables`."""
 
     def validate(self) -> list[Difference]: ...
 
@@ -39,7 +39,7 @@ class TableCheck:
     def __init__(self, tables: Comparable, *, now: float) -> None:
         self.found: list[Difference] = []
         self.total = 0
-        self._tables = tables
+        self.tables = tables
         self._suspected: list[Difference] = []
         self._due_s = now + CHECK_S
         self._repairs: dict[Difference, _Repair] = {}
@@ -68,7 +68,7 @@ class TableCheck:
         due = self._due_repairs(confirmed, now)
         if due:
             try:
-                self._tables.repair(due)
+                self.tables.repair(due)
             except Exception:  # noqa: BLE001  a repair must not end the client; it is tried again
                 _log.exception("what is not what should be could not be opened anew")
 
@@ -85,7 +85,7 @@ class TableCheck:
     def _look(self) -> list[Difference] | None:
         """What differs now; None: it cannot be told."""
         try:
-            return self._tables.validate()
+            return self.tables.validate()
         except Exception:  # noqa: BLE001  a look must not end the client
             _log.exception("the tables of bridge and endpoint could not be compared")
             return None

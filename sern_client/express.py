@@ -45,7 +45,7 @@ class ClientExpress:
         self._transport = transport
         self._wait_s = DATAGRAMS_FIRST_S if datagrams else 0.0
         self._kick = kick
-        self._connections: list[_Connection] = []
+        self.connections: list[_Connection] = []
         self._pump: Pump | None = None
         self._open_s = 0.0
         self._failures = 0
@@ -56,12 +56,12 @@ class ClientExpress:
         self._open_s = clock.now() + self._wait_s
         self._failures = 0
         self.paths.clear()
-        for connection in self._connections:
+        for connection in self.connections:
             connection.join()
 
     def tick(self) -> None:
         link = self.core.link
-        if not self._connections:
+        if not self.connections:
             if link.established and link.lane.id == LANE_ZMQ and clock.now() >= self._open_s:
                 self._open()
         else:
@@ -72,7 +72,7 @@ class ClientExpress:
         self._pump = Pump(LanePort(self.core.link, LANE_EXPRESS), self.paths.send, on_gone=lambda: None)
         try:
             for _ in range(CONNECTIONS):
-                self._connections.append(_Connection(self, self._transport))
+                self.connections.append(_Connection(self, self._transport))
         except ConfigError as error:
             _log.warning("class control has no connection of its own: %s", error)
             self._said()
@@ -91,9 +91,9 @@ class ClientExpress:
         if self._pump is not None:
             self._pump.close()
             self._pump = None
-        for connection in self._connections:
+        for connection in self.connections:
             connection.dialer.close()
-        self._connections.clear()
+        self.connections.clear()
         self.paths.clear()
         self.core.link.close_lane(now=clock.now(), lane_id=LANE_EXPRESS)
 

@@ -1,9 +1,9 @@
 """Makes endpoints from the sections of a client file."""
 
-from collections.abc import Callable
-from dataclasses import fields
+from collections.abc import Callable, Sequence
+from dataclasses import is_dataclass
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final, TypeVar, get_args, get_type_hints
 
 from sern_client.endpoints.bag import BagEndpoint, BagOptions
 from sern_client.endpoints.base import Endpoint, Publisher
@@ -14,7 +14,6 @@ from sern_client.endpoints.ros1 import Ros1Endpoint, Ros1Options
 from sern_client.endpoints.synthetic import SyntheticEndpoint, SyntheticOptions
 from sern_client.endpoints.zenoh.endpoint import ZenohEndpoint
 from sern_client.endpoints.zenoh.options import ZenohOptions
-from sern_client.endpoints.zenoh.session import SessionOptions
 from sern_client.link_topics import LinkTopics
 from sern_core.vocabulary.errors import ConfigError, UsageError
 from sern_core.vocabulary.message import TopicInfo
@@ -23,7 +22,11 @@ from sern_runtime.config import endpoints as sections
 from sern_runtime.config.client import ClientFile
 from sern_runtime.config.load import Loaded
 
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
 Resolve = Callable[[str], Path]
+Options = TypeVar("Options", bound="DataclassInstance")
 
 
 def make_endpoint(loaded: Loaded[ClientFile]) -> Endpoint:
@@ -75,95 +78,54 @@ def make_section(section: sections.EndpointSection, resolve: Resolve, *, second:
     """One of them. `second`: another process has an endpoint of this section already, whose ports are taken."""
     match section:
         case sections.BagEndpoint():
-            return BagEndpoint(
-                BagOptions(
-                    path=resolve(section.path),
-                    rate=section.rate,
-                    loop=section.loop,
-                    namespaces=section.namespaces,
-                    topics=section.topics,
-                    deny=section.deny,
-                    start_delay_s=section.start_delay_s,
-                    wait_for=section.wait_for,
-                    on_refused=section.on_refused,
-                    stamps=section.stamps,
-                )
-            )
+            return BagEndpoint(options_of(BagOptions, section, resolve))
         case sections.RecordEndpoint():
-            return RecordEndpoint(
-                RecordOptions(
-                    path=resolve(section.path),
-                    overwrite=section.overwrite,
-                    max_buffer_bytes=section.max_buffer_bytes,
-                    flush_s=section.flush_s,
-                    sync=section.sync,
-                ),
-                folder=section.path.endswith("/"),
-            )
+            return RecordEndpoint(options_of(RecordOptions, section, resolve), folder=section.path.endswith("/"))
         case sections.RclpyEndpoint():
-            return RclpyEndpoint(
-                RclpyOptions(
-                    node_name=section.node_name,
-                    domain=section.domain,
-                    poll_hz=section.poll_hz,
-                    type_paths=tuple(resolve(path) for path in section.type_paths),
-                )
-            )
+            return RclpyEndpoint(options_of(RclpyOptions, section, resolve))
         case sections.ZenohEndpoint():
-            return ZenohEndpoint(
-                ZenohOptions(
-                    session=SessionOptions(
-                        connect=section.connect,
-                        listen=section.listen,
-                        config_file=None if section.config_file is None else resolve(section.config_file),
-                        second=second,
-                    ),
-                    domain=section.domain,
-                    node_name=section.node_name,
-                    type_paths=tuple(resolve(path) for path in section.type_paths),
-                )
-            )
+            return ZenohEndpoint(options_of(ZenohOptions, section, resolve, second=second))
         case sections.DdsEndpoint():
             return _dds(section, resolve)
         case sections.SyntheticEndpoint():
-            return SyntheticEndpoint(_synthetic(section, resolve))
+            return SyntheticEndpoint(options_of(SyntheticOptions, section, resolve))
         case sections.Ros1Endpoint():
-            return Ros1Endpoint(Ros1Options(**{item.name: getattr(section, item.name) for item in fields(Ros1Options)}))
+            return Ros1Endpoint(options_of(Ros1Options, section, resolve))
     raise UsageError(f"no endpoint for a section of type {type(section).__name__}")
+
+
+def options_of(kind: type[Options], section: sections.EndpointBase, resolve: Resolve, **given: object) -> Options:
+    """The options of an endpoint: each field is the key of its name in the section, a test holds the two together.
+
+    Paths are those that the file means. Options within options come from the same section. `given`: what no file says.
+    """
+    values: dict[str, object] = {}
+    for name, hint in get_type_hints(kind).items():
+        if is_dataclass(hint):
+            assert isinstance(hint, type)
+            values[name] = options_of(hint, section, resolve, **given)
+        elif hasattr(section, name):
+            value = getattr(section, name)
+            values[name] = _resolved(value, resolve) if Path in (hint, *get_args(hint)) else value
+        elif name in given:
+            values[name] = given[name]
+    return kind(**values)
+
+
+def _resolved(value: str | Sequence[str] | None, resolve: Resolve) -> Path | tuple[Path, ...] | None:
+    if value is None:
+        return None
+    return resolve(value) if isinstance(value, str) else tuple(resolve(path) for path in value)
 
 
 def _dds(section: sections.DdsEndpoint, resolve: Resolve) -> Endpoint:
     try:
-        from sern_client.endpoints.dds.domain import DomainOptions, environment_domain
+        from sern_client.endpoints.dds.domain import environment_domain
         from sern_client.endpoints.dds.endpoint import DdsEndpoint, DdsOptions
     except ImportError as error:
         raise ConfigError(
             f"endpoint kind dds needs Cyclone DDS: {sections.installing('cyclonedds==11.0.1')} ({error})"
         ) from None
-    return DdsEndpoint(
-        DdsOptions(
-            DomainOptions(
-                domain=environment_domain() if section.domain is None else section.domain,
-                interface=section.interface,
-                peers=section.peers,
-                multicast=section.multicast,
-                localhost_only=section.localhost_only,
-                fragment_bytes=section.fragment_bytes,
-                receive_buffer_bytes=section.receive_buffer_bytes,
-                lease_s=section.lease_s,
-            ),
-            node_name=section.node_name,
-            type_paths=tuple(resolve(path) for path in section.type_paths),
-            queue_depth=section.queue_depth,
-            max_buffer_bytes=section.max_buffer_bytes,
-            offer_lifespan=section.offer_lifespan,
-            heed_sern=section.heed_sern,
-        )
-    )
-
-
-def _synthetic(section: sections.SyntheticEndpoint, resolve: Resolve) -> SyntheticOptions:
-    # Section and options have the same fields on purpose; a test keeps them so.
-    names = [item.name for item in fields(SyntheticOptions) if item.name != "cloud_files"]
-    values = {name: getattr(section, name) for name in names}
-    return SyntheticOptions(cloud_files=tuple(resolve(path) for path in section.cloud_files), **values)
+    if section.domain is None:
+        section = section.model_copy(update={"domain": environment_domain()})
+    return DdsEndpoint(options_of(DdsOptions, section, resolve))

@@ -18,6 +18,7 @@ from typing import Final
 from sern_client.actions import cancel_request, refusal
 from sern_client.endpoints import conversion
 from sern_client.endpoints.base import ServiceEndpoint, ServiceInfo, ServiceServer
+from sern_client.endpoints.common.calls import PendingCalls, Tasks
 from sern_core.site.client import ClientCore
 from sern_core.site.services import (
     CALL,
@@ -88,13 +89,8 @@ class _Used:
     server: ServiceServer | None = None
     calls: OutChannel | None = None
     gone: str = ""  # why it is served no more
-    waiting: dict[int, asyncio.Future[bytes]] = field(default_factory=dict)
+    waiting: PendingCalls = field(default_factory=PendingCalls)
     numbers: dict[int, int] = field(default_factory=dict)  # seq -> call
-
-    def fail(self, problem: str) -> None:
-        for future in self.waiting.values():
-            if not future.done():
-                future.set_exception(ServiceError(problem))
 
 
 @dataclass(slots=True, eq=False)
@@ -103,7 +99,7 @@ class _Caller:
 
     service: TopicName
     replies: OutChannel
-    tasks: set[asyncio.Task[None]] = field(default_factory=set)
+    tasks: Tasks = field(default_factory=lambda: Tasks(MAX_CALLS))
 
 
 class ServiceBridge:
@@ -133,7 +129,7 @@ class ServiceBridge:
         self.used: dict[TopicName, _Used] = {}  # by global name, which has one owner at the relay
         self._calling: dict[StreamId, _Used] = {}  # by the stream of our calls
         self.callers: dict[StreamId, _Caller] = {}  # by the stream of its calls
-        self._cancelling: set[asyncio.Task[None]] = set()
+        self._cancelling = Tasks(MAX_CALLS)
         self._said_full = False
         self._closed = False
         endpoint.watch_services(self)
@@ -213,21 +209,19 @@ class ServiceBridge:
             dropped = [seq for seq in numbers if first <= seq < first + count]
         for seq in dropped:
             number = numbers.pop(seq)
-            future = used.waiting.get(number)
-            if reason is DropReason.UNWANTED:
-                continue  # by another site of the same name than the one that offers it, which will answer
-            if future is not None and not future.done():
-                future.set_exception(ServiceError(f"the call of {used.name} was dropped on its way: {reason}"))
+            if reason is not DropReason.UNWANTED:  # by another site of that name than the one that will answer
+                used.waiting.fail(number, f"the call of {used.name} was dropped on its way: {reason}")
 
     async def stop(self) -> None:
         """Withdraw what is served here, end the calls that others have under way."""
         self._closed = True
         for used in list(self.used.values()):
             self._withdraw(used, "this site stops", unpublish=False)
-        tasks = [*self._cancelling, *(task for caller in self.callers.values() for task in caller.tasks)]
-        for task in tasks:
-            task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
+        working = [self._cancelling, *(caller.tasks for caller in self.callers.values())]
+        for tasks in working:
+            tasks.cancel()
+        for tasks in working:
+            await tasks.ended()
         self.callers.clear()
         self.offered.clear()
 
@@ -320,35 +314,31 @@ class ServiceBridge:
         calls = self._open(used)
         if len(used.waiting) >= MAX_CALLS:
             raise ServiceError(f"{MAX_CALLS} calls of {used.name} are under way already")
-        future: asyncio.Future[bytes] = asyncio.get_running_loop().create_future()
         number = self._next
         self._next = (self._next + 1) % (1 << 64)
         seq = calls.next_seq
-        used.waiting[number] = future
         used.numbers[seq] = number
         try:
-            if not self._core.send(calls, CALL.pack(number) + request, time.time_ns(), now=clock.now()):
-                raise ServiceError(f"{used.name}: too much waits for the link")
-            self._kick()
-            async with asyncio.timeout(used.rule.timeout_s):
-                return await future
+            with used.waiting.call(number) as answer:
+                if not self._core.send(calls, CALL.pack(number) + request, time.time_ns(), now=clock.now()):
+                    raise ServiceError(f"{used.name}: too much waits for the link")
+                self._kick()
+                async with asyncio.timeout(used.rule.timeout_s):
+                    return await answer
         except asyncio.CancelledError:
             if not used.gone:  # its caller is gone: if the call still waits here, it is not made
                 used.numbers.pop(seq, None)
                 self._core.link.sender.abandon(calls, seq, DropReason.UNWANTED, now=clock.now())
             raise
         finally:
-            used.waiting.pop(number, None)
             used.numbers.pop(seq, None)
 
     def _cancel_lost(self, service: TopicName, request: bytes) -> None:
         """A goal of ROS 2 whose client is told that it is refused may have been accepted, unknown to us: end it."""
         action = service.removesuffix("/_action/send_goal")
         body = cancel_request(request)
-        if action != service and body is not None and len(self._cancelling) < MAX_CALLS:
-            task = asyncio.create_task(self._cancel(TopicName(f"{action}/_action/cancel_goal"), body))
-            self._cancelling.add(task)
-            task.add_done_callback(self._cancelling.discard)
+        if action != service and body is not None and not self._cancelling.full:
+            self._cancelling.begin(self._cancel(TopicName(f"{action}/_action/cancel_goal"), body))
 
     async def _cancel(self, service: TopicName, request: bytes) -> None:
         """Until it has been answered: the link may be away."""
@@ -366,20 +356,17 @@ class ServiceBridge:
             _log.warning("an answer of %s is too short to be one", used.name)
             return
         number, failed = REPLY.unpack_from(body)
-        future = used.waiting.get(number)
-        if future is None or future.done():
-            return  # nobody waits for it any more
         rest = body[REPLY.size :]
         if failed:
             text = one_line(rest[: 4 * MAX_ERROR_CHARS].decode(errors="replace"))
-            future.set_exception(ServiceError(text or f"{used.name} failed, without saying why"))
+            used.waiting.fail(number, text or f"{used.name} failed, without saying why")
         else:
-            future.set_result(rest)
+            used.waiting.answer(number, rest)
 
     def _withdraw(self, used: _Used, why: str, *, unpublish: bool = True) -> None:
         del self.used[used.name]
         used.gone = why
-        used.fail(why)  # before the endpoint ends its calls: they shall hear why
+        used.waiting.fail_all(why)  # before the endpoint ends its calls: they shall hear why
         if used.server is not None:
             used.server.close()
         if used.calls is not None:
@@ -418,8 +405,7 @@ class ServiceBridge:
                 self._dismiss(caller)
 
     def _dismiss(self, caller: _Caller) -> None:
-        for task in caller.tasks:
-            task.cancel()
+        caller.tasks.cancel()
         self._core.unpublish(caller.replies, now=clock.now())
         self._kick()
 
@@ -438,17 +424,14 @@ class ServiceBridge:
             # It was meant for an earlier process of ours, which may have executed it.
             self._answer(caller, number, f"{caller.service} has started anew; call again".encode(), failed=True)
             return
-        if len(caller.tasks) >= MAX_CALLS:
+        if caller.tasks.full:
             self._answer(caller, number, f"{MAX_CALLS} calls are under way already".encode(), failed=True)
             return
         left_s = offered.rule.timeout_s
         if stream.spec.lifespan_s is not None:
             left_s = min(left_s, stream.spec.lifespan_s - message.age_s(clock.now()))
-        task = asyncio.create_task(
-            self._execute(caller, offered, number, message.body[CALL.size :], left_s), name=f"call-{number}"
-        )
-        caller.tasks.add(task)
-        task.add_done_callback(caller.tasks.discard)
+        work = self._execute(caller, offered, number, message.body[CALL.size :], left_s)
+        caller.tasks.begin(work, name=f"call-{number}")
 
     async def _execute(self, caller: _Caller, offered: _Offered, number: int, request: bytes, left_s: float) -> None:
         failed = False

@@ -228,26 +228,26 @@ class RelayTransport:
             )
 
         self._dial = dial
-        self._dialer = dial(self)
-        self.pump = Pump(link, self._dialer.send, on_gone=lambda: None)
-        self._dialer.open()
+        self.dialer = dial(self)
+        self.pump = Pump(link, self.dialer.send, on_gone=lambda: None)
+        self.dialer.open()
 
     @property
     def rebuilds(self) -> int:
-        return self._dialer.rebuilds
+        return self.dialer.rebuilds
 
     @property
     def waiting(self) -> bool:
         """Whether a connection is there, and its handshake under way."""
-        return self._dialer.waiting
+        return self.dialer.waiting
 
     def another(self, events: DialerEvents) -> Dialer:
         """Another connection to the same relay, for class control, not opened yet."""
-        return self._dial(events, express=True, attempt=self._dialer.attempt)
+        return self._dial(events, express=True, attempt=self.dialer.attempt)
 
     def close(self) -> None:
         self.pump.close()
-        self._dialer.close()
+        self.dialer.close()
 
     # --- DialerEvents -------------------------------------------------------------------------------------------------
 
@@ -277,7 +277,7 @@ class RelayTransport:
         except RemoteError as error:
             self.bad_frames += 1
             _log.warning("%s sent a bad frame (%s); reconnecting", self.endpoint, error)
-            self._dialer.again(f"bad frame: {error}")
+            self.dialer.again(f"bad frame: {error}")
             return
         if self.link.dirty:
             self.pump.kick()

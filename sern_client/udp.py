@@ -44,13 +44,15 @@ class ClientLane:
         self._socket: UdpClient | None = None
         self._pump: Pump | None = None
         self._rebind_s = 0.0
-        self._ask_s: float | None = None
+        self.ask_s: float | None = None
+        """When the lane is asked for again; None: it works, or an answer is awaited."""
         self._asked_s = -inf
-        self._pause_s = ASK_AGAIN_S[0]
+        self.pause_s = ASK_AGAIN_S[0]
+        """How long before that."""
 
     def ask(self) -> None:
         """A session has begun, or the lane there is will not do."""
-        self._ask_s = None
+        self.ask_s = None
         self._asked_s = clock.now()
         self.core.ask_lane(offered_ciphers(), now=clock.now())
 
@@ -119,15 +121,15 @@ class ClientLane:
 
     def tick(self) -> None:
         now = clock.now()
-        if self._ask_s is not None and now >= self._ask_s and self.core.link.established:
+        if self.ask_s is not None and now >= self.ask_s and self.core.link.established:
             self.ask()
         lane = self.core.link.lanes.by_id.get(LANE_UDP)
         if self._socket is None or lane is None:
             return
         if lane.answered and not lane.stalled:
-            self._ask_s = None
-            self._pause_s = ASK_AGAIN_S[0]
-        elif self._ask_s is None and self.core.link.lanes.by_id[LANE_ZMQ].usable:
+            self.ask_s = None
+            self.pause_s = ASK_AGAIN_S[0]
+        elif self.ask_s is None and self.core.link.lanes.by_id[LANE_ZMQ].usable:
             self._ask_later()  # a blackout takes both: then there is nobody to ask
         if self._socket.rekey_due and now >= self._asked_s + ANSWER_S:
             self.ask()
@@ -159,8 +161,8 @@ class ClientLane:
         self._kick()
 
     def _ask_later(self) -> None:
-        self._ask_s = clock.now() + self._pause_s
-        self._pause_s = min(2 * self._pause_s, ASK_AGAIN_S[1])
+        self.ask_s = clock.now() + self.pause_s
+        self.pause_s = min(2 * self.pause_s, ASK_AGAIN_S[1])
 
     def _writable(self) -> None:
         self.kick()

@@ -37,16 +37,18 @@ class Withdrawable(Protocol):
 
 
 class Withdrawal:
-    """`streams` is the bridge's table; `advertise` raises ConfigError alone, `close` nothing. `used` False: nothing is
-    ever withdrawn, so nothing is kept."""
+    """`streams` is the table of what is published here; `advertise` raises ConfigError alone, `close` nothing. `used`
+    False: nothing is ever withdrawn, so nothing is kept."""
 
     def __init__(
         self,
         streams: Mapping[StreamId, Withdrawable],
         advertise: Callable[[TopicInfo], Publisher],
         close: Callable[[Withdrawable], None],
+        *,
+        used: bool,
     ) -> None:
-        self.used = False
+        self._used = used
         self._streams = streams
         self._advertise = advertise
         self._close = close
@@ -54,7 +56,7 @@ class Withdrawal:
 
     def kept(self, stream: StreamInfo) -> Kept | None:
         """Where the latched messages of a stream are to be kept; None: nowhere."""
-        if not (self.used and stream.spec.latched):
+        if not (self._used and stream.spec.latched):
             return None
         return deque(maxlen=min(stream.spec.depth, MAX_KEPT))
 

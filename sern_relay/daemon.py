@@ -25,6 +25,7 @@ from sern_core.vocabulary.message import Message, StreamInfo
 from sern_core.vocabulary.types import ClientName, DropReason, TopicName
 from sern_relay.feed import RelayFeed
 from sern_relay.objects_view import objects_view
+from sern_relay.relay_metrics import register_relay
 from sern_relay.server import RelayServer
 from sern_relay.trace_source import of_hub
 from sern_relay.transforms import TransformObjects
@@ -41,7 +42,7 @@ from sern_runtime.draining import Progress
 from sern_runtime.entry import blamed_on, end_tasks, log_warnings, serve
 from sern_runtime.http import Health, HttpServer
 from sern_runtime.internal_errors import InternalErrors
-from sern_runtime.link_metrics import AgeHistograms, register_codecs, register_links, register_received
+from sern_runtime.link_metrics import AgeHistograms
 from sern_runtime.loop import Shutdown
 from sern_runtime.message_log import LoggedFates, MessageLog
 from sern_runtime.metrics import Metrics
@@ -326,17 +327,24 @@ class RelayDaemon:
 
     def _status(self) -> str:
         """One line for `systemctl status`."""
-        return self._and_reload(f"{self._clients_up()} clients, {len(self.hub.relayed)} streams")
+        return self._and_reload(f"{self.clients_up()} clients, {len(self.hub.relayed)} streams")
 
-    def _readiness(self) -> Health:
+    def readiness(self) -> Health:
+        """What `/readyz` says."""
         return Health(ok=self._ready, reason=self._and_reload("listening" if self._ready else "starting"))
 
     def _and_reload(self, state: str) -> str:
         """A failed reload stays beside the state until a good one; it changes nothing of what the relay does."""
         return state if self._unreloaded is None else f"{state}; {self._unreloaded}"
 
-    def _clients_up(self) -> int:
+    def clients_up(self) -> int:
+        """Clients with a session."""
         return sum(link.established for link in self.hub.links.values())
+
+    @property
+    def reload_failed(self) -> bool:
+        """Whether what the last reload read is not all in force."""
+        return self._unreloaded is not None
 
     def reload(self) -> None:
         """SIGHUP: read keys, access rules and the feed's roles anew; all or nothing. What was revoked ends now."""
@@ -382,50 +390,15 @@ class RelayDaemon:
     def _make_http(self, listen: str) -> HttpServer:
         registry = CollectorRegistry()
         metrics = Metrics(registry)
-        register_links(metrics, lambda: list(self.hub.links.values()))
-        self.datagrams.register(metrics)
-        register_received(metrics, self.hub.received, self.ages)
-        register_codecs(metrics, self.coder)
-        self.errors.register(metrics)
-        self.collector.register(metrics)
         adaptation = self.adaptation
-        self.parts.register(metrics)
-        if adaptation is not None:
-            adaptation.register(metrics)
-        metrics.gauge("sern_relay_clients", "Clients with a session.",
-                      read=lambda: [((), float(self._clients_up()))])  # fmt: skip
-        metrics.gauge("sern_relay_streams", "Streams announced by clients.",
-                      read=lambda: [((), float(len(self.hub.relayed)))])  # fmt: skip
-        metrics.gauge("sern_relay_objects", "Cross-reality objects in the registry.",
-                      read=lambda: [((), float(len(self.hub.objects)))])  # fmt: skip
-        metrics.counter("sern_relay_refusals_total", "Announcements, subscriptions and objects refused, by code.",
-                        ("code",), lambda: [((code,), float(n)) for code, n in self.refusals.items()])  # fmt: skip
-        metrics.counter("sern_bad_frames_total", "Frames that were not valid; their connections were closed.",
-                        read=lambda: [((), float(self.server.bad_frames if self.server else 0))])  # fmt: skip
-        metrics.counter("sern_relay_auth_total", "Answers of the ZAP handler.", ("result",), self._auth)
-        metrics.gauge("sern_relay_connections", "Connections, those without a proven key included.",
-                      read=lambda: [((), float(len(self.server.connections) if self.server else 0))])  # fmt: skip
-        metrics.counter("sern_relay_connections_refused_total", "Connections or messages refused, by reason.",
-                        ("reason",), self._refused_connections)  # fmt: skip
-        metrics.counter("sern_relay_replay_evicted_total", "Latched messages let go because of their bounds.",
-                        read=lambda: [((), float(self.hub.streams.replays.evicted))])  # fmt: skip
-        metrics.gauge("sern_relay_replay_bytes", "Latched messages kept for late joiners, bytes.",
-                      read=lambda: [((), float(self.hub.streams.replays.held_bytes))])  # fmt: skip
-        metrics.counter("sern_relay_transforms_refused_total", "Transforms not taken as objects, by client and reason.",
-                        ("client", "code"), self._transforms_refused)  # fmt: skip
-        metrics.counter("sern_feed_messages_total", "Messages of the plain feed, by role and what became of them.",
-                        ("role", "result"), self._fed)  # fmt: skip
-        metrics.gauge("sern_relay_reload_failed", "1 while what the last reload read is not all in force.",
-                      read=lambda: [((), float(self._unreloaded is not None))])  # fmt: skip
-        metrics.counter("sern_relay_reload_failures_total", "Reloads that kept the old configuration.",
-                        read=lambda: [((), float(self.reloads_failed))])  # fmt: skip
+        register_relay(metrics, self)
         metrics.counter("sern_http_refused_total", "Requests to the HTTP server that were none.",
                         read=lambda: [((), float(self._http.refused if self._http else 0))])  # fmt: skip
         return HttpServer(
             listen,
             registry,
             health=lambda: Health(ok=True, reason="running"),
-            ready=self._readiness,
+            ready=self.readiness,
             json_routes={
                 "/api/link": lambda: [{**link.snapshot(), "now_s": clock.now()} for link in self.hub.links.values()],
                 "/api/objects": objects_view(self.hub),
@@ -435,28 +408,6 @@ class RelayDaemon:
             },
             parts=self.parts,
         )
-
-    def _auth(self) -> list[tuple[tuple[str, ...], float]]:
-        names = ("admitted", "unknown_key", "not_now", "capped", "failed", "malformed")
-        return [((name,), float(getattr(self.zap.counters, name)) if self.zap else 0.0) for name in names]
-
-    def _refused_connections(self) -> list[tuple[tuple[str, ...], float]]:
-        server = self.server
-        if server is None:
-            return []
-        table, socket = server.connections, server.socket
-        counts = {
-            "capped": table.capped,
-            "handshake": table.handshake_failed,
-            "accept": table.accept_failed,
-            "routing_id": socket.refused_routing_ids,
-            "multipart": socket.malformed + server.inflow.endless,
-            "revoked": server.revoked,
-            "surplus": server.surplus,
-            "silent": server.silent,
-            "join": server.express.refused,
-        }
-        return [((reason,), float(count)) for reason, count in counts.items()]
 
     def _make_feed(self, ctx: "zmq.Context[zmq.Socket[bytes]]", roles: tuple[FeedRole, ...]) -> RelayFeed:
         return RelayFeed(ctx, self.hub, roles, after=self._after, refused=self.refused)
@@ -482,13 +433,6 @@ class RelayDaemon:
             if self._unreloaded == self._feed_problem:  # else a later reload failed
                 self._unreloaded = None
             self._in_force(now)
-
-    def _transforms_refused(self) -> list[tuple[tuple[str, ...], float]]:
-        refused = self.transforms.refused if self.transforms is not None else {}
-        return [((client, code), float(n)) for (client, code), n in refused.items()]
-
-    def _fed(self) -> list[tuple[tuple[str, ...], float]]:
-        return [] if self.feed is None else [(labels, float(n)) for labels, n in self.feed.results()]
 
     def topics(self) -> dict[str, object]:
         """Counters by client link and topic, and of what arrived; and what is announced, whether taken or not."""

@@ -1,7 +1,6 @@
 """The relay's end of the express lanes: further connections of a client, for class control alone."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 from typing import Final, NamedTuple
 
@@ -13,25 +12,14 @@ from sern_core.vocabulary.errors import WireError
 from sern_core.vocabulary.params import Redundancy
 from sern_core.vocabulary.types import ClientName
 from sern_core.wire import framing
+from sern_relay.connections import ClientConnection, ClientConnections
 from sern_runtime import clock
 from sern_runtime.express import CONNECTIONS, ExpressPaths
-from sern_runtime.monitor import Connection
 from sern_runtime.pump import Pump
 from sern_runtime.zmq_socket import SendResult
 
 JOIN: Final = bytes((framing.Kind.JOIN,))
 """The third byte of a datagram that joins."""
-
-
-@dataclass(slots=True, eq=False)
-class Joined:
-    """A connection that belongs to a client's session; `user` is its User-Id, `client` the name in it."""
-
-    client: ClientName
-    user: str
-    fd: int
-    connection: Connection | None
-    taken: int = 0  # messages that have come in
 
 
 class _Lane(NamedTuple):
@@ -41,11 +29,13 @@ class _Lane(NamedTuple):
 
 
 class RelayExpress:
-    """Joins connections to the sessions of the clients whose keys they have. `after` as in `RelayServer`."""
+    """Joins connections to the sessions of the clients whose keys they have. Those of `clients` that are for class
+    control alone are its own. `after` as in `RelayServer`."""
 
     def __init__(
         self,
         hub: Hub,
+        clients: ClientConnections,
         send: Callable[[bytes, bytes], SendResult],
         redundancy: Redundancy,
         *,
@@ -54,7 +44,7 @@ class RelayExpress:
         self.hub = hub
         self.refused = 0
         """Connections that named no session of their client."""
-        self.joined: dict[bytes, Joined] = {}
+        self._clients = clients
         self._send = send
         self._redundancy = redundancy
         self._after = after
@@ -64,60 +54,67 @@ class RelayExpress:
         for lane in self._lanes.values():
             lane.pump.close()
         self._lanes.clear()
-        self.joined.clear()
 
-    def join(self, routing_id: bytes, joined: Joined, data: bytes) -> Joined | None:
+    @property
+    def joined(self) -> list[ClientConnection]:
+        """The connections that have joined, the oldest first."""
+        return self._clients.for_control()
+
+    def join(self, connection: ClientConnection, data: bytes) -> ClientConnection | None:
         """A connection names its session. The answer is the connection to close, if any: itself, when there is no such
         session; the oldest of its client, when there are enough. Raises WireError."""
-        if not self.hub.join(joined.client, data, now=clock.now()):
+        client, routing_id = connection.client, connection.routing_id
+        if not self.hub.join(client, data, now=clock.now()):
             self.refused += 1
-            self.left(routing_id)
-            return joined
-        link = self.hub.links[joined.client]
-        lane = self._lanes.get(joined.client)
+            self.left(connection)
+            return connection
+        link = self.hub.links[client]
+        lane = self._lanes.get(client)
         if lane is None or lane.link is not link:
-            self._drop(joined.client)
+            self._drop(client)
             paths: ExpressPaths[bytes] = ExpressPaths(self._redundancy, link.plane.may_copy)
             pump = Pump(LanePort(link, LANE_EXPRESS), paths.send, on_gone=lambda: None)
-            lane = self._lanes[joined.client] = _Lane(link, paths, pump)
+            lane = self._lanes[client] = _Lane(link, paths, pump)
         older = None
-        others = [rid for rid, other in self.joined.items() if other.client == joined.client and rid != routing_id]
+        others = [each for each in self.joined if each.client == client and each is not connection]
         if len(others) >= CONNECTIONS:  # those of a session that is over count, too
-            older = self.joined.pop(others[0])
-            lane.paths.discard(others[0])
-        self.joined[routing_id] = joined
+            older = others[0]
+            self._clients.remove(older.routing_id)
+            lane.paths.discard(older.routing_id)
+        self._clients.add(connection)
         if routing_id not in lane.paths:
-            handle = joined.connection.handle if joined.connection is not None else None
-            lane.paths.add(routing_id, partial(self._send, routing_id), handle)
+            lane.paths.add(routing_id, partial(self._send, routing_id), connection.handle)
         lane.pump.reset()
         lane.pump.kick()
         return older
 
-    def received(self, routing_id: bytes, joined: Joined, data: framing.Datagram) -> None:
+    def received(self, connection: ClientConnection, data: framing.Datagram) -> None:
         """Raises RemoteError; the caller closes the connection."""
         if data[2:3] == JOIN:  # of the next session
-            if self.join(routing_id, joined, bytes(data)) is not None:
+            if self.join(connection, bytes(data)) is not None:
                 raise WireError("it names no session of its client")
             return
-        link = self.hub.links.get(joined.client)
+        link = self.hub.links.get(connection.client)
         if link is not None:
             link.receive(data, now=clock.now(), lane=LANE_EXPRESS)
 
-    def left(self, routing_id: bytes) -> None:
-        """The connection is gone."""
-        joined = self.joined.pop(routing_id, None)
-        lane = self._lanes.get(joined.client) if joined is not None else None
-        if joined is None or lane is None:
+    def left(self, connection: ClientConnection) -> None:
+        """The connection is gone. Idempotent."""
+        if self._clients.remove(connection.routing_id) is None:
             return
-        lane.paths.discard(routing_id)
+        lane = self._lanes.get(connection.client)
+        if lane is None:
+            return
+        lane.paths.discard(connection.routing_id)
         if not lane.paths:
-            self._drop(joined.client)
+            self._drop(connection.client)
             self._after()
 
     def end(self, client: str) -> None:
         """The client may have none any more."""
-        for routing_id in [rid for rid, joined in self.joined.items() if joined.client == client]:
-            self.left(routing_id)
+        for connection in self.joined:
+            if connection.client == client:
+                self.left(connection)
 
     def _drop(self, client: ClientName) -> None:
         lane = self._lanes.pop(client, None)

@@ -1,7 +1,7 @@
-"""The relay's lane: one ROUTER for all clients, one port of the hub for each connection."""
+"""The relay's stream lane: one ROUTER for all clients, one port of the hub for each connection of a session."""
 
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Final
 
 import zmq
@@ -13,12 +13,13 @@ from sern_core.vocabulary.names import client_name
 from sern_core.vocabulary.params import Redundancy
 from sern_core.vocabulary.types import ClientName
 from sern_core.wire import framing
-from sern_relay.express import JOIN, Joined, RelayExpress
+from sern_relay.connections import ClientConnection, ClientConnections, Served
+from sern_relay.express import JOIN, RelayExpress
 from sern_runtime import clock
 from sern_runtime.config.keys import KeyStatus, parse_user_id
 from sern_runtime.dscp import Marks
 from sern_runtime.inflow import Inflow
-from sern_runtime.monitor import Connection, ConnectionTable, TcpHandle
+from sern_runtime.monitor import ConnectionTable, TcpHandle
 from sern_runtime.pump import LANE_MESSAGE_BYTES, Pump
 from sern_runtime.zmq_socket import CurvePair, RouterSocket, SendResult, make_server
 
@@ -38,20 +39,6 @@ REFUSED_KEY: Final = {
 """What the log says of a key that was let in and does not hold any more."""
 
 _log = logging.getLogger(__name__)
-
-
-class Session:
-    """One connection: its port of the hub and the pump that serves it."""
-
-    __slots__ = ("connection", "fd", "port", "pump", "taken", "user")
-
-    def __init__(self, port: HubPort, pump: Pump, user: str, fd: int, connection: Connection | None) -> None:
-        self.port = port
-        self.pump = pump
-        self.user = user
-        self.fd = fd
-        self.connection = connection
-        self.taken = 0  # messages that have come in
 
 
 class RelayServer:
@@ -92,8 +79,6 @@ class RelayServer:
         self._marks = marks or Marks()
         self._insecure = keys is None
         self._after = after
-        self._sessions: dict[bytes, Session] = {}
-        self.express = RelayExpress(hub, self._send, redundancy, after=after)
         raw = make_server(
             ctx,
             listen,
@@ -104,40 +89,42 @@ class RelayServer:
             max_message_bytes=LANE_MESSAGE_BYTES,
         )
         self.connections = ConnectionTable(raw, max_connections=max_connections, on_change=self._connections_changed)
+        self.clients = ClientConnections(self.connections)
+        """Those of them on which a client has spoken."""
+        self.express = RelayExpress(hub, self.clients, self._send, redundancy, after=after)
         self.socket = RouterSocket(
             raw, self._received, on_view=self._received, identified=keys is not None, on_writable=self._writable
         )
         self.socket.on_refused = self._refused
-        self.inflow = Inflow(self.socket, self._taken, self._endless)
+        self.inflow = Inflow(self.socket, self.clients.taken, self._endless)
 
     def close(self) -> None:
-        for session in self._sessions.values():
-            session.pump.close()
-        self._sessions.clear()
+        for _connection, served in self.clients.sessions():
+            served.pump.close()
         self.express.close()
+        self.clients.clear()
         self.inflow.close()
         self.connections.close()
         self.socket.close()
 
     def _received(self, routing_id: bytes, user: str, data: framing.Datagram) -> None:
-        session = self._sessions.get(routing_id)
-        if session is None:
-            joined = self.express.joined.get(routing_id)
-            if joined is not None:
-                self._received_express(routing_id, joined, user, data)
+        connection = self.clients.get(routing_id)
+        if connection is None:
+            connection = self._accept(routing_id, user, bytes(data))
+            if connection is None:
                 return
-            session = self._accept(routing_id, user, bytes(data))
-            if session is None:
-                return
-        elif user != session.user:
-            self._cut(routing_id, session, f"its identity changed to {user!r}")
+        elif user != connection.user:
+            self._cut(connection, f"its identity changed to {user!r}")
             return
-        session.taken += 1
+        connection.taken += 1
         try:
-            session.port.receive(data, now=clock.now())
+            if connection.served is None:
+                self.express.received(connection, data)
+            else:
+                connection.served.port.receive(data, now=clock.now())
         except RemoteError as error:
             self.bad_frames += 1
-            self._cut(routing_id, session, f"bad frame: {error}")
+            self._cut(connection, f"bad frame: {error}")
             return
         self._after()
 
@@ -147,36 +134,13 @@ class RelayServer:
         _log.warning("connection from %s closed: %s", details.address, why)
         self.connections.cut(details.fd)
 
-    def _taken(self) -> Iterator[tuple[TcpHandle, int]]:
-        """Every connection, and how many messages came out of it."""
-        taken = {session.fd: session.taken for session in self._sessions.values()}
-        taken |= {joined.fd: joined.taken for joined in self.express.joined.values()}
-        return ((handle, taken.get(handle.fd, 0)) for handle in self.connections.handles())
-
     def _endless(self, handle: TcpHandle) -> None:
         connection = self.connections.by_fd(handle.fd)
         whose = connection.user if connection is not None and connection.user else handle.peer[0]
         _log.warning("connection of %s closed: a message without end", whose)
 
-    def _received_express(self, routing_id: bytes, joined: Joined, user: str, data: framing.Datagram) -> None:
-        if user != joined.user:
-            problem = f"its identity changed to {user!r}"
-        else:
-            try:
-                self.express.received(routing_id, joined, data)
-            except RemoteError as error:
-                self.bad_frames += 1
-                problem = f"bad frame: {error}"
-            else:
-                joined.taken += 1
-                self._after()
-                return
-        _log.warning("connection of %s for class control closed: %s", joined.client, problem)
-        self.express.left(routing_id)
-        self.connections.cut(joined.fd)
-
-    def _accept(self, routing_id: bytes, user: str, data: bytes) -> Session | None:
-        """A connection speaks for the first time: find out whose it is."""
+    def _accept(self, routing_id: bytes, user: str, data: bytes) -> ClientConnection | None:
+        """A connection speaks for the first time: find out whose it is. None: what it said is dealt with."""
         details = self.socket.peer_details()
         if self.connections.ended(details.fd):
             return None
@@ -194,14 +158,15 @@ class RelayServer:
             self.connections.cut(details.fd)
             return None
         self.connections.bind_user(details.fd, name)
-        connection = self.connections.by_fd(details.fd)
-        handle = connection.handle if connection is not None else None
+        accepted = self.connections.by_fd(details.fd)
+        connection = ClientConnection(routing_id, name, user, details.fd, accepted)
+        handle = connection.handle
         if handle is not None:
             express = data[2:3] == JOIN
             marks = self._marks
             handle.prepare(express=express, tos=marks.express_tos if express else marks.stream_tos)
         if data[2:3] == JOIN:
-            self._join(routing_id, Joined(name, user, details.fd, connection), data)
+            self._join(connection, data)
             return None
         self._make_room(name)
         port = HubPort(self.hub, name, details.address if handle is None else "{}:{}".format(*handle.peer))
@@ -209,21 +174,21 @@ class RelayServer:
         def send(datagram: bytes) -> SendResult:
             return self.socket.send_to(routing_id, datagram)
 
-        pump = Pump(port, send, on_gone=lambda: self._gone(routing_id))
-        session = self._sessions[routing_id] = Session(port, pump, user, details.fd, connection)
-        return session
+        connection.served = Served(port, Pump(port, send, on_gone=lambda: self._gone(connection)))
+        self.clients.add(connection)
+        return connection
 
     def _make_room(self, client: ClientName) -> None:
         """One more connection of a client is to come: where it has enough, the oldest without its session goes."""
-        ports = [(rid, session) for rid, session in self._sessions.items() if session.port.client == client]
-        spare = [(rid, session) for rid, session in ports if not session.port.current]
-        for routing_id, session in spare[: max(0, len(ports) + 1 - MAX_PORTS)]:
+        own = [(each, served) for each, served in self.clients.sessions() if each.client == client]
+        spare = [each for each, served in own if not served.port.current]
+        for connection in spare[: max(0, len(own) + 1 - MAX_PORTS)]:
             self.surplus += 1
             if client not in self._told and len(self._told) < MAX_TOLD:
                 self._told.add(client)
                 _log.warning("%s has more than %d connections; the oldest without its session end", client, MAX_PORTS)
-            self._gone(routing_id)
-            self.connections.cut(session.fd)
+            self._gone(connection)
+            self.connections.cut(connection.fd)
 
     def look(self) -> None:
         """See to connections. Call about once a second."""
@@ -233,14 +198,14 @@ class RelayServer:
     def _send(self, routing_id: bytes, datagram: bytes) -> SendResult:
         return self.socket.send_to(routing_id, datagram)
 
-    def _join(self, routing_id: bytes, joined: Joined, data: bytes) -> None:
+    def _join(self, connection: ClientConnection, data: bytes) -> None:
         """A connection for class control: of a session that its own client has, or of none, and then it is closed."""
         try:
-            older = self.express.join(routing_id, joined, data)
+            older = self.express.join(connection, data)
         except RemoteError as error:
             self.bad_frames += 1
-            _log.warning("connection of %s for class control closed: bad frame: %s", joined.client, error)
-            older = joined
+            _log.warning("connection of %s for class control closed: bad frame: %s", connection.client, error)
+            older = connection
         if older is not None:
             self.connections.cut(older.fd)
         self._after()
@@ -255,34 +220,33 @@ class RelayServer:
 
     def flush(self) -> None:
         """Let every port that has something to say say it."""
-        for session in self._sessions.values():
-            if session.port.dirty:
-                session.pump.kick()
+        for _connection, served in self.clients.sessions():
+            if served.port.dirty:
+                served.pump.kick()
         self.express.flush()
 
     def run_all(self) -> None:
-        for session in list(self._sessions.values()):
-            session.pump.run()
+        for _connection, served in list(self.clients.sessions()):
+            served.pump.run()
 
     def _writable(self) -> None:
-        for session in self._sessions.values():
-            session.pump.kick()
+        for _connection, served in self.clients.sessions():
+            served.pump.kick()
         self.express.kick()
 
     def local_port(self, client: ClientName) -> int | None:
         """The number of our port to which the client's session came by TCP; None while it has no such connection, as
         over ipc."""
-        for session in self._sessions.values():
-            if session.port.client == client and session.port.current:
-                handle = session.connection.handle if session.connection is not None else None
-                return None if handle is None else handle.local[1]
+        for connection, served in self.clients.sessions():
+            if connection.client == client and served.port.current:
+                return None if connection.handle is None else connection.handle.local[1]
         return None
 
     def cut_client(self, client: str) -> int:
         """End every connection of a client at once; returns how many there were."""
-        for routing_id, session in list(self._sessions.items()):
-            if session.port.client == client:
-                self._gone(routing_id)
+        for connection, _served in list(self.clients.sessions()):
+            if connection.client == client:
+                self._gone(connection)
         self.express.end(client)
         return self.connections.cut_user(client)
 
@@ -290,22 +254,21 @@ class RelayServer:
         """End every connection that has not said anything yet; returns how many there were."""
         return self.connections.cut_user("")
 
-    def _cut(self, routing_id: bytes, session: Session, why: str) -> None:
-        _log.warning("connection of %s closed: %s", session.port.client, why)
-        self._gone(routing_id)
-        self.connections.cut(session.fd)
+    def _cut(self, connection: ClientConnection, why: str) -> None:
+        what = " for class control" if connection.served is None else ""
+        _log.warning("connection of %s%s closed: %s", connection.client, what, why)
+        self._gone(connection)
+        self.connections.cut(connection.fd)
 
-    def _gone(self, routing_id: bytes) -> None:
-        session = self._sessions.pop(routing_id, None)
-        if session is not None:
-            session.pump.close()
-            session.port.disconnected(now=clock.now())
+    def _gone(self, connection: ClientConnection) -> None:
+        """It is over: whoever it belonged to is told. Idempotent."""
+        if connection.served is None:
+            self.express.left(connection)
+        elif self.clients.remove(connection.routing_id) is not None:
+            connection.served.pump.close()
+            connection.served.port.disconnected(now=clock.now())
             self._after()
 
     def _connections_changed(self) -> None:
-        for routing_id, session in list(self._sessions.items()):
-            if self.connections.by_fd(session.fd) is not session.connection:
-                self._gone(routing_id)
-        for routing_id, joined in list(self.express.joined.items()):
-            if self.connections.by_fd(joined.fd) is not joined.connection:
-                self.express.left(routing_id)
+        for connection in self.clients.lost():
+            self._gone(connection)

@@ -11,9 +11,8 @@ from sern_core.adaptation.levels import Summarised
 from sern_core.adaptation.report import adapter_json, step_json
 from sern_core.bodies.codecs import Coder
 from sern_core.link.link import Link
-from sern_core.stream.out_channel import OutChannel
-from sern_core.stream.out_message import OutMessage
 from sern_core.topics.rules import TopicRule
+from sern_core.vocabulary.message import Message, TopicSpec
 from sern_core.vocabulary.types import CLASS_LABELS, CLASSES
 from sern_runtime import clock
 from sern_runtime.config.adaptation import AdaptationSection
@@ -84,7 +83,7 @@ class Adaptation:
                 self._parts.failed(PART, error)
                 self._resting[link] = (now + pause_s, min(2.0 * pause_s, BACKOFF_S[1]))
                 with self._parts.survive(PART):
-                    self._leave(link)
+                    self._leave(link, now)
         if step and links:
             self._kick()
 
@@ -95,35 +94,35 @@ class Adaptation:
                 link, self._make_policy(), self._params, coder=self._coder, now=now, summaries=self._summaries
             )
             self._adapters[link] = adapter
-            link.plane.on_arrived = self._guarded(adapter)
-        adapter.sample()
+            link.watch_arrivals(self._guarded(adapter))
+        adapter.sample(now=now)
         if step:
             self._step(adapter, now)
 
-    def _guarded(self, adapter: HopAdapter) -> Callable[[OutChannel, OutMessage, float], None]:
+    def _guarded(self, adapter: HopAdapter) -> Callable[[TopicSpec, Message, float], None]:
         """What an adapter is told while a datagram is read: no fault of it may keep the rest from being read."""
 
-        def arrived(channel: OutChannel, out: OutMessage, now: float) -> None:
+        def arrived(spec: TopicSpec, message: Message, now: float) -> None:
             try:
-                adapter.note_arrival(channel, out, now)
+                adapter.note_arrival(spec, message, now)
             except Exception as error:  # noqa: BLE001  (as above)
                 self._parts.failed(PART, error)
 
         return arrived
 
-    def _leave(self, link: Link) -> None:
+    def _leave(self, link: Link, now: float) -> None:
         """Give a link's topics back what their rules say."""
         self._history.pop(link, None)
         adapter = self._adapters.pop(link, None)
-        link.plane.on_arrived = None
+        link.watch_arrivals(None)
         if adapter is not None:
-            adapter.close()
+            adapter.close(now=now)
 
     def reset(self) -> None:
         """Give back everything; the next tick begins anew."""
         for link in list(self._adapters):
             with self._parts.survive(PART):
-                self._leave(link)
+                self._leave(link, clock.now())
 
     def _step(self, adapter: HopAdapter, now: float) -> None:
         done = adapter.step(now=now)

@@ -6,7 +6,6 @@ from collections.abc import Callable, Collection
 from typing import Final
 
 from sern_core.link.link import Link
-from sern_core.path.lanes import LANE_UDP, LANE_ZMQ
 from sern_runtime import clock
 from sern_runtime.metrics import Metrics
 
@@ -20,8 +19,7 @@ _log = logging.getLogger(__name__)
 
 def datagrams_pass(link: Link) -> bool:
     """Whether the peer answers over the datagram lane."""
-    lane = link.lanes.by_id.get(LANE_UDP)
-    return lane is not None and lane.usable and lane.answered
+    return link.observe(now=clock.now()).datagrams_pass
 
 
 class DatagramWatch:
@@ -64,9 +62,10 @@ class DatagramWatch:
                 self._said.discard(peer)
                 _log.warning("%s: datagrams pass now, after %.0f s without", self._name(link), now - since_s)
             return
-        if not link.established:
+        view = link.observe(now=now)
+        if not view.established:
             self._passed.discard(peer)
-        if not link.established or link.lane.stalled or not link.lanes.by_id[LANE_ZMQ].usable:
+        if not view.up or not view.stream_usable:
             if peer not in self._said:  # nothing passes: that is not the datagrams' fault
                 self._without_since_s.pop(peer, None)
             return

@@ -458,7 +458,7 @@ class _Inlet(DrainedSocket):
                     inflow.came(int(body.get(zmq.SRCFD)))
                 if body.more:
                     aligned = self._realign(topic, header, body)
-                    if self._skipping:
+                    if self.skipping:
                         return True
                     if aligned is None:
                         continue
@@ -504,7 +504,7 @@ class _Inlet(DrainedSocket):
         while frame.more:
             if extra == MAX_FRAMES:
                 self.counters.malformed += 1
-                self._skip_rest(frame)
+                self.skip_rest(frame)
                 return None
             frame = self.socket.recv(_NOBLOCK, copy=False)
             tail.append(frame)

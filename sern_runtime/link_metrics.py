@@ -6,6 +6,7 @@ from typing import Final
 
 from sern_core.bodies.codecs import Coder
 from sern_core.link.link import Link
+from sern_core.link.view import LinkView
 from sern_core.vocabulary.ledger import LOSSES, NO_DROPS, ReceiveLedger
 from sern_core.vocabulary.types import CLASS_LABELS, DropReason
 from sern_runtime import clock
@@ -40,17 +41,17 @@ class AgeHistograms:
             yield (label,), histogram.snapshot()
 
 
-def _capacity(link: Link) -> float | None:
-    rate_bps = link.lane.estimator.rate_bps
-    return None if rate_bps is None else rate_bps / 8
+def _capacity(link: LinkView) -> float | None:
+    return None if link.rate_bps is None else link.rate_bps / 8
 
 
 def register_links(metrics: Metrics, links: Callable[[], Collection[Link]]) -> None:
     """State of every link and the fate of every message offered to it."""
 
-    def per_link(read: Callable[[Link], float | None]) -> Callable[[], list[tuple[Labels, float]]]:
+    def per_link(read: Callable[[LinkView], float | None]) -> Callable[[], list[tuple[Labels, float]]]:
         def collect() -> list[tuple[Labels, float]]:
-            values = [((link.peer,), read(link)) for link in links()]
+            now = clock.now()
+            values = [((link.peer,), read(link.observe(now=now))) for link in links()]
             return [(labels, value) for labels, value in values if value is not None and math.isfinite(value)]
 
         return collect
@@ -59,7 +60,7 @@ def register_links(metrics: Metrics, links: Callable[[], Collection[Link]]) -> N
         def collect() -> list[tuple[Labels, float]]:
             rows: list[tuple[Labels, float]] = []
             for link in links():
-                for label, cell in link.sender.queued().items():
+                for label, cell in link.queued().items():
                     rows.append(((link.peer, label), float(cell[index])))
             return rows
 
@@ -71,7 +72,7 @@ def register_links(metrics: Metrics, links: Callable[[], Collection[Link]]) -> N
             for link in tuple(links()):
                 yield from [
                     ((link.peer, counters.topic, CLASS_LABELS[counters.priority]), float(getattr(counters, read)))
-                    for counters in link.sender.ledger.topics.values()
+                    for counters in link.counters.values()
                 ]
 
         return collect
@@ -80,28 +81,28 @@ def register_links(metrics: Metrics, links: Callable[[], Collection[Link]]) -> N
         for link in tuple(links()):
             yield from [
                 ((link.peer, counters.topic, CLASS_LABELS[counters.priority], reason), count)
-                for counters in link.sender.ledger.topics.values()
+                for counters in link.counters.values()
                 for reason, count in _by_reason(counters.by_reason, LOSSES)
             ]
 
     gauge, counter = metrics.gauge, metrics.counter
     peer = ("peer",)
     gauge("sern_link_up", "1 while a session exists and the path answers.", peer,
-          per_link(lambda link: float(link.established and not link.lane.stalled)))  # fmt: skip
+          per_link(lambda link: float(link.up)))  # fmt: skip
     gauge("sern_link_capacity_bytes_per_second", "Estimated capacity of the link.", peer,
           per_link(_capacity))  # fmt: skip
     gauge("sern_link_window_bytes", "Bytes that may be in flight.", peer,
-          per_link(lambda link: link.lane.estimator.window_bytes))  # fmt: skip
+          per_link(lambda link: link.window_bytes))  # fmt: skip
     gauge("sern_link_inflight_bytes", "Bytes sent and not yet acknowledged.", peer,
-          per_link(lambda link: float(link.lane.flight.inflight_bytes)))  # fmt: skip
+          per_link(lambda link: float(link.inflight_bytes)))  # fmt: skip
     gauge("sern_link_rtt_seconds", "Smoothed round-trip time.", peer,
-          per_link(lambda link: link.lane.flight.rtt.srtt_s))  # fmt: skip
+          per_link(lambda link: link.srtt_s))  # fmt: skip
     gauge("sern_link_rtprop_seconds", "Round-trip time of the empty path.", peer,
-          per_link(lambda link: link.lane.estimator.rtprop_s))  # fmt: skip
+          per_link(lambda link: link.rtprop_s))  # fmt: skip
     gauge("sern_link_clock_offset_seconds", "Peer's monotonic clock minus ours.", peer,
-          per_link(lambda link: link.lanes.clock.offset_s))  # fmt: skip
+          per_link(lambda link: link.clock_offset_s))  # fmt: skip
     gauge("sern_link_clock_error_seconds", "Bound of the error of the clock offset.", peer,
-          per_link(lambda link: link.lanes.clock.error_s))  # fmt: skip
+          per_link(lambda link: link.clock_error_s))  # fmt: skip
     gauge("sern_link_queue_messages", "Messages waiting for the link, by class.", ("peer", "class"), per_class(0))
     gauge("sern_link_queue_bytes", "Bytes waiting for the link, by class.", ("peer", "class"), per_class(1))
     topic = ("peer", "topic", "class")
@@ -116,7 +117,7 @@ def register_links(metrics: Metrics, links: Callable[[], Collection[Link]]) -> N
     counter("sern_bytes_delivered_total", "Bytes that the peer has.", topic, per_topic("delivered_bytes"))
     counter("sern_messages_dropped_total", "Messages dropped, by reason.", (*topic, "reason"), drops)
     counter("sern_stray_fragments_total", "Fragments of streams that were not announced.", peer,
-            per_link(lambda link: float(link.receiver.strays)))  # fmt: skip
+            per_link(lambda link: float(link.strays)))  # fmt: skip
 
 
 def register_codecs(metrics: Metrics, coder: Coder) -> None:

@@ -122,6 +122,5 @@ class LoggedFates:
     def all_held(self, links: Iterable[Link]) -> None:
         """What waits on these links now."""
         for link in links:
-            for channel in link.sender.channels.values():
-                for out in channel.undelivered():
-                    self.held(channel.stream, out.seq, link.peer, exposed=out.exposed)
+            for message in link.undelivered():
+                self.held(message.stream, message.seq, link.peer, exposed=message.exposed)

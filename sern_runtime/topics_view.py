@@ -5,7 +5,7 @@ from dataclasses import asdict
 from typing import Any
 
 from sern_core.link.link import Link
-from sern_core.stream.coding import ChannelCodec
+from sern_core.link.view import CodecView
 from sern_core.vocabulary.ledger import ReceiveLedger
 from sern_core.vocabulary.message import StreamInfo
 from sern_core.vocabulary.types import CLASS_LABELS
@@ -16,22 +16,17 @@ TopicView = dict[str, Any]
 
 def link_summary(link: Link, *, direction: str) -> dict[str, TopicView]:
     """What was offered to a link and what became of it: offered = delivered + dropped + in_queue + in_flight."""
-    held: dict[str, list[int]] = {}
-    wanted: dict[str, bool] = {}
-    codecs = {channel.stream.id.topic: channel.codec for channel in link.sender.channels.values()}
-    for channel in link.sender.channels.values():
-        cell = held.setdefault(channel.stream.id.topic, [0, 0])
-        queued, _queued_bytes, flying, _flying_bytes = channel.held()
-        cell[0] += queued
-        cell[1] += flying
-        wanted[channel.stream.id.topic] = wanted.get(channel.stream.id.topic, False) or bool(channel.wanted)
+    held = link.held()
+    views = link.topics()
+    codecs = {view.stream.id.topic: view.codec for view in views}
+    wanted = {view.stream.id.topic for view in views if view.wanted}
     result: dict[str, TopicView] = {}
-    for topic, counters in link.sender.ledger.topics.items():
+    for topic, counters in link.counters.items():
         in_queue, in_flight = held.get(topic, (0, 0))
         result[topic] = {
             "class": CLASS_LABELS[counters.priority],
             "direction": direction,
-            "wanted": wanted.get(topic, False),
+            "wanted": topic in wanted,
             "offered": counters.offered,
             "sent": counters.offered - counters.dropped - in_queue,
             "delivered": counters.delivered,
@@ -46,7 +41,7 @@ def link_summary(link: Link, *, direction: str) -> dict[str, TopicView]:
     return result
 
 
-def _codec_view(codec: ChannelCodec | None) -> TopicView:
+def _codec_view(codec: CodecView | None) -> TopicView:
     """How a topic is compressed here: the mode in use, what it makes of the messages, and what each mode would."""
     if codec is None:
         return {}
@@ -100,11 +95,9 @@ def both_ways(link: Link, received: ReceiveLedger, *, now: float) -> dict[str, T
             topics[topic] = arrived
     types: dict[str, str] = {}
     owners: dict[str, set[str]] = {}
-    for side in (link.sender.channels, link.taking.streams):
-        for item in side.values():
-            stream = item.stream
-            types.setdefault(stream.id.topic, stream.info.type_name)
-            owners.setdefault(stream.id.topic, set()).add(stream.id.origin)
+    for stream in (*(view.stream for view in link.topics()), *link.arriving()):
+        types.setdefault(stream.id.topic, stream.info.type_name)
+        owners.setdefault(stream.id.topic, set()).add(stream.id.origin)
     for topic, view in topics.items():
         view["type"] = types.get(topic, "")
         view["owner"] = ",".join(sorted(owners.get(topic, ())))

@@ -169,8 +169,8 @@ class _Pinger(DealerSocket):
         super().__init__(socket, lambda _body: None)
         self._on_answer = on_answer
 
-    def _skip_rest(self, frame: zmq.Frame) -> None:
-        super()._skip_rest(frame)
+    def skip_rest(self, frame: zmq.Frame) -> None:
+        super().skip_rest(frame)
         self._on_answer()
 
 

@@ -150,7 +150,8 @@ class DrainedSocket(ABC):
         self._scheduled: asyncio.Handle | None = None
         self._blocked = False
         self._closed = False
-        self._skipping = False  # inside a message that is not wanted
+        self.skipping = False
+        """Inside a message that is not wanted: `_take` returns True meanwhile."""
         self._fd = int(socket.FD)
         self._loop.add_reader(self._fd, self.drain)
         self._tick = self._loop.call_later(tick_s, self._on_tick)
@@ -228,7 +229,7 @@ class DrainedSocket(ABC):
         self.drains += 1
         more = True  # also when a handler raises: the edge is used up, so the rest must be asked for
         try:
-            if not self._skipping:
+            if not self.skipping:
                 more = self._take(self._batch)
             elif self._skip():
                 trim_memory()
@@ -249,14 +250,14 @@ class DrainedSocket(ABC):
     def _take(self, count: int) -> bool:
         """Receive and hand over up to `count` messages. True: there may be more. zmq.Again: all taken."""
 
-    def _skip_rest(self, frame: zmq.Frame) -> None:
+    def skip_rest(self, frame: zmq.Frame) -> None:
         """Drop the remaining frames of a message, without which they would pass for a message of their own.
 
-        There may be very many: `_take` must return True while `_skipping`, and the next callback goes on.
+        There may be very many: `_take` calls this, returns True while `skipping`, and the next callback goes on.
         """
         self.malformed += 1
-        self._skipping = bool(frame.more)
-        if self._skipping:
+        self.skipping = bool(frame.more)
+        if self.skipping:
             self._skip()
 
     def _skip(self) -> bool:
@@ -264,7 +265,7 @@ class DrainedSocket(ABC):
         recv = self.socket.recv
         for _ in range(SKIP_FRAMES):
             if not recv(_NOBLOCK, copy=False).more:
-                self._skipping = False
+                self.skipping = False
                 return True
         return False
 
@@ -332,8 +333,8 @@ class RouterSocket(DrainedSocket):
                 self._frame = frame
                 if frame.more:
                     self._refuse("a message of several frames")
-                    self._skip_rest(frame)
-                    if self._skipping:
+                    self.skip_rest(frame)
+                    if self.skipping:
                         return True
                 elif len(routing_id) != AUTO_ROUTING_ID_BYTES or routing_id[0] != 0:
                     self.refused_routing_ids += 1
@@ -382,8 +383,8 @@ class DealerSocket(DrainedSocket):
             frame = recv(_NOBLOCK, copy=False)
             self.messages += 1
             if frame.more:
-                self._skip_rest(frame)
-                if self._skipping:
+                self.skip_rest(frame)
+                if self.skipping:
                     return True
             else:
                 if on_view is not None and len(frame) >= VIEW_BYTES:
@@ -425,9 +426,9 @@ class FrameSocket(DrainedSocket):
             while frame.more:
                 frame = recv(_NOBLOCK, copy=False)
                 if len(frames) == max_frames:
-                    self._skip_rest(frame)
+                    self.skip_rest(frame)
                     frames = []
-                    if self._skipping:
+                    if self.skipping:
                         self.messages += 1
                         return True
                     break

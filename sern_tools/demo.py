@@ -51,9 +51,9 @@ from sern_tools.demo_scenario import (
     Scenario,
     write_files,
 )
+from sern_tools.harness.processes import DRAIN_S, Child, Children, program, python, swept
 from sern_tools.message_log import TopicLog, read_logs
 from sern_tools.ports import free_ports
-from sern_tools.processes import DRAIN_S, Child, Children, program, swept
 from sern_tools.processors import ProcessorTime, crowded
 from sern_tools.shaping import RateSchedule
 from sern_tools.summary import RunFacts, analyse, judge
@@ -142,24 +142,16 @@ class Demo:
         async with Children(directory) as children:
             link, robot, site = await self._start_baseline(children, directory)
             try:
-                deadline_s = time.monotonic() + START_S
                 await asyncio.sleep(IDLE_S)
-                while True:
-                    children.check()
-                    values = {ROBOT: (await site.ask("floor"))["floor_s"], SITE: (await robot.ask("floor"))["floor_s"]}
-                    found = {origin: value for origin, value in values.items() if value is not None}
-                    if len(found) == len(values):
-                        return found
-                    if time.monotonic() > deadline_s:
-                        raise SernError(f"nothing came through the idle link within {START_S:g} s")
-                    await asyncio.sleep(POLL_S)
+                await children.until(partial(_probed, robot, site), START_S, "nothing came through the idle link")
+                return {ROBOT: (await site.ask("floor"))["floor_s"], SITE: (await robot.ask("floor"))["floor_s"]}
             finally:
                 link.close()
 
     async def _start_baseline(self, children: Children, directory: Path) -> tuple[LinkProcess, Child, Child]:
         publish, subscribe = free_ports(2)
         files = write_files(directory / "config", self.scenario, Ports(*free_ports(4)))
-        base = [sys.executable, "-m", "sern_tools.baseline"]
+        base = python("-m", "sern_tools.baseline")
         site = await children.start(
             "baseline-site",
             [
@@ -201,7 +193,7 @@ class Demo:
         async with Children(directory) as children:
             link, robot, site = await self._start_baseline(children, directory)
             try:
-                await self._until_probed(children, robot, site)
+                await children.until(partial(_probed, robot, site), START_S, "the baseline did not connect")
                 for child in (site, robot):
                     await child.ask("go")
 
@@ -219,21 +211,13 @@ class Demo:
         config = directory / "config"
         return replace(run, files={ROBOT: config / f"{ROBOT}.csv", SITE: config / f"{SITE}.csv"})
 
-    async def _until_probed(self, children: Children, robot: Child, site: Child) -> None:
-        """Both directions are connected and subscribed once a probe has arrived each way."""
-        deadline_s = time.monotonic() + START_S
-        while not all([(await child.ask("floor"))["floor_s"] for child in (robot, site)]):
-            children.check()
-            if time.monotonic() > deadline_s:
-                raise SernError(f"the baseline did not connect within {START_S:g} s")
-            await asyncio.sleep(0.1)
-
     # -- SERN ------------------------------------------------------------------------------------------------------
 
     async def run_sern(self) -> Run:
         directory = self._new_directory("sern")
         relay_port, *http_ports = free_ports(4)
         timeout = aiohttp.ClientTimeout(total=2.0)
+        where = f"the logs are in {directory}" if self.options.keep else "--keep keeps the logs"
         async with aiohttp.ClientSession(timeout=timeout) as session, Children(directory) as children:
             link = await self._start_link(children, [relay_port], datagrams=True)
             try:
@@ -246,8 +230,11 @@ class Demo:
                 for name in (RELAY, SITE, ROBOT):
                     command = self.options.relay_command if name == RELAY else self.options.client_command
                     daemons[name] = await children.start(name, [*command, "--config", str(files[name])])
-                    await self._until(children, f"{name} is ready", partial(_ready, session, web[name]))
-                await self._until(children, "the robot's messages arrive", partial(_arriving, session, web[SITE]))
+                    ready = partial(_ready, session, web[name])
+                    await children.until(ready, START_S, f"{name} is not ready ({where})", every_s=0.05)
+                arriving = partial(_arriving, session, web[SITE])
+                problem = f"none of the robot's messages arrived ({where})"
+                await children.until(arriving, START_S, problem, every_s=0.05)
 
                 behaviour = Behaviour()
 
@@ -262,25 +249,13 @@ class Demo:
                 run = await self._watch(children, link, SERN_NAME, sample)
                 run.behaviour = behaviour
                 # Upstream first: what the robot still has goes to the relay, and from there to the site.
-                await children.stop([daemons[ROBOT]])
+                await children.end(daemons[ROBOT])
                 await _drained(children, partial(_get, session, f"{web[RELAY]}/api/link"))
-                await children.stop([daemons[SITE]])
-                await children.stop([daemons[RELAY]])
-                for child in daemons.values():
-                    if child.process.returncode != 0:
-                        raise child.failure()
+                await children.end(daemons[SITE])
+                await children.end(daemons[RELAY])
             finally:
                 link.close()
         return replace(run, files={name: directory / "config" / f"{name}.csv" for name in (ROBOT, RELAY, SITE)})
-
-    async def _until(self, children: Children, what: str, condition: Callable[[], Awaitable[bool]]) -> None:
-        deadline_s = time.monotonic() + START_S
-        while not await condition():
-            children.check()
-            if time.monotonic() > deadline_s:
-                where = f"the logs are in {children.directory}" if self.options.keep else "--keep keeps the logs"
-                raise SernError(f"not within {START_S:g} s: {what}; {where}")
-            await asyncio.sleep(0.05)
 
     # -- both ------------------------------------------------------------------------------------------------------
 
@@ -357,6 +332,11 @@ class Demo:
     def _counters(self, run: Run) -> dict[str, list[Counters]]:
         directory = run.files[ROBOT].parent
         return read_counters([directory / f"{name}.summary.json" for name in (ROBOT, RELAY, SITE)])
+
+
+async def _probed(robot: Child, site: Child) -> bool:
+    """Both directions are connected and subscribed once a probe has arrived each way."""
+    return all([(await child.ask("floor"))["floor_s"] is not None for child in (robot, site)])
 
 
 # What the daemons say over HTTP ---------------------------------------------------------------------------------------

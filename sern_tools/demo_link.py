@@ -2,7 +2,6 @@
 
 import asyncio
 import json
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -10,7 +9,7 @@ from typing import Any, Final
 from sern_core.vocabulary.errors import SernError
 from sern_tools.demo_report import Carried
 from sern_tools.demo_scenario import FAR_HOST
-from sern_tools.processes import Child, Children
+from sern_tools.harness.processes import Child, Children, python
 from sern_tools.proxy import address
 
 HOST: Final = "127.0.0.1"
@@ -39,7 +38,7 @@ class LinkProcess:
     ) -> "LinkProcess":
         """Start it; with `datagrams` it listens on `FAR_HOST`, TCP and UDP, on the very ports of its targets: a relay
         tells its clients the number of its UDP port, and not where a proxy has it."""
-        command = [sys.executable, "-m", "sern_tools.proxy", "--profile", profile, "--seed", str(seed)]
+        command = python("-m", "sern_tools.proxy", "--profile", profile, "--seed", str(seed))
         for port in targets:
             listen = f"{FAR_HOST}:{port}" if datagrams else f"{HOST}:0"
             command += ["--listen", listen, "--target", f"{HOST}:{port}"]

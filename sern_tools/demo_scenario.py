@@ -4,7 +4,6 @@ The load is shaped to the link: poses, commands, a map and a counter that fit th
 clouds that bring the whole to `overload` times its usual rate. Robot topics are `/robot/...` for everyone.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -14,6 +13,7 @@ from ruamel.yaml import YAML
 from sern_core.vocabulary.errors import ConfigError
 from sern_core.vocabulary.params import SchedulerParams
 from sern_sim.profiles import LinkProfile
+from sern_tools.harness.files import Content, client_content, relay_content
 from sern_tools.keygen import make_keys
 from sern_tools.shaping import RateSchedule
 
@@ -158,19 +158,7 @@ class Scenario:
 def write_files(directory: Path, scenario: Scenario, ports: Ports) -> dict[str, Path]:
     """Keys and configuration files of one run, by the names relay, robot and site. The directory must be new."""
     make_keys(directory, RELAY, ROBOT, SITE)
-    files = {
-        RELAY: _relay(ports),
-        ROBOT: _client(
-            ROBOT,
-            FAR_HOST,
-            ports,
-            ports.robot_http,
-            scenario.robot_endpoints,
-            scenario.robot_rules,
-            discovery="dynamic",
-        ),
-        SITE: _site(scenario, ports),
-    }
+    files = {RELAY: _relay(ports), ROBOT: _robot(scenario, ports), SITE: _site(scenario, ports)}
     written = {}
     for name, content in files.items():
         written[name] = directory / f"{name}.yaml"
@@ -179,48 +167,30 @@ def write_files(directory: Path, scenario: Scenario, ports: Ports) -> dict[str, 
     return written
 
 
-def _relay(ports: Ports) -> dict[str, Any]:
-    return {
-        "relay": {
-            "name": RELAY,
-            "listen": [f"tcp://{HOST}:{ports.relay}"],
-            "secret_key_file": f"{RELAY}.key",
-            "clients_dir": "clients",
-        },
-        "access": [
+def _relay(ports: Ports) -> Content:
+    return relay_content(
+        f"tcp://{HOST}:{ports.relay}",
+        access=[
             {"client": ROBOT, "publish": ["/{self}/.*"], "subscribe": [COMMAND_TOPIC]},
             {"client": SITE, "publish": [COMMAND_TOPIC], "subscribe": [f"/{ROBOT}/.*"]},
         ],
-        "http": {"listen": f"{HOST}:{ports.relay_http}"},
-        "message_log": f"{RELAY}.csv",
-        "summary": "relay.summary.json",
-    }
+        **_said(RELAY, ports.relay_http),
+    )
 
 
-def _client(
-    name: str, relay_host: str, ports: Ports, http_port: int, endpoint: Sequence[dict[str, Any]],
-    topics: Sequence[dict[str, Any]], **discovery: str,
-) -> dict[str, Any]:  # fmt: skip
-    content: dict[str, Any] = {
-        "client": {"name": name},
-        "relay": {
-            "endpoint": f"tcp://{relay_host}:{ports.relay}",
-            "server_key_file": f"{RELAY}.pub",
-            "secret_key_file": f"{name}.key",
-        },
-        "endpoint": list(endpoint),
-        "topics": list(topics),
-        "http": {"listen": f"{HOST}:{http_port}"},
-        "message_log": f"{name}.csv",
-        "summary": f"{name}.summary.json",
-    }
-    if discovery:
-        content["discovery"] = {"mode": discovery["discovery"]}
-        content["adaptation"] = ADAPTATION
-    return content
+def _robot(scenario: Scenario, ports: Ports) -> Content:
+    return client_content(
+        ROBOT,
+        f"tcp://{FAR_HOST}:{ports.relay}",
+        scenario.robot_endpoints,
+        topics=scenario.robot_rules,
+        discovery={"mode": "dynamic"},
+        adaptation=ADAPTATION,
+        **_said(ROBOT, ports.robot_http),
+    )
 
 
-def _site(scenario: Scenario, ports: Ports) -> dict[str, Any]:
+def _site(scenario: Scenario, ports: Ports) -> Content:
     operator = {
         "kind": "synthetic",
         "role": "operator",
@@ -230,8 +200,21 @@ def _site(scenario: Scenario, ports: Ports) -> dict[str, Any]:
         "goal_rate_hz": 0.0,
     }
     commands = {"match": COMMAND_TOPIC, "class": "control", "direction": "send", "reliability": "best_effort"}
-    rules = [{**commands, "depth": 1, "lifespan_s": scenario.command_lifespan_s}]
-    content = _client(SITE, HOST, ports, ports.site_http, [operator], rules)
-    content["client"]["namespace"] = "/"  # it commands the robot by the robot's own topic
-    content["subscribe"] = [f"/{ROBOT}/.*"]
-    return content
+    return client_content(
+        SITE,
+        f"tcp://{HOST}:{ports.relay}",
+        [operator],
+        client={"namespace": "/"},  # it commands the robot by the robot's own topic
+        topics=[{**commands, "depth": 1, "lifespan_s": scenario.command_lifespan_s}],
+        subscribe=[f"/{ROBOT}/.*"],
+        **_said(SITE, ports.site_http),
+    )
+
+
+def _said(name: str, http_port: int) -> Content:
+    """Where a daemon says what it does."""
+    return {
+        "http": {"listen": f"{HOST}:{http_port}"},
+        "message_log": f"{name}.csv",
+        "summary": f"{name}.summary.json",
+    }

@@ -146,7 +146,7 @@ def replay(
     policy = setup.adaptation.make_policy(encodes=True)()
     adapter = HopAdapter(world.robot.link, policy, params, coder=coder, now=world.network.now)
     steps: list[Step] = []
-    world.every(params.interval_s / SAMPLES, lambda _now: adapter.sample())
+    world.every(params.interval_s / SAMPLES, lambda now: adapter.sample(now=now))
     world.every(params.interval_s, lambda now: steps.append(adapter.step(now=now)))
     world.feed((SETTLE_S + message.at_s, channels[message.topic], message.body) for message in messages)
     world.run(SETTLE_S + duration_s)

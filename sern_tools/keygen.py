@@ -7,6 +7,7 @@ import typer
 
 from sern_core.vocabulary.errors import ConfigError, SernError
 from sern_core.vocabulary.names import client_name
+from sern_core.vocabulary.types import ClientName
 from sern_runtime.config import keys
 
 EXIT_USER_ERROR = 2
@@ -31,13 +32,20 @@ def run_keygen(role: Role, name: str, *, out: Path = Path(), force: bool = False
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ConfigError(f"can not be made: {error.strerror or error}", file=str(out)) from error
-    pair = keys.generate(owner)
-    keys.write_secret(secret_path, pair, replace=force)
-    keys.write_public(public_path, keys.PublicKeys(owner, (keys.PublicKey(pair.public_key),)), replace=force)
+    write_pair(owner, out, out, replace=force)
     advice = _relay_advice if role == "relay" else _client_advice
     return f"wrote {secret_path} (secret, mode 0600) and {public_path} (public)\n" + advice(
         name, secret_path, public_path
     )
+
+
+def write_pair(name: ClientName, directory: Path, public_directory: Path, *, replace: bool = False) -> keys.SecretKey:
+    """A new pair, written as `NAME.key` and `NAME.pub`. ConfigError when one cannot be written."""
+    pair = keys.generate(name)
+    keys.write_secret(directory / f"{name}{keys.SECRET_SUFFIX}", pair, replace=replace)
+    public = keys.PublicKeys(name, (keys.PublicKey(pair.public_key),))
+    keys.write_public(public_directory / f"{name}{keys.PUBLIC_SUFFIX}", public, replace=replace)
+    return pair
 
 
 def make_keys(directory: Path, relay: str, *clients: str) -> None:
@@ -50,10 +58,7 @@ def make_keys(directory: Path, relay: str, *clients: str) -> None:
     theirs = directory / "clients"
     theirs.mkdir(parents=True)
     for name in names:
-        pair = keys.generate(name)
-        public = keys.PublicKeys(name, (keys.PublicKey(pair.public_key),))
-        keys.write_secret(directory / f"{name}{keys.SECRET_SUFFIX}", pair)
-        keys.write_public((directory if name == relay else theirs) / f"{name}{keys.PUBLIC_SUFFIX}", public)
+        write_pair(name, directory, directory if name == relay else theirs)
 
 
 def _relay_advice(name: str, secret: Path, public: Path) -> str:

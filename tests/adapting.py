@@ -111,6 +111,6 @@ def rig(
         robot.core.link, policy, params, coder=robot.core.coder, now=world.now, summaries=lambda: items
     )
     found = Rig(world, robot, site, adapter)
-    world.network.every(1.0 / SAMPLES, lambda _now: adapter.sample(), node=robot)
+    world.network.every(1.0 / SAMPLES, lambda now: adapter.sample(now=now), node=robot)
     world.network.every(1.0, lambda now: found.steps.append(adapter.step(now=now)), node=robot)
     return found

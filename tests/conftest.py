@@ -27,6 +27,7 @@ from tests.support import DEADLINE_S, Patience
 Context = zmq.Context[zmq.Socket[bytes]]
 PEERS: Final = Path(__file__).parent / "peers"
 LAB: Final = Path(__file__).parent / "lab"
+LONG: Final = "lab_long"
 
 for name in (
     "CYCLONEDDS_URI", "FASTRTPS_DEFAULT_PROFILES_FILE", "RMW_IMPLEMENTATION", "ROS_DISCOVERY_SERVER", "ROS_DOMAIN_ID",
@@ -55,12 +56,18 @@ def pytest_cmdline_main(config: pytest.Config) -> None:
 
 
 @pytest.hookimpl(tryfirst=True)  # before pytest-xdist reads the groups
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Ask for `no_leftover_tasks` ahead of all other fixtures, so that it is torn down after them.
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Leave the longer runs out unless they are asked for by -m (make lab).
+
+    Ask for `no_leftover_tasks` ahead of all other fixtures, so that it is torn down after them.
 
     Name the groups whose tests run one after the other where several processes share the tests: those of a file, all
     with ROS peers, which share the host's ROS domains and its multicast, and all of the lab, which has the machine.
     """
+    long = [] if LONG in config.getoption("markexpr", "") else [item for item in items if item.get_closest_marker(LONG)]
+    if long:
+        config.hook.pytest_deselected(items=long)
+        items[:] = [item for item in items if item not in long]
     for item in items:
         if isinstance(item, pytest.Function) and asyncio.iscoroutinefunction(item.function):
             item.fixturenames.insert(0, "no_leftover_tasks")

@@ -9,7 +9,6 @@ import json
 import os
 import signal
 import subprocess
-import sys
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -27,8 +26,11 @@ from sern_client.endpoints.base import Endpoint
 from sern_core.vocabulary.types import ClientName
 from sern_relay.daemon import RelayDaemon
 from sern_runtime.config.client import load_client
-from sern_runtime.config.keys import PublicKey, PublicKeys, SecretKey, generate, write_public, write_secret
+from sern_runtime.config.keys import SecretKey
 from sern_runtime.config.relay import load_relay
+from sern_tools.harness.files import client_content, relay_content, write
+from sern_tools.harness.processes import bound, daemon
+from sern_tools.keygen import write_pair
 from sern_tools.ports import free_ports
 from tests.support import DEADLINE_S, until
 
@@ -36,7 +38,6 @@ HOST: Final = "127.0.0.1"
 CALLER_HOST: Final = "127.0.0.2"
 """Where polling comes from: from HOST itself, a port that nobody listens on yet could be given to the very call that
 asks whether it answers, which would then be connected to itself."""
-ALLOW_ALL: Final = ({"client": ".*", "publish": [".*"], "subscribe": [".*"]},)
 RELIABLE: Final = ({"match": ".*", "class": "state", "reliability": "reliable"},)
 STOP_S: Final = 60.0
 START_NS: Final = 1_700_000_000_000_000_000
@@ -107,7 +108,7 @@ class Process:
         self._from = 0
         with self.log.open("ab") as stream:
             self._from = stream.tell()
-            command = [*before, sys.executable, "-P", "-m", f"sern_{program}.cli", "--config", str(config)]
+            command = bound([*before, *daemon(program, config)])
             self.process = subprocess.Popen(
                 command, stdin=subprocess.DEVNULL, stdout=stream, stderr=stream, cwd=config.parent
             )
@@ -206,19 +207,13 @@ class Lab:
         self._processes: list[Process] = []
         self._here: list[RelayDaemon | ClientDaemon] = []
 
-    def _keys(self, name: str, public: Path) -> SecretKey:
-        pair = generate(ClientName(name))
-        write_secret(self.directory / f"{name}.key", pair, replace=True)
-        write_public(public, PublicKeys(pair.name, (PublicKey(pair.public_key),)), replace=True)
-        return pair
-
     def make_relay_keys(self) -> SecretKey:
         """A new pair for the relay; relay.pub is what the clients read at their next start."""
-        return self._keys("relay", self.directory / "relay.pub")
+        return write_pair(ClientName("relay"), self.directory, self.directory, replace=True)
 
     def make_keys(self, name: str) -> SecretKey:
         """A client's pair; the relay knows it when it looks next."""
-        return self._keys(name, self.clients_dir / f"{name}.pub")
+        return write_pair(ClientName(name), self.directory, self.clients_dir, replace=True)
 
     async def __aenter__(self) -> Self:
         return self
@@ -248,46 +243,22 @@ class Lab:
 
     # --- files ------------------------------------------------------------------------------------------------------
 
-    def _write(self, name: str, content: Json) -> Path:
-        path = self.directory / f"{name}.yaml"
-        path.write_text(json.dumps(content, indent=1))  # JSON is YAML
-        return path
+    def _said(self, name: str) -> Json:
+        """Where a daemon says what it does."""
+        return {"http": {"listen": f"{HOST}:{free_ports(1)[0]}"}, "summary": f"{name}.summary.json"}
 
     def relay_file(self, **sections: Any) -> Path:
         """relay.yaml; `sections` replace or add to what is there by default, `relay` is merged."""
-        relay: Json = {"name": "relay", "listen": [self.endpoint]}
-        if self.secure:
-            relay |= {"secret_key_file": "relay.key", "clients_dir": "clients"}
-        else:
-            relay["insecure"] = True
-        content: Json = {
-            "access": list(ALLOW_ALL),
-            "http": {"listen": f"{HOST}:{free_ports(1)[0]}"},
-            "summary": "relay.summary.json",
-            **sections,
-            "relay": relay | sections.get("relay", {}),
-        }
-        return self._write("relay", content)
+        sections = self._said("relay") | sections
+        return write(self.directory, "relay", relay_content(self.endpoint, secure=self.secure, **sections))
 
     def client_file(self, name: str, endpoint: object, **sections: Any) -> Path:
         """NAME.yaml, with new keys unless they exist; `client` and `relay` are merged, the rest is replaced."""
-        relay: Json = {"endpoint": self.endpoint}
-        if self.secure:
-            relay |= {"server_key_file": "relay.pub", "secret_key_file": f"{name}.key"}
-            if not (self.directory / f"{name}.key").exists():
-                self.make_keys(name)
-        else:
-            relay["insecure"] = True
-        content: Json = {
-            "discovery": {"mode": "dynamic"},
-            "http": {"listen": f"{HOST}:{free_ports(1)[0]}"},
-            "summary": f"{name}.summary.json",
-            **sections,
-            "client": {"name": name} | sections.get("client", {}),
-            "relay": relay | sections.get("relay", {}),
-            "endpoint": endpoint,
-        }
-        return self._write(name, content)
+        if self.secure and not (self.directory / f"{name}.key").exists():
+            self.make_keys(name)
+        sections = {"discovery": {"mode": "dynamic"}} | self._said(name) | sections
+        content = client_content(name, self.endpoint, endpoint, secure=self.secure, **sections)
+        return write(self.directory, name, content)
 
     def recorder_file(self, name: str, *patterns: str, path: str = "", **sections: Any) -> Path:
         """A site that records what matches `patterns` into NAME.bag or NAME.mcap."""
@@ -352,9 +323,20 @@ class Lab:
 
 def endpoint_of(daemon: ClientDaemon, kind: type[Any]) -> Any:
     """The endpoint of a client in this process, when it has one only."""
-    endpoint: Endpoint = daemon.bridge.endpoint
+    endpoint: Endpoint = daemon.site.endpoint
     assert isinstance(endpoint, kind)
     return cast("Any", endpoint)
+
+
+def delivered(site: ClientDaemon | Process, topic: str | None = None) -> int:
+    """How many messages a site has been given, of one topic or in all."""
+    counts: dict[str, int]
+    if isinstance(site, Process):
+        topics = site.json("/api/topics").items()
+        counts = {name: int(row["delivered"]) for name, row in topics if row["direction"] == "receive"}
+    else:
+        counts = {name: counters.delivered for name, counters in site.core.received.topics.items()}
+    return sum(counts.values()) if topic is None else counts.get(topic, 0)
 
 
 def rss_bytes(process: Process) -> int:

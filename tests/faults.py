@@ -6,6 +6,7 @@ from contextlib import ExitStack, contextmanager
 from typing import Any
 from unittest.mock import patch
 
+from sern_core.link.control_reader import ControlReader
 from sern_core.link.handler import LinkHandler
 from sern_core.link.link import Link
 from sern_core.link.streams_out import StreamsOut
@@ -65,7 +66,7 @@ INSIDE: list[Place] = [
     (Flight, "acked"),
     (Scheduler, "pick"),
     (Scheduler, "charge"),
-    (Link, "_handle_control"),
+    (ControlReader, "handle"),
     (StreamsOut, "control_sent"),
     (Link, "_sweep"),
     (OutChannel, "submit"),

@@ -10,6 +10,10 @@ PURE_PACKAGES = ("sern_core", "sern_sim")
 # `random` may be imported for its type (a seeded Random is handed in), never for the module's own functions.
 RANDOM_ALLOWED = {"Random"}
 OWN_CLOCK = {"loop.py", "logs.py"}  # how long the loop was held, how often a line was written: nothing of the core
+PARTS_OF_A_LINK = {
+    "answers", "control", "end", "handshake", "lane", "lanes", "outgoing", "plane", "reading", "reassembly", "receiver",
+    "sender", "taking", "texts",
+}  # fmt: skip
 
 
 def test_layers_import_only_downward() -> None:
@@ -48,3 +52,25 @@ def test_the_core_is_given_a_clock_that_goes_on_while_the_machine_sleeps() -> No
             if isinstance(node, ast.Attribute) and node.attr.startswith("monotonic") and path.name not in OWN_CLOCK:
                 offenders.append(f"{path.name}:{node.lineno} {node.attr}")
     assert offenders == []
+
+
+def test_whoever_watches_or_adapts_a_link_goes_through_its_door() -> None:
+    """`Link.observe`, `topics` and `apply` (sern_core/link/view.py), and none of the parts that a link is made of."""
+    files = [path for name in ("sern_runtime", "sern_core/adaptation") for path in (ROOT / name).rglob("*.py")]
+    assert len(files) > 40
+    assert [found for path in files for found in _reached(path.read_text(), str(path.relative_to(ROOT)))] == []
+    assert _reached("link.sender.queued(), self.link.lanes, link.observe(now=now).lane", "a.py") == [
+        "a.py:1 link.lanes",
+        "a.py:1 link.sender",
+    ]
+
+
+def _reached(text: str, file: str) -> list[str]:
+    """Parts of a link that a module looks at, wherever the link is called one."""
+    found = []
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.Attribute) and node.attr in PARTS_OF_A_LINK:
+            owner = node.value
+            if "link" in (getattr(owner, "id", None), getattr(owner, "attr", None)):
+                found.append(f"{file}:{node.lineno} link.{node.attr}")
+    return sorted(found)

@@ -28,12 +28,12 @@ from benchmarks import child, common
 from benchmarks.common import MissingError
 from benchmarks.endpoints import shared
 from benchmarks.endpoints.dds_roles import DEPTHS, TYPES
-from benchmarks.endpoints.shared import ALONE, CHAIN, DIRECT, HOST, START_S, Figures, within
+from benchmarks.endpoints.shared import ALONE, CHAIN, DIRECT, HOST, START_S, Figures
 from sern_core.vocabulary.errors import SernError
 from sern_core.vocabulary.types import Encoding
 from sern_runtime import ros_types
+from sern_tools.harness.processes import Child, Children, cpu_s, python
 from sern_tools.ports import free_ports
-from sern_tools.processes import Child, Children
 from tests.peers.dds.peer import Peer, PeerError, build_peer, free_domain, missing_packages
 
 MEASURE_S: Final = 8.0
@@ -60,7 +60,7 @@ def _body(name: str) -> bytes:
 
 
 async def _role(children: Children, role: str, *arguments: str) -> Child:
-    command = child.python("-m", "benchmarks.endpoints.dds_roles", role, *arguments)
+    command = python("-m", "benchmarks.endpoints.dds_roles", role, *arguments)
     return await children.start(role, command, environment=child.environment())
 
 
@@ -113,10 +113,10 @@ async def _through(children: Children, stack: AsyncExitStack, system: str, progr
             await source.line(f"matched {name} 1")
             await sink.line(f"matched {name} 1")
 
-    await within(matched(), START_S, "the Fast DDS peers did not find each other")
+    await children.within(matched(), START_S, "the Fast DDS peers did not find each other")
     # A daemon says that somebody wants a topic some time after it is there.
     await asyncio.sleep(1.0)
-    before_s, began_s = child.cpu_s(*pids), time.monotonic()
+    before_s, began_s = cpu_s(*pids), time.monotonic()
     for name, body in bodies.items():
         await source.do(f"flood {name} {body} {RATES_HZ[name]} {round(RATES_HZ[name] * measure_s)}")
 
@@ -124,7 +124,7 @@ async def _through(children: Children, stack: AsyncExitStack, system: str, progr
         for name in bodies:
             await source.line(f"flooded {name}")
 
-    await within(flooded(), patience_s, "not everything could be published")
+    await children.within(flooded(), patience_s, "not everything could be published")
     took_s = time.monotonic() - began_s
     found: Figures = {}
     for name, rate_hz in RATES_HZ.items():
@@ -137,13 +137,13 @@ async def _through(children: Children, stack: AsyncExitStack, system: str, progr
         found[f"{name}_p99_ms"] = settled[int(0.99 * (len(settled) - 1))]
         found[f"{name}_lost"] = expected - len(delays_ms)
     # A bridge that is behind works on after the last message is published: that counts as well.
-    return {**found, "cpu_percent": 100 * (child.cpu_s(*pids) - before_s) / took_s}
+    return {**found, "cpu_percent": 100 * (cpu_s(*pids) - before_s) / took_s}
 
 
 async def _measured(system: str, program: Path, measure_s: float) -> Figures:
     try:
         async with shared.started() as children, AsyncExitStack() as stack:
-            return await child.beside(children, _through(children, stack, system, program, measure_s))
+            return await children.beside(_through(children, stack, system, program, measure_s))
     except (PeerError, SernError) as error:
         raise SernError(f"dds, {system}: {error}") from error
     except TimeoutError as error:

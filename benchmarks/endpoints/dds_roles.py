@@ -16,9 +16,9 @@ from typing import Any, Final
 
 from benchmarks.endpoints.rospy_roles import qualities
 from benchmarks.zenoh_session import open_session
+from sern_client.endpoints.common.handover import Handover
 from sern_client.endpoints.dds.domain import DomainOptions
 from sern_client.endpoints.dds.endpoint import DdsEndpoint, DdsOptions
-from sern_client.endpoints.handover import Handover
 from sern_core.vocabulary.message import TopicInfo
 from sern_core.vocabulary.types import Encoding, TopicName
 from sern_runtime import ros_types

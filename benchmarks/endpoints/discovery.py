@@ -10,14 +10,15 @@ import statistics
 import time
 from typing import Final
 
-from benchmarks import child, common
+from benchmarks import common
 from benchmarks.endpoints.ros1 import ROSMASTER, Ros, need, running
 from benchmarks.endpoints.ros1_roles import ODOM, TYPES, advertise, body
-from benchmarks.endpoints.shared import CHAIN, HOST, within
+from benchmarks.endpoints.shared import CHAIN, HOST
 from sern_client.endpoints.ros1 import Ros1Endpoint, Ros1Options
 from sern_core.vocabulary.errors import SernError
 from sern_core.vocabulary.message import TopicInfo
 from sern_core.vocabulary.types import TopicName
+from sern_tools.harness.processes import Children
 
 TOPICS: Final = 10
 """A round, one after the other."""
@@ -54,7 +55,7 @@ class _Nobody:
     def topic_removed(self, name: TopicName) -> None: ...
 
 
-async def _once(source: Ros1Endpoint, observer: _Observer, topic: str) -> tuple[float, float]:
+async def _once(children: Children, source: Ros1Endpoint, observer: _Observer, topic: str) -> tuple[float, float]:
     """Seconds until its first message, and until it is gone."""
     began_s = time.monotonic()
     handle = advertise(source, topic, TYPES[ODOM])
@@ -69,10 +70,10 @@ async def _once(source: Ros1Endpoint, observer: _Observer, topic: str) -> tuple[
         while topic not in observer.gone_s:  # noqa: ASYNC110  the observer's events have no loop of their own
             await asyncio.sleep(PERIOD_S / 10)
 
-    await within(first(), TIMEOUT_S, f"no message of {topic} got to the other master")
+    await children.within(first(), TIMEOUT_S, f"no message of {topic} got to the other master")
     handle.close()
     ended_s = time.monotonic()
-    await within(gone(), TIMEOUT_S, f"{topic} was not gone from the other master")
+    await children.within(gone(), TIMEOUT_S, f"{topic} was not gone from the other master")
     return observer.first_s[topic] - began_s, observer.gone_s[topic] - ended_s
 
 
@@ -83,8 +84,8 @@ async def _topics(ros: Ros, count: int) -> list[tuple[float, float]]:
     await source.start(_Nobody())
     await observer.endpoint.start(observer)
     try:
-        await _once(source, observer, "/bench/before/odom")  # the daemons have found each other
-        return [await _once(source, observer, f"/bench/run{number}/odom") for number in range(count)]
+        await _once(ros.children, source, observer, "/bench/before/odom")  # the daemons have found each other
+        return [await _once(ros.children, source, observer, f"/bench/run{number}/odom") for number in range(count)]
     finally:
         await observer.endpoint.stop()
         await source.stop()
@@ -93,7 +94,7 @@ async def _topics(ros: Ros, count: int) -> list[tuple[float, float]]:
 async def _measure(count: int) -> list[tuple[float, float]]:
     try:
         async with running() as ros:
-            return await child.beside(ros.children, _topics(ros, count))
+            return await ros.children.beside(_topics(ros, count))
     except SernError as error:
         raise SernError(f"discovery: {error}") from error
 

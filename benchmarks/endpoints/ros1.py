@@ -28,11 +28,11 @@ from benchmarks import child, common
 from benchmarks.common import MissingError
 from benchmarks.endpoints import shared
 from benchmarks.endpoints.ros1_roles import CLOUD, ODOM, TYPES
-from benchmarks.endpoints.shared import ALONE, CHAIN, DIRECT, HOST, START_S, Figures, said, within
+from benchmarks.endpoints.shared import ALONE, CHAIN, DIRECT, HOST, START_S, Figures, said
 from sern_client.endpoints.ros1.xmlrpc import CallError, XmlRpcClient
 from sern_core.vocabulary.errors import SernError
+from sern_tools.harness.processes import Child, Children, cpu_s, python
 from sern_tools.ports import free_ports
-from sern_tools.processes import Child, Children
 
 WARM_S: Final = 2.0
 MEASURE_S: Final = 8.0
@@ -92,7 +92,7 @@ class Ros:
 
     async def role(self, role: str, *arguments: object) -> Child:
         """A process of `ros1_roles`."""
-        command = child.python("-m", "benchmarks.endpoints.ros1_roles", role, *map(str, arguments))
+        command = python("-m", "benchmarks.endpoints.ros1_roles", role, *map(str, arguments))
         environment = {**self.environment(""), **child.environment()}
         return await self.children.start(role, command, talks=True, environment=environment)
 
@@ -101,7 +101,7 @@ class Ros:
         environment = {**self.environment(master), "PYTHONPATH": str(child.ROOT)}
         command = [DEBIAN_PYTHON, "-m", "benchmarks.endpoints.rospy_roles", role, *arguments, *_TOPICS]
         process = await self.children.start(f"rospy-{role}", command, talks=True, environment=environment)
-        await within(said(process, "ready"), START_S, f"rospy-{role} was not ready")
+        await self.children.within(said(process, "ready"), START_S, f"rospy-{role} was not ready")
         return process
 
     async def master(self) -> str:
@@ -121,7 +121,7 @@ class Ros:
                 except CallError:
                     await asyncio.sleep(0.02)
 
-        await within(answers(), START_S, f"{name} did not answer at {uri}")
+        await self.children.within(answers(), START_S, f"{name} did not answer at {uri}")
         client.close()
         return uri
 
@@ -170,11 +170,11 @@ async def _through(ros: Ros, system: str, load: tuple[float, int, float], measur
                 for number, topic in enumerate(TYPES)
             ]  # fmt: skip
     sink = await ros.role("sink", other, ODOM + suffix, CLOUD + suffix if load[2] else "", WARM_S, measure_s)
-    await within(said(sink, "begin"), START_S + WARM_S, "not every topic got through")
+    await ros.children.within(said(sink, "begin"), START_S + WARM_S, "not every topic got through")
     pids = [process.process.pid for process in between]
-    before_s, began_s = child.cpu_s(*pids), time.monotonic()
+    before_s, began_s = cpu_s(*pids), time.monotonic()
     await said(sink, "end")
-    used_s, took_s = child.cpu_s(*pids) - before_s, time.monotonic() - began_s
+    used_s, took_s = cpu_s(*pids) - before_s, time.monotonic() - began_s
     found: Figures = await said(sink, "found")
     return {**found, "cpu_percent": 100 * used_s / took_s}
 
@@ -182,7 +182,7 @@ async def _through(ros: Ros, system: str, load: tuple[float, int, float], measur
 async def _measured(system: str, load: tuple[float, int, float], measure_s: float) -> Figures:
     try:
         async with running() as ros:
-            return await child.beside(ros.children, _through(ros, system, load, measure_s))
+            return await ros.children.beside(_through(ros, system, load, measure_s))
     except SernError as error:
         raise SernError(f"ros1, {system}: {error}") from error
 
@@ -196,25 +196,25 @@ async def _found_many(ros: Ros, measure_s: float) -> Figures:
     master = await ros.master()
     await said(await ros.role("many", master, TOPICS), "ready")
     follower = await ros.role("follow", master, TOPICS)
-    found_s = float(await within(said(follower, "found_s"), START_S, f"{TOPICS} topics were not found"))
+    found_s = float(await ros.children.within(said(follower, "found_s"), START_S, f"{TOPICS} topics were not found"))
     await asyncio.sleep(WARM_S)
     pids = [follower.process.pid]
-    before_s, master_s, began_s = child.cpu_s(*pids), child.cpu_s(*ros.masters), time.monotonic()
+    before_s, master_s, began_s = cpu_s(*pids), cpu_s(*ros.masters), time.monotonic()
     await asyncio.sleep(measure_s)
-    used_s, asked_s = child.cpu_s(*pids) - before_s, child.cpu_s(*ros.masters) - master_s
+    used_s, asked_s = cpu_s(*pids) - before_s, cpu_s(*ros.masters) - master_s
     share = 100 / (time.monotonic() - began_s)
     found = {"found_s": found_s, "cpu_percent": share * used_s, "master_cpu_percent": share * asked_s}
     bare = (await ros.role("poll", master)).process.pid
     await asyncio.sleep(WARM_S)
-    bare_s, began_s = child.cpu_s(bare), time.monotonic()
+    bare_s, began_s = cpu_s(bare), time.monotonic()
     await asyncio.sleep(measure_s)
-    return {**found, "bare_cpu_percent": 100 * (child.cpu_s(bare) - bare_s) / (time.monotonic() - began_s)}
+    return {**found, "bare_cpu_percent": 100 * (cpu_s(bare) - bare_s) / (time.monotonic() - began_s)}
 
 
 async def _follow(measure_s: float) -> Figures:
     try:
         async with running() as ros:
-            return await child.beside(ros.children, _found_many(ros, measure_s))
+            return await ros.children.beside(_found_many(ros, measure_s))
     except SernError as error:
         raise SernError(f"{MANY}: {error}") from error
 

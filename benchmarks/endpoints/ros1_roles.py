@@ -141,7 +141,7 @@ def figures(name: str, noted: Sequence[tuple[int, int]]) -> dict[str, float]:
     numbers = [number for number, _ in noted]
     return {
         f"{name}_p50_ms": statistics.median(lags_ms),
-        f"{name}_p99_ms": lags_ms[int(len(lags_ms) * 0.99)],
+        f"{name}_p99_ms": common.percentile(lags_ms, 0.99),
         f"{name}_received": len(noted),
         f"{name}_lost": max(numbers) - min(numbers) + 1 - len(set(numbers)),
     }

@@ -1,45 +1,38 @@
 """What the parts share: children of one run, the chain of SERN's daemons, a bridge over zenoh, and the rounds."""
 
-import asyncio
 import importlib.util
-import json
 import statistics
 import tempfile
-from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import Any, Final
 
 from benchmarks import child, common
 from benchmarks.common import MissingError
 from sern_core.vocabulary.errors import SernError
+from sern_tools.harness.files import RELAY, client_content, relay_content, write
+from sern_tools.harness.processes import Child, Children, daemon, killed
 from sern_tools.keygen import make_keys
 from sern_tools.ports import free_ports
-from sern_tools.processes import Child, Children
 
 HOST: Final = "127.0.0.1"
 START_S: Final = 60.0
 """How long processes may take to start and to find each other; the machine may be busy."""
 ROUNDS: Final = 3
 DIRECT, CHAIN, ALONE = "direct", "sern-chain", "sern-in-process"
-RELAY, ROBOT, SITE = "relay", "robot1", "site"
+ROBOT, SITE = "robot1", "site"
 Environment = Mapping[str, str | None]
 Figures = dict[str, float]
-T = TypeVar("T")
 
 
 @asynccontextmanager
 async def started() -> AsyncIterator[Children]:
     """Children of one run, with a folder of their own. They are killed at the end: nothing of them is needed then."""
     with tempfile.TemporaryDirectory(prefix="sern-bench-") as name:
-        async with Children(Path(name)) as children:
-            try:
-                yield children
-            finally:
-                children.kill()
-                for each in children.children:
-                    await each.process.wait()
+        async with killed(Path(name)) as children:
+            yield children
 
 
 async def start_chain(
@@ -53,28 +46,22 @@ async def start_chain(
     folder = children.directory
     make_keys(folder, RELAY, ROBOT, SITE)
     address = f"tcp://{HOST}:{free_ports(1)[0]}"
-    files: dict[str, dict[str, Any]] = {
-        RELAY: {
-            "relay": {"name": RELAY, "listen": [address], "secret_key_file": "relay.key", "clients_dir": "clients"},
-            "access": [{"client": ".*", "publish": [".*"], "subscribe": [".*"]}],
-        }
-    }
+    files = {RELAY: relay_content(address)}
     for name, endpoint in endpoints.items():
-        files[name] = {
-            "client": {"name": name, "namespace": "/"},
-            "relay": {"endpoint": address, "server_key_file": "relay.pub", "secret_key_file": f"{name}.key"},
-            "endpoint": dict(endpoint),
-            "topics": [
+        files[name] = client_content(
+            name,
+            address,
+            dict(endpoint),
+            client={"namespace": "/"},
+            topics=[
                 {"match": ".*/odom", "class": "control", "depth": 1000, **rule},
                 {"match": ".*/cloud", "class": "bulk", "depth": 10, **rule},
             ],
-            "subscribe": ["/bench/.*"] if name == SITE else [],
-        }
+            subscribe=["/bench/.*"] if name == SITE else [],
+        )
     daemons = []
     for name, content in files.items():
-        config = folder / f"{name}.yaml"
-        config.write_text(json.dumps(content))  # JSON is YAML
-        command = child.python("-m", f"sern_{'relay' if name == RELAY else 'client'}.cli", "--config", str(config))
+        command = daemon("relay" if name == RELAY else "client", write(folder, name, content))
         daemons.append(await children.start(name, command, environment={**environment, **child.environment()}))
     return daemons
 
@@ -143,12 +130,3 @@ def reach_added(report: common.Report, where: str, rounds: Rounds, system: str, 
     """The median over rounds of what the system adds to odometry, against its limit."""
     added_ms = statistics.median(rounds.added_ms(system, "odom_p50_ms"))
     report.reach(f"{where}: latency added to odometry [ms]", added_ms, limit_ms)
-
-
-async def within(work: Awaitable[T], seconds: float, problem: str) -> T:
-    """What `work` comes to; SernError of `problem` when that takes longer."""
-    try:
-        async with asyncio.timeout(seconds):
-            return await work
-    except TimeoutError:
-        raise SernError(f"{problem} within {seconds:g} s") from None

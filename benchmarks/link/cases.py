@@ -1,6 +1,7 @@
 """The cases, what is measured in each, and which figure is held against which limit."""
 
 import argparse
+import asyncio
 import importlib.util
 import tempfile
 from collections.abc import Callable, Sequence
@@ -8,10 +9,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
-from benchmarks.common import Report
+from benchmarks.common import Report, pyplot
+from benchmarks.flood import JUNK_HZ
 from benchmarks.link import figures, peers, plots
 from benchmarks.link.forwarder import FORWARDER
-from benchmarks.link.junk import JUNK_HZ, Junk
+from benchmarks.link.junk import Junk
 from benchmarks.link.load import Kind, Load
 from benchmarks.link.runs import Outcome, Step, run
 from sern_core.vocabulary.errors import SernError
@@ -82,7 +84,11 @@ class Bench:
         self._runs += 1
         directory = self.newest = self.directory / f"{self._runs:02d}-{system}"
         directory.mkdir()
-        outcome = run(self.lab, system, model, load, duration_s, directory, script=script, warm_s=warm_s)
+        work = run(self.lab, system, model, load, duration_s, directory, script=script, warm_s=warm_s)
+        try:
+            outcome = asyncio.run(work)
+        except SernError as error:
+            raise SernError(f"{system}: {error}") from error
         self.busiest = max(self.busiest, outcome.busy)
         self.report.row(case, system, **figures.metrics(outcome), **extra(outcome))
         return outcome
@@ -373,7 +379,7 @@ def bench_all(options: argparse.Namespace, report: Report, note: str) -> bool:
         systems = tuple(system for system in systems if system != "tcpros")
         report.note(f"without rospy over TCPROS, which needs Debian packages: {', '.join(lacking)}")
     if options.plots is not None:
-        plots.check()
+        pyplot("--plots")  # before the work, not after it
         options.plots.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix="sern-bench-") as temporary, Lab() as lab:
         directory = Path(temporary)

@@ -2,21 +2,16 @@
 
 import os
 import socket
-import time
 from contextlib import suppress
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
-from struct import Struct
-from typing import Final, Self
+from typing import Self
 
+from benchmarks import flood
 from benchmarks.child import Worker
 from benchmarks.link.sern import RELAY_PORT
-from sern_runtime.seal import UDP_PAYLOAD_BYTES
 from sern_tools.lab.host import inside
 from sern_tools.lab.lab import Node
-
-JUNK_HZ: Final = 20_000
-_CLEAR: Final = Struct("!IQ")
 
 
 class Junk:
@@ -50,22 +45,11 @@ class Junk:
 
 
 def _flood(namespace: str, seconds: float, told: Connection) -> None:
-    """JUNK_HZ datagrams of full size a second to the relay in `namespace`, as evenly as a busy loop can."""
+    """Junk to the relay in `namespace`, when it is told the session."""
     with suppress(OSError):
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))  # the relay must not wait for its attacker
     with inside(namespace, lambda: socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as sock:
         sock.connect(("127.0.0.1", RELAY_PORT))
         told.send(True)
         session_id = told.recv()
-        junk = [
-            _CLEAR.pack(session_id, 2**32 + number) + os.urandom(UDP_PAYLOAD_BYTES - _CLEAR.size)
-            for number in range(256)
-        ]
-        count = 0
-        begun_s = time.monotonic()
-        while (passed_s := time.monotonic() - begun_s) < seconds:
-            if count < passed_s * JUNK_HZ:
-                with suppress(OSError):
-                    sock.send(junk[count & 0xFF])
-                count += 1
-        told.send(count / passed_s)
+        told.send(flood.send(sock, flood.junk(session_id), seconds))

@@ -19,6 +19,7 @@ from typing import Any, Final, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+READY: Final = b"ready"
 HELLO: Final = 0
 HELLO_PERIOD_S: Final = 0.05
 JITTER_S: Final = 0.020
@@ -142,7 +143,7 @@ class Orders:
 
 def ready() -> None:
     """Tell the benchmark that this end works."""
-    os.write(1, b"ready\n")
+    os.write(1, READY + b"\n")
 
 
 def offer(load: Load, duration_s: float, orders: Orders, log: Log, send: Send) -> Iterator[float]:

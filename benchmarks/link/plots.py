@@ -4,11 +4,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
+from benchmarks.common import pyplot, save
 from benchmarks.link import figures
 from benchmarks.link.load import Kind
 from benchmarks.link.runs import Outcome
 from benchmarks.link.sern import SAMPLE_COLUMNS
-from sern_core.vocabulary.errors import ConfigError
 
 SIZE_INCHES: Final = (7.5, 3.6)
 DPI: Final = 110
@@ -23,20 +23,9 @@ COLOURS: Final = {
 }
 
 
-def check() -> None:
-    """ConfigError when pictures cannot be made."""
-    try:
-        import matplotlib
-    except ImportError as error:
-        raise ConfigError("--plots needs matplotlib: pip install matplotlib") from error
-    matplotlib.use("Agg")
-
-
 def latency(path: Path, title: str, outcomes: Sequence[Outcome], floor_s: float | None) -> None:
     """Each pose that arrived: when it was sent, and how long it took; the floor as a line."""
-    from matplotlib import pyplot
-
-    figure, axes = pyplot.subplots(figsize=SIZE_INCHES)
+    figure, axes = pyplot("--plots").subplots(figsize=SIZE_INCHES)
     for outcome in reversed(outcomes):
         rows = outcome.arrived[outcome.arrived[:, figures.KIND] == Kind.POSE]
         at_s = (rows[:, figures.STAMP] - outcome.start_ns) / 1e9
@@ -51,19 +40,18 @@ def latency(path: Path, title: str, outcomes: Sequence[Outcome], floor_s: float 
     _mark(axes, outcomes[0])
     handles, labels = axes.get_legend_handles_labels()
     axes.legend(handles[::-1], labels[::-1], fontsize=7, markerscale=4, loc="center left", bbox_to_anchor=(1.0, 0.5))
-    _save(figure, path)
+    figure.tight_layout()
+    save(figure, path, DPI)
 
 
 def window(path: Path, title: str, outcome: Outcome) -> None:
     """Capacity, window and round trip as the sender's link saw them."""
-    from matplotlib import pyplot
-
     samples = figures.samples_of(outcome)
     if not len(samples):
         return
     columns = dict(zip(SAMPLE_COLUMNS, samples.T, strict=True))
     at_s = (columns["at_ns"] - outcome.start_ns) / 1e9
-    figure, (above, below) = pyplot.subplots(2, 1, sharex=True, figsize=(SIZE_INCHES[0], 4.2))
+    figure, (above, below) = pyplot("--plots").subplots(2, 1, sharex=True, figsize=(SIZE_INCHES[0], 4.2))
     above.plot(at_s, columns["rate_bps"] / 1e6, label="capacity, estimated [Mbit/s]", color="#0b6e4f", linewidth=1)
     above.legend(fontsize=7, loc="upper right")
     above.set_ylim(bottom=0)
@@ -76,7 +64,8 @@ def window(path: Path, title: str, outcome: Outcome) -> None:
     below.set_xlabel("time [s]")
     for axes in (above, below):
         _mark(axes, outcome)
-    _save(figure, path)
+    figure.tight_layout()
+    save(figure, path, DPI)
 
 
 def _mark(axes: Any, outcome: Outcome) -> None:
@@ -87,11 +76,3 @@ def _mark(axes: Any, outcome: Outcome) -> None:
     for time_s in at_s.values():
         axes.axvline(time_s, color="grey", linewidth=0.7, linestyle="--")
     axes.grid(alpha=0.3)
-
-
-def _save(figure: Any, path: Path) -> None:
-    from matplotlib import pyplot
-
-    figure.tight_layout()
-    figure.savefig(path, dpi=DPI)
-    pyplot.close(figure)

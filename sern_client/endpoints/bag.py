@@ -31,13 +31,14 @@ from rosbags.rosbag2 import Reader as Reader2
 from sern_client.endpoints.bag_faults import why
 from sern_client.endpoints.base import Difference, Held, Publisher, Sink, TopicEvents
 from sern_client.endpoints.clock import Clock, SystemClock
-from sern_client.endpoints.held import HeldSubscription
+from sern_client.endpoints.common.held import HeldSubscription
 from sern_client.endpoints.leftovers import ACTIVE
 from sern_core.topics.patterns import PatternError, PatternSet
 from sern_core.vocabulary.errors import ConfigError, UsageError
 from sern_core.vocabulary.message import TopicInfo
 from sern_core.vocabulary.types import Encoding, TopicName
 from sern_runtime import ros_types
+from sern_runtime.entry import end_tasks
 from sern_runtime.ros_types import one_line
 
 BATCH_MESSAGES: Final = 512
@@ -153,10 +154,7 @@ class BagEndpoint:
         self._task.add_done_callback(self._play_done)
 
     async def stop(self) -> None:
-        task, self._task = self._task, None
-        if task is not None:
-            task.cancel()
-            await asyncio.wait([task])
+        await end_tasks([] if self._task is None else [self._task])
         for topic in self._topics.values():
             for subscription in list(topic.subscriptions):
                 subscription.close()

@@ -152,6 +152,7 @@ class CompositeEndpoint:
         self._givers: dict[TopicName, dict[int, TopicInfo]] = {}  # members in the order they announced
         self._left_out: dict[TopicName, dict[int, TopicInfo]] = {}  # members that give it with another type
         self._joined: list[_Joined] = []
+        self._unwanted: set[TopicName] = set()  # at the far side; a member that joins later is told
         self._opened: list[_Publishers] = []
         self._service_events: ServiceEvents | None = None
         self._servers: dict[TopicName, list[ServiceEndpoint]] = {}  # members in the order they announced
@@ -184,8 +185,13 @@ class CompositeEndpoint:
         joined = _Joined(name, sink, self)
         self._joined.append(joined)
         for index in self._givers[name]:
-            joined.parts[index] = self._members[index].subscribe(name, sink)
+            self._subscribe(joined, index)
         return joined
+
+    def _subscribe(self, joined: _Joined, index: int) -> None:
+        joined.parts[index] = self._members[index].subscribe(joined.name, joined.sink)
+        if joined.name in self._unwanted:
+            self._members[index].interest(joined.name, False)
 
     def advertise(self, info: TopicInfo) -> Publisher:
         """At every member that takes it. ConfigError, with every reason, when none does."""
@@ -228,7 +234,10 @@ class CompositeEndpoint:
             self._offer(publishers)
 
     def interest(self, name: TopicName, wanted: bool) -> None:
-        for index in self._givers.get(name, ()):
+        givers = self._givers.get(name, {})
+        if givers:
+            (self._unwanted.discard if wanted else self._unwanted.add)(name)
+        for index in givers:
             self._members[index].interest(name, wanted)
 
     def validate(self, held: Held) -> list[Difference]:
@@ -252,11 +261,10 @@ class CompositeEndpoint:
     @property
     def drops(self) -> dict[DropReason, int]:
         """Those of all members."""
-        total: dict[DropReason, int] = {}
+        total: Counter[DropReason] = Counter()
         for member in self._members:
             if isinstance(member, CountingEndpoint):
-                for reason, count in member.drops.items():
-                    total[reason] = total.get(reason, 0) + count
+                total.update(member.drops)
         return total
 
     @property
@@ -344,7 +352,7 @@ class CompositeEndpoint:
         givers[index] = info
         for joined in self._joined:
             if joined.name == info.name and not known:
-                joined.parts[index] = self._members[index].subscribe(info.name, joined.sink)
+                self._subscribe(joined, index)
 
     def member_removed(self, index: int, name: TopicName) -> None:
         assert self._events is not None
@@ -360,6 +368,7 @@ class CompositeEndpoint:
                 part.close()
         if not givers:
             del self._givers[name]
+            self._unwanted.discard(name)
             self._events.topic_removed(name)
             for other, info in self._left_out.pop(name, {}).items():  # now it is their turn
                 self.member_added(other, info)

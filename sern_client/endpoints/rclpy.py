@@ -8,13 +8,17 @@ import asyncio
 import logging
 import time
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from threading import Thread
 from typing import TYPE_CHECKING, Final
 
-from sern_client.endpoints.base import GUARD_SUFFIX, Difference, Held, Publisher, Sink, Subscription, TopicEvents
-from sern_client.endpoints.handover import Handover
+from sern_client.endpoints.base import GUARD_SUFFIX, Difference, Held, Sink, TopicEvents
+from sern_client.endpoints.common.handover import Handover
+from sern_client.endpoints.common.interest import OnDemand, Subscriptions
+from sern_client.endpoints.common.saying import SayOnce
+from sern_client.endpoints.common.stream import Stream, Streams
 from sern_core.vocabulary.errors import ConfigError, UsageError
 from sern_core.vocabulary.message import TopicInfo
 from sern_core.vocabulary.types import DropReason, Encoding, TopicName
@@ -26,7 +30,6 @@ if TYPE_CHECKING:
     from rclpy.node import Node
     from rclpy.publisher import Publisher as RosPublisher
     from rclpy.qos import QoSProfile
-    from rclpy.subscription import Subscription as RosSubscription
 
 DEPTH: Final = 100
 """The depth of our subscriptions: what may wait while the executor's thread is behind."""
@@ -51,12 +54,11 @@ class RclpyEndpoint:
     def __init__(self, options: RclpyOptions) -> None:
         self.options = options
         self.types = TypeFiles(options.type_paths)
-        self._announced: dict[TopicName, str] = {}  # to its type
-        self._publishers: list[_Publisher] = []
-        self._subscriptions: list[_Subscription] = []
+        self._say_once = SayOnce(_log)
+        self._subscriptions: Subscriptions[OnDemand] = Subscriptions(self._say_once)
+        self._announced: dict[TopicName, TopicInfo] = {}
+        self._streams: Streams[_Writer] = Streams()
         self._handover: Handover | None = None
-        self._closed_drops = 0
-        self._said: set[str] = set()
 
     @property
     def encoding(self) -> Encoding | None:
@@ -70,8 +72,7 @@ class RclpyEndpoint:
     def drops(self) -> dict[DropReason, int]:
         """Messages dropped because the event loop was behind, or nobody can be reached any more."""
         behind = 0 if self._handover is None else self._handover.dropped
-        counted = {DropReason.QUEUE_FULL: behind, DropReason.DISCONNECTED: self._closed_drops}
-        return {reason: count for reason, count in counted.items() if count}
+        return Counter({DropReason.QUEUE_FULL: behind}) + self._streams.dropped
 
     async def start(self, events: TopicEvents) -> None:
         try:
@@ -99,6 +100,7 @@ class RclpyEndpoint:
 
     async def stop(self) -> None:
         await end_tasks([self._task])
+        self._subscriptions.close()
         import rclpy
 
         self._executor.shutdown()
@@ -109,58 +111,46 @@ class RclpyEndpoint:
         self._node.destroy_node()
 
     def interest(self, name: TopicName, wanted: bool) -> None:
-        """A subscription is made when the topic is offered, wanted or not."""
+        """Nobody wants it: the node has no subscription of it, unless the topic is latched."""
+        self._subscriptions.interest(name, wanted)
 
-    def subscribe(self, name: TopicName, sink: Sink) -> Subscription:
-        type_name = self._announced.get(name)
-        if type_name is None:
+    def subscribe(self, name: TopicName, sink: Sink) -> OnDemand:
+        info = self._announced.get(name)
+        if info is None:
             raise UsageError(f"{name}: no such topic was announced")
-        handover = self._handover
-        assert handover is not None, "a topic was announced, so we were started"
+        return self._subscriptions.add(OnDemand(info, sink, self._receive, self._subscriptions.remove))
 
-        def arrived(body: bytes) -> None:
-            stamp_ns = time.time_ns()
-            handover.put(lambda: None if opened.closed else _offer(sink, body, stamp_ns), len(body))
-
-        message_type = self._message_type(name, type_name)
-        qos = self._qos(name)
-        opened = _Subscription(
-            self, name, self._node, self._node.create_subscription(message_type, name, arrived, qos, raw=True)
-        )
-        self._subscriptions.append(opened)
-        return opened
-
-    def advertise(self, info: TopicInfo) -> Publisher:
+    def advertise(self, info: TopicInfo) -> "Stream[_Writer]":
         message_type = self._message_type(info.name, info.type_name)
         profile = _profile(reliable=info.reliable is not False, latched=info.latched, depth=LATCHED_DEPTH)
-        opened = _Publisher(self, info.name, self._node, self._node.create_publisher(message_type, info.name, profile))
-        self._publishers.append(opened)
-        return opened
+        writer = _Writer(self._node, self._node.create_publisher(message_type, info.name, profile))
+        return self._streams.open(info.name, writer, None)
 
     def validate(self, held: Held) -> list[Difference]:
         """Without the thread that spins nothing is received: that is a difference of every topic."""
-        found = held.differences(
-            Held(
-                Counter(publisher.name for publisher in self._publishers),
-                Counter(subscription.name for subscription in self._subscriptions),
-            )
-        )
+        found = held.differences(Held(self._streams.names, self._subscriptions.names))
+        found += self._subscriptions.differences()
         if not self._thread.is_alive():
             found.append(Difference(TopicName(""), "the thread of rclpy has ended; start the client again"))
         if self._task.done():
             found.append(Difference(TopicName(""), "nobody looks at the graph any more; start the client again"))
         return found
 
-    def closed(self, part: "_Publisher | _Subscription") -> None:
-        """A publisher or subscription of ours is no more."""
-        if isinstance(part, _Publisher):
-            self._publishers.remove(part)
-        else:
-            self._subscriptions.remove(part)
+    def _receive(self, info: TopicInfo, arrived: Callable[[bytes, int], None]) -> Callable[[], None]:
+        node, handover = self._node, self._handover
+        assert handover is not None, "a topic was announced, so we were started"
 
-    def dropped(self) -> None:
-        """A message came to a publisher that is closed."""
-        self._closed_drops += 1
+        def came(body: bytes) -> None:  # in the thread that spins
+            stamp_ns = time.time_ns()
+            handover.put(lambda: arrived(body, stamp_ns), len(body))
+
+        message_type = self._message_type(info.name, info.type_name)
+        opened = node.create_subscription(message_type, info.name, came, self._qos(info.name), raw=True)
+
+        def end() -> None:
+            node.destroy_subscription(opened)
+
+        return end
 
     def _message_type(self, name: TopicName, type_name: str) -> type[object]:
         from rosidl_runtime_py.utilities import get_message
@@ -200,7 +190,7 @@ class RclpyEndpoint:
             try:
                 self._poll()
             except Exception as error:  # noqa: BLE001  (of this look; the next may succeed)
-                self._say_once(f"the graph could not be looked at: {ros_types.one_line(error)}", error)
+                self._say_once(f"the graph could not be looked at: {ros_types.one_line(error)}", error=error)
 
     def _poll(self) -> None:
         """Announce what appeared, retract what went. A topic that cannot be looked at stays as it was."""
@@ -210,7 +200,7 @@ class RclpyEndpoint:
             try:
                 there = self._look_at(name, type_names)
             except Exception as error:  # noqa: BLE001  (a fault of one topic)
-                self._say_once(f"{name} could not be looked at: {ros_types.one_line(error)}", error)
+                self._say_once(f"{name} could not be looked at: {ros_types.one_line(error)}", error=error)
                 there = True
             if there:
                 found.add(name)
@@ -235,9 +225,10 @@ class RclpyEndpoint:
         if len(type_names) > 1:
             self._say_once(f"{name} is published with several types ({', '.join(type_names)}); left out")
             return False
-        if self._announced.get(name) == type_names[0]:
+        known = self._announced.get(name)
+        if known is not None and known.type_name == type_names[0]:
             return True
-        if name in self._announced:  # with another type: that is another topic
+        if known is not None:  # with another type: that is another topic
             del self._announced[name]
             self._events.topic_removed(name)
         try:
@@ -252,7 +243,7 @@ class RclpyEndpoint:
             latched=first.durability is DurabilityPolicy.TRANSIENT_LOCAL,
             reliable=first.reliability is ReliabilityPolicy.RELIABLE,
         )
-        self._announced[name] = type_names[0]
+        self._announced[name] = info
         self._events.topic_added(info)
         return True
 
@@ -268,51 +259,18 @@ class RclpyEndpoint:
             self._say_once(str(error))
         return TopicInfo(name, type_name, Encoding.CDR, type_hash, definition, latched, reliable)
 
-    def _say_once(self, text: str, error: Exception | None = None) -> None:
-        """`error`: one that nobody expects, shown with where it came from."""
-        if text not in self._said:
-            self._said.add(text)
-            _log.log(logging.WARNING if error is None else logging.ERROR, "%s", text, exc_info=error)
 
-
-class _Subscription:
-    def __init__(self, owner: RclpyEndpoint, name: TopicName, node: "Node", subscription: "RosSubscription") -> None:
-        self.closed = False
-        self.name = name
-        self._owner = owner
+class _Writer:
+    def __init__(self, node: "Node", publisher: "RosPublisher") -> None:
         self._node = node
-        self._subscription = subscription
-
-    def close(self) -> None:
-        if not self.closed:
-            self.closed = True
-            self._owner.closed(self)
-            self._node.destroy_subscription(self._subscription)
-
-
-class _Publisher:
-    def __init__(self, owner: RclpyEndpoint, name: TopicName, node: "Node", publisher: "RosPublisher") -> None:
-        self.name = name
-        self._owner = owner
-        self._node = node
-        self._publisher: RosPublisher | None = publisher
+        self._publisher = publisher
 
     def publish(self, body: bytes, stamp_ns: int) -> None:
         del stamp_ns  # rclpy stamps what it publishes itself
-        if self._publisher is None:
-            self._owner.dropped()
-        else:
-            self._publisher.publish(body)
+        self._publisher.publish(body)
 
     def close(self) -> None:
-        publisher, self._publisher = self._publisher, None
-        if publisher is not None:
-            self._owner.closed(self)
-            self._node.destroy_publisher(publisher)
-
-
-def _offer(sink: Sink, body: bytes, stamp_ns: int) -> None:
-    sink(body, stamp_ns)
+        self._node.destroy_publisher(self._publisher)
 
 
 def _profile(*, reliable: bool, latched: bool, depth: int) -> "QoSProfile":

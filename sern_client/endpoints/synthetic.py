@@ -16,12 +16,14 @@ from typing import Any, Final, Literal
 
 from sern_client.endpoints.base import Difference, Held, Sink, TopicEvents
 from sern_client.endpoints.clock import Clock, SystemClock
-from sern_client.endpoints.held import HeldSubscription
+from sern_client.endpoints.common.held import HeldSubscription
+from sern_client.endpoints.common.saying import say_failure
 from sern_client.endpoints.jackal import JACKAL, JackalSource, OperatorSource, Plan, Sizes
 from sern_core.vocabulary.errors import ConfigError, UsageError
 from sern_core.vocabulary.message import TopicInfo
 from sern_core.vocabulary.types import Encoding, TopicName
 from sern_runtime import ros_types
+from sern_runtime.entry import end_tasks
 from sern_sim.robot import STEP_S, RobotState
 
 COUNTER_RATE_HZ: Final = 5.0
@@ -172,13 +174,10 @@ class SyntheticEndpoint:
         for topic in self._topics.values():
             events.topic_added(topic.info)
         self._task = asyncio.create_task(self._run(), name=f"synthetic {self.options.role}")
-        self._task.add_done_callback(_log_failure)
+        self._task.add_done_callback(say_failure)
 
     async def stop(self) -> None:
-        task, self._task = self._task, None
-        if task is not None:
-            task.cancel()
-            await asyncio.wait([task])
+        await end_tasks([] if self._task is None else [self._task])
         for topic in self._topics.values():
             for subscription in list(topic.subscriptions):
                 subscription.close()
@@ -398,8 +397,3 @@ def _chosen(topics: int | tuple[str, ...]) -> list[Plan]:
     if unknown := [name for name in topics if name not in known]:
         raise ConfigError(f"the simulated robot has no topic {unknown[0]}; it has {', '.join(known)}")
     return [known[name] for name in topics]
-
-
-def _log_failure(task: asyncio.Task[None]) -> None:
-    if not task.cancelled() and (error := task.exception()) is not None:
-        _LOG.error("%s ended", task.get_name(), exc_info=error)

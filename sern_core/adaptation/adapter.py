@@ -9,7 +9,6 @@ appear are taken in by the next `step`.
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
-from math import isfinite
 from statistics import fmean
 from typing import Final, NamedTuple
 
@@ -31,9 +30,10 @@ from sern_core.adaptation.predict import SERIALISE_S
 from sern_core.adaptation.trial import CapacityTrial
 from sern_core.bodies.codecs import LOSSLESS, LOSSY, RAW_PROFILE, CodecProfile, Coder
 from sern_core.link.link import Link
-from sern_core.stream.out_channel import OutChannel
-from sern_core.stream.out_message import OutMessage
+from sern_core.link.view import LinkSettings, LinkView, TopicView
+from sern_core.stream.coding import preferred
 from sern_core.vocabulary.codec_names import Compression
+from sern_core.vocabulary.message import Message, TopicSpec
 from sern_core.vocabulary.types import CLASSES, DropReason, PriorityClass, TopicName
 
 INTERVAL_S: Final = 1.0
@@ -153,44 +153,35 @@ class HopAdapter:
         self._probe = RawProbe(params.interval_s)
         self._trial = CapacityTrial(params.interval_s, assumed_min_bps=params.ranges.bandwidth_max_bps)
         self._since_s = now
-        self._wire_bytes = link.lanes.wire_bytes
+        self._wire_bytes = link.observe(now=now).wire_bytes
         self._encode_s = self._coder_s()
         self._topics: dict[TopicName, _TopicStats] = {}
         self._arrived: dict[PriorityClass, _ClassCount] = {priority: _ClassCount() for priority in CLASSES}
         self._samples: deque[float] = deque(maxlen=SAMPLES)
         self._measured: Measurement | None = None
-        link.plane.on_arrived = self.note_arrival
+        link.watch_arrivals(self.note_arrival)
 
-    def close(self) -> None:
+    def close(self, *, now: float) -> None:
         """Give every topic back what its rule says."""
-        self.link.plane.on_arrived = None
-        for channel in self.link.sender.channels.values():
-            channel.adapt(share=1.0, depth_max=channel.spec.depth)
+        self.link.watch_arrivals(None)
+        self.link.apply(LinkSettings(), now=now)
         apply_levels(self._summaries(), Configuration())
-        for lane in self.link.lanes.by_id.values():
-            lane.copies_wanted = None
 
     # --- measuring ------------------------------------------------------------------------------------------------
 
-    def note_arrival(self, channel: OutChannel, out: OutMessage, now: float) -> None:
-        message = out.message
+    def note_arrival(self, spec: TopicSpec, message: Message, now: float) -> None:
         if message.replay or message.tombstone:
             return
-        count = self._arrived[channel.spec.priority]
-        rtt_s = self._rtt_s()
-        latency_s = max(0.0, now - message.born_s - rtt_s / 2.0)  # the acknowledgement took half a round trip
+        count = self._arrived[spec.priority]
+        latency_s = max(0.0, now - message.born_s - self.link.rtt_s / 2.0)  # the acknowledgement took half a round trip
         count.delivered += 1
         count.latency_s += latency_s
-        count.on_time += latency_s <= self._deadline_s(channel)
+        count.on_time += latency_s <= self._deadline_s(spec)
 
-    def _deadline_s(self, channel: OutChannel) -> float:
-        deadline_s = self.params.deadlines_s[channel.spec.priority]
-        lifespan_s = channel.spec.lifespan_s
+    def _deadline_s(self, spec: TopicSpec) -> float:
+        deadline_s = self.params.deadlines_s[spec.priority]
+        lifespan_s = spec.lifespan_s
         return deadline_s if lifespan_s is None else max(MIN_DEADLINE_S, min(deadline_s, lifespan_s))
-
-    def _rtt_s(self) -> float:
-        rtt_s = self.link.lane.estimator.rtprop_s
-        return rtt_s if rtt_s is not None and isfinite(rtt_s) else self.link.lane.flight.rtt.srtt_s or 0.0
 
     def _coder_s(self) -> float:
         """Processor time of encoding and of making summaries, of all time."""
@@ -199,51 +190,50 @@ class HopAdapter:
             return made_s
         return made_s + sum(counters.elapsed_s for counters in self._coder.encoded.values())
 
-    def sample(self) -> None:
+    def sample(self, *, now: float) -> None:
         """Read the capacity; about ten times an interval."""
         self._probe.finish()
-        capacity_bps = self._capacity_bps()
+        capacity_bps = self._capacity_bps(self.link.observe(now=now))
         if capacity_bps is not None:
             self._samples.append(capacity_bps)
 
-    def _capacity_bps(self) -> float | None:
+    def _capacity_bps(self, link: LinkView) -> float | None:
         """What the path can carry, as far as anybody knows: the estimate, or what is tried; and while there was never
         enough to send to tell it, what the ranges call a full link, or UNFILLED times what was carried if that is
         more."""
-        return self._trial.read(self._estimate_bps())
+        return self._trial.read(self._estimate_bps(link))
 
-    def _estimate_bps(self) -> float | None:
-        link = self.link
-        if link.lane.stalled or not link.established:
+    def _estimate_bps(self, link: LinkView) -> float | None:
+        if not link.up:
             return None
-        estimator = link.lane.estimator
-        if estimator.rate_bps is not None:
-            return estimator.rate_bps
-        return max(self.params.ranges.bandwidth_max_bps, UNFILLED * (estimator.bound_bps or 0.0))
+        if link.rate_bps is not None:
+            return link.rate_bps
+        return max(self.params.ranges.bandwidth_max_bps, UNFILLED * (link.bound_bps or 0.0))
 
-    def _channels(self) -> list[OutChannel]:
-        """Those that somebody wants."""
-        return [channel for channel in self.link.sender.channels.values() if channel.wanted and channel.ready]
+    def _wanted(self) -> list[TopicView]:
+        """Streams that somebody wants."""
+        return [view for view in self.link.topics() if view.wanted and view.ready]
 
-    def _count(self, channels: Iterable[OutChannel]) -> dict[PriorityClass, _ClassCount]:
+    def _count(self, views: Iterable[TopicView]) -> dict[PriorityClass, _ClassCount]:
         """What the interval brought, by class; the arrivals since the last call are in it."""
         counts, self._arrived = self._arrived, {priority: _ClassCount() for priority in CLASSES}
-        by_topic: dict[TopicName, list[OutChannel]] = {}
-        for channel in channels:
-            by_topic.setdefault(channel.counters.topic, []).append(channel)
+        by_topic: dict[TopicName, list[TopicView]] = {}
+        for view in views:
+            by_topic.setdefault(view.topic, []).append(view)
+        counted = self.link.counters
         for gone in self._topics.keys() - by_topic.keys():
             self._topics[gone].history.clear()
-            if gone not in self.link.sender.ledger.topics:
+            if gone not in counted:
                 del self._topics[gone]
         for topic, mine in by_topic.items():
-            counters, count = mine[0].counters, counts[mine[0].spec.priority]
+            counters, count = counted[topic], counts[mine[0].spec.priority]
             stats = self._topics.setdefault(topic, _TopicStats())
-            thinned = sum(channel.thinned for channel in mine)
+            thinned = sum(view.thinned for view in mine)
             # What its own max_rate_hz leaves out was never meant to be sent, nor what nobody wanted.
             dropped = counters.by_reason
             offered = counters.offered - dropped[DropReason.RATE_CAP] + thinned - dropped[DropReason.UNWANTED]
-            raw_bytes = sum(channel.codec.raw_bytes for channel in mine if channel.codec is not None)
-            encoded_bytes = sum(channel.codec.encoded_bytes for channel in mine if channel.codec is not None)
+            raw_bytes = sum(view.codec.raw_bytes for view in mine if view.codec is not None)
+            encoded_bytes = sum(view.codec.encoded_bytes for view in mine if view.codec is not None)
             new = stats.update(offered, counters.offered_bytes, thinned, raw_bytes, encoded_bytes)
             if self.last is None:
                 continue  # totals of who knows how long
@@ -255,19 +245,19 @@ class HopAdapter:
                 count.encoded_bytes += new.encoded_bytes
         return counts
 
-    def _offers(self, channels: Iterable[OutChannel]) -> list[Offer]:
+    def _offers(self, views: Iterable[TopicView]) -> list[Offer]:
         return [
-            Offer(channel, messages / len(history), nbytes / messages)
-            for channel in channels
-            if (history := self._topics[channel.counters.topic].history)
+            Offer(view, messages / len(history), nbytes / messages)
+            for view in views
+            if (history := self._topics[view.topic].history)
             and (messages := sum(part[0] for part in history)) > 0
             and (nbytes := sum(part[1] for part in history)) >= 0
         ]
 
-    def _demands(self, offers: Iterable[Offer], elapsed_s: float) -> tuple[ClassDemand, ...]:
+    def _demands(self, offers: Iterable[Offer], elapsed_s: float, *, lossless: bool) -> tuple[ClassDemand, ...]:
         groups: dict[PriorityClass, list[Offer]] = {}
         for offer in offers:
-            groups.setdefault(offer.channel.spec.priority, []).append(offer)
+            groups.setdefault(offer.view.spec.priority, []).append(offer)
         found = []
         for priority in CLASSES:
             weighed = groups.get(priority, [])
@@ -285,14 +275,14 @@ class HopAdapter:
                     priority,
                     rate / elapsed_s,
                     mean_bytes,
-                    mean(lambda offer: self._deadline_s(offer.channel)),
+                    mean(lambda offer: self._deadline_s(offer.view.spec)),
                     cv2=spread / mean_bytes**2 if mean_bytes > 0.0 else 0.0,
                     arrival_cv2=ARRIVAL_CV2,
                     topics=len(weighed),
-                    depth=max(1, round(mean(lambda offer: _depth(offer.channel)))),
+                    depth=max(1, round(mean(lambda offer: _depth(offer.view)))),
                     needed=self.params.needed[priority],
-                    thinnable=min(1.0, mean(lambda offer: float(offer.channel.thinnable))),
-                    protected=priority is PriorityClass.CONTROL and not self.link.lane.lossless,
+                    thinnable=min(1.0, mean(lambda offer: float(offer.view.thinnable))),
+                    protected=priority is PriorityClass.CONTROL and not lossless,
                     codecs={mode: _class_profile(mode, weighed) for mode in self.params.modes if mode != NO_CODEC},
                     prepare_s=mean(lambda offer: offer.prepare_s),
                 )
@@ -303,20 +293,23 @@ class HopAdapter:
 
     def step(self, *, now: float) -> Step:
         """The interval is over: measure it, decide for the next one, apply that."""
-        link, params = self.link, self.params
+        link, params = self.link.observe(now=now), self.params
         elapsed_s = max(now - self._since_s, 1e-3)
-        channels = self._channels()
-        counts = self._count(channels)
+        views = self._wanted()
+        counts = self._count(views)
         self._probe.abort()
-        offers = self._offers(channels)
-        demands = self._demands(offers, elapsed_s)
+        offers = self._offers(views)
+        demands = self._demands(offers, elapsed_s, lossless=link.lossless)
         items = chosen(self._summaries())
-        levels = {level: self._demands(offered, elapsed_s) for level, offered in offers_by_level(offers, items)}
+        levels = {
+            level: self._demands(offered, elapsed_s, lossless=link.lossless)
+            for level, offered in offers_by_level(offers, items, views)
+        }
         in_force = self.policy.active
         measurement, terms, value = None, None, None
-        carried_bps = fmean(self._samples) if self._samples else self._capacity_bps()
+        carried_bps = fmean(self._samples) if self._samples else self._capacity_bps(link)
         if link.established and any(count.offered for count in counts.values()):
-            measurement = self._measure(counts, demands, elapsed_s)
+            measurement = self._measure(counts, demands, link.wire_bytes - self._wire_bytes, elapsed_s)
             terms = params.ranges.terms(
                 latency_s=measurement.latency_s,
                 unreliability=measurement.unreliability,
@@ -328,8 +321,8 @@ class HopAdapter:
         if measurement is not None:
             rates, summarised = in_force.rates, any(in_force.summaries or ())
             self._trial.judge(
-                self._estimate_bps(),
-                link.lane.estimator.eased_s,
+                self._estimate_bps(link),
+                link.eased_s,
                 measurement.classes,
                 thinned=min(rates) < 1.0,
                 summarised=summarised,
@@ -337,13 +330,11 @@ class HopAdapter:
             )
         situation = Situation(
             levels.get(level_of(items), demands),
-            LinkState(
-                self._capacity_bps(), self._rtt_s(), link.lane.loss, tuple(self._samples), stream=link.lane.lossless
-            ),
+            LinkState(self._capacity_bps(link), self.link.rtt_s, link.loss, tuple(self._samples), stream=link.lossless),
             levels if items else {},
         )
         self._measured = measurement
-        self._since_s, self._wire_bytes, self._encode_s = now, link.lanes.wire_bytes, self._coder_s()
+        self._since_s, self._wire_bytes, self._encode_s = now, link.wire_bytes, self._coder_s()
         self._samples.clear()
         foreseen = self.last.decision.prediction if self.last is not None else None
         self.prediction_error = None if value is None or foreseen is None else value - foreseen.cost
@@ -359,9 +350,12 @@ class HopAdapter:
         return self.last
 
     def _measure(
-        self, counts: dict[PriorityClass, _ClassCount], demands: tuple[ClassDemand, ...], elapsed_s: float
+        self,
+        counts: dict[PriorityClass, _ClassCount],
+        demands: tuple[ClassDemand, ...],
+        wire_bytes: int,
+        elapsed_s: float,
     ) -> Measurement:
-        wire_bytes = self.link.lanes.wire_bytes - self._wire_bytes
         cpu_s = self._coder_s() - self._encode_s + SERIALISE_S * sum(count.admitted for count in counts.values())
         return measure(
             demands,
@@ -390,41 +384,39 @@ class HopAdapter:
     # --- applying -------------------------------------------------------------------------------------------------
 
     def apply(self, configuration: Configuration, *, now: float) -> None:
-        """Bring every channel and lane in line. Idempotent; what waits or is under way is left as it is."""
-        link = self.link
-        for channel in link.sender.channels.values():
-            priority = channel.spec.priority
-            channel.adapt(share=configuration.rates[priority], depth_max=configuration.queues[priority])
-            if self._coder is not None and channel.codec is not None:
-                mode = channel_mode(channel, configuration.codec)
-                if channel.codec.setting is not mode:
-                    link.sender.set_compression(channel, mode, now=now)
-        for lane in link.lanes.by_id.values():
-            lane.copies_wanted = bool(configuration.redundancy)
+        """Bring the link in line. Idempotent; what waits or is under way is left as it is."""
+        self.link.apply(settings(configuration, encodes=self._coder is not None), now=now)
 
 
-def channel_mode(channel: OutChannel, mode: str) -> Compression:
-    """What the mode z means for one topic: its rule's own setting, if any; of LOSSY_MODE what it allows."""
-    if channel.spec.compression is not None:
-        return channel.spec.compression
-    if mode != LOSSY_MODE:
-        return Compression(mode)
-    allowed = channel.codec.modes if channel.codec is not None else ()
-    return next((found for found in allowed if found in LOSSY), Compression.ZSTD)
+def settings(configuration: Configuration, *, encodes: bool) -> LinkSettings:
+    """What a configuration means for the link. `encodes`: bodies are encoded here."""
+    return LinkSettings(
+        shares=configuration.rates,
+        depths=configuration.queues,
+        codecs=codecs_of(configuration.codec) if encodes else None,
+        copies=bool(configuration.redundancy),
+    )
 
 
-def _depth(channel: OutChannel) -> int:
+def codecs_of(mode: str) -> tuple[Compression, ...]:
+    """What the mode z stands for, the better first; which of them a topic takes is up to what it allows."""
+    return (*LOSSY, Compression.ZSTD) if mode == LOSSY_MODE else (Compression(mode),)
+
+
+def _depth(view: TopicView) -> int:
     """Messages that may wait; what may not be left out waits until it is sent."""
-    return channel.spec.depth if channel.thinnable else NO_LIMIT
+    return view.spec.depth if view.thinnable else NO_LIMIT
 
 
 def _class_profile(mode: str, weighed: list[Offer]) -> CodecProfile:
     """What `mode` would make of a class: the mean of its topics, weighed by their bytes."""
+    codecs = codecs_of(mode)
     body = encoded = seconds = 0.0
-    for channel, per_interval, size, _ in weighed:
+    for view, per_interval, size, _ in weighed:
         profile = RAW_PROFILE
-        if channel.codec is not None:
-            profile = channel.codec.profiles.get(channel_mode(channel, mode), RAW_PROFILE)
+        if view.codec is not None:
+            chosen_mode = view.spec.compression or preferred(codecs, view.codec.modes)
+            profile = view.codec.profiles.get(chosen_mode, RAW_PROFILE)
         nbytes = per_interval * size
         body += nbytes
         encoded += nbytes * min(profile.ratio, 1.0)

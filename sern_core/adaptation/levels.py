@@ -9,6 +9,7 @@ from itertools import product
 from typing import Final, NamedTuple, Protocol
 
 from sern_core.adaptation.model import Configuration, Levels
+from sern_core.link.view import TopicView
 from sern_core.stream.out_channel import OutChannel
 from sern_core.summaries.spec import SummaryLevel, SummaryProfile
 from sern_core.vocabulary.types import CLASSES
@@ -54,9 +55,9 @@ class Summarised(Protocol):
 
 
 class Offer(NamedTuple):
-    """What one channel is offered: messages an interval, their mean size, processor time of making one."""
+    """What one stream is offered: messages an interval, their mean size, processor time of making one."""
 
-    channel: OutChannel
+    view: TopicView
     per_interval: float
     mean_bytes: float
     prepare_s: float = 0.0
@@ -79,38 +80,35 @@ def level_of(items: Sequence[Summarised]) -> Levels:
     return tuple(priority in summarised for priority in CLASSES)
 
 
-def offers_by_level(offers: Sequence[Offer], items: Sequence[Summarised]) -> Iterator[tuple[Levels, list[Offer]]]:
-    """Every level there is to choose, with what would be offered at it."""
+def offers_by_level(
+    offers: Sequence[Offer], items: Sequence[Summarised], views: Iterable[TopicView]
+) -> Iterator[tuple[Levels, list[Offer]]]:
+    """Every level there is to choose, with what would be offered at it. `views` are of all streams that are wanted."""
+    known = {view.stream.id: view for view in views}
+    items = [item for item in items if {item.source.stream.id, item.channel.stream.id} <= known.keys()]
     by_source: dict[OutChannel, list[Summarised]] = defaultdict(list)
     for item in items:
         by_source[item.source].append(item)
-    theirs = {channel for item in items for channel in (item.source, item.channel)}
-    others = [offer for offer in offers if offer.channel not in theirs]
-    now = {offer.channel: offer for offer in offers}
+    theirs = {channel.stream.id for item in items for channel in (item.source, item.channel)}
+    others = [offer for offer in offers if offer.view.stream.id not in theirs]
+    rates = {offer.view.stream.id: offer.per_interval for offer in offers}
     classes = {source.spec.priority for source in by_source}
     for level in product(*((False, True) if priority in classes else (False,) for priority in CLASSES)):
         found = list(others)
         for source, summaries in by_source.items():
             # Each message goes to the source or to every summary of it: so often the topic ticks.
-            own = max(now[s.channel].per_interval if s.channel in now else 0.0 for s in summaries)
-            rate = own if any(s.channel is source for s in summaries) else own + _rate(now, source)
-            found += _at(level[source.spec.priority], source, summaries, rate)
+            own = max(rates.get(item.channel.stream.id, 0.0) for item in summaries)
+            in_place = any(item.channel is source for item in summaries)
+            rate = own if in_place else own + rates.get(source.stream.id, 0.0)
+            if rate <= 0.0:
+                continue
+            if not level[source.spec.priority]:
+                found.append(Offer(known[source.stream.id], rate, summaries[0].profile.raw_bytes))
+                continue
+            for item in summaries:
+                nbytes = item.profile.raw_bytes * item.profile.bytes_ratio
+                found.append(Offer(known[item.channel.stream.id], rate, nbytes, item.profile.seconds_per_message))
         yield level, found
-
-
-def _rate(now: dict[OutChannel, Offer], channel: OutChannel) -> float:
-    return now[channel].per_interval if channel in now else 0.0
-
-
-def _at(summarised: bool, source: OutChannel, summaries: list[Summarised], rate: float) -> Iterator[Offer]:
-    if rate <= 0.0:
-        return
-    if not summarised:
-        yield Offer(source, rate, summaries[0].profile.raw_bytes)
-        return
-    for item in summaries:
-        profile = item.profile
-        yield Offer(item.channel, rate, profile.raw_bytes * profile.bytes_ratio, profile.seconds_per_message)
 
 
 def apply_levels(items: Iterable[Summarised], configuration: Configuration) -> None:

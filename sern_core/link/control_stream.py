@@ -55,7 +55,7 @@ class ControlStream:
         info = TopicInfo(CONTROL_TOPIC, "", Encoding.RAW)
         stream = StreamInfo(StreamId(self._end.name, self._end.boot, CONTROL_TOPIC), info, spec)
         counters = SendCounters(CONTROL_TOPIC, PriorityClass.CONTROL)
-        out = OutChannel(CONTROL_CHANNEL, stream, counters, lambda _channel, _outs, _reason: None, first=1)
+        out = OutChannel(CONTROL_CHANNEL, stream, counters, lambda _slot, _outs, _reason: None, first=1)
         out.wanted = out.ready = True
         incoming = InStream(
             stream,

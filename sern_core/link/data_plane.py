@@ -15,6 +15,7 @@ from sern_core.link.streams_in import StreamsIn
 from sern_core.path.lanes import COPY_DELAY_S, LANE_ZMQ, OVERHEAD_BYTES, PING_INTERVAL_S, PROBE_INTERVAL_S, Lane
 from sern_core.stream.out_channel import OutChannel
 from sern_core.stream.out_message import OutMessage
+from sern_core.vocabulary.message import Message, TopicSpec
 from sern_core.vocabulary.types import PriorityClass
 from sern_core.wire import framing
 
@@ -48,8 +49,8 @@ class DataPlane:
         self.holds = Holds(end, lanes, control, sender)
         """Why what waits does."""
         self.sweep_due_s = now + SWEEP_INTERVAL_S
-        self.on_arrived: Callable[[OutChannel, OutMessage, float], None] | None = None
-        """Called when the peer has a message whole: channel, message, now."""
+        self.on_arrived: Callable[[TopicSpec, Message, float], None] | None = None
+        """Called when the peer has a message whole: what holds for its topic, the message, now."""
 
     # --- bytes out ------------------------------------------------------------------------------------------------
 
@@ -190,7 +191,7 @@ class DataPlane:
             for item in packet.items:
                 if type(item) is SentData and item.channel.fragment_acked(item.out, item.generation):
                     if self.on_arrived is not None:
-                        self.on_arrived(item.channel, item.out, now)
+                        self.on_arrived(item.channel.spec, item.out.message, now)
                     if end.trace.steps and item.channel.slot != CONTROL_CHANNEL:
                         self._sender.told.acked(item.channel, item.out, now)
         control = self._control.out

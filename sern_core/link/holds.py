@@ -123,9 +123,10 @@ class Holds:
             "unsent_bytes": out.unsent_bytes,
         }
         standing = sender.scheduler.explain(channel.slot, now)
-        if out is channel.newest:
-            told["reason"] = HoldReason.ADAPTATION if channel.newest_thinned else HoldReason.RATE_CAP
-            told["due_in_s"] = channel.newest_due_s - now
+        gate = channel.gate
+        if gate is not None and out is gate.newest:
+            told["reason"] = HoldReason.ADAPTATION if gate.newest_thinned else HoldReason.RATE_CAP
+            told["due_in_s"] = gate.newest_due_s - now
         elif not channel.ready:
             told["reason"] = sender.told.unready_reason(channel)
         elif standing is not None:

@@ -262,3 +262,8 @@ class LaneSet:
         self._tell(now, TraceEvent.LANE_SILENT, lane=lane.name)
         if len(self.by_id) > 1:
             self.choose(now)
+
+    def validate(self, check: Callable[[bool, str], None]) -> None:
+        """Internal consistency, for tests."""
+        for lane in self.by_id.values():
+            lane.flight.validate(check)

@@ -13,17 +13,19 @@ and what had its turn is known. A lane alone would not do: what was said after i
 
 The owner calls `receive`, `next_datagram`, `next_deadline` and `handle_timeout`, each with the time, and is told what
 happens through its `LinkHandler`. Messages and streams out go through `sender` and `outgoing`, answers to the peer's
-streams through `answers` and `taking`.
+streams through `answers` and `taking`. Whoever only watches the link, or adapts it, has `observe`, `topics` and `apply`
+for a door and looks at no part.
 """
 
 import struct
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Iterator, Mapping
 from typing import Final
 
 from sern_core.bodies.codecs import Coder
+from sern_core.link import view
 from sern_core.link.answers import Answers
 from sern_core.link.composer import Composer
+from sern_core.link.control_reader import ControlReader
 from sern_core.link.control_stream import ControlStream
 from sern_core.link.data_plane import DataPlane
 from sern_core.link.definitions import DefinitionStore, PeerDefinitions
@@ -38,16 +40,17 @@ from sern_core.link.send_trace import SendTrace
 from sern_core.link.sender import Sender
 from sern_core.link.streams_in import StreamsIn
 from sern_core.link.streams_out import StreamsOut
+from sern_core.link.view import Held, LinkSettings, LinkView, TopicView, Undelivered
 from sern_core.path.lanes import LANE_UDP, LANE_ZMQ, Lane
 from sern_core.stream.in_stream import Reassembly
 from sern_core.stream.out_channel import OutChannel
 from sern_core.vocabulary.errors import RemoteError, WireError
-from sern_core.vocabulary.message import Message
+from sern_core.vocabulary.ledger import SendCounters
+from sern_core.vocabulary.message import Message, StreamInfo, TopicSpec
 from sern_core.vocabulary.params import LinkParams, SchedulerParams
 from sern_core.vocabulary.trace import LINK, DecisionTrace, TraceEvent
-from sern_core.vocabulary.types import ClientName, PriorityClass
+from sern_core.vocabulary.types import ClientName, PriorityClass, TopicName
 from sern_core.wire import framing
-from sern_core.wire.announce import decode_announcement, decode_want
 
 TIDY_S: Final = 60.0
 NUMBER_AND_STAMP: Final = struct.Struct("!IQ")
@@ -88,7 +91,7 @@ class Link:
         owner = self._owner = Owner(self, handler, end)
         self.texts = PeerDefinitions(definitions, peer)
         reassembly = self.reassembly = Reassembly(max(64 * 2**20, 2 * link.max_message_bytes))
-        control = self.control = ControlStream(end, reassembly, self._control_message)
+        control = self.control = ControlStream(end, reassembly, self._read_control)
         sender = self.sender = Sender(end, scheduler, SendTrace(end, self.texts), delivered=self._delivered, now=now)
         lanes = self.lanes = LaneSet(
             end,
@@ -116,6 +119,18 @@ class Link:
             answered=self._answered,
             finished=self._finished,
         )
+        self._control_reader = ControlReader(
+            end,
+            control,
+            sender,
+            self.outgoing,
+            taking,
+            answers,
+            self.texts,
+            self._owed_lists,
+            owner,
+            answered=self._answered,
+        )
         composer = Composer(end, lanes, control, sender, taking, self.outgoing.control_sent)
         plane = self.plane = DataPlane(
             end, lanes, control, sender, taking, answers, composer, sweep=self._sweep, now=now
@@ -125,6 +140,9 @@ class Link:
         self.handshake = Handshake(end, lanes, reassembly, self)
 
     # --- how the parts hang together ------------------------------------------------------------------------------
+
+    def _read_control(self, message: Message) -> None:
+        self._control_reader.read(message)
 
     def _settled(self) -> bool:
         return self.control.settled
@@ -385,65 +403,9 @@ class Link:
             self.failed(error, now=now)
         end.dirty = True
 
-    # --- control messages -----------------------------------------------------------------------------------------
-
-    def _control_message(self, message: Message) -> None:
-        now = self.end.now
-        envelope, attachment = self.control.decode(message, now)
-        kind = framing.take_str(envelope, "t", max_length=16)
-        before = self.control.out.next_seq
-        self._handle_control(kind, envelope, attachment, now)
-        said = self.control.out.next_seq - before
-        # Reports of drops are repeated at an announcement: ours to say, not an answer, which comes later.
-        self._answered(1 if kind == "announce" else said)
-
-    def _handle_control(self, kind: str, envelope: framing.Envelope, attachment: bytes, now: float) -> None:
-        if kind == "announce":
-            announcement = decode_announcement(envelope)
-            key = ("announce", announcement.channel)
-            owed = self._owed_lists.add(key, announcement.owed, more=announcement.more, peer=self.end.peer)
-            if owed is not None:
-                self.taking.announced(replace(announcement, owed=owed), now)
-        elif kind == "want":
-            self.outgoing.answered(decode_want(envelope), now)
-        elif kind in ("refuse", "dropped"):
-            channel = self.sender.channels.get(framing.take_int(envelope, "ch", high=0xFFFF))
-            if channel is None:
-                return  # closed meanwhile
-            if kind == "dropped":
-                self.outgoing.reported(channel, envelope)
-            else:
-                self.outgoing.refused(channel, envelope, now)
-        elif kind in ("first", "retract"):
-            slot = framing.take_int(envelope, "ch", high=0xFFFF)
-            incoming = self.taking.incoming.get(slot)
-            if incoming is None:
-                return
-            if kind == "first":
-                incoming.known = True  # had it been nobody's before, it would have been announced again
-                self.taking.skip(incoming, framing.take_int(envelope, "seq", low=1, high=framing.MAX_SEQ), now)
-            else:
-                self.taking.retract(incoming, now)
-        elif kind == "synced":
-            self.answers.batches(framing.take_bool(envelope, "batch"))
-            self.taking.synced(now)
-        elif kind == "need":
-            digest = framing.take_str(envelope, "dh", max_length=64)
-            self._define(digest, self.texts.asked(digest), now)
-        elif kind == "define":
-            digest = framing.take_str(envelope, "dh", max_length=64)
-            if self.texts.came(digest, attachment):
-                self._owner.definition(digest, now=now)
-        else:
-            self._owner.control(envelope, attachment, now=now)
-
-    def _define(self, digest: str, text: str | None, now: float) -> None:
-        if text is not None:
-            self.control.send({"t": "define", "dh": digest}, text.encode(), now=now)
-
     def definition_known(self, digest: str, *, now: float) -> None:
         """A text arrived from elsewhere: pass it on if this peer is waiting for it."""
-        self._define(digest, self.texts.known(digest), now)
+        self._control_reader.definition_known(digest, now)
 
     # --- views ----------------------------------------------------------------------------------------------------
 
@@ -486,48 +448,67 @@ class Link:
         """Whether more waits to be told than any peer leaves behind that reads what it is told."""
         return self.control.deaf(len(self.sender.channels))
 
+    def observe(self, *, now: float) -> LinkView:
+        """The link as it is now. Costs the same however many streams there are."""
+        return view.observe(self.end, self.lanes, self.receiver, now)
+
+    def topics(self) -> tuple[TopicView, ...]:
+        """Every stream that is open towards the peer."""
+        return view.topics(self.sender.channels.values())
+
+    @property
+    def counters(self) -> Mapping[TopicName, SendCounters]:
+        """What was offered and what became of it, by topic. Counters go on counting: do not write to them."""
+        return self.sender.ledger.topics
+
+    def queued(self) -> dict[str, tuple[int, int]]:
+        """Messages and bytes that wait for the lane, by class label. Looks at every stream."""
+        return self.sender.queued()
+
+    def held(self) -> dict[TopicName, Held]:
+        """Messages that wait and that are in flight, by the topic of the stream. Looks at every message."""
+        return view.held(self.sender.channels.values())
+
+    def undelivered(self) -> Iterator[Undelivered]:
+        """Every message that the peer is not known to have."""
+        return view.undelivered(self.sender.channels.values())
+
+    def arriving(self) -> list[StreamInfo]:
+        """The peer's streams, as far as they are known here."""
+        return [incoming.stream for incoming in self.taking.streams.values()]
+
+    @property
+    def rtt_s(self) -> float:
+        """The round trip of the empty path where it is known, else the smoothed one; 0: neither is."""
+        return view.rtt_s(self.lanes)
+
+    def apply(self, settings: LinkSettings, *, now: float) -> None:
+        """Set what may be set while the link runs. Idempotent; what waits or is under way is left as it is."""
+        view.apply(settings, self.sender, self.lanes, now)
+
+    def watch_arrivals(self, told: Callable[[TopicSpec, Message, float], None] | None) -> None:
+        """Have `told` called when the peer has a message whole, with what holds for its topic and with the time. It is
+        called while a datagram is read. None: nobody."""
+        self.plane.on_arrived = told
+
     def snapshot(self) -> dict[str, object]:
         """State for /api/link; None where a value is not known yet."""
-        lane, clock = self.lanes.lane, self.lanes.clock
-        flight = lane.flight
         return {
-            "peer": self.end.peer,
-            "lane": lane.name,
-            "up": self.end.established and not lane.stalled,
-            "stalled": lane.stalled,
-            "version": self.end.version,
-            "inflight_bytes": flight.inflight_bytes,
-            "srtt_s": flight.rtt.srtt_s,
-            "loss": lane.loss,
-            "fragment_bytes": lane.fragment_bytes,
-            "clock_offset_s": clock.offset_s,
-            "clock_error_s": clock.error_s if clock.ready else None,
-            **lane.estimator.snapshot(),
-            "queue": {label: {"messages": cell[0], "bytes": cell[1]} for label, cell in self.sender.queued().items()},
+            **self.observe(now=self.end.now).to_json(),
+            **self.lanes.lane.estimator.snapshot(),
+            "queue": {label: {"messages": cell[0], "bytes": cell[1]} for label, cell in self.queued().items()},
         }
 
     def validate(self) -> None:
         """Internal consistency, for tests. Raises AssertionError with what does not add up."""
-        channels, streams = self.sender.channels, self.taking.streams
 
         def check(ok: bool, text: str) -> None:
             assert ok, f"{self.end.name}->{self.end.peer}: {text}"
 
-        for channel in channels.values():
-            channel.validate(check)
-            waits = bool(channel.ready and channel.wanted and (channel.active or channel.queue))
-            check(waits == channel.offered, f"{channel.stream.id.topic}: the scheduler does not know what waits")
-        self.sender.ledger.validate([(channel.counters, *channel.held()) for channel in channels.values()], check)
-        held_bytes = sum(stream.held_bytes for stream in streams.values()) + self.control.incoming.held_bytes
-        check(self.reassembly.held_bytes == held_bytes, "reassembly bytes do not add up")
-        for stream in streams.values():
-            stream.validate(check)
-        unheard, reports = self.reassembly.unheard, [stream.reports for stream in streams.values()]
-        check(unheard.reports == sum(map(len, reports)), "reports of drops do not add up")
-        check(unheard.said == sum(each.said for each in reports), "reports of drops that were said do not add up")
-        for lane in self.lanes.by_id.values():
-            lane.flight.validate(check)
-        self.sender.scheduler.validate()
-        check(len(self.outgoing.by_stream) == len(channels), "channel tables differ")
+        self.sender.validate(check)
+        self.taking.validate(check)
+        self.lanes.validate(check)
         self.texts.validate()
-        check(self.taking.watermarks.keys() <= self.taking.incoming.keys(), "watermarks of streams that are gone")
+        held_bytes = self.taking.held_bytes + self.control.incoming.held_bytes
+        check(self.reassembly.held_bytes == held_bytes, "reassembly bytes do not add up")
+        check(len(self.outgoing.by_stream) == len(self.sender.channels), "channel tables differ")

@@ -48,15 +48,16 @@ class SendTrace:
 
     def submitted(self, channel: OutChannel, message: Message, accepted: bool, *, thinned: bool, now: float) -> None:
         """A message was offered. `thinned`: the one that it took the place of was left out by the adaptation."""
-        if channel.left_out and self.steps:
+        gate = channel.gate
+        if gate is not None and gate.left_out and self.steps:
             reason = HoldReason.ADAPTATION if thinned else HoldReason.RATE_CAP
-            self._record(channel, TraceEvent.RATE_CAPPED, channel.left_out, now, **_cap(channel, reason))
+            self._record(channel, TraceEvent.RATE_CAPPED, gate.left_out, now, **_cap(channel, reason))
         if not accepted:
             if self.steps or self._again(channel, TraceEvent.REFUSED, now):
                 waits = {"waiting": channel.kept, "waiting_bytes": channel.held_bytes}
                 self._record(channel, TraceEvent.REFUSED, message.seq, now, size_bytes=len(message.body), **waits)
-        elif channel.newest is not None:
-            reason = HoldReason.ADAPTATION if channel.newest_thinned else HoldReason.RATE_CAP
+        elif gate is not None and gate.newest is not None:
+            reason = HoldReason.ADAPTATION if gate.newest_thinned else HoldReason.RATE_CAP
             if self.steps or self._news(channel, reason, now):
                 self._record(channel, TraceEvent.HELD, message.seq, now, **_cap(channel, reason))
         elif channel.queue and channel.queue[-1].seq == message.seq:

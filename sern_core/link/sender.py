@@ -72,18 +72,19 @@ class Sender:
         if channel.spec.priority is PriorityClass.CONTROL and not message.replay:
             self.cadences.arrived(channel.slot, now=now)
         backlog = channel.offered
-        thinned = channel.thinned
+        gate = channel.gate
+        thinned = 0 if gate is None else gate.thinned
         accepted = channel.submit(message, now=now, forced=forced)
-        if channel.newest is not None:
+        if gate is not None and gate.newest is not None:
             self._held_back.add(channel.slot)
-            self.held_back_due_s = min(self.held_back_due_s, channel.newest_due_s)
+            self.held_back_due_s = min(self.held_back_due_s, gate.newest_due_s)
             end.dirty = True  # the owner looks at the deadline again
         trace = end.trace
         if trace.enabled and (
-            trace.steps or not (accepted and channel.ready and channel.wanted and channel.newest is None)
+            trace.steps or not (accepted and channel.ready and channel.wanted and (gate is None or gate.newest is None))
         ):
-            self.told.submitted(channel, message, accepted, thinned=channel.thinned > thinned, now=now)
-        channel.left_out = 0
+            thins = gate is not None and gate.thinned > thinned
+            self.told.submitted(channel, message, accepted, thinned=thins, now=now)
         if not backlog or channel.coalesced:
             self.refresh(channel, now)
         return accepted
@@ -261,6 +262,16 @@ class Sender:
         self._end.now = now
         if self.channels.get(channel.slot) is channel:
             self.refresh(channel, now)
+
+    def validate(self, check: Callable[[bool, str], None]) -> None:
+        """Internal consistency, for tests."""
+        channels = self.channels.values()
+        for channel in channels:
+            channel.validate(check)
+            waits = bool(channel.ready and channel.wanted and (channel.active or channel.queue))
+            check(waits == channel.offered, f"{channel.stream.id.topic}: the scheduler does not know what waits")
+        self.ledger.validate([(channel.counters, *channel.held()) for channel in channels], check)
+        self.scheduler.validate()
 
 
 def class_of(channel: OutChannel, out: OutMessage) -> PriorityClass:

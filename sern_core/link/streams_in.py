@@ -342,6 +342,21 @@ class StreamsIn:
             if now - since_s > end.params.retention_s:
                 self.retract(self.streams[identity], now)
 
+    @property
+    def held_bytes(self) -> int:
+        """Bytes of what has arrived in part or out of its turn."""
+        return sum(stream.held_bytes for stream in self.streams.values())
+
+    def validate(self, check: Callable[[bool, str], None]) -> None:
+        """Internal consistency, for tests."""
+        streams = self.streams.values()
+        for stream in streams:
+            stream.validate(check)
+        unheard, reports = self._reassembly.unheard, [stream.reports for stream in streams]
+        check(unheard.reports == sum(map(len, reports)), "reports of drops do not add up")
+        check(unheard.said == sum(each.said for each in reports), "reports of drops that were said do not add up")
+        check(self.watermarks.keys() <= self.incoming.keys(), "watermarks of streams that are gone")
+
 
 def _same_type(known: StreamInfo, announced: Announcement) -> bool:
     """Whether bodies of both are to be read in the same way."""

@@ -106,12 +106,12 @@ class StreamsOut:
             slot = slot % 0xFFFF + 1
         self._next_channel = slot % 0xFFFF + 1
         counters = self._sender.ledger.topic(stream.id.topic, stream.spec.priority)
-        channel = OutChannel(slot, stream, counters, self._on_dropped, first=first)
+        codec = self._sender.new_codec(stream)
+        channel = OutChannel(slot, stream, counters, self._on_dropped, first=first, codec=codec)
         channel.owed = owed
         channel.wanted = wanted
-        channel.codec = self._sender.new_codec(stream)
         if self._end.fates is not None:
-            channel.on_count = partial(self._counted, self._end.fates, stream)
+            channel.drops.on_count = partial(self._counted, self._end.fates, stream)
         channels[slot] = channel
         self.prime(channel, replays, now=now)
         self.by_stream[stream.id] = channel
@@ -129,8 +129,9 @@ class StreamsOut:
     def _counted(self, fates: Fates, stream: StreamInfo, seq: int, reason: DropReason) -> None:
         fates.dropped(stream, seq, reason, self._end.peer)
 
-    def _dropped(self, channel: OutChannel, outs: Sequence[OutMessage], reason: DropReason) -> None:
-        if self._sender.channels.get(channel.slot) is channel:
+    def _dropped(self, slot: int, outs: Sequence[OutMessage], reason: DropReason) -> None:
+        channel = self._sender.channels.get(slot)
+        if channel is not None:
             if self._end.trace.enabled:
                 self._sender.told.dropped(channel, outs, reason, self._end.now)
             self._events.dropped(channel, outs, reason)

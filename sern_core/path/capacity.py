@@ -2,7 +2,7 @@
 
 One estimator a lane. The link feeds it sends, acknowledgements and losses; it answers with a window in bytes, a
 capacity in bits per second (None while unknown) and whether the path has stalled. Algorithms live in
-`sern_core.path.congestion`, one a file.
+`sern_core.path.congestion`, one a file, with their parts beside them.
 """
 
 from abc import ABC, abstractmethod

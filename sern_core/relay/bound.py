@@ -12,7 +12,8 @@ import math
 from typing import Final
 
 from sern_core.link.link import Link
-from sern_core.stream.out_channel import CLEARED_PER_US, CLIENT_OVERHEAD_BYTES, GIVEN_UP_US, OutChannel
+from sern_core.stream.out_channel import OutChannel
+from sern_core.stream.prices import CLEARED_PER_US, CLIENT_OVERHEAD_BYTES, GIVEN_UP_US
 from sern_core.vocabulary.message import Message
 from sern_core.vocabulary.types import CLASSES, DropReason
 

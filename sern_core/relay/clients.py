@@ -182,10 +182,10 @@ class Clients:
             if client in self.port_of or not link.established:
                 continue
             link.handle_timeout(now=now)
-            waiting_s = link.lane.flight.waiting_since_s
+            view = link.observe(now=now)
+            silent_s = view.waiting_s
             patience_s = ORPHAN_S if link.handshake.cut_off else link.end.params.heartbeat_timeout_s
-            if link.lane.stalled and waiting_s is not None and now - waiting_s > patience_s:
-                silent_s = now - waiting_s
+            if view.stalled and silent_s is not None and silent_s > patience_s:
                 link.close_lane(now=now, reason=f"its connection is gone and no datagram came for {silent_s:.0f} s")
 
     def sweep(self, now: float) -> None:

@@ -8,7 +8,8 @@ from collections.abc import Callable, Mapping
 from typing import Final
 
 from sern_core.link.link import Link
-from sern_core.stream.out_channel import MESSAGE_OVERHEAD_BYTES, OutChannel
+from sern_core.stream.out_channel import OutChannel
+from sern_core.stream.prices import MESSAGE_OVERHEAD_BYTES
 from sern_core.vocabulary.message import StreamId, StreamInfo
 from sern_core.vocabulary.types import ClientName, DropReason
 

@@ -22,11 +22,11 @@ import hashlib
 import re
 from collections import OrderedDict, deque
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Final
 
-from sern_core.bodies.codecs import Work, decode, raw_size
+from sern_core.bodies.codecs import Work, decode
+from sern_core.relay.object_values import Entry, ObjectLimits, ObjectValues
 from sern_core.relay.xr_object import ChangedIds, ObjectChanges, XrObject
 from sern_core.topics.rules import COMMAND_TYPES
 from sern_core.vocabulary.codec_names import Codec
@@ -48,73 +48,6 @@ PATCH_TYPES: Final = frozenset({"map_msgs/OccupancyGridUpdate", "map_msgs/PointC
 _RESERVED: Final = re.compile(r".*@([a-z][a-z0-9_]{0,62})", re.DOTALL)
 
 
-@dataclass(frozen=True, slots=True)
-class ObjectLimits:
-    """What the registry holds; beyond it an owner is refused by name."""
-
-    max_objects_per_owner: int = 4_096
-    max_bytes_per_owner: int = 8 * 2**20  # of an owner's objects, as in max_total_bytes
-    max_held_per_owner: int = 16 * 2**20  # of an owner's objects, as in max_held_bytes
-    max_total_bytes: int = 64 * 2**20  # ids, type names, definitions, attributes and kept values
-    max_held_bytes: int = 64 * 2**20  # references to larger values
-    max_value_bytes: int = 4_096
-    max_decoded_bytes: int = 16 * 2**20  # of a value that came encoded, when somebody asks for it
-    max_definition_bytes: int = 256 * 2**10
-    max_attributes: int = 64
-    max_attribute_bytes: int = 4_096
-    max_id_chars: int = 512
-    deletions: int = 4_096  # length of the deletion log
-
-
-class _Entry:
-    """An object at rest; the hot path writes its value fields only."""
-
-    __slots__ = (
-        "attributes",
-        "body",
-        "codec",
-        "created_s",
-        "definition",
-        "definition_hash",
-        "fixed_bytes",
-        "id",
-        "kind",
-        "owner",
-        "ros_stamp_ns",
-        "seq",
-        "sha256",
-        "share",
-        "stream",
-        "type_name",
-        "updated_s",
-        "value_bytes",
-        "version",
-        "wall_ns",
-    )
-
-    def __init__(self, object_id: str, owner: ClientName, share: list[int], now: float) -> None:
-        self.id = object_id
-        self.owner = owner
-        self.share = share  # of the owner, in the registry's total and held bytes
-        self.kind = ObjectKind.TOPIC
-        self.type_name = ""
-        self.definition = ""
-        self.definition_hash = ""
-        self.attributes: Mapping[str, str] = MappingProxyType({})
-        self.body: bytes | None = None  # the value, or a reference to a large one that nobody has hashed yet
-        self.codec = 0  # of the body, until somebody asks for the value
-        self.value_bytes = -1
-        self.sha256: str | None = None
-        self.fixed_bytes = 0
-        self.seq = 0
-        self.ros_stamp_ns: int | None = None
-        self.wall_ns = 0
-        self.created_s = now
-        self.updated_s = now
-        self.version = 0
-        self.stream: StreamId | None = None
-
-
 def text_hash(definition: str) -> str:
     """SHA-256 of a definition, hex; empty when there is none."""
     return hashlib.sha256(_utf8(definition)).hexdigest() if definition else ""
@@ -123,7 +56,7 @@ def text_hash(definition: str) -> str:
 class ValueRequest(Work):
     """One large value that another thread is to decode or to hash."""
 
-    def __init__(self, registry: "ObjectRegistry", entry: _Entry, body: bytes) -> None:
+    def __init__(self, registry: "ObjectRegistry", entry: Entry, body: bytes) -> None:
         self.entry = entry
         self.body = body
         self.codec = entry.codec
@@ -151,16 +84,15 @@ class ObjectRegistry:
     def __init__(self, *, epoch: int = 0, limits: ObjectLimits | None = None) -> None:
         self.epoch = epoch
         self.limits = limits or ObjectLimits()
+        self._values = ObjectValues(self.limits)
         self.inline_bytes: int | None = None
         """The largest value that is decoded where it is asked for; None: any."""
         self._version = 0
-        self._entries: OrderedDict[str, _Entry] = OrderedDict()  # least recently changed first
-        self._by_stream: dict[StreamId, _Entry] = {}
+        self._entries: OrderedDict[str, Entry] = OrderedDict()  # least recently changed first
+        self._by_stream: dict[StreamId, Entry] = {}
         self._owned: dict[ClientName, set[str]] = {}
         self._deletions: deque[tuple[int, str]] = deque(maxlen=self.limits.deletions)
         self._forgotten_version = 0  # deletions up to this version may have left the log
-        self._total_bytes = 0
-        self._held_bytes = 0
         self._bytes_of: dict[ClientName, list[int]] = {}  # of owners: their share of total and held bytes
 
     # Writing ---------------------------------------------------------------------------------------------------------
@@ -193,12 +125,12 @@ class ObjectRegistry:
         fixed_bytes = texts_bytes + definition_bytes + attribute_bytes
         self._check(object_id, owner, definition_bytes, len(fields), attribute_bytes)
         entry = self._entries.get(object_id)
-        old_bytes = 0 if entry is None else entry.fixed_bytes + (0 if value is None else self._kept_bytes(entry))
+        old_bytes = 0 if entry is None else entry.fixed_bytes + (0 if value is None else self._values.kept_bytes(entry))
         kept_bytes = 0 if value is None or len(value) > self.limits.max_value_bytes else len(value)
         own_bytes = self._bytes_of.get(owner, (0, 0))[0]
         for what, held_bytes, limit_bytes in (
             (f"{owner}'s objects hold", own_bytes, self.limits.max_bytes_per_owner),
-            ("the registry holds", self._total_bytes, self.limits.max_total_bytes),
+            ("the registry holds", self._values.total_bytes, self.limits.max_total_bytes),
         ):
             if held_bytes - old_bytes + fixed_bytes + kept_bytes > limit_bytes:
                 raise RefusedError(
@@ -207,10 +139,10 @@ class ObjectRegistry:
                     "delete objects or shorten definitions",
                 )
         if entry is None:
-            entry = _Entry(object_id, owner, self._bytes_of.setdefault(owner, [0, 0]), now)
+            entry = Entry(object_id, owner, self._bytes_of.setdefault(owner, [0, 0]), now)
             self._entries[object_id] = entry
             self._owned.setdefault(owner, set()).add(object_id)
-        self._count(entry, fixed_bytes - entry.fixed_bytes)
+        self._values.count(entry, fixed_bytes - entry.fixed_bytes)
         entry.fixed_bytes = fixed_bytes
         entry.kind = kind
         entry.type_name = type_name
@@ -218,7 +150,7 @@ class ObjectRegistry:
         entry.definition_hash = definition_hash or text_hash(definition)
         entry.attributes = MappingProxyType(fields)
         if value is not None:
-            self._set_value(entry, value)
+            self._values.keep(entry, value)
             entry.seq = seq
             entry.ros_stamp_ns = ros_stamp_ns
         entry.wall_ns = wall_ns
@@ -255,7 +187,7 @@ class ObjectRegistry:
         if entry.stream != stream.id:
             if entry.stream is not None:
                 del self._by_stream[entry.stream]
-                self._forget_value(entry)
+                self._values.forget(entry)
             entry.stream = stream.id
             entry.seq = 0
             self._by_stream[stream.id] = entry
@@ -287,7 +219,7 @@ class ObjectRegistry:
         if entry.value_bytes == len(body) and entry.body is not None and not (codec or entry.codec):
             entry.body, entry.sha256 = body, None  # of the same size: what the budgets hold stays
         else:
-            self._set_value(entry, body, codec)
+            self._values.keep(entry, body, codec)
         self._touch(entry, now)
         return True
 
@@ -325,12 +257,12 @@ class ObjectRegistry:
     @property
     def total_bytes(self) -> int:
         """Bytes that count against `max_total_bytes`."""
-        return self._total_bytes
+        return self._values.total_bytes
 
     @property
     def held_bytes(self) -> int:
         """Bytes of large values that are only referenced."""
-        return self._held_bytes
+        return self._values.held_bytes
 
     def __len__(self) -> int:
         return len(self._entries)
@@ -371,7 +303,7 @@ class ObjectRegistry:
         """What has to be done before the values of these objects, changed after `version`, can be told. Nothing while
         `inline_bytes` is None."""
         found: list[ValueRequest] = []
-        entries: Iterable[_Entry] = reversed(self._entries.values())
+        entries: Iterable[Entry] = reversed(self._entries.values())
         if topic is not None:
             of_topic = [self._entries[object_id] for object_id in self.named(owner=owner, topic=topic)]
             entries = sorted(of_topic, key=lambda entry: -entry.version)
@@ -388,11 +320,11 @@ class ObjectRegistry:
         entry = request.entry
         if entry.body is not request.body or self._entries.get(entry.id) is not entry:
             return
-        self._forget_value(entry)
+        self._values.forget(entry)
         if request.raw is None:
             return
         if request.sha256 is None:
-            self._set_value(entry, request.raw)
+            self._values.keep(entry, request.raw)
         else:
             entry.value_bytes, entry.sha256 = len(request.raw), request.sha256
 
@@ -425,15 +357,13 @@ class ObjectRegistry:
     def validate(self) -> None:
         """Check counts, sums and orders against the objects; raises AssertionError."""
         entries = self._entries
-        small = sum(self._kept_bytes(entry) for entry in entries.values())
-        large = sum(self._referenced_bytes(entry) for entry in entries.values())
-        fixed = sum(entry.fixed_bytes for entry in entries.values())
-        assert self._total_bytes == fixed + small <= self.limits.max_total_bytes, "total bytes"
-        assert self._held_bytes == large <= self.limits.max_held_bytes, "held bytes"
+        self._values.validate(entries.values())
         for owner, (own_bytes, own_held_bytes) in self._bytes_of.items():
             mine = [entry for entry in entries.values() if entry.owner == owner]
-            assert own_bytes == sum(entry.fixed_bytes + self._kept_bytes(entry) for entry in mine), "bytes of an owner"
-            assert own_held_bytes == sum(map(self._referenced_bytes, mine)), "held bytes of an owner"
+            assert own_bytes == sum(entry.fixed_bytes + self._values.kept_bytes(entry) for entry in mine), (
+                "bytes of an owner"
+            )
+            assert own_held_bytes == sum(map(self._values.referenced_bytes, mine)), "held bytes of an owner"
             assert own_bytes <= self.limits.max_bytes_per_owner, "an owner has too much"
             assert own_held_bytes <= self.limits.max_held_per_owner, "an owner holds too much"
         assert self._bytes_of.keys() == self._owned.keys(), "owners by bytes"
@@ -483,56 +413,15 @@ class ObjectRegistry:
                 "limit; delete some",
             )
 
-    def _set_value(self, entry: _Entry, body: bytes, codec: int = Codec.NONE) -> None:
-        """Store a value, a reference, or only its size, whichever the budgets allow."""
-        limits = self.limits
-        self._forget_value(entry)
-        size = len(body)
-        own_bytes, own_held_bytes = share = entry.share
-        if size <= limits.max_value_bytes and not codec:
-            entry.value_bytes = size
-            if self._total_bytes + size <= limits.max_total_bytes and own_bytes + size <= limits.max_bytes_per_owner:
-                self._total_bytes += size  # `_count`, for every message
-                share[0] = own_bytes + size
-                entry.body = body
-            return
-        if not codec:
-            entry.value_bytes = size
-        if self._held_bytes + size <= limits.max_held_bytes and own_held_bytes + size <= limits.max_held_per_owner:
-            self._count_held(entry, size)
-            entry.body, entry.codec = body, codec
-
-    def _count(self, entry: _Entry, nbytes: int) -> None:
-        self._total_bytes += nbytes
-        entry.share[0] += nbytes
-
-    def _count_held(self, entry: _Entry, nbytes: int) -> None:
-        self._held_bytes += nbytes
-        entry.share[1] += nbytes
-
-    def _forget_value(self, entry: _Entry) -> None:
-        old = entry.body
-        if old is not None:
-            size = len(old)
-            if not entry.codec and size <= self.limits.max_value_bytes:
-                self._total_bytes -= size  # `_count`, for every message
-                entry.share[0] -= size
-            else:
-                self._count_held(entry, -size)
-            entry.body = None
-        entry.codec = 0
-        entry.value_bytes = -1
-        entry.sha256 = None
-
-    def _touch(self, entry: _Entry, now: float) -> None:
+    def _touch(self, entry: Entry, now: float) -> None:
         self._version += 1
         entry.version = self._version
         entry.updated_s = now
         self._entries.move_to_end(entry.id)
 
-    def _delete(self, entry: _Entry) -> None:
-        self._forget_value(entry)
-        self._count(entry, -entry.fixed_bytes)
+    def _delete(self, entry: Entry) -> None:
+        self._values.forget(entry)
+        self._values.count(entry, -entry.fixed_bytes)
         if entry.stream is not None:
             del self._by_stream[entry.stream]
         del self._entries[entry.id]
@@ -545,47 +434,14 @@ class ObjectRegistry:
             self._forgotten_version = self._deletions[0][0] if self._deletions else self._version
         self._deletions.append((self._version, entry.id))
 
-    def _kept_bytes(self, entry: _Entry) -> int:
-        return len(entry.body) if entry.body is not None and not self._is_reference(entry) else 0
-
-    def _referenced_bytes(self, entry: _Entry) -> int:
-        return len(entry.body) if entry.body is not None and self._is_reference(entry) else 0
-
-    def _is_reference(self, entry: _Entry) -> bool:
-        return bool(entry.codec) or entry.value_bytes > self.limits.max_value_bytes
-
-    def _decode(self, entry: _Entry) -> None:
-        """Somebody asks for a value that came encoded; what cannot be decoded has no value."""
-        body, codec = entry.body, entry.codec
-        self._forget_value(entry)
-        if body is not None:
-            try:
-                raw = decode(codec, body, max_bytes=self.limits.max_decoded_bytes)
-            except CodecError:
-                return
-            self._set_value(entry, raw)
-
-    def _claimed_bytes(self, entry: _Entry) -> int:
-        """How large the value is, or says it is; -1 for none."""
-        try:
-            return -1 if entry.body is None else raw_size(entry.codec, entry.body)
-        except CodecError:
-            return -1
-
-    def _is_long(self, entry: _Entry) -> bool:
+    def _is_long(self, entry: Entry) -> bool:
         """Whether telling the value takes longer than it may where somebody asks."""
-        return self.inline_bytes is not None and self._claimed_bytes(entry) > self.inline_bytes
+        return self.inline_bytes is not None and self._values.claimed_bytes(entry) > self.inline_bytes
 
-    def _seen(self, entry: _Entry) -> XrObject:
+    def _seen(self, entry: Entry) -> XrObject:
         long = self._is_long(entry)
-        if entry.codec and not long:
-            self._decode(entry)
-        if entry.body is not None and entry.sha256 is None and not long:
-            entry.sha256 = hashlib.sha256(entry.body).hexdigest()
-            if entry.value_bytes > self.limits.max_value_bytes:
-                # Hashed once, when first asked for; after that the body is no longer needed.
-                self._count_held(entry, -entry.value_bytes)
-                entry.body = None
+        if not long:
+            self._values.read(entry)
         return XrObject(
             id=entry.id,
             owner=entry.owner,
@@ -595,7 +451,7 @@ class ObjectRegistry:
             definition_hash=entry.definition_hash,
             attributes=entry.attributes,
             value=None if long else entry.body,
-            value_bytes=self._claimed_bytes(entry) if long else entry.value_bytes,
+            value_bytes=self._values.claimed_bytes(entry) if long else entry.value_bytes,
             value_sha256=entry.sha256,
             seq=entry.seq,
             ros_stamp_ns=entry.ros_stamp_ns,

@@ -19,7 +19,7 @@ from functools import partial
 from math import ceil
 from typing import Final, NamedTuple, Protocol
 
-from sern_core.path.lanes import Lane
+from sern_core.link.view import LinkView
 from sern_core.vocabulary.types import ClientName
 from sern_core.wire import framing
 from sern_core.wire.announce import MAX_ASKED
@@ -51,8 +51,7 @@ class PeerControl(Protocol):
 class PeerLink(Protocol):
     """What is looked at of a client's link, and how the client is told."""
 
-    @property
-    def lane(self) -> Lane: ...
+    def observe(self, *, now: float) -> LinkView: ...
 
     @property
     def established(self) -> bool: ...
@@ -215,15 +214,15 @@ class Presence:
 
     def _look(self, client: ClientName, now: float) -> None:
         link = self._links.get(client)
+        view = None if link is None else link.observe(now=now)
         old = self._states.get(client)
-        up = link is not None and link.established and not link.lane.stalled
+        up = view is not None and view.up
         since_s = now if old is None or old.up != up else old.since_s
         lane, rtt_s, rtt_at_s = ("", None, now) if old is None else (old.lane, old.rtt_s, old.rtt_at_s)
-        if link is not None and up:
-            lane = link.lane.name
-            rtt = link.lane.flight.rtt
-            if rtt.samples and _differs(rtt_s, rtt.srtt_s) and (rtt_s is None or now - rtt_at_s >= RTT_PAUSE_S):
-                rtt_s, rtt_at_s = rtt.srtt_s, now
+        if view is not None and up:
+            lane = view.lane
+            if view.srtt_s and _differs(rtt_s, view.srtt_s) and (rtt_s is None or now - rtt_at_s >= RTT_PAUSE_S):
+                rtt_s, rtt_at_s = view.srtt_s, now
         state = _State(up, since_s, lane, rtt_s, rtt_at_s)
         if state != old:
             self._states[client] = state

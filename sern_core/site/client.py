@@ -244,7 +244,7 @@ class ClientCore:
     def look_at_peers(self, *, now: float) -> list[PeerView]:
         """Who is there of those whose streams we take, by name. Call about once a second: that the own link has fallen
         silent is found here."""
-        self.peers.reached(self.link.established and not self.link.lane.stalled, now=now)
+        self.peers.reached(self.link.observe(now=now).up, now=now)
         return self.peers.look(now=now)
 
     def put_object(

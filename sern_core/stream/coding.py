@@ -1,5 +1,6 @@
 """What one channel does with its bodies, and where one body stands."""
 
+from collections.abc import Collection, Iterable
 from enum import IntEnum
 from typing import Final
 
@@ -19,6 +20,11 @@ class Coding(IntEnum):
     HELD = 1  # chosen, and waits for its turn to be encoded
     RUNNING = 2  # another thread encodes it
     DONE = 3  # goes as it is now
+
+
+def preferred(codecs: Iterable[Compression], allowed: Collection[Compression]) -> Compression:
+    """The first of `codecs` that a topic allows; `none`, which all of them do, if there is no other."""
+    return next((codec for codec in codecs if codec in allowed), Compression.NONE)
 
 
 class ChannelCodec:

@@ -5,7 +5,7 @@ from collections.abc import Iterable, Sequence
 from itertools import takewhile
 from typing import Final
 
-from sern_core.stream.out_channel import CLIENT_OVERHEAD_BYTES, MESSAGE_OVERHEAD_BYTES
+from sern_core.stream.prices import CLIENT_OVERHEAD_BYTES, MESSAGE_OVERHEAD_BYTES
 from sern_core.vocabulary.message import Message
 
 UNBOUNDED_BYTES: Final = 2**62

@@ -1,10 +1,14 @@
 """One message on its way over one hop: what of its body is still to be sent, and what became of the rest."""
 
 from collections.abc import Iterator, Sequence
+from operator import attrgetter
+from typing import Final
 
 from sern_core.stream.coding import Coding
 from sern_core.vocabulary.message import Message
 from sern_core.vocabulary.types import DROP_CODES, DropReason
+
+BY_SEQ: Final = attrgetter("seq")
 
 
 class OutMessage:
@@ -61,6 +65,11 @@ class OutMessage:
     @property
     def has_unsent(self) -> bool:
         return self.ranges is None or bool(self.ranges)
+
+    def expired(self, lifespan_s: float | None, now: float) -> bool:
+        """Whether the lifespan of its topic is over. A tombstone has none."""
+        message = self.message
+        return lifespan_s is not None and not message.tombstone and now - message.born_s + message.error_s > lifespan_s
 
     def restart(self) -> None:
         """Forget what was sent: the peer is a new process, or the body is another."""

@@ -14,7 +14,7 @@ import pytest
 from benchmarks import child, common
 from benchmarks.child import Worker, await_workers
 from sern_core.vocabulary.errors import SernError
-from sern_tools.processes import Children
+from sern_tools.harness.processes import Children, python
 from tests.support import DEADLINE_S
 
 IMPORTS = "import json, benchmarks as a, sern_core as b; print(json.dumps({m.__name__: m.__file__ for m in (a, b)}))"
@@ -45,7 +45,7 @@ def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.mark.usefixtures("elsewhere")
 def test_the_benchmarks_are_not_installed() -> None:
-    command = child.python("-c", IMPORTS)
+    command = python("-c", IMPORTS)
     done = subprocess.run(command, capture_output=True, text=True, timeout=DEADLINE_S, check=False)
     assert done.returncode == 1 and "No module named 'benchmarks'" in done.stderr
 
@@ -57,9 +57,7 @@ async def test_a_child_finds_this_checkout_from_anywhere(
     monkeypatch.setenv("PYTHONSAFEPATH", safe)
     (elsewhere / "benchmarks.py").write_text("raise SystemExit('the wrong one')")
     async with Children(elsewhere) as children:
-        process = await children.start(
-            "child", child.python("-c", IMPORTS), talks=True, environment=child.environment()
-        )
+        process = await children.start("child", python("-c", IMPORTS), talks=True, environment=child.environment())
         found = await process.read_object()
     assert found == {name: str(child.ROOT / name / "__init__.py") for name in ("benchmarks", "sern_core")}
 
@@ -69,44 +67,13 @@ def test_what_was_to_be_found_before_still_is(monkeypatch: pytest.MonkeyPatch) -
     assert child.environment() == {"PYTHONPATH": f"{child.ROOT}:/one:/two"}
 
 
-async def test_a_child_that_ends_is_the_error_of_the_work_beside_it(elsewhere: Path) -> None:
-    cancelled = asyncio.Event()
-
-    async def forever() -> None:
-        try:
-            await asyncio.Event().wait()
-        finally:
-            cancelled.set()
-
-    async with Children(elsewhere) as children:
-        await children.start("bridge", child.python("-c", "raise SystemExit('no such master')"))
-        with pytest.raises(SernError, match=r"^bridge ended \(exit status 1\): no such master$"):
-            await child.beside(children, forever())
-        assert cancelled.is_set()
-
-
-async def test_work_beside_children_comes_to_what_it_comes_to(tmp_path: Path) -> None:
-    async def fails() -> None:
-        raise SernError("nothing arrived")
-
-    async def works() -> int:
-        return 3
-
-    async with Children(tmp_path) as children:
-        process = await children.start("echo", child.python("-c", "input()"), talks=True)
-        assert await child.beside(children, works()) == 3
-        with pytest.raises(SernError, match=r"^nothing arrived$"):
-            await child.beside(children, fails())
-        assert process.running
-
-
 def test_the_words_of_a_child_reach_the_user_in_one_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     async def work(children: Children) -> None:
         process = await children.start(
             "source",
-            child.python("-m", "benchmarks.endpoints.ros1_roles", "nothing"),
+            python("-m", "benchmarks.endpoints.ros1_roles", "nothing"),
             talks=True,
             environment=child.environment(),
         )
@@ -114,7 +81,7 @@ def test_the_words_of_a_child_reach_the_user_in_one_line(
 
     async def part() -> None:
         async with Children(tmp_path) as children:
-            await child.beside(children, work(children))
+            await children.beside(work(children))
 
     def bench(_options: argparse.Namespace, _report: common.Report) -> None:
         asyncio.run(part())

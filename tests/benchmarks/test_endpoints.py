@@ -21,7 +21,7 @@ from sern_core.vocabulary.errors import SernError
 from sern_runtime.config.client import load_client
 from sern_runtime.config.keys import load_public
 from sern_runtime.config.relay import load_relay
-from sern_tools.processes import Child, Children
+from sern_tools.harness.processes import Child, Children, python
 from tests.support import DEADLINE_S
 
 PYTHON = sys.executable
@@ -228,32 +228,12 @@ def test_a_figure_that_a_round_does_not_have_is_left_out() -> None:
 
 async def test_what_was_started_has_ended_and_its_folder_is_gone() -> None:
     async with shared.started() as children:
-        process = await children.start("child", child.python("-c", "print('{}', flush=True); input()"), talks=True)
+        process = await children.start("child", python("-c", "print('{}', flush=True); input()"), talks=True)
         await process.read_object()
         folder = children.directory
         assert process.running and folder.is_dir()
     assert process.process.returncode == -signal.SIGKILL
     assert not folder.exists()
-
-
-async def test_the_cpu_time_of_a_thread_that_has_ended_counts(tmp_path: Path) -> None:
-    program = """
-import json, threading, time
-def work():
-    while time.thread_time() < 0.05:
-        pass
-thread = threading.Thread(target=work)
-thread.start()
-thread.join()
-print(json.dumps({"used_s": time.process_time()}), flush=True)
-input()
-"""
-    async with Children(tmp_path) as children:
-        first, second = [await children.start(name, child.python("-c", program), talks=True) for name in ("a", "b")]
-        used_s = [(await process.read_object())["used_s"] for process in (first, second)]
-        found_s = child.cpu_s(first.process.pid, second.process.pid)
-    assert min(used_s) >= 0.05
-    assert found_s >= sum(used_s)
 
 
 def test_cases_of_other_metrics_have_a_table_of_their_own() -> None:

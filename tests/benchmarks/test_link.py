@@ -45,7 +45,6 @@ def outcome(
         "events": {},
         "wire_packets": 4_000,
         "wire_bytes": 5_000_000,
-        "wire_dropped": 0,
         "cpu_percent": {},
         "busy": 0.5,
     }

@@ -7,13 +7,13 @@ from typing import Final
 import pytest
 
 from sern_client import latest
-from sern_client.endpoints import first
+from sern_client.endpoints.common import first
 from sern_client.endpoints.ros1 import Ros1Options, hold
 from sern_core.link import control_stream, definitions, owed_lists
 from sern_core.relay import access, awaited, draining, routing
-from sern_core.relay.objects import ObjectLimits
+from sern_core.relay.object_values import ObjectLimits
 from sern_core.site import peers
-from sern_core.stream import decoding, drop_reports, in_stream, latched, out_channel
+from sern_core.stream import decoding, drop_reports, in_stream, latched, prices
 from sern_core.vocabulary import ledger
 from sern_core.wire import numbering
 from sern_relay import server, transforms
@@ -39,7 +39,7 @@ def default(section: type[RelaySection] | type[ReplaySection], key: str) -> int:
 BOUNDS: Final[dict[str, tuple[str, ...]]] = {
     "messages that wait for a client": (
         nbytes(access.DEFAULT_QUEUE_BYTES),
-        f"{out_channel.CLIENT_OVERHEAD_BYTES} bytes a message",
+        f"{prices.CLIENT_OVERHEAD_BYTES} bytes a message",
     ),
     "half-received and waiting": (f"{in_stream.PARTIAL_IDLE_S:g} s without a fragment",),
     "latched messages for late joiners": (

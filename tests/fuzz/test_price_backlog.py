@@ -8,7 +8,8 @@ import pytest
 
 from sern_core.path.congestion.fixed import FixedWindow
 from sern_core.relay.access import DEFAULT_QUEUE_BYTES, AccessRule, AccessTable
-from sern_core.stream.out_channel import CLIENT_OVERHEAD_BYTES, OutChannel
+from sern_core.stream.out_channel import OutChannel
+from sern_core.stream.prices import CLIENT_OVERHEAD_BYTES
 from sern_core.vocabulary.params import LinkParams
 from sern_core.vocabulary.types import DropReason, PriorityClass
 from sern_core.wire import framing

@@ -7,17 +7,15 @@ import logging
 
 import pytest
 
-from sern_client.bridge import Bridge
 from sern_client.endpoints.ros1.endpoint import Ros1Endpoint, Ros1Options
 from sern_client.endpoints.ros1.subscription import Topic
-from sern_core.site.client import ClientCore
-from sern_core.stream.out_channel import MESSAGE_OVERHEAD_BYTES
+from sern_core.stream.prices import MESSAGE_OVERHEAD_BYTES
 from sern_core.topics.patterns import compile_pattern
-from sern_core.topics.rules import Discovery, DiscoveryMode, RuleSet, TopicRule
+from sern_core.topics.rules import DiscoveryMode, TopicRule
 from sern_core.vocabulary.message import DEFAULT_RELIABLE_QUEUE_BYTES
-from sern_core.vocabulary.params import LinkParams, SchedulerParams
-from sern_core.vocabulary.types import DROP_CODES, ClientName, DropReason, Encoding, Reliability, TopicName
+from sern_core.vocabulary.types import DROP_CODES, DropReason, Encoding, Reliability, TopicName
 from sern_runtime import clock, ros_types
+from tests.bridges import Shell, bridge_of
 from tests.fuzz.price import Input, Make, within_budget
 from tests.fuzz.test_hostile_peer import Hostile
 from tests.world import World
@@ -33,21 +31,15 @@ class Robot:
 
     def __init__(self) -> None:
         self.now = clock.now()
-        self.faults: list[Exception] = []
         endpoint = Ros1Endpoint(Ros1Options(host="127.0.0.1", namespace="/robot"), environ={})
-        rules = RuleSet((TopicRule(compile_pattern(LOG), reliability=Reliability.RELIABLE),))
-        self.bridge = Bridge(
-            endpoint, rules, Discovery(DiscoveryMode.DYNAMIC), "/", log=None, kick=lambda: None,
-            on_up=lambda: None, on_down=lambda _reason: None, on_fault=self.faults.append,
-        )  # fmt: skip
-        self.core = ClientCore(
-            name=ClientName("robot"), boot=1, events=self.bridge, link=LinkParams(), scheduler=SchedulerParams(),
-            now=self.now,
-        )  # fmt: skip
-        self.bridge.attach(self.core)
+        rules = (TopicRule(compile_pattern(LOG), reliability=Reliability.RELIABLE),)
+        shell = Shell()
+        self.faults = shell.faults
+        self.bridge = bridge_of(endpoint, rules, DiscoveryMode.DYNAMIC, name="robot", shell=shell, now=self.now)
+        self.core = self.bridge.core
         topic = endpoint._topics["/log"] = Topic("/log", LOG, endpoint)
         topic.announced = ros_types.topic_info(LOG, "std_msgs/msg/String", Encoding.ROS1)
-        self.bridge.topic_added(topic.announced)
+        self.bridge.outbound.topic_added(topic.announced)
         world = World()
         Hostile(world, "site").control({"t": "subscribe", "patterns": [LOG], "more": False})
         self.port = world.relay.port(self.core.name)

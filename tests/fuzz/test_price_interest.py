@@ -10,19 +10,17 @@ from typing import Any
 
 import pytest
 
-from sern_client.bridge import Bridge
 from sern_client.endpoints.ros1.endpoint import Ros1Endpoint, Ros1Options
 from sern_client.endpoints.ros1.hold import Hold
 from sern_client.endpoints.ros1.subscription import Topic
-from sern_core.site.client import ClientCore
 from sern_core.summaries.patches import PatchParams
 from sern_core.summaries.spec import SummarySpec, VoxelParams
 from sern_core.topics.patterns import compile_pattern
-from sern_core.topics.rules import Discovery, DiscoveryMode, RuleSet, TopicRule
+from sern_core.topics.rules import DiscoveryMode, TopicRule
 from sern_core.vocabulary.message import StreamInfo
-from sern_core.vocabulary.params import LinkParams, SchedulerParams
-from sern_core.vocabulary.types import ClientName, DropReason, Encoding, TopicName
+from sern_core.vocabulary.types import DropReason, Encoding, TopicName
 from sern_runtime import ros_types
+from tests.bridges import Shell, bridge_of
 from tests.steps import steps
 
 FEW, MANY = 20, 1_000
@@ -38,16 +36,10 @@ class Robot:
 
     def __init__(self, topics: int) -> None:
         self.endpoint = Ros1Endpoint(Ros1Options(host="127.0.0.1", namespace="/robot"), environ={})
-        self.faults: list[Exception] = []
-        self.bridge = Bridge(
-            self.endpoint, RuleSet(RULES), Discovery(DiscoveryMode.DYNAMIC), "/", log=None, kick=lambda: None,
-            on_up=lambda: None, on_down=lambda _reason: None, on_fault=self.faults.append,
-        )  # fmt: skip
-        self.core = ClientCore(
-            name=ClientName("robot"), boot=1, events=self.bridge, link=LinkParams(), scheduler=SchedulerParams(),
-            now=0.0,
-        )  # fmt: skip
-        self.bridge.attach(self.core)
+        shell = Shell()
+        self.faults = shell.faults
+        self.bridge = bridge_of(self.endpoint, RULES, DiscoveryMode.DYNAMIC, name="robot", shell=shell, now=0.0)
+        self.core = self.bridge.core
         for number in range(topics):
             self.add(TopicName(f"/robot/t{number}"), "std_msgs/msg/String")
         self.add(CLOUD, "sensor_msgs/msg/PointCloud2")
@@ -57,7 +49,7 @@ class Robot:
         known = name.removeprefix("/robot")
         topic = self.endpoint._topics[known] = Topic(known, name, self.endpoint)
         topic.announced = replace(ros_types.topic_info(name, type_name, Encoding.ROS1), latched=False)
-        self.bridge.topic_added(topic.announced)
+        self.bridge.outbound.topic_added(topic.announced)
 
     def stream(self, name: str) -> StreamInfo:
         return next(each.stream for each in self.core.link.sender.channels.values() if each.stream.id.topic == name)
@@ -74,7 +66,7 @@ async def wants_one(topics: int) -> Callable[[], None]:
 
 async def wants_a_summary(topics: int) -> Callable[[], None]:
     robot = Robot(topics)
-    (summary,) = (each for each in robot.bridge.summaries.topics if each.source.stream.id.topic == CLOUD)
+    (summary,) = (each for each in robot.bridge.outbound.summaries.topics if each.source.stream.id.topic == CLOUD)
     return lambda: robot.bridge.wanted(summary.channel.stream, True)
 
 
@@ -141,7 +133,7 @@ async def test_what_is_wanted_is_the_topic_of_the_stream() -> None:
     robot.bridge.wanted(robot.stream("/robot/t1"), False)
     robot.bridge.wanted(robot.stream(CLOUD), False)
     assert {name for name, wanted in robot.interested().items() if not wanted} == {"/robot/t1", CLOUD}
-    (summary,) = (each for each in robot.bridge.summaries.topics if each.source.stream.id.topic == CLOUD)
+    (summary,) = (each for each in robot.bridge.outbound.summaries.topics if each.source.stream.id.topic == CLOUD)
     summary.channel.wanted = True
     robot.bridge.wanted(summary.channel.stream, True)
     assert robot.interested() == {name: name != "/robot/t1" for name in everything}
@@ -154,19 +146,19 @@ async def test_a_topic_that_has_ended_is_not_wanted_and_begins_anew() -> None:
     robot = Robot(2)
     stream = robot.stream("/robot/t0")
     cloud = robot.endpoint._topics["/cloud"]
-    (summary,) = (each for each in robot.bridge.summaries.topics if each.source.stream.id.topic == CLOUD)
-    robot.bridge.topic_removed(TopicName("/robot/t0"))
-    robot.bridge.topic_removed(CLOUD)
+    (summary,) = (each for each in robot.bridge.outbound.summaries.topics if each.source.stream.id.topic == CLOUD)
+    robot.bridge.outbound.topic_removed(TopicName("/robot/t0"))
+    robot.bridge.outbound.topic_removed(CLOUD)
     before = robot.interested()
     robot.bridge.wanted(stream, False)
     robot.bridge.wanted(summary.channel.stream, False)
     robot.bridge.send_dropped(summary.channel.stream, 1, 1, DropReason.UNWANTED, "")
-    assert robot.interested() == before and robot.bridge._by_stream.keys() == {
+    assert robot.interested() == before and robot.bridge.outbound.streams == {
         channel.stream.id for channel in robot.core.link.sender.channels.values()
     }
     assert cloud.announced is not None
-    robot.bridge.topic_added(cloud.announced)
+    robot.bridge.outbound.topic_added(cloud.announced)
     robot.bridge.wanted(robot.stream(CLOUD), False)
     assert not robot.interested()[CLOUD]
     robot.bridge.close()
-    assert not robot.bridge._by_stream and robot.faults == []
+    assert not robot.bridge.outbound.streams and robot.faults == []

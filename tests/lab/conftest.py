@@ -10,20 +10,10 @@ from sern_tools.lab.host import LabError
 from sern_tools.lab.lab import Lab
 from sern_tools.lab.removal import pids_within
 
-LONG = "lab_long"
 HERE = Path(__file__).parent
 
 
-def pytest_configure(config: pytest.Config) -> None:
-    config.addinivalue_line("markers", f"{LONG}: longer runs of the lab; only when asked for by -m (make lab)")
-
-
-def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    if LONG not in config.getoption("markexpr", ""):
-        long = [item for item in items if item.get_closest_marker(LONG)]
-        if long:
-            config.hook.pytest_deselected(items=long)
-            items[:] = [item for item in items if item not in long]
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     # Tests that do without the session's lab come first, when its namespaces are not there yet.
     places = [place for place, item in enumerate(items) if item.path.parent == HERE]
     ours = sorted((items[place] for place in places), key=_uses_the_lab)

@@ -4,9 +4,8 @@ Judged from message logs and counters. Robot on side a, relay and site on side b
 """
 
 import json
-import time
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
-from contextlib import asynccontextmanager, contextmanager
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,138 +14,22 @@ import pytest
 from sern_runtime.profiles import load_profile
 from sern_sim.models import Flap, LinkModel, RateStep, Window
 from sern_sim.profiles import LinkProfile
-from sern_tools.counters import read_counters
-from sern_tools.demo_scenario import (
-    COMMAND_TOPIC,
-    POSE_TOPIC,
-    RELAY,
-    ROBOT,
-    SITE,
-    STATE_OVERTAKEN_LIMIT,
-    Scenario,
-)
+from sern_tools.demo_scenario import COMMAND_TOPIC, POSE_TOPIC, STATE_OVERTAKEN_LIMIT
 from sern_tools.lab.host import LabError
 from sern_tools.lab.host import run as run_command
 from sern_tools.lab.lab import Lab, Node
-from sern_tools.message_log import read_logs
-from sern_tools.summary import RunFacts, analyse, judge
-from tests.lab.test_sern import (
-    BUSY_S,
-    COUNTER,
-    MAP,
-    Placed,
-    Run,
-    files_for,
-    received,
-    waiting,
-)
+from sern_tools.summary import judge
+from tests.lab.stage import BUSY_S, COUNTER, RUN_S, UDP, ZMQ, Run, Stage, staged
 from tests.support import until
 
 pytestmark = pytest.mark.root
-UDP, ZMQ = "udp", "zmq"
 IDLE, TWICE = 0.2, 2.0
-RUN_S = 4.0
 RUNS_S = {"satcom": 2.5}  # which takes seconds to connect
 RECOVERY_S = 15.0
 """A fresh pose is there so soon after a blackout: no measure of speed, as the machine may be busy with anything."""
 NEW_ADDRESS = "198.18.0.77"
 CALM_WAY = LinkModel(rate_bps=4e6, delay_s=0.025)
 CALM = LinkProfile("calm", "4 Mbit/s, 50 ms round trip", CALM_WAY, CALM_WAY)
-
-
-class Stage:
-    """The three daemons, connected over the lab's link, and what is known of the run."""
-
-    def __init__(self, lab: Lab, directory: Path, profile: LinkProfile, overload: float, run_s: float) -> None:
-        self.lab = lab
-        self.profile = profile
-        self.run_s = run_s
-        self.scenario = Scenario(profile, run_s, overload)
-        self.files = files_for(self.scenario, directory, lab.b)
-        robot = json.loads(self.files[ROBOT].read_text())
-        robot["relay"]["udp"] = True
-        self.files[ROBOT].write_text(json.dumps(robot))
-        self.daemons: dict[str, Placed] = {}
-
-    @property
-    def relay(self) -> Placed:
-        return self.daemons[RELAY]
-
-    @property
-    def site(self) -> Placed:
-        return self.daemons[SITE]
-
-    @property
-    def robot(self) -> Placed:
-        return self.daemons[ROBOT]
-
-    async def start(self) -> None:
-        self.lab.apply(self.profile)
-        # The robot last: what it offers before anybody subscribes is unwanted, not lost.
-        for name, node in ((RELAY, self.lab.b), (SITE, self.lab.b), (ROBOT, self.lab.a)):
-            program = "relay" if name == RELAY else "client"
-            daemon = self.daemons[name] = Placed(node, name, program, self.files[name])
-            await daemon.ready()
-        await self.site.until(lambda: {POSE_TOPIC, COUNTER} <= received(self.site), "hears from the robot")
-        await self.robot.until(lambda: COMMAND_TOPIC in received(self.robot), "hears commands")
-
-    def lane(self) -> str:
-        """The lane that carries the robot's data."""
-        return str(_only(self.robot.json("/api/link"))["lane"])
-
-    async def uses(self, lane: str) -> None:
-        await self.robot.until(lambda: self.lane() == lane, f"uses lane {lane}")
-
-    def delivered(self, topic: str) -> int:
-        return int(self.site.json("/api/topics").get(topic, {}).get("delivered", 0))
-
-    async def hears(self, topic: str = POSE_TOPIC) -> None:
-        """The site gets something new on a topic."""
-        before = self.delivered(topic)
-        await self.site.until(lambda: self.delivered(topic) > before, f"hears {topic}")
-
-    async def play(self, during: Callable[["Stage"], Awaitable[None]] | None = None) -> Run:
-        """Play the profile's script, or what `during` does instead, then stop everything and read what was logged."""
-        origin_ns, before = time.time_ns(), self.lab.traffic()[0]
-        if during is None:
-            await self.lab.play(self.profile, until_s=self.run_s)
-        else:
-            await during(self)
-        after, took_s = self.lab.traffic()[0], (time.time_ns() - origin_ns) / 1e9
-        # Upstream first: what the robot still has goes to the relay, and from there to the site.
-        await self.robot.stop()
-        await self.site.until(lambda: not waiting(self.relay), "has been given everything")
-        await self.site.stop()
-        await self.relay.stop()
-        facts = RunFacts(
-            origin_ns=origin_ns,
-            duration_s=took_s,
-            floor_s={ROBOT: self.profile.up.delay_s, SITE: self.profile.down.delay_s},
-            blackouts=tuple((window.start_s, window.end_s) for window in self.profile.up.blackouts),
-            reliable_topics=frozenset({COUNTER, MAP}),
-            command_lifespans_s={COMMAND_TOPIC: self.scenario.command_lifespan_s},
-            pose_topic=POSE_TOPIC,
-            relay=RELAY,
-            takers={ROBOT: SITE, SITE: ROBOT},
-        )
-        logs = read_logs([(name, self.files[name].with_suffix(".csv")) for name in (ROBOT, RELAY, SITE)])
-        counters = read_counters([file.with_suffix(".summary.json") for file in self.files.values()])
-        return Run(analyse("SERN", logs, facts, counters), 8 * (after.bytes - before.bytes) / took_s)
-
-
-@asynccontextmanager
-async def staged(
-    lab: Lab, directory: Path, profile: LinkProfile, *, overload: float, run_s: float = RUN_S, lane: str = UDP
-) -> AsyncIterator[Stage]:
-    """A stage whose robot has come to use `lane`; what is left of it in the end is killed."""
-    stage = Stage(lab, directory, profile, overload, run_s)
-    try:
-        await stage.start()
-        await stage.uses(lane)
-        yield stage
-    finally:
-        for daemon in stage.daemons.values():
-            daemon.kill()
 
 
 def check(played: Run, profile: LinkProfile) -> None:
@@ -190,14 +73,6 @@ def flapping(flap: Flap, until_s: float) -> tuple[Window, ...]:
     return tuple(
         Window(n * period_s + flap.up_s, (n + 1) * period_s) for n in range(int((until_s - flap.up_s) / period_s))
     )
-
-
-def _only(links: object) -> dict[str, object]:
-    """A client has one link."""
-    if isinstance(links, list):
-        (links,) = links
-    assert isinstance(links, dict)
-    return links
 
 
 # --- what a lab's nodes are made to do ------------------------------------------------------------------------------

@@ -1,6 +1,5 @@
 """The lab keeps its word: what a profile says is what packets meet, and nothing of it stays behind."""
 
-import contextlib
 import math
 import os
 import signal
@@ -253,9 +252,9 @@ async def test_two_at_once_and_nothing_stays_after_kill_9(lab: Lab) -> None:
     assert not [entry for entry in RUN_DIR.iterdir() if entry.name.startswith(f"{other}.")]
 
 
-def processes_of(lab: str) -> list[str]:
-    """Processes whose command line names the lab."""
-    found = []
+def processes_of(lab: str) -> dict[int, str]:
+    """Processes whose command line names the lab, by process id."""
+    found = {}
     for entry in Path("/proc").iterdir():
         if entry.name.isdigit():
             try:
@@ -263,23 +262,22 @@ def processes_of(lab: str) -> list[str]:
             except OSError:
                 continue
             if f"sern-{lab}-" in command or f"sern_tools.lab.keeper {lab} " in command:
-                found.append(command)
+                found[int(entry.name)] = command
     return found
 
 
 async def test_the_next_start_removes_what_a_dead_keeper_left(possible: None) -> None:
     with owner_of_a_lab() as owner:
+        left = str(owner.pid)
         try:
-            # Killed in the middle of its start, keeper first.
-            await until(lambda: f"sern-{owner.pid}-{MIDDLE}" in [entry.name for entry in NETNS_DIR.iterdir()])
-            for task in Path(f"/proc/{owner.pid}/task").iterdir():
-                with contextlib.suppress(FileNotFoundError, ProcessLookupError):  # a thread or a command that has ended
-                    for pid in (task / "children").read_text().split():
-                        if b"lab.keeper" in Path(f"/proc/{pid}/cmdline").read_bytes():
-                            os.kill(int(pid), signal.SIGKILL)
+            # Killed in the middle of its start, keeper first: the owner is held there until its keeper has ended.
+            await until(lambda: f"sern-{left}-{MIDDLE}" in [entry.name for entry in NETNS_DIR.iterdir()])
+            owner.send_signal(signal.SIGSTOP)
+            (keeper,) = (pid for pid, command in processes_of(left).items() if "lab.keeper" in command)
+            os.kill(keeper, signal.SIGKILL)
+            await until(lambda: ended(keeper), "the keeper ends")
         finally:
             owner.kill()
-    left = str(owner.pid)
     assert left in labs()
     await until(lambda: left in sweep(), "the command that makes a namespace ends")
     assert namespaces(left) == [] and left not in labs()

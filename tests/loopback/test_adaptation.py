@@ -98,7 +98,7 @@ async def test_a_cloud_goes_to_its_summary_when_the_link_gets_thin_and_comes_bac
                 (link,) = adaptation.to_json()["links"]
                 return link["history"][-1]["chosen"]["summaries"] if link["history"] else None
 
-            (item,) = robot.bridge.summaries.topics
+            (item,) = robot.bridge.outbound.summaries.topics
             await until(lambda: chosen() == RAW and item.profile.messages, "raw clouds go, and their summary is known")
             proxy.start()
             await until(lambda: chosen() == THIN and item.profile.messages > 5, "thin clouds go")

@@ -31,7 +31,7 @@ async def datagrams_at(port: int, robot: ClientDaemon, relay: RelayDaemon) -> No
 
 
 def refused(robot: ClientDaemon) -> bool:
-    return not robot.core.link.established and "refused our key" in robot.reason
+    return not robot.core.link.established and "refused our key" in robot.news.reason
 
 
 @pytest.mark.parametrize(
@@ -130,7 +130,7 @@ async def test_over_ipc_there_is_no_datagram_lane(tmp_path: Path, caplog: pytest
         robot = await lab.connected(lab.client_file("robot1", DEAD_ENDS, relay={"endpoint": endpoint}))
         name, lanes = ClientName("robot1"), relay.lanes
         assert lanes is not None and not lanes.server.ports
-        assert robot._lane is None, "it asks for none"
+        assert robot.connection.lane is None, "it asks for none"
         lanes.asked(name, offered_ciphers())
         assert "robot1 gets no datagram lane: it has no TCP connection to this relay" in caplog.text
         for link in (relay.hub.links[name], robot.core.link):

@@ -53,7 +53,7 @@ class Commands:
         self.obeyed: list[Obeyed] = []
 
     def watch(self, robot: ClientDaemon) -> None:
-        endpoint = robot.bridge.endpoint
+        endpoint = robot.site.endpoint
         advertise = endpoint.advertise
 
         def watched(info: TopicInfo) -> Publisher:
@@ -107,13 +107,13 @@ def check_stop(commands: Commands) -> None:
 async def driven(robot: ClientDaemon, commands: Commands) -> int:
     """Wait until the robot is being driven; how often its lease has run out so far, as it does on a busy machine."""
     await until(lambda: len(commands.moving) > 10 and commands.obeyed[-1].twist != STILL, "the robot is driven")
-    return robot.bridge.leases_fired
+    return robot.bridge.inbound.leases_fired
 
 
 async def stood(robot: ClientDaemon, commands: Commands, fired: int) -> None:
     """Wait until the lease has run out once more than `fired` times, and said all it has to say."""
-    await until(lambda: robot.bridge.leases_fired > fired and commands.obeyed[-1].twist == STILL)
-    await until(lambda: robot.bridge._timer.deadline_s is None, "the stop command has been repeated")
+    await until(lambda: robot.bridge.inbound.leases_fired > fired and commands.obeyed[-1].twist == STILL)
+    await until(lambda: robot.bridge.inbound.lease_due_s is None, "the stop command has been repeated")
     told = {record.event for record in robot.core.trace.records(TopicName("/robot1/cmd_vel"))}
     assert TraceEvent.LEASE_EXPIRED in told and TraceEvent.DELIVERED in told
 

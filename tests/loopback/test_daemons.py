@@ -13,21 +13,10 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_typestore
 
-from sern_client.daemon import ClientDaemon
-from tests.daemons import START_NS, Lab, Process, balance, bodies, recording, rss_bytes, under, write_bag
+from tests.daemons import START_NS, Lab, balance, bodies, delivered, recording, rss_bytes, under, write_bag
 from tests.support import until
 
 HUSKY, JACKAL = "husky_gps_imu_odom.bag", "jackal_imu_odom.bag"
-
-
-def arrived(site: Process) -> int:
-    """How many messages a site in its own process has been delivered."""
-    topics = site.json("/api/topics")
-    return sum(int(topic["delivered"]) for topic in topics.values() if topic["direction"] == "receive")
-
-
-def count(site: ClientDaemon) -> int:
-    return sum(counters.delivered for counters in site.core.received.topics.values())
 
 
 def size(content: dict[str, list[bytes]]) -> int:
@@ -47,7 +36,7 @@ async def test_recordings_arrive_byte_for_byte_and_in_order(tmp_path: Path, file
         relay = await lab.process(lab.relay_file()).ready()
         site = await lab.process(lab.recorder_file("site", "/.*")).ready()
         robots = [lab.process(lab.player_file(name, bag)) for name, bag in bags.items()]
-        await site.until(lambda: arrived(site) >= sum(map(size, contents.values())), "has everything")
+        await site.until(lambda: delivered(site) >= sum(map(size, contents.values())), "has everything")
         for robot in robots:
             await robot.stop()
             topics = robot.summary()["topics"]
@@ -79,7 +68,7 @@ async def test_cdr_arrives_in_an_mcap(tmp_path: Path) -> None:
         relay = await lab.relay()
         site = await lab.connected(lab.recorder_file("site", "/.*"))
         robot = await lab.connected(lab.player_file("robot1", bag))
-        await until(lambda: count(site) == size(content))
+        await until(lambda: delivered(site) == size(content))
         for daemon in (robot, site, relay):
             await lab.end(daemon)
     assert bodies(tmp_path / "site.mcap") == under("robot1", content)
@@ -95,7 +84,7 @@ async def test_one_recording_plays_as_many_robots(tmp_path: Path) -> None:
         site = await lab.connected(lab.recorder_file("site", "/r[0-9]+/.*"))
         play = {"namespaces": names, "wait_for": [f"/{name}/chat" for name in names]}
         robots = await lab.connected(lab.player_file("fleet", bag, play=play, client={"namespace": "/"}))
-        await until(lambda: count(site) == len(names) * size(content))
+        await until(lambda: delivered(site) == len(names) * size(content))
         for daemon in (robots, site, relay):
             await lab.end(daemon)
     expected: dict[str, list[bytes]] = {}
@@ -111,7 +100,7 @@ async def test_a_burst_of_small_messages_passes_whole(tmp_path: Path) -> None:
         relay = await lab.process(lab.relay_file()).ready()
         sites = [await lab.connected(lab.recorder_file(name, "/.*")) for name in ("site1", "site2")]
         robot = await lab.connected(lab.player_file("robot1", bag))
-        await until(lambda: all(count(site) == 20_000 for site in sites), "both sites have all")
+        await until(lambda: all(delivered(site) == 20_000 for site in sites), "both sites have all")
         for daemon in (robot, *sites):
             await lab.end(daemon)
         await relay.stop()
@@ -138,7 +127,7 @@ async def test_sigterm_under_load_drains_and_everything_is_accounted_for(tmp_pat
         site = await lab.process(lab.recorder_file("site", "/.*", message_log="site.csv")).ready()
         play: dict[str, Any] = {"loop": True, "wait_for": ["/chat", "/fresh"]}
         robot = lab.process(lab.player_file("robot1", bag, play=play, topics=rules, message_log="robot1.csv"))
-        await site.until(lambda: arrived(site) > 1000, "is being sent to")
+        await site.until(lambda: delivered(site) > 1000, "is being sent to")
         first, second = (robot, relay) if who == "robot" else (relay, robot)
         await first.stop()
         if who == "robot":
@@ -166,7 +155,7 @@ async def test_sockets_are_read_in_batches_and_never_by_the_safety_tick_alone(tm
         assert relay.server is not None
         site = await lab.connected(lab.recorder_file("site", "/.*"))
         robot = await lab.connected(lab.player_file("robot1", bag))
-        await until(lambda: count(site) == 3000)
+        await until(lambda: delivered(site) == 3000)
         # Many small messages share a datagram, and many datagrams a look at the socket.
         assert relay.server.socket.messages < 3000
         for daemon in (robot, site, relay):
@@ -181,10 +170,10 @@ async def test_memory_does_not_grow_with_what_passed_through(tmp_path: Path) -> 
         site = await lab.process(lab.recorder_file("site", "/.*", message_log="site.csv")).ready()
         rule = {"match": "/chat", "class": "state", "reliability": "reliable", "max_queue_bytes": 20_000}
         robot = await lab.process(lab.player_file("robot1", bag, play={"loop": True}, topics=[rule])).ready()
-        await site.until(lambda: arrived(site) > 10_000, "has warmed up")
+        await site.until(lambda: delivered(site) > 10_000, "has warmed up")
         before = {process.name: rss_bytes(process) for process in (relay, site, robot)}
         for count_of in range(15_000, 40_001, 5000):  # a deadline each: how fast it goes is not what is asked
-            await site.until(lambda least=count_of: arrived(site) > least, "has much more")
+            await site.until(lambda least=count_of: delivered(site) > least, "has much more")
         grown = {process.name: rss_bytes(process) - before[process.name] for process in (relay, site, robot)}
         assert max(grown.values()) < 16 * 2**20, grown
         for process in (robot, site, relay):
@@ -238,7 +227,7 @@ async def test_a_topic_that_goes_both_ways_is_counted_both_ways(tmp_path: Path) 
             rule = {"match": "/tf", "class": "state", "reliability": "reliable"}
             config = lab.client_file(name, [play, {"kind": "record", "path": name}], topics=[rule], **everywhere)
             robots.append(await lab.connected(config))
-        await until(lambda: all(count(robot) == 50 for robot in robots))
+        await until(lambda: all(delivered(robot) == 50 for robot in robots))
         await until(lambda: all(robot.topics()["/tf"]["delivered"] == 50 for robot in robots))
         for robot in robots:
             topics = robot.topics()

@@ -74,7 +74,7 @@ async def test_blocked_datagrams_are_named_on_both_sides_and_so_is_their_return(
         assert scraped(relay) == {"robot1": 0.0}
         for _ in range(3):
             relay.datagrams.tick()
-            robot.datagrams.tick()
+            robot.connection.datagrams.tick()
         await nat.rebind("127.0.0.3")
         back = "robot1: datagrams pass now"
         await until(lambda: len(said(caplog, back)) == 2, "both sides say that it is up")
@@ -92,8 +92,8 @@ async def test_datagrams_that_stop_in_a_session_are_named_on_both_sides_and_so_i
     async with behind_nat(tmp_path) as (lab, nat, relay):
         robot = await connected(lab, nat)
         await until(lambda: scraped(robot) == {"relay": 1.0} and scraped(relay) == {"robot1": 1.0}, "datagrams pass")
-        for daemon in (relay, robot):
-            daemon.datagrams.tick()  # it has seen that they pass
+        for watched in (relay.datagrams, robot.connection.datagrams):
+            watched.tick()  # it has seen that they pass
         caplog.clear()  # and has said so, if that took longer than its short patience here
         nat.block()
         stopped = f"robot1: {datagram_watch.STOPPED}"
@@ -129,9 +129,9 @@ async def test_a_lane_that_is_switched_off(tmp_path: Path, caplog: pytest.LogCap
             await until(lambda: said(caplog, words), "the client says so")
             assert scraped(robot) == {"relay": 0.0}
         else:
-            await until(lambda: robot.datagrams._without_since_s, "the client looks")
-            robot.datagrams._without_since_s["relay"] -= PATIENCE_S
-            robot.datagrams.tick()
+            await until(lambda: robot.connection.datagrams._without_since_s, "the client looks")
+            robot.connection.datagrams._without_since_s["relay"] -= PATIENCE_S
+            robot.connection.datagrams.tick()
             assert not said(caplog, "datagram")
             assert scraped(robot) == {}
         relay.datagrams.tick()

@@ -208,7 +208,7 @@ async def marks_by_class(robot: ClientDaemon, relay: RelayDaemon, tap: Tap | Cap
         body = b"x" * nbytes
         robot.core.send(channels[priority], body, 0, now=clock.now())
         hub.local.inject(down[priority], body, 0, now=clock.now())
-        robot._kick()
+        robot.connection.wake()
         relay._after()
         return all(sum(size > least for _, size in way) >= 40 for way in (tap.up, tap.down))
 
@@ -313,7 +313,10 @@ async def test_connections_have_the_marks_of_the_file(tmp_path: Path) -> None:
             "robot1", {"kind": "synthetic", "role": "robot"}, relay={"udp": False}, link={"dscp": dscp}
         )
         robot = await lab.connected(file)
-        await until(lambda: robot._express is not None and len(robot._express.paths) == CONNECTIONS, "all are joined")
+        await until(
+            lambda: robot.connection.express is not None and len(robot.connection.express.paths) == CONNECTIONS,
+            "all are joined",
+        )
         server = relay.server
         assert server is not None
         await until(lambda: len(server.express.joined) == CONNECTIONS, "the relay knows that they are")
@@ -323,8 +326,8 @@ async def test_connections_have_the_marks_of_the_file(tmp_path: Path) -> None:
                 assert socket is not None
                 marked.append(socket.getsockopt(socketlib.IPPROTO_IP, socketlib.IP_TOS))
         assert sorted(marked) == [stream, express, express]
-        assert robot._transport is not None and robot._express is not None
-        ours = [robot._transport._dialer, *(each.dialer for each in robot._express._connections)]
+        assert robot.connection.transport is not None and robot.connection.express is not None
+        ours = [robot.connection.transport.dialer, *(each.dialer for each in robot.connection.express.connections)]
         marked = []
         for dialer in ours:
             assert dialer._handle is not None

@@ -19,7 +19,7 @@ import sern_client.cli
 import sern_relay.cli
 from sern_runtime import logs
 from sern_runtime.transport_watch import CUT, ENDED
-from tests.daemons import HOST, START_NS, Lab, Process, balance, write_bag
+from tests.daemons import HOST, START_NS, Lab, Process, balance, delivered, write_bag
 from tests.support import until
 
 CONFIG_ERROR = 2
@@ -225,7 +225,7 @@ async def test_a_key_that_the_relay_knows_by_another_name_is_explained(
         await until(lambda: robot.bridge.rejected_reason)
         why = "your key belongs to robot2, not to robot1"
         assert f"the relay refuses us (name): {why}" in caplog.messages
-        assert robot._ready() == (False, why)
+        assert robot.readiness() == (False, why)
 
 
 def refused(relay: Process, reason: str) -> float:
@@ -309,8 +309,3 @@ async def test_ctrl_c_twice_ends_at_once(tmp_path: Path) -> None:
         assert "SIGINT again: ending at once" in robot.text
         assert "Traceback" not in robot.text
         site.signal(signal.SIGCONT)
-
-
-def delivered(site: Process) -> int:
-    topics = site.json("/api/topics")
-    return sum(int(topic["delivered"]) for topic in topics.values() if topic["direction"] == "receive")

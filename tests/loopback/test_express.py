@@ -11,7 +11,7 @@ from sern_relay.daemon import RelayDaemon
 from sern_runtime.express import CONNECTIONS, MIN_SEGMENTS, ExpressPaths
 from sern_runtime.monitor import TcpHandle, TcpInfo
 from sern_runtime.zmq_socket import SendResult
-from tests.daemons import Lab, bodies, under, write_bag
+from tests.daemons import Lab, bodies, delivered, under, write_bag
 from tests.support import until
 
 ROBOT = ClientName("robot1")
@@ -29,14 +29,10 @@ def uses_express(robot: ClientDaemon, relay: RelayDaemon) -> bool:
     return robot.core.link.lanes.express is not None and link is not None and link.lanes.express is not None
 
 
-def arrived(site: ClientDaemon) -> int:
-    return sum(counters.delivered for counters in site.core.received.topics.values())
-
-
 def joined(relay: RelayDaemon, client: str = ROBOT) -> list[int]:
     """File descriptors of the client's connections for class control."""
     assert relay.server is not None
-    return [each.fd for each in relay.server.express.joined.values() if each.client == client]
+    return [each.fd for each in relay.server.express.joined if each.client == client]
 
 
 @pytest.mark.parametrize("secure", [True, False], ids=["keys", "insecure"])
@@ -46,7 +42,7 @@ async def test_commands_arrive_over_it_whatever_becomes_of_its_connections(tmp_p
         relay = await lab.relay()
         site = await lab.connected(lab.recorder_file("site", "/.*", relay=STREAM))
         robot = await lab.client(player(lab, bag))
-        await until(lambda: uses_express(robot, relay) and arrived(site) > 100, "class control goes there")
+        await until(lambda: uses_express(robot, relay) and delivered(site) > 100, "class control goes there")
         assert len(joined(relay)) == CONNECTIONS
         server = relay.server
         assert server is not None
@@ -56,7 +52,7 @@ async def test_commands_arrive_over_it_whatever_becomes_of_its_connections(tmp_p
             connection.handle.cut()
         await until(lambda: joined(relay) == [] or robot.core.link.lanes.express is None, "the connections are lost")
         await until(lambda: uses_express(robot, relay) and len(joined(relay)) == CONNECTIONS, "they come back")
-        await until(lambda: arrived(site) == COUNT, "every command arrives")
+        await until(lambda: delivered(site) == COUNT, "every command arrives")
         assert robot.core.link.established
         for daemon in (robot, site, relay):
             await lab.end(daemon)
@@ -69,11 +65,11 @@ async def test_it_is_joined_again_after_a_restart_of_the_relay(tmp_path: Path) -
         relay = await lab.relay()
         site = await lab.connected(lab.recorder_file("site", "/.*", relay=STREAM))
         robot = await lab.client(player(lab, bag))
-        await until(lambda: uses_express(robot, relay) and arrived(site) > 100)
+        await until(lambda: uses_express(robot, relay) and delivered(site) > 100)
         await lab.end(relay)
         relay = await lab.relay(tmp_path / "relay.yaml")
         await until(lambda: uses_express(robot, relay), "it joins the new session")
-        await until(lambda: arrived(site) == COUNT, "every command arrives")
+        await until(lambda: delivered(site) == COUNT, "every command arrives")
         for daemon in (robot, site, relay):
             await lab.end(daemon)
     assert bodies(tmp_path / "site.bag") == under("robot1", bodies(bag))
@@ -85,7 +81,7 @@ async def test_it_can_be_switched_off(tmp_path: Path) -> None:
         relay = await lab.relay()
         site = await lab.connected(lab.recorder_file("site", "/.*", relay=STREAM))
         robot = await lab.client(player(lab, bag, express=False))
-        await until(lambda: arrived(site) == 100 and joined(relay, "site"))
+        await until(lambda: delivered(site) == 100 and joined(relay, "site"))
         assert joined(relay) == []
         for daemon in (robot, site, relay):
             await lab.end(daemon)

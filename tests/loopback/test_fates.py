@@ -3,7 +3,6 @@ and connections that are cut while messages are under way."""
 
 from pathlib import Path
 
-from sern_client.daemon import ClientDaemon
 from sern_core.vocabulary.types import ClientName
 from sern_runtime.profiles import load_profile
 from sern_sim.models import LinkModel
@@ -23,14 +22,10 @@ from sern_tools.message_log import read_logs
 from sern_tools.ports import free_ports
 from sern_tools.proxy import Route, ShapingProxy
 from sern_tools.summary import Result, RunFacts, analyse, judge
-from tests.daemons import HOST, Lab
+from tests.daemons import HOST, Lab, delivered
 from tests.support import until
 
 NAMES = (ROBOT, RELAY, SITE)
-
-
-def delivered(daemon: ClientDaemon, topic: str) -> int:
-    return sum(counters.delivered for name, counters in daemon.core.received.topics.items() if name == topic)
 
 
 def read(directory: Path) -> Result:

@@ -11,7 +11,7 @@ import pytest
 import zmq
 
 from sern_client.endpoints.synthetic import SyntheticEndpoint
-from sern_core.stream.out_channel import MESSAGE_OVERHEAD_BYTES
+from sern_core.stream.prices import MESSAGE_OVERHEAD_BYTES
 from sern_core.vocabulary.types import ClientName, DropReason, Encoding, PriorityClass, TopicName
 from sern_relay.daemon import RelayDaemon
 from sern_relay.feed import InjectCounters, RelayFeed

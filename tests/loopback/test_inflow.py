@@ -179,7 +179,7 @@ async def test_the_frames_of_an_unwanted_message_are_dropped_in_slices(
     assert served.refused == ["a message of several frames"]
     assert len(slices) >= 5
     assert served.router.malformed == 1
-    assert not served.router._skipping
+    assert not served.router.skipping
     hostile.close(linger=0)
     served.close()
 

@@ -46,11 +46,11 @@ async def test_a_replaced_key_is_cut_off_over_ipc_and_comes_back_when_it_is_put_
         old = public.read_text()
         lab.make_keys("robot1")  # the new pair is at the relay; the client runs with the old one
         relay.reload()
-        assert relay.server._sessions == {}
-        await until(lambda: "refused our key" in robot.reason)
+        assert list(relay.server.clients.sessions()) == []
+        await until(lambda: "refused our key" in robot.news.reason)
         refused = relay.zap.counters.unknown_key
         await until(lambda: relay.zap is not None and relay.zap.counters.unknown_key > refused, "it tries again")
-        assert relay.server._sessions == {} and not robot.core.link.established
+        assert list(relay.server.clients.sessions()) == [] and not robot.core.link.established
         assert caplog.text.count("robot1 lost a key; 1 connections cut") == 1
         public.write_text(old)
         relay.reload()
@@ -89,7 +89,7 @@ async def test_a_connection_that_outlives_its_key_is_not_heard(
                 await silent.send(hello("robot2"))
             await silent.cut()
             assert server.socket.messages > messages
-            assert server._sessions == {} and silent.received == []
+            assert list(server.clients.sessions()) == [] and silent.received == []
             assert server.revoked == 1
             assert caplog.text.count(f"the key of robot2 {said}") == 1
         await lab.end(relay)

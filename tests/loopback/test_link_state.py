@@ -164,11 +164,11 @@ async def test_topics_of_a_robot_that_is_gone_end_and_come_back(tmp_path: Path) 
         await until(lambda: open_() == everything, "all is there")
         robot.signal(signal.SIGSTOP)  # SIGSTOP: its streams go on when it does
         await until(lambda: open_() == {"/robot1/sern/link"}, "its topics end")
-        assert not site.bridge.validate()
+        assert not site.check.tables.validate()
         robot.signal(signal.SIGCONT)
         await until(lambda: open_() == everything, "its topics are back")
         await until(lambda: (got := received("/robot1/map")) is not None and got.count >= 2, "with what was latched")
-        assert not site.bridge.validate()
+        assert not site.check.tables.validate()
 
 
 async def test_a_recording_has_the_state_of_the_link_if_it_is_to(tmp_path: Path) -> None:

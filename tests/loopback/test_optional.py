@@ -15,7 +15,7 @@ from sern_runtime.adaptation import Adaptation
 from sern_runtime.link_metrics import AgeHistograms
 from sern_runtime.message_log import MessageLog
 from sern_tools.ports import free_ports
-from tests.daemons import HOST, Lab
+from tests.daemons import HOST, Lab, delivered
 from tests.support import until
 
 ROBOT = {"kind": "synthetic", "role": "robot", "topics": 3}
@@ -24,10 +24,6 @@ QUICK = {"interval_s": 0.2}
 
 def broken(*_: object, **__: object) -> NoReturn:
     raise ZeroDivisionError("injected")
-
-
-def arrived(site: ClientDaemon) -> int:
-    return sum(counters.delivered for counters in site.core.received.topics.values())
 
 
 async def get(url: str) -> tuple[int, str]:
@@ -60,14 +56,14 @@ async def test_forwarding_goes_on(
         relay = await lab.relay(lab.relay_file(adaptation=QUICK, **more))
         site = await lab.connected(lab.recorder_file("site", "/.*", message_log="site.csv"))
         robot = await lab.connected(lab.client_file("robot1", ROBOT, adaptation=QUICK))
-        await until(lambda: arrived(site) > 20, "messages flow")
+        await until(lambda: delivered(site) > 20, "messages flow")
         daemons: dict[str, RelayDaemon | ClientDaemon] = {"relay": relay, "site": site, "robot": robot}
         with monkeypatch.context() as patch:
             patch.setattr(kind, method, broken)
             for name in where:
                 await until(lambda name=name: daemons[name].parts.failures[part] > 0, f"{name} has counted it")  # type: ignore[misc]
-            before = arrived(site)
-            await until(lambda: arrived(site) > before + 50, "messages still flow")
+            before = delivered(site)
+            await until(lambda: delivered(site) > before + 50, "messages still flow")
         for daemon in daemons.values():
             assert not any(task.done() for task in daemon.tasks)
         assert robot.core.link.established and site.core.link.established

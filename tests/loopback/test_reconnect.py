@@ -6,20 +6,14 @@ from pathlib import Path
 
 import pytest
 
-from sern_client.daemon import ClientDaemon
 from sern_core.path.lanes import LANE_UDP
 from sern_core.vocabulary.types import ClientName, TopicName
 from sern_runtime.config.keys import PublicKey, PublicKeys, load_public, write_public
-from tests.daemons import Lab, Process, bodies, under, write_bag
+from tests.daemons import Lab, Process, bodies, delivered, under, write_bag
 from tests.support import until
 
 CHAT = TopicName("/robot1/chat")
 STEADY = {"rate": 1}  # a message of each topic every millisecond
-
-
-def count(site: ClientDaemon, topic: TopicName = CHAT) -> int:
-    counters = site.core.received.topics.get(topic)
-    return 0 if counters is None else counters.delivered
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL], ids=["SIGTERM", "kill -9"])
@@ -33,12 +27,12 @@ async def test_a_reliable_stream_goes_on_over_a_restart_of_the_relay(
         site = await lab.connected(lab.recorder_file("site", "/.*"))
         robot = await lab.connected(lab.player_file("robot1", bag, play=STEADY))
         for _restart in (1, 2):
-            least = min(count(site) + 200, 1999)
-            await until(lambda least=least: count(site) > least)  # type: ignore[misc]
+            least = min(delivered(site, CHAT) + 200, 1999)
+            await until(lambda least=least: delivered(site, CHAT) > least)  # type: ignore[misc]
             relay.signal(number)
             assert await relay.ended() == (0 if number is signal.SIGTERM else -number)
             relay = await lab.process(relay.config).ready()
-        await until(lambda: count(site) == 2000 and count(site, TopicName("/robot1/log")) == 2000)
+        await until(lambda: delivered(site, CHAT) == 2000 and delivered(site, "/robot1/log") == 2000)
         assert caplog.text.count("dropped") == 0
         await lab.end(robot)
         await lab.end(site)
@@ -60,11 +54,11 @@ async def test_a_new_server_key_is_taken_up_without_loss(tmp_path: Path) -> None
         write_public(tmp_path / "relay.pub", PublicKeys(ClientName("relay"), keys), replace=True)
         site = await lab.connected(lab.recorder_file("site", "/.*"))
         robot = await lab.connected(lab.player_file("robot1", bag, play=STEADY))
-        await until(lambda: count(site) > 200)
+        await until(lambda: delivered(site, CHAT) > 200)
         shutil.move(tmp_path / "new.key", tmp_path / "relay.key")
         await relay.stop()
         relay = await lab.process(config).ready()
-        await until(lambda: count(site) == 2000, "everything arrives over the relay with its new key")
+        await until(lambda: delivered(site, CHAT) == 2000, "everything arrives over the relay with its new key")
         await lab.end(robot)
         await lab.end(site)
         await relay.stop()
@@ -80,19 +74,14 @@ async def test_a_site_that_restarts_misses_nothing_and_gets_nothing_twice(tmp_pa
         for path in ("first", "second", "third"):
             site = await lab.process(lab.recorder_file("site", "/.*", path=path)).ready()
             wanted = min(len(arrived) + 400, 2500) if path != "third" else 2500
-            base = len(arrived)
-            await site.until(lambda base=base, site=site, wanted=wanted: base + delivered(site) >= wanted, "has more")
+            more = wanted - len(arrived)
+            await site.until(lambda site=site, more=more: delivered(site, CHAT) >= more, "has more")
             await site.stop()
             recording = tmp_path / f"{path}.bag"
             if recording.exists():  # on a slow machine the earlier ones may have had everything
                 arrived += bodies(recording).get("/robot1/chat", [])
         await lab.end(robot)
     assert arrived == bodies(bag)["/chat"]
-
-
-def delivered(site: Process) -> int:
-    topics = site.json("/api/topics")
-    return int(topics.get("/robot1/chat", {"delivered": 0})["delivered"])
 
 
 def confirmed(robot: Process) -> int:
@@ -106,7 +95,7 @@ async def test_a_robot_that_is_killed_begins_a_new_stream(tmp_path: Path) -> Non
         relay = await lab.relay()
         site = await lab.connected(lab.recorder_file("site", "/.*"))
         robot = lab.process(lab.player_file("robot1", bag, play=STEADY))
-        await until(lambda: count(site) > 200)
+        await until(lambda: delivered(site, CHAT) > 200)
         robot.kill()
         await until(lambda: not relay.hub.links[ClientName("robot1")].snapshot()["up"], "the relay notices")
         robot = await lab.process(robot.config).ready()

@@ -49,7 +49,7 @@ class Traffic:
             else:
                 self.relay.hub.local.inject(self._handle, BODY, 0, now=now)
         self.relay._after()
-        self.site._kick()
+        self.site.connection.wake()
 
     def sessions(self) -> set[int]:
         """The datagram sessions that carry data now, by their number."""
@@ -91,13 +91,16 @@ async def test_a_lane_that_the_relay_gave_up_is_asked_for_again(
         relay = await lab.relay()
         site = await lab.connected(lab.client_file("site", {"kind": "synthetic", "role": "operator"}))
         traffic = Traffic(relay, site, down=True)
-        assert relay.lanes is not None and site._lane is not None
+        assert relay.lanes is not None and site.connection.lane is not None
         for _ in range(2):
             await until(traffic.sessions)
             session = relay.lanes._lanes[SITE][0]
             relay.lanes._gone(SITE, session)
             await until(lambda old=session.id: traffic.sessions() - {old})  # type: ignore[misc]
-        await until(lambda: site._lane is not None and site._lane._ask_s is None, "it works, so nothing is asked for")
-        assert site._lane._pause_s == 0.2
+        await until(
+            lambda: site.connection.lane is not None and site.connection.lane.ask_s is None,
+            "it works, so nothing is asked for",
+        )
+        assert site.connection.lane.pause_s == 0.2
         await lab.end(site)
         await lab.end(relay)

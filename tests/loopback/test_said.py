@@ -9,7 +9,7 @@ import pytest
 import zmq
 
 from sern_client import relay_name
-from sern_client.daemon import SILENT
+from sern_client.link_news import SILENT
 from sern_client.relay_name import UnresolvedError
 from sern_core.link.handshake import NEW_SESSION
 from sern_core.path.lanes import LANE_UDP
@@ -35,8 +35,8 @@ async def test_a_topic_that_no_rule_names_is_said_once(tmp_path: Path, caplog: p
         play = {"loop": True, "wait_for": []}
         robot = await lab.connected(lab.player_file("robot1", bag, play=play, topics=list(CHAT), discovery=discovery))
         again = TopicInfo(TopicName("/chta"), "std_msgs/msg/String", Encoding.ROS1)
-        robot.bridge.topic_removed(again.name)  # a node that comes and goes is no news
-        robot.bridge.topic_added(again)
+        robot.bridge.outbound.topic_removed(again.name)  # a node that comes and goes is no news
+        robot.bridge.outbound.topic_added(again)
         said = [message for message in caplog.messages if "stays here" in message]
         assert said == ["/chta (std_msgs/msg/String) stays here: no rule in `topics` names it (discovery.mode: manual)"]
 
@@ -60,8 +60,8 @@ async def test_a_relay_that_does_not_resolve_is_said_at_once_and_again(
         assert first.startswith(f"tcp://relay.example:{lab.port}: {text}")
         assert first.endswith("; trying again until it does")
         assert " s now" in second
-        assert robot._ready().reason.startswith(text)
-        assert robot._name is not None
+        assert robot.readiness().reason.startswith(text)
+        assert robot.connection.name is not None
 
         async def resolves(_host: str, _port: int) -> str:
             return "192.0.2.1"
@@ -69,7 +69,7 @@ async def test_a_relay_that_does_not_resolve_is_said_at_once_and_again(
         monkeypatch.setattr(relay_name, "resolve", resolves)
         again = "relay.example resolves again, to 192.0.2.1, after"
         await until(lambda: any(again in message for message in caplog.messages))
-        assert robot._ready().reason.endswith(" (relay.example is 192.0.2.1)")
+        assert robot.readiness().reason.endswith(" (relay.example is 192.0.2.1)")
 
 
 async def test_why_a_name_does_not_resolve() -> None:
@@ -95,15 +95,15 @@ async def test_two_processes_with_one_name_are_told_of_each_other(
         second = await lab.connected(lab.client_file("robot1", ROBOT))
         said = "another process connected as robot1 from 127.0.0.1:"
         for daemon in (first, second):
-            await until(lambda daemon=daemon: daemon._ready().reason.startswith(said), "is displaced, and says so")  # type: ignore[misc]
-            assert daemon._why() == daemon._ready().reason
+            await until(lambda daemon=daemon: daemon.readiness().reason.startswith(said), "is displaced, and says so")  # type: ignore[misc]
+            assert daemon.why() == daemon.readiness().reason
         # One line for each time that it is displaced, and one at the relay.
         await lab.end(second)
-        await until(lambda: first._ready().ok, "goes on alone")
+        await until(lambda: first.readiness().ok, "goes on alone")
         await until(lambda: len(relay.hub.relayed) == len(first.core.link.sender.channels) > 0, "has its topics again")
-        assert first.bridge.refusals == 0
+        assert first.bridge.outbound.refusals == 0
         own = [record for record in caplog.records if said in record.getMessage()]
-        assert {record.name for record in own} == {"sern_client.daemon", "sern_relay.daemon"}
+        assert {record.name for record in own} == {"sern_client.link_news", "sern_relay.daemon"}
         at_relay = [record for record in own if record.name == "sern_relay.daemon"]
         assert relay.refusals["displaced"] == len(at_relay) >= 2
         assert at_relay[0].getMessage().endswith(" has no session any more")
@@ -134,7 +134,7 @@ async def test_an_outage_that_began_with_silence_is_counted_from_there(
         relay = await lab.relay()
         robot = await lab.connected(lab.client_file("robot1", ROBOT, relay={"udp": False}))
         assert relay.server is not None
-        robot._outages.look("relay", lost=True, gone="silent", back="back", now=clock.now() - 100.0)
+        robot.news.outages.look("relay", lost=True, gone="silent", back="back", now=clock.now() - 100.0)
         relay.server.cut_client("robot1")
         said = f"{lab.endpoint}: the link is there again, after "
         await until(lambda: any(message.startswith(said) for message in caplog.messages))
@@ -148,7 +148,7 @@ async def test_a_relay_that_goes_on_with_no_session_is_said_in_words(
     async with Lab(tmp_path, "robot1") as lab:
         await lab.relay()
         robot = await lab.connected(lab.client_file("robot1", ROBOT))
-        robot._link_down(NEW_SESSION)
+        robot.link_down(NEW_SESSION)
         assert caplog.messages[-1] == f"{lab.endpoint}: the session could not go on, and another begins"
 
 
@@ -178,7 +178,7 @@ async def test_a_session_that_outlives_its_connection_says_that_there_is_another
         assert relay.server.connections.cut_user("robot1") >= 1
         await until(lambda: any("the connection is there again, after " in message for message in caplog.messages))
         assert not any("the link is there again" in message for message in caplog.messages)  # it was never gone
-        assert robot._said == set()
+        assert robot.news.said == set()
 
 
 async def test_a_reload_that_fails_twice_says_what_is_wrong_now_until_one_works(
@@ -212,7 +212,7 @@ async def test_before_anything_has_come_back_nothing_else_is_said(
     async with Lab(tmp_path, "robot1") as lab:
         with socket.create_server(("127.0.0.1", lab.port)):  # as a relay that was stopped: the kernel takes connections
             robot = await lab.client(lab.client_file("robot1", ROBOT))
-            await until(lambda: robot._ready().reason == WAITING, "has a connection")
+            await until(lambda: robot.readiness().reason == WAITING, "has a connection")
             assert not [record for record in caplog.records if record.levelname == "WARNING"]
             await lab.drop(robot)
 

@@ -25,6 +25,7 @@ from sern_client.daemon import ClientDaemon
 from sern_core.vocabulary.types import ClientName, TopicName
 from sern_core.wire import framing
 from sern_relay.daemon import REFUSAL_CODES, RelayDaemon
+from sern_relay.relay_metrics import refused_connections
 from sern_relay.server import MAX_PORTS
 from sern_runtime.config.keys import (
     PublicKey,
@@ -38,7 +39,8 @@ from sern_runtime.config.keys import (
 from sern_runtime.monitor import SocketMonitor
 from sern_runtime.udp import UdpSession
 from sern_runtime.zmq_socket import DealerSocket, make_client
-from tests.daemons import ALLOW_ALL, HOST, Lab, bodies, write_bag
+from sern_tools.harness.files import ALLOW_ALL
+from tests.daemons import HOST, Lab, bodies, write_bag
 from tests.support import until
 
 CLIENTS = ("robot1", "robot2", "site")
@@ -104,7 +106,7 @@ class Bystanders:
         await until(lambda: self.arrived > count + 50, "the stream goes on")
 
     async def refused(self, reason: str) -> None:
-        await until(lambda: dict(self.relay._refused_connections())[reason,] > 0, f"the relay counts {reason}")
+        await until(lambda: dict(refused_connections(self.relay.server))[reason,] > 0, f"the relay counts {reason}")
 
 
 @asynccontextmanager
@@ -146,7 +148,7 @@ async def test_a_stranger_and_a_client_without_keys_are_counted_and_shut_out(
         (tmp_path / "plain").mkdir()
         async with Lab(tmp_path / "plain", secure=False, relay_port=world.lab.port) as plain:
             client = await plain.client(plain.client_file("robot2", DEAD_ENDS))
-            await until(lambda: "one side has keys configured and the other has not" in client.reason)
+            await until(lambda: "one side has keys configured and the other has not" in client.news.reason)
         await world.refused("handshake")
 
 
@@ -191,7 +193,7 @@ async def test_a_claimed_routing_id_is_never_heard(tmp_path: Path, caplog: pytes
     async with bystanders(tmp_path, caplog) as world:
         server = world.relay.server
         assert server is not None
-        [victim] = [rid for rid, session in server._sessions.items() if session.port.client == "robot1"]
+        [victim] = [each.routing_id for each, _served in server.clients.sessions() if each.client == "robot1"]
         keys = load_secret(world.lab.directory / "robot2.key")
         for identity in (b"robot1", victim + b"\0"):
             async with Stranger(world.lab, keys, identity=identity) as impostor:
@@ -218,7 +220,7 @@ async def test_nobody_joins_the_session_of_another(tmp_path: Path, caplog: pytes
                 assert impostor.received == []
             assert server.express.refused == number
         await world.refused("join")
-        assert not any(joined.client == "robot2" for joined in server.express.joined.values())
+        assert not any(joined.client == "robot2" for joined in server.express.joined)
 
 
 async def test_one_client_has_a_few_connections(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -268,7 +270,7 @@ async def test_connections_for_class_control_count_over_all_sessions(
                 await until(partial(joined, count), "it has joined")
             await lane.send(framing.encode_handshake(framing.Kind.CLOSE, tag, 0, {"code": "bye", "why": "bye"}))
             await until(lambda: "robot2" not in world.relay.hub.links, "it is forgotten")
-            assert sum(each.client == "robot2" for each in server.express.joined.values()) <= 2
+            assert sum(each.client == "robot2" for each in server.express.joined) <= 2
         assert server.express.refused == 0
 
 
@@ -372,7 +374,7 @@ async def test_access_rules_hold_and_name_what_they_refuse(tmp_path: Path, caplo
         relay = await lab.relay(lab.relay_file(access=rules))
         site = await lab.connected(lab.recorder_file("site", "/robot1/.*", "/robot2/.*"))
         robot = await lab.connected(lab.player_file("robot1", bag, play={"wait_for": ["/mine"]}))
-        await until(lambda: robot.bridge.refusals == 1)
+        await until(lambda: robot.bridge.outbound.refusals == 1)
         await until(lambda: sum(c.delivered for c in site.core.received.topics.values()) == 20)
         assert "the relay refuses /robot1/secret (forbidden): robot1 may not publish /robot1/secret" in caplog.text
         assert {code: count for code, count in relay.refusals.items() if count} == {"forbidden": 1}
@@ -381,7 +383,7 @@ async def test_access_rules_hold_and_name_what_they_refuse(tmp_path: Path, caplo
         assert summary["/robot1/secret"]["delivered"] == 0
         # Somebody whom no rule names may connect, and do nothing.
         other = await lab.connected(lab.player_file("robot2", bag, play={"wait_for": []}))
-        await until(lambda: other.bridge.refusals == 2)
+        await until(lambda: other.bridge.outbound.refusals == 2)
         for daemon in (other, site, relay):
             await lab.end(daemon)
     assert set(bodies(tmp_path / "site.bag")) == {"/robot1/mine"}
@@ -398,7 +400,7 @@ async def test_a_second_owner_of_a_global_name_is_refused_by_name(
         first = await lab.connected(lab.player_file("robot1", bag, **everywhere))
         await until(lambda: sum(c.delivered for c in site.core.received.topics.values()) == 20)
         second = await lab.connected(lab.player_file("robot2", bag, play={"wait_for": []}, **everywhere))
-        await until(lambda: second.bridge.refusals == 1)
+        await until(lambda: second.bridge.outbound.refusals == 1)
         [line] = [m for m in caplog.messages if m.startswith("the relay refuses /odom")]
         assert "robot1" in line
         for daemon in (second, first, site, relay):
@@ -427,9 +429,9 @@ async def test_a_revoked_key_is_cut_off_both_ways_and_comes_back_when_allowed(
         key = lab.clients_dir / "robot2.pub"
         away = key.rename(tmp_path / "robot2.pub")
         relay.reload()
-        assert [s.port.client for s in relay.server._sessions.values() if s.port.client == "robot2"] == []
+        assert [each for each, _served in relay.server.clients.sessions() if each.client == "robot2"] == []
         before = heard[topic].delivered
-        await until(lambda: "refused our key" in second.reason)
+        await until(lambda: "refused our key" in second.news.reason)
         refused = relay.zap.counters.unknown_key
         assert refused > 0
         taken = sum(c.delivered for c in second.core.received.topics.values())
@@ -453,7 +455,7 @@ async def test_a_rotated_key_ends_the_connections_of_the_old_one(
         robot = await lab.connected(lab.client_file("robot1", DEAD_ENDS))
         lab.make_keys("robot1")  # the new pair is at the relay; the client runs with the old one
         relay.reload()
-        await until(lambda: "refused our key" in robot.reason)
+        await until(lambda: "refused our key" in robot.news.reason)
         assert "robot1 lost a key; 1 connections cut" in caplog.text
         await lab.end(robot)
         robot = await lab.connected(tmp_path / "robot1.yaml")
@@ -486,7 +488,7 @@ async def test_a_silent_connection_does_not_outlive_its_key(
             assert len(table) == 2 and not any(connection.ended for connection in table.values())
             relay._end_lapsed()
             assert all(connection.ended for connection in table.values())
-            assert relay.server._sessions == {}
+            assert list(relay.server.clients.sessions()) == []
             await loud.cut()
             await silent.cut()
             monkeypatch.undo()
@@ -523,7 +525,7 @@ async def test_a_rule_taken_away_ends_the_stream_and_given_back_restores_it(
         await until(lambda: counters and next(iter(counters.values())).delivered > 10)
         lab.relay_file(access=[{"client": "site", "subscribe": [".*"]}], http={"listen": None})
         relay.reload()
-        await until(lambda: robot.bridge.refusals == 1)
+        await until(lambda: robot.bridge.outbound.refusals == 1)
         assert "robot1 may no longer publish /robot1/count: the access rules have changed" in caplog.text
         assert robot.core.link.established and site.core.link.established
         for daemon in (robot, site, relay):

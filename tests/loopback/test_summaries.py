@@ -75,7 +75,7 @@ async def test_clouds_arrive_as_thin_clouds_scans_and_masks(tmp_path: Path, enco
         streams = {stream.stream.id.topic: stream.stream for stream in site.core.link.taking.streams.values()}
         assert streams[names[1]].attributes.items() >= {"summary": "scan", "summary_of": "/robot1/points"}.items()
         assert streams[names[0]].spec.priority == 2 and streams[names[1]].spec.priority == 1
-        for summary in robot.bridge.summaries.topics:
+        for summary in robot.bridge.outbound.summaries.topics:
             assert summary.profile.messages >= 3 and 0 < summary.profile.bytes_ratio < 0.15
             assert 0 < summary.profile.seconds_per_message < 1
         assert balance(robot.topics()) == []
@@ -112,12 +112,12 @@ async def test_the_level_may_change_at_any_time(tmp_path: Path) -> None:
         site = await lab.connected(lab.recorder_file("site", "/robot1/points"))
         robot = await lab.connected(lab.client_file("robot1", endpoint, topics=[rule]))
         topic = TopicName("/robot1/points")
-        handle = robot.bridge.summaries.topics[0]
+        handle = robot.bridge.outbound.summaries.topics[0]
         simulated: SyntheticEndpoint = endpoint_of(robot, SyntheticEndpoint)
         for _ in range(8):
             await taken(simulated, 10)
             handle.set_level(SummaryLevel.RAW if handle.level is SummaryLevel.SUMMARY else SummaryLevel.SUMMARY)
-        robot.bridge.stop_sources()
+        robot.bridge.outbound.stop_sources()
         accepted = simulated.counters.accepted
         await delivered(site, topic, accepted)
         for daemon in (robot, site, relay):
@@ -149,12 +149,12 @@ async def test_patches_arrive_as_whole_grids(tmp_path: Path, late: bool) -> None
         relay = await lab.relay()
         site = None if late else await lab.connected(lab.recorder_file("site", "/robot1/map"))
         robot = await lab.connected(lab.client_file("robot1", play, topics=[rule]))
-        await until(lambda: endpoint_of(robot, BagEndpoint).exhausted and not robot.bridge.pending)
+        await until(lambda: endpoint_of(robot, BagEndpoint).exhausted and not robot.bridge.outbound.pending)
         updates = robot.core.link.sender.ledger.topics[TopicName("/robot1/map_updates")]
         await until(lambda: updates.offered and updates.delivered == updates.offered, "updates are delivered")
         if site is None:
             site = await lab.connected(lab.recorder_file("site", "/robot1/map"))
-        rebuilds = site.bridge.rebuilds
+        rebuilds = site.bridge.inbound.rebuilds
         updates_topic = TopicName("/robot1/map_updates")
         if late:  # what came after the last whole grid, which is the one at which the map grew
             await delivered(site, topic, 1)
@@ -193,12 +193,12 @@ async def test_transforms_of_many_nodes_become_one_message(tmp_path: Path) -> No
             messages.append(("/tf", scenes.TF, tf_message(move, encoding=ros1)))
     bag = bag_of(tmp_path / "tf.bag", messages, latched=("/tf_static",))
     play = {"kind": "bag", "path": str(bag), "rate": 4.0, "wait_for": ["/tf"], "start_delay_s": 0.2}
-    rule = {"match": "/tf|/tf_static", "class": "state", "max_rate_hz": 10.0}
+    rule = {"match": "/tf|/tf_static", "class": "state", "reliability": "reliable", "max_rate_hz": 10.0}
     async with Lab(tmp_path, "robot1", "site", "late") as lab:
         relay = await lab.relay()
         site = await lab.connected(lab.recorder_file("site", "/tf", "/tf_static"))
         robot = await lab.connected(lab.client_file("robot1", play, client={"namespace": "/"}, topics=[rule]))
-        await until(lambda: endpoint_of(robot, BagEndpoint).exhausted and not robot.bridge.pending)
+        await until(lambda: endpoint_of(robot, BagEndpoint).exhausted and not robot.bridge.outbound.pending)
         late = await lab.connected(lab.recorder_file("late", "/tf_static"))
         arrived = site.core.received.topics
         sent = robot.core.link.sender.ledger.topics[TopicName("/tf")]
@@ -236,7 +236,7 @@ async def test_what_cannot_be_read_is_counted_and_said_once(tmp_path: Path, capl
         relay = await lab.relay()
         site = await lab.connected(lab.recorder_file("site", "/robot1/points/voxel", "/robot1/map", "/robot1/tf"))
         robot = await lab.connected(lab.client_file("robot1", play, topics=rules))
-        await until(lambda: endpoint_of(robot, BagEndpoint).exhausted and not robot.bridge.pending)
+        await until(lambda: endpoint_of(robot, BagEndpoint).exhausted and not robot.bridge.outbound.pending)
         for name, count in (("points/voxel", 2), ("map", 2), ("tf", 2)):
             await delivered(site, TopicName(f"/robot1/{name}"), count)
         view = robot.topics()["/robot1/points/voxel"]

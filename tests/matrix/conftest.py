@@ -12,7 +12,6 @@ import pytest
 from tests.matrix import figures
 from tests.matrix.play import Play
 
-LONG = "lab_long"
 FIGURES = "--figures"
 PLAYED = pytest.StashKey[list[figures.Played]]()
 
@@ -43,13 +42,3 @@ def pytest_configure(config: pytest.Config) -> None:
     config.stash[PLAYED] = []
     if config.getoption(FIGURES, None) is not None and hasattr(config, "workerinput"):
         raise pytest.UsageError(f"{FIGURES} needs all cells in one process: leave out -n")
-    config.addinivalue_line("markers", f"{LONG}: longer runs; only when asked for by -m (make lab)")
-
-
-def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    if LONG in config.getoption("markexpr", ""):
-        return
-    long = [item for item in items if item.get_closest_marker(LONG)]
-    if long:
-        config.hook.pytest_deselected(items=long)
-        items[:] = [item for item in items if item not in long]

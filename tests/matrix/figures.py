@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from benchmarks.common import Report
+from benchmarks.common import Report, percentile
 from tests.matrix.cells import CELLS, Cell
 from tests.matrix.play import POSE, Play
 
@@ -44,4 +44,4 @@ def report(played: Sequence[Played]) -> Report:
 def _ages(ages_s: Sequence[float]) -> dict[str, float]:
     if not ages_s:
         return {}
-    return {"pose_p50_ms": 1e3 * ages_s[len(ages_s) // 2], "pose_p99_ms": 1e3 * ages_s[int(0.99 * len(ages_s))]}
+    return {"pose_p50_ms": 1e3 * percentile(ages_s, 0.5), "pose_p99_ms": 1e3 * percentile(ages_s, 0.99)}

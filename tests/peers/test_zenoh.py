@@ -13,7 +13,6 @@ from sern_client.endpoints.base import Endpoint, Held, ServiceEndpoint, ServiceI
 from sern_client.endpoints.zenoh import names
 from sern_client.endpoints.zenoh.endpoint import ZenohEndpoint
 from sern_client.endpoints.zenoh.options import ZenohOptions
-from sern_client.endpoints.zenoh.services import _Server
 from sern_client.endpoints.zenoh.session import SessionOptions
 from sern_core.vocabulary.errors import ConfigError, ServiceError, UsageError
 from sern_core.vocabulary.message import TopicInfo
@@ -106,10 +105,10 @@ class Peer:
         assert answer["done"], f"the peer ended with {self.process.returncode}"
         return answer
 
-    async def sees(self, kind: str, name: str) -> None:
-        """Wait until the peer's own graph has it: it asks for what is latched, and calls services, only once."""
+    async def sees(self, kind: str, name: str, *, there: bool = True) -> None:
+        """Wait until the peer's own graph has it, or not: it asks for what is latched, and calls services, once."""
         async with asyncio.timeout(60):
-            while not (await self.do("sees", kind=kind, name=name.replace("/", "%")))["sees"]:
+            while (await self.do("sees", kind=kind, name=name.replace("/", "%")))["sees"] is not there:
                 pass
 
     async def kill(self) -> None:
@@ -183,6 +182,35 @@ async def test_a_node_is_heard_while_it_publishes(endpoint: tuple[ZenohEndpoint,
     await until(lambda: CHAT not in events.infos, "the topic has ended")
 
 
+async def test_a_topic_that_nobody_wants_has_no_subscriber(endpoint: tuple[ZenohEndpoint, Events], peer: Peer) -> None:
+    ours, events = endpoint
+    await peer.do("publisher", name=CHAT)
+    await until(lambda: CHAT in events.infos, "the topic is announced")
+    got: list[bytes] = []
+
+    def take(body: bytes, _stamp_ns: int) -> bool:
+        got.append(body)
+        return True
+
+    ours.subscribe(CHAT, take)
+    await peer.sees("MS", CHAT)
+    ours.interest(CHAT, False)
+    await peer.sees("MS", CHAT, there=False)
+    await peer.do("publish", name=CHAT, data="unwanted")
+    await peer.do("publisher", name="/later")
+    await until(lambda: "/later" in events.infos, "told after what was published")
+    assert CHAT in events.infos and got == []
+    ours.interest(CHAT, True)
+    await peer.sees("MS", CHAT)
+
+    async def heard() -> None:
+        while not got:  # until the subscriber has reached the peer
+            await peer.do("publish", name=CHAT, data="wanted")
+
+    await asyncio.wait_for(heard(), DEADLINE_S)
+    assert set(got) == {text("wanted")}
+
+
 async def test_what_is_published_here_reaches_a_node(endpoint: tuple[ZenohEndpoint, Events], peer: Peer) -> None:
     ours, events = endpoint
     publisher = ours.advertise(chat())
@@ -208,7 +236,8 @@ async def test_the_first_messages_wait_for_the_subscribers_there_are(
 ) -> None:
     ours, _ = endpoint
     await peer.do("subscriber", name=CHAT)
-    await until(lambda: ours._subscribers.get(CHAT), "the subscriber is known")
+    kind = names.dds_type("std_msgs/msg/String"), chat().type_hash
+    await until(lambda: ours.readers(CHAT, *kind), "the subscriber is known")
     for number in range(3):  # each time a stream of a moment
         publisher = ours.advertise(chat())
         for letter in "abc":
@@ -304,7 +333,7 @@ async def test_a_server_that_is_known_before_it_can_be_reached_is_waited_for(
     await theirs.start(Events())
     try:
         dds_name, type_hash = names.dds_type("std_srvs/srv/SetBool"), "RIHS01_" + 64 * "0"
-        token = theirs._declare_token(names.Kind.SERVER, MODE, dds_name, type_hash, names.Qos())
+        token = theirs.node.token(names.Kind.SERVER, MODE, dds_name, type_hash, names.Qos())
         await until(lambda: MODE in events.services, "the service is announced")
         with pytest.raises(ServiceError, match=f"{MODE} did not answer within 0.1 s"):
             await ours.call(MODE, b"", timeout_s=0.1)
@@ -313,16 +342,16 @@ async def test_a_server_that_is_known_before_it_can_be_reached_is_waited_for(
         async def handler(asked: bytes) -> bytes:
             return asked[::-1]
 
-        server = _Server(theirs, names.data_key(DOMAIN, MODE, dds_name, type_hash), handler)
-        server.declare(token)
+        server = theirs.serve(ServiceInfo(MODE, "std_srvs/srv/SetBool", Encoding.CDR, type_hash), handler)
         assert await call == b"olleh"
+        token.undeclare()
         server.close()
         await until(lambda: MODE not in events.services, "the service has ended")
-        assert ours._present == {}
-        alone = theirs._declare_token(names.Kind.SERVER, OTHER_MODE, dds_name, type_hash, names.Qos())
+        assert ours.services.watched == 0
+        alone = theirs.node.token(names.Kind.SERVER, OTHER_MODE, dds_name, type_hash, names.Qos())
         await until(lambda: OTHER_MODE in events.services, "a token alone")
         call = asyncio.create_task(ours.call(OTHER_MODE, b"hello", timeout_s=60))
-        await until(lambda: ours._present, "the call waits")
+        await until(lambda: ours.services.watched, "the call waits")
         alone.undeclare()
         with pytest.raises(ServiceError, match=f"{OTHER_MODE} has ended"):
             await call

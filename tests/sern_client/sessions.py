@@ -9,19 +9,19 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from random import Random
-from typing import Any, Final
+from typing import Final
 
-from sern_client.bridge import Bridge
 from sern_client.endpoints.base import Endpoint
+from sern_client.tables import Tables
 from sern_core.relay.hub import Hub
 from sern_core.relay.hub_port import HubPort
 from sern_core.site.client import ClientCore
 from sern_core.stream.out_channel import OutChannel
-from sern_core.topics.rules import Discovery, DiscoveryMode, RuleSet
 from sern_core.vocabulary.message import TopicInfo
 from sern_core.vocabulary.params import LinkParams, SchedulerParams
 from sern_core.vocabulary.types import ClientName, Encoding
 from sern_runtime import ros_types
+from tests.bridges import Shell, bridge_of
 from tests.support import until
 from tests.world import OPEN_ACCESS, spec
 
@@ -42,12 +42,9 @@ class Ignored:
 class Client:
     """A process of one client: a core and its connection."""
 
-    def __init__(self, changes: "Changes", name: str, events: Any, *patterns: str) -> None:
+    def __init__(self, changes: "Changes", core: ClientCore, *patterns: str) -> None:
         self._changes = changes
-        self.core = ClientCore(
-            name=ClientName(name), boot=changes.random.getrandbits(62), events=events, link=LINK,
-            scheduler=SchedulerParams(), now=time.monotonic(),
-        )  # fmt: skip
+        self.core = core
         self.core.subscribe(patterns, now=time.monotonic())
         self.port: HubPort | None = None
 
@@ -85,20 +82,25 @@ class Changes:
         self.endpoint = endpoint
         self.encoding = encoding
         self.hub = self._new_hub()
-        self.faults: list[Exception] = []
-        self.bridge = Bridge(
-            endpoint, RuleSet(()), Discovery(DiscoveryMode.MANUAL), "/", log=None, kick=lambda: None,
-            on_up=lambda: None, on_down=lambda _reason: None, on_fault=self.faults.append,
-        )  # fmt: skip
-        self.site = Client(self, "site", self.bridge, "/robot/.*")
-        self.bridge.attach(self.site.core)
-        self.robot = Client(self, "robot", Ignored())
+        self.shell = Shell()
+        boot = self.random.getrandbits(62)
+        self.bridge = bridge_of(endpoint, shell=self.shell, link=LINK, boot=boot, now=time.monotonic())
+        self.tables = Tables(self.bridge)
+        self.site = Client(self, self.bridge.core, "/robot/.*")
+        self.robot = Client(self, self._other("robot"))
         self.rival: Client | None = None
         self.channels: dict[str, OutChannel] = {}
 
     @property
     def wanted(self) -> dict[str, TopicInfo]:
         return {name: channel.stream.info for name, channel in self.channels.items()}
+
+    def _other(self, name: str) -> ClientCore:
+        """The core of a process that is only there to make something happen."""
+        return ClientCore(
+            name=ClientName(name), boot=self.random.getrandbits(62), events=Ignored(), link=LINK,
+            scheduler=SchedulerParams(), now=time.monotonic(),
+        )  # fmt: skip
 
     def _new_hub(self) -> Hub:
         return Hub(
@@ -138,7 +140,7 @@ class Changes:
     def _rival(self) -> None:
         """Another process of the site's name comes, with other wishes, or goes."""
         if self.rival is None:
-            self.rival = Client(self, "site", Ignored(), "/robot/nosuch")
+            self.rival = Client(self, self._other("site"), "/robot/nosuch")
             self.rival.connect()
         else:
             self.rival.disconnect()
@@ -147,7 +149,7 @@ class Changes:
     def _robot_restarts(self) -> None:
         names, self.channels = list(self.channels), {}
         self.robot.disconnect()
-        self.robot = Client(self, "robot", Ignored())
+        self.robot = Client(self, self._other("robot"))
         for name in names:
             self._publish_again(name)
         self.robot.connect()
@@ -181,7 +183,7 @@ class Changes:
         if self.rival is not None:
             self._rival()
         self.site.connect()
-        assert self.faults == []
+        assert self.shell.faults == []
 
     def settle(self) -> bool:
         """Exchange what there is; True once nothing moves."""
@@ -197,7 +199,7 @@ class Changes:
                 self.settle()
                 and all(client.core.link.established for client in self._clients())
                 and set(self.site.core.opened) == {channel.stream.id for channel in self.channels.values()}
-                and self.bridge.validate() == []
+                and self.tables.validate() == []
             )
 
         try:
@@ -205,7 +207,7 @@ class Changes:
         except AssertionError:
             raise AssertionError(
                 f"wanted {sorted(self.wanted)}, open {sorted(self.site.core.opened)}, refused "
-                f"{sorted(self.site.core.refused)}, differences: {list(map(str, self.bridge.validate()))}"
+                f"{sorted(self.site.core.refused)}, differences: {list(map(str, self.tables.validate()))}"
             ) from None
 
     def close(self) -> None:

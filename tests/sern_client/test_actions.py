@@ -112,13 +112,13 @@ class Site:
         spec = TopicSpec(PriorityClass.CONTROL, lifespan_s=0.0)
         stream = StreamInfo(StreamId(ClientName("site"), 1, GOAL.name), GOAL, spec)
         self.channel = OutChannel(
-            0, stream, SendCounters(GOAL.name, spec.priority), lambda _channel, _outs, _reason: None, first=1
+            0, stream, SendCounters(GOAL.name, spec.priority), lambda _slot, _outs, _reason: None, first=1
         )
         self.give: Sink = self.watch.outgoing(GOAL, self.channel, self._send)
         self.watch.outgoing(topic("cancel"), self.channel, self._cancel)
 
     def _send(self, _data: bytes, _stamp_ns: int) -> bool:
-        self.channel.next_seq += 1
+        self.channel.start_at(self.channel.next_seq + 1)
         return self.accepts
 
     def _cancel(self, data: bytes, _stamp_ns: int) -> bool:
@@ -352,7 +352,7 @@ async def test_a_goal_behind_one_that_was_refused_is_watched(site: Site) -> None
         if not sent:
             sent.append(data)
             return False
-        site.channel.next_seq += 1
+        site.channel.start_at(site.channel.next_seq + 1)
         return True
 
     site.server_appears()

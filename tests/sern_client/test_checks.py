@@ -133,10 +133,10 @@ async def test_a_publisher_that_its_endpoint_has_lost_is_opened_anew(master: Fak
             publication = endpoint._publications[lost]
             publication.close()  # as if a fault had ended it behind the back of everybody
             del endpoint._publications[lost]
-            found = changes.bridge.validate()
+            found = changes.tables.validate()
             assert [each.name for each in found if each.kind == "publisher"] == [lost]
-            changes.bridge.repair(found)
-            await until(lambda: changes.bridge.validate() == [])
+            changes.tables.repair(found)
+            await until(lambda: changes.tables.validate() == [])
             assert endpoint._publications[lost] is not publication
             assert all(isinstance(handle, Handle) for handle in endpoint._publications[lost].handles)
         finally:

@@ -2,19 +2,17 @@
 
 from collections.abc import Callable
 
-from sern_client.bridge import Bridge
 from sern_client.endpoints.base import Sink
 from sern_client.leaving import LEAVE_S, Leaving
-from sern_core.site.client import ClientCore
 from sern_core.stream.out_channel import OutChannel
 from sern_core.summaries.patches import PatchParams
 from sern_core.summaries.spec import SummarySpec
 from sern_core.topics.patterns import compile_pattern
-from sern_core.topics.rules import Discovery, DiscoveryMode, RuleSet, TopicRule
-from sern_core.vocabulary.params import LinkParams, SchedulerParams
-from sern_core.vocabulary.types import ClientName, Encoding, TopicName
+from sern_core.topics.rules import TopicRule
+from sern_core.vocabulary.types import Encoding, TopicName
 from sern_runtime import clock, ros_types
 from sern_sim.models import LinkModel, Window
+from tests.bridges import bridge_of
 from tests.world import SimClient, World, spec
 
 TOPIC = "/robot/odom"
@@ -133,14 +131,8 @@ MAP = TopicName("/map")
 async def test_changes_of_a_grid_have_the_same_patience_as_the_grid() -> None:
     """Its node has ended while changes were on their way; the link is down."""
     rule = TopicRule(compile_pattern("/map"), summaries=(SummarySpec(PatchParams()),))
-    bridge = Bridge(
-        Grids(), RuleSet((rule,)), Discovery(DiscoveryMode.MANUAL), "/robot", log=None,  # type: ignore[arg-type]
-        kick=lambda: None, on_up=lambda: None, on_down=lambda _reason: None, on_fault=lambda _error: None,
-    )  # fmt: skip
-    core = ClientCore(
-        name=ClientName("robot"), boot=1, events=bridge, link=LinkParams(), scheduler=SchedulerParams(), now=0.0
-    )
-    bridge.attach(core)
+    bridge = bridge_of(Grids(), (rule,), name="robot", namespace="/robot")
+    core, outbound = bridge.core, bridge.outbound
 
     def channels() -> dict[str, OutChannel]:
         return {channel.stream.id.topic: channel for channel in core.link.sender.channels.values()}
@@ -148,21 +140,21 @@ async def test_changes_of_a_grid_have_the_same_patience_as_the_grid() -> None:
     names = {"/robot/map", "/robot/map_updates"}
     info = ros_types.topic_info(MAP, "nav_msgs/msg/OccupancyGrid", Encoding.CDR)
     for owing in ("/robot/map", "/robot/map_updates"):
-        bridge.topic_added(info)
+        outbound.topic_added(info)
         assert channels().keys() == names
         core.send(channels()[owing], b"change", 1, now=clock.now())
-        bridge.topic_removed(MAP)
-        bridge.leaving.look(now=clock.now() + LEAVE_S / 2)
+        outbound.topic_removed(MAP)
+        outbound.leaving.look(now=clock.now() + LEAVE_S / 2)
         assert channels().keys() == names, owing
-        bridge.leaving.look(now=clock.now() + LEAVE_S)
+        outbound.leaving.look(now=clock.now() + LEAVE_S)
         assert channels() == {}
-    bridge.topic_added(info)
-    bridge.topic_removed(MAP)  # it owes nothing
+    outbound.topic_added(info)
+    outbound.topic_removed(MAP)  # it owes nothing
     assert channels() == {}
-    bridge.topic_added(info)
+    outbound.topic_added(info)
     core.send(channels()["/robot/map_updates"], b"change", 1, now=clock.now())
     before = channels()
-    bridge.topic_removed(MAP)
-    bridge.topic_added(info)  # its node is back
+    outbound.topic_removed(MAP)
+    outbound.topic_added(info)  # its node is back
     assert channels().keys() == names and not set(channels().values()) & set(before.values())
     bridge.close()

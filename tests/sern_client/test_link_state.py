@@ -7,20 +7,19 @@ from typing import Any
 import pytest
 from rosbags.typesys import Stores, get_typestore
 
-from sern_client.bridge import Bridge
 from sern_client.endpoints.base import Publisher
 from sern_client.link_state import LinkState
 from sern_client.link_topics import ARRAY_TYPE, STATUS_TYPE, LinkTopics, LinkView
 from sern_client.withdrawal import MAX_KEPT, Kept, Withdrawal
 from sern_core.site.client import ClientCore
 from sern_core.site.peers import PeerStatus
-from sern_core.topics.rules import Discovery, DiscoveryMode, RuleSet
 from sern_core.vocabulary.errors import ConfigError
 from sern_core.vocabulary.message import Message, StreamId, StreamInfo, TopicInfo
 from sern_core.vocabulary.params import LinkParams, SchedulerParams
 from sern_core.vocabulary.types import ClientName, Encoding, TopicName
 from sern_runtime import clock, ros_types
 from sern_runtime.optional import OptionalParts
+from tests.bridges import Shell, bridge_of
 from tests.sern_client.sessions import Ignored
 from tests.support import until
 from tests.world import spec
@@ -398,8 +397,7 @@ def _close(stream: Any) -> None:
 def test_what_is_latched_is_published_again_when_its_origin_is_back(caplog: pytest.LogCaptureFixture) -> None:
     endpoint = Endpoint()
     streams: dict[StreamId, Any] = {}
-    withdrawal = Withdrawal(streams, endpoint.advertise, _close)
-    withdrawal.used = True
+    withdrawal = Withdrawal(streams, endpoint.advertise, _close, used=True)
 
     def info(origin: str, name: str, *, latched: bool, depth: int = 1) -> StreamInfo:
         identity = StreamId(ClientName(origin), 1, TopicName(name))
@@ -437,7 +435,7 @@ def test_what_is_latched_is_published_again_when_its_origin_is_back(caplog: pyte
 
 
 def test_nothing_is_kept_where_nothing_is_withdrawn() -> None:
-    withdrawal = Withdrawal({}, Endpoint().advertise, _close)
+    withdrawal = Withdrawal({}, Endpoint().advertise, _close, used=False)
     identity = StreamId(ClientName("a"), 1, TopicName("/a"))
     stream = StreamInfo(identity, TopicInfo(identity.topic, "std_msgs/msg/String", Encoding.ROS1), spec(latched=True))
     assert withdrawal.kept(stream) is None
@@ -446,27 +444,23 @@ def test_nothing_is_kept_where_nothing_is_withdrawn() -> None:
 async def test_a_message_of_who_is_not_there_brings_its_topic_back() -> None:
     """The bridge itself: what was latched comes first, nothing twice, and its tables are those of the endpoint."""
     endpoint: Any = Endpoint()
-    faults: list[Exception] = []
-    bridge = Bridge(
-        endpoint, RuleSet(()), Discovery(DiscoveryMode.MANUAL), "/", log=None, kick=lambda: None,
-        on_up=lambda: None, on_down=lambda _reason: None, on_fault=faults.append,
-    )  # fmt: skip
-    bridge.attach(Site().core)
-    bridge.withdrawal.used = True
+    shell = Shell()
+    bridge = bridge_of(endpoint, shell=shell, withdraws=True)
+    withdrawal = bridge.inbound.withdrawal
     identity = StreamId(ClientName("jackal1"), 1, TopicName("/jackal1/map"))
     info = ros_types.topic_info("/jackal1/map", "std_msgs/msg/String", Encoding.ROS1, latched=True)
     stream = StreamInfo(identity, info, spec(latched=True))
     bridge.stream_opened(stream)
     bridge.message(stream, Message(identity, 1, b"old", 1, clock.now()), now=clock.now())
-    bridge.withdrawal.withdraw(ClientName("jackal1"))
+    withdrawal.withdraw(ClientName("jackal1"))
     assert endpoint.open == {}
     bridge.message(stream, Message(identity, 2, b"new", 2, clock.now()), now=clock.now())
     assert endpoint.open["/jackal1/map"].bodies == [b"old", b"new"]
-    bridge.withdrawal.withdraw(ClientName("jackal1"))
-    bridge.withdrawal.restore(ClientName("jackal1"))
+    withdrawal.withdraw(ClientName("jackal1"))
+    withdrawal.restore(ClientName("jackal1"))
     assert endpoint.open["/jackal1/map"].bodies == [b"new"]
-    bridge.withdrawal.withdraw(ClientName("jackal1"))
+    withdrawal.withdraw(ClientName("jackal1"))
     bridge.stream_closed(stream)
-    bridge.withdrawal.restore(ClientName("jackal1"))
-    assert endpoint.open == {} and faults == []
+    withdrawal.restore(ClientName("jackal1"))
+    assert endpoint.open == {} and shell.faults == []
     bridge.close()

@@ -16,11 +16,12 @@ import pytest
 
 from sern_client import express, guard, relay_name
 from sern_client.checks import CHECK_S, CONFIRM_S, TableCheck
-from sern_client.daemon import SILENT, ClientDaemon
+from sern_client.daemon import ClientDaemon
 from sern_client.endpoints.ros1 import services, subscription
 from sern_client.endpoints.ros1.header import encode_header
 from sern_client.express import ClientExpress
 from sern_client.guard import Guard
+from sern_client.link_news import SILENT
 from sern_client.link_topics import LinkTopics
 from sern_client.relay_name import RelayName, UnresolvedError
 from sern_client.withdrawal import Withdrawal
@@ -42,6 +43,7 @@ from tests.sern_client.endpoints.ros1.fakes import HOST, FakeMaster, FakePublish
 from tests.sern_client.test_checks import ODOM, Tables
 from tests.sern_client.test_link_state import STAMP_NS, VIEWS, Endpoint, Site, Stream, _close
 from tests.support import Events, until
+from tests.views import IDLE
 
 Said = Callable[[str], list[logging.LogRecord]]
 
@@ -169,8 +171,7 @@ def _withdrawn(scene: Scene) -> tuple[Clock, Withdrawal, Any]:
         StreamId(ClientName("jackal1"), 1, TopicName(name)): Stream(endpoint, name)
         for name in ("/jackal1/a", "/jackal1/b")
     }
-    withdrawal = Withdrawal(streams, endpoint.advertise, _close)
-    withdrawal.used = True
+    withdrawal = Withdrawal(streams, endpoint.advertise, _close, used=True)
     withdrawal.withdraw(ClientName("jackal1"))
     now.go_on()
     return now, withdrawal, streams
@@ -356,10 +357,7 @@ async def name_of_the_relay(scene: Scene) -> None:
 
 async def datagrams(scene: Scene) -> None:
     now = scene.clock()
-    lane = SimpleNamespace(id=LANE_ZMQ, stalled=False, usable=True)
-    link: Any = SimpleNamespace(
-        peer="relay", established=True, lane=lane, lanes=SimpleNamespace(by_id={LANE_ZMQ: lane})
-    )
+    link: Any = SimpleNamespace(peer="relay", observe=lambda *, now: IDLE)
     passes = iter((False, False, True))
     scene.patch.setattr(datagram_watch, "datagrams_pass", lambda _link: next(passes))
     watched = DatagramWatch(lambda: [link], lambda _link, _within_s: "no datagram gets through", lambda _link: "relay")
@@ -382,11 +380,11 @@ async def _client(scene: Scene) -> Any:
 async def link(scene: Scene) -> None:
     now = scene.clock()
     async with _client(scene) as daemon:
-        daemon._link_up()
+        daemon.link_up()
         for _ in range(2):
-            daemon._link_down("the connection to the relay was lost")
+            daemon.link_down("the connection to the relay was lost")
         now.go_on()
-        daemon._link_up()
+        daemon.link_up()
 
 
 async def silent_relay(scene: Scene) -> None:
@@ -395,7 +393,7 @@ async def silent_relay(scene: Scene) -> None:
         daemon.core.link.end.established = True
         for stalled in (False, True, True, False, False):
             daemon.core.link.lane.stalled = stalled
-            daemon._look_at_link()
+            daemon.news.look()
             now.go_on()
         daemon.core.link.end.established = False
 

@@ -6,16 +6,13 @@ from typing import Any
 import pytest
 
 from sern_client import update_topics
-from sern_client.bridge import Bridge
 from sern_client.endpoints.record import RecordEndpoint, RecordOptions
 from sern_client.update_topics import MAX_TOPICS, UpdateTopics
-from sern_core.site.client import ClientCore
 from sern_core.summaries.grids import GRID_TYPE, UPDATE_TYPE
-from sern_core.topics.rules import Discovery, DiscoveryMode, RuleSet
 from sern_core.vocabulary.message import StreamId, StreamInfo
-from sern_core.vocabulary.params import LinkParams, SchedulerParams
 from sern_core.vocabulary.types import ClientName, Encoding, TopicName
 from sern_runtime import clock, ros_types
+from tests.bridges import Shell, bridge_of
 from tests.support import Events, until
 from tests.world import spec
 
@@ -110,15 +107,9 @@ async def test_a_bridge_subscribes_as_grids_come_and_go(tmp_path: Any, monkeypat
     monkeypatch.setattr(update_topics, "PAUSE_S", 0.0)
     endpoint = RecordEndpoint(RecordOptions(tmp_path / "all"))
     await endpoint.start(Events())
-    faults: list[Exception] = []
-    bridge = Bridge(
-        endpoint, RuleSet(()), Discovery(DiscoveryMode.MANUAL), "/", log=None, kick=lambda: None,
-        on_up=lambda: None, on_down=lambda _reason: None, on_fault=faults.append,
-    )  # fmt: skip
-    core = ClientCore(
-        name=ClientName("site"), boot=1, events=bridge, link=LinkParams(), scheduler=SchedulerParams(), now=0.0
-    )
-    bridge.attach(core)
+    shell = Shell()
+    bridge = bridge_of(endpoint, shell=shell)
+    core = bridge.core
     core.subscribe(("/evil/.*/map",), now=0.0)
 
     def of(topic: TopicName, kind: str, number: int) -> StreamInfo:
@@ -136,6 +127,6 @@ async def test_a_bridge_subscribes_as_grids_come_and_go(tmp_path: Any, monkeypat
     for each in (*wholes, changes):
         bridge.stream_closed(each)
     await until(lambda: core.patterns == ("/evil/.*/map",))
-    assert faults == []
+    assert shell.faults == []
     bridge.close()
     await endpoint.stop()

@@ -16,22 +16,15 @@ from sern_core.vocabulary.types import DropReason, PriorityClass, TopicName
 from sern_runtime import metrics as module
 from sern_runtime.link_metrics import AgeHistograms, register_links, register_received
 from sern_runtime.metrics import SLICE_ROWS, Metrics, exposition
+from tests.views import link_view
 
 RULES = Path(__file__).parents[2] / "deploy" / "prometheus" / "sern.rules.yml"
 
 
 def link(peer: str, topics: int) -> Any:
     counters = [SendCounters(TopicName(f"/r/t{n}"), PriorityClass.STATE) for n in range(topics)]
-    estimator = SimpleNamespace(rate_bps=None, window_bytes=1.0, rtprop_s=None)
-    flight = SimpleNamespace(inflight_bytes=0, rtt=SimpleNamespace(srtt_s=None))
-    return SimpleNamespace(
-        peer=peer,
-        sender=SimpleNamespace(ledger=SimpleNamespace(topics={c.topic: c for c in counters}), queued=dict),
-        established=True,
-        receiver=SimpleNamespace(strays=0),
-        lane=SimpleNamespace(stalled=False, estimator=estimator, flight=flight),
-        lanes=SimpleNamespace(clock=SimpleNamespace(offset_s=None, error_s=None)),
-    )
+    view = link_view(peer=peer)
+    return SimpleNamespace(peer=peer, counters={c.topic: c for c in counters}, queued=dict, observe=lambda *, now: view)
 
 
 class Scene:
@@ -68,7 +61,7 @@ def test_a_lost_message_of_any_of_fifty_clients_and_a_hundred_topics_has_its_nam
         key: n for key, n in scene.rows("sern_messages_dropped_total").items() if re.fullmatch(alerting(), key[2])
     }
     assert len(before) == 50 * 100 * 3 and not any(before.values())
-    scene.links[49].sender.ledger.topics["/r/t99"].drop(DropReason.RETENTION, 100)
+    scene.links[49].counters["/r/t99"].drop(DropReason.RETENTION, 100)
     after = {key: n for key, n in scene.rows("sern_messages_dropped_total").items() if re.fullmatch(alerting(), key[2])}
     assert {key: n for key, n in after.items() if n != before[key]} == {("site49", "/r/t99", "retention"): 1.0}
 
@@ -76,8 +69,8 @@ def test_a_lost_message_of_any_of_fifty_clients_and_a_hundred_topics_has_its_nam
 def test_a_topic_too_many_keeps_its_reason(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "MAX_LABEL_SETS", 10)
     scene = Scene(3, 10)
-    scene.links[2].sender.ledger.topics["/r/t9"].drop(DropReason.RETENTION, 100)
-    scene.links[2].sender.ledger.topics["/r/t9"].drop(DropReason.LIFESPAN, 100)
+    scene.links[2].counters["/r/t9"].drop(DropReason.RETENTION, 100)
+    scene.links[2].counters["/r/t9"].drop(DropReason.LIFESPAN, 100)
     rows = scene.rows("sern_messages_dropped_total")
     assert rows["other", "other", "retention"] == rows["other", "other", "lifespan"] == 1
     assert len(rows) == 11 * 3 + 1
@@ -87,7 +80,7 @@ def test_rows_under_other_stay_there_and_do_not_fall_when_a_link_is_forgotten(mo
     monkeypatch.setattr(module, "MAX_LABEL_SETS", 10)
     scene = Scene(3, 10)
     for at in scene.links:
-        at.sender.ledger.topics["/r/t0"].drop(DropReason.RETENTION, 100)
+        at.counters["/r/t0"].drop(DropReason.RETENTION, 100)
     assert scene.rows("sern_messages_dropped_total")["other", "other", "retention"] == 2
     del scene.links[0]  # its ten names are free
     for _ in range(3):
@@ -96,7 +89,7 @@ def test_rows_under_other_stay_there_and_do_not_fall_when_a_link_is_forgotten(mo
         assert rows["other", "other", "retention"] == 2
     del scene.links[0]
     assert scene.rows("sern_messages_dropped_total")["other", "other", "retention"] == 2
-    scene.links[0].sender.ledger.topics["/r/t0"].drop(DropReason.RETENTION, 100)
+    scene.links[0].counters["/r/t0"].drop(DropReason.RETENTION, 100)
     assert scene.rows("sern_messages_dropped_total")["other", "other", "retention"] == 3
     scene.links.append(link("new", 10))
     assert scene.rows("sern_messages_dropped_total")["new", "/r/t0", "retention"] == 0
@@ -120,7 +113,7 @@ def test_links_and_topics_may_go_while_a_scrape_is_made(monkeypatch: pytest.Monk
         if not part and number % 4 == 0:
             scene.links.append(link(f"new{number}", 20))
             for at in scene.links[:-1]:
-                at.sender.ledger.topics.pop(f"/r/t{number % 20}", None)
+                at.counters.pop(f"/r/t{number % 20}", None)
             del scene.links[number % len(scene.links)]
     assert parts.count(b"") > 20
     text = b"".join(parts).decode()

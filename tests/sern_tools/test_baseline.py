@@ -1,8 +1,6 @@
 """The baseline over real sockets: what is offered on one side arrives on the other, logged like SERN's."""
 
 import asyncio
-import json
-import sys
 from pathlib import Path
 
 import pytest
@@ -15,6 +13,7 @@ from sern_runtime.config.client import load_client
 from sern_runtime.profiles import load_profile
 from sern_tools.baseline import Baseline
 from sern_tools.demo_scenario import COMMAND_TOPIC, POSE_TOPIC, ROBOT, SITE, Ports, Scenario, write_files
+from sern_tools.harness.processes import Children, python
 from sern_tools.message_log import MessageLog, read_logs
 from sern_tools.ports import free_ports
 from tests.support import DEADLINE_S, until
@@ -113,40 +112,27 @@ async def test_both_directions_are_carried_and_logged(files: dict[str, Path], tm
     assert merged[COMMAND_TOPIC].origin == SITE
 
 
-async def test_the_process_answers_words_and_ends_with_its_input(files: dict[str, Path]) -> None:
+async def test_the_process_answers_words_and_ends_with_its_input(files: dict[str, Path], tmp_path: Path) -> None:
     up, down = free_ports(2)
-    process = await asyncio.create_subprocess_exec(
-        sys.executable, "-m", "sern_tools.baseline", "--config", str(files[SITE]),
-        "--publish", f"bind:tcp://{HOST}:{down}", "--subscribe", f"bind:tcp://{HOST}:{up}",
-        stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE,
-    )  # fmt: skip
-    assert process.stdin is not None and process.stdout is not None
-    try:
+    command = python("-m", "sern_tools.baseline", "--config", str(files[SITE]))
+    command += ["--publish", f"bind:tcp://{HOST}:{down}", "--subscribe", f"bind:tcp://{HOST}:{up}"]
+    async with Children(tmp_path) as children:
+        process = await children.start("baseline", command, talks=True)
         async with asyncio.timeout(DEADLINE_S):
-            assert json.loads(await process.stdout.readline()) == {"ready": True}
-            process.stdin.write(b"floor\ngo\ndance\n")
-            answers = [json.loads(await process.stdout.readline()) for _ in range(3)]
+            assert await process.read_object() == {"ready": True}
+            answers = [await process.ask(word) for word in ("floor", "go", "dance")]
             assert answers == [{"floor_s": None}, {"done": "go"}, {"error": "unknown word 'dance'"}]
-            process.stdin.write(b"count\n")
-            counts = json.loads(await process.stdout.readline())["topics"]
-            assert set(counts) <= {COMMAND_TOPIC}
-            process.stdin.write(b"quiet\n")
-            assert json.loads(await process.stdout.readline()) == {"done": "quiet"}
-            process.stdin.close()
-            assert await process.wait() == 0
-    finally:
-        if process.returncode is None:
-            process.kill()
-            await process.wait()
+            assert set((await process.ask("count"))["topics"]) <= {COMMAND_TOPIC}
+            assert await process.ask("quiet") == {"done": "quiet"}
+            await children.end(process, number=None)
 
 
 @pytest.mark.parametrize(("arguments", "words"), [(["--config", "/nowhere.yaml"], "nowhere.yaml")])
-async def test_a_file_that_is_wrong_is_one_line(arguments: list[str], words: str) -> None:
-    process = await asyncio.create_subprocess_exec(
-        sys.executable, "-m", "sern_tools.baseline", *arguments, "--publish", "bind:tcp://127.0.0.1:1",
-        "--subscribe", "bind:tcp://127.0.0.1:1", stdin=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE,
-    )  # fmt: skip
-    _, errors = await process.communicate()
-    assert process.returncode == 2
-    assert len(errors.decode().splitlines()) == 1
-    assert words in errors.decode()
+async def test_a_file_that_is_wrong_is_one_line(tmp_path: Path, arguments: list[str], words: str) -> None:
+    addresses = ["--publish", "bind:tcp://127.0.0.1:1", "--subscribe", "bind:tcp://127.0.0.1:1"]
+    async with Children(tmp_path) as children:
+        process = await children.start("baseline", python("-m", "sern_tools.baseline", *arguments, *addresses))
+        assert await process.process.wait() == 2
+    text = process.log.read_text()
+    assert len(text.splitlines()) == 1
+    assert words in text

@@ -10,7 +10,7 @@ import pytest
 from sern_core.vocabulary.errors import SernError
 from sern_tools import demo
 from sern_tools.demo_scenario import ROBOT, SITE
-from sern_tools.processes import Children
+from sern_tools.harness.processes import Children
 
 
 def waiting(queued_bytes: int, inflight_bytes: int = 0) -> list[dict[str, Any]]:

@@ -12,15 +12,8 @@ from collections.abc import Callable, Hashable
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import Any, Final
 from uuid import UUID
-from weakref import WeakValueDictionary
-
-from cyclonedds.core import DDSException, Policy, Qos
-from cyclonedds.domain import DomainParticipant
-from cyclonedds.pub import DataWriter, Publisher
-from cyclonedds.sub import DataReader, Subscriber
-from cyclonedds.topic import Topic
 
 from sern_client.endpoints.base import (
     GUARD_SUFFIX,
@@ -32,43 +25,37 @@ from sern_client.endpoints.base import (
     Sink,
     TopicEvents,
 )
-from sern_client.endpoints.dds import names, node_info
+from sern_client.endpoints.common.first import LEARN_S, FirstMessages
+from sern_client.endpoints.common.interest import Subscriptions
+from sern_client.endpoints.common.saying import SayOnce
+from sern_client.endpoints.common.stream import Stream, Streams
+from sern_client.endpoints.dds import names
 from sern_client.endpoints.dds.counters import DdsCounters
 from sern_client.endpoints.dds.definitions import Definitions
-from sern_client.endpoints.dds.domain import DomainOptions, close_domain, open_domain
-from sern_client.endpoints.dds.entities import Reader, Subscription, Writer
-from sern_client.endpoints.dds.graph import MAX_COMPLAINTS, Graph, Local, Participant, Remote
-from sern_client.endpoints.dds.idl import TypeMaker
-from sern_client.endpoints.dds.names import DISCOVERY_TOPIC, SERN_KEY, RosName, user_data
+from sern_client.endpoints.dds.domain import DomainOptions
+from sern_client.endpoints.dds.entities import Entities, Writer
+from sern_client.endpoints.dds.graph import Graph, Remote
+from sern_client.endpoints.dds.names import RosName
 from sern_client.endpoints.dds.qos import (
     EndpointQos,
     mismatches,
     reader_for,
-    to_policies,
     within_reach,
     writer_for,
 )
 from sern_client.endpoints.dds.raw import INFINITE_NS
 from sern_client.endpoints.dds.services import DdsServices
-from sern_client.endpoints.dds.stream import Stream
-from sern_client.endpoints.dds.worker import Inbox, Sample, Worker
-from sern_client.endpoints.first import LEARN_S, FirstMessages
+from sern_client.endpoints.dds.subscription import Subscription
 from sern_core.vocabulary.errors import ConfigError, UsageError
 from sern_core.vocabulary.message import TopicInfo
 from sern_core.vocabulary.types import DropReason, Encoding, TopicName
 from sern_runtime import ros_types
 from sern_runtime.ros_types import ResolvedType
 
-_INFO_QOS: Final = EndpointQos(reliable=True, durability=1)
-_INFO_DEPTH: Final = 64
 RELIABLE_DEPTH: Final = 10
 """How many messages a writer keeps for its slow readers where the stream names no depth, as ROS 2 does."""
-RETRY_S: Final = 1.0
-"""A reader that DDS refused is asked for again after so long."""
 
 _log = logging.getLogger(__name__)
-
-T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,16 +72,6 @@ class DdsOptions:
     heed_sern: bool = False
 
 
-@dataclass(slots=True)
-class _Joined:
-    """What there is while the endpoint is in its domain."""
-
-    participant: DomainParticipant
-    publisher: Publisher
-    subscriber: Subscriber
-    worker: Worker
-
-
 class DdsEndpoint:
     """An `Endpoint` and `ServiceEndpoint` for one DDS domain."""
 
@@ -104,81 +81,37 @@ class DdsEndpoint:
         self.graph = Graph(UUID(int=0), self, heed_sern=options.heed_sern)
         self.graph.own_guard = options.node_name + GUARD_SUFFIX
         self.types = Definitions(options.type_paths)
-        self.services = DdsServices(self)
+        self.entities = Entities(
+            self.graph, self.counters, options.domain, node_name=options.node_name, queue_depth=options.queue_depth,
+            max_buffer_bytes=options.max_buffer_bytes,
+        )  # fmt: skip
+        self.say_once = SayOnce(_log, logging.ERROR)
+        self.services = DdsServices(self.entities, self.types, self.say_once)
+        self.subscriptions: Subscriptions[Subscription] = Subscriptions(self.say_once)
         self._events: TopicEvents | None = None
-        self._maker = TypeMaker()
-        self._joined: _Joined | None = None
-        self._topics: WeakValueDictionary[str, Topic[Any]] = WeakValueDictionary()
         self._announced: dict[TopicName, TopicInfo] = {}
-        self._subscriptions: dict[TopicName, list[Subscription]] = {}
-        self._readers: dict[UUID, Reader] = {}
-        self._leaving: dict[UUID, Reader] = {}
-        """Readers that are closed and have not ended."""
-        self._writers: dict[UUID, Writer] = {}
-        self._streams: list[Stream] = []
-        self._ending: list[FirstMessages] = []  # of streams that are closed
-        self._first_dropped: Counter[DropReason] = Counter()
+        self._streams: Streams[Writer] = Streams()
         self._started_s = 0.0
-        self._info_writer: Writer | None = None
-        self._info_due = False
         self._changed: dict[Hashable, Callable[[], None]] = {}
         """What is to be done for topics and services that are not as they were."""
-        self._said: set[int] = set()
 
     # Life cycle
 
     async def start(self, events: TopicEvents) -> None:
         """ConfigError when the domain cannot be joined with these settings."""
-        options = self.options
-        open_domain(options.domain)
-        try:
-            said = user_data(enclave="/", **{SERN_KEY: options.node_name})
-            qos = Qos(Policy.EntityName(options.node_name), Policy.Userdata(said))
-            participant = DomainParticipant(options.domain.domain, qos)
-        except DDSException as error:
-            close_domain(options.domain.domain)
-            raise ConfigError(
-                f"DDS domain {options.domain.domain} cannot be joined ({error.msg}); "
-                "too many participants on this host, or no such interface"
-            ) from None
+        self.entities.join(self.settle)
         self._events = events
         self._started_s = asyncio.get_running_loop().time()
-        self.graph.own = participant.guid
-        worker = Worker(participant, self, self.settle, max_buffer_bytes=options.max_buffer_bytes)
-        self._joined = _Joined(participant, Publisher(participant), Subscriber(participant), worker)
-        info = ros_types.resolve(node_info.TYPE, "", Encoding.CDR)
-        self.open_reader(DISCOVERY_TOPIC, info, _INFO_QOS, self._heed_nodes, depth=_INFO_DEPTH)
-        self._info_writer = self.open_writer(DISCOVERY_TOPIC, info, _INFO_QOS, depth=1)
-        self._tell_nodes()
 
     async def stop(self) -> None:
         """Leaves the domain; no thread and no socket stays behind."""
-        if self._joined is None:
+        if not self.entities.joined:
             return
         await self.services.stop()
-        for subscriptions in list(self._subscriptions.values()):
-            for subscription in list(subscriptions):
-                subscription.close()
-        for reader in list(self._readers.values()):
-            reader.close()
-        for stream in list(self._streams):
-            stream.close()
-        for first in list(self._ending):
-            first.close()
-        for writer in list(self._writers.values()):
-            writer.close()
+        self.subscriptions.close()
+        self._streams.close()
         self._events = None
-        await self._joined.worker.stop()
-        for guid in list(self._leaving):
-            self._reader_ended(guid)
-        self._info_writer = None
-        self._topics.clear()
-        # Leaving tells everybody, which may take a moment.
-        self.counters.faults += self._joined.worker.faults
-        left = [self._joined]
-        self._joined = None
-        await asyncio.get_running_loop().run_in_executor(None, left.clear)
-        await asyncio.get_running_loop().run_in_executor(None, close_domain, self.options.domain.domain)
+        await self.entities.leave()
 
     @property
     def encoding(self) -> Encoding:
@@ -195,40 +128,28 @@ class DdsEndpoint:
         info = self._announced.get(name)
         if info is None:
             raise UsageError(f"{name}: no such topic was announced")
-        subscription = Subscription(self, info, names.to_dds(name), sink)
-        self._subscriptions.setdefault(name, []).append(subscription)
-        self._refresh(subscription)
-        return subscription
+        return self.subscriptions.add(
+            Subscription(self.entities, info, names.to_dds(name), sink, self.subscriptions.remove)
+        )
 
-    def advertise(self, info: TopicInfo) -> Stream:
+    def advertise(self, info: TopicInfo) -> Stream[Writer]:
         """ConfigError for another encoding than CDR, a type nobody defines, or one with another hash than here."""
         resolved = self._resolve(info)
         offered = replace(writer_for(info, lifespan=self.options.offer_lifespan), type_hash=resolved.text.type_hash)
         depth = info.depth or (RELIABLE_DEPTH if offered.reliable else 1)
         topic = names.to_dds(info.name)
-        writer = self.open_writer(topic, resolved, offered, depth=depth)
+        writer = self.entities.open_writer(topic, resolved, offered, depth=depth)
         first = FirstMessages(
             info.name,
             readers=lambda: writer.readers(self._waiting_readers(topic, names.type_to_dds(resolved.name), offered)),
             write=writer.publish,
-            dropped=self._drop_first,
+            dropped=self._streams.drop,
             max_messages=max(depth, self.options.queue_depth) if offered.reliable else depth,
             max_bytes=self.options.max_buffer_bytes,
             overflow=DropReason.QUEUE_FULL if offered.reliable else DropReason.SUPERSEDED,
             learning_s=self._started_s + LEARN_S - asyncio.get_running_loop().time(),
         )
-        stream = Stream(info.name, writer, first, self._stream_closed)
-        self._streams.append(stream)
-        return stream
-
-    def _stream_closed(self, stream: Stream) -> None:
-        """It takes no more; its writer lasts until its first messages are written."""
-        self._streams.remove(stream)
-        if len(stream.first):
-            self._ending = [first for first in self._ending if not first.over] + [stream.first]
-
-    def _drop_first(self, why: DropReason) -> None:
-        self._first_dropped[why] += 1
+        return self._streams.open(info.name, writer, first)
 
     def _waiting_readers(self, topic: str, type_name: str, offered: EndpointQos) -> set[int]:
         """The readers of others that will match such a writer and get nothing that was written before, by handle."""
@@ -256,43 +177,15 @@ class DdsEndpoint:
     def validate(self, held: Held) -> list[Difference]:
         """A wanted topic without a reader differs too. Without the thread that waits for DDS nothing is received: that
         is a difference of every topic."""
-        here = Held(subscriptions=Counter(name for name, them in self._subscriptions.items() for _ in them))
-        here.publishers.update(stream.name for stream in self._streams if stream.writer.guid in self._writers)
-        found = held.differences(here)
-        found += [
-            Difference(name, "no reader in this domain takes it")
-            for name, subscriptions in self._subscriptions.items()
-            if any(subscription.lacks_reader for subscription in subscriptions)
-        ]
-        if self._joined is not None and not self._joined.worker.alive:
+        found = held.differences(Held(self._streams.names, self.subscriptions.names))
+        found += self.subscriptions.differences()
+        if self.entities.joined and not self.entities.worker.alive:
             found.append(Difference(TopicName(""), "the thread that waits for DDS has ended; start the client again"))
         return found
 
     def interest(self, name: TopicName, wanted: bool) -> None:
         """Nobody wants it: nothing is received either, unless the topic is latched."""
-        for subscription in self._subscriptions.get(name, ()):
-            subscription.wanted = wanted
-            self._refresh(subscription)
-
-    def _refresh(self, subscription: Subscription) -> None:
-        try:
-            subscription.refresh()
-        except ConfigError as error:
-            self.say_once(f"{subscription.info.name} is not taken: {error}")
-            # Some of what DDS refuses it accepts a moment later: a reader right after the one before it was closed.
-            if not subscription.asks_again:
-                subscription.asks_again = True
-                asyncio.get_running_loop().call_later(RETRY_S, self._refresh_again, subscription)
-
-    def _refresh_again(self, subscription: Subscription) -> None:
-        subscription.asks_again = False
-        if self._joined is not None and subscription in self._subscriptions.get(subscription.info.name, ()):
-            self._refresh(subscription)
-
-    def forget(self, subscription: Subscription) -> None:
-        found = self._subscriptions.get(subscription.info.name, [])
-        if subscription in found:
-            found.remove(subscription)
+        self.subscriptions.interest(name, wanted)
 
     # Services
 
@@ -309,172 +202,15 @@ class DdsEndpoint:
     def serve(self, info: ServiceInfo, handler: ServiceHandler) -> Any:
         return self.services.serve(info, handler)
 
-    # Readers and writers, for the parts of this package
-
-    def open_reader(
-        self,
-        topic: str,
-        resolved: ResolvedType,
-        qos: EndpointQos,
-        deliver: Callable[[Sample], None],
-        *,
-        depth: int | None = None,
-        header: bool = False,
-        id_key: str = "clientid",
-        before: Reader | None = None,
-    ) -> Reader:
-        """Open a reader; with `header`, of requests or replies, which other SERN endpoints send as well.
-
-        `before` is closed as soon as there is the new one; what either receives is delivered once. ConfigError when the
-        topic is in use here with another type, or DDS cannot have the type; `before` stays open then.
-        """
-        joined = self._alive()
-        ignores = self.graph.ignores
-
-        def checked(sample: Sample) -> None:
-            if header or not ignores(sample.handle):
-                deliver(sample)
-
-        inbox = Inbox(depth or self.options.queue_depth, checked, repeats=qos.transient_local)
-        policies = to_policies(qos, depth=inbox.history, writer=False, id_key=id_key)
-        if before is not None:
-            before.inbox.record()
-        try:
-            entity = self._make(
-                lambda of: DataReader(joined.subscriber, of, policies), "reader", topic, resolved, header=header
-            )
-        except ConfigError:
-            if before is not None:
-                before.inbox.record(on=False)
-            raise
-        if before is not None:
-            before.close(rest=True)
-        number = joined.worker.watch(entity, inbox, None if before is None else before.inbox)
-        reader = Reader(self, entity, qos, inbox, number)
-        self._readers[reader.guid] = reader
-        self.graph.local_added(Local(reader.guid, False, topic, names.type_to_dds(resolved.name), qos))
-        self._info_changed()
-        return reader
-
-    def open_writer(
-        self,
-        topic: str,
-        resolved: ResolvedType,
-        qos: EndpointQos,
-        *,
-        depth: int,
-        header: bool = False,
-        id_key: str = "clientid",
-    ) -> Writer:
-        """ConfigError as `open_reader`."""
-        policies = to_policies(qos, depth=depth, writer=True, id_key=id_key)
-        joined = self._alive()
-        entity = self._make(
-            lambda of: DataWriter(joined.publisher, of, policies), "writer", topic, resolved, header=header
-        )
-        writer = Writer(self, entity, entity.guid, stamped=qos.lifespan_ns >= INFINITE_NS)
-        self._writers[writer.guid] = writer
-        self.graph.local_added(Local(writer.guid, True, topic, names.type_to_dds(resolved.name), qos))
-        self._info_changed()
-        return writer
-
-    def close_reader(self, reader: Reader, number: int) -> None:
-        if self._readers.pop(reader.guid, None) is None:
-            return
-        self._leaving[reader.guid] = reader
-        self.graph.local_removed(reader.guid)
-        self._alive().worker.unwatch(number, partial(self._reader_ended, reader.guid))
-        self._info_changed()
-
-    def _reader_ended(self, guid: UUID) -> None:
-        """All that it received is delivered or dropped."""
-        self.counters.overrun += self._leaving.pop(guid).dropped
-
-    def close_writer(self, writer: Writer, kept: list[DataWriter[Any]]) -> None:
-        """`kept` holds its entity, which is deleted on the worker's thread."""
-        if self._writers.pop(writer.guid, None) is None:
-            return
-        self.graph.local_removed(writer.guid)
-        self._alive().worker.let_go(kept)
-        self._info_changed()
-
-    def _alive(self) -> "_Joined":
-        if self._joined is None:
-            raise UsageError("the dds endpoint is not running")
-        return self._joined
-
-    def _make(
-        self, make: "Callable[[Topic[Any]], T]", what: str, topic: str, resolved: ResolvedType, *, header: bool
-    ) -> T:
-        """Make a reader or writer of a topic. ConfigError where DDS refuses it."""
-        try:
-            return make(self._topic(topic, resolved, header=header))
-        except DDSException:
-            # The worker may be deleting the topic with the last that used it, and it is still found here.
-            self._topics.pop(topic, None)
-        try:
-            return make(self._topic(topic, resolved, header=header))
-        except DDSException as error:
-            raise ConfigError(f"{topic}: no {what} ({error.msg})") from None
-
-    def _topic(self, name: str, resolved: ResolvedType, *, header: bool) -> "Topic[Any]":
-        made = self._maker.make(resolved, header=header)
-        known = self._topics.get(name)
-        if known is not None:
-            if known.data_type is made or known.data_type.__idl_typename__ == made.__idl_typename__:
-                return known
-            raise ConfigError(
-                f"{name} is in use here with type {known.data_type.__idl_typename__}, so it cannot be "
-                f"{made.__idl_typename__}; rename one of them (`remap`)"
-            )
-        try:
-            topic: Topic[Any] = Topic(self._alive().participant, name, made)
-        except DDSException as error:
-            raise ConfigError(f"{name}: no topic of type {resolved.name} ({error.msg})") from None
-        self._topics[name] = topic
-        return topic
-
     @property
     def drops(self) -> dict[DropReason, int]:
         """Messages dropped between this domain's nodes and us, by reason."""
         counted = {
-            DropReason.QUEUE_FULL: self.overruns() + self.counters.blocked + self.counters.calls,
-            DropReason.UNDECODABLE: self.counters.unreadable + self.faults,
+            DropReason.QUEUE_FULL: self.entities.overruns() + self.counters.blocked + self.counters.calls,
+            DropReason.UNDECODABLE: self.counters.unreadable + self.entities.faults,
             DropReason.DISCONNECTED: self.counters.closed,
         }
-        return {reason: count for reason, count in (Counter(counted) + self._first_dropped).items() if count}
-
-    @property
-    def faults(self) -> int:
-        """What others announced and nobody could read, and readers that DDS would not give."""
-        return self.counters.faults + (0 if self._joined is None else self._joined.worker.faults)
-
-    def overruns(self) -> int:
-        """Messages dropped because the event loop was too slow, of all readers there are and were."""
-        return self.counters.overrun + sum(
-            reader.dropped for readers in (self._readers, self._leaving) for reader in readers.values()
-        )
-
-    def say_once(self, line: str | Callable[[], str], *about: Hashable) -> None:
-        """What a person has to know and do something about: once for each line, or for what it is `about`."""
-        said = hash(about or line)
-        if said not in self._said and len(self._said) < MAX_COMPLAINTS:
-            self._said.add(said)
-            _log.error("%s", line if isinstance(line, str) else line())
-
-    # Discovery: told by the worker
-
-    def participant_added(self, participant: Participant) -> None:
-        self.graph.participant_added(participant)
-
-    def participant_removed(self, guid: UUID) -> None:
-        self.graph.participant_removed(guid)
-
-    def remote_added(self, remote: Remote) -> None:
-        self.graph.remote_added(remote)
-
-    def remote_removed(self, guid: UUID) -> None:
-        self.graph.remote_removed(guid)
+        return {reason: count for reason, count in (Counter(counted) + self._streams.dropped).items() if count}
 
     # Discovery: told by the graph
 
@@ -508,8 +244,7 @@ class DdsEndpoint:
                 self._announced[name.name] = info
                 self._events.topic_added(info)
             return
-        for subscription in self._subscriptions.get(name.name, ()):
-            self._refresh(subscription)
+        self.subscriptions.refresh(name.name)
 
     def _describe(self, name: TopicName, writers: list[Remote]) -> TopicInfo | None:
         """The topic as the first of its writers has it whose type is known here."""
@@ -551,29 +286,3 @@ class DdsEndpoint:
 
     def _left_alone(self, name: TopicName, writer: Remote, why: str) -> str:
         return f"{name} of {self.graph.owner(writer)} is left alone: {why}"
-
-    # Nodes
-
-    def _heed_nodes(self, sample: Sample) -> None:
-        if len(sample.body) > node_info.MAX_BODY_BYTES:
-            self.counters.unreadable += 1
-            return
-        found = node_info.decode(sample.body)
-        if found is not None and found[0] != self.graph.own:
-            self.graph.nodes_of(*found)
-
-    def _info_changed(self) -> None:
-        """Tell the others of our node's readers and writers, once for all that changed in this turn of the loop."""
-        if self._info_writer is not None and not self._info_due and self._events is not None:
-            self._info_due = True
-            asyncio.get_running_loop().call_soon(self._tell_nodes)
-
-    def _tell_nodes(self) -> None:
-        self._info_due = False
-        if self._info_writer is None or self._events is None:
-            return
-        hidden = {self._info_writer.guid}
-        writers = [guid for guid in self._writers if guid not in hidden]
-        readers = [local.guid for local in self.graph.locals.values() if not local.writer]
-        body = node_info.encode(self.graph.own, self.options.node_name, readers, writers)
-        self._info_writer.publish(body, 0)

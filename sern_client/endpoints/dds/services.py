@@ -10,24 +10,24 @@ import asyncio
 import logging
 import secrets
 import struct
-from collections.abc import Callable, Hashable
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from typing import Final, Protocol
+from typing import Final
 
 from sern_client.endpoints.base import ServiceEvents, ServiceHandler, ServiceInfo
+from sern_client.endpoints.common.calls import PendingCalls, Tasks, within
+from sern_client.endpoints.common.saying import SayOnce
 from sern_client.endpoints.dds import names
-from sern_client.endpoints.dds.counters import DdsCounters
 from sern_client.endpoints.dds.definitions import Definitions
-from sern_client.endpoints.dds.entities import Reader, Writer
-from sern_client.endpoints.dds.graph import Graph, Remote, puts_header
+from sern_client.endpoints.dds.entities import Entities, Reader, Writer
+from sern_client.endpoints.dds.graph import Remote, puts_header
 from sern_client.endpoints.dds.names import Role
 from sern_client.endpoints.dds.qos import EndpointQos
 from sern_client.endpoints.dds.worker import Sample
 from sern_core.vocabulary.errors import ConfigError, ServiceError, UsageError
 from sern_core.vocabulary.types import Encoding, TopicName
 from sern_runtime import ros_services
-from sern_runtime.ros_types import ResolvedType
 
 DEPTH: Final = 10
 """History of requests and replies: what ROS 2 has by default for services."""
@@ -71,41 +71,26 @@ def new_service_id() -> str:
     return ".".join(f"{byte:x}" for byte in secrets.token_bytes(16))
 
 
-async def _matched(side: "_Side") -> None:
+async def _matched(side: Reader | Writer) -> None:
     """Wait until a writer has a reader, or a reader a writer."""
     while not side.matched:  # noqa: ASYNC110  DDS says so by status only
         await asyncio.sleep(MATCH_POLL_S)
-
-
-class _Side(Protocol):
-    """A reader or writer, as far as it matters here. `matched`: how many of others it is connected with."""
-
-    @property
-    def matched(self) -> int: ...
-
-    def close(self) -> None: ...
-
-
-class _Out(_Side, Protocol):
-    def publish(self, body: bytes, stamp_ns: int) -> None: ...
 
 
 @dataclass(slots=True)
 class _Client:
     info: ServiceInfo
     ident: int
-    writer: _Out
-    reader: _Side
-    waiting: dict[int, asyncio.Future[bytes]]
+    writer: Writer
+    reader: Reader
+    pending: PendingCalls
     number: int = 0
     met_s: float | None = None
 
     def close(self) -> None:
         self.writer.close()
         self.reader.close()
-        for future in self.waiting.values():
-            if not future.done():
-                future.set_exception(ServiceError(f"{self.info.name}: the service is gone"))
+        self.pending.fail_all(f"{self.info.name}: the service is gone")
 
 
 @dataclass(slots=True, eq=False)
@@ -116,9 +101,9 @@ class _Server:
     info: ServiceInfo
     handler: ServiceHandler
     closed: bool = False
-    writer: _Out | None = None
-    reader: _Side | None = None
-    tasks: set[asyncio.Task[None]] = field(default_factory=set)
+    writer: Writer | None = None
+    reader: Reader | None = None
+    tasks: Tasks = field(default_factory=lambda: Tasks(MAX_CALLS))
 
     def close(self) -> None:
         if self.closed:
@@ -133,50 +118,16 @@ class _Server:
     def _end(self) -> None:
         if self.writer is not None:
             self.writer.close()
-        for task in self.tasks:
-            task.cancel()
-
-
-class ServiceOwner(Protocol):
-    """What services need of the endpoint that has them."""
-
-    graph: Graph
-    counters: DdsCounters
-    types: Definitions
-
-    def open_reader(
-        self,
-        topic: str,
-        resolved: ResolvedType,
-        qos: EndpointQos,
-        deliver: Callable[[Sample], None],
-        *,
-        header: bool = False,
-        id_key: str = "clientid",
-    ) -> Reader:
-        """With `header`, of requests or replies. ConfigError where DDS gives none."""
-
-    def open_writer(
-        self,
-        topic: str,
-        resolved: ResolvedType,
-        qos: EndpointQos,
-        *,
-        depth: int,
-        header: bool = False,
-        id_key: str = "clientid",
-    ) -> Writer:
-        """ConfigError as `open_reader`."""
-
-    def say_once(self, line: str | Callable[[], str], *about: Hashable) -> None:
-        """What a person has to know and do something about."""
+        self.tasks.cancel()
 
 
 class DdsServices:
     """The services of one endpoint."""
 
-    def __init__(self, endpoint: ServiceOwner) -> None:
-        self._endpoint = endpoint
+    def __init__(self, entities: Entities, types: Definitions, say_once: SayOnce) -> None:
+        self._entities = entities
+        self._types = types
+        self._say_once = say_once
         self._events: ServiceEvents | None = None
         self._known: dict[TopicName, ServiceInfo] = {}
         self._clients: dict[TopicName, _Client] = {}
@@ -188,13 +139,14 @@ class DdsServices:
             events.service_added(info)
 
     async def stop(self) -> None:
-        tasks = [task for server in self._servers for task in server.tasks]
-        for server in list(self._servers):
+        servers = list(self._servers)
+        for server in servers:
             server.close()
         for client in self._clients.values():
             client.close()
         self._clients.clear()
-        await asyncio.gather(*tasks, return_exceptions=True)
+        for server in servers:
+            await server.tasks.ended()
 
     def forget(self, server: _Server) -> None:
         if server in self._servers:
@@ -222,7 +174,7 @@ class DdsServices:
 
     def _find(self, name: TopicName) -> ServiceInfo | None:
         """A service is there when one participant reads its requests and writes its replies."""
-        graph = self._endpoint.graph
+        graph = self._entities.graph
         repliers = {writer.participant for writer in graph.writers(names.to_dds(name, Role.REPLY))}
         unknown: set[tuple[str, str]] = set()
         for reader in graph.readers(names.to_dds(name, Role.REQUEST)):
@@ -238,12 +190,10 @@ class DdsServices:
             if kind in unknown:
                 continue
             try:
-                text = self._endpoint.types.service(*kind)
+                text = self._types.service(*kind)
             except ConfigError as error:
                 unknown.add(kind)
-                self._endpoint.say_once(
-                    f"service {name} of {graph.owner(reader)} is left alone: {names.cut(str(error), 600)}"
-                )
+                self._say_once(f"service {name} of {graph.owner(reader)} is left alone: {names.cut(str(error), 600)}")
                 continue
             return ServiceInfo(name, type_name, Encoding.CDR, text.type_hash, text.definition)
         return None
@@ -251,8 +201,8 @@ class DdsServices:
     def _understood(self, name: TopicName, remote: Remote) -> bool:
         if puts_header(remote):
             return True
-        self._endpoint.say_once(
-            f"service {name}: {self._endpoint.graph.owner(remote)} uses rmw_fastrtps, whose calls Cyclone DDS cannot "
+        self._say_once(
+            f"service {name}: {self._entities.graph.owner(remote)} uses rmw_fastrtps, whose calls Cyclone DDS cannot "
             "carry; run that node with RMW_IMPLEMENTATION=rmw_cyclonedds_cpp to have its services bridged"
         )
         return False
@@ -271,17 +221,11 @@ class DdsServices:
             client = self._clients[name] = self._open(info)
         client.number += 1
         number = client.number
-        future: asyncio.Future[bytes] = asyncio.get_running_loop().create_future()
-        client.waiting[number] = future
-        try:
-            async with asyncio.timeout(timeout_s):
+        with client.pending.call(number) as answer:
+            async with within(timeout_s, f"{name}: no answer within {timeout_s:g} s"):
                 await self._met(client)
                 client.writer.publish(Wrapped.join(request, client.ident, number), 0)
-                return await future
-        except TimeoutError:
-            raise ServiceError(f"{name}: no answer within {timeout_s:g} s") from None
-        finally:
-            client.waiting.pop(number, None)
+                return await answer
 
     async def _met(self, client: _Client) -> None:
         """Wait until a new client and its server know each other.
@@ -298,27 +242,26 @@ class DdsServices:
 
     def _open(self, info: ServiceInfo) -> _Client:
         client_id = secrets.randbits(64)
-        waiting: dict[int, asyncio.Future[bytes]] = {}
+        pending = PendingCalls()
 
         def deliver(sample: Sample) -> None:
             try:
                 body, client, number = Wrapped.split(sample.body)
             except ValueError:
-                self._endpoint.counters.unreadable += 1
+                self._entities.counters.unreadable += 1
                 return
-            future = waiting.get(number)
-            if client == client_id and future is not None and not future.done():
-                future.set_result(body)
+            if client == client_id:
+                pending.answer(number, body)
 
         try:
             writer, reader = self._pair(info, deliver, new_service_id(), serve=False)
         except ConfigError as error:
             raise ServiceError(str(error)) from None
-        return _Client(info, client_id, writer, reader, waiting)
+        return _Client(info, client_id, writer, reader, pending)
 
     def _pair(
         self, info: ServiceInfo, deliver: Callable[[Sample], None], ident: str, *, serve: bool
-    ) -> tuple[_Out, _Side]:
+    ) -> tuple[Writer, Reader]:
         """Writer and reader of one side of a service."""
         resolved = ros_services.resolve(info.type_name, info.definition, Encoding.CDR)
         request = names.to_dds(info.name, Role.REQUEST), resolved.request
@@ -326,10 +269,10 @@ class DdsServices:
         (out_topic, out_type), (in_topic, in_type) = (reply, request) if serve else (request, reply)
         key = "serviceid" if serve else "clientid"
         qos = EndpointQos(reliable=True, type_hash=in_type.text.type_hash, service_id=ident)
-        reader = self._endpoint.open_reader(in_topic, in_type, qos, deliver, header=True, id_key=key)
+        reader = self._entities.open_reader(in_topic, in_type, qos, deliver, header=True, id_key=key)
         qos = replace(qos, type_hash=out_type.text.type_hash)
         try:
-            writer = self._endpoint.open_writer(out_topic, out_type, qos, depth=DEPTH, header=True, id_key=key)
+            writer = self._entities.open_writer(out_topic, out_type, qos, depth=DEPTH, header=True, id_key=key)
         except ConfigError:
             reader.close()
             raise
@@ -343,7 +286,7 @@ class DdsServices:
             raise ConfigError(f"service {info.name}: {info.encoding} bodies cannot be served in ROS 2")
         if any(server.info.name == info.name for server in self._servers):
             raise UsageError(f"service {info.name} is served already")
-        text = self._endpoint.types.service(info.type_name) if not info.definition else None
+        text = self._types.service(info.type_name) if not info.definition else None
         if text is not None:
             info = ServiceInfo(info.name, info.type_name, info.encoding, text.type_hash, text.definition)
         server = _Server(self, info, handler)
@@ -356,22 +299,20 @@ class DdsServices:
         return server
 
     def _asked(self, server: _Server, sample: Sample) -> None:
-        caller = self._endpoint.graph.writer(sample.handle)
+        caller = self._entities.graph.writer(sample.handle)
         if caller is not None and not self._understood(server.info.name, caller):
             return
         try:
             request, client, number = Wrapped.split(sample.body)
         except ValueError as error:
-            self._endpoint.counters.unreadable += 1
-            self._endpoint.say_once(f"service {server.info.name}: {error}")
+            self._entities.counters.unreadable += 1
+            self._say_once(f"service {server.info.name}: {error}")
             return
-        if len(server.tasks) >= MAX_CALLS:
-            self._endpoint.counters.calls += 1
-            self._endpoint.say_once(f"service {server.info.name}: more than {MAX_CALLS} calls at a time; some fail")
+        if server.tasks.full:
+            self._entities.counters.calls += 1
+            self._say_once(f"service {server.info.name}: more than {MAX_CALLS} calls at a time; some fail")
             return
-        task = asyncio.get_running_loop().create_task(self._answer(server, request, client, number))
-        server.tasks.add(task)
-        task.add_done_callback(server.tasks.discard)
+        server.tasks.begin(self._answer(server, request, client, number))
 
     async def _answer(self, server: _Server, request: bytes, client: int, number: int) -> None:
         try:

@@ -170,10 +170,7 @@ class Ros1Endpoint:
     @property
     def drops(self) -> dict[DropReason, int]:
         """Messages dropped between local nodes and us, either way, by reason."""
-        total = dict(self.counters.dropped)
-        for why, number in self._limits.dropped.items():
-            total[why] = total.get(why, 0) + number
-        return total
+        return self.counters.dropped + self._limits.dropped
 
     @property
     def connected(self) -> bool:

@@ -19,6 +19,7 @@ from collections.abc import Awaitable, Callable, Mapping
 from contextlib import suppress
 from typing import Final, NamedTuple, Protocol
 
+from sern_client.endpoints.common.saying import Trouble
 from sern_client.endpoints.ros1.frames import keep_alive
 from sern_client.endpoints.ros1.master import Master, SystemState
 from sern_client.endpoints.ros1.xmlrpc import CallError, UnreachableError, split_uri
@@ -97,7 +98,7 @@ class Node:
         self.alive = False
         self.members: list[Member] = []
         self._master = master
-        self._said = ""
+        self._trouble = Trouble(_log, name)
         self._look = asyncio.Event()
         self._transport: asyncio.BaseTransport | None = None
         self._task = asyncio.create_task(self._run(), name=f"ros1 node {name}")
@@ -147,7 +148,7 @@ class Node:
                 if loop.time() - began_s < SHORT_WATCH_S:
                     await self._pause(pause_s)
                 else:
-                    self._said = ""
+                    self._trouble.forget()
                 continue
             await self._pause(pause_s)
             pause_s = min(pause_s * 2, LOOK_AGAIN_S[1])
@@ -158,19 +159,14 @@ class Node:
             self._dead()
         except Exception:  # noqa: BLE001  what a member does must not end the watching either
             _log.exception("%s: what it offers could not be withdrawn", self.name)
-        if self._says(f"{type(error).__name__}: {error}"):
+        if self._trouble.is_new(f"{type(error).__name__}: {error}"):
             _log.error("%s: the watching of this node failed; it is tried again", self.name, exc_info=error)
-
-    def _says(self, problem: str) -> bool:
-        """Whether a problem is to be logged: once until it is another one."""
-        new, self._said = problem != self._said, problem
-        return new
 
     async def _watch(self) -> None:
         try:
             host, port = split_uri(self.uri)
         except CallError as error:
-            if self.uri and self._says(str(error)):
+            if self.uri and self._trouble.is_new(str(error)):
                 _log.warning("%s: the master has %s; its ROS_HOSTNAME is to be another one", self.name, error)
             raise
         loop = asyncio.get_running_loop()

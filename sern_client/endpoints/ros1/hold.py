@@ -8,10 +8,11 @@ being sent to whoever is connected, and each of those subscribers gets them when
 
 import asyncio
 import logging
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Iterable
 from typing import Final
 
+from sern_client.endpoints.common.queue import BoundedQueue
 from sern_core.vocabulary.types import DropReason
 
 HOLD_S: Final = 2.0
@@ -37,13 +38,12 @@ class Hold:
         self._topic = topic
         self._overflow = overflow
         self._lost: Counter[DropReason] = Counter()  # a loss for somebody, if the master knows a subscriber
-        self._max_messages = max_messages
-        self._max_bytes = max_bytes
         self._dropped = dropped
         self._done = done
         self._loop = asyncio.get_running_loop()
-        self._kept: deque[tuple[bytes, float, DropReason]] = deque()
-        self._nbytes = 0
+        self._kept: BoundedQueue[tuple[bytes, float, DropReason]] = BoundedQueue(
+            max_bytes=max_bytes, max_items=max_messages
+        )
         self._waited_for: set[str] | None = None  # None: the master has not told yet who subscribes
         self._served: set[str] = set()
         self._timer: asyncio.TimerHandle | None = None
@@ -72,9 +72,7 @@ class Hold:
         now = self._loop.time()
         self._forget_old(now)
         why = DropReason.LIFESPAN if left_s < HOLD_S else DropReason.DISCONNECTED
-        self._kept.append((body, now + min(HOLD_S, left_s), why))
-        self._nbytes += len(body)
-        while len(self._kept) > self._max_messages or (self._nbytes > self._max_bytes and len(self._kept) > 1):
+        for _ in self._kept.put((body, now + min(HOLD_S, left_s), why), len(body)):
             self._lose(self._overflow)
 
     def joined(self, caller: str) -> list[bytes]:
@@ -101,7 +99,6 @@ class Hold:
         self.over = True
         self._kept.clear()
         self._lost.clear()
-        self._nbytes = 0
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
@@ -124,17 +121,15 @@ class Hold:
                 self._topic, ", ".join(sorted(self._waited_for)), HOLD_S, count, "" if count == 1 else "s",
             )  # fmt: skip
         while self._kept:
-            self._lose(self._kept[0][2])
+            self._lose(self._kept.pop()[2])
         self.close()
         self._done()
 
     def _forget_old(self, now: float) -> None:
-        while self._kept and self._kept[0][1] <= now:
-            self._lose(self._kept[0][2])
+        while self._kept and self._kept.first[1] <= now:
+            self._lose(self._kept.pop()[2])
 
     def _lose(self, why: DropReason) -> None:
-        body, _, _ = self._kept.popleft()
-        self._nbytes -= len(body)
         if self._waited_for is not None:
             self._dropped(why, 1)
         else:

@@ -22,9 +22,9 @@ class Listener(ABC):
         server, self._server = self._server, None
         if server is not None:
             server.close()
-            await self._end_connections()
+            await self.end_connections()
             await server.wait_closed()
 
     @abstractmethod
-    async def _end_connections(self) -> None:
+    async def end_connections(self) -> None:
         """End every connection that was accepted, and wait for its end."""

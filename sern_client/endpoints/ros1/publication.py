@@ -8,12 +8,13 @@ messages wait for the subscribers that there are (`hold`), also when the far sid
 
 import asyncio
 import logging
-from collections import deque
+from collections import Counter
 from collections.abc import Callable, Iterable
 from functools import partial
 from math import inf
 from typing import Final
 
+from sern_client.endpoints.common.queue import BoundedQueue
 from sern_client.endpoints.ros1.frames import LENGTH, Frames
 from sern_client.endpoints.ros1.header import BRIDGE_FIELD, shown
 from sern_client.endpoints.ros1.hold import Hold
@@ -46,8 +47,8 @@ class Feed:
         self.sent_messages = 0
         self.dropped = 0
         self._transport: asyncio.Transport | None = link.transport
-        self._queue: deque[bytes] = deque()
-        self._queued_bytes = 0
+        limits = publication.limits
+        self._queue: BoundedQueue[bytes] = BoundedQueue(max_bytes=limits.bytes, max_items=limits.messages)
         self._paused = False
         self._over = False  # nothing follows what was sent
         link.transport.set_write_buffer_limits(high=WRITE_BUFFER_BYTES)
@@ -71,16 +72,12 @@ class Feed:
             self._transport.writelines((LENGTH.pack(len(body)), body))
 
     def _keep(self, body: bytes) -> None:
-        limits = self.publication.limits
-        self._queue.append(body)
-        self._queued_bytes += len(body)
-        while len(self._queue) > limits.messages or (self._queued_bytes > limits.bytes and len(self._queue) > 1):
-            self._queued_bytes -= len(self._queue.popleft())
+        for _ in self._queue.put(body, len(body)):
             if not self.dropped:
                 _log.warning("%s: %s is slower than its messages; the oldest are dropped",
                              self.publication.topic, self.caller)  # fmt: skip
             self.dropped += 1
-            limits.drop(DropReason.QUEUE_FULL)
+            self.publication.limits.drop(DropReason.QUEUE_FULL)
 
     def pause(self) -> None:
         self._paused = True
@@ -88,9 +85,7 @@ class Feed:
     def resume(self) -> None:
         self._paused = False
         while self._queue and not self._paused:
-            body = self._queue.popleft()
-            self._queued_bytes -= len(body)
-            self._write(body, None)
+            self._write(self._queue.pop(), None)
 
     def ended(self) -> None:
         """The connection is gone, and what waited for it is lost."""
@@ -106,7 +101,7 @@ class Feed:
         if self._transport is not None and not self._over:
             self._over = True
             while self._queue:
-                self._write(self._queue.popleft(), None)
+                self._write(self._queue.pop(), None)
             self._transport.write_eof()
 
     def close(self) -> None:
@@ -121,10 +116,10 @@ class Limits:
     def __init__(self, messages: int, size_bytes: int) -> None:
         self.messages = messages
         self.bytes = size_bytes
-        self.dropped: dict[DropReason, int] = {}
+        self.dropped: Counter[DropReason] = Counter()
 
     def drop(self, why: DropReason, count: int = 1) -> None:
-        self.dropped[why] = self.dropped.get(why, 0) + count
+        self.dropped[why] += count
 
 
 class Publication:

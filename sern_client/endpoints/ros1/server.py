@@ -6,6 +6,7 @@ from contextlib import suppress
 from itertools import count
 from typing import Final, Protocol
 
+from sern_client.endpoints.common.saying import SayOnce
 from sern_client.endpoints.ros1.frames import Frames
 from sern_client.endpoints.ros1.header import encode_header, shown
 from sern_client.endpoints.ros1.listener import Listener
@@ -149,9 +150,10 @@ class TcprosServer(Listener):
         self.max_frame_bytes = max_frame_bytes
         self.connections: set[Inbound] = set()
         self.numbers = count(1)
-        self._said: set[str] = set()
+        self.complain = SayOnce(_log, logging.ERROR, most=MAX_REFUSALS)
+        """Say what a peer does wrong."""
 
-    async def _end_connections(self) -> None:
+    async def end_connections(self) -> None:
         for connection in list(self.connections):
             if connection.transport is not None:
                 connection.transport.close()
@@ -161,11 +163,3 @@ class TcprosServer(Listener):
                     await asyncio.sleep(0.005)
         for connection in list(self.connections):
             connection.close()
-
-    def complain(self, problem: str) -> None:
-        """Log a problem of a peer, once."""
-        if problem in self._said:
-            return
-        if len(self._said) < MAX_REFUSALS:
-            self._said.add(problem)
-            _log.error("%s", problem)

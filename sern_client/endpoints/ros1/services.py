@@ -10,6 +10,8 @@ from collections.abc import Callable
 from typing import Final, NamedTuple
 
 from sern_client.endpoints.base import ServiceEvents, ServiceHandler, ServiceInfo
+from sern_client.endpoints.common.calls import within
+from sern_client.endpoints.common.saying import Trouble
 from sern_client.endpoints.ros1.frames import LENGTH
 from sern_client.endpoints.ros1.graph import Graph
 from sern_client.endpoints.ros1.header import (
@@ -25,7 +27,7 @@ from sern_client.endpoints.ros1.server import Inbound
 from sern_client.endpoints.ros1.xmlrpc import CallError, reason, split_uri
 from sern_core.vocabulary.errors import ConfigError, ServiceError, UsageError, WireError
 from sern_core.vocabulary.types import Encoding, TopicName
-from sern_runtime import clock, ros_types
+from sern_runtime import ros_types
 
 PROBE_S: Final = 5.0
 PROBE_AGAIN_S: Final = (0.25, 10.0)
@@ -69,8 +71,7 @@ class Provider:
         self.info: ServiceInfo | None = None
         self._owner = owner
         self._task: asyncio.Task[None] | None = None
-        self._said = ""
-        self._failed_s = 0.0  # since when, if something was said
+        self._trouble = Trouble(_log, f"{service}: service of {node_name}")
 
     def up(self, uri: str) -> None:
         del uri  # its own address is looked up, because it is not its node's
@@ -95,7 +96,7 @@ class Provider:
                 if BRIDGE_FIELD not in fields or self._owner.heed_sern:
                     self.info = self._describe(fields)
                     self._owner.announce(self)
-                self._answers()
+                self._trouble.over()
                 return
             except (CallError, WireError, OSError, asyncio.IncompleteReadError, ConfigError) as error:
                 problem = reason(error)
@@ -103,20 +104,10 @@ class Provider:
                 problem = f"no answer within {PROBE_S:g} s"
             except Exception as error:  # noqa: BLE001  an error of ours must not be the end of a service
                 problem, unexpected = f"internal error: {reason(error)}", error
-            if problem != self._said:
-                if not self._said:
-                    self._failed_s = clock.now()
-                self._said = problem
-                level = logging.WARNING if unexpected is None else logging.ERROR
-                _log.log(level, "%s: service of %s: %s", self.service, self.node_name, problem, exc_info=unexpected)
+            level = logging.WARNING if unexpected is None else logging.ERROR
+            self._trouble.say(problem, level, unexpected, lost=True)
             await asyncio.sleep(pause_s)
             pause_s = min(pause_s * 2, PROBE_AGAIN_S[1])
-
-    def _answers(self) -> None:
-        if self._said:
-            self._said = ""
-            after_s = clock.now() - self._failed_s
-            _log.warning("%s: service of %s answers again, after %.0f s", self.service, self.node_name, after_s)
 
     async def _probe(self) -> dict[str, str]:
         uri = await self._owner.master.service_uri(self.service)
@@ -197,10 +188,8 @@ class ServiceWatch:
         if len(request) > self._max_message_bytes:
             raise ServiceError(f"{service}: a request of {len(request)} bytes is above {self._max_message_bytes}")
         try:
-            async with asyncio.timeout(timeout_s):
+            async with within(timeout_s, f"{service}: no response within {timeout_s:g} s"):
                 return await self._call(service, request)
-        except TimeoutError:
-            raise ServiceError(f"{service}: no response within {timeout_s:g} s") from None
         except CallError as error:
             raise ServiceError(f"{service}: {error}") from error
         except asyncio.IncompleteReadError:

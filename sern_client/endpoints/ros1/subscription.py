@@ -8,12 +8,13 @@ SERN endpoint is never a source: its messages came over a link.
 import asyncio
 import logging
 import time
+from collections import Counter
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Final, Protocol
 
 from sern_client.endpoints.base import Sink
+from sern_client.endpoints.common.saying import Trouble, say_failure
 from sern_client.endpoints.ros1.frames import Frames
 from sern_client.endpoints.ros1.header import BRIDGE_FIELD, check_lengths, encode_header
 from sern_client.endpoints.ros1.master import ANY
@@ -22,7 +23,7 @@ from sern_client.tf_latch import TfLatch, is_static_tf
 from sern_core.vocabulary.errors import ConfigError, WireError
 from sern_core.vocabulary.message import TopicInfo
 from sern_core.vocabulary.types import DropReason, Encoding, TopicName
-from sern_runtime import clock, ros_types
+from sern_runtime import ros_types
 
 CONNECT_S: Final = 5.0
 BACKOFF_S: Final = (0.1, 5.0)
@@ -39,12 +40,12 @@ class ReceiveCounters:
     accepted: int = 0
     refused: int = 0
     """Offered to the link, which counts them, and answered with no."""
-    dropped: dict[DropReason, int] = field(default_factory=dict)
+    dropped: Counter[DropReason] = field(default_factory=Counter)
     mismatches: int = 0
     """Publishers that were refused because they mean another type."""
 
     def drop(self, why: DropReason) -> None:
-        self.dropped[why] = self.dropped.get(why, 0) + 1
+        self.dropped[why] += 1
 
 
 class Owner(Protocol):
@@ -131,8 +132,7 @@ class Source:
         self.wake = asyncio.Event()
         """Its messages are wanted now."""
         self._task: asyncio.Task[None] | None = None
-        self._said = ""
-        self._failed_s: float | None = None  # since when no connection is accepted, if that was said
+        self._trouble = Trouble(_log, f"{topic.topic}: publisher {node_name}")
         self._too_large = False
 
     def up(self, uri: str) -> None:
@@ -142,7 +142,7 @@ class Source:
         self.down()
         self.uri = uri
         self._task = asyncio.create_task(self._run(), name=f"ros1 {self.topic.topic} from {self.node_name}")
-        self._task.add_done_callback(_log_failure)
+        self._task.add_done_callback(say_failure)
 
     def down(self) -> None:
         """Its node is dead, or no longer publishes this."""
@@ -221,7 +221,7 @@ class Source:
     def broke(self, error: WireError) -> None:
         """It broke the protocol after its header came, or with it."""
         if self.link is not None and self.link.open:
-            self.say(str(error))
+            self._trouble.say(str(error))
         else:
             self._failed(str(error))
         if self.fields is not None:
@@ -231,8 +231,7 @@ class Source:
     def _failed(self, problem: str, error: Exception | None = None) -> None:
         """There is no connection, or none that is of use. `error`: what nobody expected."""
         level = logging.WARNING if error is None else logging.ERROR
-        if self.say(problem, level, error) and self._failed_s is None:
-            self._failed_s = clock.now()
+        self._trouble.say(problem, level, error, lost=True)
 
     def greet(self, link: _Link, fields: dict[str, str]) -> None:
         """Its header has come: decide whether to stay connected."""
@@ -244,10 +243,7 @@ class Source:
         self.fields = fields
         ours = BRIDGE_FIELD in fields and not self.topic.owner.heed_sern
         self.info = None if ours else self._describe(fields)
-        if self._failed_s is not None:
-            failed_s, self._failed_s, self._said = self._failed_s, None, ""
-            after_s = clock.now() - failed_s
-            _log.warning("%s: publisher %s answers again, after %.0f s", self.topic.topic, self.node_name, after_s)
+        self._trouble.over()
         self.topic.sources_changed()
         if not self.topic.connects(self):
             link.close()
@@ -274,10 +270,12 @@ class Source:
         try:
             computed = ros_types.hash_of(type_name, text, Encoding.ROS1)
         except ConfigError as error:
-            self.say(error.problem)
+            self._trouble.say(error.problem)
             return ""
         if computed != md5:
-            self.say(f"md5sum {md5} of {type_name} does not belong to the definition it sends, which has {computed}")
+            self._trouble.say(
+                f"md5sum {md5} of {type_name} does not belong to the definition it sends, which has {computed}"
+            )
             return ""
         return text
 
@@ -288,7 +286,7 @@ class Source:
             f"it publishes {self.info.type_name} with md5sum {self.info.type_hash}, others here "
             f"{announced.type_name} with {announced.type_hash}; not received, rebuild one of them"
         )
-        if self.say(problem, logging.ERROR):
+        if self._trouble.say(problem, logging.ERROR):
             self.topic.owner.counters.mismatches += 1
 
     def too_large(self, size_bytes: int, limit_bytes: int) -> None:
@@ -296,15 +294,7 @@ class Source:
         self.topic.owner.counters.drop(DropReason.TOO_LARGE)
         if not self._too_large:
             self._too_large = True
-            self.say(f"a message of {size_bytes} bytes is dropped, max_message_bytes is {limit_bytes}")
-
-    def say(self, problem: str, level: int = logging.WARNING, error: Exception | None = None) -> bool:
-        """Log a problem, once until it is another one. `error`: with where it came from."""
-        if problem == self._said:
-            return False
-        self._said = problem
-        _log.log(level, "%s: publisher %s: %s", self.topic.topic, self.node_name, problem, exc_info=error)
-        return True
+            self._trouble.say(f"a message of {size_bytes} bytes is dropped, max_message_bytes is {limit_bytes}")
 
 
 class Topic:
@@ -437,9 +427,3 @@ def _same_type(one: TopicInfo | None, other: TopicInfo | None) -> bool:
     return (
         one is not None and other is not None and (one.type_name, one.type_hash) == (other.type_name, other.type_hash)
     )
-
-
-def _log_failure(task: asyncio.Task[None]) -> None:
-    with suppress(asyncio.CancelledError):
-        if (error := task.exception()) is not None:
-            _log.error("%s ended", task.get_name(), exc_info=error)

@@ -289,7 +289,7 @@ class XmlRpcServer(Listener):
         self.connections: set[_Server] = set()
         self._dispatch = dispatch
 
-    async def _end_connections(self) -> None:
+    async def end_connections(self) -> None:
         for connection in list(self.connections):
             connection.close()
 

@@ -17,7 +17,7 @@ from threading import Condition, Thread
 from types import ModuleType
 from typing import Any, Final
 
-from sern_client.endpoints.handover import Handover
+from sern_client.endpoints.common.handover import Handover
 from sern_core.vocabulary.errors import ConfigError
 from sern_runtime.config.endpoints import installing
 from sern_runtime.ros_types import one_line

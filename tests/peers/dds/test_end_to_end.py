@@ -109,7 +109,7 @@ async def test_ros2_reaches_rospy(tmp_path: Path, domain: int, make_peer: MakePe
 
 
 def _subscription(robot: ClientDaemon) -> Any:
-    (subscription,) = endpoint_of(robot, DdsEndpoint)._subscriptions[TopicName("/odom")]
+    (subscription,) = endpoint_of(robot, DdsEndpoint).subscriptions.of(TopicName("/odom"))
     return subscription
 
 

@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import pytest
 
-from sern_client.endpoints import first
+from sern_client.endpoints.common import first
 from sern_core.vocabulary.message import TopicInfo
 from sern_core.vocabulary.types import DropReason, Encoding
 from sern_runtime.ros_types import topic_info

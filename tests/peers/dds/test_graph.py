@@ -30,10 +30,10 @@ async def test_we_are_a_node(domain: int, make_peer: MakePeer, make_endpoint: Ma
         assert found is not None and found[0] == endpoint.graph.own
         return found[1]
 
-    await peer.until(lambda: publisher.guid.bytes in node_info.by_entity(nodes()))
+    await peer.until(lambda: publisher.writer.guid.bytes in node_info.by_entity(nodes()))
     assert [node.name for node in nodes()] == ["/sern_jackal"]
     publisher.close()
-    await peer.until(lambda: publisher.guid.bytes not in node_info.by_entity(nodes()))
+    await peer.until(lambda: publisher.writer.guid.bytes not in node_info.by_entity(nodes()))
 
 
 async def test_nodes_of_others_are_named(domain: int, make_peer: MakePeer, make_endpoint: MakeEndpoint) -> None:

@@ -81,7 +81,7 @@ async def test_from_ros2_to_the_link(
         await until(partial(_has, recorder, number))
     assert strangers([got for got, _ in recorder.got], bodies) == {}
     assert all(stamp_ns > STAMP_NS for _, stamp_ns in recorder.got)
-    assert endpoint.counters.received == len(bodies) and endpoint.overruns() == 0
+    assert endpoint.counters.received == len(bodies) and endpoint.entities.overruns() == 0
     subscription.close()
     await peer.line("matched a 0")
     await peer.do("close a")
@@ -97,7 +97,7 @@ async def test_from_the_link_to_ros2(
     publisher = endpoint.advertise(topic_info("/from/afar", TYPES[dds_type], CDR, reliable=True))
     await peer.do(f"sub b rt/from/afar {dds_type} reliable")
     await peer.line("matched b 1")
-    await until(lambda: publisher.matched == 1)  # each side finds the other by itself
+    await until(lambda: publisher.writer.matched == 1)  # each side finds the other by itself
     bodies = [body_of(dds_type, seed) for seed in range(10)]
     for body in bodies:
         publisher.publish(body, STAMP_NS)
@@ -122,7 +122,7 @@ async def test_large_messages_arrive_whole(domain: int, make_peer: MakePeer, mak
     publisher = endpoint.advertise(topic_info("/echo", TYPES[CLOUD], CDR, reliable=True))
     await peer.line("matched a 1")
     await peer.line("matched b 1")
-    await until(lambda: publisher.matched == subscription.matched == 1)
+    await until(lambda: publisher.writer.matched == subscription.matched == 1)
     body = cloud(1_000_000)
     await peer.do(f"write a {body.hex()}")
     await until(lambda: len(recorder.got) == 1)
@@ -239,7 +239,7 @@ async def test_two_sern_endpoints_beside_each_other_make_no_loop(
         for endpoint, recorder in ((one, heard_one), (two, heard_two), (chain, heard_chain))
     ]
     await peer.do(f"sub b rt/tf {STRING} reliable")
-    await until(lambda: publisher.matched == 3)  # the peer, and the readers of the other two
+    await until(lambda: publisher.writer.matched == 3)  # the peer, and the readers of the other two
     await peer.line("matched a 4")  # those of all three, and its own
     # Our own writer is not among those of `one`; the others' readers have the peer's and that one.
     await until(lambda: [subscription.matched for subscription in subscriptions] == [1, 2, 2])

@@ -203,6 +203,21 @@ async def test_the_far_side_s_interest_reaches_those_that_give_the_topic(events:
     endpoint.interest(TopicName("/unknown"), True)
     assert giver.interests == [(STRING.name, True)]
     assert other.interests == []
+    endpoint.interest(STRING.name, False)
+    endpoint.subscribe(STRING.name, lambda _body, _stamp_ns: True)
+    assert other.events is not None
+    other.events.topic_added(STRING)
+    assert other.interests == [(STRING.name, False)], "one that joins later is told what the others were"
+    endpoint.interest(STRING.name, True)
+    assert giver.interests[-1] == other.interests[-1] == (STRING.name, True)
+
+    endpoint.interest(STRING.name, False)
+    giver.events.topic_removed(STRING.name)
+    other.events.topic_removed(STRING.name)
+    other.interests.clear()
+    other.events.topic_added(STRING)
+    endpoint.subscribe(STRING.name, lambda _body, _stamp_ns: True)
+    assert other.interests == [], "a topic that begins anew is wanted"
     await endpoint.stop()
 
 

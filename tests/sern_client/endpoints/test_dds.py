@@ -296,19 +296,19 @@ async def test_a_loop_that_is_too_slow_loses_the_oldest(domain_id: int, monkeypa
             return True
 
         subscription = two.subscribe(info.name, sink)
-        await until(lambda: publisher.matched == 1)
+        await until(lambda: publisher.writer.matched == 1)
         bodies = [b"\0\x01\0\0\x04\0\0\0" + b"%03d\0" % number for number in range(100)]
-        assert publisher.first.over  # what is published goes out at once
+        assert not publisher.waits  # what is published goes out at once
         for body in bodies:
             publisher.publish(body, 1)
         patience = Patience()
-        while two.overruns() < 50 and not patience.over():
+        while two.entities.overruns() < 50 and not patience.over():
             pass  # the loop is busy with something else
         await until(lambda: bodies[-1] in got)
-        assert two.overruns() + len(got) == 100 and two.overruns() >= 50
+        assert two.entities.overruns() + len(got) == 100 and two.entities.overruns() >= 50
         assert got == sorted(got)
         subscription.close()
-        assert two.overruns() >= 50
+        assert two.entities.overruns() >= 50
     finally:
         await two.stop()
         await one.stop()
@@ -375,7 +375,8 @@ async def test_a_topic_that_is_just_being_deleted_is_made_anew(
     domain_id: int, monkeypatch: pytest.MonkeyPatch, refusals: int
 ) -> None:
     """The worker deletes it with its last reader or writer; until that is done it is found, and of no use."""
-    from sern_client.endpoints.dds import endpoint as module
+    from sern_client.endpoints.dds import entities
+    from sern_client.endpoints.dds.endpoint import DdsEndpoint, DdsOptions
 
     topics: list[Any] = []
 
@@ -390,10 +391,10 @@ async def test_a_topic_that_is_just_being_deleted_is_made_anew(
 
         def topic_removed(self, name: TopicName) -> None: ...
 
-    one = module.DdsEndpoint(module.DdsOptions(DomainOptions(domain_id, localhost_only=True)))
+    one = DdsEndpoint(DdsOptions(DomainOptions(domain_id, localhost_only=True)))
     await one.start(Silent())
     try:
-        monkeypatch.setattr(module, "DataWriter", refuse)
+        monkeypatch.setattr(entities, "DataWriter", refuse)
         info = topic_info("/chat", "std_msgs/msg/String", Encoding.CDR)
         if refusals == 1:
             one.advertise(info)

@@ -12,12 +12,13 @@ import pytest
 
 pytest.importorskip("cyclonedds", reason="the dds endpoint needs cyclonedds: pip install cyclonedds==11.0.1")
 
+from sern_client.endpoints.common.stream import Stream
 from sern_client.endpoints.dds import endpoint as module
 from sern_client.endpoints.dds.domain import DomainOptions
 from sern_client.endpoints.dds.endpoint import DdsEndpoint, DdsOptions
+from sern_client.endpoints.dds.entities import Writer
 from sern_client.endpoints.dds.graph import Remote
 from sern_client.endpoints.dds.qos import EndpointQos, mismatches, reader_for, within_reach
-from sern_client.endpoints.dds.stream import Stream
 from sern_core.vocabulary.errors import ConfigError
 from sern_core.vocabulary.types import DropReason, Encoding, TopicName
 from sern_runtime.ros_types import topic_info
@@ -82,17 +83,17 @@ class Pair:
 
     def add(self, remote: Remote) -> None:
         """A writer comes that `two` is told of."""
-        self.two.remote_added(remote)
+        self.two.graph.remote_added(remote)
         settle(self.two)
 
-    async def connect(self) -> Stream:
+    async def connect(self) -> Stream[Writer]:
         """Take /chat of `one` at `two`."""
         info = topic_info("/chat", "std_msgs/msg/String", Encoding.CDR, reliable=True)
         publisher = self.one.advertise(replace(info, depth=500))
         await until(lambda: self.two.graph.writers("rt/chat"))
         self.two.subscribe(TopicName("/chat"), self.sink)
-        await until(lambda: publisher.matched == 1)
-        assert publisher.first.over and len(self.opened) == 1
+        await until(lambda: publisher.writer.matched == 1)
+        assert not publisher.waits and len(self.opened) == 1
         return publisher
 
 
@@ -106,14 +107,14 @@ async def pair(monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[Pair]:
     domain = DomainOptions(free_domain(), localhost_only=True)
     opened: list[EndpointQos] = []
     one, two = DdsEndpoint(DdsOptions(domain)), DdsEndpoint(DdsOptions(domain, heed_sern=True, queue_depth=500))
-    open_reader = two.open_reader
+    open_reader = two.entities.open_reader
 
     def counted(topic: str, resolved: Any, qos: EndpointQos, *rest: Any, **options: Any) -> Any:
         if topic == "rt/chat":
             opened.append(qos)
         return open_reader(topic, resolved, qos, *rest, **options)
 
-    monkeypatch.setattr(two, "open_reader", counted)
+    monkeypatch.setattr(two.entities, "open_reader", counted)
     await one.start(Events())
     await two.start(Events())
     yield Pair(one, two, opened)
@@ -132,7 +133,7 @@ async def test_a_writer_that_never_matches_leaves_the_reader_alone(pair: Pair, c
     pair.add(writer(51, **changed))
     for number in range(60, 70):
         pair.add(writer(number))
-        pair.two.remote_removed(UUID(int=number))
+        pair.two.graph.remote_removed(UUID(int=number))
         settle(pair.two)
     assert len(pair.opened) == 1
     publisher.publish(body(1), 1)
@@ -147,11 +148,10 @@ async def test_messages_survive_a_fault_in_discovery(pair: Pair, monkeypatch: py
     def fail(handle: int) -> bool:
         raise OSError("Cyclone DDS does not say")
 
-    assert pair.two._joined is not None
-    monkeypatch.setattr(pair.two._joined.worker._discovery, "find_writer", fail)
+    monkeypatch.setattr(pair.two.entities.worker._discovery, "find_writer", fail)
     publisher.publish(body(1), 1)
     await until(lambda: pair.got == [body(1)])
-    assert pair.two.drops == {DropReason.UNDECODABLE: pair.two.faults} and pair.two.faults >= 1
+    assert pair.two.drops == {DropReason.UNDECODABLE: pair.two.entities.faults} and pair.two.entities.faults >= 1
 
 
 async def test_what_a_reader_has_received_outlives_it(pair: Pair) -> None:
@@ -163,7 +163,7 @@ async def test_what_a_reader_has_received_outlives_it(pair: Pair) -> None:
     pair.add(writer(50, qos=EndpointQos()))
     assert [qos.reliable for qos in pair.opened] == [True, False]
     await until(lambda: pair.got == bodies, "all that was written")
-    await until(lambda: not pair.two._leaving, "the end of the reader")
+    await until(lambda: not pair.two.entities.leaving, "the end of the reader")
     assert pair.two.drops == {}
 
 
@@ -171,9 +171,8 @@ class Held:
     """Keeps a worker's thread in a job until `go`."""
 
     def __init__(self, endpoint: DdsEndpoint) -> None:
-        assert endpoint._joined is not None
         self._began, self._end = threading.Event(), threading.Event()
-        endpoint._joined.worker._do(self._wait)
+        endpoint.entities.worker._do(self._wait)
         assert self._began.wait(DEADLINE_S)
 
     def _wait(self) -> None:
@@ -184,10 +183,12 @@ class Held:
         self._end.set()
 
 
-async def in_the_end(pair: Pair, publisher: Stream) -> list[bytes]:
+async def in_the_end(pair: Pair, publisher: Stream[Writer]) -> list[bytes]:
     """All that came, when what is written last has come and no reader is being let go."""
     last = body(9999)
-    await until(lambda: publisher.matched == 1 and not pair.two._leaving, "the end of the readers before")
+    await until(
+        lambda: publisher.writer.matched == 1 and not pair.two.entities.leaving, "the end of the readers before"
+    )
     publisher.publish(last, 1)
     await until(lambda: last in pair.got, "the last message")
     return pair.got[:-1]
@@ -196,7 +197,7 @@ async def in_the_end(pair: Pair, publisher: Stream) -> list[bytes]:
 @pytest.mark.parametrize("depth", [500, 3000])
 async def test_a_reader_made_anew_takes_nothing_twice(pair: Pair, depth: int) -> None:
     """Both readers receive while the thread is busy; of the same messages some have the same time stamp."""
-    pair.two.options = replace(pair.two.options, queue_depth=depth)
+    pair.two.entities.queue_depth = depth
     publisher = await pair.connect()
     held = Held(pair.two)
     bodies = [body(number) for number in range(depth // 2)] + [body(7), body(7)]
@@ -240,14 +241,14 @@ async def test_history_is_not_delivered_again(pair: Pair) -> None:
 async def test_nothing_is_lost_between_two_readers(pair: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
     """The thread does all that it has to do, and a message comes, just before there is the new reader."""
     publisher = await pair.connect()
-    make = pair.two._make
+    make = pair.two.entities.make
 
     def after_a_message(*given: Any, **options: Any) -> Any:
         Held(pair.two).go()
         publisher.publish(body(1), 1)
         return make(*given, **options)
 
-    monkeypatch.setattr(pair.two, "_make", after_a_message)
+    monkeypatch.setattr(pair.two.entities, "make", after_a_message)
     pair.add(writer(50, qos=EndpointQos()))
     assert len(pair.opened) == 2
     assert await in_the_end(pair, publisher) == [body(1)]
@@ -260,7 +261,7 @@ async def test_the_reader_before_stays_where_dds_gives_no_other(pair: Pair, monk
         raise ConfigError("out of resources")
 
     with monkeypatch.context() as patch:
-        patch.setattr(pair.two, "_make", refuse)
+        patch.setattr(pair.two.entities, "make", refuse)
         pair.add(writer(50, qos=EndpointQos()))
     publisher.publish(body(1), 1)
     await until(lambda: pair.got == [body(1)])
@@ -281,7 +282,7 @@ async def test_what_dds_refuses_is_asked_for_again_once_a_second(pair: Pair, mon
         raise ConfigError("out of resources")
 
     with monkeypatch.context() as patch:
-        patch.setattr(pair.two, "_make", refuse)
+        patch.setattr(pair.two.entities, "make", refuse)
         patch.setattr(asyncio.get_running_loop(), "call_later", later)
         for number in range(50, 60):
             pair.add(writer(number, qos=EndpointQos()))
@@ -314,15 +315,15 @@ def test_many_writers_of_unknown_types_are_looked_up_once(
     monkeypatch.setattr(endpoint.graph, "owner", named)
     unknown = [writer(k, type_name="x::msg::dds_::T_", qos=replace(RELIABLE, type_hash=str(k % 2))) for k in range(300)]
     for one in unknown[:200]:
-        endpoint.remote_added(one)
+        endpoint.graph.remote_added(one)
     assert not lookups and settle(endpoint) == 1
     assert lookups == [("x/msg/T", "0"), ("x/msg/T", "1")] and owners == unknown[:2]
     for one in unknown[200:]:
-        endpoint.remote_added(one)
-    endpoint.remote_added(writer(400, topic="rt/other", type_name="no type"))
+        endpoint.graph.remote_added(one)
+    endpoint.graph.remote_added(writer(400, topic="rt/other", type_name="no type"))
     assert settle(endpoint) == 2 and len(lookups) == 4 and len(owners) == 2 and heard.infos == {}
     assert len(caplog.messages) == 3 and caplog.messages[0].startswith("/chat of participant without a name")
-    endpoint.remote_added(writer(500))
+    endpoint.graph.remote_added(writer(500))
     settle(endpoint)
     assert list(heard.infos) == ["/chat"]
 
@@ -339,7 +340,9 @@ def test_many_readers_of_unknown_services_are_looked_up_once(monkeypatch: pytest
         return service(type_name, request_hash)
 
     monkeypatch.setattr(endpoint.types, "service", counted)
-    endpoint.remote_added(writer(0, topic="rr/addReply", type_name="x::srv::dds_::S_Response_"))
+    endpoint.graph.remote_added(writer(0, topic="rr/addReply", type_name="x::srv::dds_::S_Response_"))
     for k in range(200):
-        endpoint.remote_added(writer(k + 1, writer=False, topic="rq/addRequest", type_name="x::srv::dds_::S_Request_"))
+        endpoint.graph.remote_added(
+            writer(k + 1, writer=False, topic="rq/addRequest", type_name="x::srv::dds_::S_Request_")
+        )
     assert settle(endpoint) == 1 and lookups == ["x/srv/S"] and heard.services == {}

@@ -50,9 +50,8 @@ async def endpoint() -> AsyncIterator[DdsEndpoint]:
 
 @pytest.fixture
 async def worker(endpoint: DdsEndpoint) -> Worker:
-    assert endpoint._joined is not None
     await until(lambda: endpoint.graph.participants)  # of itself: what discovery has to say at first is said
-    return endpoint._joined.worker
+    return endpoint.entities.worker
 
 
 def inbox_of(count: int, deliver: Callable[[Sample], None]) -> Inbox:
@@ -114,9 +113,9 @@ async def test_a_fault_in_one_sample_keeps_no_other(worker: Worker) -> None:
 
 async def test_an_endless_list_of_nodes_is_counted_and_not_read(endpoint: DdsEndpoint) -> None:
     body = node_info.encode(endpoint.graph.own, "x", [], [])
-    endpoint._heed_nodes(Sample(body + bytes(node_info.MAX_BODY_BYTES), 1, 1))
+    endpoint.entities.heed_nodes(Sample(body + bytes(node_info.MAX_BODY_BYTES), 1, 1))
     assert endpoint.drops == {DropReason.UNDECODABLE: 1}
-    endpoint._heed_nodes(Sample(b"no such thing", 1, 1))  # of before Iron
+    endpoint.entities.heed_nodes(Sample(b"no such thing", 1, 1))  # of before Iron
     assert endpoint.drops == {DropReason.UNDECODABLE: 1}
 
 
@@ -196,7 +195,8 @@ async def test_messages_wait_in_dds_while_the_event_loop_is_behind(endpoint: Dds
     got: list[bytes] = []
     info = ros_types.resolve("std_msgs/msg/String", "string data", Encoding.CDR)
     opened = [
-        endpoint.open_reader("rt/chat", info, EndpointQos(), lambda sample: got.append(sample.body)) for _ in range(2)
+        endpoint.entities.open_reader("rt/chat", info, EndpointQos(), lambda sample: got.append(sample.body))
+        for _ in range(2)
     ]
     other = DomainParticipant(endpoint.options.domain.domain)
     writer = DataWriter(Publisher(other), Topic(other, "rt/chat", TypeMaker().make(info)))
@@ -227,7 +227,7 @@ async def test_messages_arrive_during_a_flood_of_discoveries(
     """Whenever the event loop has caught up, there are so many more that it is behind again."""
     got: list[bytes] = []
     info = ros_types.resolve("std_msgs/msg/String", "string data", Encoding.CDR)
-    reader = endpoint.open_reader("rt/chat", info, EndpointQos(), lambda sample: got.append(sample.body))
+    reader = endpoint.entities.open_reader("rt/chat", info, EndpointQos(), lambda sample: got.append(sample.body))
     other = DomainParticipant(endpoint.options.domain.domain)
     writer = DataWriter(Publisher(other), Topic(other, "rt/chat", TypeMaker().make(info)))
     await until(lambda: reader.matched and endpoint.graph.writers("rt/chat"))

@@ -5,8 +5,8 @@ from math import inf
 
 import pytest
 
-from sern_client.endpoints import first
-from sern_client.endpoints.first import FirstMessages, Readers
+from sern_client.endpoints.common import first
+from sern_client.endpoints.common.first import FirstMessages, Readers
 from sern_core.vocabulary.types import DropReason
 from tests.support import until
 

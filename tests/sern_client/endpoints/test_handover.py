@@ -6,7 +6,7 @@ from threading import Thread
 
 import pytest
 
-from sern_client.endpoints.handover import ITEM_BYTES, TURN_S, Handover
+from sern_client.endpoints.common.handover import ITEM_BYTES, TURN_S, Handover
 from sern_runtime import clock
 from tests.support import until
 

@@ -4,6 +4,7 @@ An installation of ROS 2 is not among the tests' peers; the type checker compare
 """
 
 import sys
+from collections import Counter
 from collections.abc import Callable
 from enum import Enum
 from threading import Event
@@ -177,6 +178,44 @@ async def test_topics_of_others_come_and_go_and_bytes_pass(graph: Graph) -> None
     await until(lambda: CHAT not in events.infos, "gone")
     await endpoint.stop()
     assert graph.ended.is_set() and graph.destroyed
+
+
+async def test_what_nobody_wants_has_no_subscription(graph: Graph) -> None:
+    endpoint, events = RclpyEndpoint(RclpyOptions(poll_hz=100)), Events()
+    latched = TopicName("/map")
+    graph.offer(CHAT)
+    graph.offer(latched, latched=True)
+    await endpoint.start(events)
+    got: list[bytes] = []
+
+    def take(body: bytes, _stamp_ns: int) -> bool:
+        got.append(body)
+        return True
+
+    opened = [endpoint.subscribe(name, take) for name in (CHAT, latched)]
+    before, _ = graph.subscriptions[CHAT]
+    before(b"waits for the loop")
+    for name in (CHAT, latched):
+        endpoint.interest(name, False)
+    assert set(graph.subscriptions) == {latched}, "what is latched must be there for whoever comes"
+    graph.offer("/late")
+    await until(lambda: "/late" in events.infos, "the graph is looked at all the same")
+    assert set(events.infos) == {CHAT, latched, "/late"}
+    held = Held(subscriptions=Counter([CHAT, latched]))
+    assert endpoint.validate(held) == [] and got == []
+
+    graph.offer(CHAT, node="another", latched=True)
+    del graph.publishers[CHAT][0]
+    endpoint.interest(CHAT, True)
+    callback, profile = graph.subscriptions[CHAT]
+    assert profile.durability is Durability.TRANSIENT_LOCAL, "what the publishers of now offer is asked for"
+    before(b"of the one before")
+    callback(b"first")
+    await until(lambda: got == [b"first"], "passed on")
+    for subscription in opened:
+        subscription.close()
+    assert graph.subscriptions == {} and endpoint.validate(Held()) == []
+    await endpoint.stop()
 
 
 async def test_what_we_publish_is_not_announced_to_us(graph: Graph) -> None:

@@ -1,21 +1,32 @@
 """The configuration sections of the endpoints offer what the endpoints take, with the same defaults."""
 
-from dataclasses import MISSING, fields
+from dataclasses import MISSING, Field, asdict, fields, is_dataclass
+from pathlib import Path
+from typing import Any, get_type_hints
 
 import pytest
 
+pytest.importorskip("cyclonedds", reason="the dds endpoint needs cyclonedds: pip install cyclonedds==11.0.1")
+
 from sern_client.endpoints.bag import BagOptions
+from sern_client.endpoints.dds.endpoint import DdsOptions
 from sern_client.endpoints.jackal import JACKAL
+from sern_client.endpoints.rclpy import RclpyOptions
 from sern_client.endpoints.record import RecordOptions
 from sern_client.endpoints.ros1 import Ros1Options
 from sern_client.endpoints.synthetic import SyntheticOptions
+from sern_client.endpoints.zenoh.options import ZenohOptions
+from sern_client.factory import options_of
 from sern_runtime.config.endpoints import (
     MAX_SYNTHETIC_TOPICS,
     BagEndpoint,
+    DdsEndpoint,
     EndpointBase,
+    RclpyEndpoint,
     RecordEndpoint,
     Ros1Endpoint,
     SyntheticEndpoint,
+    ZenohEndpoint,
 )
 
 PAIRS = [
@@ -23,17 +34,58 @@ PAIRS = [
     (SyntheticEndpoint, SyntheticOptions),
     (RecordEndpoint, RecordOptions),
     (Ros1Endpoint, Ros1Options),
+    (DdsEndpoint, DdsOptions),
+    (ZenohEndpoint, ZenohOptions),
+    (RclpyEndpoint, RclpyOptions),
 ]
+SAID_BY_NO_FILE = {"second"}
+OTHERWISE_BY_DEFAULT = {(DdsOptions, "domain")}
+"""Which domain it is where the file says nothing, the environment says."""
+
+
+def every(kind: Any) -> dict[str, Field[Any]]:
+    """The fields of options and of the options in them."""
+    found: dict[str, Field[Any]] = {}
+    hints = get_type_hints(kind)
+    for field in fields(kind):
+        found |= every(hints[field.name]) if is_dataclass(hints[field.name]) else {field.name: field}
+    return found
 
 
 @pytest.mark.parametrize(("section", "options"), PAIRS, ids=lambda item: item.__name__)
-def test_section_mirrors_options(section: type[EndpointBase], options: type[BagOptions]) -> None:
+def test_section_mirrors_options(section: type[EndpointBase], options: type[Any]) -> None:
     settings = {name: field for name, field in section.model_fields.items() if name != "kind"}
-    assert set(settings) == {field.name for field in fields(options)}
-    for field in fields(options):
+    known = every(options)
+    assert set(settings) == known.keys() - SAID_BY_NO_FILE
+    for name in settings.keys() - {name for kind, name in OTHERWISE_BY_DEFAULT if kind is options}:
         # What must be chosen in a file may have a default in code.
-        if field.default is not MISSING and not settings[field.name].is_required():
-            assert settings[field.name].default == field.default, field.name
+        if known[name].default is not MISSING and not settings[name].is_required():
+            assert settings[name].default == known[name].default, name
+
+
+def test_options_are_those_of_the_section() -> None:
+    section = ZenohEndpoint(
+        kind="zenoh", connect=("tcp/a:1",), config_file="session.json5", domain=7, type_paths=("one", "two")
+    )
+    made = options_of(ZenohOptions, section, Path("/folder").joinpath, second=True)
+    assert asdict(made) == {
+        "session": {
+            "connect": ("tcp/a:1",), "listen": None, "config_file": Path("/folder/session.json5"), "second": True,
+        },
+        "domain": 7,
+        "node_name": "sern",
+        "type_paths": (Path("/folder/one"), Path("/folder/two")),
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(("section", "options"), PAIRS, ids=lambda item: item.__name__)
+def test_every_key_of_a_section_reaches_the_options(section: type[EndpointBase], options: type[Any]) -> None:
+    values: dict[str, Any] = {name: f"value of {name}" for name in section.model_fields}
+    made = options_of(options, section.model_construct(**values), Path)
+    found = asdict(made)
+    found |= {key: value for inner in found.values() if isinstance(inner, dict) for key, value in inner.items()}
+    for name in values.keys() - {"kind"}:
+        assert found[name] in (values[name], Path(values[name])), name
 
 
 def test_as_many_topics_as_the_robot_has() -> None:

@@ -3,16 +3,17 @@
 import asyncio
 import json
 import sys
+from collections import Counter
 from collections.abc import AsyncIterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import pytest
 
 pytest.importorskip("zenoh", reason="the library eclipse-zenoh is missing: pip install 'sern[zenoh]'")
 
-from sern_client.endpoints.base import ServiceInfo
-from sern_client.endpoints.handover import ITEM_BYTES
+from sern_client.endpoints.base import Held, ServiceInfo
+from sern_client.endpoints.common.handover import ITEM_BYTES
 from sern_client.endpoints.zenoh import names
 from sern_client.endpoints.zenoh import session as module
 from sern_client.endpoints.zenoh.endpoint import ZenohEndpoint
@@ -55,7 +56,7 @@ async def test_a_loop_that_is_behind_counts_what_it_drops(monkeypatch: pytest.Mo
     endpoint = ZenohEndpoint(ZenohOptions(SessionOptions(connect=(), listen=("tcp/127.0.0.1:0",))))
     await endpoint.start(Events())
     try:
-        monkeypatch.setattr(endpoint.session.handover, "_max_bytes", 115)
+        monkeypatch.setattr(endpoint.session.handover.messages, "max_bytes", 115)
         for _ in range(3):
             endpoint.session.handover.put(lambda: None, 10)
         await asyncio.sleep(0)
@@ -161,27 +162,36 @@ async def test_the_router_of_the_file_is_the_one_that_is_said_to_be_missing(
         await endpoint.stop()
 
 
+class Two(NamedTuple):
+    """Endpoints that reach each other, and what each of them announces."""
+
+    one: ZenohEndpoint
+    other: ZenohEndpoint
+    events: Events
+    other_events: Events
+
+
 @pytest.fixture
-async def two() -> AsyncIterator[tuple[ZenohEndpoint, ZenohEndpoint]]:
+async def two() -> AsyncIterator[Two]:
     """One that listens, and one that comes to it."""
     (port,) = free_ports(1)
     here, there = f"tcp/127.0.0.1:{port}", "tcp/127.0.0.1:0"
     one = ZenohEndpoint(ZenohOptions(SessionOptions(connect=(), listen=(here,))))
     other = ZenohEndpoint(ZenohOptions(SessionOptions(connect=(here,), listen=(there,))))
-    await one.start(Events())
-    await other.start(Events())
-    yield one, other
+    made = Two(one, other, Events(), Events())
+    await one.start(made.events)
+    other.watch_services(made.other_events)
+    await other.start(made.other_events)
+    yield made
     await other.stop()
     await one.stop()
 
 
-async def test_an_attachment_counts_for_what_waits(
-    two: tuple[ZenohEndpoint, ZenohEndpoint], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    here, there = two
+async def test_an_attachment_counts_for_what_waits(two: Two, monkeypatch: pytest.MonkeyPatch) -> None:
+    here, there = two.one, two.other
     info = ros_types.topic_info("/chat", "std_msgs/msg/String", Encoding.CDR)
     there.advertise(info)
-    await until(lambda: info.name in here._topics)
+    await until(lambda: info.name in two.events.infos)
     got: list[bytes] = []
 
     def sink(body: bytes, _stamp_ns: int) -> bool:
@@ -196,36 +206,91 @@ async def test_an_attachment_counts_for_what_waits(
     def arrived() -> bool:
         """Until the two have met, what is published is for nobody: again and again."""
         there.session.opened.put(key, b"", attachment=bytes(60_000))
-        return bool(handover._messages)
+        return bool(handover.messages)
 
     await until(arrived)
-    assert handover._nbytes >= 60_000 and handover._messages[0].nbytes == 60_000 + ITEM_BYTES
+    assert handover.messages.nbytes == len(handover.messages) * (60_000 + ITEM_BYTES)
     handover._run()
     assert b"" in got
 
 
-async def test_a_request_that_is_dropped_is_refused(
-    two: tuple[ZenohEndpoint, ZenohEndpoint], monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_a_request_that_is_dropped_is_refused(two: Two, monkeypatch: pytest.MonkeyPatch) -> None:
     """More have arrived than the loop serves: the oldest is told at once, and does not wait for its timeout."""
-    server, caller = two
+    server, caller = two.one, two.other
     lamp = ServiceInfo(TopicName("/lamp"), "std_srvs/srv/SetBool", Encoding.CDR, "RIHS01_" + "5" * 64)
 
     async def echo(request: bytes) -> bytes:
         return request
 
     server.serve(lamp, echo)
-    await until(lambda: lamp.name in caller._servers)
+    await until(lambda: lamp.name in two.other_events.services)
     assert await caller.call(lamp.name, b"first", timeout_s=DEADLINE_S) == b"first"
     handover = server.session.handover
-    monkeypatch.setattr(handover, "_max_bytes", 1)
+    monkeypatch.setattr(handover.messages, "max_bytes", 1)
     monkeypatch.setattr(handover, "_wakes", lambda: False)  # the loop is busy
     calls = list[asyncio.Task[bytes]]()
     for word in (b"one", b"two"):
         calls.append(asyncio.create_task(caller.call(lamp.name, word, timeout_s=DEADLINE_S)))
-        await until(lambda: handover._messages and handover.dropped == len(calls) - 1)
+        await until(lambda: handover.messages and handover.dropped == len(calls) - 1)
     with pytest.raises(ServiceError, match="/lamp: the bridge is behind"):
         await calls[0]
     assert not calls[1].done() and server.drops == {DropReason.QUEUE_FULL: 1}
     handover._run()
     assert await calls[1] == b"two"
+
+
+async def test_what_nobody_wants_is_not_taken_from_the_session(two: Two) -> None:
+    here, there = two.one, two.other
+    info = ros_types.topic_info("/chat", "std_msgs/msg/String", Encoding.CDR)
+    kind = names.dds_type(info.type_name), info.type_hash
+    publisher = there.advertise(info)
+    await until(lambda: info.name in two.events.infos)
+    got: list[bytes] = []
+
+    def sink(body: bytes, _stamp_ns: int) -> bool:
+        got.append(body)
+        return True
+
+    subscription = here.subscribe(info.name, sink)
+    matching = there.session.opened.declare_publisher(here.node.key(info.name, *kind))
+    await until(lambda: there.readers(info.name, *kind) == 1 and matching.matching_status.matching)
+    publisher.publish(b"wanted", 1)
+    await until(lambda: got == [b"wanted"])
+
+    here.interest(info.name, False)
+    await until(lambda: there.readers(info.name, *kind) == 0 and not matching.matching_status.matching)
+    publisher.publish(b"unwanted", 2)
+    held = Held(subscriptions=Counter([info.name]))
+    assert here.validate(held) == [] and info.name in two.events.infos, "it is offered all the same"
+
+    here.interest(info.name, True)
+    await until(lambda: there.readers(info.name, *kind) == 1 and matching.matching_status.matching)
+    publisher.publish(b"again", 3)
+    await until(lambda: len(got) == 2)
+    assert got == [b"wanted", b"again"]
+    subscription.close()
+    await until(lambda: there.readers(info.name, *kind) == 0)
+    assert here.validate(Held()) == []
+
+
+async def test_what_is_latched_is_there_when_it_is_wanted_again(two: Two) -> None:
+    here, there = two.one, two.other
+    info = ros_types.topic_info("/map", "std_msgs/msg/String", Encoding.CDR, latched=True)
+    publisher = there.advertise(info)
+    publisher.publish(b"one", 1)
+    await until(lambda: info.name in two.events.infos)
+    got: list[bytes] = []
+
+    def sink(body: bytes, _stamp_ns: int) -> bool:
+        got.append(body)
+        return True
+
+    here.subscribe(info.name, sink)
+    here.interest(info.name, False)
+    await until(lambda: got == [b"one"])
+    publisher.publish(b"two", 2)
+    await until(lambda: got == [b"one", b"two"], "what is latched is taken for whoever comes")
+    here.interest(info.name, True)
+    publisher.publish(b"three", 3)
+    await until(lambda: len(got) == 3)
+    assert got == [b"one", b"two", b"three"], "each once"

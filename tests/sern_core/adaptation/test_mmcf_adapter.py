@@ -85,7 +85,7 @@ def test_the_configuration_reaches_channels_lanes_and_codecs() -> None:
     assert raw.codec is not None and raw.codec.setting is Compression.NONE  # its rule says so
     assert r.robot.core.link.lane.redundant
     assert cloud.thinned == pytest.approx(0.75 * 8.0 * 5.0, abs=6)
-    r.adapter.close()
+    r.adapter.close(now=r.world.now)
     assert (cloud.share, cloud.depth) == (1.0, 2) and scan.depth == 5
     assert not r.robot.core.link.lane.redundant
 
@@ -213,7 +213,7 @@ def test_a_cloud_goes_to_its_summary_while_the_link_is_thin_and_comes_back(*, in
     told = step_json(r.at(30.0))
     assert told["chosen"]["summaries"] == {"control": False, "state": False, "bulk": True}
     assert "s bulk" in told["chosen"]["text"]
-    r.adapter.close()
+    r.adapter.close(now=r.world.now)
     assert item.level is SummaryLevel.RAW
 
 

@@ -57,11 +57,11 @@ def test_any_spec_that_may_be_announced_can_be_adapted_to(specs: list[TopicSpec]
                 robot.send(channel, bytes(size))
             world.run(0.05)
             for adapter in adapters:
-                adapter.sample()
+                adapter.sample(now=world.now)
         world.run(0.5)
         for adapter in adapters:
             step = adapter.step(now=world.now)
             assert step.cost is None or 0.0 <= step.cost <= 1.0, interval
     for adapter in adapters:
-        adapter.close()
+        adapter.close(now=world.now)
     world.validate()

@@ -9,8 +9,9 @@ from sern_core.relay import clients
 from sern_core.relay.access import AccessRule, AccessTable
 from sern_core.relay.hub import HubParams
 from sern_core.site import client
-from sern_core.stream.out_channel import CLIENT_OVERHEAD_BYTES, OutChannel
+from sern_core.stream.out_channel import OutChannel
 from sern_core.stream.out_message import OutMessage
+from sern_core.stream.prices import CLIENT_OVERHEAD_BYTES
 from sern_core.vocabulary.message import Message
 from sern_core.vocabulary.params import LinkParams
 from sern_core.vocabulary.types import ClientName, DropReason

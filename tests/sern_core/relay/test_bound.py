@@ -10,7 +10,8 @@ from sern_core.link.link import Link
 from sern_core.path.congestion.fixed import FixedWindow
 from sern_core.relay.access import DEFAULT_QUEUE_BYTES, AccessRule, AccessTable
 from sern_core.relay.bound import TOMBSTONE_BYTES
-from sern_core.stream.out_channel import CLIENT_OVERHEAD_BYTES, MESSAGE_OVERHEAD_BYTES, OutChannel
+from sern_core.stream.out_channel import OutChannel
+from sern_core.stream.prices import CLIENT_OVERHEAD_BYTES, MESSAGE_OVERHEAD_BYTES
 from sern_core.vocabulary.message import TopicSpec
 from sern_core.vocabulary.types import ClientName, DropReason, PriorityClass, Reliability
 from sern_core.wire import framing

@@ -2,7 +2,7 @@
 
 from sern_core.relay.access import AccessRule, AccessTable
 from sern_core.relay.relayed_streams import MAX_DENIED
-from sern_core.stream.out_channel import MESSAGE_OVERHEAD_BYTES
+from sern_core.stream.prices import MESSAGE_OVERHEAD_BYTES
 from sern_core.vocabulary.types import DropReason
 from sern_sim.models import LinkModel, Window
 from tests.world import World, spec

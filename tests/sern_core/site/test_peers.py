@@ -5,8 +5,9 @@ from collections.abc import Callable
 
 import pytest
 
+from sern_core.link.view import LinkView
 from sern_core.path.flight import STALL_MIN_S, STALL_RTTS
-from sern_core.path.lanes import PING_INTERVAL_S, Lane
+from sern_core.path.lanes import PING_INTERVAL_S
 from sern_core.relay import presence as presence_module
 from sern_core.relay.access import AccessRule, AccessTable
 from sern_core.relay.hub import HubParams
@@ -14,11 +15,11 @@ from sern_core.relay.presence import BACK_PAUSE_S, MAX_TOLD, Presence
 from sern_core.site.peers import LET_GO_S, MAX_ENDED, MAX_GIVEN_UP, MAX_PEERS, PeerChange, Peers, PeerStatus, PeerView
 from sern_core.vocabulary.errors import WireError
 from sern_core.vocabulary.message import TopicInfo
-from sern_core.vocabulary.params import LinkParams
 from sern_core.vocabulary.types import ClientName, Encoding, PriorityClass, TopicName
 from sern_core.wire import framing
 from sern_core.wire.announce import MAX_ASKED
 from sern_sim.models import LinkModel, Window
+from tests.views import IDLE
 from tests.world import SimClient, World, spec
 
 CONNECTED, GONE, UNKNOWN = PeerStatus.CONNECTED, PeerStatus.GONE, PeerStatus.UNKNOWN
@@ -638,11 +639,13 @@ class Told:
 
     established = True
     heard = 1_000_000
-    lane = Lane(0, LinkParams(), lossless=True)
 
     def __init__(self) -> None:
         self.items: list[framing.Envelope] = []
         self.control = self
+
+    def observe(self, *, now: float) -> LinkView:
+        return IDLE
 
     def send(self, envelope: framing.Envelope, attachment: bytes = b"", *, now: float) -> int:
         self.items += envelope["peers"]

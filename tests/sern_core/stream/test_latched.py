@@ -11,7 +11,8 @@ from sern_core.relay.hub import HubParams
 from sern_core.relay.relayed_streams import REPLAY_US
 from sern_core.relay.routing import SLICE_UNITS, UNIT_S
 from sern_core.stream.latched import MAX_REPLAY_MESSAGES, LatchedCache, ReplayStore
-from sern_core.stream.out_channel import CLIENT_OVERHEAD_BYTES, MESSAGE_OVERHEAD_BYTES, OutChannel
+from sern_core.stream.out_channel import OutChannel
+from sern_core.stream.prices import CLIENT_OVERHEAD_BYTES, MESSAGE_OVERHEAD_BYTES
 from sern_core.vocabulary.message import Message, StreamId, StreamInfo, TopicInfo
 from sern_core.vocabulary.types import ClientName, DropReason, Encoding, PriorityClass, TopicName
 from sern_core.wire.announce import Announcement, encode_announcement

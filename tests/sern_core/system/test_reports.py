@@ -5,7 +5,7 @@ import pytest
 from sern_core.link.streams_out import SEVERAL
 from sern_core.relay.access import AccessRule, AccessTable
 from sern_core.stream import drop_reports
-from sern_core.stream.out_channel import CLIENT_OVERHEAD_BYTES
+from sern_core.stream.prices import CLIENT_OVERHEAD_BYTES
 from sern_core.vocabulary.errors import WireError
 from sern_core.vocabulary.message import StreamId, StreamInfo, TopicInfo
 from sern_core.vocabulary.types import DropReason, Encoding, PriorityClass, TopicName

@@ -31,6 +31,7 @@ CORE = [
         "relay/hub_port.py",
         "relay/relayed_streams.py",
         "link/link.py",
+        "link/control_reader.py",
         "relay/presence.py",
         "link/handshake.py",
     )

@@ -1,7 +1,8 @@
 """Child processes that never outlive their parent's work: started together, watched, stopped in order.
 
 Each child is a session of its own, so that Ctrl-C in the terminal reaches only the parent, which then stops the
-children the way a supervisor does: SIGTERM, time to drain, SIGKILL.
+children the way a supervisor does: SIGTERM, time to drain, SIGKILL. What a child writes on standard error is kept, and
+the last of it is in the error that tells of its end.
 """
 
 import asyncio
@@ -13,23 +14,50 @@ import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+import time
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final, Self
+from typing import Any, Final, Self, TypeVar
 
 from sern_core.vocabulary.errors import SernError
-from sern_tools import child as launcher
-from sern_tools import sweeper as sweeping
+from sern_tools.harness import launcher
+from sern_tools.harness import sweeper as sweeping
 
 DRAIN_S: Final = 45.0
 """How long a child may take to end after SIGTERM when all is well: a daemon drains first."""
 ABORT_S: Final = 5.0
 """The same when the whole is being given up."""
+LOOK_S: Final = 0.2
+"""How soon who waits notices that a child has ended."""
 TAIL_LINES: Final = 4
 LINE_BYTES: Final = 2**20
 _PLAIN_PYTHON: Final = (sys.executable, "-I", "-S")
 """The Python command for helpers that import nothing that is installed."""
+
+T = TypeVar("T")
+
+
+def python(*arguments: str) -> list[str]:
+    """A command of this interpreter, e.g. `python("-m", "sern_tools.proxy")`.
+
+    `-P`: the folder it is started in does not say what is imported.
+    """
+    return [sys.executable, "-P", *arguments]
+
+
+def daemon(program: str, config: Path) -> list[str]:
+    """The command of a daemon of this interpreter; `program`: relay or client."""
+    return python("-m", f"sern_{program}.cli", "--config", str(config))
+
+
+def cpu_s(*pids: int) -> float:
+    """CPU time of these processes, all threads, those that have ended as well; also of who was not waited for yet.
+    OSError when one is no more.
+
+    The clock is that of clock_getcpuclockid(3): nanoseconds, where /proc/PID/stat has ticks of 10 ms.
+    """
+    return sum(time.clock_gettime((~pid << 3) | 2) for pid in pids)
 
 
 def bound(command: Sequence[str]) -> list[str]:
@@ -100,23 +128,31 @@ class Child:
     def running(self) -> bool:
         return self.process.returncode is None
 
-    async def read_object(self) -> dict[str, Any]:
-        """The next line of its output as JSON. SernError when it ended instead."""
+    async def read_line(self) -> bytes:
+        """The next line of its output. SernError when it ended instead."""
         assert self.process.stdout is not None
         line = await self.process.stdout.readline()
         if not line:
             await self.process.wait()
             raise self.failure()
-        answer: dict[str, Any] = json.loads(line)
+        return line
+
+    async def read_object(self) -> dict[str, Any]:
+        """The next line of its output as JSON. SernError when it ended instead."""
+        answer: dict[str, Any] = json.loads(await self.read_line())
         return answer
+
+    async def say(self, word: str) -> None:
+        """Send one line to its input. Nothing happens when it has ended: what it does not answer says so."""
+        assert self.process.stdin is not None
+        if not self.process.stdin.is_closing():  # else it has ended, and uvloop raises RuntimeError for a write
+            with contextlib.suppress(ConnectionError):
+                self.process.stdin.write(word.encode() + b"\n")
+                await self.process.stdin.drain()
 
     async def ask(self, word: str) -> dict[str, Any]:
         """Send one line to its input and return the line it answers."""
-        assert self.process.stdin is not None
-        if not self.process.stdin.is_closing():  # else it has ended, and uvloop raises RuntimeError for a write
-            with contextlib.suppress(ConnectionError):  # it has ended; the missing answer says so
-                self.process.stdin.write(word.encode() + b"\n")
-                await self.process.stdin.drain()
+        await self.say(word)
         return await self.read_object()
 
     def signal(self, number: int) -> None:
@@ -184,30 +220,97 @@ class Children:
         self.children.append(child)
         return child
 
+    def cpu_s(self) -> dict[str, float]:
+        """CPU time by name; as the function."""
+        return {child.name: cpu_s(child.process.pid) for child in self.children}
+
     def check(self) -> None:
         """Raises SernError when a child ended that nobody told to."""
         for child in self.children:
             if not child.running and not child.stopping:
                 raise child.failure()
 
-    async def stop(self, children: Iterable[Child], *, within_s: float = DRAIN_S) -> None:
-        """SIGTERM to all of them and the end of their input; SIGKILL for who is still there after `within_s`."""
+    def words(self) -> str:
+        """The last words of all of them, as an addition to an error; empty where nobody has said anything."""
+        told = [f"{child.name} said: {words}" for child in self.children if (words := last_words(child.log))]
+        return f" ({'; '.join(told)})" if told else ""
+
+    async def beside(self, work: Awaitable[T]) -> T:
+        """What `work` comes to. As soon as a child ends that nobody told to, `work` is cancelled, and the SernError has
+        the child's last words."""
+        task = asyncio.ensure_future(work)
+        try:
+            while not (await asyncio.wait((task,), timeout=LOOK_S))[0]:
+                self.check()
+            if task.exception() is not None:
+                self.check()  # which may be why
+            return task.result()
+        finally:
+            task.cancel()
+            await asyncio.wait((task,))
+
+    async def within(self, work: Awaitable[T], seconds: float, problem: str) -> T:
+        """As `beside`; SernError of `problem`, with the last words of all, when it takes longer."""
+        try:
+            async with asyncio.timeout(seconds):
+                return await self.beside(work)
+        except TimeoutError:
+            raise SernError(f"{problem} within {seconds:g} s{self.words()}") from None
+
+    async def until(
+        self, condition: Callable[[], Awaitable[object]], seconds: float, problem: str, *, every_s: float = 0.1
+    ) -> None:
+        """Ask until `condition` is met; as `within`."""
+
+        async def met() -> None:
+            while not await condition():  # noqa: ASYNC110  the condition is somebody else's state
+                await asyncio.sleep(every_s)
+
+        await self.within(met(), seconds, problem)
+
+    async def stop(
+        self, children: Iterable[Child], *, number: int | None = signal.SIGTERM, within_s: float = DRAIN_S
+    ) -> list[Child]:
+        """The end of their input to all of them, one after the other, and the signal `number`, if any; SIGKILL for who
+        is still there after `within_s`. Who that was."""
         leaving = list(children)
         for child in leaving:
             child.stopping = True
             if child.process.stdin is not None:
                 child.process.stdin.close()
-            child.signal(signal.SIGTERM)
+            if number is not None:
+                child.signal(number)
         waits = [asyncio.ensure_future(child.process.wait()) for child in leaving]
-        if waits:
-            _, late = await asyncio.wait(waits, timeout=within_s)
-            if late:
-                self.kill()
-                await asyncio.wait(waits)
+        if not waits:
+            return []
+        _, pending = await asyncio.wait(waits, timeout=within_s)
+        late = [child for child, wait in zip(leaving, waits, strict=True) if wait in pending]
+        if late:
+            self.kill()
+            await asyncio.wait(waits)
+        return late
+
+    async def end(self, *children: Child, number: int | None = signal.SIGTERM, within_s: float = DRAIN_S) -> None:
+        """`stop` those that have done their work. SernError when one is late, or ends with a status other than 0."""
+        for child in await self.stop(children, number=number, within_s=within_s):
+            raise SernError(f"{child.name} does not end within {within_s:g} s{self.words()}")
+        for child in children:
+            if child.process.returncode != 0:
+                raise child.failure()
 
     def kill(self) -> None:
         for child in self.children:
             child.signal(signal.SIGKILL)
+
+
+@contextlib.asynccontextmanager
+async def killed(directory: Path) -> AsyncIterator[Children]:
+    """Children that have nothing more to do at the end of the block: who is left gets SIGKILL."""
+    async with Children(directory) as children:
+        try:
+            yield children
+        finally:
+            children.kill()
 
 
 def program(name: str) -> list[str]:

@@ -1,4 +1,4 @@
-"""Becomes a program that ends with its parent, even by SIGKILL: `python -I -S child.py PARENT COMMAND ...`.
+"""Becomes a program that ends with its parent, even by SIGKILL: `python -I -S launcher.py PARENT COMMAND ...`.
 
 PARENT is the process id of who starts it. It is run by its path and imports nothing of the project, so that it costs
 some milliseconds. Between fork and exec of a process with threads no Python may run: it could wait for ever for a lock

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from threading import Lock
 from typing import Final, NamedTuple
 
+from sern_client.endpoints.common.queue import BoundedQueue
 from sern_runtime import clock
 
 DEFAULT_MAX_BYTES: Final = 64 * 2**20
@@ -23,7 +24,6 @@ class _News(NamedTuple):
 class _Message(NamedTuple):
     number: int
     deliver: Callable[[], None]
-    nbytes: int
     shed: Callable[[], None] | None
 
 
@@ -38,12 +38,11 @@ class Handover:
         self.dropped = 0
         """Messages, because more than `max_bytes` waited (queue_full)."""
         self._loop = loop
-        self._max_bytes = max_bytes
         self._lock = Lock()
         self._count = 0
         self._news: deque[_News] = deque()
-        self._messages: deque[_Message] = deque()
-        self._nbytes = 0
+        self.messages: BoundedQueue[_Message] = BoundedQueue(max_bytes=max_bytes)
+        """Those that wait; to be changed in here alone."""
         self._scheduled = False
         self._closed = False
 
@@ -65,9 +64,8 @@ class Handover:
             if self._closed:
                 return
             self._count += 1
-            self._messages.append(_Message(self._count, deliver, nbytes + ITEM_BYTES, shed))
-            self._nbytes += nbytes + ITEM_BYTES
-            dropped = self._shed()
+            dropped = self.messages.put(_Message(self._count, deliver, shed), nbytes + ITEM_BYTES)
+            self.dropped += len(dropped)
             wake = self._wakes()
         if wake:
             self._loop.call_soon_threadsafe(self._run)
@@ -80,30 +78,18 @@ class Handover:
         with self._lock:
             self._closed = True
             self._news.clear()
-            self._messages.clear()
-            self._nbytes = 0
+            self.messages.clear()
 
     def _wakes(self) -> bool:
         """Whether the loop is to be woken: it is not while it has items to serve."""
         wake, self._scheduled = not self._scheduled, True
         return wake
 
-    def _shed(self) -> list[_Message]:
-        dropped: list[_Message] = []
-        while self._nbytes > self._max_bytes and len(self._messages) > 1:
-            message = self._messages.popleft()
-            self._nbytes -= message.nbytes
-            dropped.append(message)
-        self.dropped += len(dropped)
-        return dropped
-
     def _next(self) -> Callable[[], None] | None:
         """The oldest item; None where there is no more, and the next one wakes the loop."""
         with self._lock:
-            if self._messages and not (self._news and self._news[0].number < self._messages[0].number):
-                message = self._messages.popleft()
-                self._nbytes -= message.nbytes
-                return message.deliver
+            if self.messages and not (self._news and self._news[0].number < self.messages.first.number):
+                return self.messages.pop().deliver
             if self._news:
                 return self._news.popleft().deliver
             self._scheduled = False

@@ -8,10 +8,10 @@ own start, what comes first waits for that.
 
 import asyncio
 import logging
-from collections import deque
 from collections.abc import Callable
 from typing import Final, NamedTuple
 
+from sern_client.endpoints.common.queue import BoundedQueue
 from sern_core.vocabulary.types import DropReason
 
 HOLD_S: Final = 1.0
@@ -57,8 +57,6 @@ class FirstMessages:
         self._readers = readers
         self._write = write
         self._dropped = dropped
-        self._max_messages = max_messages
-        self._max_bytes = max_bytes
         self._overflow = overflow
         self._loop = asyncio.get_running_loop()
         self._since_s = self._loop.time()
@@ -66,8 +64,7 @@ class FirstMessages:
         self._give_up_s = max(self._since_s + HOLD_S, self._learned_s) + SETTLE_S
         self._connected_s: float | None = None
         self._done: Callable[[], None] | None = None
-        self._kept: deque[_Kept] = deque()
-        self._nbytes = 0
+        self._kept: BoundedQueue[_Kept] = BoundedQueue(max_bytes=max_bytes, max_items=max_messages)
         self._timer: asyncio.TimerHandle | None = None
         self._judge()
 
@@ -81,10 +78,7 @@ class FirstMessages:
         if self.over:
             self._write(body, stamp_ns)
             return
-        self._kept.append(_Kept(body, stamp_ns, self._loop.time() + left_s))
-        self._nbytes += len(body)
-        while len(self._kept) > self._max_messages or (self._nbytes > self._max_bytes and len(self._kept) > 1):
-            self._nbytes -= len(self._kept.popleft().body)
+        for _ in self._kept.put(_Kept(body, stamp_ns, self._loop.time() + left_s), len(body)):
             self._dropped(self._overflow)
         if self._timer is None:
             self._timer = self._loop.call_later(_POLL_S, self._look)
@@ -136,7 +130,6 @@ class FirstMessages:
             return
         self.over = True
         now = self._loop.time()
-        self._nbytes = 0
         try:
             self._write_kept(now)
         finally:
@@ -147,7 +140,7 @@ class FirstMessages:
     def _write_kept(self, now: float) -> None:
         complained = False
         while self._kept:
-            body, stamp_ns, until_s = self._kept.popleft()
+            body, stamp_ns, until_s = self._kept.pop()
             if until_s < now:
                 self._dropped(DropReason.LIFESPAN)
                 continue

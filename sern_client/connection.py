@@ -1,0 +1,182 @@
+"""One relay's transports: the stream, the datagram lane, the connections for class control, and the relay's name."""
+
+import asyncio
+import logging
+import secrets
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from random import Random
+from typing import Final
+
+import zmq
+
+from sern_client.express import ClientExpress
+from sern_client.relay_name import RelayName, name_in
+from sern_client.transport import RelayTransport
+from sern_client.udp import ClientLane
+from sern_core.link.link import Link
+from sern_core.site.client import ClientCore
+from sern_core.wire import framing
+from sern_runtime import clock
+from sern_runtime.config.base import split_tcp
+from sern_runtime.config.client import RelayConnection
+from sern_runtime.config.shared import LinkSection
+from sern_runtime.datagram_watch import DatagramWatch
+from sern_runtime.draining import Progress
+from sern_runtime.zmq_socket import CurvePair
+
+PATIENCE_S: Final = 2.0
+"""How long a stopping client waits, beside some round trips, for the next sign that what it still owes gets further."""
+STALL_PATIENCE_S: Final = 5.0
+"""The same while it has more to send and a session: a path that has stalled often comes back."""
+PATIENCE_RTTS: Final = 4.0
+
+_log = logging.getLogger(__name__)
+
+
+class Connection:
+    """Joins a core to its relay: `open` once, then any calls, then `close`, which is safe at any time.
+
+    `on_down` is told why the stream is down. What is None is not open: not yet, or not wanted, or not possible here.
+    """
+
+    def __init__(
+        self, core: ClientCore, relay: RelayConnection, link: LinkSection, *, on_down: Callable[[str], None]
+    ) -> None:
+        self.transport: RelayTransport | None = None
+        self.lane: ClientLane | None = None
+        self.express: ClientExpress | None = None
+        self.name: RelayName | None = None
+        self.datagrams = DatagramWatch(lambda: [core.link], self._no_datagrams, lambda link: link.end.name)
+        self._core = core
+        self._relay = relay
+        self._link = link
+        self._on_down = on_down
+
+    def open(self, ctx: "zmq.Context[zmq.Socket[bytes]]", keys: CurvePair | None, server_keys: Sequence[str]) -> None:
+        """Connect, for as long as it takes and again and again. Raises ConfigError when the address is none."""
+        relay, link, marks = self._relay, self._link, self._link.dscp.marks()
+        self.transport = RelayTransport(
+            ctx,
+            self._core.link,
+            relay.endpoint,
+            keys,
+            server_keys,
+            heartbeat_timeout_s=link.heartbeat_timeout_s,
+            handshake_interval_s=relay.handshake_interval_s,
+            random=Random(secrets.randbits(64)),
+            on_reason=self._on_down,
+            after=self.wake,
+            marks=marks,
+        )
+        named = name_in(relay.endpoint)
+        if named is not None:
+            self.name = RelayName(relay.endpoint, *named)
+            self.name.tick(connected=False)
+        address = split_tcp(relay.endpoint)
+        if relay.udp and keys is not None and address is not None:
+            self.lane = ClientLane(self._core, address[0], kick=self.wake, marks=marks)
+        if relay.express and address is not None:
+            self.express = ClientExpress(
+                self._core, self.transport, link.redundancy, datagrams=self.lane is not None, kick=self.wake
+            )
+
+    @property
+    def waiting(self) -> bool:
+        """Whether a stream is there, and its handshake under way."""
+        return self.transport is not None and self.transport.waiting
+
+    @property
+    def bad_frames(self) -> int:
+        """Frames from the relay on the stream that were not valid."""
+        return 0 if self.transport is None else self.transport.bad_frames
+
+    def wake(self) -> None:
+        """The core may have something to send."""
+        if self.transport is not None:
+            self.transport.pump.kick()
+        if self.lane is not None:
+            self.lane.kick()
+        if self.express is not None:
+            self.express.kick()
+
+    def session_began(self) -> None:
+        """Ask for what a session may have beside its stream."""
+        if self.lane is not None:
+            self.lane.ask()
+        if self.express is not None:
+            self.express.begin()
+
+    def lane_offered(self, parameters: framing.Envelope) -> None:
+        """The relay has keys for a datagram lane. Raises WireError when it has not."""
+        if self.lane is not None:
+            self.lane.offered(parameters)
+
+    def lane_closed(self) -> None:
+        """The core has closed the datagram lane."""
+        if self.lane is not None:
+            self.lane.closed()
+
+    def tick(self) -> None:
+        """Look after all of them. Call about twice a second."""
+        if self.lane is not None:
+            self.lane.tick()
+        self.datagrams.tick()
+        if self.express is not None:
+            self.express.tick()
+        if self.name is not None:
+            self.name.tick(connected=self._core.link.established)
+
+    async def drain(self, pending: Callable[[], int], *, limit_s: float) -> None:
+        """Go on sending what is owed while that gets anywhere, `limit_s` at most. What arrives meanwhile is taken.
+        `pending`: messages that are still to be offered to the link.
+
+        The relay must get everything; whether all subscribers confirm it is waited for as long as confirmations come,
+        because a subscriber that is away is the relay's to wait for.
+        """
+        link = self._core.link
+        now = clock.now()
+        progress = Progress()
+        give_up_s = now + limit_s
+        while now < give_up_s:
+            channels = [channel for channel in link.sender.channels.values() if channel.wanted is not False]
+            unsent = sum(len(c.queue) + len(c.flying) + (c.newest is not None) for c in channels) + pending()
+            unconfirmed = sum(len(channel.retained) for channel in channels)
+            if not unconfirmed and (not unsent or not link.established or link.lane.stalled):
+                break
+            left = (unsent, unconfirmed, sum(nbytes for _messages, nbytes in link.sender.queued().values()))
+            patience_s = STALL_PATIENCE_S if unsent and link.established else PATIENCE_S
+            if progress.still_s(left, now=now) > patience_s + PATIENCE_RTTS * link.lane.flight.rtt.srtt_s:
+                break
+            self.wake()
+            await asyncio.sleep(0.02)
+            now = clock.now()
+        unconfirmed = sum(len(channel.retained) for channel in link.sender.channels.values())
+        if unconfirmed:
+            _log.warning("stopping with %d reliable messages that not everyone has confirmed", unconfirmed)
+
+    async def leave(self) -> None:
+        """Confirm what has arrived, and say goodbye."""
+        if self.transport is None:
+            return
+        self.wake()
+        await asyncio.sleep(0.02)  # what has arrived here is confirmed before we say goodbye
+        self.transport.pump.run()
+        self._core.link.close("client stops", now=clock.now())
+        self.transport.pump.run()
+        await asyncio.sleep(0.05)  # libzmq's thread takes it from here
+
+    def close(self) -> None:
+        """End whatever was opened, the last first, also when a part of it fails. Idempotent."""
+        with ExitStack() as stack:
+            if self.transport is not None:
+                stack.callback(self.transport.close)
+            if self.express is not None:
+                stack.callback(self.express.close)
+            if self.lane is not None:
+                stack.callback(self.lane.closed)
+            if self.name is not None:
+                stack.callback(self.name.close)
+
+    def _no_datagrams(self, link: Link, within_s: float) -> str | None:
+        return None if self.lane is None else self.lane.problem(link, within_s)

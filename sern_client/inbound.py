@@ -1,0 +1,407 @@
+"""Publishes streams from elsewhere at the endpoint: names, leases and stop commands, rebuilt grids, what is kept."""
+
+import logging
+import time
+from collections import Counter
+from collections.abc import Callable, Collection, KeysView, Sequence
+from dataclasses import replace
+from math import inf
+from typing import Final
+
+from sern_client.actions import GoalWatch
+from sern_client.endpoints.base import Difference, Publisher, keepers_of, publisher_within
+from sern_client.frames import Rewrite
+from sern_client.guard import Guard
+from sern_client.keeping import Keeping
+from sern_client.rebuild import Rebuilds
+from sern_client.site import Site
+from sern_client.update_topics import UpdateTopics
+from sern_client.withdrawal import Kept, Withdrawable, Withdrawal
+from sern_core.site.client import ClientCore
+from sern_core.site.lease import CommandLease
+from sern_core.site.services import parse as parse_service
+from sern_core.vocabulary.errors import ConfigError
+from sern_core.vocabulary.ledger import MAX_TOPICS, OTHER_TOPIC
+from sern_core.vocabulary.message import Message, StreamId, StreamInfo, TopicInfo
+from sern_core.vocabulary.types import ClientName, DropReason, TopicName
+from sern_runtime import clock, ros_types
+from sern_runtime.fine_timer import fine_timer
+from sern_runtime.link_metrics import AgeHistograms
+from sern_runtime.loop import Timer
+
+MAX_PROBLEMS: Final = 256
+AGAIN_S: Final = (1.0, 60.0)
+"""First and longest pause before a stream that could not be published here is tried again."""
+
+_log = logging.getLogger(__name__)
+
+
+class Incoming:
+    """A stream from elsewhere that is published here, as `info`. `stop` is the body that a lost link makes us publish.
+    `publisher` None: it is of use to another stream only. `guarded`: what the guard calls it; None: it has none."""
+
+    __slots__ = ("guarded", "info", "kept", "lease", "local", "publish", "publisher", "rewrite", "stop", "withdrawn")
+
+    def __init__(
+        self,
+        info: TopicInfo,
+        publisher: Publisher | None,
+        lease: CommandLease | None,
+        stop: bytes | None,
+        rewrite: Rewrite | None,
+        *,
+        guarded: int | None,
+        kept: Kept | None,
+    ) -> None:
+        self.info = info
+        self.local = info.name
+        self.use(publisher)
+        self.lease = lease
+        self.stop = stop
+        self.rewrite = rewrite
+        self.guarded = guarded
+        self.kept = kept
+        self.withdrawn: ClientName | None = None
+
+    def use(self, publisher: Publisher | None) -> None:
+        self.publisher = publisher
+        self.publish = None if publisher is None else publisher_within(publisher)
+
+
+class Inbound:
+    """Is told by the core of streams from elsewhere, those of services excepted.
+
+    `guard` publishes stop commands while this process cannot. `goals`: those of ROS 1 that this site gives to others.
+    `withdraws`: topics of an origin that is not there may be ended (`withdrawal`), so what is latched in them is kept.
+    """
+
+    def __init__(
+        self,
+        site: Site,
+        core: ClientCore,
+        *,
+        guard: Guard | None = None,
+        goals: GoalWatch | None = None,
+        withdraws: bool = False,
+    ) -> None:
+        self.ages = AgeHistograms()
+        self.subscription_problems: dict[str, str] = {}
+        """What the relay does not let us have, in its words, with the code."""
+        self.deadlines_missed: dict[TopicName, int] = {}
+        self.leases_fired = 0
+        self.publish_failures = 0
+        self._site = site
+        self._core = core
+        self._guard = guard
+        self._goals = goals
+        self._closed = False
+        self._streams: dict[StreamId, Incoming] = {}
+        self.withdrawal = Withdrawal(self._streams, self._advertise, self._close_publisher, used=withdraws)
+        """Ends the topics of who is not there."""
+        self._last_arrival_s: dict[StreamId, float] = {}
+        self._timer = fine_timer(self._leases_due)  # one that is due while the machine sleeps is due when it wakes
+        self._unreceived: dict[StreamId, str] = {}  # streams that could not be published here, and why
+        self._again = Timer(self._reconsider)
+        self._again_s = AGAIN_S[0]
+        self.rebuilds = Rebuilds(self._grid_shown, self._settle)
+        self._updates = UpdateTopics(lambda: core.patterns, self._subscribe)
+        self.keeping = Keeping(keepers_of(site.endpoint), core.hold, self._release_kept, self._keep_in)
+        self._keep_timer = Timer(self.keeping.keep_soon)
+
+    @property
+    def streams(self) -> KeysView[StreamId]:
+        """Every stream that is taken here."""
+        return self._streams.keys()
+
+    @property
+    def lease_due_s(self) -> float | None:
+        """When the next stop command is published unless a command comes; None: no lease runs."""
+        return self._timer.deadline_s
+
+    def close(self) -> None:
+        """Before the endpoint is stopped: a robot that is being commanded is told to stand still."""
+        self._closed = True
+        self._timer.close()
+        self._keep_timer.cancel()
+        self._again.cancel()
+        self.rebuilds.close()
+        self._updates.close()
+        for incoming in self._streams.values():
+            self._release(incoming)
+        self._streams.clear()
+
+    # --- streams begin and end --------------------------------------------------------------------------------------
+
+    def stream_opened(self, stream: StreamInfo) -> None:
+        """Publish a stream here from now on. Raises ConfigError if that cannot be; it is tried again then."""
+        local = self._site.rules.inward(stream.id.topic, namespace=self._site.namespace)
+        info = replace(stream.info, name=local)
+        try:
+            resolved = self._site.rules.resolve(info, local_name=local)
+            if not resolved.direction.receives:
+                raise ConfigError(f"{local} is only sent from here (direction: send); not received")
+            publisher = None
+            if self._published_here(stream):
+                publisher = self._advertise(info)
+        except ConfigError as error:
+            self._not_received(stream, str(error))
+            raise
+        self._unreceived.pop(stream.id, None)
+        lease = stop = guarded = None
+        if resolved.lease is not None:
+            stop = ros_types.zero_message(info.type_name, info.encoding)
+            if stop is None:
+                _log.error("%s is %s: on_link_loss cannot stop it; no lease", local, info.type_name)
+            else:
+                lease = CommandLease(resolved.lease.after_s)
+        rewrite, kept = self._site.frames.incoming(info), self.withdrawal.kept(stream)
+        if self._guard is not None and stop is not None:
+            guarded = self._guard.opened(info, stop)
+        incoming = Incoming(info, publisher, lease, stop, rewrite, guarded=guarded, kept=kept)
+        self._streams[stream.id] = incoming
+        if self._goals is not None:
+            self._goals.opened(info, lambda body: self._publish(incoming, body, time.time_ns()))
+        updates = self.rebuilds.opened(stream, lambda body, stamp_ns: self._show(incoming, body, stamp_ns))
+        if updates is not None:
+            self._updates.opened(stream.id, updates)
+        _log.info("receiving %s from %s as %s", stream.id.topic, stream.id.origin, local)
+
+    def stream_closed(self, stream: StreamInfo) -> None:
+        """A stream, taken here or not, has ended."""
+        self.rebuilds.closed(stream)
+        self._updates.closed(stream.id)
+        if self._core.refused and not self._closed:  # it may have been in their way
+            self._again_s = AGAIN_S[0]
+            self._again.arm(clock.now())
+        incoming = self._streams.pop(stream.id, None)
+        self._site.values.forget(stream.id)
+        self._last_arrival_s.pop(stream.id, None)
+        if incoming is not None:
+            if self._goals is not None:
+                self._goals.ended(incoming.local)
+            self._release(incoming)
+            _log.info("%s from %s has ended", stream.id.topic, stream.id.origin)
+
+    def _advertise(self, info: TopicInfo) -> Publisher:
+        """ConfigError whatever goes wrong: the streams beside it must go on."""
+        try:
+            return self._site.advertise(info)
+        except ConfigError:
+            raise
+        except Exception as error:
+            self.publish_failures += 1
+            _log.exception("%s cannot be published here", info.name)
+            raise ConfigError(f"{info.name}: cannot be published here: {ros_types.one_line(error)}") from error
+
+    def _published_here(self, stream: StreamInfo) -> bool:
+        """Whether a stream is published: updates of patches are taken to make whole grids of them, unless somebody here
+        has asked for them."""
+        return not self.rebuilds.is_updates(stream) or self._updates.of_site(stream.id.topic)
+
+    def _not_received(self, stream: StreamInfo, problem: str) -> None:
+        """Said once; tried again, because what is in its way may go: another stream of that name, for one."""
+        if self._unreceived.get(stream.id) != problem:
+            _log.error("%s from %s is not received: %s", stream.id.topic, stream.id.origin, problem)
+        self._unreceived[stream.id] = problem
+        if self._again.deadline_s is None and not self._closed:
+            self._again.arm(clock.now() + self._again_s)
+
+    def _reconsider(self) -> None:
+        refused = self._core.refused
+        self._unreceived = {stream: problem for stream, problem in self._unreceived.items() if stream in refused}
+        self._again_s = min(2 * self._again_s, AGAIN_S[1])
+        self._core.reconsider(now=clock.now())
+        self._site.kick()
+
+    def _subscribe(self, patterns: tuple[str, ...]) -> None:
+        self._core.subscribe(patterns, now=clock.now())
+        self._site.kick()
+
+    def _release(self, incoming: Incoming) -> None:
+        """No more commands will come from there: the last one must not stand."""
+        if incoming.lease is not None and incoming.stop is not None and incoming.lease.deadline() is not None:
+            self._publish(incoming, incoming.stop, time.time_ns())
+        if self._guard is not None and incoming.guarded is not None:
+            self._guard.closed(incoming.guarded)
+        self._close_publisher(incoming)
+
+    def _close_publisher(self, incoming: Withdrawable) -> None:
+        if incoming.publisher is not None:
+            try:
+                incoming.publisher.close()
+            except Exception:  # noqa: BLE001  a fault of one topic, as in `_publish`
+                self.publish_failures += 1
+                _log.exception("%s could not be ended here", incoming.info.name)
+
+    # --- messages ---------------------------------------------------------------------------------------------------
+
+    def message(self, stream: StreamInfo, message: Message, *, now: float) -> bool:
+        """A message has its turn. False: its stream is not published here."""
+        incoming = self._streams.get(stream.id)
+        if incoming is None:
+            return False
+        self._site.values.passed(stream, message.seq, message.body)
+        age_s = now - message.born_s
+        if incoming.lease is not None:
+            incoming.lease.renew(born_s=message.born_s)
+            self._arm()
+            self._tell_guard(incoming)  # before it is published: no stop command of before may come after it
+        mark = self.keeping.mark() if stream.spec.reliable and self.keeping else None
+        if not self.rebuilds.message(stream, message, owed=mark is not None):
+            lifespan_s = stream.spec.lifespan_s
+            left_s = inf if lifespan_s is None else max(lifespan_s - age_s, 0.0)
+            self._show(incoming, message.body, message.stamp_ns, left_s)
+        if mark is None:
+            pass
+        elif self.rebuilds.owes(stream, message.seq):
+            self._core.hold(stream.id, message.seq)
+        else:
+            self.keeping.published(stream.id, message.seq, mark)
+        if self._goals is not None:
+            self._goals.message(incoming.local, stream.info.encoding, message.body)
+        try:
+            self.ages.observe(stream.spec.priority, age_s)
+            if stream.spec.deadline_s is not None:
+                self._check_deadline(stream, now)
+        except Exception as error:  # noqa: BLE001  (of what is counted alone)
+            self._site.parts.failed("metrics", error)
+        try:
+            if self._site.log is not None:
+                self._site.log.delivered(stream, message, age_s)
+        except Exception as error:  # noqa: BLE001  (of the log alone)
+            self._site.parts.failed("message_log", error)
+        return True
+
+    def _show(self, incoming: Incoming, body: bytes, stamp_ns: int, left_s: float = inf) -> None:
+        """Publish what came, or was put together here."""
+        if incoming.rewrite is not None:
+            try:
+                body = incoming.rewrite(body)
+            except Exception as error:  # noqa: BLE001  (as it came is better than not at all)
+                self._site.parts.failed("frames", error)
+        self._publish(incoming, body, stamp_ns, left_s)
+        if incoming.kept is not None:
+            incoming.kept.append((body, stamp_ns))
+
+    def _publish(self, incoming: Incoming, body: bytes, stamp_ns: int, left_s: float = inf) -> None:
+        """`left_s`: how much longer the message is young enough."""
+        if incoming.withdrawn is not None:
+            self.withdrawal.restore_one(incoming)
+        if incoming.publish is None:
+            return
+        try:
+            incoming.publish(body, stamp_ns, left_s)
+        except Exception:  # noqa: BLE001  (a fault of one topic; the link below must finish what it was doing)
+            self.publish_failures += 1
+            _log.exception("%s could not be published here", incoming.local)
+
+    def _check_deadline(self, stream: StreamInfo, now: float) -> None:
+        last_s = self._last_arrival_s.get(stream.id)
+        self._last_arrival_s[stream.id] = now
+        deadline_s = stream.spec.deadline_s
+        if last_s is not None and deadline_s is not None and now - last_s > deadline_s:
+            topic = stream.id.topic
+            known = topic in self.deadlines_missed or len(self.deadlines_missed) < MAX_TOPICS
+            counted = topic if known else OTHER_TOPIC
+            self.deadlines_missed[counted] = self.deadlines_missed.get(counted, 0) + 1
+            _log.warning("%s: %.3f s between messages, deadline %.3f s", topic, now - last_s, deadline_s)
+
+    # --- what is confirmed later ------------------------------------------------------------------------------------
+
+    def _grid_shown(self, publish: Callable[[], None], owed: Sequence[tuple[StreamId, int]]) -> None:
+        """Publish a grid; the updates in it are kept when it is."""
+        mark = self.keeping.mark()
+        publish()
+        self._settle([(stream, seq) for stream, seq in owed if not self.keeping.published(stream, seq, mark)])
+
+    def _settle(self, owed: Sequence[tuple[StreamId, int]]) -> None:
+        for stream, seq in owed:
+            self._core.release(stream, seq, now=clock.now())
+
+    def _keep_in(self, delay_s: float) -> None:
+        self._keep_timer.arm(clock.now() + delay_s)
+
+    def _release_kept(self, stream: StreamId, seq: int, lost: DropReason | None) -> None:
+        self._core.release(stream, seq, lost=lost, now=clock.now())
+        self._site.kick()
+
+    # --- what is said of streams from elsewhere ---------------------------------------------------------------------
+
+    def expired(self, stream: StreamInfo, seq: int, reason: DropReason) -> None:
+        """A reliable message was dropped on its way here."""
+        if self._site.log is not None:
+            self._site.log.expired(stream, seq, reason)
+        _log.warning("%s: reliable message %d was dropped on its way: %s", stream.id.topic, seq, reason)
+
+    def skipped(self, stream: StreamInfo, count: int) -> None:
+        """Reliable messages were given up before this site was told of their stream again."""
+        _log.warning("%s: %d reliable messages were given up while we were away", stream.id.topic, count)
+
+    def undecodable(self, stream: StreamInfo, problem: str) -> None:
+        """The body of a message could not be decoded."""
+        _log.error("%s from %s cannot be decoded and is dropped: %s", stream.id.topic, stream.id.origin, problem)
+
+    def subscription_refused(self, code: str, text: str) -> None:
+        """The relay does not let us have something that we asked for. Said once, as it is told in every session."""
+        if text not in self.subscription_problems:
+            _log.error("the relay refuses a subscription (%s): %s", code, text)
+            if len(self.subscription_problems) < MAX_PROBLEMS:
+                self.subscription_problems[text] = code
+
+    # --- consistency ------------------------------------------------------------------------------------------------
+
+    @property
+    def held(self) -> Counter[TopicName]:
+        """Our publishers at the endpoint, by local name."""
+        return Counter(incoming.local for incoming in self._streams.values() if incoming.publisher is not None)
+
+    def validate(self) -> list[Difference]:
+        """Compare our table with the core's: what is not as it should be."""
+        streams = {stream for stream in self._core.opened if parse_service(stream.topic) is None}
+        halves = (("the core", streams - self._streams.keys()), ("the bridge", self._streams.keys() - streams))
+        return [
+            Difference(stream.topic, f"a stream of {stream.origin} is open in {where} only")
+            for where, only_there in halves
+            for stream in sorted(only_there)
+        ]
+
+    def repair(self, names: Collection[TopicName]) -> None:
+        """Publish these topics at the endpoint anew."""
+        for name in names:
+            for incoming in [each for each in self._streams.values() if each.local == name]:
+                if incoming.publisher is not None:
+                    self._close_publisher(incoming)
+                    try:
+                        incoming.use(self._advertise(incoming.info))
+                    except ConfigError as error:
+                        _log.error("%s cannot be published again: %s", name, error)
+
+    # --- leases -----------------------------------------------------------------------------------------------------
+
+    def _arm(self) -> None:
+        deadlines = [
+            deadline_s
+            for incoming in self._streams.values()
+            if incoming.lease is not None and (deadline_s := incoming.lease.deadline()) is not None
+        ]
+        self._timer.arm(min(deadlines) if deadlines else None)
+
+    def _tell_guard(self, incoming: Incoming) -> None:
+        if self._guard is not None and incoming.guarded is not None and incoming.lease is not None:
+            self._guard.lease(incoming.guarded, incoming.lease.deadline())
+
+    def _leases_due(self) -> None:
+        now = clock.now()
+        for stream, incoming in self._streams.items():
+            lease = incoming.lease
+            if lease is None or incoming.stop is None:
+                continue
+            first = not lease.expired
+            if lease.due(now=now):
+                self._publish(incoming, incoming.stop, time.time_ns())
+                self._tell_guard(incoming)
+                if first:
+                    self.leases_fired += 1
+                    self._core.lease_expired(stream, lease.after_s, now=now)
+                    _log.warning("%s: no fresh command; publishing the stop command", incoming.local)
+        self._arm()

@@ -1,0 +1,70 @@
+"""Says in the log when the relay is lost, silent, and there again: each loss once, its end with how long it took."""
+
+import logging
+from typing import Final
+
+from sern_core.link.handshake import NEW_SESSION
+from sern_core.link.link import Link
+from sern_runtime import clock
+from sern_runtime.outages import Outages
+from sern_runtime.transport_watch import NOT_YET
+
+SILENT: Final = "the relay does not answer now; the session waits for it"
+
+_log = logging.getLogger(__name__)
+
+
+class LinkNews:
+    """Is told what becomes of `link`; `relay` is its address, as a person knows it."""
+
+    def __init__(self, link: Link, relay: str) -> None:
+        self.reason = NOT_YET
+        """Why the link was last down, in words."""
+        self.said: set[str] = set()
+        """Reasons that were said since the last session: an attempt that fails as before is no news."""
+        self.outages = Outages(_log, logging.WARNING)
+        self._link = link
+        self._relay = relay
+        self._down_since_s = clock.now()
+        self._stopping = False
+
+    def stopping(self) -> None:
+        """What ends from now on ends because we do."""
+        self._stopping = True
+
+    def down(self, reason: str) -> None:
+        """Told by the transport and by the session on it, usually of the same thing."""
+        self.reason = reason
+        link, silent_since_s = self._link, None
+        if not link.established:  # else the session goes on over the other lane
+            silent_since_s = self.outages.since_s(link.peer)
+            self.outages.forget(link.peer)
+        if self._stopping:
+            return
+        if not self.said:
+            self._down_since_s = clock.now()
+        if silent_since_s is not None:  # it began before anybody gave it up
+            self._down_since_s = min(self._down_since_s, silent_since_s)
+        if reason not in self.said:
+            self.said.add(reason)
+            then = "" if reason == NEW_SESSION else "; trying again until it works"
+            _log.warning("%s: %s%s", self._relay, reason, then)
+
+    def up(self) -> None:
+        """A session has begun."""
+        if self.said:  # in the words and at the level of the loss
+            _log.warning("%s: the link is there again, after %.0f s", self._relay, clock.now() - self._down_since_s)
+        self.said.clear()
+
+    def look(self) -> None:
+        """Say that the relay has been silent for a while in a session that goes on, and when it is not any more."""
+        link, now = self._link, clock.now()
+        if not link.established:
+            return
+        if self.said and link.handshake.transport_up:  # a session that outlived its connection has another now
+            self.said.clear()
+            _log.warning("%s: the connection is there again, after %.0f s", self._relay, now - self._down_since_s)
+        self.outages.look(
+            link.peer, lost=link.lane.stalled, now=now,
+            gone=f"{self._relay}: {SILENT}", back=f"{self._relay}: the relay answers again",
+        )  # fmt: skip

@@ -1,0 +1,291 @@
+"""Offers an endpoint's topics to the link: discovery, rules, names, and what is made of their messages before."""
+
+import logging
+from collections import Counter
+from collections.abc import Callable, Collection, KeysView
+from dataclasses import replace
+from typing import Final
+
+from sern_client.actions import GoalWatch
+from sern_client.endpoints.base import Difference, Sink, Subscription
+from sern_client.frames import Rewrite
+from sern_client.leaving import Leaving
+from sern_client.site import Site
+from sern_client.summarise import Send, Source, Summaries, streams_of
+from sern_client.tf_merge import LatchedTransforms, MergedTransforms
+from sern_core.site.client import ClientCore
+from sern_core.stream.out_channel import OutChannel
+from sern_core.summaries.transforms import is_static
+from sern_core.topics.rules import Discovery, ResolvedTopic
+from sern_core.vocabulary.errors import ConfigError, UsageError
+from sern_core.vocabulary.ledger import MAX_TOPICS
+from sern_core.vocabulary.message import StreamId, StreamInfo, TopicInfo
+from sern_core.vocabulary.names import to_global
+from sern_core.vocabulary.types import DropReason, Encoding, TopicName
+from sern_runtime import clock
+
+CLOSED: Final = "it is offered to nobody: its channel is closed"
+
+_log = logging.getLogger(__name__)
+
+
+class Outgoing:
+    """A local topic that is offered to the link; `source` makes something else of it before. Its messages go to
+    `sink`."""
+
+    __slots__ = ("channel", "name", "sink", "source", "subscription")
+
+    def __init__(
+        self, name: TopicName, channel: OutChannel, subscription: Subscription, source: Source | None, sink: Sink
+    ) -> None:
+        self.name = name
+        self.channel = channel
+        self.sink = sink
+        self.subscription = subscription
+        self.source = source
+
+    @property
+    def streams(self) -> set[StreamId]:
+        """All that its messages go to, in whatever form."""
+        own = {self.channel.stream.id}
+        return own if self.source is None else own | self.source.streams
+
+
+class Outbound:
+    """`TopicEvents` of the endpoint. The core's news of our own streams come to it as well. `goals`: those of ROS 1
+    that this site gives to others, where there are rules for them."""
+
+    def __init__(self, site: Site, core: ClientCore, discovery: Discovery, *, goals: GoalWatch | None = None) -> None:
+        self.refusals = 0
+        """Publications that the relay did not take."""
+        self.summaries = Summaries(self._sender, site.parts)
+        self.leaving = Leaving(self._unpublish)
+        self._site = site
+        self._core = core
+        self._discovery = discovery
+        self._goals = goals
+        self._stopped = False
+        self._closed = False
+        self._topics: dict[TopicName, Outgoing] = {}
+        self._by_stream: dict[StreamId, Outgoing] = {}  # the same, by each stream it goes to
+        self._unnamed: set[TopicName] = set()  # local topics without a rule, of which it was said
+
+    @property
+    def streams(self) -> KeysView[StreamId]:
+        """Every stream that a local topic goes to now."""
+        return self._by_stream.keys()
+
+    @property
+    def pending(self) -> int:
+        """Messages that something else is being made of, and that are not offered to the link yet."""
+        return sum(outgoing.source.pending for outgoing in self._topics.values() if outgoing.source is not None)
+
+    def stop_sources(self) -> None:
+        """Offer nothing more to the link. Idempotent."""
+        self._stopped = True
+        for outgoing in self._topics.values():
+            outgoing.subscription.close()
+
+    def close(self) -> None:
+        """End whatever makes something of messages; before the endpoint is stopped."""
+        self.stop_sources()
+        self._closed = True
+        for outgoing in self._topics.values():
+            if outgoing.source is not None:
+                outgoing.source.close()
+                for channel in outgoing.source.own:
+                    self._unpublish(channel)
+        self.summaries.close()
+        self._topics.clear()
+        self._by_stream.clear()
+        self.leaving.close()
+
+    # --- TopicEvents: from the endpoint -----------------------------------------------------------------------------
+
+    def topic_added(self, info: TopicInfo) -> None:
+        if info.name in self._topics or self._stopped:
+            return
+        self.leaving.come_back(info.name)
+        rules = self._site.rules
+        listed = rules.find(info.type_name, info.name) is not None
+        if not self._discovery.wants(info.name, info.type_name, listed=listed):
+            if self._discovery.wants(info.name, info.type_name, listed=True):  # only a rule is missing
+                self._say_unnamed(info)
+            return
+        try:
+            resolved = rules.resolve(info, local_name=info.name)
+        except ConfigError as error:
+            _log.error("%s", error)
+            return
+        if not resolved.direction.sends:
+            return
+        name = to_global(resolved.name, self._site.namespace)
+        try:
+            channel, source = self._offer(info, resolved, name)
+        except UsageError as error:
+            _log.error("%s cannot be offered as %s: %s", info.name, name, error)
+            return
+        sink = self._sink(channel, self._site.frames.outgoing(info)) if source is None else source.sink
+        if self._goals is not None:
+            sink = self._goals.outgoing(info, channel, sink)
+        try:
+            subscription = self._site.endpoint.subscribe(info.name, sink)
+        except UsageError as error:
+            _log.error("%s cannot be taken: %s", info.name, error)
+            self._withdraw(channel, source)
+            return
+        outgoing = self._topics[info.name] = Outgoing(info.name, channel, subscription, source, sink)
+        self._by_stream.update(dict.fromkeys(outgoing.streams, outgoing))
+        self._site.kick()
+
+    def topic_removed(self, name: TopicName) -> None:
+        outgoing = self._topics.pop(name, None)
+        if outgoing is not None:
+            for stream in outgoing.streams:
+                del self._by_stream[stream]
+            if self._goals is not None:
+                self._goals.withdrawn(name)
+            outgoing.subscription.close()
+            self._forget_source(outgoing.source)
+            self.leaving.leave(name, *streams_of(outgoing.channel, outgoing.source), now=clock.now())
+            self._site.kick()
+
+    def _say_unnamed(self, info: TopicInfo) -> None:
+        """Said once for each name: a rule with a typing error looks like a robot without the topic."""
+        if info.name not in self._unnamed and len(self._unnamed) < MAX_TOPICS:
+            self._unnamed.add(info.name)
+            _log.info("%s (%s) stays here: no rule in `topics` names it (discovery.mode: manual)", info.name,
+                      info.type_name)  # fmt: skip
+
+    def _withdraw(self, channel: OutChannel, source: Source | None) -> None:
+        """Offer a topic no more."""
+        self._forget_source(source)
+        for each in streams_of(channel, source):
+            self._unpublish(each)
+
+    def _unpublish(self, channel: OutChannel) -> None:
+        self._site.values.forget(channel.stream.id)
+        self._core.unpublish(channel, now=clock.now())
+
+    def _forget_source(self, source: Source | None) -> None:
+        if source is not None:
+            source.close()
+            self.summaries.forget(source)
+
+    def _offer(self, info: TopicInfo, resolved: ResolvedTopic, name: TopicName) -> tuple[OutChannel, Source | None]:
+        """Offer a topic to the link, with what its rule makes of it. UsageError when it cannot be."""
+        core, spec = self._core, resolved.spec
+        if resolved.rule is not None and resolved.summaries:
+            opened = self.summaries.open(core, info, resolved, self._site.rules.rules[resolved.rule], name)
+            if opened is not None:
+                return opened
+        merge = resolved.merge_tf and info.encoding is not Encoding.RAW
+        static = info.latched or is_static(info.name)
+        capped_hz = spec.max_rate_hz
+        if merge:
+            # A message of all static transforms replaces the ones before; every other one counts.
+            spec = replace(spec, max_rate_hz=None, depth=1 if static else spec.depth)
+        channel = core.publish(replace(info, name=name), spec, now=clock.now())
+        if not merge:
+            return channel, None
+        send = self._sender(channel, info)
+        if static:
+            return channel, LatchedTransforms(core, channel, send, info.name, info.encoding)
+        return channel, MergedTransforms(core, channel, send, info.name, info.encoding, max_rate_hz=capped_hz)
+
+    def _sink(self, channel: OutChannel, rewrite: Rewrite | None) -> Sink:
+        send = self._send(channel, rewrite)
+        return lambda body, stamp_ns: send(body, stamp_ns, None)
+
+    def _sender(self, channel: OutChannel, info: TopicInfo) -> Send:
+        """What puts bodies of the type `info` into a channel; for topics of which something else is made."""
+        return self._send(channel, self._site.frames.outgoing(info))
+
+    def _send(self, channel: OutChannel, rewrite: Rewrite | None) -> Callable[[bytes, int, float | None], bool]:
+        core, kick, log, stream, parts = self._core, self._site.kick, self._site.log, channel.stream, self._site.parts
+        passed = self._site.values.passed
+
+        def send(body: bytes, stamp_ns: int, born_s: float | None) -> bool:
+            seq = channel.next_seq
+            if rewrite is not None:
+                body = rewrite(body)
+            accepted = core.send(channel, body, stamp_ns, born_s=born_s, now=clock.now())
+            if accepted:
+                passed(stream, seq, body)
+            if log is not None:
+                try:
+                    log.offered(stream, seq, body, stamp_ns, accepted=accepted)
+                except Exception as error:  # noqa: BLE001  (of the log alone)
+                    parts.failed("message_log", error)
+            kick()
+            return accepted
+
+        return send
+
+    # --- from the core ----------------------------------------------------------------------------------------------
+
+    def wanted(self, stream: StreamInfo, wanted: bool) -> None:
+        """Whether anybody at the far side wants a stream of ours."""
+        outgoing = self._by_stream.get(stream.id)
+        if outgoing is None:
+            return
+        endpoint, source = self._site.endpoint, outgoing.source
+        if source is None:
+            endpoint.interest(outgoing.name, wanted)
+            return
+        if wanted:
+            source.audience_changed()
+        endpoint.interest(outgoing.name, source.wanted)
+
+    def send_dropped(self, stream: StreamInfo, first: int, count: int, reason: DropReason, where: str) -> None:
+        """Messages of ours were dropped, as `ClientEvents` says: log what somebody wanted."""
+        outgoing = self._by_stream.get(stream.id)
+        if outgoing is not None and outgoing.source is not None:
+            outgoing.source.lost(stream.id)
+        if self._goals is not None:
+            self._goals.send_dropped(stream.id, first, count, reason)
+        if not stream.spec.reliable or self._closed:  # what is left at the end was said in one line
+            return
+        name, last = stream.id.topic, first + count - 1
+        if reason is DropReason.UNWANTED:  # who wanted it has left or unsubscribed: counted, and no loss to anybody
+            _log.debug("%s: nobody wants our reliable messages %d to %d any more", name, first, last)
+        elif count == 1 and where:
+            _log.warning("%s: our reliable message %d was dropped for %s: %s", name, first, where, reason)
+        elif count == 1:
+            _log.warning("%s: our reliable message %d was dropped here: %s", name, first, reason)
+        elif where:
+            _log.warning("%s: our reliable messages %d to %d were dropped for %s: %s", name, first, last, where, reason)
+        else:
+            _log.warning("%s: our reliable messages %d to %d were dropped here: %s", name, first, last, reason)
+
+    def publication_refused(self, stream: StreamInfo, code: str, text: str) -> None:
+        """The relay does not take a stream of ours."""
+        self.refusals += 1
+        _log.error("the relay refuses %s (%s): %s", stream.id.topic, code, text)
+
+    # --- consistency ------------------------------------------------------------------------------------------------
+
+    @property
+    def held(self) -> Counter[TopicName]:
+        """Our subscriptions at the endpoint, by local name."""
+        return Counter(self._topics.keys())
+
+    def validate(self) -> list[Difference]:
+        """Compare our table with the core's: what is not as it should be."""
+        return [
+            Difference(name, CLOSED)
+            for name, outgoing in self._topics.items()
+            if outgoing.channel.stream.id not in self._core.link.outgoing.by_stream
+        ]
+
+    def repair(self, names: Collection[TopicName]) -> None:
+        """Take these topics from the endpoint anew."""
+        for name in names:
+            outgoing = self._topics.get(name)
+            if outgoing is not None:
+                outgoing.subscription.close()
+                try:
+                    outgoing.subscription = self._site.endpoint.subscribe(name, outgoing.sink)
+                except UsageError as error:
+                    _log.error("%s cannot be taken again: %s", name, error)
+                    self.topic_removed(name)

@@ -1,0 +1,129 @@
+"""What the link takes, by what the receiver got, and what is known of a link that got slower."""
+
+from math import inf
+
+from sern_core.path.congestion.params import HybridParams
+from sern_core.path.congestion.parts import GreatestRate, LatelyArrived
+
+
+class LinkRate:
+    """The greatest rate of late. `value` is in bytes/s: the capacity if it is `saturated`, that is if there ever was
+    more to send; else what was offered. `peak` is the greatest of the last minute or so."""
+
+    __slots__ = ("_mark", "_params", "_rates", "_span_limited", "arrived", "peak", "saturated", "value")
+
+    def __init__(self, params: HybridParams) -> None:
+        self._params = params
+        self._rates = GreatestRate()
+        self.value: float | None = None
+        self.saturated = False
+        self.peak = 0.0
+        self.measure_anew()
+
+    def measure_anew(self) -> None:
+        """What arrived so far says nothing about what will."""
+        self.skip_span()
+        self._span_limited = False
+        self.arrived = LatelyArrived()
+
+    def skip_span(self) -> None:
+        """The span of now is not measured to its end."""
+        self._mark: tuple[float, int] | None = None
+
+    def stalled(self) -> None:
+        """Nothing is known of the link; what begins anew shows little at first."""
+        self._rates.clear()
+        self.value = None
+        self.saturated = False
+        self.measure_anew()
+
+    def measure(
+        self, receiver_s: float, cum_bytes: int, *, app_limited: bool, rtt_s: float
+    ) -> tuple[float, bool] | None:
+        """The rate over a span that ends now, and whether there was not always more to send; None: it goes on."""
+        mark = self._mark
+        if mark is None:
+            self._mark = (receiver_s, cum_bytes)
+            self._span_limited = app_limited
+            return None
+        if app_limited:
+            self._span_limited = True
+        span_s = receiver_s - mark[0]
+        if span_s < self._params.min_rate_span_s or span_s < rtt_s:
+            return None
+        rate = (cum_bytes - mark[1]) / span_s
+        if rate <= 0.0:
+            return None  # the receiver names newer packets and no more bytes: that says nothing of the path
+        limited = self._span_limited
+        self._mark = (receiver_s, cum_bytes)
+        self._span_limited = app_limited  # nothing more was there when this packet left: the next span begins idle
+        return rate, limited
+
+    def note(self, now: float, rate: float, rtt_s: float) -> None:
+        """The link has carried `rate`."""
+        self.value = self._rates.note(now, rate, max(self._params.rate_window_s, 3 * rtt_s))
+
+    def replace(self, now: float, rate: float, rtt_s: float) -> None:
+        """The link carries `rate`, whatever was seen before."""
+        self._rates.clear()
+        self.note(now, rate, rtt_s)
+
+    def decay(self, elapsed_s: float) -> None:
+        """Forget a little of the peak."""
+        self.peak = max(self.value or 0.0, self.peak * (1 - self._params.peak_decay * elapsed_s))
+
+
+class Slowdown:
+    """Whether the link got slower, and whether the queue that this made has gone."""
+
+    __slots__ = ("_full", "_params", "faster_rate", "most_queue_s")
+
+    def __init__(self, params: HybridParams) -> None:
+        self._params = params
+        self.faster_rate: float | None = None
+        """Of which we had most, before the link seemed to get slower."""
+        self.most_queue_s: float | None = None
+        """The longest queue since then, whatever share of the link we had."""
+        self._full: tuple[float, int] | None = None  # (time, bytes) at the receiver since which a queue never went
+
+    def not_full(self) -> None:
+        """The queue went, or who keeps it is somebody else."""
+        self._full = None
+
+    def arrives(self, receiver_s: float, cum_bytes: int) -> float | None:
+        """While a queue stays the link is never idle: the bytes/s that arrived over a span; None: it goes on."""
+        full = self._full
+        if full is None:
+            self._full = (receiver_s, cum_bytes)
+            return None
+        span_s = receiver_s - full[0]
+        if span_s < self._params.min_rate_span_s:
+            return None
+        self._full = (receiver_s, cum_bytes)
+        return (cum_bytes - full[1]) / span_s
+
+    def forget(self) -> None:
+        """Whatever it was, it is not that the link got slower."""
+        self.faster_rate = self.most_queue_s = None
+
+    def began(self, rate: LinkRate, slower: float) -> bool:
+        """The link carries `slower` now. True: that is clearly less than it did."""
+        value = rate.value
+        if self.faster_rate is None and value is not None and value >= rate.peak / 2:
+            self.faster_rate = value  # we had most of the link
+        if value is None or slower >= self._params.slower * value:
+            return False
+        if self.most_queue_s is None:
+            self.most_queue_s = 0.0
+        return True
+
+    def went(self, queue_s: float, window: float, room: float, rate: LinkRate, rtt_s: float | None) -> bool:
+        """Whether the queue of a link that got slower came down to the least that we have under way. On a link that is
+        a hundred times slower that is long against what a packet took before, and no queue seems ever to go."""
+        most_s, value, params = self.most_queue_s, rate.value, self._params
+        if most_s is None or value is None:
+            return False
+        self.most_queue_s = max(most_s, queue_s)
+        least = window <= room and queue_s * value < window + room
+        far = most_s > params.went_rtts * (rtt_s or inf) and value < params.went_slower * rate.peak
+        return least and far and queue_s < params.went * most_s

@@ -1,0 +1,122 @@
+"""The metrics of a relay: read at scrape from whoever counts."""
+
+from collections.abc import Mapping
+from typing import Protocol
+
+from sern_core.bodies.codecs import Coder
+from sern_core.relay.hub import Hub
+from sern_relay.feed import RelayFeed
+from sern_relay.server import RelayServer
+from sern_relay.transforms import TransformObjects
+from sern_runtime.adaptation import Adaptation
+from sern_runtime.collector import CollectorWatch
+from sern_runtime.datagram_watch import DatagramWatch
+from sern_runtime.internal_errors import InternalErrors
+from sern_runtime.link_metrics import AgeHistograms, register_codecs, register_links, register_received
+from sern_runtime.metrics import Metrics
+from sern_runtime.optional import OptionalParts
+from sern_runtime.zap import ZapHandler
+
+
+class Counting(Protocol):
+    """The parts of a relay that count: its daemon. None: not there yet, or not wanted; the feed comes and goes."""
+
+    hub: Hub
+    datagrams: DatagramWatch
+    ages: AgeHistograms
+    coder: Coder
+    errors: InternalErrors
+    collector: CollectorWatch
+    parts: OptionalParts
+    adaptation: Adaptation | None
+    server: RelayServer | None
+    zap: ZapHandler | None
+    feed: RelayFeed | None
+    transforms: TransformObjects | None
+    reloads_failed: int
+
+    @property
+    def refusals(self) -> Mapping[str, int]:
+        """Refusals by code."""
+
+    @property
+    def reload_failed(self) -> bool:
+        """Whether what the last reload read is not all in force."""
+
+    def clients_up(self) -> int:
+        """Clients with a session."""
+
+
+def register_relay(metrics: Metrics, relay: Counting) -> None:
+    """Have `metrics` read all of them."""
+    hub = relay.hub
+    register_links(metrics, lambda: list(hub.links.values()))
+    relay.datagrams.register(metrics)
+    register_received(metrics, hub.received, relay.ages)
+    register_codecs(metrics, relay.coder)
+    relay.errors.register(metrics)
+    relay.collector.register(metrics)
+    relay.parts.register(metrics)
+    if relay.adaptation is not None:
+        relay.adaptation.register(metrics)
+    metrics.gauge("sern_relay_clients", "Clients with a session.",
+                  read=lambda: [((), float(relay.clients_up()))])  # fmt: skip
+    metrics.gauge("sern_relay_streams", "Streams announced by clients.",
+                  read=lambda: [((), float(len(hub.relayed)))])  # fmt: skip
+    metrics.gauge("sern_relay_objects", "Cross-reality objects in the registry.",
+                  read=lambda: [((), float(len(hub.objects)))])  # fmt: skip
+    metrics.counter("sern_relay_refusals_total", "Announcements, subscriptions and objects refused, by code.",
+                    ("code",), lambda: [((code,), float(n)) for code, n in relay.refusals.items()])  # fmt: skip
+    metrics.counter("sern_bad_frames_total", "Frames that were not valid; their connections were closed.",
+                    read=lambda: [((), float(relay.server.bad_frames if relay.server else 0))])  # fmt: skip
+    metrics.counter("sern_relay_auth_total", "Answers of the ZAP handler.", ("result",),
+                    lambda: _auth(relay.zap))  # fmt: skip
+    metrics.gauge("sern_relay_connections", "Connections, those without a proven key included.",
+                  read=lambda: [((), float(len(relay.server.connections) if relay.server else 0))])  # fmt: skip
+    metrics.counter("sern_relay_connections_refused_total", "Connections or messages refused, by reason.",
+                    ("reason",), lambda: refused_connections(relay.server))  # fmt: skip
+    metrics.counter("sern_relay_replay_evicted_total", "Latched messages let go because of their bounds.",
+                    read=lambda: [((), float(hub.streams.replays.evicted))])  # fmt: skip
+    metrics.gauge("sern_relay_replay_bytes", "Latched messages kept for late joiners, bytes.",
+                  read=lambda: [((), float(hub.streams.replays.held_bytes))])  # fmt: skip
+    metrics.counter("sern_relay_transforms_refused_total", "Transforms not taken as objects, by client and reason.",
+                    ("client", "code"), lambda: _transforms_refused(relay.transforms))  # fmt: skip
+    metrics.counter("sern_feed_messages_total", "Messages of the plain feed, by role and what became of them.",
+                    ("role", "result"), lambda: _fed(relay.feed))  # fmt: skip
+    metrics.gauge("sern_relay_reload_failed", "1 while what the last reload read is not all in force.",
+                  read=lambda: [((), float(relay.reload_failed))])  # fmt: skip
+    metrics.counter("sern_relay_reload_failures_total", "Reloads that kept the old configuration.",
+                    read=lambda: [((), float(relay.reloads_failed))])  # fmt: skip
+
+
+def _auth(zap: ZapHandler | None) -> list[tuple[tuple[str, ...], float]]:
+    names = ("admitted", "unknown_key", "not_now", "capped", "failed", "malformed")
+    return [((name,), float(getattr(zap.counters, name)) if zap else 0.0) for name in names]
+
+
+def refused_connections(server: RelayServer | None) -> list[tuple[tuple[str, ...], float]]:
+    """Connections and messages that were refused so far, by reason."""
+    if server is None:
+        return []
+    table, socket = server.connections, server.socket
+    counts = {
+        "capped": table.capped,
+        "handshake": table.handshake_failed,
+        "accept": table.accept_failed,
+        "routing_id": socket.refused_routing_ids,
+        "multipart": socket.malformed + server.inflow.endless,
+        "revoked": server.revoked,
+        "surplus": server.surplus,
+        "silent": server.silent,
+        "join": server.express.refused,
+    }
+    return [((reason,), float(count)) for reason, count in counts.items()]
+
+
+def _transforms_refused(transforms: TransformObjects | None) -> list[tuple[tuple[str, ...], float]]:
+    refused = transforms.refused if transforms is not None else {}
+    return [((client, code), float(n)) for (client, code), n in refused.items()]
+
+
+def _fed(feed: RelayFeed | None) -> list[tuple[tuple[str, ...], float]]:
+    return [] if feed is None else [(labels, float(n)) for labels, n in feed.results()]
