@@ -51,6 +51,7 @@ from sern_runtime.metrics import Metrics
 from sern_runtime.optional import OptionalParts
 from sern_runtime.sdnotify import Notifier, Watchdog
 from sern_runtime.topics_view import TopicView, both_ways
+from sern_runtime.trace_view import of_client, trace_view
 from sern_runtime.transport_watch import NOT_YET, WAITING
 
 KEEP_PATIENCE_S: Final = 2.0
@@ -320,10 +321,10 @@ class ClientDaemon:
             health=lambda: Health(ok=True, reason="running"),
             ready=self.readiness,
             json_routes={
-                "/api/link": lambda: [self.core.link.snapshot()],
+                "/api/link": lambda: [{**self.core.link.snapshot(), "now_s": clock.now()}],
                 "/api/peers": self.link_state.to_json,
                 "/api/topics": self.topics,
-                "/api/trace": self.core.trace.to_json,
+                "/api/trace": trace_view(of_client(self.core.link, self.core.trace), clock.now),
                 "/api/values": self.site.values.view(),
                 **({} if adaptation is None else {"/api/mmcf": adaptation.to_json}),
             },

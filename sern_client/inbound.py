@@ -392,7 +392,7 @@ class Inbound:
 
     def _leases_due(self) -> None:
         now = clock.now()
-        for incoming in self._streams.values():
+        for stream, incoming in self._streams.items():
             lease = incoming.lease
             if lease is None or incoming.stop is None:
                 continue
@@ -402,5 +402,6 @@ class Inbound:
                 self._tell_guard(incoming)
                 if first:
                     self.leases_fired += 1
+                    self._core.lease_expired(stream, lease.after_s, now=now)
                     _log.warning("%s: no fresh command; publishing the stop command", incoming.local)
         self._arm()

@@ -15,6 +15,7 @@ from prometheus_client import CollectorRegistry
 from sern_core.link.link import Link
 from sern_core.relay.access import AccessTable
 from sern_core.relay.hub import Hub, HubParams
+from sern_core.relay.traces import Traces
 from sern_core.stream.decoding import Decoder
 from sern_core.stream.out_channel import OutChannel
 from sern_core.topics.rules import FeedRole
@@ -26,6 +27,7 @@ from sern_relay.feed import RelayFeed
 from sern_relay.objects_view import objects_view
 from sern_relay.relay_metrics import register_relay
 from sern_relay.server import RelayServer
+from sern_relay.trace_source import of_hub
 from sern_relay.transforms import TransformObjects
 from sern_relay.udp import RelayLanes
 from sern_runtime import clock, ros_types
@@ -48,6 +50,7 @@ from sern_runtime.optional import OptionalParts
 from sern_runtime.outages import Outages
 from sern_runtime.sdnotify import Notifier, Watchdog
 from sern_runtime.topics_view import announced_summary, link_summary, received_summary
+from sern_runtime.trace_view import trace_view
 from sern_runtime.zap import Refusal, TemporaryRefusal, ZapHandler, self_test
 
 ZAP_DOMAIN: Final = "sern"
@@ -113,6 +116,7 @@ class RelayDaemon:
             scheduler=model.scheduler.params(),
             params=HubParams(cache_bytes=model.replay.cache_bytes, resume_s=model.replay.resume_s),
             wall_ns=lambda _now: time.time_ns(),
+            traces=Traces(),
             now=clock.now(),
         )
         self.hub.after = self._after
@@ -396,9 +400,10 @@ class RelayDaemon:
             health=lambda: Health(ok=True, reason="running"),
             ready=self.readiness,
             json_routes={
-                "/api/link": lambda: [link.snapshot() for link in self.hub.links.values()],
+                "/api/link": lambda: [{**link.snapshot(), "now_s": clock.now()} for link in self.hub.links.values()],
                 "/api/objects": objects_view(self.hub),
                 "/api/topics": self.topics,
+                "/api/trace": trace_view(of_hub(self.hub), clock.now),
                 **({} if adaptation is None else {"/api/mmcf": adaptation.to_json}),
             },
             parts=self.parts,

@@ -21,6 +21,10 @@ JsonSource = Callable[[], object]
 """Gives what `json.dumps` takes, from state, at once."""
 
 
+class UnknownError(UsageError):
+    """What was asked for is not here: answered with 404 and one line that says what is."""
+
+
 class JsonParts(NamedTuple):
     """A large answer: pieces of JSON text, each made when it is asked for, some of them in a turn of the loop. Above
     MAX_ANSWER_BYTES it is refused with `too_large`, one line."""
@@ -31,8 +35,8 @@ class JsonParts(NamedTuple):
 
 class JsonQuery(NamedTuple):
     """A JSON source with parameters, all optional: `?name=value`. `read` gets those that were given, and raises
-    UsageError for a value it does not take; that and unknown names are answered with 400 and one line. What it gives is
-    what `json.dumps` takes, or JsonParts."""
+    UsageError for a value it does not take; that and unknown names are answered with 400 and one line,
+    UnknownError with 404. What it gives is what `json.dumps` takes, or JsonParts."""
 
     accepts: tuple[str, ...]
     read: Callable[[Mapping[str, str]], object]
@@ -252,6 +256,8 @@ def _json_route(source: JsonSource | JsonQuery) -> Handler:
                     body = await joined(answer)
             else:
                 body = json.dumps(answer).encode()
+        except UnknownError as error:
+            return web.json_response({"error": str(error)}, status=404)
         except UsageError as error:
             return web.json_response({"error": str(error)}, status=400)
         return web.Response(

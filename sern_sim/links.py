@@ -10,6 +10,7 @@ All times here are integer nanoseconds of scenario time (zero is the start of th
 from bisect import bisect_right
 from collections import deque
 from collections.abc import Callable
+from dataclasses import replace
 from math import isfinite
 from random import Random
 from typing import Final, NamedTuple
@@ -104,6 +105,8 @@ class Link:
         "_loss",
         "_mean_loss",
         "_normal",
+        "_path_ns",
+        "_paths",
         "_plain",
         "_queue_packets",
         "_rate",
@@ -153,7 +156,11 @@ class Link:
         self._burst_bad = False
         self._queue_packets = model.queue_packets
         # The random stages are skipped as a whole on a link that has none.
-        self._plain = not (model.loss or model.burst_loss or model.jitter_s or model.reorder or model.duplicate)
+        self._plain = not (
+            model.loss or model.burst_loss or model.jitter_s or model.reorder or model.duplicate or model.path_steps
+        )
+        self._paths = deque((to_ns(step.at_s), step) for step in model.path_steps)
+        self._path_ns = self._paths[0][0] if self._paths else NEVER  # when delay and loss are others next
 
         # (from_ns, bits per second or 0 for unlimited), and the segment in force at the time of the last departure
         steps = [(0, model.rate_bps), *((to_ns(step.at_s), step.rate_bps) for step in model.rate_steps)]
@@ -184,6 +191,8 @@ class Link:
         self.sent_packets += 1
         self.sent_bytes += size_bytes
         self.twice = False
+        if t_ns >= self._path_ns:
+            self._change_path(t_ns)
         if t_ns >= self._down_end_ns:
             self._pass_blackout(t_ns)
         if t_ns >= self._down_start_ns:
@@ -241,6 +250,8 @@ class Link:
     def _send_stream(self, size_bytes: int, t_ns: int) -> int:
         self.sent_packets += 1
         self.sent_bytes += size_bytes
+        if t_ns >= self._path_ns:
+            self._change_path(t_ns)
         segments = 1 if size_bytes <= SEGMENT_BYTES else -(-size_bytes // SEGMENT_BYTES)
         wire_bytes = size_bytes + segments * self.model.overhead_bytes
         self._settle_queue(t_ns)
@@ -345,6 +356,16 @@ class Link:
         return max(deviation_ns, -self._delay_ns)
 
     # ------------------------------------------------------------------ schedules
+
+    def _change_path(self, t_ns: int) -> None:
+        """Delay and loss of what is sent at `t_ns` are the latest step's."""
+        while t_ns >= self._path_ns:
+            step = self._paths.popleft()[1]
+            self._path_ns = self._paths[0][0] if self._paths else NEVER
+            model = replace(self.model, loss=step.loss)
+            self._delay_ns = to_ns(step.delay_s)
+            self._stall_ns = 2 * self._delay_ns + to_ns(model.stall_s)
+            self._loss, self._mean_loss = step.loss, model.mean_loss
 
     def blackout_after(self, t_ns: int) -> tuple[int, int]:
         """(start, end) of the first blackout that ends after `t_ns`; (NEVER, NEVER) when there is none."""

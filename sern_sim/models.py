@@ -49,6 +49,14 @@ class RateStep(NamedTuple):
     rate_bps: float | None
 
 
+class PathStep(NamedTuple):
+    """Delay and loss are these from `at_s` on."""
+
+    at_s: float
+    delay_s: float
+    loss: float
+
+
 class Window(NamedTuple):
     """A blackout: the path is gone in [start_s, end_s)."""
 
@@ -90,6 +98,8 @@ class LinkModel:
     Jitter alone never reorders (a packet waits for the one before it, as in netem with a rate); reordering does:
     with probability `reorder` a packet is held back by `reorder_delay_s` and others overtake it.
 
+    `path_steps`: delay and loss change over time; in the virtual-time network only. A falling delay does not reorder.
+
     `stream` mode: queue limit, reordering and duplication do not apply; a lost segment instead stalls everything
     behind it for a round trip (2 · delay_s) plus `stall_s`, doubled when the retransmission is lost too. A blackout
     freezes bytes where they are; one longer than `disconnect_after_s` breaks the connection, which loses what was in
@@ -110,6 +120,7 @@ class LinkModel:
     queue_packets: int = DEFAULT_QUEUE_PACKETS
     overhead_bytes: int = 0
     rate_steps: tuple[RateStep, ...] = ()
+    path_steps: tuple[PathStep, ...] = ()
     blackouts: tuple[Window, ...] = ()
     flap: Flap | None = None
     mode: LinkMode = LinkMode.DATAGRAM
@@ -141,6 +152,16 @@ class LinkModel:
             if not max(last_s, -0.0) <= step.at_s < inf or step.at_s == last_s:
                 raise UsageError(f"rate_steps: the step at {step.at_s} s is out of order: list steps by rising time")
             last_s = step.at_s
+        last_s = -inf
+        for path in self.path_steps:
+            _check_probability("path_steps.loss", path.loss)
+            if self.streaming and path.loss >= 1.0:
+                raise UsageError("path_steps: loss is 1 in stream mode, so nothing would ever arrive: use a blackout")
+            if not 0.0 <= path.delay_s < inf:
+                raise UsageError(f"path_steps: delay_s is {path.delay_s}: give a time of 0 s or more")
+            if not max(last_s, -0.0) <= path.at_s < inf or path.at_s == last_s:
+                raise UsageError(f"path_steps: the step at {path.at_s} s is out of order: list steps by rising time")
+            last_s = path.at_s
         last_s = -inf
         for window in self.blackouts:
             if not max(last_s, -0.0) <= window.start_s < window.end_s < inf or window.start_s == last_s:

@@ -10,7 +10,7 @@ import os
 import sys
 import urllib.error
 import urllib.request
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Final
 from urllib.parse import urlsplit
 
@@ -35,6 +35,10 @@ class NotFoundError(SernError):
     """The daemon has no such path: it is another kind of daemon, or an older one."""
 
 
+class UnknownError(SernError):
+    """The daemon has the path, and not what was asked for there; its own words say what it has."""
+
+
 def checked_api(api: str) -> str:
     """`api` without a trailing slash. Raises UsageError when it is not http://HOST:PORT."""
     try:
@@ -47,11 +51,12 @@ def checked_api(api: str) -> str:
     return api.rstrip("/")
 
 
-def local_api() -> str:
-    """The daemon of this machine, at the first of `LOCAL_APIS` that answers. One before it that hangs is named on
-    standard error. Raises SernError where none answers."""
+def local_api(apis: Sequence[str] | None = None) -> str:
+    """The daemon of this machine, at the first of `apis` that answers (None: `LOCAL_APIS`). One before it that hangs is
+    named on standard error. Raises SernError where none answers."""
+    apis = LOCAL_APIS if apis is None else apis
     silent: list[str] = []
-    for api in LOCAL_APIS:
+    for api in apis:
         try:
             get_json(api, PROBED, timeout_s=PROBE_S)
         except SilentError:
@@ -64,7 +69,7 @@ def local_api() -> str:
             return api
     if silent:
         raise SernError(f"no daemon answers on this machine; {_hung(silent)}")
-    ports = ", ".join(api.rpartition(":")[2] for api in LOCAL_APIS)
+    ports = ", ".join(api.rpartition(":")[2] for api in apis)
     raise SernError(
         f"no daemon answers on this machine (127.0.0.1, ports {ports}); is one running, and is http.listen set in its "
         "file? --api gives another address"
@@ -76,7 +81,8 @@ def _hung(addresses: list[str]) -> str:
 
 
 def get_json(api: str, path: str, *, timeout_s: float | None = None) -> Any:
-    """The JSON at `path` of the daemon at `api`. Raises NotFoundError for a path it lacks, else SernError.
+    """The JSON at `path` of the daemon at `api`. Raises NotFoundError for a path it lacks, UnknownError and UsageError
+    in the daemon's words for what it does not have or take there, else SernError.
 
     `timeout_s`: how long it may be silent; None: `TIMEOUT_S`.
     """
@@ -85,8 +91,13 @@ def get_json(api: str, path: str, *, timeout_s: float | None = None) -> Any:
             return json.load(answer)
     except urllib.error.HTTPError as error:
         with error:
+            said = _said(error)
             if error.code == 404:
+                if said:
+                    raise UnknownError(f"{api}: {said}") from None
                 raise NotFoundError(f"{api} has no {path}: it is another kind of daemon") from None
+            if error.code == 400 and said:
+                raise UsageError(f"{api}: {said}") from None
             raise SernError(f"{api}{path}: HTTP status {error.code}; see the daemon's log") from None
     except urllib.error.URLError as error:
         reason = getattr(error.reason, "strerror", None) or error.reason
@@ -97,6 +108,16 @@ def get_json(api: str, path: str, *, timeout_s: float | None = None) -> Any:
         raise SilentError(f"{api}{path}: no answer in time; it hangs, or is no SERN daemon") from None
     except (OSError, http.client.HTTPException, ValueError):
         raise SernError(f"{api}{path}: the answer is not JSON; is this a SERN daemon?") from None
+
+
+def _said(error: urllib.error.HTTPError) -> str:
+    """The line with which a daemon says what is wrong with a question; empty: it did not."""
+    try:
+        answer = json.load(error)
+    except (OSError, http.client.HTTPException, ValueError):
+        return ""
+    said = answer.get("error") if isinstance(answer, dict) else None
+    return " ".join(said.split()) if isinstance(said, str) else ""
 
 
 def is_stream(item: Mapping[str, Any]) -> bool:

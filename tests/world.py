@@ -15,6 +15,7 @@ from sern_core.link.link import Link
 from sern_core.relay.access import AccessRule, AccessTable
 from sern_core.relay.hub import Hub, HubParams
 from sern_core.relay.hub_port import HubPort
+from sern_core.relay.traces import Traces
 from sern_core.site.client import ClientCore
 from sern_core.stream.decoding import DecodeRequest
 from sern_core.stream.encoding import EncodeRequest
@@ -22,6 +23,7 @@ from sern_core.stream.out_channel import OutChannel
 from sern_core.vocabulary.codec_names import DEFAULT_LOSSY, Compression, LossyParams
 from sern_core.vocabulary.message import Message, StreamId, StreamInfo, TopicInfo, TopicSpec
 from sern_core.vocabulary.params import LinkParams, SchedulerParams
+from sern_core.vocabulary.trace import DecisionTrace
 from sern_core.vocabulary.types import (
     ClientName,
     DropReason,
@@ -205,6 +207,7 @@ class SimClient:
             events=self,
             link=link,
             scheduler=scheduler,
+            trace=DecisionTrace(),
             now=self.now,
             lossless=lossless,
             coder=coder,
@@ -360,6 +363,7 @@ class SimHub:
             link=world.link,
             scheduler=SchedulerParams(),
             params=world.hub_params,
+            traces=Traces(),
             wall_ns=lambda t: int(t * 1e9),
             now=self.now,
             lossless=world.lossless,
@@ -548,3 +552,4 @@ class World:
         self.relay.hub.validate()
         for client in self.clients.values():
             client.core.link.validate()
+            client.core.trace.validate()

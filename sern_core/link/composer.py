@@ -13,7 +13,6 @@ from sern_core.path.lanes import OVERHEAD_BYTES, Lane
 from sern_core.stream.coding import Coding
 from sern_core.stream.out_channel import OutChannel
 from sern_core.stream.out_message import OutMessage
-from sern_core.vocabulary.trace import TraceEvent
 from sern_core.vocabulary.types import PriorityClass
 from sern_core.wire import framing
 
@@ -43,6 +42,8 @@ class Composer:
         self._sender = sender
         self._taking = taking
         self._control_sent = control_sent
+        self.served: OutChannel | None = None
+        """What left last, while decisions are traced; control messages aside."""
 
     def fill(self, datagram: Datagram, lane: Lane, now: float) -> bool:
         """Fill one datagram: watermarks, then what the scheduler picks, of one class; control ahead of all but class 0.
@@ -132,7 +133,12 @@ class Composer:
 
     def _put(self, datagram: Datagram, channel: OutChannel, out: OutMessage, limit: int, now: float) -> int:
         """Append one fragment; returns by how many bytes the datagram grew."""
+        started = out.started
+        grown = datagram.fragment(channel, out, limit, now)
         trace = self._end.trace
-        if trace.enabled and not out.started:
-            trace.record(now, out.message.stream.topic, TraceEvent.CHOSEN, seq=out.seq, peer=self._end.peer)
-        return datagram.fragment(channel, out, limit, now)
+        if trace.enabled and channel is not self._control.out:
+            self.served = channel
+            told = self._sender.told
+            if trace.steps or channel.slot in told.holding:
+                told.left(channel, out, started, now)
+        return grown

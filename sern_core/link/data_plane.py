@@ -8,6 +8,7 @@ from sern_core.link.composer import Composer
 from sern_core.link.control_stream import CONTROL_CHANNEL, ControlStream
 from sern_core.link.datagram import Datagram, SentData, SentWatermark
 from sern_core.link.end import End
+from sern_core.link.holds import Holds
 from sern_core.link.lane_set import LaneSet
 from sern_core.link.sender import Sender
 from sern_core.link.streams_in import StreamsIn
@@ -15,7 +16,6 @@ from sern_core.path.lanes import COPY_DELAY_S, LANE_ZMQ, OVERHEAD_BYTES, PING_IN
 from sern_core.stream.out_channel import OutChannel
 from sern_core.stream.out_message import OutMessage
 from sern_core.vocabulary.message import Message, TopicSpec
-from sern_core.vocabulary.trace import TraceEvent
 from sern_core.vocabulary.types import PriorityClass
 from sern_core.wire import framing
 
@@ -46,6 +46,8 @@ class DataPlane:
         self._answers = answers
         self._composer = composer
         self._sweep = sweep
+        self.holds = Holds(end, lanes, control, sender)
+        """Why what waits does."""
         self.sweep_due_s = now + SWEEP_INTERVAL_S
         self.on_arrived: Callable[[TopicSpec, Message, float], None] | None = None
         """Called when the peer has a message whole: what holds for its topic, the message, now."""
@@ -69,6 +71,9 @@ class DataPlane:
         datagram = Datagram()
         if not lane.stalled or now >= lane.probe_due_s:
             self._fill(datagram, lane, now)
+            if now >= self.holds.due_s and self._sender.scheduler.busy:
+                self.holds.served = self._composer.served
+                self.holds.look(now)
         arrivals = lane.arrivals
         if arrivals.unacked and not end.half_read and (datagram.items or arrivals.due or now >= arrivals.deadline_s()):
             # In front: the receiver's clock estimate has the newest sample before it judges the age of what follows.
@@ -187,9 +192,8 @@ class DataPlane:
                 if type(item) is SentData and item.channel.fragment_acked(item.out, item.generation):
                     if self.on_arrived is not None:
                         self.on_arrived(item.channel.spec, item.out.message, now)
-                    if end.trace.enabled and item.channel.slot != CONTROL_CHANNEL:
-                        topic = item.out.message.stream.topic
-                        end.trace.record(now, topic, TraceEvent.ACKED, seq=item.out.seq, peer=end.peer)
+                    if end.trace.steps and item.channel.slot != CONTROL_CHANNEL:
+                        self._sender.told.acked(item.channel, item.out, now)
         control = self._control.out
         if control.retained:
             control.settle()

@@ -199,6 +199,11 @@ class PeerDefinitions:
         self._told.add(digest)
         return self.store.get(digest)
 
+    def peer_asked(self, user: Hashable) -> bool:
+        """Whether the peer has asked, in this session, for the text that this stream of ours uses."""
+        digest = self._out.digests.get(user)
+        return digest is not None and (digest in self._asked or digest in self._told)
+
     def known(self, digest: str) -> str | None:
         """A text is here, from whomever: the text if this peer waits for it."""
         if digest in self._in.counts:

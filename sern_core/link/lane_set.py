@@ -9,9 +9,11 @@ from sern_core.path.clocksync import ClockSync
 from sern_core.path.flight import Packet
 from sern_core.path.lanes import LANE_EXPRESS, LANE_UDP, LANE_ZMQ, PROVEN_ACKS, Lane
 from sern_core.vocabulary.errors import WireError
-from sern_core.vocabulary.trace import LINK, TraceEvent
+from sern_core.vocabulary.trace import LINK, Field, TraceEvent
 
 RATE_INTERVAL_S: Final = 0.05
+TOLD_CHANGE: Final = 1.5
+"""A rate that is known to be so many times what was told, or as much less, is told to the trace of decisions."""
 
 
 class LaneSet:
@@ -35,6 +37,7 @@ class LaneSet:
         self._give_back = give_back
         self._on_rate = on_rate
         self._rate_due_s = now
+        self._told_bps = 0.0
         self.clock = ClockSync()
         """The peer's clock, as the stamps of all lanes tell."""
         self.lane = Lane(LANE_ZMQ, end.params, lossless=lossless)
@@ -132,8 +135,8 @@ class LaneSet:
             left, self.express = self.express, lane
             if left is not None:
                 self.recall(left, now)
-            state = "takes" if lane is not None else "leaves"
-            self._trace_up(now, f"class control {state} express")
+            self._tell(now, TraceEvent.LANE_USED, lane=(lane or self.lane).name, what="class control")
+            self._end.dirty = True
 
     def _use(self, lane: Lane, now: float) -> None:
         old = self.lane
@@ -142,12 +145,19 @@ class LaneSet:
         self.lane = lane
         if not old.lossless or not old.usable:
             self.recall(old, now)
-        self._trace_up(now, f"lane {lane.name}")
+        self._tell(now, TraceEvent.LANE_USED, lane=lane.name, what="data")
+        self._end.dirty = True
         self._rate_known(now)
 
-    def _trace_up(self, now: float, reason: str) -> None:
-        self._end.trace.record(now, LINK, TraceEvent.LINK_UP, peer=self._end.peer, reason=reason)
-        self._end.dirty = True
+    def _tell_rate(self, now: float) -> None:
+        told_bps, rate_bps = self._told_bps, self.lane.estimator.rate_bps or 0.0
+        if rate_bps and not told_bps / TOLD_CHANGE < rate_bps < told_bps * TOLD_CHANGE:
+            self._told_bps = rate_bps
+            rtt_s = self.lane.flight.rtt.srtt_s
+            self._tell(now, TraceEvent.CAPACITY, rate_bps=round(rate_bps), rtt_s=rtt_s)
+
+    def _tell(self, now: float, event: TraceEvent, **fields: Field) -> None:
+        self._end.trace.record(now, LINK, event, 0, peer=self._end.peer, **fields)
 
     def recall(self, lane: Lane, now: float) -> None:
         """Requeue every packet in flight on `lane`. The receiver drops duplicates."""
@@ -156,7 +166,10 @@ class LaneSet:
     def _rate_known(self, now: float) -> None:
         self._rate_due_s = now + RATE_INTERVAL_S
         known = self.lane.estimator.rate_bps is not None
-        self._on_rate(self.lane.rate_changed() or None, known, now)
+        rate_bps = self.lane.rate_changed() or None
+        self._on_rate(rate_bps, known, now)
+        if known and self._end.trace.enabled:
+            self._tell_rate(now)
 
     # --- acknowledgements and silence -----------------------------------------------------------------------------
 
@@ -215,7 +228,9 @@ class LaneSet:
         if packets:
             lane.resolved(acked=len(packets))
         if newer or packets:
-            lane.stalled = False
+            if lane.stalled:
+                lane.stalled = False
+                self._tell(now, TraceEvent.LANE_ANSWERS, lane=lane.name)
             lane.proofs += 1
             lane.answered = True
             self._end.dirty = True
@@ -244,8 +259,7 @@ class LaneSet:
         lane.probe_due_s = now
         if lane.beside is None or not lane.beside.usable:
             lane.estimator.on_stall(now=now)
-        reason = f"{lane.name}: no acknowledgement"
-        self._end.trace.record(now, LINK, TraceEvent.LINK_DOWN, peer=self._end.peer, reason=reason)
+        self._tell(now, TraceEvent.LANE_SILENT, lane=lane.name)
         if len(self.by_id) > 1:
             self.choose(now)
 

@@ -36,6 +36,7 @@ from sern_core.link.lane_set import LaneSet
 from sern_core.link.owed_lists import OwedLists
 from sern_core.link.reading import Reading
 from sern_core.link.receiver import Receiver
+from sern_core.link.send_trace import SendTrace
 from sern_core.link.sender import Sender
 from sern_core.link.streams_in import StreamsIn
 from sern_core.link.streams_out import StreamsOut
@@ -91,7 +92,7 @@ class Link:
         self.texts = PeerDefinitions(definitions, peer)
         reassembly = self.reassembly = Reassembly(max(64 * 2**20, 2 * link.max_message_bytes))
         control = self.control = ControlStream(end, reassembly, self._read_control)
-        sender = self.sender = Sender(end, scheduler, delivered=self._delivered, now=now)
+        sender = self.sender = Sender(end, scheduler, SendTrace(end, self.texts), delivered=self._delivered, now=now)
         lanes = self.lanes = LaneSet(
             end,
             lossless=lossless,

@@ -9,6 +9,7 @@ from math import inf
 
 from sern_core.bodies.codecs import LOSSY, Coder, LossyTopic
 from sern_core.link.end import End
+from sern_core.link.send_trace import SendTrace
 from sern_core.path.period import Cadences
 from sern_core.stream.coding import ChannelCodec, Coding
 from sern_core.stream.encoding import Encoder
@@ -20,7 +21,6 @@ from sern_core.vocabulary.ledger import SendLedger
 from sern_core.vocabulary.message import Message, StreamInfo
 from sern_core.vocabulary.names import plain_type
 from sern_core.vocabulary.params import SchedulerParams
-from sern_core.vocabulary.trace import TraceEvent
 from sern_core.vocabulary.types import CLASS_LABELS, DropReason, Ordering, PriorityClass
 
 
@@ -28,9 +28,17 @@ class Sender:
     """Queues and scheduler of one end. `delivered` is told when the peer's watermark of a channel has moved."""
 
     def __init__(
-        self, end: End, scheduler: SchedulerParams, *, delivered: Callable[[OutChannel], None], now: float
+        self,
+        end: End,
+        scheduler: SchedulerParams,
+        told: SendTrace,
+        *,
+        delivered: Callable[[OutChannel], None],
+        now: float,
     ) -> None:
         self._end = end
+        self.told = told
+        """What the trace of decisions is told of messages on their way out."""
         self._delivered = delivered
         self.scheduler = Scheduler(scheduler, now=now)
         self.paper = scheduler.ordering is Ordering.PAPER
@@ -72,17 +80,11 @@ class Sender:
             self.held_back_due_s = min(self.held_back_due_s, gate.newest_due_s)
             end.dirty = True  # the owner looks at the deadline again
         trace = end.trace
-        if trace.enabled:
-            topic = message.stream.topic
-            if gate is not None and gate.left_out:
-                why = _why_capped(channel, gate.thinned > thinned)
-                trace.record(now, topic, TraceEvent.RATE_CAPPED, seq=gate.left_out, reason=why)
-            if gate is not None and gate.newest is not None:
-                why = _why_capped(channel, gate.newest_thinned)
-                trace.record(now, topic, TraceEvent.HELD, seq=message.seq, reason=why, peer=end.peer)
-            else:
-                event = TraceEvent.QUEUED if accepted else TraceEvent.REFUSED
-                trace.record(now, topic, event, seq=message.seq, peer=end.peer)
+        if trace.enabled and (
+            trace.steps or not (accepted and channel.ready and channel.wanted and (gate is None or gate.newest is None))
+        ):
+            thins = gate is not None and gate.thinned > thinned
+            self.told.submitted(channel, message, accepted, thinned=thins, now=now)
         if not backlog or channel.coalesced:
             self.refresh(channel, now)
         return accepted
@@ -93,9 +95,8 @@ class Sender:
         for slot in list(self._held_back):
             channel = self.channels.get(slot)
             if channel is not None and channel.release(now):
-                topic = channel.stream.id.topic
-                seq = channel.queue[-1].seq
-                self._end.trace.record(now, topic, TraceEvent.QUEUED, seq=seq, peer=self._end.peer)
+                if self._end.trace.steps:
+                    self.told.queued(channel, channel.queue[-1].seq, channel.queue[-1].size, now)
                 self.refresh(channel, now)
             if channel is None or channel.newest is None:
                 self._held_back.discard(slot)
@@ -107,7 +108,6 @@ class Sender:
         """Drop a message on its way in; of a reliable stream a tombstone goes on in its place."""
         self._end.now = now
         channel.reject(message, reason)
-        self._end.trace.record(now, message.stream.topic, TraceEvent.DROPPED, seq=message.seq, reason=reason)
         self.refresh(channel, now)
 
     def abandon(self, channel: OutChannel, seq: int, reason: DropReason, *, now: float) -> bool:
@@ -129,7 +129,10 @@ class Sender:
 
     def watermark(self, channel: OutChannel, seq: int, now: float) -> int:
         """The peer has everything of a reliable channel up to `seq`; returns how many messages are let go of."""
+        before = channel.watermark
         done = channel.delivered_to(seq)
+        if self._end.trace.enabled and channel.watermark > before:
+            self.told.confirmed(channel, now)
         self.refresh(channel, now)
         self._delivered(channel)
         return done
@@ -139,10 +142,8 @@ class Sender:
         end = self._end
         for channel, some in fragments.items():
             again = channel.fragments_lost(some, now=now)
-            if end.trace.enabled:
-                topic = channel.stream.id.topic
-                for out in again:
-                    end.trace.record(now, topic, TraceEvent.LOST, seq=out.seq, peer=end.peer)
+            if end.trace.enabled and self.channels.get(channel.slot) is channel:
+                self.told.lost(channel, again, now)
             if self.channels.get(channel.slot) is channel:
                 self.refresh(channel, now)
 
@@ -154,6 +155,8 @@ class Sender:
         for channel in list(self.channels.values()):
             watermark = channel.watermark
             room -= channel.sweep(now, up=self._end.established, room=room)
+            if self._end.trace.enabled and not channel.ready:
+                self.told.unready(channel, now, again=False)
             if channel.offered or channel.active:
                 self.refresh(channel, now)
             if channel.watermark > watermark:
@@ -249,9 +252,8 @@ class Sender:
         assert self.encoder is not None and channel.codec is not None
         if self.encoder.ready(channel, out, channel.codec, now=now):
             return True
-        end = self._end
-        if end.trace.enabled:
-            end.trace.record(now, out.message.stream.topic, TraceEvent.ENCODING, seq=out.seq, peer=end.peer)
+        if self._end.trace.enabled:
+            self.told.encoding(channel, out, now)
         self.refresh(channel, now)
         return False
 
@@ -270,10 +272,6 @@ class Sender:
             check(waits == channel.offered, f"{channel.stream.id.topic}: the scheduler does not know what waits")
         self.ledger.validate([(channel.counters, *channel.held()) for channel in channels], check)
         self.scheduler.validate()
-
-
-def _why_capped(channel: OutChannel, thinned: bool) -> str:
-    return f"the adaptation lets {channel.share:.0%} of the messages in" if thinned else "max_rate_hz"
 
 
 def class_of(channel: OutChannel, out: OutMessage) -> PriorityClass:

@@ -18,7 +18,6 @@ from sern_core.stream.out_message import OutMessage
 from sern_core.vocabulary.errors import UsageError, WireError
 from sern_core.vocabulary.fates import Fates
 from sern_core.vocabulary.message import Message, StreamId, StreamInfo
-from sern_core.vocabulary.trace import TraceEvent
 from sern_core.vocabulary.types import DROP_REASONS, DropReason
 from sern_core.wire import framing
 from sern_core.wire.announce import Announcement, Want, announcement_parts, definition_hash
@@ -35,8 +34,6 @@ RETAINED_PER_US: Final = 16
 """What a report of drops is charged with, for what it looks through."""
 ANNOUNCE_US: Final = 12
 """What a session that begins is charged with for each stream that is announced in it."""
-MAX_TRACED: Final = 100
-"""The most of one run of dropped messages that the trace of decisions has."""
 SEVERAL: Final = "several clients"
 """Who will not get a message when the report of its drop names nobody; it is no client's name."""
 
@@ -115,13 +112,19 @@ class StreamsOut:
         channel.wanted = wanted
         if self._end.fates is not None:
             channel.drops.on_count = partial(self._counted, self._end.fates, stream)
-        channel.prime(replays, now=now)
         channels[slot] = channel
+        self.prime(channel, replays, now=now)
         self.by_stream[stream.id] = channel
         self._texts.use_outgoing(slot, _digest(stream), stream.info.definition)
         if self._end.established:
             self.announce(channel, now)
         return channel
+
+    def prime(self, channel: OutChannel, replays: Sequence[Message], *, now: float) -> None:
+        """Put latched messages (oldest first, marked as replays) ahead of what waits in a channel."""
+        primed = channel.prime(replays, now=now)
+        if primed and self._end.trace.enabled:
+            self._sender.told.replayed(channel, primed, now)
 
     def _counted(self, fates: Fates, stream: StreamInfo, seq: int, reason: DropReason) -> None:
         fates.dropped(stream, seq, reason, self._end.peer)
@@ -129,9 +132,8 @@ class StreamsOut:
     def _dropped(self, slot: int, outs: Sequence[OutMessage], reason: DropReason) -> None:
         channel = self._sender.channels.get(slot)
         if channel is not None:
-            end, topic = self._end, channel.stream.id.topic
-            for out in outs[:MAX_TRACED]:
-                end.trace.record(end.now, topic, TraceEvent.DROPPED, seq=out.seq, reason=reason, peer=end.peer)
+            if self._end.trace.enabled:
+                self._sender.told.dropped(channel, outs, reason, self._end.now)
             self._events.dropped(channel, outs, reason)
 
     def close(self, channel: OutChannel, reason: DropReason, *, now: float) -> None:
@@ -141,6 +143,7 @@ class StreamsOut:
         channel.ready = False
         self._sender.refresh(channel, now)
         self._sender.channels.pop(channel.slot, None)
+        self._sender.told.forget(channel)
         self._sender.cadences.forget(channel.slot)
         if self.by_stream.get(channel.stream.id) is channel:
             del self.by_stream[channel.stream.id]

@@ -90,6 +90,7 @@ class LinkView(NamedTuple):
             "version": self.version,
             "inflight_bytes": self.inflight_bytes,
             "srtt_s": self.srtt_s,
+            "loss": self.loss,
             "fragment_bytes": self.fragment_bytes,
             "clock_offset_s": self.clock_offset_s,
             "clock_error_s": self.clock_error_s if isfinite(self.clock_error_s) else None,

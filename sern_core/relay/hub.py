@@ -32,6 +32,7 @@ from sern_core.relay.objects import ObjectRegistry
 from sern_core.relay.presence import Presence
 from sern_core.relay.relayed_streams import RelayedStreams
 from sern_core.relay.routing import BadPatternError, RouteChange, RoutingTable
+from sern_core.relay.traces import Traces
 from sern_core.stream.in_stream import InStream
 from sern_core.stream.out_channel import OutChannel
 from sern_core.stream.out_message import OutMessage
@@ -39,7 +40,6 @@ from sern_core.vocabulary.errors import RefusedError, WireError
 from sern_core.vocabulary.message import Message
 from sern_core.vocabulary.names import is_client_name, name_problem
 from sern_core.vocabulary.params import LinkParams, SchedulerParams
-from sern_core.vocabulary.trace import DecisionTrace
 from sern_core.vocabulary.types import ClientName, DropReason, TopicName
 from sern_core.wire import framing
 from sern_core.wire.announce import Announcement
@@ -75,14 +75,15 @@ class Hub:
         scheduler: SchedulerParams,
         params: HubParams | None = None,
         wall_ns: Callable[[float], int],
-        trace: DecisionTrace | None = None,
+        traces: Traces | None = None,
         now: float,
         lossless: bool = True,
     ) -> None:
         self.name = name
         self.boot = boot
         params = params or HubParams()
-        self.trace = trace or DecisionTrace(enabled=False)
+        self.traces = traces or Traces(enabled=False)
+        """Why messages to the clients were held or dropped."""
         self._link_params = link
         self._scheduler_params = scheduler
         self._lossless = lossless
@@ -132,7 +133,7 @@ class Hub:
             definitions=self.definitions,
             link=self._link_params,
             scheduler=self._scheduler_params,
-            trace=self.trace,
+            trace=self.traces.of(client),
             now=now,
             lossless=self._lossless,
             auto_confirm=False,
@@ -206,6 +207,7 @@ class Hub:
         self.events.lane_closed(client)
         link.close_streams()
         self.clients.forget(client)
+        self.traces.forget(client)
         self._subscriptions.pop(client, None)
         self.matching.forget(client)
         self.awaited.forget(client)
@@ -391,6 +393,7 @@ class Hub:
         self.objects.validate()
         self.streams.replays.validate()
         self.definitions.validate()
+        self.traces.validate()
         for identity, relayed in self.relayed.items():
             outs = set(self.routing.subscribers(identity))
             held = set(relayed.outs) | relayed.unopened | relayed.waiting.keys()

@@ -270,7 +270,7 @@ class RelayedStreams:
         for relayed in self.by_id.values():
             if link.peer in relayed.outs:
                 channel = relayed.outs[link.peer][1]
-                channel.prime(self.latched(link, relayed, channel.first_seq, now), now=now)
+                link.outgoing.prime(channel, self.latched(link, relayed, channel.first_seq, now), now=now)
 
     def latched(self, link: Link, relayed: Relayed, first: int, now: float) -> list[Message]:
         """The latched messages that a late joiner may have before `first`: of those that are not too many for what may

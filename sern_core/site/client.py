@@ -296,7 +296,7 @@ class ClientCore:
     def on_up(self, link: Link, *, resumed: bool, now: float) -> None:
         if not resumed:
             for identity, cache in self._latched.items():
-                link.outgoing.by_stream[identity].prime(cache.replay(), now=now)
+                link.outgoing.prime(link.outgoing.by_stream[identity], cache.replay(), now=now)
         self.peers.session_began(now=now)
         self._send_subscription(now, self.peers.asked())
         self._tell(self.events.link_up, resumed=resumed)
@@ -423,6 +423,15 @@ class ClientCore:
             self._failed(stream, message, DropReason.FAULT, "", now)
         else:
             self.received.of(stream.stream).arrived(len(message.body), now - message.born_s, now)
+            if self.trace.steps:
+                self.trace.record(
+                    now,
+                    message.stream.topic,
+                    TraceEvent.DELIVERED,
+                    message.seq,
+                    origin=message.stream.origin,
+                    age_s=now - message.born_s,
+                )
             if not message.replay:  # which is the relay's
                 self.peers.arrived(message.stream.origin, now=now)
 
@@ -430,7 +439,7 @@ class ClientCore:
         """A message has had its turn and cannot be handed on."""
         topic = stream.stream.id.topic
         self.received.of(stream.stream).drop_arrived(reason)
-        self.trace.record(now, topic, TraceEvent.DROPPED, seq=message.seq, reason=reason, peer=self.link.peer)
+        self._arrival_dropped(stream.stream.id, message.seq, reason, now)
         if self.link.end.fates is not None and (not stream.reliable or reason is DropReason.DISCONNECTED):
             self.link.end.fates.discarded(stream.stream, message.seq, reason, self.link.peer)
         told = self._undecodable
@@ -472,14 +481,21 @@ class ClientCore:
         if stream is None:
             return
         if lost is not None:
-            self.trace.record(now, identity.topic, TraceEvent.DROPPED, seq=seq, reason=lost, peer=self.link.peer)
+            self._arrival_dropped(identity, seq, lost, now)
             self.link.answers.report(stream, seq, lost, self.name)
             self.events.expired(stream.stream, seq, lost)
         self._settled(stream)
 
     def on_in_drop(self, link: Link, stream: InStream, reason: DropReason, nbytes: int, count: int) -> None:
         self.received.of(stream.stream).drop_arrived(reason, count)
-        self.trace.record(link.now, stream.stream.id.topic, TraceEvent.DROPPED, reason=reason, peer=link.peer)
+        self._arrival_dropped(stream.stream.id, 0, reason, link.now)
+
+    def _arrival_dropped(self, identity: StreamId, seq: int, reason: DropReason, now: float) -> None:
+        self.trace.record(now, identity.topic, TraceEvent.DROPPED, seq, reason=reason, origin=identity.origin)
+
+    def lease_expired(self, identity: StreamId, after_s: float, *, now: float) -> None:
+        """Called by whoever keeps the lease of a command topic: no fresh command came, and it is stopped."""
+        self.trace.record(now, identity.topic, TraceEvent.LEASE_EXPIRED, origin=identity.origin, after_s=after_s)
 
     def on_out_drop(self, link: Link, channel: OutChannel, outs: Sequence[OutMessage], reason: DropReason) -> None:
         runs = list(in_sequence(outs))

@@ -18,10 +18,11 @@ GRACE_S: Final = 0.05
 class CommandLease:
     """Tell it of every command that is delivered (`renew`), ask it when to wake (`deadline`) and then `due`."""
 
-    __slots__ = ("_after_s", "_expired_s", "_next_s", "fired")
+    __slots__ = ("_expired_s", "_next_s", "after_s", "fired")
 
     def __init__(self, after_s: float) -> None:
-        self._after_s = after_s
+        self.after_s = after_s
+        """How long a command holds."""
         self._next_s: float | None = None
         self._expired_s: float | None = None
         self.fired = 0
@@ -30,7 +31,7 @@ class CommandLease:
     def renew(self, *, born_s: float) -> None:
         """A command was delivered that was born at `born_s` (monotonic): freshness counts from its birth."""
         self._expired_s = None
-        self._next_s = born_s + self._after_s
+        self._next_s = born_s + self.after_s
 
     @property
     def expired(self) -> bool:

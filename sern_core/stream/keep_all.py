@@ -114,13 +114,13 @@ class KeepAll:
             drops.tell(OutMessage(message), reason)
         self.skip_to(message.seq + 1)
 
-    def prime(self, replays: Sequence[Message], now: float) -> None:
-        """Put latched messages ahead of everything."""
+    def prime(self, replays: Sequence[Message], now: float) -> Sequence[OutMessage]:
+        """Put latched messages ahead of everything; returns those that are to be sent."""
         limit = self.retained[0].seq if self.retained else self.next_seq
         fresh = [OutMessage(message) for message in replays if message.seq < limit]
         fresh = [out for out in fresh if not out.expired(self._spec.lifespan_s, now)]
         if not fresh:
-            return
+            return fresh
         for out in fresh:
             out.retain_from_s = now
             self._drops.counters.offer(out.offered_bytes)
@@ -135,6 +135,7 @@ class KeepAll:
         gaps = [(out.seq, seq) for out, seq in zip(fresh, after, strict=True) if seq > out.seq + 1]
         if gaps:
             self.gaps = deque((*gaps, *self.gaps))
+        return fresh
 
     def _keep(self, out: OutMessage) -> None:
         if self.retained is NOTHING:

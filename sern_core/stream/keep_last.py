@@ -69,8 +69,8 @@ class KeepLast:
         self.next_seq = message.seq + 1
         self._drops.drop(OutMessage(message), reason)
 
-    def prime(self, replays: Sequence[Message], now: float) -> None:
-        """Put latched messages ahead of everything, as many as `depth` leaves room for."""
+    def prime(self, replays: Sequence[Message], now: float) -> Sequence[OutMessage]:
+        """Put latched messages ahead of everything, as many as `depth` leaves room for; returns those."""
         transit, gate = self._transit, self.gate
         newest = None if gate is None else gate.newest
         limit = transit.queue[0].seq if transit.queue else newest.seq if newest is not None else self.next_seq
@@ -78,11 +78,12 @@ class KeepLast:
         fresh = [out for out in fresh if not out.expired(self._spec.lifespan_s, now)]
         fresh = fresh[max(0, len(fresh) + len(transit.queue) - self._spec.depth) :]
         if not fresh:
-            return
+            return fresh
         for out in fresh:
             out.retain_from_s = now
             self._drops.counters.offer(out.offered_bytes)
         transit.put_first(fresh)
+        return fresh
 
     def adapt(self, share: float, depth_max: int) -> None:
         """Let in a share of the messages from the next one on, and fewer of them wait."""

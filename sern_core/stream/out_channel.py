@@ -152,9 +152,10 @@ class OutChannel:
         if self._all is not None:
             self._all.leave_out(message, reason)
 
-    def prime(self, replays: Sequence[Message], *, now: float) -> None:
-        """Put latched messages (oldest first, marked as replays) ahead of everything; nothing has been sent yet."""
-        self._kept.prime(replays, now)
+    def prime(self, replays: Sequence[Message], *, now: float) -> Sequence[OutMessage]:
+        """Put latched messages (oldest first, marked as replays) ahead of everything; nothing has been sent yet.
+        Returns those that are to be sent."""
+        return self._kept.prime(replays, now)
 
     def start_at(self, first: int) -> None:
         """Nothing has been submitted yet: begin at seq `first` instead."""

@@ -212,15 +212,6 @@ class PendingClass:
                 best, highest = slot, score
         return best
 
-    def rank(self, slot: int, now: float) -> int:
-        """How many pending messages of the class have a higher score than that of `slot`. O(n), for explanations."""
-        scores = [
-            gain * (1.0 + self._eta * min(now - since_s, self._a_max_s))
-            for gain, since_s in zip(self._gains, self._sinces, strict=True)
-        ]
-        own = scores[self._index[slot]]
-        return sum(score > own for score in scores)
-
     def validate(self) -> None:
         """Raise AssertionError unless the lists, the index and the lines agree."""
         assert len(self.slots) == len(self._gains) == len(self._sinces) == len(self._index)

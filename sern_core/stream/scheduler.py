@@ -351,6 +351,9 @@ class Scheduler:
 
     def _pick_marked(self, interval: _Interval, now: float, *, window_open: bool) -> int | None:
         interval.advance(self._entries, now)
+        return self._first_marked(interval, now, window_open=window_open)
+
+    def _first_marked(self, interval: _Interval, now: float, *, window_open: bool) -> int | None:
         for slot in interval.marked:
             entry = self._entries.get(slot)
             if entry is None:
@@ -443,7 +446,35 @@ class Scheduler:
         self._interval.stale.clear()
         return stale
 
-    # For people and tests
+    # For people
+
+    @property
+    def busy(self) -> bool:
+        """Whether anything waits, here or for its encoding."""
+        return bool(self._entries or self._encoding)
+
+    def waiting(self) -> list[int]:
+        """The slots of which something waits, those whose message is being encoded included."""
+        return [*self._entries, *self._encoding]
+
+    def waits_for(
+        self, slot: int, now: float, *, window_open: bool = True, beside: bool = False
+    ) -> tuple[WaitReason | None, int | None]:
+        """What a slot of `waiting` waits for, None: it is the next one; and which slot is the next one, None: nobody
+        is. `beside`: class control has a connection of its own (`pick_control`, `pick_rest`). It changes nothing."""
+        if slot not in self._entries:
+            return WaitReason.ENCODING, None
+        entry = self._entries[slot]
+        if beside and self._interval is None:
+            if entry.priority == 0:
+                chosen = self.pick_control(now=now, window_open=window_open)
+            else:
+                chosen = self.pick_rest(now=now) if window_open else None
+        elif self._interval is not None:
+            chosen = self._first_marked(self._interval, now, window_open=window_open)
+        else:
+            chosen = self.pick(now=now, window_open=window_open)
+        return self._reason(slot, entry, chosen, now, window_open=window_open), chosen
 
     def explain(self, slot: int, now: float, *, window_open: bool = True) -> Standing | None:
         """How the slot stands at `now`, and what it waits for; None when nothing of it is pending. O(n)."""
@@ -458,7 +489,7 @@ class Scheduler:
             size_bytes=entry.size_bytes,
             score=score(entry, now, self.params),
             rank=self._rank(slot, entry, now),
-            waits_for=self._waits_for(slot, entry, now, window_open=window_open),
+            waits_for=self.waits_for(slot, now, window_open=window_open)[0],
         )
 
     def _rank(self, slot: int, entry: _Entry, now: float) -> int:
@@ -471,10 +502,9 @@ class Scheduler:
             if other_slot != slot
         )
 
-    def _waits_for(self, slot: int, entry: _Entry, now: float, *, window_open: bool) -> WaitReason | None:
-        if slot not in self._entries:
-            return WaitReason.ENCODING
-        chosen = self.pick(now=now, window_open=window_open)
+    def _reason(
+        self, slot: int, entry: _Entry, chosen: int | None, now: float, *, window_open: bool
+    ) -> WaitReason | None:
         if chosen == slot:
             return None
         if self._interval is not None and slot not in self._interval.marked:

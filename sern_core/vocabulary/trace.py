@@ -1,10 +1,10 @@
-"""A bounded log of decisions, and the story of why a topic's last message was sent, held or dropped.
+"""A bounded log of decisions: what became of each message at one end of a hop, and what it had to wait for.
 
 Each topic has a ring of its own, so that a pose at 50 Hz does not push out what happened to a map. Events of the link
-itself (`link_up`, `link_down`, `window`) are recorded under LINK and woven into every story.
+itself are recorded under LINK. `sern explain` makes sentences of the records.
 
 Recording costs one call and one tuple; when `enabled` is false it costs the call, and the hot path may test `enabled`
-itself to save that.
+itself to save that. Without `steps` only what is out of the ordinary is recorded: what a relay can afford.
 """
 
 from collections import deque
@@ -22,56 +22,60 @@ OTHER: Final = TopicName("other")
 """Where topics beyond `max_topics` are recorded together; no topic has this name, they start with a slash."""
 DEFAULT_CAPACITY: Final = 128
 DEFAULT_MAX_TOPICS: Final = 1024
+RECORD_BYTES: Final = 640
+"""What a record counts for in `max_bytes`: CPython 3.11 takes 300 to 600 bytes for one."""
+DEFAULT_MAX_BYTES: Final = 8 * 2**20
 
 Field = int | float | str
 
 
 class TraceEvent(StrEnum):
-    """What was decided. Closed: tests and tools match on it."""
+    """What was decided. Closed: a test makes each of them happen, and tools have a sentence for each."""
 
-    OFFERED = "offered"  # the source handed it over
+    # On the way out
     QUEUED = "queued"  # it waits in its topic's queue
-    SUPERSEDED = "superseded"  # a newer sample took its place
-    ENCODING = "encoding"  # its body is being compressed or summarised
-    CHOSEN = "chosen"  # the scheduler took it for the link
-    HELD = "held"  # the scheduler passed it over for now
-    FRAGMENT_SENT = "fragment_sent"
-    SENT = "sent"  # its last fragment was sent
-    ACKED = "acked"
-    LOST = "lost"  # a fragment was judged lost
-    RETRANSMITTED = "retransmitted"
-    DELIVERED = "delivered"  # handed to the sink at this end, or reported delivered by the other
-    DROPPED = "dropped"
-    REFUSED = "refused"  # the sender was told no
-    REPLAYED = "replayed"  # sent again to a late joiner or after an outage
-    RATE_CAPPED = "rate_capped"
-    LEASE_EXPIRED = "lease_expired"  # on_link_loss fired for a command topic
-    WINDOW = "window"  # the link's window or capacity estimate changed much
-    LINK_UP = "link_up"
-    LINK_DOWN = "link_down"
+    RATE_CAPPED = "rate_capped"  # left out by a rate cap: a newer one came before its time
+    REFUSED = "refused"  # the queue of a reliable topic is full, and the sender was told no
+    REPLAYED = "replayed"  # a latched message is sent again, to a late joiner
+    HELD = "held"  # it was passed over, for a HoldReason
+    ENCODING = "encoding"  # another thread makes its body smaller
+    BEGUN = "begun"  # its first fragment leaves, and more follow
+    SENT = "sent"  # its last fragment left
+    LOST = "lost"  # a fragment was lost on the way, and goes again
+    ACKED = "acked"  # the other end has it whole
+    CONFIRMED = "confirmed"  # reliable: everybody who is owed the stream has everything up to it
+    # On both
+    DROPPED = "dropped"  # for a DropReason
+    # On the way in
+    DELIVERED = "delivered"  # handed on at this end
+    LEASE_EXPIRED = "lease_expired"  # no fresh command came, and the stop command was published
+    # The link
+    LINK_UP = "link_up"  # a session begins
+    LINK_DOWN = "link_down"  # and ends
+    LANE_USED = "lane_used"  # data, or class control, goes another way from now on
+    LANE_SILENT = "lane_silent"  # nothing is acknowledged any more
+    LANE_ANSWERS = "lane_answers"  # and it is again
+    CAPACITY = "capacity"  # the link is known to carry much more, or less, than before
 
 
-_VERDICTS: Final[Mapping[TraceEvent, str]] = {
-    TraceEvent.OFFERED: "was offered and nothing was decided yet",
-    TraceEvent.QUEUED: "is waiting in its queue",
-    TraceEvent.SUPERSEDED: "was dropped: a newer sample took its place",
-    TraceEvent.ENCODING: "is being encoded",
-    TraceEvent.CHOSEN: "was chosen for the link",
-    TraceEvent.HELD: "is held",
-    TraceEvent.FRAGMENT_SENT: "is being sent",
-    TraceEvent.SENT: "was sent and is not acknowledged yet",
-    TraceEvent.ACKED: "was sent and acknowledged",
-    TraceEvent.LOST: "lost a fragment on the way",
-    TraceEvent.RETRANSMITTED: "was sent again after a loss",
-    TraceEvent.DELIVERED: "was delivered",
-    TraceEvent.DROPPED: "was dropped",
-    TraceEvent.REFUSED: "was refused",
-    TraceEvent.REPLAYED: "was replayed",
-    TraceEvent.RATE_CAPPED: "was left out by a rate cap",
-}
-"""How a story ends, by the message's last event. Events that decide nothing about a message are not here."""
+class HoldReason(StrEnum):
+    """Why a message that waits is not the one that is sent."""
 
-_SUFFIXES: Final = (("_bytes", " bytes"), ("_bps", " bit/s"), ("_hz", " Hz"), ("_s", " s"))
+    LINK_DOWN = "link_down"  # there is no session
+    SILENT = "silent"  # nothing is acknowledged: only questions go out, whether the path is back
+    ANNOUNCEMENT = "announcement"  # the other end has not said yet whether it wants the stream
+    DEFINITION = "definition"  # nor can it before it has the text of the type, which it has asked for
+    CONTROL = "control"  # the link's own messages go first
+    WINDOW = "window"  # as much is under way as the link carries
+    PACING = "pacing"  # the link is busy with the datagram before
+    CLASS = "class"  # a more urgent class goes first
+    OUTRANKED = "outranked"  # another topic of its class has the higher score
+    FLOOR = "floor"  # a less urgent class is given its floor
+    SHARE = "share"  # class control has had its share of the link, and others wait
+    INTERVAL = "interval"  # ordering `paper`: it did not fit into this interval's budget
+    ENCODER = "encoder"  # as many bodies are being encoded as may be at a time
+    RATE_CAP = "rate_cap"  # the topic's max_rate_hz
+    ADAPTATION = "adaptation"  # the adaptation lets in a share of the topic's messages
 
 
 class TraceRecord(NamedTuple):
@@ -89,35 +93,55 @@ class TraceRecord(NamedTuple):
 
 
 class DecisionTrace:
-    """Keeps the last `capacity` events of each of up to `max_topics` topics."""
+    """Keeps the last `capacity` events of each of up to `max_topics` topics, and `max_bytes` of all together.
 
-    __slots__ = ("_capacity", "_max_topics", "_number", "_rings", "enabled")
+    Without `steps` it is told only what is out of the ordinary: a message that went its way leaves nothing.
+    """
+
+    __slots__ = ("_capacity", "_max_records", "_max_topics", "_number", "_rings", "_size", "enabled", "steps")
 
     def __init__(
-        self, capacity: int = DEFAULT_CAPACITY, *, max_topics: int = DEFAULT_MAX_TOPICS, enabled: bool = True
+        self,
+        capacity: int = DEFAULT_CAPACITY,
+        *,
+        max_topics: int = DEFAULT_MAX_TOPICS,
+        max_bytes: int = DEFAULT_MAX_BYTES,
+        enabled: bool = True,
+        steps: bool = True,
     ) -> None:
         if capacity < 1 or max_topics < 1:
             raise UsageError(f"DecisionTrace: capacity {capacity} and max_topics {max_topics} must be at least 1")
+        if max_bytes < RECORD_BYTES:
+            raise UsageError(f"DecisionTrace: max_bytes {max_bytes} must be at least {RECORD_BYTES}")
         self.enabled = enabled
+        self.steps = steps and enabled
+        """Whether to record also what happens to every message; read by whoever records."""
         self._capacity = capacity
         self._max_topics = max_topics
+        self._max_records = max_bytes // RECORD_BYTES
         self._number = 0
+        self._size = 0
         self._rings: dict[TopicName, deque[tuple[int, float, TopicName, TraceEvent, int, dict[str, Field]]]] = {}
 
     def record(self, now: float, topic: TopicName, event: TraceEvent, seq: int = 0, **fields: Field) -> None:
-        """Note one decision. Names of fields carry units: `size_bytes`, `age_s`, `budget_bytes`; `reason` is a word."""
+        """Note one decision. Names of fields carry units: `size_bytes`, `age_s`, `rate_bps`; `reason` is a word."""
         if not self.enabled:
             return
         ring = self._rings.get(topic)
         if ring is None:
             ring = self._new_ring(topic)
         self._number += 1
+        if len(ring) < self._capacity:
+            self._size += 1
         ring.append((self._number, now, topic, event, seq, fields))
+        if self._size > self._max_records:
+            self._make_room(topic, ring)
 
     @property
     def topics(self) -> tuple[TopicName, ...]:
-        """Topics with a ring of their own, sorted."""
-        return tuple(sorted(topic for topic in self._rings if topic not in (LINK, OTHER)))
+        """Topics of which something is recorded, sorted."""
+        named = set(self._rings) | {entry[2] for entry in self._rings.get(OTHER, ())}
+        return tuple(sorted(named - {LINK, OTHER}))
 
     def records(self, topic: TopicName | None = None) -> tuple[TraceRecord, ...]:
         """Records of a topic, or of everything (None), in the order they were made."""
@@ -127,55 +151,28 @@ class DecisionTrace:
             return tuple(TraceRecord(*entry) for entry in self._rings[topic])
         return tuple(TraceRecord(*entry) for entry in self._rings.get(OTHER, ()) if entry[2] == topic)
 
-    def story(self, topic: TopicName) -> list[str]:
-        """Why the topic's last message was sent, held or dropped, one line an event, the verdict last.
-
-        The last message is the one offered last, or when no offer is in the log the one of the newest event.
-        """
-        mine = self.records(topic)
-        first = next((at for at in reversed(range(len(mine))) if mine[at].event is TraceEvent.OFFERED), None)
-        if first is None:
-            first = next((at for at in reversed(range(len(mine))) if mine[at].seq), None)
-            if first is None:
-                return [f"{topic}: nothing is recorded" + ("" if self.enabled else "; the trace is switched off")]
-            first = next(at for at, record in enumerate(mine) if record.seq == mine[first].seq)
-        seq = mine[first].seq
-        about = [record for record in mine[first:] if record.seq in (seq, 0)]
-        link = [record for record in self.records(LINK) if record.number > mine[first].number]
-        start = mine[first].now
-        lines = [f"{topic} message {seq}"]
-        lines += [
-            f"  {record.now - start:+.3f} s  {'link: ' if record.topic == LINK else ''}{_line(record)}"
-            for record in merge(about, link)
-        ]
-        last = next((record for record in reversed(about) if record.event in _VERDICTS), None)
-        if last is None:
-            lines.append(f"message {seq} has no decision in the log")
-        else:
-            why = _why(last)
-            lines.append(f"message {seq} {_VERDICTS[last.event]}{': ' + why if why else ''}")
-        return lines
+    def about(self, topic: TopicName) -> tuple[TraceRecord, ...]:
+        """Records of a topic, and what happened to the link from shortly before the first of them on."""
+        mine, link = self.records(topic), self.records(LINK)
+        if not mine:
+            return link
+        earlier = [record for record in link if record.number < mine[0].number][-1:]  # how the link was then
+        later = [record for record in link if record.number > mine[0].number]
+        return tuple(merge(mine, earlier + later))
 
     def to_json(self, topic: TopicName | None = None) -> list[dict[str, Any]]:
         """Records as JSON objects: number, now_s, topic, event, seq, and the fields beside them."""
-        return [
-            {
-                **record.fields,
-                "number": record.number,
-                "now_s": record.now,
-                "topic": record.topic,
-                "event": record.event.value,
-                "seq": record.seq,
-            }
-            for record in self.records(topic)
-        ]
+        return [record_json(record) for record in self.records(topic)]
 
     def clear(self) -> None:
         self._rings.clear()
+        self._size = 0
 
     def validate(self) -> None:
         """Check bounds and order; raises AssertionError."""
         assert len(self._rings) <= self._max_topics + 2, "too many rings"
+        assert self._size == sum(map(len, self._rings.values())), "records are miscounted"
+        assert self._size <= self._max_records, "more records than there is room for"
         for topic, ring in self._rings.items():
             assert 0 < len(ring) <= self._capacity, f"{topic}: {len(ring)} records"
             numbers = [entry[0] for entry in ring]
@@ -191,24 +188,25 @@ class DecisionTrace:
         ring = self._rings[topic] = deque(maxlen=self._capacity)
         return ring
 
-
-def _line(record: TraceRecord) -> str:
-    details = ", ".join(f"{_name(key)} {_value(key, value)}" for key, value in record.fields.items())
-    return record.event.value.replace("_", " ") + (f" ({details})" if details else "")
-
-
-def _why(record: TraceRecord) -> str:
-    """The deciding event's reason, then its other fields."""
-    parts = [str(record.fields["reason"])] if "reason" in record.fields else []
-    parts += [f"{_name(key)} {_value(key, value)}" for key, value in record.fields.items() if key != "reason"]
-    return ", ".join(parts)
-
-
-def _name(key: str) -> str:
-    suffix = next((suffix for suffix, _ in _SUFFIXES if key.endswith(suffix)), "")
-    return key.removesuffix(suffix).replace("_", " ")
+    def _make_room(
+        self, topic: TopicName, ring: deque[tuple[int, float, TopicName, TraceEvent, int, dict[str, Field]]]
+    ) -> None:
+        """Let go of the oldest record of a topic with more than its share: most often of the one just recorded."""
+        if len(ring) == 1 or len(ring) * len(self._rings) <= self._max_records:
+            topic, ring = max(self._rings.items(), key=lambda item: len(item[1]))
+        ring.popleft()
+        self._size -= 1
+        if not ring:
+            del self._rings[topic]
 
 
-def _value(key: str, value: Field) -> str:
-    unit = next((unit for suffix, unit in _SUFFIXES if key.endswith(suffix)), "")
-    return (f"{value:.4g}" if isinstance(value, float) else str(value)) + unit
+def record_json(record: TraceRecord) -> dict[str, Any]:
+    """A record as a JSON object."""
+    return {
+        **record.fields,
+        "number": record.number,
+        "now_s": record.now,
+        "topic": record.topic,
+        "event": record.event.value,
+        "seq": record.seq,
+    }

@@ -12,6 +12,7 @@ from sern_client.daemon import ClientDaemon
 from sern_client.endpoints.base import Publisher
 from sern_client.endpoints.synthetic import SyntheticEndpoint
 from sern_core.vocabulary.message import TopicInfo
+from sern_core.vocabulary.trace import TraceEvent
 from sern_core.vocabulary.types import TopicName
 from sern_runtime import ros_types
 from tests.daemons import Lab, endpoint_of
@@ -113,6 +114,8 @@ async def stood(robot: ClientDaemon, commands: Commands, fired: int) -> None:
     """Wait until the lease has run out once more than `fired` times, and said all it has to say."""
     await until(lambda: robot.bridge.inbound.leases_fired > fired and commands.obeyed[-1].twist == STILL)
     await until(lambda: robot.bridge.inbound.lease_due_s is None, "the stop command has been repeated")
+    told = {record.event for record in robot.core.trace.records(TopicName("/robot1/cmd_vel"))}
+    assert TraceEvent.LEASE_EXPIRED in told and TraceEvent.DELIVERED in told
 
 
 async def test_the_operator_drives_the_robot_and_sees_it_move(tmp_path: Path) -> None:

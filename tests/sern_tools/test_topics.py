@@ -190,7 +190,11 @@ def test_a_narrow_terminal_keeps_what_matters_most() -> None:
 class Stub(BaseHTTPRequestHandler):
     def do_GET(self) -> None:
         body = {"/api/bad": b"<html>", "/api/empty": b"{}"}.get(self.path)
-        self.send_response(200 if body is not None else 500 if self.path == "/api/broken" else 404)
+        status = 200 if body is not None else 500 if self.path == "/api/broken" else 404
+        if self.path in ("/api/trace?topic=/x", "/api/trace?tipoc=/x"):
+            status = 404 if "topic" in self.path else 400
+            body = b'{"error": "topic is not known here; known: /y"}'
+        self.send_response(status)
         self.end_headers()
         self.wfile.write(body or b"")
 
@@ -213,6 +217,8 @@ def test_what_a_daemon_may_answer(stub: str, monkeypatch: pytest.MonkeyPatch) ->
     assert api.get_json(stub, "/api/empty") == {}
     for path, error, words in (
         ("/api/missing", api.NotFoundError, "another kind of daemon"),
+        ("/api/trace?topic=/x", api.UnknownError, r"^http://127.0.0.1:\d+: topic is not known here; known: /y$"),
+        ("/api/trace?tipoc=/x", UsageError, "topic is not known here; known: /y"),
         ("/api/broken", SernError, "HTTP status 500; see the daemon's log"),
         ("/api/bad", SernError, "the answer is not JSON"),
     ):
