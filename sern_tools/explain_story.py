@@ -342,7 +342,8 @@ def _alike(life: Life) -> tuple[object, ...]:
 def lines(records: Sequence[Record], *, now_s: float, last: int) -> Iterator[str]:
     """The last messages of one topic, the newest last, and what happened to the link meanwhile. Times are how long ago.
 
-    Messages next to each other that fared alike share one of `last` lines.
+    Messages next to each other that fared alike share one of `last` lines. What happened to the link has at most as
+    many beside: of a quiet topic on a restless link the messages are what was asked for.
     """
     told = lives(records)
     runs: list[list[Life]] = []
@@ -356,10 +357,13 @@ def lines(records: Sequence[Record], *, now_s: float, last: int) -> Iterator[str
     since_s = entries[0][0] if entries else now_s
     link = [record for record in records if TraceEvent(record["event"]) in LINK_EVENTS]
     before = [record for record in link if record["now_s"] < since_s][-1:]
-    entries += [
-        (record["now_s"], 0, f"{'link':>13} {'':>8}  {link_sentence(record)}")
-        for record in (*before, *(record for record in link if record["now_s"] >= since_s))
-    ]
+    seen = [*before, *(record for record in link if record["now_s"] >= since_s)]
+    older, newest = seen[:-last], seen[-last:]
+    if older:
+        entries.append(
+            (older[-1]["now_s"], 0, f"{'link':>13} {'':>8}  {len(older)} changes up to here (--last shows more)")
+        )
+    entries += [(record["now_s"], 0, f"{'link':>13} {'':>8}  {link_sentence(record)}") for record in newest]
     for at_s, _order, text in sorted(entries, key=lambda entry: entry[:2]):
         yield f"{_ago(now_s - at_s):>9}  {text}"
 

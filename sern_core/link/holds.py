@@ -10,6 +10,7 @@ from typing import Any, Final
 from sern_core.link.control_stream import ControlStream
 from sern_core.link.end import End
 from sern_core.link.lane_set import LaneSet
+from sern_core.link.send_trace import held_back
 from sern_core.link.sender import Sender
 from sern_core.path.lanes import LANE_EXPRESS, Lane
 from sern_core.stream.coding import Coding
@@ -125,8 +126,8 @@ class Holds:
         standing = sender.scheduler.explain(channel.slot, now)
         gate = channel.gate
         if gate is not None and out is gate.newest:
-            told["reason"] = HoldReason.ADAPTATION if gate.newest_thinned else HoldReason.RATE_CAP
-            told["due_in_s"] = gate.newest_due_s - now
+            reason = HoldReason.ADAPTATION if gate.newest_thinned else HoldReason.RATE_CAP
+            told |= {**held_back(channel, reason), "due_in_s": gate.newest_due_s - now}
         elif not channel.ready:
             told["reason"] = sender.told.unready_reason(channel)
         elif standing is not None:

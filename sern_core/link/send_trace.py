@@ -51,7 +51,7 @@ class SendTrace:
         gate = channel.gate
         if gate is not None and gate.left_out and self.steps:
             reason = HoldReason.ADAPTATION if thinned else HoldReason.RATE_CAP
-            self._record(channel, TraceEvent.RATE_CAPPED, gate.left_out, now, **_cap(channel, reason))
+            self._record(channel, TraceEvent.RATE_CAPPED, gate.left_out, now, **held_back(channel, reason))
         if not accepted:
             if self.steps or self._again(channel, TraceEvent.REFUSED, now):
                 waits = {"waiting": channel.kept, "waiting_bytes": channel.held_bytes}
@@ -59,7 +59,7 @@ class SendTrace:
         elif gate is not None and gate.newest is not None:
             reason = HoldReason.ADAPTATION if gate.newest_thinned else HoldReason.RATE_CAP
             if self.steps or self._news(channel, reason, now):
-                self._record(channel, TraceEvent.HELD, message.seq, now, **_cap(channel, reason))
+                self._record(channel, TraceEvent.HELD, message.seq, now, **held_back(channel, reason))
         elif channel.queue and channel.queue[-1].seq == message.seq:
             if self.steps:
                 self.queued(channel, message.seq, len(message.body), now)
@@ -171,7 +171,8 @@ class SendTrace:
             end.trace.record(now, stream.topic, event, seq, peer=end.peer, origin=stream.origin, **fields)
 
 
-def _cap(channel: OutChannel, reason: HoldReason) -> dict[str, Field]:
+def held_back(channel: OutChannel, reason: HoldReason) -> dict[str, Field]:
+    """Why a cap or the adaptation leaves a message out, with the rate or the share that it lets in."""
     if reason is HoldReason.ADAPTATION:
         return {"reason": reason, "share": channel.share}
     return {"reason": reason, "rate_hz": channel.spec.max_rate_hz or 0.0}

@@ -41,6 +41,19 @@ def test_what_a_message_waited_for_and_what_became_of_it() -> None:
     assert advice(records, None) == ""
 
 
+def test_a_restless_link_does_not_bury_a_quiet_topic() -> None:
+    changes = [(1.0 + step, TraceEvent.CAPACITY, 0, RELAY | {"rate_bps": 1e6, "rtt_s": 0.05}) for step in range(20)]
+    records = recorded(
+        (0.5, TraceEvent.QUEUED, 1, RELAY),
+        (0.6, TraceEvent.ACKED, 1, RELAY),
+        *changes,
+        (30.0, TraceEvent.QUEUED, 2, RELAY),
+    )
+    told = list(lines(records, now_s=31.0, last=4))
+    assert [line.split()[2] for line in told] == ["1", "link", "link", "link", "link", "link", "2"]
+    assert told[1].endswith("16 changes up to here (--last shows more)") and told[1].split()[0] == "15.0"
+
+
 def test_a_message_that_waits_and_one_that_was_dropped_for_it() -> None:
     """A newer message inherits what its stream waits for, and neighbours that fared alike share a line."""
     records = recorded(

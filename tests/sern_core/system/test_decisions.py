@@ -7,6 +7,7 @@ from typing import Final
 import pytest
 
 from sern_core.link.holds import LOOK_S, LOOKED_AT
+from sern_core.link.view import LinkSettings
 from sern_core.site.lease import CommandLease
 from sern_core.stream.out_channel import OutChannel
 from sern_core.vocabulary.codec_names import Compression
@@ -404,6 +405,22 @@ def test_how_a_stream_stands_is_told_without_changing_anything() -> None:
     assert cloud["waiting"] >= 1 and cloud["rank"] >= 0 and cloud["unsent_bytes"] > 0
     assert cloud["reason"] in set(HoldReason)
     assert link.sender.scheduler.waiting() == before
+
+
+def test_what_is_held_back_stands_with_the_rate_or_the_share_that_is_let_in() -> None:
+    world = World()
+    robot, _site = pair(world)
+    capped_topic, thinned_topic = robot.publish("/robot/a", spec(max_rate_hz=2.0)), robot.publish("/robot/b", spec())
+    channels = (capped_topic, thinned_topic)
+    world.run(1.0)
+    link = robot.core.link
+    link.apply(LinkSettings(shares=(0.4, 0.4, 0.4)), now=robot.now)
+    for _ in range(2):
+        for channel in channels:
+            assert robot.send(channel, b"x")
+    capped, thinned = (link.plane.holds.standing(channel, robot.now) for channel in channels)
+    assert (capped["reason"], capped["rate_hz"]) == (HoldReason.RATE_CAP, 2.0)
+    assert (thinned["reason"], thinned["share"]) == (HoldReason.ADAPTATION, 0.4)
 
 
 def test_a_look_is_bounded() -> None:
