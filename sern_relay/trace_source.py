@@ -15,9 +15,9 @@ def of_hub(hub: Hub) -> Source:
             if identity.topic != topic:
                 continue
             if relayed.source is not None:
-                yield Seen(relayed.source, relayed.stream.stream, None)
+                yield Seen(relayed.source, relayed.stream.stream, goes_out=False)
             for link, channel in relayed.outs.values():
-                yield Seen(link, channel.stream, channel)
+                yield Seen(link, channel.stream, goes_out=True)
 
     return Source(
         lambda: {str(name): trace for name, trace in hub.traces.by_client().items()},

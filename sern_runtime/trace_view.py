@@ -12,7 +12,6 @@ from difflib import get_close_matches
 from typing import Any, Final, NamedTuple
 
 from sern_core.link.link import Link
-from sern_core.stream.out_channel import OutChannel
 from sern_core.vocabulary.message import StreamInfo
 from sern_core.vocabulary.trace import DecisionTrace, record_json
 from sern_core.vocabulary.types import CLASS_LABELS, TopicName
@@ -28,11 +27,11 @@ TOO_LARGE: Final = "the answer is too large; ask for one topic, or of a relay fo
 
 
 class Seen(NamedTuple):
-    """One stream on one link. `channel` is None for what arrives here."""
+    """One stream on one link, which goes out there or arrives."""
 
     link: Link
     stream: StreamInfo
-    channel: OutChannel | None
+    goes_out: bool
 
 
 class Source(NamedTuple):
@@ -79,16 +78,16 @@ def of_client(link: Link, trace: DecisionTrace) -> Source:
     """A client has one link."""
 
     def streams(topic: TopicName) -> Iterator[Seen]:
-        for channel in link.sender.channels.values():
-            if channel.stream.id.topic == topic:
-                yield Seen(link, channel.stream, channel)
-        for identity, stream in link.taking.streams.items():
-            if identity.topic == topic:
-                yield Seen(link, stream.stream, None)
+        for out in link.topics():
+            if out.stream.id.topic == topic:
+                yield Seen(link, out.stream, goes_out=True)
+        for stream in link.arriving():
+            if stream.id.topic == topic:
+                yield Seen(link, stream, goes_out=False)
 
     def topics() -> Iterator[str]:
-        yield from (channel.stream.id.topic for channel in link.sender.channels.values())
-        yield from (identity.topic for identity in link.taking.streams)
+        yield from (out.stream.id.topic for out in link.topics())
+        yield from (stream.id.topic for stream in link.arriving())
 
     return Source(lambda: {link.peer: trace}, topics, streams)
 
@@ -114,12 +113,12 @@ def _all(traces: Iterable[DecisionTrace]) -> Iterator[str]:
 
 
 def _stream(seen: Seen, now: float) -> dict[str, Any]:
-    link, stream, channel = seen
+    link, stream, goes_out = seen
     spec = stream.spec
     told: dict[str, Any] = {
         "peer": link.peer,
         "origin": stream.id.origin,
-        "direction": "receive" if channel is None else "send",
+        "direction": "send" if goes_out else "receive",
         "up": link.established,
         "class": CLASS_LABELS[spec.priority],
         "reliable": spec.reliable,
@@ -128,12 +127,13 @@ def _stream(seen: Seen, now: float) -> dict[str, Any]:
         "lifespan_s": spec.lifespan_s,
         "max_rate_hz": spec.max_rate_hz,
     }
-    if channel is None:
+    sending = link.sending(stream.id, now=now) if goes_out else None
+    if sending is None:
         return told
-    counters = channel.counters
+    counters = sending.counters
     return told | {
-        "wanted": channel.wanted,
-        "standing": link.plane.holds.standing(channel, now),
+        "wanted": sending.wanted,
+        "standing": sending.standing,
         "offered": counters.offered,
         "delivered": counters.delivered,
         "refused": counters.refused,

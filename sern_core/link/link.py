@@ -40,13 +40,13 @@ from sern_core.link.send_trace import SendTrace
 from sern_core.link.sender import Sender
 from sern_core.link.streams_in import StreamsIn
 from sern_core.link.streams_out import StreamsOut
-from sern_core.link.view import Held, LinkSettings, LinkView, TopicView, Undelivered
+from sern_core.link.view import Held, LinkSettings, LinkView, Sending, TopicView, Undelivered
 from sern_core.path.lanes import LANE_UDP, LANE_ZMQ, Lane
 from sern_core.stream.in_stream import Reassembly
 from sern_core.stream.out_channel import OutChannel
 from sern_core.vocabulary.errors import RemoteError, WireError
 from sern_core.vocabulary.ledger import SendCounters
-from sern_core.vocabulary.message import Message, StreamInfo, TopicSpec
+from sern_core.vocabulary.message import Message, StreamId, StreamInfo, TopicSpec
 from sern_core.vocabulary.params import LinkParams, SchedulerParams
 from sern_core.vocabulary.trace import LINK, DecisionTrace, TraceEvent
 from sern_core.vocabulary.types import ClientName, PriorityClass, TopicName
@@ -472,6 +472,13 @@ class Link:
     def undelivered(self) -> Iterator[Undelivered]:
         """Every message that the peer is not known to have."""
         return view.undelivered(self.sender.channels.values())
+
+    def sending(self, stream: StreamId, *, now: float) -> Sending | None:
+        """How a stream stands that is open towards the peer; None: it is not. Changes nothing."""
+        channel = self.outgoing.by_stream.get(stream)
+        if channel is None:
+            return None
+        return Sending(channel.wanted, channel.counters, self.plane.holds.standing(channel, now))
 
     def arriving(self) -> list[StreamInfo]:
         """The peer's streams, as far as they are known here."""

@@ -18,6 +18,7 @@ from sern_core.path.lanes import LANE_NAMES, LANE_UDP
 from sern_core.stream.coding import preferred
 from sern_core.stream.out_channel import OutChannel
 from sern_core.vocabulary.codec_names import Compression
+from sern_core.vocabulary.ledger import SendCounters
 from sern_core.vocabulary.message import StreamInfo, TopicSpec
 from sern_core.vocabulary.types import CLASSES, ClientName, TopicName
 
@@ -133,6 +134,17 @@ class TopicView(NamedTuple):
     @property
     def spec(self) -> TopicSpec:
         return self.stream.spec
+
+
+class Sending(NamedTuple):
+    """A stream on its way out, looked at closely."""
+
+    wanted: bool | None
+    """The peer wants it; None: it has not answered yet."""
+    counters: SendCounters
+    """What was offered of its topic, and what became of it."""
+    standing: Mapping[str, object]
+    """How much waits of it, and why (`Holds.standing`)."""
 
 
 class Held(NamedTuple):
