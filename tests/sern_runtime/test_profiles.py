@@ -232,7 +232,16 @@ def test_a_missing_file_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 
 def test_the_file_has_a_key_for_every_figure_of_a_model() -> None:
     """What only a stream or a script has is not among the keys of a link."""
-    elsewhere = {"rate_steps", "blackouts", "flap", "mode", "stall_s", "disconnect_after_s", "reconnect_s"}
+    elsewhere = {
+        "rate_steps",
+        "path_steps",
+        "blackouts",
+        "flap",
+        "mode",
+        "stall_s",
+        "disconnect_after_s",
+        "reconnect_s",
+    }
     assert set(LinkSection.model_fields) == {field.name for field in fields(LinkModel)} - elsewhere
     for name, info in LinkSection.model_fields.items():
         assert info.default == getattr(LinkModel(), name)

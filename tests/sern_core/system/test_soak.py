@@ -35,6 +35,9 @@ STATIC = frozenset(
         ".peers._ended[]",
         ".peers._heard_s",
         ".peers._peers",
+        ".trace._rings",  # DEFAULT_MAX_BYTES of all together
+        ".trace._rings[]",
+        ".trace._rings[][][]",
         ".received.topics[].by_reason",  # one row with all topics that have ended
     }
 )
