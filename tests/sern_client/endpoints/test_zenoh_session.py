@@ -6,6 +6,7 @@ import sys
 from collections import Counter
 from collections.abc import AsyncIterator
 from pathlib import Path
+from threading import Event
 from typing import Any, NamedTuple
 
 import pytest
@@ -260,6 +261,9 @@ async def test_what_nobody_wants_is_not_taken_from_the_session(two: Two) -> None
     here.interest(info.name, False)
     await until(lambda: there.readers(info.name, *kind) == 0 and not matching.matching_status.matching)
     publisher.publish(b"unwanted", 2)
+    written = Event()
+    there.session.put(written.set, 0)  # after it, in the thread that writes
+    await until(written.is_set)
     held = Held(subscriptions=Counter([info.name]))
     assert here.validate(held) == [] and info.name in two.events.infos, "it is offered all the same"
 
