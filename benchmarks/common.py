@@ -190,7 +190,7 @@ def medians(runs: Sequence[Mapping[str, float]]) -> dict[str, float]:
 
 
 def percentile(values: Sequence[float], share: float) -> float:
-    """Of sorted values the one that this share of them is below; inf of none."""
+    """The value of sorted ones that this share of them is below; inf of none."""
     return values[min(len(values) - 1, int(share * len(values)))] if values else inf
 
 

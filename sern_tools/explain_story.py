@@ -102,7 +102,7 @@ class Life:
     size_bytes: int | None = None
     replay: bool = False
     holds: dict[str, Record] = field(default_factory=dict)
-    """By reason, in their order; the last of them last."""
+    """The last record of each reason to wait, the latest last."""
     held_s: float | None = None
     encoding_s: float | None = None
     begun_s: float | None = None

@@ -35,7 +35,7 @@ DRAIN_S: Final = 1.5
 STOP_S: Final = 20.0
 """Time for a process to end when it is told to."""
 EXACT_S: Final = 0.005
-"""So long before a moment the loop's timers, which know whole milliseconds, leave off."""
+"""How long before a moment the loop's timers, which know whole milliseconds, leave off."""
 
 Action = Callable[[Lab], None]
 

@@ -200,7 +200,7 @@ class PeerDefinitions:
         return self.store.get(digest)
 
     def peer_asked(self, user: Hashable) -> bool:
-        """Whether the peer has asked, in this session, for the text that this stream of ours uses."""
+        """Whether the peer has asked, since the link came up, for the text that this stream of ours uses."""
         digest = self._out.digests.get(user)
         return digest is not None and (digest in self._asked or digest in self._told)
 

@@ -56,7 +56,7 @@ class LinkView(NamedTuple):
     loss: float
     """Share of recent packets that were lost."""
     waiting_s: float | None
-    """For how long something has waited for an acknowledgement; None: nothing waits for one."""
+    """How long something has waited for an acknowledgement; None: nothing waits for one."""
     stream_usable: bool
     """The lane of the connection on which the session began is there and answers."""
     datagrams_pass: bool
@@ -82,7 +82,7 @@ class LinkView(NamedTuple):
         return LANE_NAMES[self.lane_id]
 
     def to_json(self) -> dict[str, object]:
-        """For /api/link; None where a value is not known yet."""
+        """The row of /api/link; None where a value is not known yet."""
         return {
             "peer": self.peer,
             "lane": self.lane,
@@ -172,9 +172,9 @@ class LinkSettings:
     """
 
     shares: tuple[float, ...] = (1.0,) * len(CLASSES)
-    """By class: the share of the messages that is let in, in (0, 1]."""
+    """The share of the messages that is let in, in (0, 1], by class."""
     depths: tuple[int, ...] = (UNLIMITED,) * len(CLASSES)
-    """By class: how many messages of a topic may wait, where its own depth is not less."""
+    """How many messages of a topic may wait, by class, where its own depth is not less."""
     codecs: tuple[Compression, ...] | None = None
     """Compression modes in order of preference, of which each topic takes the first that it allows, unless its rule
     names one. None: all stay as they are."""

@@ -250,7 +250,7 @@ class Children:
             await asyncio.wait((task,))
 
     async def within(self, work: Awaitable[T], seconds: float, problem: str) -> T:
-        """As `beside`; SernError of `problem`, with the last words of all, when it takes longer."""
+        """Wait as `beside`; SernError of `problem`, with the last words of all, when it takes longer."""
         try:
             async with asyncio.timeout(seconds):
                 return await self.beside(work)

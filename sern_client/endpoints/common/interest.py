@@ -116,7 +116,7 @@ class Subscriptions(Generic[S]):
             subscription.close()
 
     def interest(self, name: TopicName, wanted: bool) -> None:
-        """As `Endpoint.interest`."""
+        """Take a topic from now on, or no more: see `Endpoint.interest`."""
         for subscription in self.of(name):
             subscription.wanted = wanted
             self._refresh(subscription)

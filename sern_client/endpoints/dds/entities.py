@@ -56,7 +56,7 @@ class Reader:
         return self.inbox.dropped
 
     def close(self, *, rest: bool = False) -> None:
-        """With `rest`, what it has received is still delivered."""
+        """Take nothing more. `rest`: what it has received is still delivered."""
         self.inbox.closed = not rest
         self._entity = None  # the worker is the last to hold it, and lets go on its own thread
         self._owner.close_reader(self, self._number)

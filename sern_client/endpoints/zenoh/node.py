@@ -52,7 +52,7 @@ class Node:
         return f"{names.SPACE}/{self._domain}/**"
 
     def owns(self, entity: Entity) -> bool:
-        """Whether it is of this client: of this session, or of the guard's."""
+        """Whether it is of this client: declared through our zenoh session, or by the guard."""
         return entity.session == self._zid or entity.node == f"/{self._name}{GUARD_SUFFIX}"
 
     def key(self, name: TopicName, dds_name: str, type_hash: str) -> str:

@@ -51,7 +51,7 @@ class Services:
 
     @property
     def watched(self) -> int:
-        """Of how many services it is known whether requests would reach a server."""
+        """How many services are watched: whether requests would reach a server is known of them."""
         return len(self._present)
 
     def server_changed(self, entity: Entity, alive: bool) -> None:

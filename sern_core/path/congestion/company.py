@@ -33,9 +33,9 @@ class Rival:
         self._pinned = Swing()  # of the queue while the window is at its least
         self._recent: deque[float] = deque(maxlen=self._params.stuck_epochs)  # queues of the last epochs
         self.adopted_until_s = -inf
-        """Until then the path was taken for a longer one: should it be short again, there was a rival."""
+        """The end of a time for which the path was taken for a longer one: short again, it has shown a rival."""
         self.until_s = -inf
-        """Until then a queue that stays is taken for a rival's."""
+        """The end of a time in which a queue that stays is taken for a rival's."""
         self.calm_window = 0.0
         """The last window with which the queue was as wanted."""
 

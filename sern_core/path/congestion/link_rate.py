@@ -81,7 +81,7 @@ class Slowdown:
     def __init__(self, params: HybridParams) -> None:
         self._params = params
         self.faster_rate: float | None = None
-        """Of which we had most, before the link seemed to get slower."""
+        """The rate of which we had most, before the link seemed to get slower."""
         self.most_queue_s: float | None = None
         """The longest queue since then, whatever share of the link we had."""
         self._full: tuple[float, int] | None = None  # (time, bytes) at the receiver since which a queue never went

@@ -36,7 +36,7 @@ class QueueView:
         """What the largest packet takes."""
         self.jitter_s = 0.0
         self.least_spread_s = 0.0
-        """Of the delay in an epoch, but for chance: what jitter makes of it, whoever else sends."""
+        """The least spread of the delay in an epoch, but for chance: what jitter makes of it, whoever else sends."""
         self.target_s = 0.0
         self.high_s = inf
         """A longer queue is to go at once."""
