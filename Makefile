@@ -6,13 +6,14 @@ TEST_PROCESSES ?= 3
 RANDOM_TESTS = $(shell grep -rlE '^(from|import) (hypothesis|tests\.exploring)' tests --include='test_*.py' | grep -v tests/peers)
 PACKAGES := sern_core sern_runtime sern_relay sern_client sern_sim sern_tools benchmarks tests
 
-.PHONY: help setup lint format types test explore lab bench performance endpoints figures picture demo schemas clean
+.PHONY: help setup lint format types test explore standstills lab bench performance endpoints figures picture demo schemas clean
 
 help:
 	@echo "make setup    create $(VENV) with pinned dependencies"
 	@echo "make demo     relay, robot and site over a bad link, on this machine, next to plain ZMQ"
 	@echo "make test     the tests but the longer ones of make lab;  make lint, make types: static checks"
 	@echo "make explore  the tests with random input, with new cases and ten times as many; SEED=... repeats a run"
+	@echo "make standstills   the tests whose processes stand still for moments, as on a loaded machine; SEED=..."
 	@echo "make lab      the whole matrix of bad links, and the longer runs over tc netem, which need root"
 	@echo "make performance   as root: measure link, fleet and policies of docs/performance.md anew, two hours of an idle machine"
 	@echo "make endpoints, make figures   the other tables: ROS endpoints, 15 minutes; virtual time, summaries and codecs, 30"
@@ -52,6 +53,11 @@ SEED := $(or $(SEED),$(shell date +%s))
 explore: setup
 	@echo "SEED=$(SEED)"
 	SERN_EXPLORE=$(SEED) $(BIN)/python -m pytest -n $(TEST_PROCESSES) --dist loadgroup --hypothesis-seed=$(SEED) $(RANDOM_TESTS)
+
+# What has a timetable of its own, or no process besides the tests, shows nothing here.
+standstills: setup
+	$(BIN)/python -m tests.standstills $(SEED) -q -n $(TEST_PROCESSES) --dist loadgroup tests/sern_client tests/sern_relay \
+		tests/sern_runtime tests/sern_tools tests/loopback tests/peers tests/deploy tests/benchmarks
 
 # Of the matrix also the quarter that is in every `make test`.
 lab: setup

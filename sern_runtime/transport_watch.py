@@ -47,6 +47,9 @@ CUT: Final = (
 guess."""
 OTHER: Final = "what listens there is no relay: it does not speak ZeroMQ's protocol"
 
+_TIME_WAS_OVER: Final = (errno.EAGAIN, errno.EINTR)
+"""libzmq says the errno of its last call then: that nothing was to be read, or that a machine which stood still goes
+on."""
 _ZAP_UNKNOWN_KEY: Final = 400
 _MECHANISM_MISMATCH: Final = 0x11000002  # ZMQ_PROTOCOL_ERROR_ZMTP_MECHANISM_MISMATCH
 
@@ -173,7 +176,7 @@ class TransportWatch:
 def _unfinished(number: int, received: int | None) -> str:
     """Why a handshake has no end: libzmq's errno, and how many bytes came (None: not known)."""
     greeted = received is not None and received >= GREETING_BYTES
-    if number == errno.EAGAIN:  # its time was over
+    if number in _TIME_WAS_OVER:
         silent = received is not None and received <= 1  # one for the end of the stream
         return SILENT if silent else HALF_WAY if greeted else UNFINISHED
     return CUT if received is None else ENDED if greeted else SHUT

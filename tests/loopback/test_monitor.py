@@ -1,6 +1,7 @@
 """What happens to connections: the watch of a client, the table of a server, and the TCP socket underneath."""
 
 import asyncio
+import errno
 import os
 import socket as socketlib
 from pathlib import Path
@@ -8,6 +9,7 @@ from pathlib import Path
 import pytest
 import zmq
 
+from sern_runtime import transport_watch
 from sern_runtime.config.keys import SecretKey
 from sern_runtime.monitor import (
     HANDSHAKE_GRACE_S,
@@ -172,6 +174,14 @@ async def test_what_listens_in_place_of_a_relay_is_told_apart(
     finally:
         client.close()
         server.close()
+
+
+@pytest.mark.parametrize("number", [errno.EAGAIN, errno.EINTR])
+def test_a_handshake_that_ran_out_of_time_is_one_also_after_a_standstill(number: int) -> None:
+    """A process that is continued finds its wait interrupted: libzmq has this errno when its timer comes next."""
+    told = [transport_watch._unfinished(number, received) for received in (0, 64, None)]
+    assert told == [SILENT, HALF_WAY, UNFINISHED]
+    assert transport_watch._unfinished(errno.EPIPE, 0) == SHUT
 
 
 async def test_connections_are_counted_until_they_end(zmq_context: Context) -> None:
