@@ -5,21 +5,21 @@ from typing import Any
 
 import pytest
 
-from sern_core.link import reading
 from sern_core.link.link import Link
 from sern_core.vocabulary.errors import WireError
 from sern_core.vocabulary.message import StreamId, StreamInfo, TopicInfo
+from sern_core.vocabulary.params import LinkParams
 from sern_core.vocabulary.types import Encoding, TopicName
 from sern_core.wire import framing
 from sern_core.wire.announce import Announcement, encode_announcement
 from tests.fuzz.test_hostile_peer import Hostile, _whole
-from tests.world import World, spec
+from tests.world import World, limited, spec
 
 STREAMS = 150
 
 
-def robot_and_readers(count: int = 20) -> Hostile:
-    world = World()
+def robot_and_readers(count: int = 20, link: LinkParams | None = None) -> Hostile:
+    world = World(link=link)
     peer = Hostile(world)
     for number in range(count):
         Hostile(world, f"reader{number}").control({"t": "subscribe", "patterns": [".*"], "more": False})
@@ -152,9 +152,8 @@ def test_bytes_of_no_honest_peer_that_are_read_later_end_the_session() -> None:
         peer.say(framing.PING_FRAME)
 
 
-def test_what_waits_to_be_read_has_a_bound(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(reading, "MAX_UNREAD_BYTES", 500_000)
-    peer = robot_and_readers()
+def test_what_waits_to_be_read_has_a_bound() -> None:
+    peer = robot_and_readers(link=limited(unread_bytes=500_000))
     peer.say(announced(peer))
 
     def send_on() -> None:
