@@ -1,4 +1,4 @@
-"""`SERN_COMPILE=1 pip wheel .` compiles the core with mypyc; without it the core stays the Python it is written in."""
+"""`SERN_COMPILE=1` builds a wheel whose core mypyc has compiled (`make wheel`). Without it the core stays Python."""
 
 import os
 from pathlib import Path
@@ -9,6 +9,7 @@ extensions: list[Extension] = []
 if os.environ.get("SERN_COMPILE") == "1":
     from mypyc.build import mypycify
 
-    extensions = mypycify([str(path) for path in sorted(Path("sern_core").rglob("*.py"))], opt_level="2", debug_level="0")
+    sources = [str(path) for path in sorted(Path("sern_core").rglob("*.py"))]
+    extensions = mypycify(sources, opt_level="2", debug_level="0")
 
 setup(ext_modules=extensions)
