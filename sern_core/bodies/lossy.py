@@ -167,7 +167,7 @@ class Image:
     kind: str
     bigendian: int
     step: int
-    data: memoryview
+    data: bytes | memoryview
 
     @property
     def row_bytes(self) -> int:
@@ -217,7 +217,7 @@ def encode_image(body: bytes, encoding: Encoding, params: LossyParams) -> tuple[
     picture = pillow.frombuffer(mode, (image.width, image.height), image.data, "raw", raw_mode, image.step, 1)
     out = io.BytesIO()
     picture.save(out, "JPEG", quality=params.jpeg_quality)
-    head = write_image(replace(image, step=row_bytes, data=memoryview(b"")), encoding)
+    head = write_image(replace(image, step=row_bytes, data=b""), encoding)
     return len(head) + image.height * row_bytes, _pack(encoding, head, out.getvalue())
 
 
@@ -240,4 +240,4 @@ def decode_image(packed: memoryview, size: int) -> bytes:
         pixels: bytes = picture.tobytes("raw", "BGR" if empty.kind == "bgr8" else mode)
     except (OSError, SyntaxError, ValueError, MemoryError, struct.error, pillow.DecompressionBombError) as error:
         raise CodecError(f"a damaged JPEG ({type(error).__name__})") from None
-    return write_image(replace(empty, data=memoryview(pixels)), encoding)
+    return write_image(replace(empty, data=pixels), encoding)
