@@ -333,6 +333,7 @@ class Ros1Endpoint:
         if kind == "service":
             await self._master.unregister_service(name, self._service_uri)
         elif kind == "publisher":
+            self._tcpros.returning.ended(name)
             await self._master.unregister_publisher(name)
         else:
             await self._master.unregister_subscriber(name)
@@ -415,6 +416,9 @@ class Ros1Endpoint:
 
     def tcpros_address(self) -> tuple[str, int]:
         return self.host, self._tcpros_port
+
+    def asks_for(self, topic: str, caller: str) -> None:
+        self._tcpros.returning.asked(topic, caller)
 
     def publishers_changed(self, topic: str, uris: list[str]) -> None:
         """The master tells its subscribers at once. What it says is asked again, because anybody can call this."""

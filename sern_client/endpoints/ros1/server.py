@@ -11,6 +11,7 @@ from sern_client.endpoints.ros1.frames import Frames
 from sern_client.endpoints.ros1.header import encode_header, shown
 from sern_client.endpoints.ros1.listener import Listener
 from sern_client.endpoints.ros1.publication import Feed, Publication
+from sern_client.endpoints.ros1.returning import Returning
 from sern_core.vocabulary.errors import WireError
 
 MAX_CONNECTIONS: Final = 2048
@@ -91,8 +92,12 @@ class Inbound(Frames):
         if (problem := publication.refusal(fields)) is not None:
             self.refuse(problem)
             return
-        self.max_frame_bytes = 0
         caller = shown(fields, "callerid", self.peer)
+        if self.server.returning.too_early(topic, caller):
+            self.close()
+            return
+        self.server.returning.served(topic, caller)
+        self.max_frame_bytes = 0
         self.answer(publication.answer)
         self._feed = Feed(self, publication, caller, next(self.server.numbers))
         publication.join(self._feed)
@@ -149,6 +154,7 @@ class TcprosServer(Listener):
         self.services = services
         self.max_frame_bytes = max_frame_bytes
         self.connections: set[Inbound] = set()
+        self.returning = Returning()
         self.numbers = count(1)
         self.complain = SayOnce(_log, logging.ERROR, most=MAX_REFUSALS)
         """Say what a peer does wrong."""

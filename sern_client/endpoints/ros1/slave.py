@@ -43,6 +43,10 @@ class Node(Protocol):
 
     def publishers_changed(self, topic: str, uris: list[str]) -> None: ...
 
+    def asks_for(self, topic: str, caller: str) -> None:
+        """A node is about to be told where to connect for a topic that is published here."""
+        ...
+
     def told_to_shut_down(self, why: str) -> None: ...
 
 
@@ -52,15 +56,15 @@ class SlaveApi:
     def __init__(self, node: Node, master_uri: str) -> None:
         self._node = node
         self._master_uri = master_uri
-        self._methods: dict[str, tuple[int, Callable[..., Answer]]] = {  # arguments beside the caller
+        self._methods: dict[str, tuple[int, Callable[..., Answer]]] = {  # arguments beside the caller, who comes first
             "getBusStats": (0, self._bus_stats),
             "getBusInfo": (0, self._bus_info),
-            "getMasterUri": (0, lambda: (1, "", self._master_uri)),
-            "getName": (0, lambda: (0, "not told", "")),
-            "getPid": (0, lambda: (1, "", os.getpid())),
-            "getSubscriptions": (0, lambda: (1, "subscriptions", [list(pair) for pair in node.subscribed()])),
-            "getPublications": (0, lambda: (1, "publications", [list(pair) for pair in node.published()])),
-            "paramUpdate": (2, lambda _key, _value: (1, "not subscribed to parameters", 0)),
+            "getMasterUri": (0, lambda _caller: (1, "", self._master_uri)),
+            "getName": (0, lambda _caller: (0, "not told", "")),
+            "getPid": (0, lambda _caller: (1, "", os.getpid())),
+            "getSubscriptions": (0, lambda _caller: (1, "subscriptions", [list(pair) for pair in node.subscribed()])),
+            "getPublications": (0, lambda _caller: (1, "publications", [list(pair) for pair in node.published()])),
+            "paramUpdate": (2, lambda _caller, _key, _value: (1, "not subscribed to parameters", 0)),
             "publisherUpdate": (2, self._publisher_update),
             "requestTopic": (2, self._request_topic),
             "shutdown": (-1, self._shutdown),
@@ -73,29 +77,30 @@ class SlaveApi:
             return -1, f"{method}: the first parameter is the caller's name", 0
         if count >= 0 and len(params) != count + 1:
             return -1, f"{method}: {count + 1} parameters, not {len(params)}", 0
-        return call(*params[1:])
+        return call(*params)
 
-    def _publisher_update(self, topic: Any, uris: Any) -> Answer:
+    def _publisher_update(self, _caller: str, topic: Any, uris: Any) -> Answer:
         if not isinstance(topic, str) or not isinstance(uris, list) or not all(isinstance(uri, str) for uri in uris):
             return -1, "publisherUpdate: caller, topic and a list of URIs", 0
         self._node.publishers_changed(topic, uris)
         return 1, "", 0
 
-    def _request_topic(self, topic: Any, protocols: Any) -> Answer:
+    def _request_topic(self, caller: str, topic: Any, protocols: Any) -> Answer:
         if not isinstance(topic, str) or not isinstance(protocols, list):
             return -1, "requestTopic: caller, topic and a list of protocols", 0
         if topic not in {name for name, _ in self._node.published()}:
             return 0, f"not a publisher of [{topic[:200]}]", 0
         if not any(isinstance(protocol, list) and protocol[:1] == ["TCPROS"] for protocol in protocols):
             return 0, "no supported protocol: TCPROS only", 0
+        self._node.asks_for(topic, caller)
         host, port = self._node.tcpros_address()
         return 1, f"ready on {host}:{port}", ["TCPROS", host, port]
 
-    def _shutdown(self, *why: Any) -> Answer:
+    def _shutdown(self, _caller: str, *why: Any) -> Answer:
         self._node.told_to_shut_down(str(why[0])[:200] if why else "")
         return 1, "shutdown", 0
 
-    def _bus_info(self) -> Answer:
+    def _bus_info(self, _caller: str) -> Answer:
         rows = [
             [
                 link.id, link.peer, link.direction, "TCPROS", link.topic, True,
@@ -105,7 +110,7 @@ class SlaveApi:
         ]  # fmt: skip
         return 1, "bus info", rows
 
-    def _bus_stats(self) -> Answer:
+    def _bus_stats(self, _caller: str) -> Answer:
         published: dict[str, list[list[Any]]] = {}
         subscribed: list[list[Any]] = []
         totals: dict[str, int] = {}

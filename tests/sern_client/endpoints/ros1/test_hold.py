@@ -5,7 +5,8 @@ from dataclasses import replace
 
 import pytest
 
-from sern_client.endpoints.ros1 import hold
+from sern_client.endpoints.ros1 import hold, returning
+from sern_client.endpoints.ros1.xmlrpc import XmlRpcClient
 from sern_core.vocabulary.types import DropReason
 from tests.sern_client.endpoints.ros1.fakes import STRING, FakeMaster, listening, running, text
 from tests.support import until
@@ -24,6 +25,7 @@ def known(master: FakeMaster) -> FakeMaster:
 def patient(monkeypatch: pytest.MonkeyPatch) -> None:
     """A busy machine must not make a subscriber come too late."""
     monkeypatch.setattr(hold, "HOLD_S", 60.0)
+    monkeypatch.setattr(returning, "TOLD_S", 60.0)
 
 
 async def known_to_subscribe(master: FakeMaster) -> None:
@@ -93,6 +95,35 @@ async def test_a_topic_that_has_ended_stays_until_its_message_is_there(known: Fa
             await listener.header()
             assert await listener.frame() == text("only")
             assert await listener.reader.read() == b""
+        await until(lambda: not known.tables[0])
+        assert endpoint.drops == {}
+
+
+async def test_who_has_not_heard_of_the_end_gets_nothing_that_it_would_throw_away(known: FakeMaster) -> None:
+    """Connections that end are made again by themselves, and given up for another when the master has told of both."""
+    async with running(known) as (endpoint, _):
+        stream = endpoint.advertise(STRING)
+        stream.publish(text("one"), 0)
+        stream.close()
+        async with listening(endpoint, topic="/chat") as listener:
+            await listener.header()
+            assert await listener.frame() == text("one") and await listener.reader.read() == b""
+        await until(lambda: not known.tables[0])
+        stream = endpoint.advertise(STRING)
+        stream.publish(text("two"), 0)
+        stream.close()
+        await until(lambda: known.tables[0].get("/chat") == ["/sern"])
+        async with listening(endpoint, topic="/chat") as again:
+            assert await again.reader.read() == b"", "it has not heard that the topic has ended"
+        node = XmlRpcClient(known.nodes["/sern"])
+        try:
+            answer = await node.call("requestTopic", "/listener", "/chat", [["TCPROS"]])
+            assert answer == ["TCPROS", *endpoint.tcpros_address()]
+        finally:
+            node.close()
+        async with listening(endpoint, topic="/chat") as anew:
+            await anew.header()
+            assert await anew.frame() == text("two") and await anew.reader.read() == b""
         await until(lambda: not known.tables[0])
         assert endpoint.drops == {}
 
