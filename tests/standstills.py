@@ -21,16 +21,19 @@ BETWEEN_S: Final = (0.01, 0.05, 0.1)
 NOT_RUNNING: Final = "TtZ"  # stopped, by a test or a debugger, or dead
 
 
+def children(pid: int) -> list[int]:
+    """None of a process that has ended meanwhile."""
+    try:
+        tasks = list(Path(f"/proc/{pid}/task").iterdir())
+        return [int(child) for task in tasks for child in (task / "children").read_text().split()]
+    except OSError:
+        return []
+
+
 def descendants(pid: int) -> Iterator[int]:
-    """Children and theirs. One that ends meanwhile has none."""
-    for task in Path(f"/proc/{pid}/task").glob("*/children"):
-        try:
-            children = [int(child) for child in task.read_text().split()]
-        except OSError:
-            continue
-        for child in children:
-            yield child
-            yield from descendants(child)
+    for child in children(pid):
+        yield child
+        yield from descendants(child)
 
 
 def runs(pid: int) -> bool:
