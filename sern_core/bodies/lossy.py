@@ -129,8 +129,8 @@ def decode_cloud(packed: memoryview, size: int) -> bytes:
     encoding, head, data = _unpack(packed)
     try:
         empty = read_cloud(head, encoding)
-    except BodyError as error:
-        raise CodecError(str(error)) from None
+    except BodyError as no_cloud:
+        raise CodecError(str(no_cloud)) from None
     if empty.fields != _XYZ or len(empty.points):
         raise CodecError("a lossy cloud whose head has other fields or data")
     if not len(data):
@@ -226,8 +226,8 @@ def decode_image(packed: memoryview, size: int) -> bytes:
     encoding, head, data = _unpack(packed)
     try:
         empty = read_image(head, encoding)
-    except BodyError as error:
-        raise CodecError(str(error)) from None
+    except BodyError as no_image:
+        raise CodecError(str(no_image)) from None
     if len(empty.data) or empty.step != empty.row_bytes or len(head) + empty.height * empty.step != size:
         raise CodecError("a lossy image whose head does not fit its size")
     pillow = _library("jpeg", "PIL.Image")

@@ -396,9 +396,9 @@ class Link:
             elif lane == LANE_ZMQ and now >= self.plane.sweep_due_s:
                 end.now = now
                 self.plane.sweep(now)
-        except RemoteError as error:
-            self._unreadable = error
-            self.handshake.abort(f"what it sent could not be read: {error}", now)
+        except RemoteError as unreadable:
+            self._unreadable = unreadable
+            self.handshake.abort(f"what it sent could not be read: {unreadable}", now)
         except Exception as error:  # noqa: BLE001  (as in `receive`)
             self.failed(error, now=now)
         end.dirty = True

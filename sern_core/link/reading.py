@@ -71,6 +71,10 @@ class Reading:
         self.due_s = now + self._reassembly.work_us * 1e-6
         self._end.dirty = True
 
+    def _through(self) -> bool:
+        """Nothing waits for its time. A method of its own: `_read` changes what a type checker believes of `due_s`."""
+        return self.due_s is None
+
     def _keep(self, lane: Lane, number: int, stamp_us: int, data: bytes) -> None:
         """Read it later."""
         self._unread_bytes += len(data) + UNREAD_OVERHEAD_BYTES
@@ -95,7 +99,7 @@ class Reading:
             lane = self._lanes.by_id.get(lane_id)
             if lane is not None:  # else it is closed, and what came over it comes again
                 self._read(lane, number, stamp_us, data, now, position)
-            done = self.due_s is None
+            done = self._through()
         if not done or self._unread:
             self.due_s = now + reassembly.work_us * 1e-6
         if self.on_read is not None:

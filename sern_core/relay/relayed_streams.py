@@ -229,10 +229,10 @@ class RelayedStreams:
         try:
             replays = self.latched(link, relayed, first, now)
             channel = link.outgoing.open(stream, first=first, now=now, replays=replays)
-        except UsageError as error:
+        except UsageError as full:
             relayed.unopened.add(client)
-            self._events.refused(client, "too_many_streams", str(error))
-            said = {"t": "denied", "topic": identity.topic, "code": "too_many_streams", "why": str(error)[:400]}
+            self._events.refused(client, "too_many_streams", str(full))
+            said = {"t": "denied", "topic": identity.topic, "code": "too_many_streams", "why": str(full)[:400]}
             self._clients.tell(client, said, now)
         except Exception as error:  # noqa: BLE001  (of this client's link: the origin and the others go on)
             relayed.unopened.add(client)

@@ -450,12 +450,10 @@ def _is_text(value: object, max_length: int) -> bool:
 
 def _are_texts(values: list[object], max_length: int) -> bool:
     """`_is_text` of each: they are searched as one, since a list of names is most of what tells who wants a stream."""
+    if not all(type(text) is str for text in values):
+        return False
     texts = cast(list[str], values)
-    return (
-        all(type(text) is str for text in texts)
-        and max(map(len, texts), default=0) <= max_length
-        and _UNPRINTABLE.search("".join(texts)) is None
-    )
+    return max(map(len, texts), default=0) <= max_length and _UNPRINTABLE.search("".join(texts)) is None
 
 
 def take_str(envelope: Envelope, key: str, *, max_length: int = 512, default: str | None = None) -> str:
