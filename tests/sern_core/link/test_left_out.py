@@ -10,6 +10,7 @@ from tests.sern_core.system.test_reports import said
 from tests.world import World, limited
 
 
+@pytest.mark.interpreted
 def test_a_stream_that_nobody_wants_is_not_told_of_again_as_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
     """What is left out is told once it is done. A stream that is forgotten meanwhile has nothing left to be told of,
     also when it goes on in slices the next time."""

@@ -91,6 +91,7 @@ def acknowledges(peer: Hostile) -> bool:
     return bool(acks)
 
 
+@pytest.mark.interpreted
 def test_a_datagram_that_costs_much_is_read_in_slices_and_in_order(monkeypatch: pytest.MonkeyPatch) -> None:
     peer = robot_and_readers()
     got = taken(peer, monkeypatch)
@@ -103,6 +104,7 @@ def test_a_datagram_that_costs_much_is_read_in_slices_and_in_order(monkeypatch: 
     peer.hub.validate()
 
 
+@pytest.mark.interpreted
 def test_others_have_their_turn_in_between(monkeypatch: pytest.MonkeyPatch) -> None:
     peer = robot_and_readers()
     other = Hostile(peer.world, "other")
@@ -128,6 +130,7 @@ def test_nothing_of_it_is_acknowledged_before_it_is_read() -> None:
     assert acknowledges(peer)
 
 
+@pytest.mark.interpreted
 def test_a_session_that_ends_meanwhile_loses_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     peer = robot_and_readers()
     got = taken(peer, monkeypatch)
@@ -185,6 +188,7 @@ def none_below(peer: Hostile) -> None:
     peer.control({"t": "first", "ch": 1, "seq": 2 + 2 * WAITING})
 
 
+@pytest.mark.interpreted
 @pytest.mark.parametrize(("release", "step"), [(first_one, 1), (none_below, 2)])
 def test_what_waited_is_released_in_slices_and_in_order(
     release: Callable[[Hostile], None], step: int, monkeypatch: pytest.MonkeyPatch
@@ -203,6 +207,7 @@ def test_what_waited_is_released_in_slices_and_in_order(
     peer.hub.validate()
 
 
+@pytest.mark.interpreted
 @pytest.mark.parametrize(("release", "step"), [(first_one, 1), (none_below, 2)])
 def test_what_is_released_goes_on_when_the_session_has_ended(
     release: Callable[[Hostile], None], step: int, monkeypatch: pytest.MonkeyPatch

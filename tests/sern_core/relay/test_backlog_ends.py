@@ -101,6 +101,7 @@ def test_what_ends_is_what_waited_and_nothing_else(actions: list[str], end: str,
         assert waiting - set(lost_before) <= set(taken) and taken == sorted(set(taken))
 
 
+@pytest.mark.interpreted
 def test_what_lapses_in_many_sweeps_is_reported_once_and_never_sent(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where 500 messages lapse at a time and a sweep is for 3: the next one is due at once, and what lies between two
     sweeps sends none of them."""

@@ -114,6 +114,7 @@ def test_what_the_relay_itself_publishes_is_nobodys() -> None:
     assert GONE not in statuses(site).values(), "the site has asked of it in its new session"
 
 
+@pytest.mark.interpreted
 def test_a_client_that_does_not_ask_is_told_nothing() -> None:
     """Peers of an earlier version: a control message that it does not know would end its session."""
     world = World().watch()
@@ -751,6 +752,7 @@ def test_a_client_asks_of_the_last_of_many() -> None:
     assert known.asked() == [*(f"c{number}" for number in range(6, MAX_ASKED + 5)), "c0"]
 
 
+@pytest.mark.interpreted
 def test_of_what_is_no_name_of_a_client_nothing_is_said() -> None:
     """As it came it may be too long to be said: what is bounded in a name is its characters."""
     world = World().watch()

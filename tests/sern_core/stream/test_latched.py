@@ -121,6 +121,7 @@ def test_of_a_deep_stream_the_newest_are_kept_and_the_others_counted() -> None:
     store.validate()
 
 
+@pytest.mark.interpreted
 @pytest.mark.parametrize("reliable", [True, False])
 @pytest.mark.parametrize("restarts", [False, True])
 def test_a_late_joiner_gets_the_newest_that_may_wait_for_it(
@@ -159,6 +160,7 @@ def test_a_late_joiner_gets_the_newest_that_may_wait_for_it(
     world.validate()
 
 
+@pytest.mark.interpreted
 def test_many_latched_messages_are_replayed_in_slices(monkeypatch: pytest.MonkeyPatch) -> None:
     peer = Hostile()
     streams, depth = 60, 300
