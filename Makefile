@@ -6,12 +6,13 @@ TEST_PROCESSES ?= 3
 RANDOM_TESTS = $(shell grep -rlE '^(from|import) (hypothesis|tests\.exploring)' tests --include='test_*.py' | grep -v tests/peers)
 PACKAGES := sern_core sern_runtime sern_relay sern_client sern_sim sern_tools benchmarks tests
 
-.PHONY: help setup lint format types test explore standstills lab bench performance endpoints figures picture demo schemas clean
+.PHONY: help setup lint format types test wheel test-compiled explore standstills lab bench performance endpoints figures picture demo schemas clean
 
 help:
 	@echo "make setup    create $(VENV) with pinned dependencies"
 	@echo "make demo     relay, robot and site over a bad link, on this machine, next to plain ZMQ"
 	@echo "make test     the tests but the longer ones of make lab;  make lint, make types: static checks"
+	@echo "make wheel    a wheel in dist/ whose core is compiled;  make test-compiled: the tests of the core and of the daemons on it"
 	@echo "make explore  the tests with random input, with new cases and ten times as many; SEED=... repeats a run"
 	@echo "make standstills   the tests whose processes stand still for moments, as on a loaded machine; SEED=..."
 	@echo "make lab      the whole matrix of bad links, and the longer runs over tc netem, which need root"
@@ -47,6 +48,24 @@ types: setup
 test: setup
 	$(BIN)/python -m pytest -n $(TEST_PROCESSES) --dist loadgroup --ignore tests/lab
 	$(BIN)/python -m pytest tests/lab
+
+# Needs a C compiler, and the headers of the Python that it is for. What an earlier build left does not get into it.
+wheel: setup
+	rm -rf build/lib.* build/bdist.* dist/sern-*.whl
+	SERN_COMPILE=1 $(BIN)/python -m pip wheel --disable-pip-version-check --no-deps --no-build-isolation -w dist .
+
+# The wheel in an environment of its own, and no source beside it: of the checkout only the tests are to be found.
+COMPILED := $(VENV)-compiled
+CORE_TESTS := tests/sern_core tests/sern_sim tests/fuzz tests/test_vectors.py tests/test_compiled.py
+test-compiled: wheel
+	$(PYTHON) -m venv $(COMPILED)
+	$(COMPILED)/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt "$$(ls dist/sern-*.whl)[dev,bench,report,lossy,dds,zenoh]"
+	$(COMPILED)/bin/python -m pip install --quiet --disable-pip-version-check --no-deps --force-reinstall dist/sern-*.whl
+	mkdir -p build/checkout
+	ln -sfn ../../tests build/checkout/tests
+	ln -sfn ../../benchmarks build/checkout/benchmarks
+	SERN_CORE=compiled PYTHONSAFEPATH=1 PYTHONPATH=$(CURDIR)/build/checkout $(COMPILED)/bin/python -m pytest \
+		-o pythonpath=build/checkout -n $(TEST_PROCESSES) --dist loadgroup $(CORE_TESTS) tests/loopback
 
 # One look at the clock: all that takes the seed has the same one.
 SEED := $(or $(SEED),$(shell date +%s))
@@ -104,4 +123,4 @@ schemas: setup
 	$(BIN)/python -m sern_runtime.config.export schemas docs/configuration.md
 
 clean:
-	rm -rf $(VENV) build *.egg-info .mypy_cache .ruff_cache .pytest_cache .import_linter_cache
+	rm -rf $(VENV) $(COMPILED) build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .import_linter_cache

@@ -6,12 +6,17 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from sern_runtime import version
+
 if TYPE_CHECKING:
     from sern_runtime.config.shared import LogSection
 
 
 def command(
     config: Annotated[Path, typer.Option("--config", "-c", help="The client's configuration file (YAML).")],
+    _version: Annotated[
+        bool, typer.Option("--version", callback=version.shown("sern-client"), is_eager=True, help=version.HELP)
+    ] = False,
 ) -> None:
     """Bridge this site's ROS topics to a SERN relay, until SIGTERM or Ctrl-C."""
 

@@ -6,12 +6,17 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from sern_runtime import version
+
 if TYPE_CHECKING:
     from sern_runtime.config.shared import LogSection
 
 
 def command(
     config: Annotated[Path, typer.Option("--config", "-c", help="The relay's configuration file (YAML).")],
+    _version: Annotated[
+        bool, typer.Option("--version", callback=version.shown("sern-relay"), is_eager=True, help=version.HELP)
+    ] = False,
 ) -> None:
     """Carry ROS topics between SERN clients, until SIGTERM or Ctrl-C. SIGHUP reads keys and access rules anew."""
 

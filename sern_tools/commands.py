@@ -1,7 +1,10 @@
 """The `sern` command. Every subcommand is registered here, in one place."""
 
+from typing import Annotated
+
 import typer
 
+from sern_runtime import version
 from sern_tools import check, keygen
 from sern_tools.demo import demo
 from sern_tools.echo import echo
@@ -17,6 +20,17 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
+
+
+@app.callback()
+def _options(
+    _version: Annotated[
+        bool, typer.Option("--version", callback=version.shown("sern"), is_eager=True, help=version.HELP)
+    ] = False,
+) -> None:
+    pass
+
+
 app.command()(demo)
 app.add_typer(keygen.app, name="keygen")
 app.add_typer(lab_app, name="lab")

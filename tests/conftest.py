@@ -18,6 +18,7 @@ import uvloop
 import zmq
 
 from sern_core.vocabulary.types import ClientName
+from sern_runtime import version
 from sern_runtime.config.keys import SecretKey, generate
 from sern_runtime.loop import raise_open_files
 from sern_tools.ports import release_claims
@@ -28,6 +29,7 @@ Context = zmq.Context[zmq.Socket[bytes]]
 PEERS: Final = Path(__file__).parent / "peers"
 LAB: Final = Path(__file__).parent / "lab"
 LONG: Final = "lab_long"
+INTERPRETED: Final = "interpreted"
 
 for name in (
     "CYCLONEDDS_URI", "FASTRTPS_DEFAULT_PROFILES_FILE", "RMW_IMPLEMENTATION", "ROS_DISCOVERY_SERVER", "ROS_DOMAIN_ID",
@@ -57,7 +59,7 @@ def pytest_cmdline_main(config: pytest.Config) -> None:
 
 @pytest.hookimpl(tryfirst=True)  # before pytest-xdist reads the groups
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Leave the longer runs out unless they are asked for by -m (make lab).
+    """Leave the longer runs out unless they are asked for by -m (make lab), and what a compiled core cannot show.
 
     Ask for `no_leftover_tasks` ahead of all other fixtures, so that it is torn down after them.
 
@@ -69,6 +71,8 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         config.hook.pytest_deselected(items=long)
         items[:] = [item for item in items if item not in long]
     for item in items:
+        if version.compiled() and item.get_closest_marker(INTERPRETED):
+            item.add_marker(pytest.mark.skip(reason="replaces what compiled code does not look up"))
         if isinstance(item, pytest.Function) and asyncio.iscoroutinefunction(item.function):
             item.fixturenames.insert(0, "no_leftover_tasks")
         apart = [folder for folder in (PEERS, LAB) if folder in item.path.parents]

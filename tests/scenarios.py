@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from sern_core.stream.in_stream import PARTIAL_IDLE_S
 from sern_core.stream.out_channel import OutChannel
 from sern_core.vocabulary.message import StreamId, TopicSpec
+from sern_core.vocabulary.params import LinkParams
 from sern_core.vocabulary.types import DropReason, PriorityClass
 from sern_sim.models import Jitter, LinkModel, Window
 from tests.world import Clock, SimClient, World, spec
@@ -123,9 +124,10 @@ class Run:
     """A scenario being played. `lives` are all processes of clients that ever were, `steady` the subscribers that were
     there all along."""
 
-    def __init__(self, scenario: Scenario) -> None:
+    def __init__(self, scenario: Scenario, link: LinkParams | None = None) -> None:
         self.scenario = scenario
-        self.world = World(scenario.seed, lossless=scenario.lossless, relay_clock=scenario.relay_clock).watch(0.25)
+        world = World(scenario.seed, link=link, lossless=scenario.lossless, relay_clock=scenario.relay_clock)
+        self.world = world.watch(0.25)
         self.robot = self.world.client("robot", scenario.robot, clock=scenario.robot_clock)
         self.site = self.world.client("site", scenario.site, clock=scenario.site_clock, patterns=["/robot/.*"])
         self.lives = [self.robot, self.site]

@@ -21,6 +21,7 @@ from sern_core.stream.decoding import DecodeRequest
 from sern_core.stream.encoding import EncodeRequest
 from sern_core.stream.out_channel import OutChannel
 from sern_core.vocabulary.codec_names import DEFAULT_LOSSY, Compression, LossyParams
+from sern_core.vocabulary.limits import PeerLimits
 from sern_core.vocabulary.message import Message, StreamId, StreamInfo, TopicInfo, TopicSpec
 from sern_core.vocabulary.params import LinkParams, SchedulerParams
 from sern_core.vocabulary.trace import DecisionTrace
@@ -39,6 +40,11 @@ from sern_sim.network import Hop, Network
 from sern_sim.ports import Port
 
 OPEN_ACCESS = AccessTable([AccessRule(client=".*", publish=(".*",), subscribe=(".*",), replay=(".*",))])
+
+
+def limited(**limits: int) -> LinkParams:
+    """A link whose peer may cost no more than this (`PeerLimits`)."""
+    return LinkParams(limits=PeerLimits(**limits))
 
 
 def spec(

@@ -185,10 +185,10 @@ class HopAdapter:
 
     def _coder_s(self) -> float:
         """Processor time of encoding and of making summaries, of all time."""
-        made_s = sum(item.cpu_s for item in self._summaries() if item.adapt)
+        made_s = sum((item.cpu_s for item in self._summaries() if item.adapt), 0.0)
         if self._coder is None:
             return made_s
-        return made_s + sum(counters.elapsed_s for counters in self._coder.encoded.values())
+        return made_s + sum((counters.elapsed_s for counters in self._coder.encoded.values()), 0.0)
 
     def sample(self, *, now: float) -> None:
         """Read the capacity; about ten times an interval."""

@@ -1,7 +1,7 @@
 """Parts of the queueing formulas: what one class asks of the link, what overruns a queue, what comes too late."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Final
 
 import numpy as np
@@ -36,8 +36,11 @@ class Service:
 
     def of(self, places: NDArray[np.int64]) -> "Service":
         """The same of some candidates."""
-        arrays = {name: getattr(self, name)[places] for name in self.__slots__ if name != "demand"}
+        arrays = {name: getattr(self, name)[places] for name in ARRAYS}
         return Service(self.demand, **arrays)
+
+
+ARRAYS: Final = tuple(field.name for field in fields(Service) if field.name != "demand")
 
 
 @dataclass(slots=True)

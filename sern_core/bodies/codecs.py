@@ -19,9 +19,10 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from struct import Struct
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import lz4.block
+from mypy_extensions import mypyc_attr
 
 from sern_core.bodies import lossy
 from sern_core.vocabulary.codec_names import Codec, Compression, LossyParams
@@ -147,7 +148,7 @@ def _unpack_zstd(packed: memoryview, size: int) -> bytes:
     if packed[:4].tobytes() != ZSTD_MAGIC:
         raise CodecError("no Zstandard frame")
     try:
-        info = zstd.get_frame_info(packed)
+        info: Any = zstd.get_frame_info(packed)  # its sizes may be None, whatever its types say
         if info.decompressed_size != size:
             raise CodecError(f"a Zstandard frame of {info.decompressed_size} bytes in a body that claims {size}")
         if info.dictionary_id:
@@ -289,6 +290,7 @@ class Coder:
         return raw, self.clock() - start_s
 
 
+@mypyc_attr(allow_interpreted_subclasses=True)  # tests have works of their own
 class Work(ABC):
     """Something that takes long: `run` in any thread, then `done` where the core lives, then the link is polled."""
 

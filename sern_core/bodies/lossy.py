@@ -129,8 +129,8 @@ def decode_cloud(packed: memoryview, size: int) -> bytes:
     encoding, head, data = _unpack(packed)
     try:
         empty = read_cloud(head, encoding)
-    except BodyError as error:
-        raise CodecError(str(error)) from None
+    except BodyError as no_cloud:
+        raise CodecError(str(no_cloud)) from None
     if empty.fields != _XYZ or len(empty.points):
         raise CodecError("a lossy cloud whose head has other fields or data")
     if not len(data):
@@ -167,7 +167,7 @@ class Image:
     kind: str
     bigendian: int
     step: int
-    data: memoryview
+    data: bytes | memoryview
 
     @property
     def row_bytes(self) -> int:
@@ -217,7 +217,7 @@ def encode_image(body: bytes, encoding: Encoding, params: LossyParams) -> tuple[
     picture = pillow.frombuffer(mode, (image.width, image.height), image.data, "raw", raw_mode, image.step, 1)
     out = io.BytesIO()
     picture.save(out, "JPEG", quality=params.jpeg_quality)
-    head = write_image(replace(image, step=row_bytes, data=memoryview(b"")), encoding)
+    head = write_image(replace(image, step=row_bytes, data=b""), encoding)
     return len(head) + image.height * row_bytes, _pack(encoding, head, out.getvalue())
 
 
@@ -226,8 +226,8 @@ def decode_image(packed: memoryview, size: int) -> bytes:
     encoding, head, data = _unpack(packed)
     try:
         empty = read_image(head, encoding)
-    except BodyError as error:
-        raise CodecError(str(error)) from None
+    except BodyError as no_image:
+        raise CodecError(str(no_image)) from None
     if len(empty.data) or empty.step != empty.row_bytes or len(head) + empty.height * empty.step != size:
         raise CodecError("a lossy image whose head does not fit its size")
     pillow = _library("jpeg", "PIL.Image")
@@ -240,4 +240,4 @@ def decode_image(packed: memoryview, size: int) -> bytes:
         pixels: bytes = picture.tobytes("raw", "BGR" if empty.kind == "bgr8" else mode)
     except (OSError, SyntaxError, ValueError, MemoryError, struct.error, pillow.DecompressionBombError) as error:
         raise CodecError(f"a damaged JPEG ({type(error).__name__})") from None
-    return write_image(replace(empty, data=memoryview(pixels)), encoding)
+    return write_image(replace(empty, data=pixels), encoding)

@@ -27,8 +27,6 @@ CONTROL_US: Final = 30
 CONTROL_BYTES_PER_US: Final = 16
 ATTACHMENT_BYTES_PER_US: Final = 250
 """What a control message is charged with (`Reassembly.work_us`): itself, its size, what its attachment unpacks to."""
-MAX_UNHEARD: Final = 20_000
-"""Control messages that a peer may have answered, beside four for each channel, before it reads an answer."""
 
 
 class ControlStream:
@@ -122,5 +120,5 @@ class ControlStream:
         if self.out.watermark >= self._unheard_seq:
             self._unheard, self._unheard_seq = 0, self.out.next_seq - 1
         self._unheard += count
-        if self._unheard > MAX_UNHEARD + 4 * streams:
+        if self._unheard > self._end.params.limits.unheard + 4 * streams:
             raise WireError(f"{self._end.peer} does not read {self._unheard} answers and goes on asking")

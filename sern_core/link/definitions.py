@@ -17,8 +17,6 @@ MAX_DEFINITIONS: Final = 16_384
 """Texts that a process keeps, of all its peers."""
 MAX_PEER_DEFINITIONS: Final = 2048
 """Questions for texts that a peer may leave unanswered for streams that have ended."""
-MAX_PEER_DEFINITION_BYTES: Final = 16 * 2**20
-"""Texts that the streams of one peer may use; all types of a ROS distribution together have less than 2 MB."""
 LINGERING_TEXTS: Final = 64
 LINGERING_BYTES: Final = 256 * 2**10
 """Texts of streams of one peer that have ended, kept while its session lasts."""
@@ -97,9 +95,10 @@ class _Users:
 class PeerDefinitions:
     """What one link has to do with definitions: which its streams use, which were asked for, told, and are awaited."""
 
-    def __init__(self, store: DefinitionStore, peer: ClientName) -> None:
+    def __init__(self, store: DefinitionStore, peer: ClientName, *, max_bytes: int) -> None:
         self.store = store
         self.peer = peer
+        self._max_bytes = max_bytes
         self.bytes = 0
         """Texts that the peer's streams use, lingering ones included."""
         self._in = _Users()
@@ -143,10 +142,8 @@ class PeerDefinitions:
                 self._let_go(LINGERING_TEXTS, LINGERING_BYTES)
             else:
                 self.store.release(last)
-        if self.bytes > MAX_PEER_DEFINITION_BYTES:
-            raise WireError(
-                f"the streams of {self.peer} use more than {MAX_PEER_DEFINITION_BYTES} bytes of definitions"
-            )
+        if self.bytes > self._max_bytes:
+            raise WireError(f"the streams of {self.peer} use more than {self._max_bytes} bytes of definitions")
 
     def use_outgoing(self, user: Hashable, digest: str, text: str = "") -> None:
         """A stream that is offered to the peer names this digest; "": it has none, or has ended."""
@@ -228,10 +225,8 @@ class PeerDefinitions:
             return False  # its stream has ended
         if digest in self.store:
             return True
-        if self.bytes + len(attachment) > MAX_PEER_DEFINITION_BYTES:
-            raise WireError(
-                f"{self.peer} sends more than {MAX_PEER_DEFINITION_BYTES} bytes of definitions for its streams"
-            )
+        if self.bytes + len(attachment) > self._max_bytes:
+            raise WireError(f"{self.peer} sends more than {self._max_bytes} bytes of definitions for its streams")
         self.store.put(digest, text)
         self._charge(digest)
         return True

@@ -36,7 +36,8 @@ BEGIN_AHEAD_S: Final = 0.1
 A HELLO that comes too early is not answered; the initiator says it again after `HELLO_INTERVAL_S`."""
 SHORT_SESSION_S: Final = 5.0
 """A session that is taken from us sooner than this was short."""
-DISPLACED_S: Final = (0.5, 10.0)
+DISPLACED_MIN_S: Final = 0.5
+DISPLACED_MAX_S: Final = 10.0
 """First and longest pause after the second short session in a row, and those that follow."""
 DISPLACED: Final = "displaced"
 """The code of the refusal that ends a session because another process connected under its name."""
@@ -310,13 +311,13 @@ class Handshake:
         self._short_sessions = self._short_sessions + 1 if short else 0
         if self._short_sessions < 2:
             return 0.0
-        return min(DISPLACED_S[0] * 2.0 ** min(self._short_sessions - 2, 16), DISPLACED_S[1])
+        return min(DISPLACED_MIN_S * 2.0 ** min(self._short_sessions - 2, 16), DISPLACED_MAX_S)
 
     def _yield_s(self, now: float) -> float:
         """How long to wait when the relay has said that another process has our name now. Two that both want it take
         turns, each as long as the other waits: a session of that length is no sign that the other has gone."""
-        last_s = DISPLACED_S[0] * 2.0**self._displaced_pauses if self._displaced_pauses else 0.0
-        if now - self._end.up_since_s > 2 * min(last_s, DISPLACED_S[1]) + SHORT_SESSION_S:
+        last_s = DISPLACED_MIN_S * 2.0**self._displaced_pauses if self._displaced_pauses else 0.0
+        if now - self._end.up_since_s > 2 * min(last_s, DISPLACED_MAX_S) + SHORT_SESSION_S:
             self._displaced_pauses = 0
         self._displaced_pauses = min(self._displaced_pauses + 1, 16)
-        return min(DISPLACED_S[0] * 2.0**self._displaced_pauses, DISPLACED_S[1])
+        return min(DISPLACED_MIN_S * 2.0**self._displaced_pauses, DISPLACED_MAX_S)

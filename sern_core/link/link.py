@@ -89,8 +89,8 @@ class Link:
         self._unreadable: RemoteError | None = None  # found at a time when nobody could be told
         end = self.end = End(name=name, boot=boot, peer=peer, initiator=initiator, params=link, trace=trace, now=now)
         owner = self._owner = Owner(self, handler, end)
-        self.texts = PeerDefinitions(definitions, peer)
-        reassembly = self.reassembly = Reassembly(max(64 * 2**20, 2 * link.max_message_bytes))
+        self.texts = PeerDefinitions(definitions, peer, max_bytes=link.limits.peer_definition_bytes)
+        reassembly = self.reassembly = Reassembly(max(64 * 2**20, 2 * link.max_message_bytes), link.limits)
         control = self.control = ControlStream(end, reassembly, self._read_control)
         sender = self.sender = Sender(end, scheduler, SendTrace(end, self.texts), delivered=self._delivered, now=now)
         lanes = self.lanes = LaneSet(
@@ -102,7 +102,7 @@ class Link:
             on_rate=self._rate_known,
             now=now,
         )
-        self._owed_lists = OwedLists()
+        self._owed_lists = OwedLists(link.limits.owed)
         answers = self.answers = Answers(end, control, reassembly)
         self.outgoing = StreamsOut(
             end, control, sender, self.texts, self._owed_lists, reassembly, owner, at_once=self._at_once
@@ -396,9 +396,9 @@ class Link:
             elif lane == LANE_ZMQ and now >= self.plane.sweep_due_s:
                 end.now = now
                 self.plane.sweep(now)
-        except RemoteError as error:
-            self._unreadable = error
-            self.handshake.abort(f"what it sent could not be read: {error}", now)
+        except RemoteError as unreadable:
+            self._unreadable = unreadable
+            self.handshake.abort(f"what it sent could not be read: {unreadable}", now)
         except Exception as error:  # noqa: BLE001  (as in `receive`)
             self.failed(error, now=now)
         end.dirty = True

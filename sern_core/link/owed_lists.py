@@ -1,17 +1,13 @@
 """Lists of names that travel in several control messages. Pure."""
 
-from typing import Final
-
 from sern_core.vocabulary.errors import WireError
-
-MAX_OWED: Final = 8192
-"""Names in lists that have begun and not ended, and of one stream."""
 
 
 class OwedLists:
     """Lists of a session, by the message that they are in and its channel."""
 
-    def __init__(self) -> None:
+    def __init__(self, max_names: int) -> None:
+        self._max_names = max_names
         self._parts: dict[tuple[str, int], list[str]] = {}  # more of them will come
         self._unfinished = 0  # names in them
 
@@ -24,8 +20,8 @@ class OwedLists:
         """The names of a list once it is complete, else None. Raises WireError if `peer` leaves too much unfinished."""
         if more:
             self._unfinished += len(names)
-            if self._unfinished > MAX_OWED:
-                raise WireError(f"{peer} leaves lists of more than {MAX_OWED} names unfinished")
+            if self._unfinished > self._max_names:
+                raise WireError(f"{peer} leaves lists of more than {self._max_names} names unfinished")
             if names:
                 self._parts.setdefault(key, []).extend(names)
             return None

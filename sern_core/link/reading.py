@@ -1,9 +1,9 @@
 """Datagrams of a session are read in slices, in order, and each is read whole or its session ends. Pure.
 
 What a peer says may cost much more than its bytes: one announcement, a channel for each of fifty subscribers. So
-reading stops when that has cost `SLICE_US`, and goes on after as long a rest, at the very frame: what follows depends
-on it. Nothing of a datagram that is half read is acknowledged, and nothing of those behind it, so that a session that
-ends meanwhile loses nothing; a peer that waits for acknowledgements is slowed down by it.
+reading stops when that has cost a slice (`PeerLimits`), and goes on after as long a rest, at the very frame: what
+follows depends on it. Nothing of a datagram that is half read is acknowledged, and nothing of those behind it, so that
+a session that ends meanwhile loses nothing; a peer that waits for acknowledgements is slowed down by it.
 """
 
 from collections import deque
@@ -14,14 +14,12 @@ from sern_core.link.end import End
 from sern_core.link.lane_set import LaneSet
 from sern_core.link.receiver import Receiver
 from sern_core.path.lanes import Lane
-from sern_core.stream.in_stream import SLICE_US, Reassembly
+from sern_core.stream.in_stream import Reassembly
 from sern_core.vocabulary.errors import WireError
 from sern_core.wire import framing
 
-MAX_UNREAD_BYTES: Final = 32 * 2**20
 UNREAD_OVERHEAD_BYTES: Final = 256
-"""Datagrams of a peer that wait to be read, each with so much beside it: far more than any window lets a peer send that
-hears of none."""
+"""What a datagram that waits to be read takes beside its own size."""
 
 
 class Reading:
@@ -73,10 +71,14 @@ class Reading:
         self.due_s = now + self._reassembly.work_us * 1e-6
         self._end.dirty = True
 
+    def _through(self) -> bool:
+        """Nothing waits for its time. A method of its own: `_read` changes what a type checker believes of `due_s`."""
+        return self.due_s is None
+
     def _keep(self, lane: Lane, number: int, stamp_us: int, data: bytes) -> None:
         """Read it later."""
         self._unread_bytes += len(data) + UNREAD_OVERHEAD_BYTES
-        if self._unread_bytes > MAX_UNREAD_BYTES:
+        if self._unread_bytes > self._end.params.limits.unread_bytes:
             text = f"{self._end.peer} goes on sending although {len(self._unread)} datagrams wait to be read"
             raise WireError(text)
         self._unread.append((lane.id, number, stamp_us, data, 0))
@@ -88,7 +90,7 @@ class Reading:
         reassembly.work_us = 0
         self.due_s = None
         done = self._go_on(now)
-        while done and self._unread and reassembly.work_us <= SLICE_US:
+        while done and self._unread and reassembly.work_us <= reassembly.slice_us:
             lane_id, number, stamp_us, data, position = self._unread.popleft()
             self._unread_bytes -= len(data) + UNREAD_OVERHEAD_BYTES
             if position:
@@ -97,7 +99,7 @@ class Reading:
             lane = self._lanes.by_id.get(lane_id)
             if lane is not None:  # else it is closed, and what came over it comes again
                 self._read(lane, number, stamp_us, data, now, position)
-            done = self.due_s is None
+            done = self._through()
         if not done or self._unread:
             self.due_s = now + reassembly.work_us * 1e-6
         if self.on_read is not None:

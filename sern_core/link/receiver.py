@@ -12,7 +12,7 @@ from sern_core.link.lane_set import LaneSet
 from sern_core.link.sender import Sender
 from sern_core.link.streams_in import StreamsIn
 from sern_core.path.lanes import OVERHEAD_BYTES, Lane
-from sern_core.stream.in_stream import SLICE_US, Reassembly
+from sern_core.stream.in_stream import Reassembly
 from sern_core.vocabulary.errors import RemoteError, WireError
 from sern_core.vocabulary.types import DropReason
 from sern_core.wire import framing
@@ -131,7 +131,7 @@ class Receiver:
                 raise  # what follows it depends on it: the session ends
             self._events.fault(error)
             stream.fail(wide, total, now)
-        return self._reassembly.work_us > SLICE_US
+        return self._reassembly.work_us > self._reassembly.slice_us
 
     def on_ack(self, lane: int, highest: int, sack: int, echo_us: int, received_us: int, cum_bytes: int) -> None:
         """FrameSink: an acknowledgement of what we sent."""
@@ -148,7 +148,7 @@ class Receiver:
         if wide > out_channel.watermark:
             done = self._sender.watermark(out_channel, wide, self._end.now)
             self._reassembly.work_us += WATERMARK_US + done // DONE_PER_US
-        return self._reassembly.work_us > SLICE_US
+        return self._reassembly.work_us > self._reassembly.slice_us
 
     def on_ping(self) -> None:
         """FrameSink: the peer asks for an acknowledgement now."""

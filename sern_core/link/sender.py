@@ -13,7 +13,7 @@ from sern_core.link.send_trace import SendTrace
 from sern_core.path.period import Cadences
 from sern_core.stream.coding import ChannelCodec, Coding
 from sern_core.stream.encoding import Encoder
-from sern_core.stream.out_channel import LAPSED_A_SWEEP, OutChannel
+from sern_core.stream.out_channel import OutChannel
 from sern_core.stream.out_message import OutMessage
 from sern_core.stream.scheduler import Scheduler
 from sern_core.vocabulary.codec_names import Compression
@@ -151,7 +151,7 @@ class Sender:
         """Expire what nobody will send, also while the link is down. True: that was all."""
         if now >= self.held_back_due_s:
             self.release_held_back(now)
-        room = LAPSED_A_SWEEP
+        most = room = self._end.params.limits.lapsed_a_sweep
         for channel in list(self.channels.values()):
             watermark = channel.watermark
             room -= channel.sweep(now, up=self._end.established, room=room)
@@ -161,7 +161,7 @@ class Sender:
                 self.refresh(channel, now)
             if channel.watermark > watermark:
                 self._delivered(channel)
-        self.lapsed += LAPSED_A_SWEEP - room
+        self.lapsed += most - room
         return room > 0
 
     # --- what goes next -------------------------------------------------------------------------------------------
@@ -174,7 +174,7 @@ class Sender:
                 channel.offered = False
                 self.scheduler.withdraw(channel.slot)
             return
-        size_bytes: float = out.unsent_bytes
+        size_bytes = float(out.unsent_bytes)
         codec = channel.codec
         if codec is not None and out.coding is not Coding.DONE:
             if out.withheld:

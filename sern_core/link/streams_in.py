@@ -10,7 +10,7 @@ from sern_core.link.definitions import PeerDefinitions
 from sern_core.link.end import End
 from sern_core.link.events import Events
 from sern_core.link.lane_set import LaneSet
-from sern_core.stream.in_stream import SLICE_US, InStream, Reassembly
+from sern_core.stream.in_stream import InStream, Reassembly
 from sern_core.vocabulary.errors import RefusedError, RemoteError, WireError
 from sern_core.vocabulary.message import Message, StreamId, StreamInfo
 from sern_core.vocabulary.types import ClientName, DropReason
@@ -318,7 +318,7 @@ class StreamsIn:
                 del self._skipping[stream]
                 self._skipped(stream, now)
         while self._gone:
-            if reassembly.work_us > SLICE_US:
+            if reassembly.work_us > reassembly.slice_us:
                 return False
             self.retract(self._gone.popleft(), now)
         return self._finished(now)

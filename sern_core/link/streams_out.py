@@ -10,7 +10,7 @@ from sern_core.link.control_stream import ControlStream
 from sern_core.link.definitions import PeerDefinitions
 from sern_core.link.end import End
 from sern_core.link.events import Events
-from sern_core.link.owed_lists import MAX_OWED, OwedLists
+from sern_core.link.owed_lists import OwedLists
 from sern_core.link.sender import Sender
 from sern_core.stream.in_stream import Reassembly
 from sern_core.stream.out_channel import OutChannel
@@ -247,8 +247,9 @@ class StreamsOut:
         names = dict.fromkeys(before) | dict.fromkeys(want.add)
         for name in want.drop:
             names.pop(name, None)
-        if len(names) > MAX_OWED:
-            raise WireError(f"{self._end.peer} owes a stream to more than {MAX_OWED} names")
+        most = self._end.params.limits.owed
+        if len(names) > most:
+            raise WireError(f"{self._end.peer} owes a stream to more than {most} names")
         return tuple(names)
 
     def _charge(self, price: int, now: float) -> None:

@@ -10,6 +10,8 @@ from dataclasses import dataclass
 from math import inf
 from typing import Final
 
+from mypy_extensions import mypyc_attr
+
 PACING_BURST_S: Final = 0.001
 """A timer may be this late; what could have left meanwhile leaves at once."""
 PACING_DEBT_S: Final = 0.1
@@ -47,6 +49,7 @@ class Receiver:
         return back
 
 
+@mypyc_attr(allow_interpreted_subclasses=True)  # those that this one is compared with
 class CapacityEstimator(ABC):
     """Window and capacity of one lane. Every method takes the time from its caller.
 

@@ -197,10 +197,10 @@ class RateGuard:
     def __init__(
         self,
         *,
+        now: float,
         max_bytes_per_s: float | None = None,
         max_rate_hz: float | None = None,
         burst_s: float = DEFAULT_BURST_S,
-        now: float,
     ) -> None:
         for name, rate in (("max_bytes_per_s", max_bytes_per_s), ("max_rate_hz", max_rate_hz), ("burst_s", burst_s)):
             if rate is not None and not (rate > 0 and math.isfinite(rate)):

@@ -9,6 +9,7 @@ from sern_core.relay.hub_events import GuardedEvents
 from sern_core.relay.relayed_streams import RelayedStreams
 from sern_core.relay.routing import Denied, Match, RouteChange, RoutingTable
 from sern_core.vocabulary.errors import RefusedError
+from sern_core.vocabulary.limits import PeerLimits
 from sern_core.vocabulary.message import StreamId
 from sern_core.vocabulary.names import is_client_name
 from sern_core.vocabulary.types import ClientName, TopicName
@@ -19,8 +20,6 @@ OWED_PER_US: Final = 2
 such clients are looked at in one."""
 MAX_AWAITED_CLIENTS: Final = 1024
 """Clients that have not come back yet and are waited for."""
-MAX_AWAITED_TOPICS: Final = 2048
-"""Streams held for one client that has not come back yet; origins name them, so there must be an end to it."""
 
 
 class Awaited:
@@ -33,12 +32,14 @@ class Awaited:
         routing: RoutingTable,
         events: GuardedEvents,
         known: Callable[[ClientName], bool],
+        limits: PeerLimits,
     ) -> None:
         self._clients = clients
         self._streams = streams
         self._routing = routing
         self._events = events
         self.known = known
+        self._most_topics = limits.awaited_topics
         self._topics: dict[ClientName, set[TopicName]] = {}
         self._heard: set[ClientName] = set()  # said what they want, to this run of the relay
 
@@ -73,7 +74,7 @@ class Awaited:
             source.reassembly.work_us += AWAIT_US
             self._clients.link(client, now)
             topics = self._topics.setdefault(client, set())
-            if len(topics) >= MAX_AWAITED_TOPICS and identity.topic not in topics:
+            if len(topics) >= self._most_topics and identity.topic not in topics:
                 continue
             topics.add(identity.topic)
             if self._routing.info(identity) is None or client in self._routing.subscribers(identity):
@@ -93,4 +94,4 @@ class Awaited:
         """Internal consistency, for tests."""
         for table in (self._topics, self._heard):
             assert all(client in clients for client in table), "something is kept for clients that are forgotten"
-        assert all(len(topics) <= MAX_AWAITED_TOPICS for topics in self._topics.values()), "too much is awaited"
+        assert all(len(topics) <= self._most_topics for topics in self._topics.values()), "too much is awaited"

@@ -72,7 +72,7 @@ class QueueBound:
         if excess_bytes > 0 and shed:
             excess_bytes = self._shed(link, channel, excess_bytes, now)
         if excess_bytes <= 0:
-            self._at_most_bytes = self.max_bytes + excess_bytes
+            self._at_most_bytes = float(self.max_bytes + excess_bytes)
             return True
         self._at_most_bytes = UNKNOWN
         self._full_until_s[priority] = now + FULL_S

@@ -10,7 +10,7 @@ from sern_core.relay.access import AccessTable, RateGuard
 from sern_core.relay.bound import QueueBound
 from sern_core.relay.hub_events import GuardedEvents
 from sern_core.relay.hub_port import HubPort
-from sern_core.stream.out_channel import LAPSED_A_SWEEP
+from sern_core.vocabulary.limits import PeerLimits
 from sern_core.vocabulary.types import ClientName
 from sern_core.wire import framing
 
@@ -30,8 +30,10 @@ class Clients:
         make_link: Callable[[ClientName, float], Link],
         *,
         resume_s: float,
+        limits: PeerLimits,
     ) -> None:
         self.access = access
+        self._limits = limits
         self._events = events
         self._make_link = make_link
         self.resume_s = resume_s
@@ -159,7 +161,7 @@ class Clients:
 
     def lapse(self, now: float) -> bool:
         """Retention goes on while clients are away. True: there is more to do."""
-        room = LAPSED_A_SWEEP  # for all together: each may have a little
+        room = self._limits.lapsed_a_sweep  # for all together: each may have a little
         for client in list(self._absent_since):
             link = self.links[client]
             if link.established:

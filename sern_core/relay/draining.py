@@ -10,11 +10,10 @@ from typing import Final
 from sern_core.link.link import Link
 from sern_core.stream.out_channel import OutChannel
 from sern_core.stream.prices import MESSAGE_OVERHEAD_BYTES
+from sern_core.vocabulary.limits import PeerLimits
 from sern_core.vocabulary.message import StreamId, StreamInfo
 from sern_core.vocabulary.types import ClientName, DropReason
 
-MAX_DRAINING: Final = 256
-"""Channels of one client; beyond that the longest ended are given up."""
 MAX_DRAINING_BYTES: Final = 32 * 2**20
 """Bytes of one client that wait in them, overhead included."""
 
@@ -24,8 +23,9 @@ Close = Callable[[ClientName, Link, OutChannel, DropReason, float], None]
 class Draining:
     """`close` ends a channel: its messages are dropped for a reason, and the client is told that the stream is gone."""
 
-    def __init__(self, close: Close) -> None:
+    def __init__(self, close: Close, limits: PeerLimits) -> None:
         self._close = close
+        self._most = limits.draining
         self._by_client: dict[ClientName, dict[StreamId, tuple[Link, OutChannel]]] = {}  # the longest ended first
 
     def __len__(self) -> int:
@@ -44,7 +44,7 @@ class Draining:
         bound_bytes = MAX_DRAINING_BYTES if max_bytes is None else min(max_bytes, MAX_DRAINING_BYTES)
         held_bytes = sum(_held_bytes(channel) for _link, channel in entries.values())
         for identity, (_link, channel) in list(entries.items()):
-            if len(entries) <= MAX_DRAINING and held_bytes <= bound_bytes:
+            if len(entries) <= self._most and held_bytes <= bound_bytes:
                 return
             held_bytes -= _held_bytes(channel)
             self._end(client, identity, DropReason.QUEUE_FULL, now)
@@ -97,7 +97,7 @@ class Draining:
         """Internal consistency, for tests. Returns the identities of the channels."""
         channels = set()
         for client, entries in self._by_client.items():
-            assert 0 < len(entries) <= MAX_DRAINING, f"{client}: {len(entries)} channels drain"
+            assert 0 < len(entries) <= self._most, f"{client}: {len(entries)} channels drain"
             assert sum(_held_bytes(channel) for _link, channel in entries.values()) <= MAX_DRAINING_BYTES, client
             for identity, (link, channel) in entries.items():
                 assert links.get(client) is link, f"{identity.topic} drains towards a link that is gone"

@@ -12,7 +12,7 @@ and so is one whose name is revoked.
 
 from collections import Counter, defaultdict
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Final
 
@@ -31,7 +31,7 @@ from sern_core.relay.object_control import apply_object
 from sern_core.relay.objects import ObjectRegistry
 from sern_core.relay.presence import Presence
 from sern_core.relay.relayed_streams import RelayedStreams
-from sern_core.relay.routing import BadPatternError, RouteChange, RoutingTable
+from sern_core.relay.routing import BadPatternError, RouteChange, RoutingLimits, RoutingTable
 from sern_core.relay.traces import Traces
 from sern_core.stream.in_stream import InStream
 from sern_core.stream.out_channel import OutChannel
@@ -54,10 +54,12 @@ MAX_SUBSCRIPTION_PARTS: Final = 64
 
 @dataclass(frozen=True, slots=True)
 class HubParams:
-    """`cache_bytes`: latched messages kept in all. `resume_s`: how long an absent client is waited for."""
+    """`cache_bytes`: latched messages kept in all. `resume_s`: how long an absent client is waited for. `routing`: what
+    one client may hold in the table of topics."""
 
     cache_bytes: int = 64 * 2**20
     resume_s: float = 600.0
+    routing: RoutingLimits = field(default_factory=RoutingLimits)
 
 
 class Hub:
@@ -73,10 +75,10 @@ class Hub:
         events: HubEvents,
         link: LinkParams,
         scheduler: SchedulerParams,
-        params: HubParams | None = None,
         wall_ns: Callable[[float], int],
-        traces: Traces | None = None,
         now: float,
+        params: HubParams | None = None,
+        traces: Traces | None = None,
         lossless: bool = True,
     ) -> None:
         self.name = name
@@ -96,13 +98,17 @@ class Hub:
         self.events = GuardedEvents(events)
         self.definitions = DefinitionStore()
         self.objects = ObjectRegistry(epoch=boot)
-        self.routing = RoutingTable(access)
+        self.routing = RoutingTable(access, limits=params.routing)
         self.matching = Matching(self.routing, self._subscribed, self._apply)
         self.local_owners: set[ClientName] = set()
         """Names under which the relay itself publishes; no client may have one of them."""
-        clients = self.clients = Clients(access, self.events, self._make_link, resume_s=params.resume_s)
+        clients = self.clients = Clients(
+            access, self.events, self._make_link, resume_s=params.resume_s, limits=link.limits
+        )
         self.links = clients.links
-        self.presence = Presence(clients.links, self.local_owners, self.matching.due_s, clients.attempt, self._was_read)
+        self.presence = Presence(
+            clients.links, self.local_owners, self.matching.due_s, clients.attempt, self._was_read, link.limits
+        )
         streams = self.streams = RelayedStreams(
             clients,
             self.routing,
@@ -112,6 +118,7 @@ class Hub:
             cache_bytes=params.cache_bytes,
             wall_ns=wall_ns,
             ended=self._own_ended,
+            limits=link.limits,
         )
         self.relayed = streams.by_id
         self.forwarding = Forwarding(name, clients, streams, self.objects, self.events)
@@ -119,7 +126,7 @@ class Hub:
         self.local = LocalStreams(
             boot, self.local_owners, clients.links, self.routing, self._numbering, streams, self.forwarding
         )
-        self.awaited = Awaited(clients, streams, self.routing, self.events, known)
+        self.awaited = Awaited(clients, streams, self.routing, self.events, known, link.limits)
 
     # --- how the parts hang together ------------------------------------------------------------------------------
 

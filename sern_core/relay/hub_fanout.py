@@ -8,18 +8,12 @@ the one before had: those channels are closed in slices too, and first.
 """
 
 from collections.abc import Callable, Sequence
-from typing import Final
 
 from sern_core.link.link import Link
 from sern_core.relay.hub_events import Relayed
-from sern_core.stream.in_stream import SLICE_US
 from sern_core.stream.out_channel import OutChannel
 from sern_core.vocabulary.message import StreamId
 from sern_core.vocabulary.types import ClientName
-
-CHANNEL_US: Final = 80
-CLOSE_US: Final = 30
-"""What a peer is charged with for each channel that is opened or closed for it, in microseconds."""
 
 Ending = tuple[Link, OutChannel]
 
@@ -53,21 +47,21 @@ class Fanout:
 
     def go_on(self, link: Link, *, now: float) -> bool:
         """One slice for the streams of a peer, as far as its account allows. True: nobody waits any more."""
-        reassembly = link.reassembly
+        reassembly, limits = link.reassembly, link.reassembly.limits
         ending = self._ending.get(link.peer)
         while ending:
-            if reassembly.work_us > SLICE_US:
+            if reassembly.work_us > reassembly.slice_us:
                 return False
-            reassembly.work_us += CLOSE_US
+            reassembly.work_us += limits.close_us
             identity, outs = next(iter(ending.items()))
             self.close(next(iter(outs)), identity, now=now)
         streams = self._by_origin.get(link.peer)
         while streams:
             identity, relayed = next(iter(streams.items()))
             while relayed.waiting:
-                if reassembly.work_us > SLICE_US:
+                if reassembly.work_us > reassembly.slice_us:
                     return False
-                reassembly.work_us += CHANNEL_US
+                reassembly.work_us += limits.channel_us
                 client = next(iter(relayed.waiting))
                 del relayed.waiting[client]
                 self._offer(client, identity, now)

@@ -104,14 +104,14 @@ class ObjectRegistry:
         owner: ClientName,
         kind: ObjectKind,
         type_name: str,
+        wall_ns: int,
+        now: float,
         definition: str = "",
         definition_hash: str = "",
         attributes: Mapping[str, str] | None = None,
         value: bytes | None = None,
         seq: int = 0,
         ros_stamp_ns: int | None = None,
-        wall_ns: int,
-        now: float,
     ) -> XrObject:
         """Create or replace an object; `value` None keeps the value that is there.
 

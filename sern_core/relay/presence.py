@@ -20,14 +20,13 @@ from math import ceil
 from typing import Final, NamedTuple, Protocol
 
 from sern_core.link.view import LinkView
+from sern_core.vocabulary.limits import PeerLimits
 from sern_core.vocabulary.types import ClientName
 from sern_core.wire import framing
 from sern_core.wire.announce import MAX_ASKED
 
 MAX_TOLD: Final = 24
 """Peers in one message: an envelope holds 4 KiB."""
-TOLD_AT_ONCE: Final = 500
-"""Messages in one turn of the loop: some milliseconds."""
 BACK_PAUSE_S: Final = 5.0
 """A client that is here again has so long to say what it has, before a client that looks for it is told that it has
 nothing there: that one would end what it shows of it, and begin again."""
@@ -104,12 +103,14 @@ class Presence:
         matching: Container[ClientName],
         attempt: Callable[[ClientName, float, Callable[[], object]], None],
         after: Callable[[], None],
+        limits: PeerLimits,
     ) -> None:
         self._links = links
         self._local = local
         self._matching = matching
         self._attempt = attempt
         self._after = after
+        self._told_at_once = limits.told_at_once
         self._taken: dict[ClientName, Counter[ClientName]] = {}  # streams that a client takes, by origin
         self._takers: dict[ClientName, set[ClientName]] = {}  # the same the other way round
         self._states: dict[ClientName, _State] = {}  # of those in `_takers`, as they were looked at last
@@ -190,7 +191,7 @@ class Presence:
 
     def tell(self, *, now: float) -> bool:
         """Say what is due. True: there may be more; call again in another turn."""
-        room = TOLD_AT_ONCE
+        room = self._told_at_once
         for client, watching in list(self._watchers.items()):
             if client in self._asked and client not in self._matching:
                 self._look_for(client, watching, now)

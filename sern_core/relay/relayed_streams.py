@@ -17,6 +17,7 @@ from sern_core.stream.in_stream import InStream
 from sern_core.stream.latched import ReplayStore, as_replays, newest_that_fit, waiting_bytes
 from sern_core.stream.out_channel import OutChannel
 from sern_core.vocabulary.errors import RefusedError, UsageError, WireError
+from sern_core.vocabulary.limits import PeerLimits
 from sern_core.vocabulary.message import Message, StreamId, StreamInfo
 from sern_core.vocabulary.types import ClientName, DropReason
 from sern_core.wire.announce import check_onwards
@@ -42,6 +43,7 @@ class RelayedStreams:
         cache_bytes: int,
         wall_ns: Callable[[float], int],
         ended: Callable[[Relayed, float], None],
+        limits: PeerLimits,
     ) -> None:
         self._clients = clients
         self._routing = routing
@@ -54,7 +56,7 @@ class RelayedStreams:
         self.by_id: dict[StreamId, Relayed] = {}
         self.replays = ReplayStore(cache_bytes)
         self.fanout = Fanout(self.offer, self._told, self._let_go)
-        self.draining = Draining(self._end_channel)
+        self.draining = Draining(self._end_channel, limits)
         self.tap: Callable[[StreamInfo], bool] = lambda _stream: False
         """Whether the relay itself wants a stream (a subscriber of the feed); set by the shell."""
         self._unsubscribed: OutChannel | None = None  # is being closed because its taker wants it no more
@@ -227,10 +229,10 @@ class RelayedStreams:
         try:
             replays = self.latched(link, relayed, first, now)
             channel = link.outgoing.open(stream, first=first, now=now, replays=replays)
-        except UsageError as error:
+        except UsageError as full:
             relayed.unopened.add(client)
-            self._events.refused(client, "too_many_streams", str(error))
-            said = {"t": "denied", "topic": identity.topic, "code": "too_many_streams", "why": str(error)[:400]}
+            self._events.refused(client, "too_many_streams", str(full))
+            said = {"t": "denied", "topic": identity.topic, "code": "too_many_streams", "why": str(full)[:400]}
             self._clients.tell(client, said, now)
         except Exception as error:  # noqa: BLE001  (of this client's link: the origin and the others go on)
             relayed.unopened.add(client)

@@ -8,7 +8,7 @@ Theory of operation
 - Patterns are matched once per (client, global name), whatever the number of streams and messages under that name, and
   only against names that the client may subscribe to.
 - A new stream is matched at once: it costs at most `MAX_CLIENT_PROGRAM` steps a character and client. A new interest,
-  which has all names before it, is worked out in slices of `SLICE_UNITS`: while `unfinished`, call `go_on`. Until a
+  which has all names before it, is worked out in slices: while `unfinished`, call `go_on`. Until a
   name's turn has come it stays as it was; what a client may no longer have is taken away at once.
 
 Names
@@ -38,8 +38,6 @@ RETIRED_BOOTS: Final = 8
 """Replaced boots remembered per client, against announcements that were still under way."""
 UNIT_S: Final = 4e-9
 """What one instruction of a pattern's program costs for one character at most, roughly: the unit of what follows."""
-SLICE_UNITS: Final = 2_000_000
-"""Matching that is done in one go."""
 NAME_UNITS: Final = 500
 """A look at one name, access included."""
 ROUTE_UNITS: Final = 20_000
@@ -67,6 +65,8 @@ class RoutingLimits:
     """What all patterns of a client may need together, in instructions of RE2."""
     max_all_streams: int = 60_000
     """What all clients may have together: what fits into the channel numbers of one that takes everything."""
+    slice_units: int = 2_000_000
+    """Matching that is done in one go."""
 
 
 class Match(NamedTuple):
@@ -463,7 +463,7 @@ class RoutingTable:
                 self.spent_units += ROUTE_UNITS
                 if takes:
                     self.spent_units += sum(map(self.route_units, self._topics[name].streams.values()))
-            if self.spent_units >= SLICE_UNITS:
+            if self.spent_units >= self._limits.slice_units:
                 return
         if not interest.patterns.texts and not interest.exact:
             del self._interests[client]

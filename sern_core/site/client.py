@@ -7,7 +7,7 @@ appear and which messages have their turn. Everything about bandwidth, order, re
 from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from typing import Final, ParamSpec, Protocol
+from typing import ParamSpec, Protocol
 
 from sern_core.bodies.codecs import CodecProfile, Coder
 from sern_core.link.definitions import DefinitionStore
@@ -33,9 +33,6 @@ P = ParamSpec("P")
 
 RELAY_NAME = ClientName("relay")
 """What the relay is called until its WELCOME says its own name."""
-
-MAX_RUNS_TOLD: Final = 1_000
-"""Runs of messages that are told of one by one: each is a line in a log."""
 
 
 class ClientEvents(Protocol):
@@ -107,8 +104,8 @@ class ClientCore:
         events: ClientEvents,
         link: LinkParams,
         scheduler: SchedulerParams,
-        trace: DecisionTrace | None = None,
         now: float,
+        trace: DecisionTrace | None = None,
         lossless: bool = True,
         coder: Coder | None = None,
     ) -> None:
@@ -116,6 +113,7 @@ class ClientCore:
         self.boot = boot
         self.events = events
         self.trace = trace or DecisionTrace(enabled=False)
+        self._runs_told = link.limits.runs_told
         self.definitions = DefinitionStore()
         self.received = ReceiveLedger()
         """Counters of what arrives, by topic: delivered, and dropped on arrival for a reason."""
@@ -166,9 +164,9 @@ class ClientCore:
         info: TopicInfo,
         spec: TopicSpec,
         *,
+        now: float,
         attributes: dict[str, str] | None = None,
         owed: tuple[ClientName, ...] = (),
-        now: float,
     ) -> OutChannel:
         """Offer a topic under its global name. Offering it again after `unpublish` goes on counting where it ended.
         `attributes` travel with its announcement. `owed`: of a reliable topic, clients that it is for: a relay that has
@@ -190,7 +188,7 @@ class ClientCore:
         self._latched.pop(channel.stream.id, None)
         self.link.outgoing.close(channel, DropReason.SHUTDOWN, now=now)
 
-    def send(self, channel: OutChannel, body: bytes, stamp_ns: int, *, born_s: float | None = None, now: float) -> bool:
+    def send(self, channel: OutChannel, body: bytes, stamp_ns: int, *, now: float, born_s: float | None = None) -> bool:
         """Offer one message. False: refused, the reliable queue is full; offer it again later or count it lost.
         `born_s`: when it was taken, if that was before `now`."""
         message = Message(channel.stream.id, channel.next_seq, body, stamp_ns, now if born_s is None else born_s)
@@ -253,10 +251,10 @@ class ClientCore:
         kind: ObjectKind,
         type_name: str,
         *,
-        attributes: dict[str, str] | None = None,
-        value: bytes = b"",
         wall_ns: int,
         now: float,
+        attributes: dict[str, str] | None = None,
+        value: bytes = b"",
     ) -> None:
         """Create or replace a cross-reality object of ours at the relay (node metadata, a transform, a patch)."""
         envelope: framing.Envelope = {
@@ -469,7 +467,7 @@ class ClientCore:
         """Called for the reliable message that is just being handed on: it is not confirmed before `release`."""
         self._held.setdefault(identity, {})[seq] = None
 
-    def release(self, identity: StreamId, seq: int, *, lost: DropReason | None = None, now: float) -> None:
+    def release(self, identity: StreamId, seq: int, *, now: float, lost: DropReason | None = None) -> None:
         """A message that was held has been dealt with, or was `lost` after all; then its origin is told."""
         held = self._held.get(identity)
         if held is None or seq not in held:
@@ -499,7 +497,7 @@ class ClientCore:
 
     def on_out_drop(self, link: Link, channel: OutChannel, outs: Sequence[OutMessage], reason: DropReason) -> None:
         runs = list(in_sequence(outs))
-        if channel.reliable and len(runs) > MAX_RUNS_TOLD:
+        if channel.reliable and len(runs) > self._runs_told:
             runs = [outs]  # what lies between was told before
         for run in runs:
             first, count = run[0], run[-1].seq - run[0].seq + 1

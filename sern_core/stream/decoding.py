@@ -127,9 +127,9 @@ class Decoder(Generic[Context]):
                 raw, elapsed_s = coder.decode(message.codec, message.body)
                 self._decoded(context, message, raw, elapsed_s, now)
                 return True
-        except CodecError as error:
+        except CodecError as undecodable:
             coder.undecodable += 1
-            self._failed(context, message, DropReason.UNDECODABLE, str(error), now)
+            self._failed(context, message, DropReason.UNDECODABLE, str(undecodable), now)
             return True
         except Exception as error:  # noqa: BLE001  (of one body, whatever a library makes of it)
             self._fault(error)

@@ -12,13 +12,9 @@ from operator import attrgetter
 from typing import Final
 
 from sern_core.vocabulary.errors import WireError
+from sern_core.vocabulary.limits import LIMITS, PeerLimits
 from sern_core.vocabulary.types import DropReason
 
-MAX_REPORTS: Final = 16_384
-"""Reports that one peer has not heard of. Above it, neighbours are one run whichever clients they name, and a peer that
-goes on sending without reading any is cut."""
-MAX_KEPT_REPORTS: Final = 8 * MAX_REPORTS
-"""The most reports that are kept for one peer. What would be one more is counted here like any drop, and not told."""
 UNREAD_S: Final = 10.0
 """How long a peer may go on sending while it reads none of the reports that were said in the session."""
 STEP_S: Final = 1.0
@@ -28,9 +24,10 @@ STEP_S: Final = 1.0
 class Unheard:
     """How much is to be reported to one peer, of all its streams, and whether it reads."""
 
-    __slots__ = ("_last_s", "_unread_s", "reports", "said")
+    __slots__ = ("_last_s", "_unread_s", "limits", "reports", "said")
 
-    def __init__(self) -> None:
+    def __init__(self, limits: PeerLimits = LIMITS) -> None:
+        self.limits = limits
         self.reports = 0
         self.said = 0  # of these, in the session
         self._unread_s = 0.0
@@ -38,7 +35,7 @@ class Unheard:
 
     @property
     def crowded(self) -> bool:
-        return self.reports > MAX_REPORTS
+        return self.reports > self.limits.reports
 
     def begin(self) -> None:
         """A session has begun: nothing was said in it."""
@@ -127,7 +124,7 @@ class DropReports:
             high += 1
         parts = self._joined(parts)
         more = len(parts) - (high - low)
-        if more > 0 and self._unheard.reports + more > MAX_KEPT_REPORTS:
+        if more > 0 and self._unheard.reports + more > self._unheard.limits.kept_reports:
             return
         unsaid[low:high] = parts
         self._unheard.reports += more

@@ -15,6 +15,7 @@ from typing import Final
 
 from sern_core.stream.drop_reports import DropReports, Unheard
 from sern_core.vocabulary.errors import WireError
+from sern_core.vocabulary.limits import LIMITS, PeerLimits
 from sern_core.vocabulary.message import Message, StreamInfo
 from sern_core.vocabulary.types import DROP_CODES, DROP_REASONS, DropReason, PriorityClass
 from sern_core.wire.framing import FLAG_REPLAY, FLAG_TOMBSTONE, Datagram
@@ -36,8 +37,6 @@ PIECES_INCLUDED: Final = 4
 HELD_OVERHEAD_BYTES: Final = 1024
 """What a half-received or waiting message counts for beside its body: without it, small ones could fill the memory. It
 is more than they take, since a peer ends all of them at a word, in one turn of the loop."""
-SLICE_US: Final = 6000
-"""What reading may cost before others get their turn, in microseconds as they are charged here and by the owner."""
 TURN_US: Final = 4
 """A message that waited and has its turn, without what its owner does with it."""
 STALE_US: Final = 1
@@ -154,16 +153,18 @@ class Partial:
 class Reassembly:
     """Memory that half-received and waiting messages of one link may hold in all, and how much is to be reported."""
 
-    __slots__ = ("behind", "held_bytes", "holders", "latest", "limit_bytes", "unheard", "work_us")
+    __slots__ = ("behind", "held_bytes", "holders", "latest", "limit_bytes", "limits", "slice_us", "unheard", "work_us")
 
-    def __init__(self, limit_bytes: int) -> None:
-        self.unheard = Unheard()
+    def __init__(self, limit_bytes: int, limits: PeerLimits = LIMITS) -> None:
+        self.limits = limits
+        self.slice_us = limits.slice_us
+        self.unheard = Unheard(limits)
         self.limit_bytes = limit_bytes
         self.held_bytes = 0
         self.holders: OrderedDict[InStream, None] = OrderedDict()
         """Best-effort streams with half-received messages, untouched for longest first."""
         self.latest: InStream | None = None  # the last of them
-        self.work_us = 0  # what the reading under way has cost so far
+        self.work_us = 0  # what the reading under way has cost so far; more than `slice_us` is enough
         self.behind: OrderedDict[InStream, None] = OrderedDict()
         """Streams with messages whose turn has come; nothing else is read before they have had it."""
 
@@ -444,7 +445,7 @@ class InStream:
                 if not order or order[0] != self.delivered + 1:
                     reassembly.behind.pop(self, None)
                     return
-            if reassembly.work_us > SLICE_US:
+            if reassembly.work_us > reassembly.slice_us:
                 reassembly.behind[self] = None
                 return
             if stale:

@@ -12,7 +12,6 @@ from bisect import insort
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from math import inf
-from typing import Final
 
 from sern_core.stream.coding import ChannelCodec
 from sern_core.stream.gate import Gate
@@ -23,11 +22,9 @@ from sern_core.stream.out_message import OutMessage
 from sern_core.stream.prices import CLEARED_PER_US, CLIENT_OVERHEAD_BYTES, GIVEN_UP_US
 from sern_core.stream.transit import Transit
 from sern_core.vocabulary.ledger import SendCounters
+from sern_core.vocabulary.limits import LIMITS
 from sern_core.vocabulary.message import Message, StreamInfo
 from sern_core.vocabulary.types import DropReason
-
-LAPSED_A_SWEEP: Final = 1_000
-"""Messages of a link that are given up in one sweep: some milliseconds."""
 
 
 class OutChannel:
@@ -290,7 +287,7 @@ class OutChannel:
         """Give up reliable message `seq`; a tombstone stays. False: it has been begun, or is not here."""
         return self._all is not None and self._all.abandon(seq, reason)
 
-    def sweep(self, now: float, *, up: bool, room: int = LAPSED_A_SWEEP) -> int:
+    def sweep(self, now: float, *, up: bool, room: int = LIMITS.lapsed_a_sweep) -> int:
         """Expire what nobody will send: lifespan and retention, also while the link is down.
 
         Of a reliable stream at most `room` messages are given up; `SEEN_PER_LAPSED` that are looked at and stay count

@@ -147,7 +147,8 @@ class BodyWriter:
         self._parts.append(data)
         self._size += len(data)
 
-    def _number(self, code: str, value: float, size: int) -> None:
+    def _number(self, code: str, value: object, size: int) -> None:
+        """`object`: as a float an integer would not stay one in compiled code."""
         try:
             self._put(_FORMATS["<"][code].pack(value), size)
         except (struct.error, OverflowError):

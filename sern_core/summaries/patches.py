@@ -135,7 +135,7 @@ class PatchMaker:
         """Something was lost on its way: the next grid goes whole."""
         self._last = None
 
-    def change(self, body: bytes, *, whole: bool = False, now: float) -> Change:
+    def change(self, body: bytes, *, now: float, whole: bool = False) -> Change:
         """The messages for one more OccupancyGrid body. `whole`: send it whole in any case. BodyError."""
         grid = read_grid(body, self._encoding)
         last, params = self._last, self.params

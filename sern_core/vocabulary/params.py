@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 
 from sern_core.vocabulary.errors import UsageError
+from sern_core.vocabulary.limits import PeerLimits
 from sern_core.vocabulary.message import DEFAULT_RETENTION_S
 from sern_core.vocabulary.types import Ordering
 
@@ -91,6 +92,8 @@ class LinkParams:
     """Second copies of class control, a few milliseconds behind the first; what arrives twice counts once."""
     max_message_bytes: int = 16 * 2**20
     """Larger messages are dropped with reason `too_large`; also the receiver's reassembly limit a message."""
+    limits: PeerLimits = field(default_factory=PeerLimits)
+    """What the peer may cost."""
 
     def __post_init__(self) -> None:
         for name, ok in (

@@ -52,6 +52,9 @@ from sern_core.vocabulary.errors import VersionError, WireError
 MAGIC: Final = 0x53
 VERSION_MIN: Final = 1
 VERSION_MAX: Final = 1
+Versions = tuple[int, int]
+"""The oldest and the newest wire version that a side speaks."""
+VERSIONS: Final[Versions] = (VERSION_MIN, VERSION_MAX)
 """The wire versions this code speaks; peers agree on the highest common one at hello."""
 HANDSHAKE_VERSION: Final = 1
 """Version byte of every handshake datagram, for ever: a peer must be able to read the HELLO that offers its version."""
@@ -154,8 +157,9 @@ def encode_header(kind: int, tag: int, number: int, stamp_us: int, *, version: i
     return HEADER.pack(MAGIC, version, kind, tag, number, stamp_us & 0xFFFFFFFFFFFFFFFF)
 
 
-def decode_header(data: bytes) -> Header:
-    """Split off and check the header of any datagram. Raises WireError, or VersionError for an unknown version."""
+def decode_header(data: bytes, versions: Versions = VERSIONS) -> Header:
+    """Split off and check the header of any datagram. Raises WireError, or VersionError for a version that is none of
+    `versions`."""
     if len(data) < HEADER_BYTES:
         raise WireError(f"datagram of {len(data)} bytes is shorter than its {HEADER_BYTES}-byte header")
     if len(data) > MAX_DATAGRAM_BYTES:
@@ -166,8 +170,8 @@ def decode_header(data: bytes) -> Header:
     if kind in _HANDSHAKE_KINDS:
         if version != HANDSHAKE_VERSION:
             raise VersionError(f"handshake with version byte {version}; it is {HANDSHAKE_VERSION} in every version")
-    elif not VERSION_MIN <= version <= VERSION_MAX:
-        raise VersionError(f"wire version {version} is unknown here; this side speaks {VERSION_MIN} to {VERSION_MAX}")
+    elif not versions[0] <= version <= versions[1]:
+        raise VersionError(f"wire version {version} is unknown here; this side speaks {versions[0]} to {versions[1]}")
     elif kind != Kind.DATA:
         raise WireError(f"unknown datagram kind {kind}")
     return Header(version, kind, tag, number, stamp_us)
@@ -309,8 +313,13 @@ def encode_envelope(envelope: Envelope) -> bytes:
     return packed
 
 
-class _Map(list[tuple[bytes, object]]):
+class _Map:
     """A map as it is on the wire, in order and with whatever keys it repeats."""
+
+    __slots__ = ("pairs",)
+
+    def __init__(self, pairs: list[tuple[bytes, object]]) -> None:
+        self.pairs = pairs
 
 
 def decode_envelope(data: bytes) -> Envelope:
@@ -356,11 +365,11 @@ def _plain(value: object, depth: int) -> object:
             result = {
                 key.decode(): item.decode() if type(item) is bytes else item if type(item) in _PLAIN
                 else _plain(item, depth - 1)
-                for key, item in value
+                for key, item in value.pairs
             }  # fmt: skip
         except UnicodeDecodeError:
             raise WireError("text in an envelope is not UTF-8") from None
-        if len(result) != len(value):
+        if len(result) != len(value.pairs):
             raise WireError("an envelope repeats a key")
         return result
     if isinstance(value, list):
@@ -426,9 +435,9 @@ def take_float(envelope: Envelope, key: str, *, low: float, high: float, default
 
 
 _UNPRINTABLE: Final = re.compile(
-    "[\x00-\x1f\x7f-\xa0\xad\u0600-\u0605\u061c\u06dd\u070f\u0890\u0891\u08e2\u1680\u180e\u2000-\u200f\u2028-\u202f\u205f-\u206f"
-    "\u3000\ud800-\uf8ff\ufeff\ufff0-\ufffb\ufffe\uffff\U000110bd\U000110cd\U00013430-\U0001343f\U0001bca0-\U0001bca3"
-    "\U0001d173-\U0001d17a\U000e0000-\U000e00ff\U000f0000-\U0010ffff]"
+    r"[\x00-\x1f\x7f-\xa0\xad\u0600-\u0605\u061c\u06dd\u070f\u0890\u0891\u08e2\u1680\u180e\u2000-\u200f\u2028-\u202f\u205f-\u206f"
+    r"\u3000\ud800-\uf8ff\ufeff\ufff0-\ufffb\ufffe\uffff\U000110bd\U000110cd\U00013430-\U0001343f\U0001bca0-\U0001bca3"
+    r"\U0001d173-\U0001d17a\U000e0000-\U000e00ff\U000f0000-\U0010ffff]"
 )
 """Control and format characters, spaces other than the usual one, surrogates, private use. A list of our own:
 `str.isprintable` knows other characters in every version of Python, and what a relay takes every receiver must."""
@@ -441,12 +450,10 @@ def _is_text(value: object, max_length: int) -> bool:
 
 def _are_texts(values: list[object], max_length: int) -> bool:
     """`_is_text` of each: they are searched as one, since a list of names is most of what tells who wants a stream."""
+    if not all(type(text) is str for text in values):
+        return False
     texts = cast(list[str], values)
-    return (
-        all(type(text) is str for text in texts)
-        and max(map(len, texts), default=0) <= max_length
-        and _UNPRINTABLE.search("".join(texts)) is None
-    )
+    return max(map(len, texts), default=0) <= max_length and _UNPRINTABLE.search("".join(texts)) is None
 
 
 def take_str(envelope: Envelope, key: str, *, max_length: int = 512, default: str | None = None) -> str:
@@ -498,11 +505,12 @@ def decode_handshake(data: bytes) -> Envelope:
     return decode_envelope(data[HEADER_BYTES:])
 
 
-def agree_version(low: int, high: int) -> int:
-    """The highest wire version both sides speak. Raises VersionError naming both ranges."""
-    best = min(high, VERSION_MAX)
-    if best < max(low, VERSION_MIN):
+def agree_version(low: int, high: int, versions: Versions = VERSIONS) -> int:
+    """The highest wire version that both speak: the peer `low` to `high`, this side `versions`. Raises VersionError
+    naming both ranges."""
+    best = min(high, versions[1])
+    if best < max(low, versions[0]):
         raise VersionError(
-            f"the peer speaks wire versions {low} to {high}, this side {VERSION_MIN} to {VERSION_MAX}: update the older"
+            f"the peer speaks wire versions {low} to {high}, this side {versions[0]} to {versions[1]}: update the older"
         )
     return best

@@ -9,12 +9,13 @@ import pytest
 from sern_client import latest
 from sern_client.endpoints.common import first
 from sern_client.endpoints.ros1 import Ros1Options, hold
-from sern_core.link import control_stream, definitions, owed_lists
+from sern_core.link import control_stream, definitions
 from sern_core.relay import access, awaited, draining, routing
 from sern_core.relay.object_values import ObjectLimits
 from sern_core.site import peers
 from sern_core.stream import decoding, drop_reports, in_stream, latched, prices
 from sern_core.vocabulary import ledger
+from sern_core.vocabulary.limits import LIMITS
 from sern_core.wire import numbering
 from sern_relay import server, transforms
 from sern_runtime import express, feed_inflow, feed_subscriptions
@@ -50,21 +51,21 @@ BOUNDS: Final[dict[str, tuple[str, ...]]] = {
     "patterns and names subscribed to": (f"{ROUTING.max_patterns} and {ROUTING.max_exact:,}",),
     "parts of an unfinished subscription": (
         f"{ROUTING.max_exact:,} patterns",
-        f"{owed_lists.MAX_OWED:,} names",
+        f"{LIMITS.owed:,} names",
     ),
     "definitions (": (
-        nbytes(definitions.MAX_PEER_DEFINITION_BYTES),
+        nbytes(LIMITS.peer_definition_bytes),
         f"{definitions.MAX_DEFINITIONS:,} texts",
         f"{definitions.LINGERING_TEXTS} texts ({nbytes(definitions.LINGERING_BYTES)})",
     ),
     "definitions asked for": (f"{definitions.MAX_PEER_DEFINITIONS:,} that nobody",),
     "reports of drops": (
-        f"{drop_reports.MAX_KEPT_REPORTS:,} runs",
-        f"above {drop_reports.MAX_REPORTS:,} runs",
+        f"{LIMITS.kept_reports:,} runs",
+        f"above {LIMITS.reports:,} runs",
         f"for {drop_reports.UNREAD_S:g} s",
     ),
     "control messages to a client": (
-        f"{control_stream.MAX_UNHEARD:,} answers",
+        f"{LIMITS.unheard:,} answers",
         f"{nbytes(control_stream.MAX_TOLD_BYTES)} + {nbytes(control_stream.MAX_TOLD_CHANNEL_BYTES)} a channel",
     ),
     "objects (": (
@@ -73,7 +74,7 @@ BOUNDS: Final[dict[str, tuple[str, ...]]] = {
     ),
     "large values of objects": (f"{nbytes(OBJECTS.max_held_per_owner)}, of {nbytes(OBJECTS.max_held_bytes)} in all",),
     "transforms as objects": (f"{transforms.MAX_PAIRS:,} pairs", f"{transforms.MAX_WAITING} messages"),
-    "clients that are waited for": (f"{awaited.MAX_AWAITED_CLIENTS:,};", f"{awaited.MAX_AWAITED_TOPICS:,} each"),
+    "clients that are waited for": (f"{awaited.MAX_AWAITED_CLIENTS:,};", f"{LIMITS.awaited_topics:,} each"),
     "boots of a client": (f"| {routing.RETIRED_BOOTS} |",),
     "numbers of streams": (f"{numbering.MAX_ENDED:,},",),
     "counters by topic": (f"{ledger.MAX_TOPICS:,} ",),
@@ -94,7 +95,7 @@ TIMES: Final = {
     "docs/operations.md": (
         f"`replay.resume_s`, {default(ReplaySection, 'resume_s') // 60} minutes",
         f"of more than {peers.MAX_GIVEN_UP} such clients",
-        f"than {draining.MAX_DRAINING} of them or {nbytes(draining.MAX_DRAINING_BYTES)}",
+        f"than {LIMITS.draining} of them or {nbytes(draining.MAX_DRAINING_BYTES)}",
     ),
 }
 

@@ -8,6 +8,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from sern_core.vocabulary.errors import VersionError, WireError
+from sern_core.vocabulary.params import LinkParams
 from sern_core.vocabulary.types import PriorityClass
 from sern_core.wire import framing
 from sern_core.wire.announce import Announcement, decode_announcement, definition_hash, encode_announcement
@@ -152,8 +153,8 @@ def test_what_is_rejected_stays_so_with_more_behind_it(name: str) -> None:
 class Duet:
     """A relay core with a client core in a session, joined by hand; every datagram between them is kept."""
 
-    def __init__(self) -> None:
-        world = World()
+    def __init__(self, params: LinkParams | None = None) -> None:
+        world = World(link=params)
         self.now = 0.0
         self.hub = world.relay.hub
         self.robot = world.client("robot", patterns=[".*"])

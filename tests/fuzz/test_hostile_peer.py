@@ -7,15 +7,14 @@ from typing import Any, Final
 
 import pytest
 
-from sern_core.link import control_stream, definitions, handshake
-from sern_core.relay import awaited
+from sern_core.link import handshake
 from sern_core.vocabulary.errors import WireError
 from sern_core.vocabulary.message import StreamId, StreamInfo, TopicInfo
 from sern_core.vocabulary.types import ClientName, Encoding, PriorityClass, TopicName
 from sern_core.wire import framing
 from sern_core.wire.announce import Announcement, definition_hash, encode_announcement
 from tests.fuzz.test_fuzz_wire import Duet
-from tests.world import World, spec
+from tests.world import World, limited, spec
 
 
 class Hostile:
@@ -328,10 +327,8 @@ ALLOWED_BYTES: Final = 18 * 2**20
 
 
 @pytest.mark.parametrize("name", ATTACKS)
-def test_state_stays_bounded(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(control_stream, "MAX_UNHEARD", 300)
-    monkeypatch.setattr(definitions, "MAX_PEER_DEFINITION_BYTES", 2 * 2**20)
-    peer = Hostile()
+def test_state_stays_bounded(name: str) -> None:
+    peer = Hostile(World(link=limited(unheard=300, peer_definition_bytes=2 * 2**20)))
     gc.collect()
     tracemalloc.start()
     try:
@@ -397,9 +394,8 @@ def test_a_client_that_connects_again_and_again_has_its_session_each_time() -> N
         assert link.end.tag == index + 2 and link.established
 
 
-def test_origins_cannot_have_any_number_of_streams_kept_for_an_absent_client(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(awaited, "MAX_AWAITED_TOPICS", 50)
-    peer = Hostile()
+def test_origins_cannot_have_any_number_of_streams_kept_for_an_absent_client() -> None:
+    peer = Hostile(World(link=limited(awaited_topics=50)))
     for index in range(100):
         peer.announce(1, f"/robot/t{index}", reliable=True, owed=("absent",))
         peer.control({"t": "retract", "ch": 1})
@@ -407,10 +403,9 @@ def test_origins_cannot_have_any_number_of_streams_kept_for_an_absent_client(mon
     peer.hub.validate()
 
 
-def test_an_honest_peer_is_not_taken_for_a_hostile_one(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_honest_peer_is_not_taken_for_a_hostile_one() -> None:
     """One that reads what it is told may ask for ever."""
-    monkeypatch.setattr(control_stream, "MAX_UNHEARD", 10)
-    duet = Duet()
+    duet = Duet(limited(unheard=10))
     for index in range(100):
         duet.site.core.subscribe((".*",) if index % 2 else (), now=duet.now)
         duet.settle(0.05)

@@ -2,7 +2,8 @@
 
 import pytest
 
-from sern_core.stream.drop_reports import MAX_KEPT_REPORTS, DropReports
+from sern_core.stream.drop_reports import DropReports
+from sern_core.vocabulary.limits import LIMITS
 from sern_core.vocabulary.types import DROP_CODES, DropReason, PriorityClass
 from sern_core.wire import framing
 from tests.fuzz.price import Input, Make, within_budget
@@ -11,7 +12,7 @@ from tests.fuzz.test_price_datagrams import control, filled, one_more_slice, sai
 from tests.world import World
 
 BACKLOG = 3_200
-FIRST = 2 * MAX_KEPT_REPORTS
+FIRST = 2 * LIMITS.kept_reports
 LOST = DROP_CODES[DropReason.LOST]
 
 
@@ -33,7 +34,7 @@ def crowded(*, first: int = FIRST) -> tuple[Hostile, Hostile, DropReports]:
         stream.reports.add(seq, DropReason.LOST, "site")
     for seq in range(FIRST + BACKLOG, FIRST + BACKLOG + 10, 2):
         stream.reports.add(seq, DropReason.LOST, "site")
-    assert link.reassembly.unheard.reports == len(stream.reports) == MAX_KEPT_REPORTS
+    assert link.reassembly.unheard.reports == len(stream.reports) == LIMITS.kept_reports
     return reader, origin, stream.reports
 
 
@@ -52,7 +53,7 @@ def of_one_each() -> Input:
     def rest() -> bool:
         more = one_more_slice(reader)
         assert more or sum(out.counted for out in channel.retained) == len(frames)
-        assert len(reports) == MAX_KEPT_REPORTS
+        assert len(reports) == LIMITS.kept_reports
         return more
 
     return Input(sum(map(len, frames)), lambda: reader.say(*frames), rest=rest)
@@ -67,7 +68,7 @@ def of_a_run_that_holds_many() -> Input:
 
     def rest() -> bool:
         more = one_more_slice(reader)
-        assert more or len(reports) == MAX_KEPT_REPORTS - BACKLOG // 2 + 1
+        assert more or len(reports) == LIMITS.kept_reports - BACKLOG // 2 + 1
         return more
 
     return Input(len(frame), lambda: reader.say(frame), rest=rest)

@@ -113,6 +113,7 @@ async def test_a_wrong_question_is_answered_in_one_line(tmp_path: Path, paramete
         assert await ask(relay, **parameters) == (400, {"error": said})
 
 
+@pytest.mark.interpreted
 async def test_an_encoded_cloud_is_decoded_beside_the_loop_when_somebody_asks(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

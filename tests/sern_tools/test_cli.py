@@ -3,6 +3,12 @@
 import signal
 import subprocess
 import sys
+from importlib.metadata import version
+from pathlib import Path
+
+import pytest
+
+import sern_core.link.link
 
 INTERRUPTED_AT = """
 import os, signal, sys
@@ -26,3 +32,13 @@ def test_ctrl_c_during_the_imports_is_an_end_without_a_traceback() -> None:
             [sys.executable, "-P", "-c", program], capture_output=True, text=True, timeout=120, check=False
         )
         assert (done.returncode, done.stdout, done.stderr) == (-signal.SIGINT, "", "")
+
+
+@pytest.mark.parametrize("program", ["sern", "sern-relay", "sern-client"])
+def test_each_program_says_its_version_and_whether_its_core_is_compiled(program: str) -> None:
+    done = subprocess.run(
+        [Path(sys.executable).with_name(program), "--version"], capture_output=True, text=True, timeout=120, check=False
+    )
+    source = Path(sern_core.link.link.__file__).suffix == ".py"
+    core = "plain Python" if source else "compiled"
+    assert (done.returncode, done.stdout, done.stderr) == (0, f"{program} {version('sern')}, {core} core\n", "")

@@ -32,7 +32,7 @@ from sern_core.path.congestion.company import Drain, Rival
 from sern_core.path.congestion.growth import Growth
 from sern_core.path.congestion.link_rate import LinkRate, Slowdown
 from sern_core.path.congestion.losses import Losses
-from sern_core.path.congestion.mode import TRANSITIONS, Event, Mode
+from sern_core.path.congestion.mode import STARTUP, TRANSITIONS, Event
 from sern_core.path.congestion.pace import Pace
 from sern_core.path.congestion.params import DEFAULT_HYBRID, HybridParams
 from sern_core.path.congestion.parts import Cubic, Eased
@@ -59,7 +59,7 @@ class HybridWindow(CapacityEstimator):
 
     def _begin(self) -> None:
         params = self._params
-        self._mode = Mode.STARTUP
+        self._mode = STARTUP
         self._window = float(self._initial_bytes)
         self._fragment = float(self._first_fragment_bytes)
         self._rate = LinkRate(params)

@@ -10,28 +10,28 @@ STARTUP_BESIDE   DRAIN               COMPETE_DRAIN
 from collections.abc import Mapping
 from enum import Enum, auto
 from types import MappingProxyType
-from typing import Final
+from typing import Final, NamedTuple
 
 
-class Mode(Enum):
+class Mode(NamedTuple):
     """What the window is doing. While it competes a rival keeps the queue, and the window follows CUBIC."""
 
-    STARTUP = (True, False, False)
+    starting: bool
     """It goes where the trains of packets point."""
-    STEADY = (False, False, False)
-    """It follows the queue."""
-    DRAIN = (False, True, False)
-    """It makes way for a round trip, to see the path empty."""
-    COMPETE = (False, False, True)
-    COMPETE_DRAIN = (False, True, True)
-    """It makes way, to see whether the rival has gone."""
-    STARTUP_BESIDE = (True, False, True)
-    """It started again before a queue was judged that was found to be a rival's."""
+    draining: bool
+    """It makes way for a round trip, to see the path empty; while it competes, whether the rival has gone."""
+    competing: bool
 
-    def __init__(self, starting: bool, draining: bool, competing: bool) -> None:
-        self.starting = starting
-        self.draining = draining
-        self.competing = competing
+
+STEADY: Final = Mode(starting=False, draining=False, competing=False)
+"""It follows the queue."""
+STARTUP: Final = Mode(starting=True, draining=False, competing=False)
+DRAIN: Final = Mode(starting=False, draining=True, competing=False)
+COMPETE: Final = Mode(starting=False, draining=False, competing=True)
+COMPETE_DRAIN: Final = Mode(starting=False, draining=True, competing=True)
+STARTUP_BESIDE: Final = Mode(starting=True, draining=False, competing=True)
+"""It started again before a queue was judged that was found to be a rival's."""
+MODES: Final = (STEADY, STARTUP, DRAIN, COMPETE, COMPETE_DRAIN, STARTUP_BESIDE)
 
 
 class Event(Enum):
@@ -50,12 +50,12 @@ class Event(Enum):
 
 TRANSITIONS: Final[Mapping[Event, Mapping[Mode, Mode]]] = MappingProxyType(
     {
-        Event.RESTART: dict.fromkeys(Mode, Mode.STARTUP),
-        Event.FILLED: {Mode.STARTUP: Mode.STEADY, Mode.STARTUP_BESIDE: Mode.COMPETE},
-        Event.MAKE_WAY: {Mode.STEADY: Mode.DRAIN, Mode.COMPETE: Mode.COMPETE_DRAIN},
-        Event.MADE_WAY: {Mode.DRAIN: Mode.STEADY, Mode.COMPETE_DRAIN: Mode.COMPETE},
-        Event.RIVAL: {Mode.STEADY: Mode.COMPETE, Mode.STARTUP: Mode.STARTUP_BESIDE},
-        Event.RIVAL_GONE: {Mode.COMPETE: Mode.STEADY, Mode.STARTUP_BESIDE: Mode.STARTUP},
+        Event.RESTART: dict.fromkeys(MODES, STARTUP),
+        Event.FILLED: {STARTUP: STEADY, STARTUP_BESIDE: COMPETE},
+        Event.MAKE_WAY: {STEADY: DRAIN, COMPETE: COMPETE_DRAIN},
+        Event.MADE_WAY: {DRAIN: STEADY, COMPETE_DRAIN: COMPETE},
+        Event.RIVAL: {STEADY: COMPETE, STARTUP: STARTUP_BESIDE},
+        Event.RIVAL_GONE: {COMPETE: STEADY, STARTUP_BESIDE: STARTUP},
     }
 )
 """The mode after an event, by the mode before it. What is not here cannot happen."""

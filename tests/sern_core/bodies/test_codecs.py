@@ -187,6 +187,7 @@ def test_a_coder_measures_with_the_clock_it_is_given() -> None:
     assert coder.decode(encoded.codec, encoded.body) == (TEXT, 1.0)
 
 
+@pytest.mark.interpreted
 def test_a_fault_of_a_codec_is_told_and_costs_one_body(monkeypatch: pytest.MonkeyPatch) -> None:
     """Whatever a library raises: what is to be encoded goes as it is, what is to be decoded is undecodable."""
     from sern_core.bodies import codecs

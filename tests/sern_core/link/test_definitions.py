@@ -4,15 +4,15 @@ from random import Random
 
 import pytest
 
-from sern_core.link import definitions
 from sern_core.link.definitions import LINGERING_TEXTS, DefinitionStore, PeerDefinitions
 from sern_core.vocabulary.errors import WireError
+from sern_core.vocabulary.limits import LIMITS
 from sern_core.vocabulary.types import ClientName
 from sern_core.wire import framing
 from sern_core.wire.announce import definition_hash
 from tests.exploring import seeds
 from tests.fuzz.test_hostile_peer import Hostile
-from tests.world import World, spec
+from tests.world import World, limited, spec
 
 
 def test_texts_go_with_the_streams_that_use_them() -> None:
@@ -81,9 +81,8 @@ def test_what_a_client_had_kept_is_gone_however_often_it_comes_back() -> None:
     peer.hub.validate()
 
 
-def test_what_the_streams_of_a_client_use_has_a_bound(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(definitions, "MAX_PEER_DEFINITION_BYTES", 10_000)
-    peer = Hostile()
+def test_what_the_streams_of_a_client_use_has_a_bound() -> None:
+    peer = Hostile(World(link=limited(peer_definition_bytes=10_000)))
 
     def define(index: int) -> None:
         text = f"#{index}".ljust(2_000)
@@ -122,7 +121,9 @@ def test_a_text_that_comes_too_late_is_not_kept() -> None:
 def test_uses_add_up_whatever_happens(seed: int) -> None:
     random = Random(seed)
     store = DefinitionStore()
-    links = [PeerDefinitions(store, ClientName(f"peer{index}")) for index in range(3)]
+    links = [
+        PeerDefinitions(store, ClientName(f"peer{index}"), max_bytes=LIMITS.peer_definition_bytes) for index in range(3)
+    ]
     texts = {definition_hash(text): text for text in (f"uint8 x{index}\n" for index in range(12))}
     for _ in range(2_000):
         link = random.choice(links)

@@ -7,18 +7,19 @@ from typing import Any
 
 import pytest
 
-from sern_core.link import owed_lists
 from sern_core.link.interest import PAUSE_MAX_S, Interest
 from sern_core.stream.in_stream import InStream, Reassembly
 from sern_core.vocabulary.errors import WireError
+from sern_core.vocabulary.limits import LIMITS
 from sern_core.vocabulary.message import StreamId, StreamInfo, TopicInfo
+from sern_core.vocabulary.params import LinkParams
 from sern_core.vocabulary.types import ClientName, Encoding, TopicName
 from sern_core.wire import framing
 from sern_core.wire.announce import MAX_STRINGS, decode_want
 from tests.exploring import seeds
 from tests.fuzz.test_hostile_peer import Hostile, subscriber_of
 from tests.make_vectors import Frames
-from tests.world import SimClient, World, spec
+from tests.world import SimClient, World, limited, spec
 
 ROBOT_BYTES = 2000
 """What a hundred plain subscribers may cost a robot."""
@@ -207,9 +208,9 @@ def test_a_relay_keeps_no_names_that_a_subscriber_says_it_owes() -> None:
     assert [(channel.wanted, channel.owed) for channel in channels] == [(True, ())] * 3
 
 
-def told_robot(topics: int) -> tuple[SimClient, Callable[[framing.Envelope], None]]:
+def told_robot(topics: int, link: LinkParams | None = None) -> tuple[SimClient, Callable[[framing.Envelope], None]]:
     """A client with reliable topics, and what says a control message of the relay to it."""
-    world = World()
+    world = World(link=link)
     robot = world.client("robot")
     for index in range(topics):
         robot.publish(f"/robot/log{index}", spec(reliable=True))
@@ -233,9 +234,8 @@ def test_channels_that_are_owed_alike_share_one_list() -> None:
     assert len({id(channel.owed) for channel in channels}) == 1
 
 
-def test_lists_that_are_finished_leave_room_for_others(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(owed_lists, "MAX_OWED", 10)
-    robot, tell = told_robot(1)
+def test_lists_that_are_finished_leave_room_for_others() -> None:
+    robot, tell = told_robot(1, limited(owed=10))
     channel = next(iter(robot.core.link.sender.channels.values()))
     for row in range(5):
         names = [f"site{row}{index}" for index in range(6)]
@@ -251,10 +251,10 @@ def test_lists_that_are_finished_leave_room_for_others(monkeypatch: pytest.Monke
 def test_a_stream_is_owed_to_no_more_names_than_fit() -> None:
     robot, tell = told_robot(1)
     channel = next(iter(robot.core.link.sender.channels.values()))
-    names = [f"site{index}" for index in range(owed_lists.MAX_OWED)]
+    names = [f"site{index}" for index in range(LIMITS.owed)]
     for start in range(0, len(names), MAX_STRINGS):
         tell({"t": "want", "ch": channel.slot, "on": True, "add": names[start : start + MAX_STRINGS]})
-    assert len(channel.owed) == owed_lists.MAX_OWED
+    assert len(channel.owed) == LIMITS.owed
     with pytest.raises(WireError, match="owes a stream to more than"):
         tell({"t": "want", "ch": channel.slot, "on": True, "add": ["one_more"]})
 

@@ -2,21 +2,19 @@
 
 import pytest
 
-from sern_core.link import reading, receiver, streams_in
 from sern_core.link.link import Link
-from sern_core.stream import in_stream
 from sern_core.stream.in_stream import InStream
 from sern_core.wire import framing
 from tests.fuzz.test_hostile_peer import Hostile, _whole
 from tests.sern_core.system.test_reports import said
+from tests.world import World, limited
 
 
+@pytest.mark.interpreted
 def test_a_stream_that_nobody_wants_is_not_told_of_again_as_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
     """What is left out is told once it is done. A stream that is forgotten meanwhile has nothing left to be told of,
     also when it goes on in slices the next time."""
-    for module in (in_stream, reading, receiver, streams_in):
-        monkeypatch.setattr(module, "SLICE_US", 5)
-    peer = Hostile()
+    peer = Hostile(World(link=limited(slice_us=5)))
     told: list[int] = []
 
     def on_skipped(_link: Link, _stream: InStream, count: int, *, now: float) -> None:

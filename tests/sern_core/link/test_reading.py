@@ -5,21 +5,21 @@ from typing import Any
 
 import pytest
 
-from sern_core.link import reading
 from sern_core.link.link import Link
 from sern_core.vocabulary.errors import WireError
 from sern_core.vocabulary.message import StreamId, StreamInfo, TopicInfo
+from sern_core.vocabulary.params import LinkParams
 from sern_core.vocabulary.types import Encoding, TopicName
 from sern_core.wire import framing
 from sern_core.wire.announce import Announcement, encode_announcement
 from tests.fuzz.test_hostile_peer import Hostile, _whole
-from tests.world import World, spec
+from tests.world import World, limited, spec
 
 STREAMS = 150
 
 
-def robot_and_readers(count: int = 20) -> Hostile:
-    world = World()
+def robot_and_readers(count: int = 20, link: LinkParams | None = None) -> Hostile:
+    world = World(link=link)
     peer = Hostile(world)
     for number in range(count):
         Hostile(world, f"reader{number}").control({"t": "subscribe", "patterns": [".*"], "more": False})
@@ -91,6 +91,7 @@ def acknowledges(peer: Hostile) -> bool:
     return bool(acks)
 
 
+@pytest.mark.interpreted
 def test_a_datagram_that_costs_much_is_read_in_slices_and_in_order(monkeypatch: pytest.MonkeyPatch) -> None:
     peer = robot_and_readers()
     got = taken(peer, monkeypatch)
@@ -103,6 +104,7 @@ def test_a_datagram_that_costs_much_is_read_in_slices_and_in_order(monkeypatch: 
     peer.hub.validate()
 
 
+@pytest.mark.interpreted
 def test_others_have_their_turn_in_between(monkeypatch: pytest.MonkeyPatch) -> None:
     peer = robot_and_readers()
     other = Hostile(peer.world, "other")
@@ -128,6 +130,7 @@ def test_nothing_of_it_is_acknowledged_before_it_is_read() -> None:
     assert acknowledges(peer)
 
 
+@pytest.mark.interpreted
 def test_a_session_that_ends_meanwhile_loses_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     peer = robot_and_readers()
     got = taken(peer, monkeypatch)
@@ -152,9 +155,8 @@ def test_bytes_of_no_honest_peer_that_are_read_later_end_the_session() -> None:
         peer.say(framing.PING_FRAME)
 
 
-def test_what_waits_to_be_read_has_a_bound(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(reading, "MAX_UNREAD_BYTES", 500_000)
-    peer = robot_and_readers()
+def test_what_waits_to_be_read_has_a_bound() -> None:
+    peer = robot_and_readers(link=limited(unread_bytes=500_000))
     peer.say(announced(peer))
 
     def send_on() -> None:
@@ -186,6 +188,7 @@ def none_below(peer: Hostile) -> None:
     peer.control({"t": "first", "ch": 1, "seq": 2 + 2 * WAITING})
 
 
+@pytest.mark.interpreted
 @pytest.mark.parametrize(("release", "step"), [(first_one, 1), (none_below, 2)])
 def test_what_waited_is_released_in_slices_and_in_order(
     release: Callable[[Hostile], None], step: int, monkeypatch: pytest.MonkeyPatch
@@ -204,6 +207,7 @@ def test_what_waited_is_released_in_slices_and_in_order(
     peer.hub.validate()
 
 
+@pytest.mark.interpreted
 @pytest.mark.parametrize(("release", "step"), [(first_one, 1), (none_below, 2)])
 def test_what_is_released_goes_on_when_the_session_has_ended(
     release: Callable[[Hostile], None], step: int, monkeypatch: pytest.MonkeyPatch

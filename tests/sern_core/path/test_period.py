@@ -114,6 +114,7 @@ def test_among_many_topics_there_is_no_gap() -> None:
     assert cadences.share(10.0 + 20 * PERIOD_S + 0.0007, DATAGRAM_S) == 1.0
 
 
+@pytest.mark.interpreted
 def test_poses_meet_less_than_they_would_if_nothing_were_cut(monkeypatch: pytest.MonkeyPatch) -> None:
     def mean_late_s() -> float:
         world = World()

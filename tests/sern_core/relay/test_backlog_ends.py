@@ -4,11 +4,8 @@ import pytest
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
-from sern_core.link import sender
-from sern_core.relay import clients
 from sern_core.relay.access import AccessRule, AccessTable
 from sern_core.relay.hub import HubParams
-from sern_core.site import client
 from sern_core.stream.out_channel import OutChannel
 from sern_core.stream.out_message import OutMessage
 from sern_core.stream.prices import CLIENT_OVERHEAD_BYTES
@@ -17,7 +14,7 @@ from sern_core.vocabulary.params import LinkParams
 from sern_core.vocabulary.types import ClientName, DropReason
 from sern_sim.models import LinkModel
 from tests.exploring import cases
-from tests.world import World, spec
+from tests.world import World, limited, spec
 
 PHASES = (Phase.explicit, Phase.generate)
 LARGE_BYTES = 2_000
@@ -104,10 +101,10 @@ def test_what_ends_is_what_waited_and_nothing_else(actions: list[str], end: str,
         assert waiting - set(lost_before) <= set(taken) and taken == sorted(set(taken))
 
 
+@pytest.mark.interpreted
 def test_what_lapses_in_many_sweeps_is_reported_once_and_never_sent(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where 500 messages lapse at a time and a sweep is for 3: the next one is due at once, and what lies between two
     sweeps sends none of them."""
-    monkeypatch.setattr(sender, "LAPSED_A_SWEEP", 3)
     sent: list[bool] = []
     take = OutChannel.take
 
@@ -116,7 +113,7 @@ def test_what_lapses_in_many_sweeps_is_reported_once_and_never_sent(monkeypatch:
         return take(channel, out, room, now)
 
     monkeypatch.setattr(OutChannel, "take", taken)
-    world = World().watch()
+    world = World(link=limited(lapsed_a_sweep=3)).watch()
     robot = world.client("robot")
     thin = LinkModel(rate_bps=40e3, delay_s=0.05).as_stream()
     site = world.client("site", thin, thin, patterns=["/robot/.*"])
@@ -136,13 +133,9 @@ def test_what_lapses_in_many_sweeps_is_reported_once_and_never_sent(monkeypatch:
 
 
 @pytest.mark.parametrize(("count", "kept"), [(10, [27, 24, 21, 17, 14, 11, 7, 4, 1]), (2, [2])])
-def test_what_lapses_for_clients_that_are_away_goes_in_many_turns(
-    count: int, kept: list[int], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_lapses_for_clients_that_are_away_goes_in_many_turns(count: int, kept: list[int]) -> None:
     """Also of several clients: one turn is not for all that wait for all of them, however little it is of each."""
-    for module in (sender, clients):
-        monkeypatch.setattr(module, "LAPSED_A_SWEEP", 3)
-    world = World(hub_params=HubParams(resume_s=1e6))
+    world = World(link=limited(lapsed_a_sweep=3), hub_params=HubParams(resume_s=1e6))
     robot = world.client("robot")
     sites = [world.client(name, patterns=["/robot/.*"]) for name in ("one", "two", "three")]
     log = robot.publish("/robot/log", spec(reliable=True, retention_s=60.0))
@@ -168,11 +161,10 @@ def test_what_lapses_for_clients_that_are_away_goes_in_many_turns(
 
 @pytest.mark.parametrize(("reliable", "most", "told"), [(True, 9, 3), (True, 2, 5), (False, 2, 3)])
 def test_an_origin_is_told_of_exactly_what_is_dropped_unless_that_is_in_too_many_runs(
-    reliable: bool, most: int, told: int, monkeypatch: pytest.MonkeyPatch
+    reliable: bool, most: int, told: int
 ) -> None:
     """Between two reliable messages lies what was told before, between two others perhaps one that arrived."""
-    monkeypatch.setattr(client, "MAX_RUNS_TOLD", most)
-    world = World()
+    world = World(link=limited(runs_told=most))
     robot = world.client("robot")
     channel = robot.publish("/robot/a", spec(reliable=reliable))
     outs = [OutMessage(Message(channel.stream.id, seq, b"x", 0, robot.now)) for seq in (1, 3, 5)]

@@ -4,14 +4,13 @@ from collections.abc import Callable
 
 import pytest
 
-from sern_core.relay import draining
 from sern_core.relay.access import AccessRule, AccessTable
 from sern_core.relay.hub import HubParams
 from sern_core.stream.out_channel import OutChannel
 from sern_core.vocabulary.message import StreamInfo
 from sern_core.vocabulary.types import ClientName, DropReason
 from tests.fuzz.test_hostile_peer import Hostile, _whole
-from tests.world import OPEN_ACCESS, SimClient, World, spec
+from tests.world import OPEN_ACCESS, SimClient, World, limited, spec
 
 
 class Ended:
@@ -159,9 +158,8 @@ def test_a_client_that_stays_away_takes_it_along() -> None:
     assert not case.world.relay.hub.streams.draining and ClientName("site") not in case.world.relay.hub.links
 
 
-def test_there_is_a_bound_for_each_client(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(draining, "MAX_DRAINING", 50)
-    world = World()
+def test_there_is_a_bound_for_each_client() -> None:
+    world = World(link=limited(draining=50))
     site = Hostile(world, "site")
     site.control({"t": "subscribe", "patterns": [".*"], "more": False})
     site.port.disconnected(now=0.0)

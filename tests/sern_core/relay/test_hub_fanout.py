@@ -4,17 +4,17 @@ from random import Random
 
 import pytest
 
-from sern_core.relay import hub_fanout
 from sern_core.relay.hub_events import Relayed
-from sern_core.stream.in_stream import SLICE_US
+from sern_core.vocabulary.limits import LIMITS
 from sern_core.vocabulary.message import StreamId
+from sern_core.vocabulary.params import LinkParams
 from sern_core.vocabulary.types import ClientName, TopicName
 from tests.exploring import seeds
 from tests.fuzz.test_hostile_peer import Hostile, _whole
-from tests.world import World
+from tests.world import World, limited
 
 READERS = 300
-A_SLICE = SLICE_US // hub_fanout.CHANNEL_US + 1
+A_SLICE = LIMITS.slice_us // LIMITS.channel_us + 1
 
 
 def reading(world: World, count: int) -> list[Hostile]:
@@ -246,7 +246,7 @@ def test_the_streams_of_a_process_that_was_started_anew_end_in_slices() -> None:
         assert left[-1] <= 20 or not stream_of(peer, "/robot/t1").outs, "a new stream is told before the old ones end"
         turn(peer)
         left.append(sum(len(link.sender.channels) for link in links))
-        assert left[-2] - left[-1] <= SLICE_US // hub_fanout.CLOSE_US + 1
+        assert left[-2] - left[-1] <= LIMITS.slice_us // LIMITS.close_us + 1
         if len(left) == 2:
             hub.forget(readers[0].name, "revoked", now=peer.now)
             links.pop(0)
@@ -262,9 +262,9 @@ def test_the_streams_of_a_process_that_was_started_anew_end_in_slices() -> None:
 class Party:
     """An origin and its readers, who do as they like; a slice is two channels."""
 
-    def __init__(self, seed: int) -> None:
+    def __init__(self, seed: int, link: LinkParams) -> None:
         self.random = Random(seed)
-        self.world = World()
+        self.world = World(link=link)
         self.hub = self.world.relay.hub
         self.readers = reading(self.world, 12)
         self.loyal = set(self.readers)  # those that have wanted everything all the time
@@ -350,10 +350,8 @@ class Party:
 
 
 @pytest.mark.parametrize("seed", seeds(40))
-def test_whatever_happens_everybody_gets_all_they_want(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(hub_fanout, "CHANNEL_US", SLICE_US // 2)
-    monkeypatch.setattr(hub_fanout, "CLOSE_US", SLICE_US // 2)
-    party = Party(seed)
+def test_whatever_happens_everybody_gets_all_they_want(seed: int) -> None:
+    party = Party(seed, limited(channel_us=LIMITS.slice_us // 2, close_us=LIMITS.slice_us // 2))
     party.announce()
     for _ in range(60):
         party.step()
@@ -382,4 +380,4 @@ def test_a_slice_pays_for_its_channels() -> None:
     peer = Hostile(world)
     peer.announce(1, "/robot/a")
     link = peer.hub.links[ClientName("robot")]
-    assert SLICE_US < link.reassembly.work_us <= SLICE_US + 2 * hub_fanout.CHANNEL_US
+    assert LIMITS.slice_us < link.reassembly.work_us <= LIMITS.slice_us + 2 * LIMITS.channel_us

@@ -1,11 +1,10 @@
 """The relay matches patterns in slices: what a client subscribes to holds up nobody, and all of it comes in the end."""
 
-import pytest
-
 from sern_core.relay import routing
 from sern_core.relay.access import AccessRule, AccessTable
+from sern_core.relay.hub import HubParams
 from sern_core.relay.hub_matching import MATCHING_SHARE
-from sern_core.relay.routing import SLICE_UNITS, UNIT_S
+from sern_core.relay.routing import UNIT_S, RoutingLimits
 from tests.fuzz.test_hostile_peer import Hostile
 from tests.world import World, spec
 
@@ -71,8 +70,8 @@ def test_a_flood_of_subscriptions_is_worth_its_share_of_time() -> None:
     mallory.now = world.relay.now
     done = flood(world, mallory, subscriptions=500)
     assert len(done) > 2
-    assert max(done) < 1.5 * SLICE_UNITS
-    assert sum(done) * UNIT_S < 1.1 * MATCHING_SHARE + SLICE_UNITS * UNIT_S
+    assert max(done) < 1.5 * RoutingLimits().slice_units
+    assert sum(done) * UNIT_S < 1.1 * MATCHING_SHARE + RoutingLimits().slice_units * UNIT_S
     while (due_s := world.relay.hub.matching.due_s.get(mallory.name)) is not None:
         mallory.port.handle_timeout(now=due_s)
     assert "/x499.+" in world.relay.hub.routing._interests[mallory.name].patterns.texts  # the last one counts
@@ -86,16 +85,15 @@ def test_without_rights_patterns_cost_next_to_nothing() -> None:
     mallory.now = world.relay.now
     mallory.control({"t": "subscribe", "patterns": [".?" * 26 + "!"], "more": False})
     hub = world.relay.hub
-    assert hub.routing.spent_units < 0.2 * SLICE_UNITS
+    assert hub.routing.spent_units < 0.2 * RoutingLimits().slice_units
     assert not hub.matching.due_s
 
 
-def test_new_access_rules_are_worked_out_over_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    world = World()
+def test_new_access_rules_are_worked_out_over_time() -> None:
+    world = World(hub_params=HubParams(routing=RoutingLimits(slice_units=10 * routing.ROUTE_UNITS)))
     topics(world, 100)
     sites = [world.client(name, patterns=["/.*[ab].*"]) for name in ("site1", "site2", "site3")]
     world.run(2.0)
-    monkeypatch.setattr(routing, "SLICE_UNITS", 10 * routing.ROUTE_UNITS)
     hub = world.relay.hub
     hub.revoke(AccessTable([AccessRule("robot", publish=(".*",))]), now=world.relay.now)
     assert all(hub.routing.received_by(site.name) == () for site in sites)  # what is taken away goes at once

@@ -8,7 +8,6 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule, run_state_machine_as_test
 
-from sern_core.relay import routing
 from sern_core.relay.access import AccessRule, AccessTable
 from sern_core.relay.routing import NAME_UNITS, NO_CHANGE, Denied, Match, RouteChange, RoutingLimits, RoutingTable
 from sern_core.vocabulary.errors import RefusedError
@@ -289,7 +288,7 @@ def test_hostile_patterns_are_matched_in_slices() -> None:
         matched += table.go_on(B).matched
         slices += 1
     assert slices > 10
-    assert largest_units < 1.2 * routing.SLICE_UNITS
+    assert largest_units < 1.2 * RoutingLimits().slice_units
     assert len(matched) == len(set(matched)) == 500
 
 
@@ -378,7 +377,7 @@ class RoutingMachine(RuleBasedStateMachine):
 
     @initialize()
     def start(self) -> None:
-        self.table = RoutingTable(OPEN)
+        self.table = RoutingTable(OPEN, limits=RoutingLimits(slice_units=1) if self.sliced else None)
         self.access = OPEN
         self.streams: dict[StreamId, bool] = {}
         self.interests: dict[ClientName, tuple[tuple[str, ...], frozenset[TopicName]]] = {}
@@ -505,9 +504,7 @@ class SlicedMachine(RoutingMachine):
 
 
 @pytest.mark.parametrize("machine", [RoutingMachine, SlicedMachine])
-def test_against_brute_force(machine: type[RoutingMachine], monkeypatch: pytest.MonkeyPatch) -> None:
-    if machine.sliced:
-        monkeypatch.setattr(routing, "SLICE_UNITS", 1)
+def test_against_brute_force(machine: type[RoutingMachine]) -> None:
     run_state_machine_as_test(
         machine,
         settings=settings(max_examples=cases(60), stateful_step_count=30),

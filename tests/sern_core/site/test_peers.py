@@ -8,12 +8,12 @@ import pytest
 from sern_core.link.view import LinkView
 from sern_core.path.flight import STALL_MIN_S, STALL_RTTS
 from sern_core.path.lanes import PING_INTERVAL_S
-from sern_core.relay import presence as presence_module
 from sern_core.relay.access import AccessRule, AccessTable
 from sern_core.relay.hub import HubParams
 from sern_core.relay.presence import BACK_PAUSE_S, MAX_TOLD, Presence
 from sern_core.site.peers import LET_GO_S, MAX_ENDED, MAX_GIVEN_UP, MAX_PEERS, PeerChange, Peers, PeerStatus, PeerView
 from sern_core.vocabulary.errors import WireError
+from sern_core.vocabulary.limits import LIMITS, PeerLimits
 from sern_core.vocabulary.message import TopicInfo
 from sern_core.vocabulary.types import ClientName, Encoding, PriorityClass, TopicName
 from sern_core.wire import framing
@@ -114,6 +114,7 @@ def test_what_the_relay_itself_publishes_is_nobodys() -> None:
     assert GONE not in statuses(site).values(), "the site has asked of it in its new session"
 
 
+@pytest.mark.interpreted
 def test_a_client_that_does_not_ask_is_told_nothing() -> None:
     """Peers of an earlier version: a control message that it does not know would end its session."""
     world = World().watch()
@@ -652,13 +653,15 @@ class Told:
         return 0
 
 
-def asking(matching: set[ClientName], *others: str) -> tuple[Presence, Told, dict[ClientName, Told]]:
+def asking(
+    matching: set[ClientName], *others: str, told_at_once: int = LIMITS.told_at_once
+) -> tuple[Presence, Told, dict[ClientName, Told]]:
     def attempt(_client: ClientName, _now: float, call: Callable[[], object]) -> None:
         call()
 
     site = Told()
     links = {ClientName(name): Told() for name in others} | {ClientName("site"): site}
-    presence = Presence(links, set(), matching, attempt, lambda: None)
+    presence = Presence(links, set(), matching, attempt, lambda: None, PeerLimits(told_at_once=told_at_once))
     presence.watch(ClientName("site"), now=0.0)
     return presence, site, links
 
@@ -727,10 +730,9 @@ def test_there_is_an_end_to_those_of_whom_a_client_may_ask() -> None:
     assert len(site.items) == MAX_ASKED + 1 and len(presence._watchers[ClientName("site")].missing) == MAX_ASKED
 
 
-def test_what_many_clients_are_told_takes_many_turns(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_many_clients_are_told_takes_many_turns() -> None:
     """A relay that begins anew is asked by all of them at once."""
-    monkeypatch.setattr(presence_module, "TOLD_AT_ONCE", 4)
-    presence, _site, links = asking(set(), *(f"s{number}" for number in range(4)))
+    presence, _site, links = asking(set(), *(f"s{number}" for number in range(4)), told_at_once=4)
     for name in links:
         presence.watch(name, now=0.0)
         presence.ask(name, [ClientName(f"c{number}") for number in range(2 * MAX_TOLD)])
@@ -750,6 +752,7 @@ def test_a_client_asks_of_the_last_of_many() -> None:
     assert known.asked() == [*(f"c{number}" for number in range(6, MAX_ASKED + 5)), "c0"]
 
 
+@pytest.mark.interpreted
 def test_of_what_is_no_name_of_a_client_nothing_is_said() -> None:
     """As it came it may be too long to be said: what is bounded in a name is its characters."""
     world = World().watch()

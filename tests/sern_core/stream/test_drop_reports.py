@@ -4,9 +4,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sern_core.stream import drop_reports
 from sern_core.stream.drop_reports import UNREAD_S, DropReports, Unheard
 from sern_core.vocabulary.errors import WireError
+from sern_core.vocabulary.limits import PeerLimits
 from sern_core.vocabulary.types import DropReason
 
 REASONS = (DropReason.LOST, DropReason.RETENTION, DropReason.UNWANTED)
@@ -44,46 +44,44 @@ def told(reports: DropReports, *, runs: bool = True) -> list[tuple[int, int, Dro
 
 @given(st.lists(STEPS, max_size=60), st.sampled_from([0, 3, 1000]))
 def test_reports_cover_exactly_what_was_reported(steps: list[tuple], limit: int) -> None:  # type: ignore[type-arg]
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(drop_reports, "MAX_REPORTS", limit)
-        unheard = Unheard()
-        reports = DropReports(unheard)
-        waits: dict[int, set[tuple[DropReason, str]]] = {}  # what was ever reported of a message that is to be said
-        flying: list[tuple[int, set[int]]] = []
-        number = 0
-        for kind, *step in steps:
-            if kind == "add":
-                seq, reason, where, count = step
-                reports.add(seq, reason, where, count)
-                for each in range(seq, seq + count):
-                    waits.setdefault(each, set()).add((reason, where))
-            elif kind == "say":
-                report = reports.first(runs=step[0])
-                if report is not None:
-                    number += 1
-                    reports.say(report, number)
-                    seqs = set(range(report.seq, report.end))
-                    for seq in seqs:
-                        assert limit < 1000 or (report.reason, report.where) in waits[seq]
-                        del waits[seq]
-                    flying.append((number, seqs))
-                else:
-                    assert not waits
-            elif kind == "heard":
-                reached = number - step[0]
-                flying = [each for each in flying if each[0] > reached]
-                assert reports.heard(reached) == (not flying and not waits)
+    unheard = Unheard(PeerLimits(reports=limit))
+    reports = DropReports(unheard)
+    waits: dict[int, set[tuple[DropReason, str]]] = {}  # what was ever reported of a message that is to be said
+    flying: list[tuple[int, set[int]]] = []
+    number = 0
+    for kind, *step in steps:
+        if kind == "add":
+            seq, reason, where, count = step
+            reports.add(seq, reason, where, count)
+            for each in range(seq, seq + count):
+                waits.setdefault(each, set()).add((reason, where))
+        elif kind == "say":
+            report = reports.first(runs=step[0])
+            if report is not None:
+                number += 1
+                reports.say(report, number)
+                seqs = set(range(report.seq, report.end))
+                for seq in seqs:
+                    assert limit < 1000 or (report.reason, report.where) in waits[seq]
+                    del waits[seq]
+                flying.append((number, seqs))
             else:
-                reports.unsay()
-                for _number, seqs in flying:
-                    for seq in seqs:
-                        waits.setdefault(seq, set()).update((reason, where) for reason in REASONS for where in "ab")
-                flying = []
-            checked(reports, unheard)
-        found = [seq for first, count, _reason, _where in told(reports) for seq in range(first, first + count)]
-        assert sorted(found) == sorted(waits), "a message is left out, or said twice"
-        reports.clear()
-        assert (unheard.reports, unheard.said) == (0, 0)
+                assert not waits
+        elif kind == "heard":
+            reached = number - step[0]
+            flying = [each for each in flying if each[0] > reached]
+            assert reports.heard(reached) == (not flying and not waits)
+        else:
+            reports.unsay()
+            for _number, seqs in flying:
+                for seq in seqs:
+                    waits.setdefault(seq, set()).update((reason, where) for reason in REASONS for where in "ab")
+            flying = []
+        checked(reports, unheard)
+    found = [seq for first, count, _reason, _where in told(reports) for seq in range(first, first + count)]
+    assert sorted(found) == sorted(waits), "a message is left out, or said twice"
+    reports.clear()
+    assert (unheard.reports, unheard.said) == (0, 0)
 
 
 @given(st.permutations(range(1, 30)))
@@ -120,9 +118,8 @@ def test_a_message_is_reported_for_the_first_client_that_does_not_get_it() -> No
     ]
 
 
-def test_above_the_limit_a_run_takes_the_place_of_what_it_holds(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(drop_reports, "MAX_REPORTS", 100)
-    unheard = Unheard()
+def test_above_the_limit_a_run_takes_the_place_of_what_it_holds() -> None:
+    unheard = Unheard(PeerLimits(reports=100))
     reports = DropReports(unheard)
     for seq in range(2, 2 * 103 + 1, 2):
         reports.add(seq, DropReason.LOST, "eve")
@@ -134,10 +131,8 @@ def test_above_the_limit_a_run_takes_the_place_of_what_it_holds(monkeypatch: pyt
     assert (20, 101, DropReason.LOST, "") in told(reports)
 
 
-def test_no_more_is_kept_than_there_is_room_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(drop_reports, "MAX_REPORTS", 10)
-    monkeypatch.setattr(drop_reports, "MAX_KEPT_REPORTS", 50)
-    unheard = Unheard()
+def test_no_more_is_kept_than_there_is_room_for() -> None:
+    unheard = Unheard(PeerLimits(reports=10, kept_reports=50))
     reports = DropReports(unheard)
     for seq in range(200, 0, -2):
         reports.add(seq, DropReason.LOST, "eve")
@@ -148,9 +143,8 @@ def test_no_more_is_kept_than_there_is_room_for(monkeypatch: pytest.MonkeyPatch)
 
 
 class TestAPeerThatDoesNotRead:
-    def crowd(self, monkeypatch: pytest.MonkeyPatch) -> tuple[Unheard, DropReports]:
-        monkeypatch.setattr(drop_reports, "MAX_REPORTS", 10)
-        unheard = Unheard()
+    def crowd(self) -> tuple[Unheard, DropReports]:
+        unheard = Unheard(PeerLimits(reports=10))
         reports = DropReports(unheard)
         for seq in range(1, 41, 2):
             reports.add(seq, DropReason.LOST, "eve")
@@ -160,13 +154,13 @@ class TestAPeerThatDoesNotRead:
         for tick in range(int(10 * for_s)):
             unheard.check(start_s + 0.1 * tick)
 
-    def test_it_is_not_judged_by_what_it_was_not_told(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        unheard, _reports = self.crowd(monkeypatch)
+    def test_it_is_not_judged_by_what_it_was_not_told(self) -> None:
+        unheard, _reports = self.crowd()
         self.sends(unheard, 0.0, 1000.0)
         assert unheard.crowded
 
-    def test_it_is_cut_when_it_has_gone_on_for_long(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        unheard, reports = self.crowd(monkeypatch)
+    def test_it_is_cut_when_it_has_gone_on_for_long(self) -> None:
+        unheard, reports = self.crowd()
         report = reports.first(runs=True)
         assert report is not None
         reports.say(report, 1)
@@ -175,8 +169,8 @@ class TestAPeerThatDoesNotRead:
             self.sends(unheard, 100.0 + UNREAD_S - 1.0, 1.5)
 
     @pytest.mark.parametrize("again", ["it hears of one", "a session begins"])
-    def test_it_has_the_time_again(self, monkeypatch: pytest.MonkeyPatch, again: str) -> None:
-        unheard, reports = self.crowd(monkeypatch)
+    def test_it_has_the_time_again(self, again: str) -> None:
+        unheard, reports = self.crowd()
         for number in range(1, 6):
             report = reports.first(runs=True)
             assert report is not None
@@ -190,8 +184,8 @@ class TestAPeerThatDoesNotRead:
         with pytest.raises(WireError):
             self.sends(unheard, 50.0, 11.0)
 
-    def test_a_time_when_we_were_held_up_counts_little(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        unheard, reports = self.crowd(monkeypatch)
+    def test_a_time_when_we_were_held_up_counts_little(self) -> None:
+        unheard, reports = self.crowd()
         report = reports.first(runs=True)
         assert report is not None
         reports.say(report, 1)

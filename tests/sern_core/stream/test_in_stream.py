@@ -15,12 +15,12 @@ from sern_core.stream.in_stream import (
     MAX_PIECES,
     PARTIAL_IDLE_S,
     PIECE_BYTES,
-    SLICE_US,
     InStream,
     Partial,
     Reassembly,
 )
 from sern_core.vocabulary.errors import WireError
+from sern_core.vocabulary.limits import LIMITS
 from sern_core.vocabulary.message import Message, StreamId, StreamInfo, TopicInfo
 from sern_core.vocabulary.types import DROP_CODES, ClientName, DropReason, Encoding, TopicName
 from sern_core.wire.framing import FLAG_TOMBSTONE
@@ -242,7 +242,7 @@ def test_many_half_received_messages_are_left_out_in_slices() -> None:
     stream.skip_to(1000 + count, 0.0)
     slices = 1
     while stream in room.behind:
-        assert room.work_us < 2 * SLICE_US
+        assert room.work_us < 2 * LIMITS.slice_us
         room.work_us = 0
         stream.go_on(0.0)
         slices += 1

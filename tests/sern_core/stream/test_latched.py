@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from sern_core.relay.access import AccessRule, AccessTable
 from sern_core.relay.hub import HubParams
 from sern_core.relay.relayed_streams import REPLAY_US
-from sern_core.relay.routing import SLICE_UNITS, UNIT_S
+from sern_core.relay.routing import UNIT_S, RoutingLimits
 from sern_core.stream.latched import MAX_REPLAY_MESSAGES, LatchedCache, ReplayStore
 from sern_core.stream.out_channel import OutChannel
 from sern_core.stream.prices import CLIENT_OVERHEAD_BYTES, MESSAGE_OVERHEAD_BYTES
@@ -121,6 +121,7 @@ def test_of_a_deep_stream_the_newest_are_kept_and_the_others_counted() -> None:
     store.validate()
 
 
+@pytest.mark.interpreted
 @pytest.mark.parametrize("reliable", [True, False])
 @pytest.mark.parametrize("restarts", [False, True])
 def test_a_late_joiner_gets_the_newest_that_may_wait_for_it(
@@ -159,6 +160,7 @@ def test_a_late_joiner_gets_the_newest_that_may_wait_for_it(
     world.validate()
 
 
+@pytest.mark.interpreted
 def test_many_latched_messages_are_replayed_in_slices(monkeypatch: pytest.MonkeyPatch) -> None:
     peer = Hostile()
     streams, depth = 60, 300
@@ -185,5 +187,5 @@ def test_many_latched_messages_are_replayed_in_slices(monkeypatch: pytest.Monkey
         replayed.append(0)
         matching.go_on(LATE, now=matching.due_s[LATE])
     assert sum(replayed) == streams * depth
-    assert max(replayed) * REPLAY_US <= SLICE_UNITS * UNIT_S * 1e6 + depth * REPLAY_US
+    assert max(replayed) * REPLAY_US <= RoutingLimits().slice_units * UNIT_S * 1e6 + depth * REPLAY_US
     peer.hub.validate()

@@ -131,6 +131,7 @@ def _calls(seed: int, lossless: bool) -> dict[Place, int]:
     return calls
 
 
+@pytest.mark.interpreted
 @settings(max_examples=cases(25), phases=[Phase.explicit, Phase.generate])
 @given(data=st.data(), lossless=st.booleans(), after=st.booleans())
 def test_an_error_at_any_call_costs_at_most_what_it_was_about(data: st.DataObject, lossless: bool, after: bool) -> None:
@@ -234,6 +235,7 @@ def test_a_definition_that_a_site_fails_at_costs_its_own_stream_only() -> None:
     world.validate()
 
 
+@pytest.mark.interpreted
 @pytest.mark.parametrize("reliable", [False, True])
 @pytest.mark.parametrize("offload", [False, True])
 def test_a_library_that_fails_at_a_body_does_not_stop_its_stream(
@@ -267,6 +269,7 @@ def test_a_library_that_fails_at_a_body_does_not_stop_its_stream(
     world.validate()
 
 
+@pytest.mark.interpreted
 def test_a_body_that_cannot_be_encoded_goes_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
     world = World(compress=True)
     robot, site = world.client("robot"), world.client("site", patterns=[".*"])
@@ -283,6 +286,7 @@ def test_a_body_that_cannot_be_encoded_goes_as_it_is(monkeypatch: pytest.MonkeyP
     assert robot.core.coder.unencodable
 
 
+@pytest.mark.interpreted
 def test_what_fails_towards_one_client_costs_that_one_its_session_and_nobody_a_message() -> None:
     world = World()
     world.expected_faults = (Injected,)
@@ -316,6 +320,7 @@ def test_what_fails_towards_one_client_costs_that_one_its_session_and_nobody_a_m
     world.validate()
 
 
+@pytest.mark.interpreted
 def test_a_full_table_of_channels_refuses_one_subscriber_and_not_the_origin(monkeypatch: pytest.MonkeyPatch) -> None:
     world = World()
     robot = world.client("robot")
@@ -346,6 +351,7 @@ def test_a_full_table_of_channels_refuses_one_subscriber_and_not_the_origin(monk
     world.validate()
 
 
+@pytest.mark.interpreted
 @pytest.mark.parametrize("lane", [LANE_ZMQ, LANE_UDP])
 @pytest.mark.parametrize("front", [False, True])
 def test_nothing_that_a_bad_datagram_carried_is_lost_on_any_lane(lane: int, front: bool) -> None:
@@ -379,6 +385,7 @@ def test_nothing_that_a_bad_datagram_carried_is_lost_on_any_lane(lane: int, fron
     lanes.check_log()
 
 
+@pytest.mark.interpreted
 def test_a_control_message_that_nobody_knows_does_not_hold_up_what_came_before_it() -> None:
     """Datagrams overtake each other: what waits behind such a message was acknowledged before."""
     lanes = TwoLanes(stream=models()[0], datagrams=models()[1])
@@ -411,6 +418,7 @@ def test_a_control_message_that_nobody_knows_does_not_hold_up_what_came_before_i
     lanes.check_log()
 
 
+@pytest.mark.interpreted
 def test_memory_that_cannot_be_had_costs_one_message(monkeypatch: pytest.MonkeyPatch) -> None:
     world = World()
     robot, site = world.client("robot"), world.client("site", patterns=[".*"])

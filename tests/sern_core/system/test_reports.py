@@ -4,7 +4,6 @@ import pytest
 
 from sern_core.link.streams_out import SEVERAL
 from sern_core.relay.access import AccessRule, AccessTable
-from sern_core.stream import drop_reports
 from sern_core.stream.prices import CLIENT_OVERHEAD_BYTES
 from sern_core.vocabulary.errors import WireError
 from sern_core.vocabulary.message import StreamId, StreamInfo, TopicInfo
@@ -14,7 +13,7 @@ from sern_core.wire.announce import Announcement, encode_announcement
 from sern_sim.models import LinkModel
 from tests.fuzz.test_hostile_peer import Hostile, _whole
 from tests.sern_core.link.test_interest import ControlBytes
-from tests.world import World, spec
+from tests.world import OPEN_ACCESS, World, limited, spec
 
 CAPPED = AccessTable([AccessRule(client=".*", publish=(".*",), subscribe=(".*",), max_rate_hz=10.0)])
 
@@ -44,12 +43,8 @@ def said(peer: Hostile, *, acknowledge: bool = True) -> list[dict[str, object]]:
 
 
 @pytest.mark.parametrize("absent", [False, True], ids=["rate cap", "retention"])
-def test_a_peer_that_never_reads_has_no_more_kept_for_it_in_any_session(
-    absent: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(drop_reports, "MAX_REPORTS", 500)
-    monkeypatch.setattr(drop_reports, "MAX_KEPT_REPORTS", 800)
-    world = World() if absent else World(access=CAPPED)
+def test_a_peer_that_never_reads_has_no_more_kept_for_it_in_any_session(absent: bool) -> None:
+    world = World(link=limited(reports=500, kept_reports=800), access=OPEN_ACCESS if absent else CAPPED)
     peer = Hostile(world)
     site = Hostile(world, "site")
     site.control({"t": "subscribe", "patterns": [".*"], "more": False})
@@ -86,10 +81,9 @@ def test_a_peer_that_never_reads_has_no_more_kept_for_it_in_any_session(
     peer.hub.validate()
 
 
-def test_a_peer_that_reads_now_and_then_is_not_cut(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_peer_that_reads_now_and_then_is_not_cut() -> None:
     """The length of the table alone is no reason: it goes on sending for 75 s, and reads every 2.5 s."""
-    monkeypatch.setattr(drop_reports, "MAX_REPORTS", 10)
-    peer = Hostile(World(access=CAPPED))
+    peer = Hostile(World(link=limited(reports=10), access=CAPPED))
     peer.announce(1, "/robot/a", reliable=True)
     peer.control({"t": "synced", "batch": True})
     said(peer)
@@ -104,11 +98,10 @@ def test_a_peer_that_reads_now_and_then_is_not_cut(monkeypatch: pytest.MonkeyPat
     peer.hub.validate()
 
 
-def test_what_others_report_does_not_end_the_session_of_an_origin(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_others_report_does_not_end_the_session_of_an_origin() -> None:
     """A subscriber gives up every second message of a robot that is away. It comes back with new messages in its first
     flight, before it can have heard of any, and both are had: every report, and all that it sends."""
-    monkeypatch.setattr(drop_reports, "MAX_REPORTS", 300)
-    world = World()
+    world = World(link=limited(reports=300))
     robot = world.client("robot", LinkModel(delay_s=0.025).as_stream())
     site = world.client("site", patterns=["/robot/.*"])
     other = world.client("other", patterns=["/robot/log"])
@@ -129,7 +122,7 @@ def test_what_others_report_does_not_end_the_session_of_an_origin(monkeypatch: p
         other.core.link.control.send(envelope, now=other.now)
     world.run(15.0)
     unheard = world.relay.hub.links[robot.name].reassembly.unheard
-    assert unheard.reports == len(given_up) > 2 * drop_reports.MAX_REPORTS
+    assert unheard.reports == len(given_up) > 600
     world.until(lambda: len(robot.ups) == 2, within_s=10.0)
     first = pose.next_seq
     world.until(lambda: unheard.reports == 0, within_s=5.0)
@@ -172,9 +165,8 @@ def test_what_makes_room_newest_first_is_one_run() -> None:
     hub.validate()
 
 
-def test_what_several_will_not_get_is_reported_once_above_the_limit(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(drop_reports, "MAX_REPORTS", 10)
-    world = World()
+def test_what_several_will_not_get_is_reported_once_above_the_limit() -> None:
+    world = World(link=limited(reports=10))
     robot = world.client("robot", LinkModel(delay_s=0.025).as_stream())
     sites = [world.client(f"site{number}", patterns=["/robot/log"]) for number in range(3)]
     for site in sites:
