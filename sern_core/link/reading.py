@@ -72,7 +72,7 @@ class Reading:
         self._end.dirty = True
 
     def _through(self) -> bool:
-        """Nothing waits for its time. A method of its own: `_read` changes what a type checker believes of `due_s`."""
+        """Nothing waits for its time. A method of its own: that `_read` may set `due_s` is nothing a compiler sees."""
         return self.due_s is None
 
     def _keep(self, lane: Lane, number: int, stamp_us: int, data: bytes) -> None:

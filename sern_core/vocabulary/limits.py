@@ -41,3 +41,4 @@ class PeerLimits:
 
 
 LIMITS: Final = PeerLimits()
+"""What holds where nobody says otherwise."""
