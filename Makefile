@@ -73,7 +73,7 @@ explore: setup
 	@echo "SEED=$(SEED)"
 	SERN_EXPLORE=$(SEED) $(BIN)/python -m pytest -n $(TEST_PROCESSES) --dist loadgroup --hypothesis-seed=$(SEED) $(RANDOM_TESTS)
 
-# What has a timetable of its own, or no process besides the tests, shows nothing here.
+# Those with processes of their own. Not the lab: it measures, and has the machine for itself.
 standstills: setup
 	$(BIN)/python -m tests.standstills $(SEED) -q -n $(TEST_PROCESSES) --dist loadgroup tests/sern_client tests/sern_relay \
 		tests/sern_runtime tests/sern_tools tests/loopback tests/peers tests/deploy tests/benchmarks

@@ -72,7 +72,11 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         items[:] = [item for item in items if item not in long]
     for item in items:
         if version.compiled() and item.get_closest_marker(INTERPRETED):
-            item.add_marker(pytest.mark.skip(reason="replaces what compiled code does not look up"))
+            item.add_marker(
+                pytest.mark.skip(
+                    reason="replaces a method of the core, which compiled code does not look up: make test runs it"
+                )
+            )
         if isinstance(item, pytest.Function) and asyncio.iscoroutinefunction(item.function):
             item.fixturenames.insert(0, "no_leftover_tasks")
         apart = [folder for folder in (PEERS, LAB) if folder in item.path.parents]

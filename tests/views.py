@@ -1,11 +1,13 @@
-"""A link as one that nobody has used looks, for what reads views of links."""
+"""Views: of a link that nobody has used, for what reads views of links; of the peers that a client knows."""
 
 from math import inf
 from typing import Any
 
 from sern_core.link.view import LinkView
 from sern_core.path.lanes import LANE_ZMQ
+from sern_core.site.peers import PeerStatus, PeerView
 from sern_core.vocabulary.types import ClientName
+from tests.world import SimClient
 
 IDLE = LinkView(
     peer=ClientName("relay"),
@@ -37,3 +39,11 @@ IDLE = LinkView(
 def link_view(**changes: Any) -> LinkView:
     """IDLE but for `changes`."""
     return IDLE._replace(**changes)
+
+
+def peers(client: SimClient) -> dict[str, PeerView]:
+    return {view.name: view for view in client.core.look_at_peers(now=client.now)}
+
+
+def statuses(client: SimClient) -> dict[str, PeerStatus]:
+    return {name: view.status for name, view in peers(client).items()}

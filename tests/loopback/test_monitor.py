@@ -336,6 +336,7 @@ async def test_all_connections_are_capped(zmq_context: Context) -> None:
     late = Client(zmq_context, server.endpoint)
     await until(lambda: server.table.capped)
     await until(lambda: all(client.watch.up for client in first), "the first two are connected")
+    assert not late.watch.up
     for client in (*first, late):
         client.close()
     server.close()

@@ -122,7 +122,7 @@ async def test_an_address_that_is_none_is_blamed_on_its_setting(
 
 
 ENDS = ("connection.close", "link_state.close", "bridge.close", "site.endpoint.stop")
-"""In this order: nothing arrives any more, and then a robot is told to stand still while its endpoint is there."""
+"""The order matters: nothing arrives any more, and then a robot is told to stand still while its endpoint is there."""
 
 
 def _watch(daemon: ClientDaemon, patch: pytest.MonkeyPatch, *, broken: str = "") -> list[str]:

@@ -89,7 +89,7 @@ async def test_a_relay_that_answers_is_not_looked_up(world: World, caplog: pytes
 
 
 async def test_where_it_leads_is_said_once_and_when_it_changes(world: World, caplog: pytest.LogCaptureFixture) -> None:
-    """As where a hotel's network answers every name with its own address."""
+    """A hotel's network, for one, answers every name with its own address."""
     caplog.set_level("INFO")
     world.resolves_s = 0.0
     await world.run(30)

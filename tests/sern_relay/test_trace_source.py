@@ -14,7 +14,7 @@ from tests.world import World, spec
 
 
 def views() -> tuple[JsonQuery, JsonQuery]:
-    """Of a client and of its relay, whose way to the site is thin."""
+    """What a client and its relay answer; the way from there to the site is thin."""
     world = World()
     robot = world.client("robot")
     world.client("site", LinkModel(rate_bps=300e3, delay_s=0.02).as_stream(), patterns=["/robot/.*"])

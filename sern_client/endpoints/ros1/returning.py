@@ -18,7 +18,7 @@ MAX_KEPT: Final = 1024
 
 
 class Returning:
-    """Who has been served, by topic and name. Not for longer than the endpoint lives, and of the last `MAX_KEPT`."""
+    """Who has been served, by topic and name: the last `MAX_KEPT`, while the endpoint lives."""
 
     def __init__(self) -> None:
         self._ended_s: OrderedDict[tuple[str, str], float | None] = OrderedDict()  # None: the topic has not ended

@@ -1,17 +1,15 @@
-"""The multi-metric cost function: weights, predictions, corrections, and the choice."""
+"""The controller: its corrections, its floors, and the choice."""
 
 import itertools
 from dataclasses import replace
 from math import exp
 from random import Random
 
-import numpy as np
 import pytest
 
-from sern_core.adaptation.cost import PROFILES, Ranges, Weights, cost, measure, profile, profile_floors
+from sern_core.adaptation.cost import Ranges, Weights, profile, profile_floors
 from sern_core.adaptation.model import (
     ClassDemand,
-    ClassOutcome,
     Configuration,
     LinkState,
     Measurement,
@@ -19,11 +17,9 @@ from sern_core.adaptation.model import (
     Situation,
     Terms,
 )
-from sern_core.adaptation.playback import CapacityPath
 from sern_core.adaptation.policy import (
     FLOOR_KEPT,
     CapacityPlan,
-    Decision,
     FixedPolicy,
     Mmcf,
     fixed_reliability,
@@ -32,263 +28,19 @@ from sern_core.adaptation.policy import (
 from sern_core.adaptation.predict import PLANNED_SHARE, Bounds, Grid, Predictor
 from sern_core.adaptation.residuals import Residuals
 from sern_core.bodies.codecs import CodecProfile
-from sern_core.vocabulary.errors import ConfigError, UsageError
-from sern_core.vocabulary.types import PriorityClass
-
-CONTROL, STATE, BULK = PriorityClass
-RANGES = Ranges()
-CODECS = {"lz4": CodecProfile(0.8, 300e6), "zstd": CodecProfile(0.6, 60e6)}
-GRID = Grid.of(
-    rates=[(1.0,), (1.0, 0.5), (1.0, 0.6, 0.4, 0.25, 0.1)],
-    queues=[(1,), (1,), (1, 3)],
-    codecs=("none", "lz4", "zstd"),
-    redundancy=(0, 1),
+from sern_core.vocabulary.errors import UsageError
+from tests.sern_core.adaptation.situations import (
+    BULK,
+    CODECS,
+    CONTROL,
+    GRID,
+    RANGES,
+    STATE,
+    as_measured,
+    controller,
+    predicted,
+    situation,
 )
-
-
-def situation(capacity_bps: float | None = 4e6, *, loss: float = 0.0, rtt_s: float = 0.05) -> Situation:
-    return Situation(
-        (
-            ClassDemand(CONTROL, 70.0, 140.0, 0.4, arrival_cv2=0.0, topics=2, protected=True),
-            ClassDemand(STATE, 12.0, 3400.0, 0.5, cv2=1.0, arrival_cv2=0.0, topics=2, codecs=CODECS),
-            ClassDemand(BULK, 10.0, 42000.0, 1.0, arrival_cv2=0.0, topics=2, needed=0.4, codecs=CODECS),
-        ),
-        LinkState(capacity_bps, rtt_s, loss),
-    )
-
-
-def as_measured(prediction: Prediction, *, ratios: dict[PriorityClass, float] | None = None) -> Measurement:
-    """An interval that came out exactly as predicted."""
-    return Measurement(
-        prediction.latency_s,
-        prediction.unreliability,
-        prediction.compute,
-        prediction.bandwidth_bps,
-        saturated=False,
-        ratios=ratios or {},
-    )
-
-
-def controller(
-    weights: Weights | None = None,
-    *,
-    grid: Grid = GRID,
-    ranges: Ranges = RANGES,
-    floors: tuple[float, ...] = (0.0, 0.0, 0.0),
-    initial: Configuration | None = None,
-) -> Mmcf:
-    weights = weights or profile("teleoperation")
-    return Mmcf(grid, weights=weights, ranges=ranges, floors=floors, initial=initial)
-
-
-def predicted(decision: Decision) -> Prediction:
-    assert decision.prediction is not None
-    return decision.prediction
-
-
-# --- weights, ranges, cost ------------------------------------------------------------------------------------------
-
-
-def test_profiles_are_the_documented_ones() -> None:
-    assert tuple(PROFILES["teleoperation"]) == (0.45, 0.30, 0.10, 0.15)
-    assert tuple(PROFILES["mapping"]) == (0.10, 0.30, 0.15, 0.45)
-    assert all(sum(weights) == pytest.approx(1.0) for weights in PROFILES.values())
-
-
-@pytest.mark.parametrize(
-    ("weights", "message"),
-    [
-        ((0.5, 0.5, 0.5, 0.0), "weights: the weights add up to 1.5: change them so that the sum is 1"),
-        ((-0.1, 0.6, 0.3, 0.2), "w_latency: w_latency is -0.1: a weight is a number from 0 to 1"),
-        ((0.2, 0.2, 0.2, float("nan")), "w_bandwidth: w_bandwidth is nan: a weight is a number from 0 to 1"),
-    ],
-)
-def test_wrong_weights_are_one_clear_line(weights: tuple[float, float, float, float], message: str) -> None:
-    with pytest.raises(ConfigError) as caught:
-        Weights(*weights)
-    assert str(caught.value) == message
-
-
-def test_unknown_profile_names_the_known_ones() -> None:
-    with pytest.raises(ConfigError, match="unknown profile 'fast': use one of teleoperation, mapping, balanced"):
-        profile("fast")
-
-
-def test_wrong_ranges_are_refused() -> None:
-    with pytest.raises(ConfigError, match="latency_max_s is 0: it must be above latency_min_s"):
-        Ranges(latency_max_s=0.0)
-    with pytest.raises(ConfigError, match="compute_max is 0: it must be above 0"):
-        Ranges(compute_max=0.0)
-
-
-def test_terms_are_clipped_to_their_ranges_and_weighted() -> None:
-    ranges = Ranges(latency_min_s=0.1, latency_max_s=0.5, compute_max=0.25, bandwidth_max_bps=8e6)
-    terms = ranges.terms(latency_s=0.3, unreliability=0.2, compute=0.5, bandwidth_bps=2e6, capacity_bps=None)
-    assert terms == pytest.approx((0.5, 0.2, 1.0, 0.25))
-    assert cost(Weights(0.4, 0.3, 0.2, 0.1), terms) == pytest.approx(0.2 + 0.06 + 0.2 + 0.025)
-    none = ranges.terms(latency_s=0.0, unreliability=0.0, compute=0.0, bandwidth_bps=0.0, capacity_bps=1e6)
-    assert none == (0.0, 0.0, 0.0, 0.0)
-
-
-@pytest.mark.parametrize(
-    ("capacity_bps", "share_of_capacity", "full_bps"),
-    [(40e6, True, 40e6), (0.3e6, True, 0.3e6), (None, True, 8e6), (40e6, False, 8e6), (0.0, True, 1e3)],
-)
-def test_bandwidth_is_a_share_of_what_the_link_can_carry(
-    *, capacity_bps: float | None, share_of_capacity: bool, full_bps: float
-) -> None:
-    ranges = Ranges(share_of_capacity=share_of_capacity)
-    assert ranges.bandwidth_full_bps(capacity_bps) == full_bps
-    terms = ranges.terms(
-        latency_s=0.0, unreliability=0.0, compute=0.0, bandwidth_bps=0.25 * full_bps, capacity_bps=capacity_bps
-    )
-    assert terms.bandwidth == pytest.approx(0.25)
-
-
-def test_predictions_are_priced_as_measurements_are() -> None:
-    """Steady, and over a path whose mean is the capacity."""
-    predictor = Predictor(GRID, weights=profile("mapping"), ranges=RANGES)
-    for capacity_bps in (0.6e6, 4e6, 40e6):
-        path = CapacityPath.of(6.0, [PLANNED_SHARE * capacity_bps] * 60, 6)
-        for found in (
-            predictor.predict(situation(capacity_bps)),
-            predictor.predict(situation(capacity_bps), None, path),
-        ):
-            one = found.prediction(5)
-            terms = RANGES.terms(
-                latency_s=one.latency_s,
-                unreliability=one.unreliability,
-                compute=one.compute,
-                bandwidth_bps=one.bandwidth_bps,
-                capacity_bps=capacity_bps,
-            )
-            assert one.terms == pytest.approx(terms)
-
-
-def test_reliability_is_of_what_was_needed_not_of_what_was_sent() -> None:
-    """Half of a class that needs 40 % is full reliability; a tenth is a quarter of it, however perfectly delivered."""
-    demands = [ClassDemand(BULK, 10.0, 1000.0, 1.0, needed=0.4)]
-
-    def unreliability(on_time: int) -> float:
-        outcome = ClassOutcome(BULK, 10, on_time, on_time, on_time, 0.1 * on_time)
-        return measure(demands, [outcome], interval_s=1.0, cpu_s=0.0, saturated=False, ranges=RANGES).unreliability
-
-    assert unreliability(5) == 0.0
-    assert unreliability(1) == pytest.approx(0.75)
-    assert unreliability(0) == 1.0
-
-
-def test_classes_without_traffic_do_not_count() -> None:
-    demands = [ClassDemand(CONTROL, 10.0, 100.0, 0.2), ClassDemand(BULK, 0.0, 1000.0, 1.0)]
-    outcomes = [ClassOutcome(CONTROL, 10, 10, 10, 10, 0.5), ClassOutcome(BULK, 0, 0, 0, 0, 0.0)]
-    got = measure(demands, outcomes, interval_s=1.0, cpu_s=0.01, saturated=False, ranges=RANGES)
-    assert got.unreliability == 0.0
-    assert got.latency_s == pytest.approx(0.05)
-    assert got.compute == pytest.approx(0.01)
-
-
-def test_a_class_of_which_nothing_arrives_has_the_largest_latency_and_one_thinned_to_nothing_keeps_its_last() -> None:
-    demands = [ClassDemand(BULK, 10.0, 1000.0, 1.0)]
-
-    def latency_s(outcome: ClassOutcome, previous: Measurement | None = None) -> Measurement:
-        return measure(demands, [outcome], interval_s=1.0, cpu_s=0.0, saturated=False, ranges=RANGES, previous=previous)
-
-    lost = latency_s(ClassOutcome(BULK, 10, 10, 0, 0, 0.0))
-    assert lost.latency_s == RANGES.latency_max_s
-    before = latency_s(ClassOutcome(BULK, 10, 1, 1, 1, 0.12))
-    assert latency_s(ClassOutcome(BULK, 10, 0, 0, 0, 0.0), before).latency_s == pytest.approx(0.12)
-
-
-# --- predictions ----------------------------------------------------------------------------------------------------
-
-
-def one(demand: ClassDemand, configuration: Configuration, link: LinkState) -> Prediction:
-    predictor = Predictor(Grid([configuration]), weights=profile("balanced"), ranges=Ranges(latency_max_s=10.0))
-    return predictor.predict(Situation((demand,), link)).prediction(0)
-
-
-def test_an_unloaded_link_costs_serialisation_and_half_a_round_trip() -> None:
-    demand = ClassDemand(CONTROL, 1.0, 940.0, 1.0)
-    got = one(demand, Configuration(), LinkState(1e6, 0.1))
-    serialised_s = 8 * (940 + 60) / (PLANNED_SHARE * 1e6)
-    assert got.latency_s == pytest.approx(0.05 + serialised_s, rel=0.02)
-    assert got.unreliability < 0.01
-    assert got.bandwidth_bps == pytest.approx(8 * 1000, rel=0.01)
-
-
-def test_the_wait_is_that_of_an_m_g_1_queue() -> None:
-    """Poisson arrivals of one size at load 0.6, a queue that never overflows: W = ρX/(2(1−ρ)) (Pollaczek–Khinchine)."""
-    x_s = 8 * 1000 / (PLANNED_SHARE * 1e6)
-    demand = ClassDemand(CONTROL, 0.6 / x_s, 940.0, 10.0, topics=1000)
-    got = one(demand, Configuration(), LinkState(1e6, 0.0))
-    assert got.latency_s == pytest.approx(x_s + 0.6 * x_s / (2 * 0.4), rel=0.02)
-
-
-def test_a_less_urgent_class_delays_by_a_fragment_not_by_a_message() -> None:
-    control = ClassDemand(CONTROL, 10.0, 100.0, 0.5)
-    predictor = Predictor(Grid([Configuration()]), weights=profile("balanced"), ranges=RANGES)
-
-    def control_s(*more: ClassDemand) -> float:
-        found = predictor.predict(Situation((control, *more), LinkState(1e6, 0.0)))
-        return found.prediction(0).classes[0].latency_s
-
-    fragment_s = 8 * 1231 / 0.9e6
-    small = control_s(ClassDemand(BULK, 0.5, 100_000.0, 1.0))
-    large = control_s(ClassDemand(BULK, 0.05, 1_000_000.0, 1.0))
-    assert control_s() < small < control_s() + fragment_s
-    assert large == pytest.approx(small, rel=0.02)
-
-
-@pytest.mark.parametrize("capacity_bps", [1e4, 1e5, 1e6, 1e7, 1e9])
-@pytest.mark.parametrize("loss", [0.0, 0.1, 1.0])
-def test_predictions_are_finite_and_in_range_at_any_load(capacity_bps: float, loss: float) -> None:
-    predictor = Predictor(GRID, weights=profile("mapping"), ranges=RANGES)
-    got = predictor.predict(situation(capacity_bps, loss=loss))
-    for array in (got.latency_s, got.unreliability, got.compute, got.bandwidth_bps, got.cost, *got.terms):
-        assert np.isfinite(array).all()
-    assert ((got.cost >= 0.0) & (got.cost <= 1.0)).all()
-    assert (got.bandwidth_bps <= 1.001 * PLANNED_SHARE * capacity_bps).all()
-    for part in got.classes:
-        for array in (part.drop, part.late, part.on_time):
-            assert ((array >= 0.0) & (array <= 1.0)).all()
-
-
-def test_less_capacity_is_never_better() -> None:
-    predictor = Predictor(GRID, weights=profile("teleoperation"), ranges=RANGES)
-    scores = [predictor.predict(situation(c)) for c in (8e6, 4e6, 2e6, 1e6, 5e5, 2e5)]
-    for more, less in itertools.pairwise(scores):
-        assert (less.unreliability >= more.unreliability - 0.02).all()
-
-
-def test_redundancy_squares_the_loss_of_protected_classes() -> None:
-    demand = ClassDemand(CONTROL, 50.0, 100.0, 1.0, arrival_cv2=0.0, protected=True)
-    link = LinkState(1e7, 0.05, 0.1)
-    once = one(demand, Configuration(), link)
-    twice = one(demand, Configuration(redundancy=1), link)
-    assert once.unreliability == pytest.approx(0.1, abs=0.01)
-    assert twice.unreliability == pytest.approx(0.01, abs=0.005)
-    assert twice.bandwidth_bps == pytest.approx(2 * once.bandwidth_bps, rel=0.01)
-
-
-def test_a_repaired_message_costs_time_instead_of_reliability() -> None:
-    link = LinkState(1e7, 0.05, 0.1)
-    large = ClassDemand(BULK, 1.0, 30_000.0, 1.0, arrival_cv2=0.0)
-    repaired, bare = one(large, Configuration(), link), one(replace(large, repaired=False), Configuration(), link)
-    assert repaired.unreliability < 0.01 < 0.9 < bare.unreliability
-    assert repaired.latency_s > bare.latency_s + 0.05
-
-
-def test_reliable_topics_are_not_thinned() -> None:
-    demand = ClassDemand(BULK, 10.0, 1000.0, 1.0, thinnable=0.0)
-    got = one(demand, Configuration(rates=(1.0, 1.0, 0.1)), LinkState(1e7, 0.0))
-    assert got.unreliability < 0.01
-
-
-def test_the_capacity_must_be_known() -> None:
-    predictor = Predictor(GRID, weights=profile("balanced"), ranges=RANGES)
-    with pytest.raises(UsageError, match="capacity"):
-        predictor.predict(situation(None))
-
 
 # --- feasibility and choice -----------------------------------------------------------------------------------------
 

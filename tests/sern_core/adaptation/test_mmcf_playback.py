@@ -8,7 +8,7 @@ from sern_core.adaptation.model import ClassDemand, Configuration, LinkState, Pr
 from sern_core.adaptation.playback import STEPS, CapacityPath
 from sern_core.adaptation.predict import PLANNED_SHARE, Grid, Predictor
 from sern_core.vocabulary.types import PriorityClass
-from tests.sern_core.adaptation.test_mmcf import GRID, RANGES, situation
+from tests.sern_core.adaptation.situations import GRID, RANGES, situation
 
 CONTROL, STATE, BULK = PriorityClass
 

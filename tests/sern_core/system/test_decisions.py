@@ -122,7 +122,7 @@ def dropped() -> tuple[TraceRecord, ...]:
 
 
 def lease_expired() -> tuple[TraceRecord, ...]:
-    """As a site's bridge does it."""
+    """A lease ends, and the core is told as a site's bridge tells it."""
     world = World()
     robot, site = pair(world)
     command = robot.publish("/robot/cmd", spec(PriorityClass.CONTROL))
