@@ -213,12 +213,15 @@ async def marks_by_class(robot: ClientDaemon, relay: RelayDaemon, tap: Tap | Cap
         return all(sum(size > least for _, size in way) >= 40 for way in (tap.up, tap.down))
 
     def quiet() -> bool:
-        """Whether nothing of the class before is still to come."""
+        """Whether nothing of the class before is still to come, and nothing that the session says of its streams: that
+        is as long as what is counted here, and of another class."""
         links = (robot.core.link, hub.links[ClientName("robot1")])
         mine = [channel for link in links for channel in link.sender.channels.values()]
-        return not any(channel.queue or channel.flying for channel in mine)
+        return all(link.control.settled for link in links) and not any(c.queue or c.flying for c in mine)
 
     seen: Seen = {}
+    await until(lambda: len(robot.core.link.taking.incoming) == len(down), "all are announced")
+    await until(quiet, "the session has said what there is to say")
     clear()
     for priority, nbytes in ((PriorityClass.CONTROL, 300), (PriorityClass.STATE, 500), (PriorityClass.BULK, 20_000)):
         least = min(nbytes, 1000)
