@@ -76,7 +76,7 @@ class Connection:
         address = split_tcp(relay.endpoint)
         if relay.udp and keys is not None and address is not None:
             self.lane = ClientLane(self._core, address[0], kick=self.wake, marks=marks)
-        if relay.express and address is not None:
+        if relay.priority_connections and address is not None:
             self.express = ClientExpress(
                 self._core, self.transport, link.redundancy, datagrams=self.lane is not None, kick=self.wake
             )

@@ -15,6 +15,7 @@ from pydantic_core import ErrorDetails
 
 from sern_core.vocabulary.errors import ConfigError
 from sern_runtime.config.base import FileModel, Section, resolve
+from sern_runtime.config.renamed import renamed_key
 from sern_runtime.config.yaml import Document, Loc, Node, parse_document, read_document
 
 M = TypeVar("M", bound=FileModel)
@@ -168,7 +169,10 @@ def _render(document: Document, model: type[Section], details: ErrorDetails) -> 
     if kind == "extra_forbidden":
         parent = _trace(document, model, loc[:-1])
         key = str(loc[-1])
-        return document.error((*parent.loc, key), _unknown("key", key, accepted_keys(parent.models), quiet=True))
+        accepted = accepted_keys(parent.models)
+        new = renamed_key(key, accepted)
+        problem = _unknown("key", key, accepted, quiet=True) if new is None else f"is called {new} now"
+        return document.error((*parent.loc, key), problem)
     place = _trace(document, model, loc)
     if kind == "fault":
         return document.error((*place.loc, *context["at"]), str(context["problem"]))

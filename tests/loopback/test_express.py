@@ -80,7 +80,7 @@ async def test_it_can_be_switched_off(tmp_path: Path) -> None:
     async with Lab(tmp_path, "robot1", "site") as lab:
         relay = await lab.relay()
         site = await lab.connected(lab.recorder_file("site", "/.*", relay=STREAM))
-        robot = await lab.client(player(lab, bag, express=False))
+        robot = await lab.client(player(lab, bag, priority_connections=False))
         await until(lambda: delivered(site) == 100 and joined(relay, "site"))
         assert joined(relay) == []
         for daemon in (robot, site, relay):

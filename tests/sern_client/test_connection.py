@@ -76,7 +76,7 @@ def with_parts(said: list[str], core: ClientCore | None = None, *, broken: tuple
     [
         (NOBODY, True, {}, {"lane", "express"}),
         (NOBODY, True, {"udp": False}, {"express"}),
-        (NOBODY, True, {"express": False}, {"lane"}),
+        (NOBODY, True, {"priority_connections": False}, {"lane"}),
         (NOBODY, False, {}, {"express"}),  # datagrams are sealed with keys that come over a proven stream
         (LOCAL, False, {}, {"express", "name"}),
         ("ipc://nobody", True, {}, set()),
@@ -120,7 +120,7 @@ async def test_a_relay_hears_from_it_and_what_is_no_frame_is_counted(zmq_context
     try:
         port = router.bind_to_random_port("tcp://127.0.0.1")
         reasons: list[str] = []
-        connection = connection_to(f"tcp://127.0.0.1:{port}", down=reasons.append, express=False)
+        connection = connection_to(f"tcp://127.0.0.1:{port}", down=reasons.append, priority_connections=False)
         connection.open(zmq_context, None, ())
         await until(lambda: router.poll(0), "says HELLO")
         peer, data = router.recv_multipart()

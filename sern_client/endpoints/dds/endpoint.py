@@ -1,8 +1,8 @@
 """The `dds` endpoint: what a ROS 2 domain publishes goes to the link, what comes from the link is published there.
 
 What another SERN endpoint publishes in the same domain came over a link already and is not offered again, so that two
-of them beside each other make no loop; they know each other by the USER_DATA of their participants. `heed_sern` turns
-that off, for a chain of two links with a domain in the middle.
+of them beside each other make no loop; they know each other by the USER_DATA of their participants. `accept_bridged`
+turns that off, for a chain of two links with a domain in the middle.
 """
 
 import asyncio
@@ -69,7 +69,7 @@ class DdsOptions:
     queue_depth: int = 100
     max_buffer_bytes: int = 64 * 2**20
     offer_lifespan: bool = False
-    heed_sern: bool = False
+    accept_bridged: bool = False
 
 
 class DdsEndpoint:
@@ -78,7 +78,7 @@ class DdsEndpoint:
     def __init__(self, options: DdsOptions) -> None:
         self.options = options
         self.counters = DdsCounters()
-        self.graph = Graph(UUID(int=0), self, heed_sern=options.heed_sern)
+        self.graph = Graph(UUID(int=0), self, accept_bridged=options.accept_bridged)
         self.graph.own_guard = options.node_name + GUARD_SUFFIX
         self.types = Definitions(options.type_paths)
         self.entities = Entities(
