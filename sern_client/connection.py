@@ -10,7 +10,7 @@ from typing import Final
 
 import zmq
 
-from sern_client.express import ClientExpress
+from sern_client.priority_lane import ClientExpress
 from sern_client.relay_name import RelayName, name_in
 from sern_client.transport import RelayTransport
 from sern_client.udp import ClientLane

@@ -14,7 +14,7 @@ from sern_core.vocabulary.params import Redundancy
 from sern_core.vocabulary.types import ClientName
 from sern_core.wire import framing
 from sern_relay.connections import ClientConnection, ClientConnections, Served
-from sern_relay.express import JOIN, RelayExpress
+from sern_relay.priority_lanes import JOIN, RelayExpress
 from sern_runtime import clock
 from sern_runtime.config.keys import KeyStatus, parse_user_id
 from sern_runtime.dscp import Marks

@@ -11,7 +11,7 @@ import zmq
 
 from benchmarks.link.load import HELLO_PERIOD_S, Kind, Load, Log, Orders, Spec, offer, ready
 from sern_client.daemon import TICK_S
-from sern_client.express import ClientExpress
+from sern_client.priority_lane import ClientExpress
 from sern_client.transport import RelayTransport
 from sern_client.udp import ClientLane
 from sern_core.site.client import ClientCore

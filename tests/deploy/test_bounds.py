@@ -18,7 +18,7 @@ from sern_core.vocabulary import ledger
 from sern_core.vocabulary.limits import LIMITS
 from sern_core.wire import numbering
 from sern_relay import server, transforms
-from sern_runtime import express, feed_inflow, feed_subscriptions
+from sern_runtime import feed_inflow, feed_subscriptions, priority_paths
 from sern_runtime.config.relay import RelaySection, ReplaySection
 
 ROOT: Final = Path(__file__).resolve().parents[2]
@@ -81,7 +81,7 @@ BOUNDS: Final[dict[str, tuple[str, ...]]] = {
     "decisions of the access rules": (f"{access.CACHE_ENTRIES:,} ",),
     "bodies that are being decoded": (nbytes(decoding.MAX_WAITING_BYTES),),
     "connections, half-open ones": (f"{default(RelaySection, 'max_connections')} |",),
-    "connections of one client": (f"{server.MAX_PORTS}; {express.CONNECTIONS} |",),
+    "connections of one client": (f"{server.MAX_PORTS}; {priority_paths.CONNECTIONS} |",),
     "connections of the plain feed": (f"{feed_inflow.MAX_CONNECTIONS} |",),
     "latest values at a client": (f"{latest.MAX_TOPICS:,} streams", f"{latest.MAX_VALUE_BYTES // 1024} kB each"),
 }

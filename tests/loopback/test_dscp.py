@@ -17,7 +17,7 @@ from sern_relay.daemon import RelayDaemon
 from sern_runtime import clock
 from sern_runtime.config.shared import DscpSection
 from sern_runtime.dscp import Marks
-from sern_runtime.express import CONNECTIONS
+from sern_runtime.priority_paths import CONNECTIONS
 from sern_runtime.udp import UdpServer
 from sern_runtime.udp_client import UdpClient
 from sern_runtime.zmq_socket import SendResult

@@ -14,15 +14,15 @@ from typing import Any, Final, NamedTuple
 
 import pytest
 
-from sern_client import express, guard, relay_name
+from sern_client import guard, priority_lane, relay_name
 from sern_client.checks import CHECK_S, CONFIRM_S, TableCheck
 from sern_client.daemon import ClientDaemon
 from sern_client.endpoints.ros1 import services, subscription
 from sern_client.endpoints.ros1.header import encode_header
-from sern_client.express import ClientExpress
 from sern_client.guard import Guard
 from sern_client.link_news import SILENT
 from sern_client.link_topics import LinkTopics
+from sern_client.priority_lane import ClientExpress
 from sern_client.relay_name import RelayName, UnresolvedError
 from sern_client.withdrawal import Withdrawal
 from sern_core.path.lanes import LANE_EXPRESS, LANE_ZMQ
@@ -263,7 +263,7 @@ async def _express(scene: Scene, lose: Callable[[Transport], None]) -> None:
     lose(transport)
     lane.tick()
     if transport.made:
-        for _ in range(express.ATTEMPTS):
+        for _ in range(priority_lane.ATTEMPTS):
             for connection in transport.made:
                 connection.up(None)
                 connection.down("closed")
@@ -271,7 +271,7 @@ async def _express(scene: Scene, lose: Callable[[Transport], None]) -> None:
     assert LANE_EXPRESS not in link.lanes.by_id
     transport.problem = ""
     transport.made.clear()
-    now.go_on(express.ASK_AGAIN_S)
+    now.go_on(priority_lane.ASK_AGAIN_S)
     lane.tick()
     for connection in transport.made:
         connection.up(None)

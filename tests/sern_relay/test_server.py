@@ -13,8 +13,8 @@ from sern_relay import server as servers
 from sern_relay.server import MAX_PORTS, REFUSED_KEY, RelayServer
 from sern_runtime import clock
 from sern_runtime.config.keys import KeyStatus, SecretKey, user_id
-from sern_runtime.express import CONNECTIONS
 from sern_runtime.monitor import Connection
+from sern_runtime.priority_paths import CONNECTIONS
 from sern_runtime.zmq_socket import PeerDetails, SendResult
 from tests.sern_client.sessions import Ignored
 from tests.world import OPEN_ACCESS

@@ -15,8 +15,8 @@ from sern_core.vocabulary.params import SchedulerParams
 from sern_core.vocabulary.trace import LINK, HoldReason, TraceEvent, TraceRecord
 from sern_core.vocabulary.types import ClientName, DropReason, Ordering, PriorityClass, TopicName
 from sern_sim.models import LinkModel, RateStep, Window
-from tests.sern_core.link.test_express import Express, stream
 from tests.sern_core.link.test_lanes import TwoLanes, models
+from tests.sern_core.link.test_priority_lane import Express, stream
 from tests.world import SimClient, World, spec
 
 THIN = LinkModel(rate_bps=500e3, delay_s=0.02).as_stream()

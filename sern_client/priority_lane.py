@@ -13,8 +13,8 @@ from sern_core.vocabulary.errors import ConfigError, RemoteError
 from sern_core.vocabulary.params import Redundancy
 from sern_core.wire import framing
 from sern_runtime import clock
-from sern_runtime.express import CONNECTIONS, ExpressPaths
 from sern_runtime.monitor import TcpHandle
+from sern_runtime.priority_paths import CONNECTIONS, ExpressPaths
 from sern_runtime.pump import Pump
 
 DATAGRAMS_FIRST_S: Final = 3.0

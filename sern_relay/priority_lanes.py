@@ -14,7 +14,7 @@ from sern_core.vocabulary.types import ClientName
 from sern_core.wire import framing
 from sern_relay.connections import ClientConnection, ClientConnections
 from sern_runtime import clock
-from sern_runtime.express import CONNECTIONS, ExpressPaths
+from sern_runtime.priority_paths import CONNECTIONS, ExpressPaths
 from sern_runtime.pump import Pump
 from sern_runtime.zmq_socket import SendResult
 

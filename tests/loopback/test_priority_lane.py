@@ -8,8 +8,8 @@ from sern_client.daemon import ClientDaemon
 from sern_core.vocabulary.params import Redundancy
 from sern_core.vocabulary.types import ClientName
 from sern_relay.daemon import RelayDaemon
-from sern_runtime.express import CONNECTIONS, MIN_SEGMENTS, ExpressPaths
 from sern_runtime.monitor import TcpHandle, TcpInfo
+from sern_runtime.priority_paths import CONNECTIONS, MIN_SEGMENTS, ExpressPaths
 from sern_runtime.zmq_socket import SendResult
 from tests.daemons import Lab, bodies, delivered, under, write_bag
 from tests.support import until
