@@ -12,7 +12,7 @@ from sern_core.link.end import End
 from sern_core.link.lane_set import LaneSet
 from sern_core.link.send_trace import held_back
 from sern_core.link.sender import Sender
-from sern_core.path.lanes import LANE_EXPRESS, Lane
+from sern_core.path.lanes import LANE_PRIORITY, Lane
 from sern_core.stream.coding import Coding
 from sern_core.stream.out_channel import OutChannel
 from sern_core.stream.scheduler import WaitReason
@@ -81,7 +81,7 @@ class Holds:
             served = None
         if closed and served is not None and served.spec.priority < channel.spec.priority:
             return HoldReason.CLASS, self._before(served.slot)
-        beside = self._lanes.express is not None
+        beside = self._lanes.priority_lane is not None
         # As if there were room, for that says who would take it; the room itself is what the first in line waits for.
         wait, chosen = self._sender.scheduler.waits_for(channel.slot, now, beside=beside)
         if wait is not None and wait is not WaitReason.WINDOW:
@@ -99,9 +99,9 @@ class Holds:
         return HoldReason.WINDOW, {"inflight_bytes": lane.flight.inflight_bytes, **known}
 
     def _lane_of(self, channel: OutChannel) -> Lane:
-        express = self._lanes.express
+        own = self._lanes.priority_lane
         control = channel.spec.priority is PriorityClass.CONTROL
-        return express if control and express is not None and express.id == LANE_EXPRESS else self._lanes.lane
+        return own if control and own is not None and own.id == LANE_PRIORITY else self._lanes.lane
 
     def _before(self, slot: int | None) -> dict[str, Field]:
         """Who goes first."""

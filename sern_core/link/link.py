@@ -163,7 +163,7 @@ class Link:
             lanes.lane.lossless
             and self.end.resumed
             and channel.wanted
-            and not (channel.spec.priority is PriorityClass.CONTROL and lanes.express is not None)
+            and not (channel.spec.priority is PriorityClass.CONTROL and lanes.priority_lane is not None)
         )
 
     def _finished(self, now: float) -> bool:

@@ -12,9 +12,9 @@ from sern_core.vocabulary.types import PriorityClass
 
 LANE_ZMQ: Final = 0
 LANE_UDP: Final = 1
-LANE_EXPRESS: Final = 2
+LANE_PRIORITY: Final = 2
 """Class control alone, over TCP connections of its own: behind no bulk byte, and no retransmission of one."""
-LANE_NAMES: Final = {LANE_ZMQ: "zmq", LANE_UDP: "udp", LANE_EXPRESS: "express"}
+LANE_NAMES: Final = {LANE_ZMQ: "zmq", LANE_UDP: "udp", LANE_PRIORITY: "priority"}
 
 DATAGRAM_BYTES: Final = 1171
 """A datagram of the UDP lane: with seal, session and kind it is 1200 bytes of UDP payload, which every path carries."""
@@ -51,7 +51,7 @@ def _estimator(params: LinkParams) -> CapacityEstimator:
 class Path:
     """What the lanes over one path have in common: one window, one pace, and one count of what has arrived.
 
-    The express lane shares the path of the stream that it is beside. With a window of its own each of them would take
+    The priority lane shares the path of the stream that it is beside. With a window of its own each of them would take
     the other's traffic for a slower link, and class control would have none while the stream has nothing to send.
     """
 
@@ -177,8 +177,8 @@ class Lane:
 
     @property
     def redundant(self) -> bool:
-        """Whether class control is sent twice here; the express lane's connections see to that themselves."""
-        if self.lossless or self.id == LANE_EXPRESS or self._redundancy is Redundancy.OFF:
+        """Whether class control is sent twice here; the priority lane's connections see to that themselves."""
+        if self.lossless or self.id == LANE_PRIORITY or self._redundancy is Redundancy.OFF:
             return False
         if self._redundancy is Redundancy.ALWAYS:
             return True

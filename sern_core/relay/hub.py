@@ -18,7 +18,7 @@ from typing import Final
 
 from sern_core.link.definitions import DefinitionStore
 from sern_core.link.link import TIDY_S, Link
-from sern_core.path.lanes import LANE_EXPRESS
+from sern_core.path.lanes import LANE_PRIORITY
 from sern_core.relay.access import AccessTable
 from sern_core.relay.awaited import Awaited
 from sern_core.relay.clients import Clients
@@ -241,7 +241,7 @@ class Hub:
         link.open_lane(now=now)
 
     def join(self, client: ClientName, data: bytes, *, now: float) -> bool:
-        """A connection says that it belongs to the client's session: open the express lane, unless it is open. `client`
+        """A connection belongs to the session of the client: open the priority lane, unless it is open. `client`
         is bound to the connection's key. False: there is no such session. Raises WireError."""
         header = framing.decode_header(data)
         envelope = framing.decode_handshake(data)
@@ -250,8 +250,8 @@ class Hub:
             return False
         if not link.handshake.joins(envelope, header.tag):
             return False
-        if LANE_EXPRESS not in link.lanes.by_id:
-            link.open_lane(now=now, lane_id=LANE_EXPRESS)
+        if LANE_PRIORITY not in link.lanes.by_id:
+            link.open_lane(now=now, lane_id=LANE_PRIORITY)
         return True
 
     # --- LinkHandler ----------------------------------------------------------------------------------------------
