@@ -55,7 +55,7 @@ class Datagram:
         message = out.message
         start, end = channel.take(out, max(limit - self.size - framing.DATA_FIRST_BYTES, MIN_SHARE_BYTES), now)
         self.items.append(SentData(channel, out, out.generation, start, end))
-        flags = framing.FLAG_TOMBSTONE if message.tombstone else 0
+        flags = framing.FLAG_DROP_MARKER if message.drop_marker else 0
         if message.replay:
             flags |= framing.FLAG_REPLAY
         if channel.spec.priority is PriorityClass.CONTROL:

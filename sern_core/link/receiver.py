@@ -88,7 +88,7 @@ class Receiver:
     ) -> bool | None:
         """FrameSink: one fragment."""
         now = self._end.now
-        if codec and (codec not in KNOWN_CODECS or channel == CONTROL_CHANNEL or flags & framing.FLAG_TOMBSTONE):
+        if codec and (codec not in KNOWN_CODECS or channel == CONTROL_CHANNEL or flags & framing.FLAG_DROP_MARKER):
             raise WireError(f"codec {codec} has no place there")
         if flags & framing.FLAG_URGENT:
             self._lane.arrivals.due = True

@@ -105,7 +105,7 @@ class Sender:
         self.held_back_due_s = due_s
 
     def reject(self, channel: OutChannel, message: Message, reason: DropReason, *, now: float) -> None:
-        """Drop a message on its way in; of a reliable stream a tombstone goes on in its place."""
+        """Drop a message on its way in; of a reliable stream a drop marker goes on in its place."""
         self._end.now = now
         channel.reject(message, reason)
         self.refresh(channel, now)

@@ -232,13 +232,13 @@ class StreamsIn:
                 self._undelivered(stream, message, error)
 
     def _undelivered(self, stream: InStream, message: Message, error: Exception) -> None:
-        """The owner failed at a message: it is given up, and its tombstone has the turn."""
+        """The owner failed at a message: it is given up, and its drop marker has the turn."""
         self._events.fault(error)
-        if message.tombstone:
+        if message.drop_marker:
             lost = message
         elif stream.reliable:
             self._in_drop(stream, DropReason.FAULT, len(message.body), (message.seq,), reported=True)
-            lost = stream.tombstone(message.seq, DropReason.FAULT, message.stamp_ns, message.born_s)
+            lost = stream.drop_marker(message.seq, DropReason.FAULT, message.stamp_ns, message.born_s)
         else:
             self._in_drop(stream, DropReason.FAULT, len(message.body), (message.seq,), reported=False)
             return
@@ -250,7 +250,7 @@ class StreamsIn:
     def _in_drop(self, stream: InStream, reason: DropReason, nbytes: int, seqs: Sequence[int], reported: bool) -> None:
         if reported:
             for seq in seqs:
-                self._answers.report(stream, seq, reason, self._end.name)  # its tombstone tells the owner
+                self._answers.report(stream, seq, reason, self._end.name)  # its drop marker tells the owner
                 self._answered(1)
         else:
             self._events.discarded(stream, reason, nbytes, seqs)

@@ -24,7 +24,7 @@ class HubEvents(Protocol):
     def stream_removed(self, stream: StreamInfo) -> None: ...
 
     def message(self, stream: StreamInfo, message: Message, *, now: float) -> None:
-        """A message passed; the plain feed takes it. Tombstones are not reported."""
+        """A message passed; the plain feed takes it. Drop markers are not reported."""
 
     def refused(self, client: ClientName, code: str, text: str) -> None: ...
 

@@ -409,7 +409,7 @@ class ClientCore:
         if stream.unhandled and not stream.reliable and lifespan_s is not None and message.age_s(now) > lifespan_s:
             self._failed(stream, message, DropReason.LIFESPAN, "", now)  # while it was decoded
             return
-        if message.tombstone:
+        if message.drop_marker:
             reason = message.drop_reason
             self.received.of(stream.stream).drop_arrived(reason)
             self._tell(self.events.expired, stream.stream, message.seq, reason)

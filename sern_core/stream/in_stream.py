@@ -1,8 +1,8 @@
-"""The receiving side of a stream on one hop: reassembly, duplicates, order, tombstones.
+"""The receiving side of a stream on one hop: reassembly, duplicates, order, drop markers.
 
 Best effort is delivered in increasing seq (a late older sample is dropped as superseded); reliable is delivered
-once and in order, a tombstone taking its message's turn. A reliable message that cannot be kept here (too late, too
-large, no room) becomes a tombstone as well, and the sender is told: nothing waits for it for ever.
+once and in order, a drop marker taking its message's turn. A reliable message that cannot be kept here (too late, too
+large, no room) becomes a drop marker as well, and the sender is told: nothing waits for it for ever.
 State is kept per `StreamId`, across sessions and peers: that is what makes "once" hold when a relay comes back as a
 new process and everything is sent again.
 """
@@ -18,7 +18,7 @@ from sern_core.vocabulary.errors import WireError
 from sern_core.vocabulary.limits import LIMITS, PeerLimits
 from sern_core.vocabulary.message import Message, StreamInfo
 from sern_core.vocabulary.types import DROP_CODES, DROP_REASONS, DropReason, PriorityClass
-from sern_core.wire.framing import FLAG_REPLAY, FLAG_TOMBSTONE, Datagram
+from sern_core.wire.framing import FLAG_DROP_MARKER, FLAG_REPLAY, Datagram
 
 PARTIAL_IDLE_S: Final = 10.0
 """A half-received best-effort message with a newer one behind it that gets no fragment for so long was given up. The
@@ -193,7 +193,7 @@ class Reassembly:
 Deliver = Callable[["InStream", Message], None]
 OnInDrop = Callable[["InStream", DropReason, int, Sequence[int], bool], None]
 """`on_drop(stream, reason, nbytes, seqs, reported)`, `nbytes` of all of them together."""
-"""Stream, reason, bytes, seq, and whether its tombstone follows: a reliable message that was given up here."""
+"""Stream, reason, bytes, seq, and whether its drop marker follows: a reliable message that was given up here."""
 
 
 class InStream:
@@ -266,12 +266,12 @@ class InStream:
         if seq <= self.delivered:
             self._late(seq, len(body))
             return
-        if self._partials and (flags & FLAG_TOMBSTONE or len(body) == total):
+        if self._partials and (flags & FLAG_DROP_MARKER or len(body) == total):
             self._discard_partial(seq)
         if self._waiting and seq in self._waiting:
             self._on_drop(self, DropReason.DUPLICATE, len(body), (seq,), False)
             return
-        if flags & FLAG_TOMBSTONE:
+        if flags & FLAG_DROP_MARKER:
             code = body[0] if body[0] in DROP_REASONS else DROP_CODES[DropReason.LOST]
             self._arrived(Message(self.stream.id, seq, bytes(body), stamp_ns, born_s, code))
             return
@@ -342,7 +342,7 @@ class InStream:
         return False
 
     def give_up(self, seq: int, reason: DropReason, nbytes: int, now: float) -> None:
-        """Message `seq` cannot be taken here: best effort loses it, of a reliable stream a tombstone takes its turn."""
+        """Message `seq` cannot be taken: best effort loses it, of a reliable stream a drop marker takes its turn."""
         self._now = now
         if seq <= self.delivered or seq in self._waiting:
             return
@@ -352,7 +352,7 @@ class InStream:
         if self._reassembly.unheard.crowded:
             self._check_heard()
         self._on_drop(self, reason, nbytes, (seq,), True)
-        self._arrived(self.tombstone(seq, reason, 0, now))
+        self._arrived(self.drop_marker(seq, reason, 0, now))
 
     def fail(self, seq: int, nbytes: int, now: float) -> None:
         """Message `seq` met an error of ours: it is given up, and what waited behind it goes on."""
@@ -360,7 +360,7 @@ class InStream:
         self.give_up(seq, DropReason.FAULT, nbytes, now)
         self._advance()
 
-    def tombstone(self, seq: int, reason: DropReason, stamp_ns: int, born_s: float) -> Message:
+    def drop_marker(self, seq: int, reason: DropReason, stamp_ns: int, born_s: float) -> Message:
         """What takes the turn of a reliable message that was dropped."""
         code = DROP_CODES[reason]
         return Message(self.stream.id, seq, bytes([code]), stamp_ns, born_s, code)
@@ -419,10 +419,10 @@ class InStream:
             return
         size = len(message.body)
         if not self._reassembly.make_room(size + HELD_OVERHEAD_BYTES):
-            # Without the message before it this one cannot be kept; its tombstone can.
-            if not message.tombstone:
+            # Without the message before it this one cannot be kept; its drop marker can.
+            if not message.drop_marker:
                 self._on_drop(self, DropReason.REASSEMBLY, size, (seq,), True)
-                message = self.tombstone(seq, DropReason.REASSEMBLY, message.stamp_ns, message.born_s)
+                message = self.drop_marker(seq, DropReason.REASSEMBLY, message.stamp_ns, message.born_s)
             if not self._reassembly.make_room(len(message.body) + HELD_OVERHEAD_BYTES):
                 raise WireError(f"more messages out of order than {self._reassembly.limit_bytes} bytes hold")
         self._waiting[seq] = message
@@ -469,7 +469,7 @@ class InStream:
         lifespan_s = self.lifespan_s
         if (
             lifespan_s is not None
-            and not message.tombstone
+            and not message.drop_marker
             and self._now - message.born_s + message.error_s > lifespan_s
         ):
             # Late as far as can be known: where the clocks' offset is uncertain, the worst of it counts.
@@ -478,7 +478,7 @@ class InStream:
                 self._on_drop(self, DropReason.LIFESPAN, size, (message.seq,), False)
                 return
             self._on_drop(self, DropReason.LIFESPAN, size, (message.seq,), True)
-            message = self.tombstone(message.seq, DropReason.LIFESPAN, message.stamp_ns, message.born_s)
+            message = self.drop_marker(message.seq, DropReason.LIFESPAN, message.stamp_ns, message.born_s)
         self.known = True
         self._deliver(self, message)
 

@@ -141,11 +141,11 @@ class OutChannel:
         return self._kept.submit(message, now, forced=forced, unwanted=self.wanted is False)
 
     def reject(self, message: Message, reason: DropReason) -> None:
-        """Drop a message that cannot travel at all; a reliable stream goes on over its tombstone."""
+        """Drop a message that cannot travel at all; a reliable stream goes on over its drop marker."""
         self._kept.reject(message, reason)
 
     def leave_out(self, message: Message, reason: DropReason) -> None:
-        """There is no room for this reliable message, nor for a tombstone: the stream goes on behind it."""
+        """There is no room for this reliable message, nor for a drop marker: the stream goes on behind it."""
         if self._all is not None:
             self._all.leave_out(message, reason)
 
@@ -269,9 +269,9 @@ class OutChannel:
         out.size = size
 
     def drop_head(self, reason: DropReason, now: float) -> None:
-        """Give up the message that would go next (best effort); a reliable one becomes a tombstone."""
+        """Give up the message that would go next (best effort); a reliable one becomes a drop marker."""
         out = self.head(now)
-        if out is not None and not out.message.tombstone:
+        if out is not None and not out.message.drop_marker:
             self._kept.give_up(out, reason)
 
     def shed(self, room_bytes: int, reason: DropReason) -> int:
@@ -284,7 +284,7 @@ class OutChannel:
         return self._kept.shed(room_bytes, reason)
 
     def abandon(self, seq: int, reason: DropReason) -> bool:
-        """Give up reliable message `seq`; a tombstone stays. False: it has been begun, or is not here."""
+        """Give up reliable message `seq`; a drop marker stays. False: it has been begun, or is not here."""
         return self._all is not None and self._all.abandon(seq, reason)
 
     def sweep(self, now: float, *, up: bool, room: int = LIMITS.lapsed_a_sweep) -> int:
@@ -374,7 +374,7 @@ class OutChannel:
 
     @property
     def kept(self) -> int:
-        """How many messages wait here or are under way, tombstones included."""
+        """How many messages wait here or are under way, drop markers included."""
         return self._kept.kept
 
     @property
@@ -398,12 +398,12 @@ class OutChannel:
         return self._kept.unbegun_bytes
 
     def undelivered(self) -> list[OutMessage]:
-        """What is queued or in flight; counted tombstones are neither."""
+        """What is queued or in flight; counted drop markers are neither."""
         return self._kept.undelivered()
 
     def held(self) -> tuple[int, int, int, int]:
         """(messages queued, bytes queued, messages in flight, bytes in flight), bytes as they were offered; counted
-        tombstones are neither."""
+        drop markers are neither."""
         queued, flying = self._kept.split()
         queued_bytes, flying_bytes = sum(o.offered_bytes for o in queued), sum(o.offered_bytes for o in flying)
         return len(queued), queued_bytes, len(flying), flying_bytes

@@ -91,10 +91,10 @@ MAX_AGE_S: Final = AGE_UNIT_S * 0xFFFFFFFF
 AGE_ERRORS_S: Final = (0.0, *(AGE_UNIT_S * 2.0 ** (code / 8) for code in range(254)), float("inf"))
 """How much too young an age may be, by its code: every hop adds the uncertainty of its own clock offset."""
 
-FLAG_TOMBSTONE: Final = 0x01  # the message was dropped upstream; the body is one byte, its DROP_CODES value
+FLAG_DROP_MARKER: Final = 0x01  # the message was dropped upstream; the body is one byte, its DROP_CODES value
 FLAG_REPLAY: Final = 0x02  # a transient_local sample for a late joiner
 FLAG_URGENT: Final = 0x04  # class control: acknowledge at once
-KNOWN_FLAGS: Final = FLAG_TOMBSTONE | FLAG_REPLAY | FLAG_URGENT
+KNOWN_FLAGS: Final = FLAG_DROP_MARKER | FLAG_REPLAY | FLAG_URGENT
 
 
 class Kind(IntEnum):
@@ -212,8 +212,8 @@ def decode_frames(data: Datagram, sink: FrameSink, position: int = HEADER_BYTES)
             if length < SMALL_BODY_BYTES and type(data) is memoryview:
                 data = data.tobytes()  # small bodies, of which a datagram has many, are quicker cut from bytes
             body = data[position : position + length]
-            if flags & FLAG_TOMBSTONE and total != 1:
-                raise WireError("a tombstone carries exactly one byte")
+            if flags & FLAG_DROP_MARKER and total != 1:
+                raise WireError("a tombstone carries exactly one byte")  # a drop marker, in the words of the vectors
             position += length
             if sink.on_data(
                 flags, channel, seq, offset, total, body, stamp_ns, age * AGE_UNIT_S, codec, AGE_ERRORS_S[error]

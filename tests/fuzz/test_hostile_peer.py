@@ -207,10 +207,10 @@ def empty_messages_that_wait(peer: Hostile) -> Iterator[None]:
 
 
 @attack
-def tombstones_that_wait(peer: Hostile) -> Iterator[None]:
+def drop_markers_that_wait(peer: Hostile) -> Iterator[None]:
     peer.announce(1, "/robot/a", reliable=True)
     for seq in range(0, 60_000, 60):
-        peer.say(*(_whole(1, seq + i + 3, b"\x01", flags=framing.FLAG_TOMBSTONE) for i in range(60)))
+        peer.say(*(_whole(1, seq + i + 3, b"\x01", flags=framing.FLAG_DROP_MARKER) for i in range(60)))
         yield
 
 

@@ -223,11 +223,11 @@ def frames(draw: st.DrawFn) -> bytes:
     stamp_ns = draw(st.sampled_from([0, 1, -1, 2**63 - 1, -(2**63)]))
     age, error = draw(st.sampled_from([0, 1, 10_000, 2**32 - 1])), draw(st.sampled_from([0, 1, 254, 255]))
     flags, codec, offset = draw(st.sampled_from([0, 0, framing.FLAG_REPLAY, framing.FLAG_URGENT])), 0, 0
-    match draw(st.sampled_from(["whole", "whole", "codec", "tombstone", "piece", "watermark"])):
+    match draw(st.sampled_from(["whole", "whole", "codec", "drop marker", "piece", "watermark"])):
         case "watermark":
             return framing.encode_watermark(channel, seq)
-        case "tombstone":
-            flags |= framing.FLAG_TOMBSTONE
+        case "drop marker":
+            flags |= framing.FLAG_DROP_MARKER
             body = bytes([draw(st.sampled_from([0, 1, 255, *DROP_CODES.values()]))])
             total = 1
         case "piece":

@@ -169,9 +169,9 @@ def messages_out_of_order(peer: Hostile) -> list[bytes]:
 
 
 @datagram
-def tombstones(peer: Hostile) -> list[bytes]:
+def drop_markers(peer: Hostile) -> list[bytes]:
     peer.announce(1, "/robot/a", reliable=True)
-    return filled(lambda index: _whole(1, index + 1, b"\x01", flags=framing.FLAG_TOMBSTONE))
+    return filled(lambda index: _whole(1, index + 1, b"\x01", flags=framing.FLAG_DROP_MARKER))
 
 
 @datagram

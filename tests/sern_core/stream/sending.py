@@ -30,7 +30,7 @@ class Sender:
     def message(self, seq: int, size: int = 100, *, now: float = 0.0, replay: bool = False) -> Message:
         return Message(self.stream.id, seq, bytes(size), 0, now, 0, replay)
 
-    def tombstone(self, seq: int) -> Message:
+    def drop_marker(self, seq: int) -> Message:
         return Message(self.stream.id, seq, b"\x01", 0, 0.0, 1)
 
     def submit(self, count: int = 1, size: int = 100, *, now: float = 0.0) -> list[bool]:

@@ -102,7 +102,7 @@ def test_overflow_is_refused_and_accepted_again_later() -> None:
     assert site.seqs("/robot/log") == [1, 2, 3, 4, 5, 6]
 
 
-def test_expired_messages_leave_tombstones_in_their_turn_and_are_reported() -> None:
+def test_expired_messages_leave_drop_markers_in_their_turn_and_are_reported() -> None:
     world = World().watch()
     robot, site = pair(world, robot=THIN)
     log = robot.publish("/robot/log", spec(reliable=True, lifespan_s=0.5))

@@ -108,7 +108,7 @@ def test_datagram_size_limit() -> None:
 
 @STEADY
 @given(
-    st.integers(0, framing.KNOWN_FLAGS).filter(lambda flags: not flags & framing.FLAG_TOMBSTONE),
+    st.integers(0, framing.KNOWN_FLAGS).filter(lambda flags: not flags & framing.FLAG_DROP_MARKER),
     U16,
     st.integers(0, 2**64),
     st.binary(max_size=40),
