@@ -7,8 +7,9 @@ from typing import Final
 import pytest
 
 from sern_client import latest
-from sern_client.endpoints.common import first
-from sern_client.endpoints.ros1 import Ros1Options, hold
+from sern_client.endpoints.common import first_messages
+from sern_client.endpoints.ros1 import Ros1Options
+from sern_client.endpoints.ros1 import first_messages as ros1_first_messages
 from sern_core.link import control_stream, definitions
 from sern_core.relay import access, awaited, draining, routing
 from sern_core.relay.object_values import ObjectLimits
@@ -87,9 +88,9 @@ BOUNDS: Final[dict[str, tuple[str, ...]]] = {
 }
 """What the rows of the table in docs/operations.md say, by their beginning."""
 TIMES: Final = {
-    "docs/ros2-dds.md": (f"{first.HOLD_S:g} s at most", f"For {first.LEARN_S:g} s after its start"),
+    "docs/ros2-dds.md": (f"{first_messages.HOLD_S:g} s at most", f"For {first_messages.LEARN_S:g} s after its start"),
     "docs/ros1.md": (
-        f"for {hold.HOLD_S:g} s at most",
+        f"for {ros1_first_messages.HOLD_S:g} s at most",
         f"`poll_hz`, {1 / Ros1Options('http://localhost:1', 'localhost', 'x').poll_hz:g} s",
     ),
     "docs/operations.md": (

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from sern_client.endpoints.ros1.endpoint import Ros1Endpoint, Ros1Options
-from sern_client.endpoints.ros1.hold import Hold
+from sern_client.endpoints.ros1.first_messages import Hold
 from sern_client.endpoints.ros1.subscription import Topic
 from sern_core.summaries.patches import PatchParams
 from sern_core.summaries.spec import SummarySpec, VoxelParams

@@ -4,7 +4,7 @@ from collections import Counter
 from math import inf
 from typing import Generic, Protocol, TypeVar
 
-from sern_client.endpoints.common.first import FirstMessages
+from sern_client.endpoints.common.first_messages import FirstMessages
 from sern_core.vocabulary.types import DropReason, TopicName
 
 

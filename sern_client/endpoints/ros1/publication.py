@@ -15,9 +15,9 @@ from math import inf
 from typing import Final
 
 from sern_client.endpoints.common.queue import BoundedQueue
+from sern_client.endpoints.ros1.first_messages import Hold
 from sern_client.endpoints.ros1.frames import LENGTH, Frames
 from sern_client.endpoints.ros1.header import BRIDGE_FIELD, shown
-from sern_client.endpoints.ros1.hold import Hold
 from sern_client.tf_latch import TfLatch, is_static_tf
 from sern_core.vocabulary.errors import ConfigError
 from sern_core.vocabulary.message import TopicInfo

@@ -22,7 +22,7 @@ from sern_client.endpoints.base import (
     Sink,
     TopicEvents,
 )
-from sern_client.endpoints.common.first import LEARN_S, FirstMessages
+from sern_client.endpoints.common.first_messages import LEARN_S, FirstMessages
 from sern_client.endpoints.common.interest import OnDemand, Subscriptions
 from sern_client.endpoints.common.saying import SayOnce
 from sern_client.endpoints.common.stream import Stream, Streams

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 
-from sern_client.endpoints.ros1 import hold, returning
+from sern_client.endpoints.ros1 import first_messages, returning
 from sern_client.endpoints.ros1.xmlrpc import XmlRpcClient
 from sern_core.vocabulary.types import DropReason
 from tests.sern_client.endpoints.ros1.fakes import STRING, FakeMaster, listening, running, text
@@ -24,7 +24,7 @@ def known(master: FakeMaster) -> FakeMaster:
 @pytest.fixture(autouse=True)
 def patient(monkeypatch: pytest.MonkeyPatch) -> None:
     """A busy machine must not make a subscriber come too late."""
-    monkeypatch.setattr(hold, "HOLD_S", 60.0)
+    monkeypatch.setattr(first_messages, "HOLD_S", 60.0)
     monkeypatch.setattr(returning, "TOLD_S", 60.0)
 
 

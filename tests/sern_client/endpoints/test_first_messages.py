@@ -5,8 +5,8 @@ from math import inf
 
 import pytest
 
-from sern_client.endpoints.common import first
-from sern_client.endpoints.common.first import FirstMessages, Readers
+from sern_client.endpoints.common import first_messages
+from sern_client.endpoints.common.first_messages import FirstMessages, Readers
 from sern_core.vocabulary.types import DropReason
 from tests.support import until
 
@@ -36,8 +36,8 @@ class Topic:
 @pytest.fixture(autouse=True)
 def unhurried(monkeypatch: pytest.MonkeyPatch) -> None:
     """Times out when a test says so only."""
-    monkeypatch.setattr(first, "HOLD_S", 600.0)
-    monkeypatch.setattr(first, "SETTLE_S", 0.0)
+    monkeypatch.setattr(first_messages, "HOLD_S", 600.0)
+    monkeypatch.setattr(first_messages, "SETTLE_S", 0.0)
 
 
 async def test_without_subscribers_nothing_waits() -> None:
