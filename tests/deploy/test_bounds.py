@@ -88,9 +88,12 @@ BOUNDS: Final[dict[str, tuple[str, ...]]] = {
 }
 """What the rows of the table in docs/operations.md say, by their beginning."""
 TIMES: Final = {
-    "docs/ros2-dds.md": (f"{first_messages.HOLD_S:g} s at most", f"For {first_messages.LEARN_S:g} s after its start"),
+    "docs/ros2-dds.md": (
+        f"{first_messages.FIRST_MESSAGES_S:g} s at most",
+        f"For {first_messages.LEARN_S:g} s after its start",
+    ),
     "docs/ros1.md": (
-        f"for {ros1_first_messages.HOLD_S:g} s at most",
+        f"for {ros1_first_messages.FIRST_MESSAGES_S:g} s at most",
         f"`poll_hz`, {1 / Ros1Options('http://localhost:1', 'localhost', 'x').poll_hz:g} s",
     ),
     "docs/operations.md": (

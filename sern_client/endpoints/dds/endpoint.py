@@ -139,7 +139,7 @@ class DdsEndpoint:
         depth = info.depth or (RELIABLE_DEPTH if offered.reliable else 1)
         topic = names.to_dds(info.name)
         writer = self.entities.open_writer(topic, resolved, offered, depth=depth)
-        first = FirstMessages(
+        first_messages = FirstMessages(
             info.name,
             readers=lambda: writer.readers(self._waiting_readers(topic, names.type_to_dds(resolved.name), offered)),
             write=writer.publish,
@@ -149,7 +149,7 @@ class DdsEndpoint:
             overflow=DropReason.QUEUE_FULL if offered.reliable else DropReason.SUPERSEDED,
             learning_s=self._started_s + LEARN_S - asyncio.get_running_loop().time(),
         )
-        return self._streams.open(info.name, writer, first)
+        return self._streams.open(info.name, writer, first_messages)
 
     def _waiting_readers(self, topic: str, type_name: str, offered: EndpointQos) -> set[int]:
         """The readers of others that will match such a writer and get nothing that was written before, by handle."""

@@ -180,7 +180,7 @@ class Ros1Endpoint:
     @property
     def waited_for(self) -> int:
         """Topics that we publish whose first messages wait for subscribers."""
-        return sum(not publication.hold.over for publication in self._publications.values())
+        return sum(not publication.first_messages.over for publication in self._publications.values())
 
     # Endpoint
 

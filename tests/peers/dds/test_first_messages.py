@@ -21,7 +21,7 @@ FOREVER_S = 600.0
 def patient(monkeypatch: pytest.MonkeyPatch) -> Callable[[float], None]:
     """Nothing is written by the clock: `patient(0.0)` says that the subscriber knows, where the product waits."""
     monkeypatch.setattr("sern_client.endpoints.dds.endpoint.LEARN_S", FOREVER_S)
-    monkeypatch.setattr(first_messages, "HOLD_S", FOREVER_S)
+    monkeypatch.setattr(first_messages, "FIRST_MESSAGES_S", FOREVER_S)
 
     def settle(after_s: float) -> None:
         monkeypatch.setattr(first_messages, "SETTLE_S", after_s)

@@ -36,7 +36,7 @@ class Topic:
 @pytest.fixture(autouse=True)
 def unhurried(monkeypatch: pytest.MonkeyPatch) -> None:
     """Times out when a test says so only."""
-    monkeypatch.setattr(first_messages, "HOLD_S", 600.0)
+    monkeypatch.setattr(first_messages, "FIRST_MESSAGES_S", 600.0)
     monkeypatch.setattr(first_messages, "SETTLE_S", 0.0)
 
 
@@ -96,7 +96,7 @@ async def test_what_is_kept_is_bounded_and_every_drop_counted() -> None:
     late.publish(b"old", left_s=0.0)
     late.publish(b"new")
     assert not late.first.over and late.dropped == []
-    late.first._give_up_s = 0.0  # its subscriber has crashed: HOLD_S is over
+    late.first._give_up_s = 0.0  # its subscriber has crashed: FIRST_MESSAGES_S is over
     await until(lambda: late.first.over)
     assert late.written == [b"new"]
     assert late.dropped == [DropReason.LIFESPAN]  # the other was written: it is in no count of what was not

@@ -24,7 +24,7 @@ def known(master: FakeMaster) -> FakeMaster:
 @pytest.fixture(autouse=True)
 def patient(monkeypatch: pytest.MonkeyPatch) -> None:
     """A busy machine must not make a subscriber come too late."""
-    monkeypatch.setattr(first_messages, "HOLD_S", 60.0)
+    monkeypatch.setattr(first_messages, "FIRST_MESSAGES_S", 60.0)
     monkeypatch.setattr(returning, "TOLD_S", 60.0)
 
 
@@ -198,7 +198,7 @@ async def test_a_dead_subscriber_is_waited_for_only_so_long(
         stream.close()
         assert endpoint.drops == {} and known.tables[0]["/chat"] == ["/sern"]
         with caplog.at_level(logging.WARNING):
-            publication.hold._timed_out()  # as after HOLD_S
+            publication.first_messages._timed_out()  # as after FIRST_MESSAGES_S
             await until(lambda: not known.tables[0])
         assert endpoint.drops == {DropReason.DISCONNECTED: 1}
     assert "/chat: /listener has not connected within 60 s; it missed 1 message" in caplog.messages
