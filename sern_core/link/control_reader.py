@@ -8,7 +8,7 @@ from sern_core.link.control_stream import ControlStream
 from sern_core.link.definitions import PeerDefinitions
 from sern_core.link.end import End
 from sern_core.link.events import Events
-from sern_core.link.owed_lists import OwedLists
+from sern_core.link.name_lists import OwedLists
 from sern_core.link.sender import Sender
 from sern_core.link.streams_in import StreamsIn
 from sern_core.link.streams_out import StreamsOut

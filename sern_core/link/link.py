@@ -33,7 +33,7 @@ from sern_core.link.end import End
 from sern_core.link.handler import LinkHandler, Owner
 from sern_core.link.handshake import Handshake
 from sern_core.link.lane_set import LaneSet
-from sern_core.link.owed_lists import OwedLists
+from sern_core.link.name_lists import OwedLists
 from sern_core.link.reading import Reading
 from sern_core.link.receiver import Receiver
 from sern_core.link.send_trace import SendTrace

@@ -19,8 +19,8 @@ from typing import Final
 from sern_core.link.definitions import DefinitionStore
 from sern_core.link.link import TIDY_S, Link
 from sern_core.path.lanes import LANE_PRIORITY
+from sern_core.relay.absent import Awaited
 from sern_core.relay.access import AccessTable
-from sern_core.relay.awaited import Awaited
 from sern_core.relay.clients import Clients
 from sern_core.relay.forwarding import Forwarding
 from sern_core.relay.hub_events import GuardedEvents, HubEvents, Relayed

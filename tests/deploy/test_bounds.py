@@ -11,7 +11,7 @@ from sern_client.endpoints.common import first_messages
 from sern_client.endpoints.ros1 import Ros1Options
 from sern_client.endpoints.ros1 import first_messages as ros1_first_messages
 from sern_core.link import control_stream, definitions
-from sern_core.relay import access, awaited, draining, routing
+from sern_core.relay import absent, access, draining, routing
 from sern_core.relay.object_values import ObjectLimits
 from sern_core.site import peers
 from sern_core.stream import decoding, drop_reports, in_stream, latched, prices
@@ -75,7 +75,7 @@ BOUNDS: Final[dict[str, tuple[str, ...]]] = {
     ),
     "large values of objects": (f"{nbytes(OBJECTS.max_held_per_owner)}, of {nbytes(OBJECTS.max_held_bytes)} in all",),
     "transforms as objects": (f"{transforms.MAX_PAIRS:,} pairs", f"{transforms.MAX_WAITING} messages"),
-    "clients that are waited for": (f"{awaited.MAX_AWAITED_CLIENTS:,};", f"{LIMITS.awaited_topics:,} each"),
+    "clients that are waited for": (f"{absent.MAX_AWAITED_CLIENTS:,};", f"{LIMITS.awaited_topics:,} each"),
     "boots of a client": (f"| {routing.RETIRED_BOOTS} |",),
     "numbers of streams": (f"{numbering.MAX_ENDED:,},",),
     "counters by topic": (f"{ledger.MAX_TOPICS:,} ",),
