@@ -59,7 +59,7 @@ class Composer:
         control_only = lane is self._lanes.priority_lane
         window_open = lane.open_at(now)
         if not control_only and self._taking.watermarks:
-            for slot, seq in self._taking.take_watermarks(MAX_WATERMARKS, heard=control.heard):
+            for slot, seq in self._taking.take_watermarks(MAX_WATERMARKS, acked_seq=control.acked_seq):
                 datagram.watermark(slot, seq)
         served: PriorityClass | None = None
         ride = False  # it is the turn of a little control, behind class 0

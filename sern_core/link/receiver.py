@@ -70,7 +70,7 @@ class Receiver:
             if not arrivals.arrived(number, stamp_us, len(data) + OVERHEAD_BYTES, now=now):
                 return 0
             if arrivals.due or arrivals.unacked <= 2:
-                self._end.dirty = True  # an acknowledgement is owed; of the third and later ones the deadline is known
+                self._end.dirty = True  # an acknowledgement is due; of the third and later ones the deadline is known
         return framing.decode_frames(data, self, position or framing.HEADER_BYTES)
 
     def on_data(

@@ -289,11 +289,12 @@ class StreamsIn:
         stream.unhandled = oldest
         self._confirm_own(stream)
 
-    def take_watermarks(self, limit: int, *, heard: int) -> Iterator[tuple[int, int]]:
-        """Up to `limit` of (channel, delivered) to be told, each taken when it is asked for. `heard`: the number of
+    def take_watermarks(self, limit: int, *, acked_seq: int) -> Iterator[tuple[int, int]]:
+        """Up to `limit` of (channel, delivered) to be told, each taken when it is asked for. `acked_seq`: the number of
         the last control message that the peer has acknowledged."""
         for slot in list(self.watermarks)[:limit]:
-            if self.incoming[slot].reports.heard(heard):  # of drops first: else it would take them for delivered
+            # Of drops first: else it would take them for delivered.
+            if self.incoming[slot].reports.acknowledged(acked_seq):
                 yield slot, self.watermarks.pop(slot)
 
     def tell_again(self, slot: int) -> None:
@@ -323,12 +324,12 @@ class StreamsIn:
             self.retract(self._gone.popleft(), now)
         return self._finished(now)
 
-    def sweep_heard(self) -> None:
+    def sweep_acked(self) -> None:
         """Let go of reports, and of what is half received of streams that are not wanted, once the peer knows."""
-        heard = self._control.heard
+        acked_seq = self._control.acked_seq
         for stream in self.incoming.values():
-            stream.reports.heard(heard)
-            if 0 < stream.pause_seq <= heard:
+            stream.reports.acknowledged(acked_seq)
+            if 0 < stream.pause_seq <= acked_seq:
                 stream.forget(DropReason.UNWANTED)  # the peer has given up what is half received or waits here
                 self._skipping.pop(stream, None)  # it is where it was to go on, and nobody is to hear of it later
 
@@ -352,9 +353,9 @@ class StreamsIn:
         streams = self.streams.values()
         for stream in streams:
             stream.validate(check)
-        unheard, reports = self._reassembly.unheard, [stream.reports for stream in streams]
-        check(unheard.reports == sum(map(len, reports)), "reports of drops do not add up")
-        check(unheard.said == sum(each.said for each in reports), "reports of drops that were said do not add up")
+        unacked, reports = self._reassembly.unacked_reports, [stream.reports for stream in streams]
+        check(unacked.reports == sum(map(len, reports)), "reports of drops do not add up")
+        check(unacked.said == sum(each.said for each in reports), "reports of drops that were said do not add up")
         check(self.watermarks.keys() <= self.incoming.keys(), "watermarks of streams that are gone")
 
 

@@ -10,7 +10,7 @@ from sern_core.link.control_stream import ControlStream
 from sern_core.link.definitions import PeerDefinitions
 from sern_core.link.end import End
 from sern_core.link.events import Events
-from sern_core.link.name_lists import OwedLists
+from sern_core.link.name_lists import NameLists
 from sern_core.link.sender import Sender
 from sern_core.stream.in_stream import Reassembly
 from sern_core.stream.out_channel import OutChannel
@@ -28,7 +28,7 @@ ANSWER_PRICE: Final = 16
 """What an answer about an open channel costs, next to one about a channel that is closed."""
 NAMED_PER_US: Final = 16
 ANSWER_US: Final = 6
-OWED_PER_US: Final = 16
+NAMES_PER_US: Final = 16
 """What naming channels, answers about open ones, and lists of names are charged with (`Reassembly.work_us`)."""
 RETAINED_PER_US: Final = 16
 """What a report of drops is charged with, for what it looks through."""
@@ -47,7 +47,7 @@ class StreamsOut:
         control: ControlStream,
         sender: Sender,
         texts: PeerDefinitions,
-        owed_lists: OwedLists,
+        name_lists: NameLists,
         reassembly: Reassembly,
         events: Events,
         *,
@@ -57,7 +57,7 @@ class StreamsOut:
         self._control = control
         self._sender = sender
         self._texts = texts
-        self._owed_lists = owed_lists
+        self._name_lists = name_lists
         self._reassembly = reassembly
         self._events = events
         self._at_once = at_once
@@ -86,7 +86,7 @@ class StreamsOut:
         *,
         first: int,
         now: float,
-        owed: tuple[str, ...] = (),
+        required: tuple[str, ...] = (),
         wanted: bool | None = None,
         replays: Sequence[Message] = (),
     ) -> OutChannel:
@@ -108,7 +108,7 @@ class StreamsOut:
         counters = self._sender.ledger.topic(stream.id.topic, stream.spec.priority)
         codec = self._sender.new_codec(stream)
         channel = OutChannel(slot, stream, counters, self._on_dropped, first=first, codec=codec)
-        channel.owed = owed
+        channel.required = required
         channel.wanted = wanted
         if self._end.fates is not None:
             channel.drops.on_count = partial(self._counted, self._end.fates, stream)
@@ -155,8 +155,8 @@ class StreamsOut:
         stream = channel.stream
         digest = _digest(stream)
         self._texts.use_outgoing(channel.slot, digest)  # in another session its origin may say another
-        owed = channel.owed if channel.reliable else ()
-        announcement = Announcement(channel.slot, stream, digest, channel.first_seq, owed)
+        required = channel.required if channel.reliable else ()
+        announcement = Announcement(channel.slot, stream, digest, channel.first_seq, required)
         channel.ready = False
         seq = 0
         for envelope in announcement_parts(announcement):
@@ -212,18 +212,18 @@ class StreamsOut:
         """The peer has said whether it wants streams of ours. Raises WireError for more answers than questions."""
         end, reassembly = self._end, self._reassembly
         if not end.initiator:
-            # Who is owed is for origins to remember: a client that takes a stream is owed it itself, and no more.
-            want = replace(want, owed=(), add=(), drop=())
+            # Who is required is for origins to remember: a client that takes a stream speaks for itself alone.
+            want = replace(want, required=(), add=(), drop=())
             if want.more:
                 return
         first = want.runs[0][0]
         if want.more:
-            self._owed_lists.add(("want", first), want.owed or (), more=True, peer=end.peer)
+            self._name_lists.add(("want", first), want.required or (), more=True, peer=end.peer)
             return
-        owed = None
-        if want.owed is not None:
-            owed = self._owed_lists.add(("want", first), want.owed, more=False, peer=end.peer)
-        changed: dict[int, tuple[tuple[str, ...], tuple[str, ...]]] = {}  # by identity: what was owed, what is now
+        required = None
+        if want.required is not None:
+            required = self._name_lists.add(("want", first), want.required, more=False, peer=end.peer)
+        changed: dict[int, tuple[tuple[str, ...], tuple[str, ...]]] = {}  # by identity: who was required, who is now
         for first, last in want.runs:
             self._charge(last - first + 1, now)
             reassembly.work_us += (last - first + 1) // NAMED_PER_US
@@ -232,22 +232,22 @@ class StreamsOut:
                 if channel is not None:  # else closed meanwhile
                     self._charge(ANSWER_PRICE, now)
                     reassembly.work_us += ANSWER_US
-                    if owed is None:
-                        before = channel.owed
-                        if id(before) not in changed:  # channels that are owed alike share one list
+                    if required is None:
+                        before = channel.required
+                        if id(before) not in changed:  # channels with the same required clients share one list
                             changed[id(before)] = before, self._changed(before, want)
-                        channel.owed = changed[id(before)][1]
+                        channel.required = changed[id(before)][1]
                     else:
-                        channel.owed = owed
+                        channel.required = required
                     self._answer_came(channel, want, now)
 
     def _changed(self, before: tuple[str, ...], want: Want) -> tuple[str, ...]:
         """What an answer by difference makes of a list of names."""
-        self._reassembly.work_us += len(before) // OWED_PER_US
+        self._reassembly.work_us += len(before) // NAMES_PER_US
         names = dict.fromkeys(before) | dict.fromkeys(want.add)
         for name in want.drop:
             names.pop(name, None)
-        most = self._end.params.limits.owed
+        most = self._end.params.limits.required
         if len(names) > most:
             raise WireError(f"{self._end.peer} owes a stream to more than {most} names")
         return tuple(names)

@@ -99,7 +99,7 @@ class Lane:
         self._copied_packets = 0  # so many more will have copies
         self.copies_wanted: bool | None = None
         """What the adaptation says of them, where the configuration leaves it open (`auto`); None: the loss decides."""
-        self._unheard_bytes = 0.0
+        self._unacked_bytes = 0.0
         """What arrives between two acknowledgements of a fast stream, beyond the two fragments that make one due."""
         self.priority = PriorityClass.STATE
         """The most urgent class in the latest datagram; acknowledgements, questions and control messages are STATE."""
@@ -119,7 +119,7 @@ class Lane:
         """Adopt the rate that the path carries at least; returns it."""
         rate_bps = self.estimator.bound_bps
         self.fragment_bytes = self._fragment_bytes(rate_bps)
-        self._unheard_bytes = max(0.0, self.arrivals.spacing_s * (rate_bps or 0.0) / 8 - 2 * self.fragment_bytes)
+        self._unacked_bytes = max(0.0, self.arrivals.spacing_s * (rate_bps or 0.0) / 8 - 2 * self.fragment_bytes)
         return rate_bps
 
     def leave(self) -> None:
@@ -149,7 +149,7 @@ class Lane:
         if self.stalled:
             return False
         nbytes = self.flight.inflight_bytes if self.beside is None else self.under_way_bytes
-        return nbytes < self.estimator.window_bytes + self._unheard_bytes
+        return nbytes < self.estimator.window_bytes + self._unacked_bytes
 
     def open_at(self, now: float) -> bool:
         """Whether a datagram below class 0 may leave now."""

@@ -1,4 +1,4 @@
-"""Channels of streams that have ended while a client was still owed reliable messages of them. Pure.
+"""Channels of streams that have ended while a client was still to get reliable messages of them. Pure.
 
 They go on until the client has confirmed everything, within bounds for each client. Whatever else would end them ends
 them as well: the right to the stream, the interest in it, the client itself, and another stream of the same name.

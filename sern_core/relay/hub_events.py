@@ -99,7 +99,7 @@ class Relayed:
         self.cache: LatchedCache | None = None
         self.keep_latched(replays)
 
-    def owed(self) -> tuple[ClientName, ...]:
+    def required(self) -> tuple[ClientName, ...]:
         """Who gets the stream, and who is about to."""
         return tuple(dict.fromkeys((*self.outs, *self.waiting)) if self.waiting else self.outs)
 

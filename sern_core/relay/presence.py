@@ -41,7 +41,7 @@ class PeerControl(Protocol):
     """The control messages to a client."""
 
     @property
-    def heard(self) -> int:
+    def acked_seq(self) -> int:
         """The number of the last one up to which the client has acknowledged all."""
 
     def send(self, envelope: framing.Envelope, attachment: bytes = b"", *, now: float) -> int: ...
@@ -235,7 +235,7 @@ class Presence:
         watching, link = self._watchers.get(client), self._links.get(client)
         if watching is None or link is None or not watching.due or not link.established:
             return 0
-        if link.control.heard < watching.seq:
+        if link.control.acked_seq < watching.seq:
             return 0  # it is told the latest once it has heard of what was said before
         count = ceil(len(watching.due) / MAX_TOLD)
         self._attempt(client, now, partial(self._say, client, watching, link, now))

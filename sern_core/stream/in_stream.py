@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 from heapq import heappop, heappush
 from typing import Final
 
-from sern_core.stream.drop_reports import DropReports, Unheard
+from sern_core.stream.drop_reports import DropReports, UnackedReports
 from sern_core.vocabulary.errors import WireError
 from sern_core.vocabulary.limits import LIMITS, PeerLimits
 from sern_core.vocabulary.message import Message, StreamInfo
@@ -153,12 +153,22 @@ class Partial:
 class Reassembly:
     """Memory that half-received and waiting messages of one link may hold in all, and how much is to be reported."""
 
-    __slots__ = ("behind", "held_bytes", "holders", "latest", "limit_bytes", "limits", "slice_us", "unheard", "work_us")
+    __slots__ = (
+        "behind",
+        "held_bytes",
+        "holders",
+        "latest",
+        "limit_bytes",
+        "limits",
+        "slice_us",
+        "unacked_reports",
+        "work_us",
+    )
 
     def __init__(self, limit_bytes: int, limits: PeerLimits = LIMITS) -> None:
         self.limits = limits
         self.slice_us = limits.slice_us
-        self.unheard = Unheard(limits)
+        self.unacked_reports = UnackedReports(limits)
         self.limit_bytes = limit_bytes
         self.held_bytes = 0
         self.holders: OrderedDict[InStream, None] = OrderedDict()
@@ -222,7 +232,7 @@ class InStream:
         self.paused = False  # it was not wanted, and the peer has not said yet where it goes on
         self.pause_seq = 0  # the control message of the session that said so
         self.known = False  # something has had its turn, or an earlier session announced it: a gap is then a gap
-        self.reports = DropReports(reassembly.unheard)  # drops that the peer may not know of yet
+        self.reports = DropReports(reassembly.unacked_reports)  # drops that the peer may not know of yet
         self._seen = 0  # best effort: bit i set when seq delivered-1-i arrived
         self._partials: dict[int, Partial] = {}  # best effort: untouched for longest first
         self._lowest = 0  # no half-received message has a seq below it
@@ -323,9 +333,9 @@ class InStream:
                 )
             )
 
-    def _check_heard(self) -> None:
+    def _check_reports_read(self) -> None:
         if self.channel_id is not None:  # not of the control stream
-            self._reassembly.unheard.check(self._now)
+            self._reassembly.unacked_reports.check(self._now)
 
     def _pay(self, seq: int, partial: Partial) -> bool:
         """Take the pieces of a message into account. False: there was no room for them, and it is lost."""
@@ -349,8 +359,8 @@ class InStream:
         if not self.reliable:
             self._on_drop(self, reason, nbytes, (seq,), False)
             return
-        if self._reassembly.unheard.crowded:
-            self._check_heard()
+        if self._reassembly.unacked_reports.crowded:
+            self._check_reports_read()
         self._on_drop(self, reason, nbytes, (seq,), True)
         self._arrived(self.drop_marker(seq, reason, 0, now))
 
@@ -409,8 +419,8 @@ class InStream:
                 self._lowest = min(self._partials, default=0)
             self._turn(message)
             return
-        if self._reassembly.unheard.crowded:
-            self._check_heard()
+        if self._reassembly.unacked_reports.crowded:
+            self._check_reports_read()
         if seq == self.delivered + 1:
             self.delivered = seq
             self._turn(message)

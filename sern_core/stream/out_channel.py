@@ -39,9 +39,9 @@ class OutChannel:
         "drops",
         "last_sent_s",
         "offered",
-        "owed",
         "ready",
         "reliable",
+        "required",
         "slot",
         "spec",
         "stream",
@@ -78,7 +78,7 @@ class OutChannel:
         """Whether it was announced in the session."""
         self.offered = False
         """Whether the scheduler knows of a pending message."""
-        self.owed: tuple[str, ...] = ()
+        self.required: tuple[str, ...] = ()
         """Reliable subscribers behind the peer, as it told us."""
 
     # --- what is where --------------------------------------------------------------------------------------------
@@ -363,7 +363,7 @@ class OutChannel:
 
     def peer_restarted(self) -> None:
         """A new process at the other end has nothing of what we sent: everything waits to be sent again."""
-        self._kept.restart(alone=len(self.owed) < 2)
+        self._kept.restart(alone=len(self.required) < 2)
 
     def clear(self, reason: DropReason) -> int:
         """The stream ends: whatever is left is dropped for `reason`. Returns what that costs, in microseconds."""

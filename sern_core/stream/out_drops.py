@@ -25,7 +25,7 @@ class OutDrops:
         self._reliable = reliable
         self.counters = counters
         self.live_from = 0
-        """Reliable: what is kept below this seq are replays, and between them lies what the peer is not owed."""
+        """Reliable: what is kept below this seq are replays, and between them lies what the peer is not to get."""
         self.on_count: Callable[[int, DropReason], None] | None = None
         """Told of every drop that is counted, by seq; for audits."""
 

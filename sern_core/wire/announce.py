@@ -42,19 +42,19 @@ def definition_hash(definition: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Announcement:
-    """A stream on a channel of the session. `first`: nothing below this seq will come. `owed`: who must get it.
-    `more`: only `owed` counts, and goes on in another part."""
+    """A stream on a channel of the session. `first`: nothing below this seq will come. `required`: who must get it.
+    `more`: only `required` counts, and goes on in another part."""
 
     channel: int
     stream: StreamInfo
     definition_hash: str
     first: int
-    owed: tuple[str, ...] = ()
+    required: tuple[str, ...] = ()
     more: bool = False
 
 
 def encode_announcement(announcement: Announcement) -> framing.Envelope:
-    """The envelope of an announcement. Of `owed`, as many names as it has room for."""
+    """The envelope of an announcement. Of `required`, as many names as it has room for."""
     stream = announcement.stream
     info, spec = stream.info, stream.spec
     envelope: framing.Envelope = {
@@ -68,7 +68,7 @@ def encode_announcement(announcement: Announcement) -> framing.Envelope:
         "hash": info.type_hash,
         "dh": announcement.definition_hash,
         "first": announcement.first,
-        "owed": list(announcement.owed[:MAX_STRINGS]),
+        "owed": list(announcement.required[:MAX_STRINGS]),
         "cls": int(spec.priority),
         "w": spec.weight,
         "rel": spec.reliable,
@@ -87,17 +87,17 @@ def encode_announcement(announcement: Announcement) -> framing.Envelope:
 
 
 def announcement_parts(announcement: Announcement) -> list[framing.Envelope]:
-    """The envelopes of an announcement, so many that all of `owed` has room."""
+    """The envelopes of an announcement, so many that all of `required` has room."""
     parts: list[framing.Envelope] = []
     stream = announcement.stream
     part = replace(announcement, stream=StreamInfo(stream.id, stream.info, stream.spec), more=True)
-    owed = announcement.owed
+    required = announcement.required
     while True:
-        last = encode_announcement(replace(announcement, owed=owed))
-        if len(last["owed"]) == len(owed):
+        last = encode_announcement(replace(announcement, required=required))
+        if len(last["owed"]) == len(required):
             return [*parts, last]
-        parts.append(encode_announcement(replace(part, owed=owed)))  # without attributes: names fit for certain
-        owed = owed[len(parts[-1]["owed"]) :]
+        parts.append(encode_announcement(replace(part, required=required)))  # without attributes: names fit for certain
+        required = required[len(parts[-1]["owed"]) :]
 
 
 def check_stream(stream: StreamInfo) -> None:
@@ -171,20 +171,20 @@ def decode_announcement(envelope: framing.Envelope) -> Announcement:
         stream=StreamInfo(StreamId(origin, framing.take_int(envelope, "boot"), topic), info, spec, attributes),
         definition_hash=digest,
         first=framing.take_int(envelope, "first", low=1, high=framing.MAX_SEQ),
-        owed=tuple(framing.take_strings(envelope, "owed", max_length=64)),
+        required=tuple(framing.take_strings(envelope, "owed", max_length=64)),
         more=framing.take_bool(envelope, "more"),
     )
 
 
 @dataclass(frozen=True, slots=True)
 class Want:
-    """Whether streams are wanted. `runs`: first and last of the channels it is said of, rising. `owed`: who is to get
-    them if they are reliable; None: `add` and `drop` are the difference to what was said before. `more`: only `owed`
-    counts, and goes on in another part."""
+    """Whether streams are wanted. `runs`: first and last of the channels it is said of, rising. `required`: who is to
+    get them if they are reliable; None: `add` and `drop` are the difference to what was said before. `more`: only
+    `required` counts, and goes on in another part. On the wire its key is `owed`."""
 
     runs: tuple[tuple[int, int], ...]
     on: bool
-    owed: tuple[str, ...] | None
+    required: tuple[str, ...] | None
     add: tuple[str, ...]
     drop: tuple[str, ...]
     more: bool
@@ -194,7 +194,7 @@ def encode_want(
     slots: Sequence[int],
     on: bool,
     *,
-    owed: Sequence[str] = (),
+    required: Sequence[str] = (),
     add: Sequence[str] | None = None,
     drop: Sequence[str] | None = None,
     more: bool = False,
@@ -212,7 +212,7 @@ def encode_want(
         "ch": slots[0],
         "on": on,
         "chs": runs or None,
-        "owed": list(owed) or None,
+        "owed": list(required) or None,
         "add": None if add is None else list(add),
         "drop": list(drop) if drop else None,
         "more": more or None,
@@ -235,7 +235,7 @@ def decode_want(envelope: framing.Envelope) -> Want:
     return Want(
         runs=tuple(runs),
         on=framing.take_bool(envelope, "on"),
-        owed=None if difference else tuple(framing.take_strings(envelope, "owed", max_length=64)),
+        required=None if difference else tuple(framing.take_strings(envelope, "owed", max_length=64)),
         add=tuple(framing.take_strings(envelope, "add", max_length=64)),
         drop=tuple(framing.take_strings(envelope, "drop", max_length=64)),
         more=framing.take_bool(envelope, "more"),

@@ -52,7 +52,7 @@ BOUNDS: Final[dict[str, tuple[str, ...]]] = {
     "patterns and names subscribed to": (f"{ROUTING.max_patterns} and {ROUTING.max_exact:,}",),
     "parts of an unfinished subscription": (
         f"{ROUTING.max_exact:,} patterns",
-        f"{LIMITS.owed:,} names",
+        f"{LIMITS.required:,} names",
     ),
     "definitions (": (
         nbytes(LIMITS.peer_definition_bytes),
@@ -66,7 +66,7 @@ BOUNDS: Final[dict[str, tuple[str, ...]]] = {
         f"for {drop_reports.UNREAD_S:g} s",
     ),
     "control messages to a client": (
-        f"{LIMITS.unheard:,} answers",
+        f"{LIMITS.unacked:,} answers",
         f"{nbytes(control_stream.MAX_TOLD_BYTES)} + {nbytes(control_stream.MAX_TOLD_CHANNEL_BYTES)} a channel",
     ),
     "objects (": (
@@ -75,7 +75,7 @@ BOUNDS: Final[dict[str, tuple[str, ...]]] = {
     ),
     "large values of objects": (f"{nbytes(OBJECTS.max_held_per_owner)}, of {nbytes(OBJECTS.max_held_bytes)} in all",),
     "transforms as objects": (f"{transforms.MAX_PAIRS:,} pairs", f"{transforms.MAX_WAITING} messages"),
-    "clients that are waited for": (f"{absent.MAX_AWAITED_CLIENTS:,};", f"{LIMITS.awaited_topics:,} each"),
+    "clients that are waited for": (f"{absent.MAX_ABSENT_CLIENTS:,};", f"{LIMITS.absent_topics:,} each"),
     "boots of a client": (f"| {routing.RETIRED_BOOTS} |",),
     "numbers of streams": (f"{numbering.MAX_ENDED:,},",),
     "counters by topic": (f"{ledger.MAX_TOPICS:,} ",),

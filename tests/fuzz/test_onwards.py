@@ -324,7 +324,7 @@ def test_a_stream_cannot_count_beyond_what_can_be_announced(reliable: bool) -> N
 
 
 def test_names_that_no_client_has_are_not_waited_for() -> None:
-    """All names that are owed a stream are said to its origin in one message: they must fit."""
+    """All names that a stream requires are said to its origin in one message: they must fit."""
     yard = Yard()
     for number in range(3):
         owed = [f"{number}{index:02}".ljust(64, "\U0001f916") for index in range(12)]

@@ -137,7 +137,7 @@ def test_a_backlog_of_drop_markers_and_gaps_ends_as_one_span() -> None:
 
 
 def test_what_lies_between_replays_is_not_told_of() -> None:
-    """It was never owed to who joined late, and others may have it yet."""
+    """Who joined late was never to get it, and others may have it yet."""
     sender = Sender(spec(reliable=True, latched=True, depth=3), first=12)
     sender.channel.prime([sender.message(seq, replay=True) for seq in (2, 3, 6, 9)], now=0.0)
     sender.submit()

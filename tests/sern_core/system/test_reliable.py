@@ -44,7 +44,7 @@ def test_a_new_relay_waits_for_whom_the_origin_owes_its_stream() -> None:
     robot, site = pair(world)
     log = robot.publish("/robot/log", spec(reliable=True))
     world.run(2.0)
-    assert log.owed == ("site",)
+    assert log.required == ("site",)
     world.network.crash_node(site)
     world.restart_relay()
     world.run(2.0)
@@ -351,7 +351,7 @@ def test_a_message_too_large_for_the_origin_or_the_relay_is_reported_and_passed_
     assert site.seqs("/robot/cloud") == [1, 4]
 
 
-def test_a_topic_withdrawn_with_messages_still_owed_is_delivered_first() -> None:
+def test_a_topic_withdrawn_with_messages_still_waiting_is_delivered_first() -> None:
     """The robot's process is gone; what the relay has taken over is still delivered."""
     world = World().watch()
     robot, site = pair(world, site=LinkModel(rate_bps=100e3, delay_s=0.05).as_stream())
