@@ -59,7 +59,7 @@ class RelayedStreams:
         self.draining = Draining(self._end_channel, limits)
         self.tap: Callable[[StreamInfo], bool] = lambda _stream: False
         """Whether the relay itself wants a stream (a subscriber of the feed); set by the shell."""
-        self._unsubscribed: OutChannel | None = None  # is being closed because its taker wants it no more
+        self._unsubscribed: OutChannel | None = None  # is being closed because its subscriber wants it no more
         self._room: tuple[ClientName, float, int] | None = None  # for replays to a client at this time
 
     # --- streams come and go --------------------------------------------------------------------------------------
@@ -113,7 +113,7 @@ class RelayedStreams:
         reason: DropReason = DropReason.UNWANTED,
         source: Link | None = None,
     ) -> None:
-        """Open and close channels as the routes have changed; `reason`: of dropping what no longer has a taker;
+        """Open and close channels as the routes have changed; `reason`: of dropping what no longer has a subscriber;
         `source`: whose announcement it was, so that subscribers are told of it in slices."""
         touched: set[StreamId] = set(change.wanted) | set(change.unwanted)
         for identity in change.removed:
