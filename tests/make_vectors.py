@@ -95,7 +95,7 @@ class Frames:
     def on_data(
         self,
         flags: int,
-        channel: int,
+        channel_id: int,
         seq: int,
         offset: int,
         total: int,
@@ -108,7 +108,7 @@ class Frames:
         frame: Vector = {
             "type": "DATA",
             "flags": [name for name, bit in FLAGS.items() if flags & bit],
-            "channel": channel,
+            "channel": channel_id,
             "seq": seq,
             "offset": offset,
             "total": total,
@@ -137,8 +137,8 @@ class Frames:
             }
         )
 
-    def on_watermark(self, channel: int, delivered: int) -> None:
-        self.frames.append({"type": "WATERMARK", "channel": channel, "delivered": delivered})
+    def on_watermark(self, channel_id: int, delivered: int) -> None:
+        self.frames.append({"type": "WATERMARK", "channel": channel_id, "delivered": delivered})
 
     def on_ping(self) -> None:
         self.frames.append({"type": "PING"})

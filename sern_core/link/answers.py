@@ -40,9 +40,9 @@ class Answers:
         """Whether the peer understands several channels in one message, and differences."""
         self._interest.batches = understood
 
-    def expect(self, stream: InStream, slot: int) -> None:
+    def expect(self, stream: InStream, channel_id: int) -> None:
         """The peer has announced a stream: it waits for an answer, whatever it was told before, and for reports."""
-        self._interest.forget(slot)
+        self._interest.forget(channel_id)
         stream.reports.unsay()
         if stream.reports:
             self._reporting[stream] = None
@@ -95,12 +95,12 @@ class Answers:
         """Say so many reports as the peer can be expected to hear of soon; those that wait grow into runs meanwhile."""
         retained = self._control.out.retained
         for stream in list(self._reporting):
-            slot = stream.channel_id
+            channel_id = stream.channel_id
             reports, runs = stream.reports, self._interest.batches
-            while slot is not None and (report := reports.first(runs=runs)) is not None:
+            while channel_id is not None and (report := reports.first(runs=runs)) is not None:
                 if len(retained) >= MAX_REPORTS_UNACKED:
                     return
                 code = DROP_CODES[report.reason]
-                envelope = encode_dropped(slot, report.seq, code, report.where, report.count)
+                envelope = encode_dropped(channel_id, report.seq, code, report.where, report.count)
                 reports.say(report, self._control.send(envelope, now=now))
             del self._reporting[stream]

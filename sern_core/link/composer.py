@@ -59,8 +59,8 @@ class Composer:
         control_only = lane is self._lanes.priority_lane
         window_open = lane.open_at(now)
         if not control_only and self._taking.watermarks:
-            for slot, seq in self._taking.take_watermarks(MAX_WATERMARKS, acked_seq=control.acked_seq):
-                datagram.watermark(slot, seq)
+            for channel_id, seq in self._taking.take_watermarks(MAX_WATERMARKS, acked_seq=control.acked_seq):
+                datagram.watermark(channel_id, seq)
         served: PriorityClass | None = None
         ride = False  # it is the turn of a little control, behind class 0
         spoke = False
@@ -139,6 +139,6 @@ class Composer:
         if trace.enabled and channel is not self._control.out:
             self.served = channel
             told = self._sender.told
-            if trace.steps or channel.slot in told.holding:
+            if trace.steps or channel.channel_id in told.holding:
                 told.left(channel, out, started, now)
         return grown

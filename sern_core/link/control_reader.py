@@ -60,7 +60,7 @@ class ControlReader:
         """Hand a message to the part it is for; what the link does not know is for its owner."""
         if kind == "announce":
             announcement = decode_announcement(envelope)
-            key = ("announce", announcement.channel)
+            key = ("announce", announcement.channel_id)
             required = self._name_lists.add(key, announcement.required, more=announcement.more, peer=self._end.peer)
             if required is not None:
                 self._taking.announced(replace(announcement, required=required), now)
@@ -75,8 +75,8 @@ class ControlReader:
             else:
                 self._outgoing.refused(channel, envelope, now)
         elif kind in ("first", "retract"):
-            slot = framing.take_int(envelope, "ch", high=0xFFFF)
-            incoming = self._taking.incoming.get(slot)
+            channel_id = framing.take_int(envelope, "ch", high=0xFFFF)
+            incoming = self._taking.incoming.get(channel_id)
             if incoming is None:
                 return
             if kind == "first":

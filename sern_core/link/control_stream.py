@@ -12,7 +12,7 @@ from sern_core.vocabulary.message import Message, StreamId, StreamInfo, TopicInf
 from sern_core.vocabulary.types import Encoding, PriorityClass, Reliability, TopicName
 from sern_core.wire import framing
 
-CONTROL_CHANNEL: Final = 0
+CONTROL_CHANNEL_ID: Final = 0
 CONTROL_TOPIC: Final = TopicName("/_sern/control")
 MAX_CONTROL_BYTES: Final = 2 + framing.MAX_ENVELOPE_BYTES + framing.MAX_ATTACHMENT_BYTES + 1024
 """A control message: envelope and packed attachment (what cannot be packed grows a little)."""
@@ -53,7 +53,7 @@ class ControlStream:
         info = TopicInfo(CONTROL_TOPIC, "", Encoding.RAW)
         stream = StreamInfo(StreamId(self._end.name, self._end.boot, CONTROL_TOPIC), info, spec)
         counters = SendCounters(CONTROL_TOPIC, PriorityClass.CONTROL)
-        out = OutChannel(CONTROL_CHANNEL, stream, counters, lambda _slot, _outs, _reason: None, first=1)
+        out = OutChannel(CONTROL_CHANNEL_ID, stream, counters, lambda _channel_id, _outs, _reason: None, first=1)
         out.wanted = out.ready = True
         incoming = InStream(
             stream,

@@ -5,7 +5,7 @@ from typing import Any, Final
 
 from sern_core.link.answers import Answers
 from sern_core.link.composer import Composer
-from sern_core.link.control_stream import CONTROL_CHANNEL, ControlStream
+from sern_core.link.control_stream import CONTROL_CHANNEL_ID, ControlStream
 from sern_core.link.datagram import Datagram, SentData, SentWatermark
 from sern_core.link.end import End
 from sern_core.link.holds import Holds
@@ -192,7 +192,7 @@ class DataPlane:
                 if type(item) is SentData and item.channel.fragment_acked(item.out, item.generation):
                     if self.on_arrived is not None:
                         self.on_arrived(item.channel.spec, item.out.message, now)
-                    if end.trace.steps and item.channel.slot != CONTROL_CHANNEL:
+                    if end.trace.steps and item.channel.channel_id != CONTROL_CHANNEL_ID:
                         self._sender.told.acked(item.channel, item.out, now)
         control = self._control.out
         if control.retained:
@@ -207,7 +207,7 @@ class DataPlane:
             if type(item) is SentData:
                 lost.setdefault(item.channel, []).append((item.out, item.generation, item.start, item.end))
             elif type(item) is SentWatermark:
-                self._taking.tell_again(item.channel)
+                self._taking.tell_again(item.channel_id)
             else:
                 lane.ping = True
         self._sender.lost(lost, now)
@@ -275,4 +275,4 @@ class DataPlane:
 
 
 def _urgent(channel: OutChannel) -> bool:
-    return channel.spec.priority is PriorityClass.CONTROL and channel.slot != CONTROL_CHANNEL
+    return channel.spec.priority is PriorityClass.CONTROL and channel.channel_id != CONTROL_CHANNEL_ID

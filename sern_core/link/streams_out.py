@@ -62,7 +62,7 @@ class StreamsOut:
         self._events = events
         self._at_once = at_once
         self.by_stream: dict[StreamId, OutChannel] = {}
-        self._next_channel = 1
+        self._next_channel_id = 1
         self._on_dropped = self._dropped  # one for all channels
         self._announcing: deque[tuple[int, OutChannel]] = deque()  # may send once that control message is on its way
         self._price = self._priced_us = 0  # of the answers that came at this time
@@ -101,21 +101,21 @@ class StreamsOut:
             raise UsageError(f"the definition of {stream.id.topic} exceeds {framing.MAX_ATTACHMENT_BYTES} bytes")
         if len(channels) >= 0xFFFF:
             raise UsageError(f"all 65535 channels towards {peer} are in use")
-        slot = self._next_channel
-        while slot in channels:
-            slot = slot % 0xFFFF + 1
-        self._next_channel = slot % 0xFFFF + 1
+        channel_id = self._next_channel_id
+        while channel_id in channels:
+            channel_id = channel_id % 0xFFFF + 1
+        self._next_channel_id = channel_id % 0xFFFF + 1
         counters = self._sender.ledger.topic(stream.id.topic, stream.spec.priority)
         codec = self._sender.new_codec(stream)
-        channel = OutChannel(slot, stream, counters, self._on_dropped, first=first, codec=codec)
+        channel = OutChannel(channel_id, stream, counters, self._on_dropped, first=first, codec=codec)
         channel.required = required
         channel.wanted = wanted
         if self._end.fates is not None:
             channel.drops.on_count = partial(self._counted, self._end.fates, stream)
-        channels[slot] = channel
+        channels[channel_id] = channel
         self.prime(channel, replays, now=now)
         self.by_stream[stream.id] = channel
-        self._texts.use_outgoing(slot, _digest(stream), stream.info.definition)
+        self._texts.use_outgoing(channel_id, _digest(stream), stream.info.definition)
         if self._end.established:
             self.announce(channel, now)
         return channel
@@ -129,8 +129,8 @@ class StreamsOut:
     def _counted(self, fates: Fates, stream: StreamInfo, seq: int, reason: DropReason) -> None:
         fates.dropped(stream, seq, reason, self._end.peer)
 
-    def _dropped(self, slot: int, outs: Sequence[OutMessage], reason: DropReason) -> None:
-        channel = self._sender.channels.get(slot)
+    def _dropped(self, channel_id: int, outs: Sequence[OutMessage], reason: DropReason) -> None:
+        channel = self._sender.channels.get(channel_id)
         if channel is not None:
             if self._end.trace.enabled:
                 self._sender.told.dropped(channel, outs, reason, self._end.now)
@@ -142,21 +142,21 @@ class StreamsOut:
         channel.clear(reason)
         channel.ready = False
         self._sender.refresh(channel, now)
-        self._sender.channels.pop(channel.slot, None)
+        self._sender.channels.pop(channel.channel_id, None)
         self._sender.told.forget(channel)
-        self._sender.cadences.forget(channel.slot)
+        self._sender.cadences.forget(channel.channel_id)
         if self.by_stream.get(channel.stream.id) is channel:
             del self.by_stream[channel.stream.id]
-        self._texts.use_outgoing(channel.slot, "")
-        self._control.send({"t": "retract", "ch": channel.slot}, now=now)
+        self._texts.use_outgoing(channel.channel_id, "")
+        self._control.send({"t": "retract", "ch": channel.channel_id}, now=now)
 
     def announce(self, channel: OutChannel, now: float) -> None:
         """Tell the peer that the stream is there, on its channel."""
         stream = channel.stream
         digest = _digest(stream)
-        self._texts.use_outgoing(channel.slot, digest)  # in another session its origin may say another
+        self._texts.use_outgoing(channel.channel_id, digest)  # in another session its origin may say another
         required = channel.required if channel.reliable else ()
-        announcement = Announcement(channel.slot, stream, digest, channel.first_seq, required)
+        announcement = Announcement(channel.channel_id, stream, digest, channel.first_seq, required)
         channel.ready = False
         seq = 0
         for envelope in announcement_parts(announcement):
@@ -169,7 +169,7 @@ class StreamsOut:
         """Control message `seq` is on the wire."""
         while self._announcing and self._announcing[0][0] <= seq:
             channel = self._announcing.popleft()[1]
-            if self._sender.channels.get(channel.slot) is channel:
+            if self._sender.channels.get(channel.channel_id) is channel:
                 channel.ready = True
                 self._sender.refresh(channel, self._end.now)
 
@@ -197,7 +197,7 @@ class StreamsOut:
     def _tell_gap(self, channel: OutChannel, now: float) -> None:
         first = channel.next_gap()
         if first is not None:
-            self._control.send({"t": "first", "ch": channel.slot, "seq": first}, now=now)
+            self._control.send({"t": "first", "ch": channel.channel_id, "seq": first}, now=now)
 
     def delivered(self, channel: OutChannel) -> None:
         """The peer's watermark of a channel has moved."""
@@ -227,8 +227,8 @@ class StreamsOut:
         for first, last in want.runs:
             self._charge(last - first + 1, now)
             reassembly.work_us += (last - first + 1) // NAMED_PER_US
-            for slot in range(first, last + 1):
-                channel = self._sender.channels.get(slot)
+            for channel_id in range(first, last + 1):
+                channel = self._sender.channels.get(channel_id)
                 if channel is not None:  # else closed meanwhile
                     self._charge(ANSWER_PRICE, now)
                     reassembly.work_us += ANSWER_US
@@ -264,7 +264,7 @@ class StreamsOut:
 
     def _answer_came(self, channel: OutChannel, want: Want, now: float) -> None:
         if want.on and channel.wanted is False and channel.reliable:
-            self._control.send({"t": "first", "ch": channel.slot, "seq": channel.first_seq}, now=now)
+            self._control.send({"t": "first", "ch": channel.channel_id, "seq": channel.first_seq}, now=now)
         self._set_wanted(channel, want.on, DropReason.UNWANTED)
         channel.ready = True
         self._sender.refresh(channel, now)

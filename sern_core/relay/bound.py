@@ -91,7 +91,9 @@ class QueueBound:
                 if reliable and lowest is priority:
                     continue  # among equals, who came first stays
                 # The largest queues first: fewest streams lose anything.
-                chosen = sorted((c for c in rows if c.reliable is reliable), key=lambda c: (-c.unbegun_bytes, c.slot))
+                chosen = sorted(
+                    (c for c in rows if c.reliable is reliable), key=lambda c: (-c.unbegun_bytes, c.channel_id)
+                )
                 for channel in chosen:
                     if excess_bytes <= 0:
                         return excess_bytes

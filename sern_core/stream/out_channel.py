@@ -28,12 +28,14 @@ from sern_core.vocabulary.types import DropReason
 
 
 class OutChannel:
-    """One stream towards one peer. The link serves it through `head` and `take`; `slot` is its scheduler slot."""
+    """One stream towards one peer. The link serves it through `head` and `take`; `channel_id` is its number in the
+    session, by which the scheduler names it as well."""
 
     __slots__ = (
         "_all",
         "_kept",
         "_transit",
+        "channel_id",
         "codec",
         "counters",
         "drops",
@@ -42,7 +44,6 @@ class OutChannel:
         "ready",
         "reliable",
         "required",
-        "slot",
         "spec",
         "stream",
         "wanted",
@@ -50,7 +51,7 @@ class OutChannel:
 
     def __init__(
         self,
-        slot: int,
+        channel_id: int,
         stream: StreamInfo,
         counters: SendCounters,
         on_drop: OnDrop,
@@ -59,14 +60,14 @@ class OutChannel:
         codec: ChannelCodec | None = None,
     ) -> None:
         spec = stream.spec
-        self.slot = slot
+        self.channel_id = channel_id
         self.stream = stream
         self.spec = spec
         self.counters = counters
         self.codec = codec
         """None: bodies go as they come."""
         self.reliable = spec.reliable
-        self.drops = OutDrops(slot, counters, on_drop, reliable=spec.reliable)
+        self.drops = OutDrops(channel_id, counters, on_drop, reliable=spec.reliable)
         self._transit = Transit(coded=codec is not None)
         self._all = KeepAll(spec, self._transit, self.drops, first=first) if spec.reliable else None
         self._kept = self._all or KeepLast(spec, self._transit, self.drops, first=first)

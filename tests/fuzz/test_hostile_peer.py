@@ -59,7 +59,7 @@ class Hostile:
 
     def announce(
         self,
-        channel: int,
+        channel_id: int,
         topic: str,
         *,
         first: int = 1,
@@ -72,17 +72,17 @@ class Hostile:
         identity = StreamId(self.name, self.boot, TopicName(topic))
         info = TopicInfo(identity.topic, "a/b", Encoding.CDR)
         stream = StreamInfo(identity, info, spec(priority, reliable=reliable, depth=depth))
-        self.control(encode_announcement(Announcement(channel, stream, digest, first, required)))
+        self.control(encode_announcement(Announcement(channel_id, stream, digest, first, required)))
 
 
-def _whole(channel: int, seq: int, body: bytes = b"x", *, flags: int = 0) -> bytes:
-    return framing.encode_data_first(flags, channel, seq, len(body), len(body), 0, 0.0, 0) + body
+def _whole(channel_id: int, seq: int, body: bytes = b"x", *, flags: int = 0) -> bytes:
+    return framing.encode_data_first(flags, channel_id, seq, len(body), len(body), 0, 0.0, 0) + body
 
 
-def _piece(channel: int, seq: int, offset: int, total: int, body: bytes = b"x") -> bytes:
+def _piece(channel_id: int, seq: int, offset: int, total: int, body: bytes = b"x") -> bytes:
     if offset:
-        return framing.encode_data_next(0, channel, seq, offset, total, len(body)) + body
-    return framing.encode_data_first(0, channel, seq, total, len(body), 0, 0.0, 0) + body
+        return framing.encode_data_next(0, channel_id, seq, offset, total, len(body)) + body
+    return framing.encode_data_first(0, channel_id, seq, total, len(body), 0, 0.0, 0) + body
 
 
 Attack = Callable[[Hostile], Iterator[None]]

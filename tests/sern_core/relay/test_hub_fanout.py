@@ -77,9 +77,9 @@ def test_absent_clients_are_waited_for_in_slices() -> None:
     peer = Hostile()
     peer.hub.absent.known = lambda _client: True
     absent = tuple(f"site{number:02}" for number in range(48))
-    for slot in range(1, 11):
-        peer.announce(slot, f"/robot/t{slot}", reliable=True, required=absent)
-        peer.say(_whole(slot, 1))
+    for channel_id in range(1, 11):
+        peer.announce(channel_id, f"/robot/t{channel_id}", reliable=True, required=absent)
+        peer.say(_whole(channel_id, 1))
     slices = 0
     before = opened = 0
     while due_s(peer) is not None:
@@ -90,8 +90,8 @@ def test_absent_clients_are_waited_for_in_slices() -> None:
         before = opened
         slices += 1
     assert slices > 5 and opened == 480
-    for slot in range(1, 11):
-        relayed = stream_of(peer, f"/robot/t{slot}")
+    for channel_id in range(1, 11):
+        relayed = stream_of(peer, f"/robot/t{channel_id}")
         assert set(relayed.outs) == set(absent)
         assert all([out.seq for out in channel.retained] == [1] for _link, channel in relayed.outs.values())
     peer.hub.validate()

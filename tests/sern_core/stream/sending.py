@@ -23,7 +23,7 @@ class Sender:
         self.channel = OutChannel(1, self.stream, counters, self._drop, first=first)
         self.channel.wanted = self.channel.ready = True
 
-    def _drop(self, _slot: int, outs: Sequence[OutMessage], reason: DropReason) -> None:
+    def _drop(self, _channel_id: int, outs: Sequence[OutMessage], reason: DropReason) -> None:
         self.drops += [(out.seq, reason) for out in outs]
         self.told.append((outs[0].seq, outs[-1].seq, reason))
 

@@ -64,7 +64,7 @@ def announcements(draw: st.DrawFn) -> Announcement:
     )
     identity = StreamId(ClientName(draw(NAMES)), draw(st.integers(0, 2**63 - 1)), topic)
     return Announcement(
-        channel=draw(st.integers(1, 0xFFFF)),
+        channel_id=draw(st.integers(1, 0xFFFF)),
         stream=StreamInfo(identity, info, spec, draw(st.dictionaries(PRINTABLE, PRINTABLE, max_size=3))),
         definition_hash=draw(st.just("") | st.from_regex(r"\A[0-9a-f]{32}\Z")),
         first=draw(st.integers(1, framing.MAX_SEQ)),
