@@ -78,7 +78,7 @@ class WindowSection(Section):
     """How many bytes may be in flight."""
 
     algorithm: WindowAlgorithm = _LINK.window.algorithm
-    """`delay`: measured, keeps the standing queue short; `fixed`: always `fixed_bytes`."""
+    """`hybrid`: by measured delay and rate, keeps the standing queue short; `fixed`: always `fixed_bytes`."""
     fixed_bytes: Bytes = _LINK.window.fixed_bytes
     """The window of algorithm `fixed`: capacity × round-trip time."""
 
