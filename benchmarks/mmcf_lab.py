@@ -273,8 +273,8 @@ async def _play(
     lab.link(LINK, LINK)
     async with killed(directory) as children:
         relay = await start_relay(children, lab.b, udp=True)
-        taker = await start_daemon(children, lab.b, "client", site)
-        giver = await start_daemon(children, lab.a, "client", robot)
+        site_daemon = await start_daemon(children, lab.b, "client", site)
+        robot_daemon = await start_daemon(children, lab.a, "client", robot)
         problem = "not every topic of the robot got through"
         await children.until(partial(_connected, lab.a, topics), START_S, problem)
         start_ns = time.monotonic_ns() + int(WARM_S * 1e9)
@@ -288,7 +288,7 @@ async def _play(
         (directory / "mmcf.json").write_text(json.dumps(_ask(lab.a, "/api/mmcf")))
         await sleep_until(time.monotonic_ns() + int(DRAIN_S * 1e9))
         # The robot first, so that nothing is offered any more; then who listens, then the relay.
-        for daemon in (giver, taker, relay):
+        for daemon in (robot_daemon, site_daemon, relay):
             await children.end(daemon, within_s=STOP_S)
     return edges
 

@@ -1,7 +1,7 @@
 """What one decision of the scheduler costs, beside rescoring every pending message, in one run.
 
 A decision is everything the link asks of the scheduler for one fragment: `pick`, `charge`, and `offer` of what is
-pending in the slot afterwards. All topics are of one class and always have a message, sizes are log-uniform between
+pending in the channel afterwards. All topics are of one class and always have a message, sizes are log-uniform between
 60 B and 60 kB, and the winner's next message replaces it each time: the case that no cached choice can shorten.
 Rescoring is bare: it knows no classes, floors or bucket, so that at few topics it has less to do than a decision here.
 `single` is a lone topic whose message comes and goes: `offer`, `pick`, `charge`, `withdraw`. All is CPU time;
@@ -35,17 +35,17 @@ class Rescoring:
         self._params = params
         self._pending: dict[int, tuple[float, float, float]] = {}
 
-    def offer(self, slot: int, *, weight: float, size_bytes: float, since_s: float) -> None:
-        self._pending[slot] = (weight, size_bytes, since_s)
+    def offer(self, channel_id: int, *, weight: float, size_bytes: float, since_s: float) -> None:
+        self._pending[channel_id] = (weight, size_bytes, since_s)
 
     def pick(self, *, now: float) -> int:
         eta, epsilon_bytes, a_max_s = self._params.eta, self._params.epsilon_bytes, self._params.a_max_s
         best, highest = -1, -math.inf
-        for slot, (weight, size_bytes, since_s) in self._pending.items():
+        for channel_id, (weight, size_bytes, since_s) in self._pending.items():
             age_s = now - since_s
             score = weight * (1.0 + eta * (age_s if age_s < a_max_s else a_max_s)) / (size_bytes + epsilon_bytes)
             if score > highest:
-                best, highest = slot, score
+                best, highest = channel_id, score
         return best
 
 
@@ -57,8 +57,8 @@ def sizes(count: int) -> list[float]:
 def full_scheduler(size_bytes: list[float]) -> Scheduler:
     scheduler = Scheduler(SchedulerParams(), now=0.0)
     scheduler.set_rate(NBYTES * 8.0 / STEP_S, now=0.0)
-    for slot, size in enumerate(size_bytes):
-        scheduler.offer(slot, priority=BULK, weight=1.0, size_bytes=size, since_s=0.0)
+    for channel_id, size in enumerate(size_bytes):
+        scheduler.offer(channel_id, priority=BULK, weight=1.0, size_bytes=size, since_s=0.0)
     return scheduler
 
 
@@ -73,10 +73,10 @@ def decisions(count: int, repeats: int) -> Callable[[], float]:
         started = process_time()
         for _ in range(repeats):
             now += STEP_S
-            slot = pick(now=now)
-            assert slot is not None
+            channel_id = pick(now=now)
+            assert channel_id is not None
             charge(BULK, NBYTES, now=now)
-            offer(slot, priority=BULK, weight=1.0, size_bytes=size_bytes[slot], since_s=now)
+            offer(channel_id, priority=BULK, weight=1.0, size_bytes=size_bytes[channel_id], since_s=now)
         return (process_time() - started) / repeats * 1e6
 
     return measure
@@ -101,8 +101,8 @@ def picks(count: int, repeats: int) -> Callable[[], float]:
 def rescored(count: int, repeats: int, *, whole_decision: bool) -> Callable[[], float]:
     size_bytes = sizes(count)
     peer = Rescoring(SchedulerParams())
-    for slot, size in enumerate(size_bytes):
-        peer.offer(slot, weight=1.0, size_bytes=size, since_s=0.0)
+    for channel_id, size in enumerate(size_bytes):
+        peer.offer(channel_id, weight=1.0, size_bytes=size, since_s=0.0)
     now = 0.0
 
     def measure() -> float:
@@ -110,9 +110,9 @@ def rescored(count: int, repeats: int, *, whole_decision: bool) -> Callable[[], 
         started = process_time()
         for _ in range(repeats):
             now += STEP_S
-            slot = peer.pick(now=now)
+            channel_id = peer.pick(now=now)
             if whole_decision:
-                peer.offer(slot, weight=1.0, size_bytes=size_bytes[slot], since_s=now)
+                peer.offer(channel_id, weight=1.0, size_bytes=size_bytes[channel_id], since_s=now)
         return (process_time() - started) / repeats * 1e6
 
     return measure

@@ -10,7 +10,7 @@ from typing import Final
 
 import zmq
 
-from sern_client.express import ClientExpress
+from sern_client.priority_lane import ClientPriorityLane
 from sern_client.relay_name import RelayName, name_in
 from sern_client.transport import RelayTransport
 from sern_client.udp import ClientLane
@@ -45,7 +45,7 @@ class Connection:
     ) -> None:
         self.transport: RelayTransport | None = None
         self.lane: ClientLane | None = None
-        self.express: ClientExpress | None = None
+        self.priority_lane: ClientPriorityLane | None = None
         self.name: RelayName | None = None
         self.datagrams = DatagramWatch(lambda: [core.link], self._no_datagrams, lambda link: link.end.name)
         self._core = core
@@ -76,8 +76,8 @@ class Connection:
         address = split_tcp(relay.endpoint)
         if relay.udp and keys is not None and address is not None:
             self.lane = ClientLane(self._core, address[0], kick=self.wake, marks=marks)
-        if relay.express and address is not None:
-            self.express = ClientExpress(
+        if relay.priority_connections and address is not None:
+            self.priority_lane = ClientPriorityLane(
                 self._core, self.transport, link.redundancy, datagrams=self.lane is not None, kick=self.wake
             )
 
@@ -97,15 +97,15 @@ class Connection:
             self.transport.pump.kick()
         if self.lane is not None:
             self.lane.kick()
-        if self.express is not None:
-            self.express.kick()
+        if self.priority_lane is not None:
+            self.priority_lane.kick()
 
     def session_began(self) -> None:
         """Ask for what a session may have beside its stream."""
         if self.lane is not None:
             self.lane.ask()
-        if self.express is not None:
-            self.express.begin()
+        if self.priority_lane is not None:
+            self.priority_lane.begin()
 
     def lane_offered(self, parameters: framing.Envelope) -> None:
         """The relay has keys for a datagram lane. Raises WireError when it has not."""
@@ -122,8 +122,8 @@ class Connection:
         if self.lane is not None:
             self.lane.tick()
         self.datagrams.tick()
-        if self.express is not None:
-            self.express.tick()
+        if self.priority_lane is not None:
+            self.priority_lane.tick()
         if self.name is not None:
             self.name.tick(connected=self._core.link.established)
 
@@ -171,8 +171,8 @@ class Connection:
         with ExitStack() as stack:
             if self.transport is not None:
                 stack.callback(self.transport.close)
-            if self.express is not None:
-                stack.callback(self.express.close)
+            if self.priority_lane is not None:
+                stack.callback(self.priority_lane.close)
             if self.lane is not None:
                 stack.callback(self.lane.closed)
             if self.name is not None:

@@ -56,15 +56,15 @@ class Keeping:
     def published(self, stream: StreamId, seq: int, mark: Numbers) -> bool:
         """The keepers that have taken something since `mark` have taken this message. False: there are none, and it is
         not held."""
-        takers = [i for i, keeper in enumerate(self._keepers) if keeper.taken > mark[i]]
-        if not takers:
+        took = [i for i, keeper in enumerate(self._keepers) if keeper.taken > mark[i]]
+        if not took:
             return False
-        self._left[stream, seq] = len(takers)
+        self._left[stream, seq] = len(took)
         self._hold(stream, seq)
         if not self._asked:
             self._asked = True
             self._soon(SOON_S)
-        for index in takers:
+        for index in took:
             self._waiting[index].append((self._keepers[index].taken, stream, seq))
         return True
 

@@ -286,7 +286,7 @@ class ServiceBridge:
             info = used.offer.info
             calls = TopicInfo(call_name(used.name, self._core.name), info.type_name, info.encoding)
             try:
-                used.calls = self._core.publish(calls, spec, owed=(used.offer.id.origin,), now=clock.now())
+                used.calls = self._core.publish(calls, spec, required=(used.offer.id.origin,), now=clock.now())
             except UsageError as error:
                 raise ServiceError(f"{used.name} cannot be called from here: {error}") from None
             self._calling[used.calls.stream.id] = used

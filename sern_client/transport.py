@@ -59,7 +59,7 @@ class Dialer:
         handshake_interval_s: float,
         random: Random,
         tos: int = 0,
-        express: bool = False,
+        priority_lane: bool = False,
         attempt: int = 0,
     ) -> None:
         self.rebuilds = 0
@@ -74,7 +74,7 @@ class Dialer:
         self._handshake_ivl_ms = int(handshake_interval_s * 1000)
         self._heartbeat_timeout_ms = int(heartbeat_timeout_s * 1000)
         self._random = random
-        self._express = express
+        self._priority_lane = priority_lane
         self._tos = tos
         self._backoff_s = REBUILD_MIN_S
         self._rebuild: asyncio.TimerHandle | None = None
@@ -152,7 +152,7 @@ class Dialer:
     def _up(self, handle: TcpHandle | None) -> None:
         self._handle = handle
         if handle is not None:
-            handle.prepare(express=self._express, tos=self._tos)
+            handle.prepare(priority_lane=self._priority_lane, tos=self._tos)
         self._backoff_s = REBUILD_MIN_S
         self._was_up = True
         self._events.up(handle)
@@ -212,7 +212,7 @@ class RelayTransport:
         self.bad_frames = 0
         self._on_reason = on_reason
 
-        def dial(events: DialerEvents, *, express: bool = False, attempt: int = 0) -> Dialer:
+        def dial(events: DialerEvents, *, priority_lane: bool = False, attempt: int = 0) -> Dialer:
             return Dialer(
                 ctx,
                 endpoint,
@@ -222,8 +222,8 @@ class RelayTransport:
                 heartbeat_timeout_s=heartbeat_timeout_s,
                 handshake_interval_s=handshake_interval_s,
                 random=random,
-                tos=marks.express_tos if express else marks.stream_tos,
-                express=express,
+                tos=marks.priority_lane_tos if priority_lane else marks.stream_tos,
+                priority_lane=priority_lane,
                 attempt=attempt,
             )
 
@@ -243,7 +243,7 @@ class RelayTransport:
 
     def another(self, events: DialerEvents) -> Dialer:
         """Another connection to the same relay, for class control, not opened yet."""
-        return self._dial(events, express=True, attempt=self.dialer.attempt)
+        return self._dial(events, priority_lane=True, attempt=self.dialer.attempt)
 
     def close(self) -> None:
         self.pump.close()

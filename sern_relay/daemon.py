@@ -85,7 +85,7 @@ async def run_relay(path: Path, shutdown: Shutdown) -> int:
     return 0
 
 
-def _owes(link: Link, channel: OutChannel, last: int) -> bool:
+def _unconfirmed(link: Link, channel: OutChannel, last: int) -> bool:
     """Whether a connected client has yet to confirm messages up to `last`."""
     return link.established and bool(channel.retained) and channel.retained[0].seq <= last
 
@@ -444,23 +444,23 @@ class RelayDaemon:
         }
 
     async def drain(self) -> None:
-        """Go on with what connected clients are owed while that gets anywhere, then end their sessions."""
+        """Go on with what connected clients have not confirmed while that gets anywhere, then end their sessions."""
         now = clock.now()
         progress = Progress()
         give_up_s = now + self.loaded.model.link.drain_s
         # What comes in from now on its sources keep until the next relay confirms it.
-        owed = [
+        unconfirmed = [
             (link, channel, channel.next_seq - 1)
             for link in self.hub.links.values()
             for channel in link.sender.channels.values()
             if channel.retained
         ]
         while now < give_up_s:
-            owed = [item for item in owed if _owes(*item)]
-            if not owed:
+            unconfirmed = [item for item in unconfirmed if _unconfirmed(*item)]
+            if not unconfirmed:
                 break
             left = (
-                sum(len(channel.retained) for _link, channel, _last in owed),
+                sum(len(channel.retained) for _link, channel, _last in unconfirmed),
                 sum(nbytes for link in self.hub.links.values() for _messages, nbytes in link.sender.queued().values()),
             )
             if progress.still_s(left, now=now) > PATIENCE_S:

@@ -108,7 +108,7 @@ def refused_connections(server: RelayServer | None) -> list[tuple[tuple[str, ...
         "revoked": server.revoked,
         "surplus": server.surplus,
         "silent": server.silent,
-        "join": server.express.refused,
+        "join": server.priority_lanes.refused,
     }
     return [((reason,), float(count)) for reason, count in counts.items()]
 

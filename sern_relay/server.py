@@ -14,7 +14,7 @@ from sern_core.vocabulary.params import Redundancy
 from sern_core.vocabulary.types import ClientName
 from sern_core.wire import framing
 from sern_relay.connections import ClientConnection, ClientConnections, Served
-from sern_relay.express import JOIN, RelayExpress
+from sern_relay.priority_lanes import JOIN, RelayPriorityLanes
 from sern_runtime import clock
 from sern_runtime.config.keys import KeyStatus, parse_user_id
 from sern_runtime.dscp import Marks
@@ -25,7 +25,7 @@ from sern_runtime.zmq_socket import CurvePair, RouterSocket, SendResult, make_se
 
 MAX_PORTS: Final = 4
 """Connections of one client for its session: the one that has it, another process under the same name, and those that
-a change of network left behind. Those for class control alone are bounded by `RelayExpress`."""
+a change of network left behind. Those for class control alone are bounded by `RelayPriorityLanes`."""
 SILENT_INTERVALS: Final = 2.0
 """Times `handshake_interval_s` until a connection must have spoken: once for the handshake, and once for what is said
 right after it."""
@@ -91,7 +91,7 @@ class RelayServer:
         self.connections = ConnectionTable(raw, max_connections=max_connections, on_change=self._connections_changed)
         self.clients = ClientConnections(self.connections)
         """Those of them on which a client has spoken."""
-        self.express = RelayExpress(hub, self.clients, self._send, redundancy, after=after)
+        self.priority_lanes = RelayPriorityLanes(hub, self.clients, self._send, redundancy, after=after)
         self.socket = RouterSocket(
             raw, self._received, on_view=self._received, identified=keys is not None, on_writable=self._writable
         )
@@ -101,7 +101,7 @@ class RelayServer:
     def close(self) -> None:
         for _connection, served in self.clients.sessions():
             served.pump.close()
-        self.express.close()
+        self.priority_lanes.close()
         self.clients.clear()
         self.inflow.close()
         self.connections.close()
@@ -119,7 +119,7 @@ class RelayServer:
         connection.taken += 1
         try:
             if connection.served is None:
-                self.express.received(connection, data)
+                self.priority_lanes.received(connection, data)
             else:
                 connection.served.port.receive(data, now=clock.now())
         except RemoteError as error:
@@ -162,9 +162,9 @@ class RelayServer:
         connection = ClientConnection(routing_id, name, user, details.fd, accepted)
         handle = connection.handle
         if handle is not None:
-            express = data[2:3] == JOIN
+            joins = data[2:3] == JOIN
             marks = self._marks
-            handle.prepare(express=express, tos=marks.express_tos if express else marks.stream_tos)
+            handle.prepare(priority_lane=joins, tos=marks.priority_lane_tos if joins else marks.stream_tos)
         if data[2:3] == JOIN:
             self._join(connection, data)
             return None
@@ -193,7 +193,7 @@ class RelayServer:
     def look(self) -> None:
         """See to connections. Call about once a second."""
         self.silent += self.connections.cut_silent(self._silent_s)
-        self.express.look()
+        self.priority_lanes.look()
 
     def _send(self, routing_id: bytes, datagram: bytes) -> SendResult:
         return self.socket.send_to(routing_id, datagram)
@@ -201,7 +201,7 @@ class RelayServer:
     def _join(self, connection: ClientConnection, data: bytes) -> None:
         """A connection for class control: of a session that its own client has, or of none, and then it is closed."""
         try:
-            older = self.express.join(connection, data)
+            older = self.priority_lanes.join(connection, data)
         except RemoteError as error:
             self.bad_frames += 1
             _log.warning("connection of %s for class control closed: bad frame: %s", connection.client, error)
@@ -223,7 +223,7 @@ class RelayServer:
         for _connection, served in self.clients.sessions():
             if served.port.dirty:
                 served.pump.kick()
-        self.express.flush()
+        self.priority_lanes.flush()
 
     def run_all(self) -> None:
         for _connection, served in list(self.clients.sessions()):
@@ -232,7 +232,7 @@ class RelayServer:
     def _writable(self) -> None:
         for _connection, served in self.clients.sessions():
             served.pump.kick()
-        self.express.kick()
+        self.priority_lanes.kick()
 
     def local_port(self, client: ClientName) -> int | None:
         """The number of our port to which the client's session came by TCP; None while it has no such connection, as
@@ -247,7 +247,7 @@ class RelayServer:
         for connection, _served in list(self.clients.sessions()):
             if connection.client == client:
                 self._gone(connection)
-        self.express.end(client)
+        self.priority_lanes.end(client)
         return self.connections.cut_user(client)
 
     def cut_unbound(self) -> int:
@@ -263,7 +263,7 @@ class RelayServer:
     def _gone(self, connection: ClientConnection) -> None:
         """It is over: whoever it belonged to is told. Idempotent."""
         if connection.served is None:
-            self.express.left(connection)
+            self.priority_lanes.left(connection)
         elif self.clients.remove(connection.routing_id) is not None:
             connection.served.pump.close()
             connection.served.port.disconnected(now=clock.now())

@@ -41,7 +41,7 @@ class Marks:
         return (self.control << 2, self.state << 2, self.bulk << 2)
 
     @property
-    def express_tos(self) -> int:
+    def priority_lane_tos(self) -> int:
         """The IP byte of a connection that carries class control alone."""
         return self.tos[PriorityClass.CONTROL]
 

@@ -45,7 +45,7 @@ TCP_RTO_MAX_MS: Final = 44
 """Linux 6.15 and later; not yet in the socket module."""
 STREAM_CONGESTION: Final = "cubic"
 """BBR's PROBE_RTT shows as 160-260 ms spikes of class 0 every 10 s; the window above it keeps the queue short."""
-EXPRESS_CONGESTION: Final = "bbr"
+PRIORITY_LANE_CONGESTION: Final = "bbr"
 """A loss takes from a thin stream what cubic lets it send, and the next pose waits; BBR leaves it 4 segments."""
 SO_MAX_PACING_RATE: Final = 47
 """Linux; not yet in the socket module."""
@@ -266,10 +266,10 @@ class TcpHandle(SocketHandle):
             raw = connection.getsockopt(socketlib.IPPROTO_TCP, socketlib.TCP_CONGESTION, 16)
         return raw.rstrip(b"\0").decode("ascii", "replace")
 
-    def prepare(self, *, express: bool, tos: int) -> None:
+    def prepare(self, *, priority_lane: bool, tos: int) -> None:
         """What a connection of a lane needs, with `tos` as its IP byte (DSCP in the upper six bits); what the kernel
         does not have or allow is left as it is."""
-        self.set_congestion(EXPRESS_CONGESTION if express else STREAM_CONGESTION)
+        self.set_congestion(PRIORITY_LANE_CONGESTION if priority_lane else STREAM_CONGESTION)
         self.set_rto_max()
         self.set_pacing()
         self._set(socketlib.IP_TOS, tos, level=socketlib.IPPROTO_IP)

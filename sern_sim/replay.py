@@ -166,7 +166,7 @@ class ReplayWorld:
                 self.network.at(at_s, lambda now: give(channel, body, now), node=self.robot_node)
 
         def give(channel: OutChannel, body: bytes, now: float) -> None:
-            if self.robot.link.sender.channels.get(channel.slot) is channel:
+            if self.robot.link.sender.channels.get(channel.channel_id) is channel:
                 self.robot.send(channel, body, int(now * 1e9), now=now)
             arm()
 

@@ -325,7 +325,7 @@ class Demo:
             reliable_topics=frozenset(name for name, log in logs.items() if log.priority == "state"),
             command_lifespans_s={COMMAND_TOPIC: self.scenario.command_lifespan_s},
             relay=RELAY,
-            takers={ROBOT: SITE, SITE: ROBOT},
+            subscribers={ROBOT: SITE, SITE: ROBOT},
             pose_topic=POSE_TOPIC if POSE_TOPIC in poses else max(poses, key=poses.__getitem__, default=""),
         )
 

@@ -1,6 +1,6 @@
 """What became of every message of a topic, by its seq, from the message logs of all daemons on its way. Pure.
 
-    origin --> relay --> taker
+    origin --> relay --> subscriber
 
 Each message that was offered has one fate: it was delivered, refused, dropped at one place for one reason, or still
 waited at one place at the end. What its sender could not know (`unconfirmed`) is decided by what the next place says of
@@ -34,7 +34,7 @@ class Route:
 
     origin: str
     relay: str
-    taker: str
+    subscriber: str
 
 
 @dataclass(slots=True)
@@ -67,10 +67,10 @@ class _Words:
         self.sent = log.dropped.get((route.origin, route.relay), {})
         self.received = log.received.get(route.relay, set())
         self.stopped = log.discarded.get((route.relay, route.origin), {})
-        self.forwarded = log.dropped.get((route.relay, route.taker), {})
-        self.held = log.held.get((route.relay, route.taker), {})
+        self.forwarded = log.dropped.get((route.relay, route.subscriber), {})
+        self.held = log.held.get((route.relay, route.subscriber), {})
         self.kept = log.held.get((route.relay, ""), {})
-        self.taken = {**log.discarded.get((route.taker, route.relay), {}), **log.expired}
+        self.taken = {**log.discarded.get((route.subscriber, route.relay), {}), **log.expired}
 
 
 def fates(log: TopicLog, route: Route, *, reliable: bool) -> Fates:
@@ -102,7 +102,7 @@ def _best_effort(words: _Words, seq: int) -> Fate | str:
             return f"delivered, but {route.relay} never had it"
         if forwarded not in (None, UNCONFIRMED):
             return f"{route.relay} dropped it ({forwarded}), yet it was delivered"
-        return Fate(route.taker, "delivered")
+        return Fate(route.subscriber, "delivered")
     if not arrived:
         return _first(
             (route.origin, None if sent == UNCONFIRMED else sent),
@@ -117,7 +117,7 @@ def _further(words: _Words, seq: int) -> Fate | None:
     route, forwarded, held = words.route, words.forwarded.get(seq), words.held.get(seq)
     return _first(
         (route.relay, None if forwarded == UNCONFIRMED else forwarded),
-        (route.taker, words.taken.get(seq)),
+        (route.subscriber, words.taken.get(seq)),
         (route.relay, forwarded),
         (route.relay, "waiting" if held is not None else None),
         (route.relay, words.stopped.get(seq)),
@@ -135,12 +135,12 @@ def _reliable(words: _Words, seq: int) -> Fate | str:
             return f"delivered, but {route.relay} never had it"
         if sent is not None and sent not in MAY_HAVE_ARRIVED:
             return f"{route.origin} reports it as dropped ({sent}), yet it was delivered"
-        return Fate(route.taker, "delivered")
+        return Fate(route.subscriber, "delivered")
     return (
-        _first((route.taker, words.taken.get(seq)))
+        _first((route.subscriber, words.taken.get(seq)))
         or (_further(words, seq) if seq in words.received else None)
         or _first((route.origin, sent), (route.relay, words.stopped.get(seq)))
-        or f"nobody reports it, and {route.taker} does not have it"
+        or f"nobody reports it, and {route.subscriber} does not have it"
     )
 
 

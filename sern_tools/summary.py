@@ -42,7 +42,7 @@ class RunFacts:
     command_lifespans_s: Mapping[str, float] = field(default_factory=dict)
     pose_topic: str = ""
     relay: str = "relay"  # under which name its log was read
-    takers: Mapping[str, str] = field(default_factory=dict)  # who gets the messages of each origin
+    subscribers: Mapping[str, str] = field(default_factory=dict)  # who gets the messages of each origin
 
 
 @dataclass(slots=True)
@@ -259,11 +259,14 @@ def _account(result: Result, counters: Mapping[str, Sequence[Counters]]) -> None
     facts = result.facts
     for name, log in sorted(result.logs.items()):
         topic = result.topics[name]
-        route = Route(log.origin, facts.relay, facts.takers.get(log.origin, ""))
+        route = Route(log.origin, facts.relay, facts.subscribers.get(log.origin, ""))
         found = fates(log, route, reliable=name in facts.reliable_topics)
         topic.dropped, topic.under_way = found.dropped(), found.waiting
         result.fates[name] = found
-        given_up = log.dropped.get((route.origin, route.relay), {}), log.dropped.get((route.relay, route.taker), {})
+        given_up = (
+            log.dropped.get((route.origin, route.relay), {}),
+            log.dropped.get((route.relay, route.subscriber), {}),
+        )
         result.unconfirmed += sum(UNCONFIRMED in (sent.get(seq) for sent in given_up) for seq in found.by_seq)
         result.unconfirmed_arrived += sum(
             UNCONFIRMED in (sent.get(seq) for sent in given_up) and fate.what != UNCONFIRMED

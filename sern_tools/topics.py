@@ -36,8 +36,8 @@ NOT_LOSSES: Final = frozenset({"duplicate"})
 
 @dataclass(slots=True)
 class Counts:
-    """Counters of one topic at one time. `takers`: links over which it is wanted now. `untaken`: it is announced at a
-    relay, and nobody takes it."""
+    """Counters of one topic at one time. `subscribers`: links over which it is wanted now. `untaken`: it is
+    announced at a relay, and nobody takes it."""
 
     priority: str
     received: int = 0
@@ -45,7 +45,7 @@ class Counts:
     delivered: int = 0
     delivered_bytes: int = 0
     queued: int = 0
-    takers: int = 0
+    subscribers: int = 0
     untaken: bool = False
     age_s: float | None = None
     reasons: Counter[str] = field(default_factory=Counter)
@@ -72,7 +72,7 @@ class Row:
     in_bytes_per_s: float
     out_bytes_per_s: float
     age_s: float | None
-    takers: int
+    subscribers: int
     untaken: bool
     queued: int
     dropped: int
@@ -98,7 +98,7 @@ def parse_topics(answer: Mapping[str, Any]) -> dict[str, Counts]:
                 counts.delivered += row["delivered"]
                 counts.delivered_bytes += row["bytes_delivered"]
                 counts.queued += row["in_queue"] + row["in_flight"]
-                counts.takers += bool(row["wanted"])
+                counts.subscribers += bool(row["wanted"])
             counts.reasons.update({reason: n for reason, n in row["dropped"].items() if reason not in NOT_LOSSES})
     # A topic that nobody takes stays at its origin: no counter at the relay knows it. Older relays do not list them.
     for name, announced in answer.get("announced", {}).items() if _is_relay(answer) else ():
@@ -142,7 +142,7 @@ def compare(
                 in_bytes_per_s=(counts.received_bytes - past.received_bytes) / interval_s,
                 out_bytes_per_s=(counts.delivered_bytes - past.delivered_bytes) / interval_s,
                 age_s=counts.age_s,
-                takers=counts.takers,
+                subscribers=counts.subscribers,
                 untaken=counts.untaken,
                 queued=counts.queued,
                 dropped=counts.reasons.total(),
@@ -230,7 +230,7 @@ COLUMNS: Final = (
     Column("in B/s", lambda row: si(row.in_bytes_per_s), 100),
     Column("out B/s", lambda row: si(row.out_bytes_per_s), 100),
     Column("age s", lambda row: "" if row.age_s is None else f"{row.age_s:.{3 if row.age_s < 10 else 0}f}"),
-    Column("subs", lambda row: str(row.takers or ""), 100),
+    Column("subs", lambda row: str(row.subscribers or ""), 100),
     Column("queued", lambda row: str(row.queued or ""), 100),
     Column("drops", lambda row: str(row.dropped or "")),
     Column("why", _why, 100, number=False),

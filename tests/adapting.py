@@ -51,7 +51,7 @@ class Rig:
         world = self.world
 
         def send(now: float) -> None:
-            if world.network.elapsed_s < until_s and channel.slot in self.robot.core.link.sender.channels:
+            if world.network.elapsed_s < until_s and channel.channel_id in self.robot.core.link.sender.channels:
                 self.robot.core.send(channel, body[:size], 0, now=now)
 
         # Off the beat of the intervals, as sources are.

@@ -29,7 +29,8 @@ DIRECTORY: Final = Path(__file__).resolve().parents[1] / "schemas" / "vectors"
 
 Vector = dict[str, Any]
 
-FLAGS: Final = {"TOMBSTONE": framing.FLAG_TOMBSTONE, "REPLAY": framing.FLAG_REPLAY, "URGENT": framing.FLAG_URGENT}
+FLAGS: Final = {"TOMBSTONE": framing.FLAG_DROP_MARKER, "REPLAY": framing.FLAG_REPLAY, "URGENT": framing.FLAG_URGENT}
+"""By the names that the vectors have for them, which never change."""
 DEFINITION: Final = "std_msgs/Header header\nfloat64[] ranges\n"
 
 
@@ -94,7 +95,7 @@ class Frames:
     def on_data(
         self,
         flags: int,
-        channel: int,
+        channel_id: int,
         seq: int,
         offset: int,
         total: int,
@@ -107,7 +108,7 @@ class Frames:
         frame: Vector = {
             "type": "DATA",
             "flags": [name for name, bit in FLAGS.items() if flags & bit],
-            "channel": channel,
+            "channel": channel_id,
             "seq": seq,
             "offset": offset,
             "total": total,
@@ -136,8 +137,8 @@ class Frames:
             }
         )
 
-    def on_watermark(self, channel: int, delivered: int) -> None:
-        self.frames.append({"type": "WATERMARK", "channel": channel, "delivered": delivered})
+    def on_watermark(self, channel_id: int, delivered: int) -> None:
+        self.frames.append({"type": "WATERMARK", "channel": channel_id, "delivered": delivered})
 
     def on_ping(self) -> None:
         self.frames.append({"type": "PING"})
@@ -457,14 +458,14 @@ def _bad_bytes() -> Iterator[tuple[str, str, bytes]]:
     yield "empty-first-fragment", "datagram", header + framing.encode_data_first(0, 3, 41, 10, 0, 0, 0.0, 0)
     size = framing.MAX_FRAGMENT_BYTES + 1
     yield "oversize-fragment", "datagram", header + framing.encode_data_first(0, 3, 41, size, size, 0, 0.0, 0)
-    tombstone = framing.FLAG_TOMBSTONE
+    marker = framing.FLAG_DROP_MARKER
     yield (
         "tombstone-of-two",
         "datagram",
-        header + framing.encode_data_first(tombstone, 3, 41, 2, 2, 0, 0.0, 0) + b"\1\1",
+        header + framing.encode_data_first(marker, 3, 41, 2, 2, 0, 0.0, 0) + b"\1\1",
     )
-    yield "tombstone-of-none", "datagram", header + framing.encode_data_first(tombstone, 3, 41, 0, 0, 0, 0.0, 0)
-    yield "tombstone-empty-of-one", "datagram", header + framing.encode_data_first(tombstone, 3, 41, 1, 0, 0, 0.0, 0)
+    yield "tombstone-of-none", "datagram", header + framing.encode_data_first(marker, 3, 41, 0, 0, 0, 0.0, 0)
+    yield "tombstone-empty-of-one", "datagram", header + framing.encode_data_first(marker, 3, 41, 1, 0, 0, 0.0, 0)
     yield "five-acks", "datagram", header + 5 * by_name["ack"][first:]
 
     def envelope(data: bytes) -> bytes:

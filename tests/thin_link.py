@@ -33,10 +33,10 @@ class ThinLink:
 
     def ages_s(self, topic: str) -> list[float]:
         """True ages of what arrived once the link's capacity was found, youngest first. What the
-        taker thinks is as true as it says."""
-        sender, taker = (self.site, self.robot) if topic == COMMAND else (self.robot, self.site)
+        receiver thinks is as true as it says."""
+        sender, receiver = (self.site, self.robot) if topic == COMMAND else (self.robot, self.site)
         found = []
-        for got in taker.on(topic):
+        for got in receiver.on(topic):
             age_s = got.at_s - sender.sent[topic, got.seq][0]
             assert abs(got.age_s - age_s) <= got.error_s
             if got.at_s - self.world.network.start_s > SETTLED_S:

@@ -34,7 +34,7 @@ class _Observer:
     """What there is at the other master, and when."""
 
     def __init__(self, uri: str) -> None:
-        self.endpoint = Ros1Endpoint(Ros1Options(uri, HOST, "observer", poll_hz=OBSERVE_HZ, heed_sern=True))
+        self.endpoint = Ros1Endpoint(Ros1Options(uri, HOST, "observer", poll_hz=OBSERVE_HZ, accept_bridged=True))
         self.first_s: dict[str, float] = {}
         self.gone_s: dict[str, float] = {}
 

@@ -11,7 +11,7 @@ import zmq
 
 from benchmarks.link.load import HELLO_PERIOD_S, Kind, Load, Log, Orders, Spec, offer, ready
 from sern_client.daemon import TICK_S
-from sern_client.express import ClientExpress
+from sern_client.priority_lane import ClientPriorityLane
 from sern_client.transport import RelayTransport
 from sern_client.udp import ClientLane
 from sern_core.site.client import ClientCore
@@ -70,13 +70,13 @@ class End:
             on_reason=self.problems.append,
             after=self.kick,
         )
-        self._express = ClientExpress(
+        self._priority_lane = ClientPriorityLane(
             self.core, self._transport, LinkParams().redundancy, datagrams=self._lane is not None, kick=self.kick
         )
 
     def kick(self) -> None:
         self._transport.pump.kick()
-        self._express.kick()
+        self._priority_lane.kick()
         if self._lane is not None:
             self._lane.kick()
 
@@ -87,7 +87,7 @@ class End:
         if self.spec.system == "sern-one":
             return link.established
         if self._lane is None:
-            return link.established and link.lanes.express is not None
+            return link.established and link.lanes.priority_lane is not None
         return link.established and link.lane.name == "udp"
 
     async def tick(self) -> None:
@@ -96,7 +96,7 @@ class End:
             if self._lane is not None:
                 self._lane.tick()
             if self.spec.system != "sern-one":
-                self._express.tick()
+                self._priority_lane.tick()
 
     async def sample(self) -> None:
         while True:
@@ -118,7 +118,7 @@ class End:
             )
 
     def close(self) -> None:
-        self._express.close()
+        self._priority_lane.close()
         self._transport.close()
         if self._lane is not None:
             self._lane.closed()
@@ -129,7 +129,7 @@ class End:
     def link_up(self, *, resumed: bool) -> None:
         if self._lane is not None:
             self._lane.ask()
-        self._express.begin()
+        self._priority_lane.begin()
 
     def link_down(self, reason: str) -> None:
         self.problems.append(reason)

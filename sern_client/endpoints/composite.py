@@ -149,7 +149,7 @@ class CompositeEndpoint:
         self._members = list(endpoints)
         self._events: TopicEvents | None = None
         self._started: list[Endpoint] = []
-        self._givers: dict[TopicName, dict[int, TopicInfo]] = {}  # members in the order they announced
+        self._providers: dict[TopicName, dict[int, TopicInfo]] = {}  # members in the order they announced
         self._left_out: dict[TopicName, dict[int, TopicInfo]] = {}  # members that give it with another type
         self._joined: list[_Joined] = []
         self._unwanted: set[TopicName] = set()  # at the far side; a member that joins later is told
@@ -180,11 +180,11 @@ class CompositeEndpoint:
             raise failure
 
     def subscribe(self, name: TopicName, sink: Sink) -> Subscription:
-        if name not in self._givers:
+        if name not in self._providers:
             raise UsageError(f"{name}: no endpoint announced such a topic")
         joined = _Joined(name, sink, self)
         self._joined.append(joined)
-        for index in self._givers[name]:
+        for index in self._providers[name]:
             self._subscribe(joined, index)
         return joined
 
@@ -234,10 +234,10 @@ class CompositeEndpoint:
             self._offer(publishers)
 
     def interest(self, name: TopicName, wanted: bool) -> None:
-        givers = self._givers.get(name, {})
-        if givers:
+        providers = self._providers.get(name, {})
+        if providers:
             (self._unwanted.discard if wanted else self._unwanted.add)(name)
-        for index in givers:
+        for index in providers:
             self._members[index].interest(name, wanted)
 
     def validate(self, held: Held) -> list[Difference]:
@@ -248,7 +248,7 @@ class CompositeEndpoint:
             found += member.validate(
                 Held(
                     Counter(opened.name for opened in self._opened if index in opened.parts),
-                    Counter(joined.name for joined in self._joined if index in self._givers.get(joined.name, ())),
+                    Counter(joined.name for joined in self._joined if index in self._providers.get(joined.name, ())),
                 )
             )
         return found
@@ -335,12 +335,12 @@ class CompositeEndpoint:
 
     def member_added(self, index: int, info: TopicInfo) -> None:
         assert self._events is not None
-        givers = self._givers.setdefault(info.name, {})
-        if not givers or set(givers) == {index}:
-            givers[index] = info
+        providers = self._providers.setdefault(info.name, {})
+        if not providers or set(providers) == {index}:
+            providers[index] = info
             self._events.topic_added(info)
             return
-        first = next(iter(givers.values()))
+        first = next(iter(providers.values()))
         if (info.type_name, info.encoding) != (first.type_name, first.encoding):
             _LOG.warning(
                 "%s: two endpoints give it, as %s (%s) and as %s (%s); the second is left out",
@@ -348,8 +348,8 @@ class CompositeEndpoint:
             )  # fmt: skip
             self._left_out.setdefault(info.name, {})[index] = info
             return
-        known = index in givers
-        givers[index] = info
+        known = index in providers
+        providers[index] = info
         for joined in self._joined:
             if joined.name == info.name and not known:
                 self._subscribe(joined, index)
@@ -360,14 +360,14 @@ class CompositeEndpoint:
         left_out.pop(index, None)
         if not left_out:
             self._left_out.pop(name, None)
-        givers = self._givers.get(name, {})
-        if givers.pop(index, None) is None:
+        providers = self._providers.get(name, {})
+        if providers.pop(index, None) is None:
             return
         for joined in self._joined:
             if joined.name == name and (part := joined.parts.pop(index, None)) is not None:
                 part.close()
-        if not givers:
-            del self._givers[name]
+        if not providers:
+            del self._providers[name]
             self._unwanted.discard(name)
             self._events.topic_removed(name)
             for other, info in self._left_out.pop(name, {}).items():  # now it is their turn

@@ -170,7 +170,7 @@ class HopAdapter:
     # --- measuring ------------------------------------------------------------------------------------------------
 
     def note_arrival(self, spec: TopicSpec, message: Message, now: float) -> None:
-        if message.replay or message.tombstone:
+        if message.replay or message.drop_marker:
             return
         count = self._arrived[spec.priority]
         latency_s = max(0.0, now - message.born_s - self.link.rtt_s / 2.0)  # the acknowledgement took half a round trip

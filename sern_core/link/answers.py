@@ -1,6 +1,6 @@
 """What one end of a hop tells the other about its streams: whether they are wanted, and what was dropped of them. Pure.
 
-Answers say nothing that the peer knows (`Interest`). Reports of drops wait while the peer has not heard the latest,
+Answers say nothing that the peer knows (`Interest`). Reports of drops wait until the peer has acknowledged the latest,
 and become runs of messages meanwhile; they survive the session.
 """
 
@@ -13,7 +13,7 @@ from sern_core.stream.in_stream import InStream, Reassembly
 from sern_core.vocabulary.types import DROP_CODES, DropReason
 from sern_core.wire.announce import encode_dropped
 
-MAX_REPORTS_UNHEARD: Final = 64
+MAX_REPORTS_UNACKED: Final = 64
 """Control messages that may wait for the peer's acknowledgement before reports of drops wait as well."""
 
 
@@ -32,7 +32,7 @@ class Answers:
     def begin(self) -> None:
         """A session has begun: nothing was said in it."""
         self._interest.begin()
-        self._reassembly.unheard.begin()
+        self._reassembly.unacked_reports.begin()
         self._reporting.clear()
         self.unsaid = False
 
@@ -40,9 +40,9 @@ class Answers:
         """Whether the peer understands several channels in one message, and differences."""
         self._interest.batches = understood
 
-    def expect(self, stream: InStream, slot: int) -> None:
+    def expect(self, stream: InStream, channel_id: int) -> None:
         """The peer has announced a stream: it waits for an answer, whatever it was told before, and for reports."""
-        self._interest.forget(slot)
+        self._interest.forget(channel_id)
         stream.reports.unsay()
         if stream.reports:
             self._reporting[stream] = None
@@ -54,16 +54,16 @@ class Answers:
         if stream.channel_id is not None:
             self._interest.forget(stream.channel_id)
 
-    def answer(self, stream: InStream, wanted: bool, *, now: float, owed: tuple[str, ...] = ()) -> None:
-        """Tell the peer, if it does not know, whether its stream is wanted; `owed` names the clients that must get a
-        reliable one."""
+    def answer(self, stream: InStream, wanted: bool, *, now: float, required: tuple[str, ...] = ()) -> None:
+        """Tell the peer, if it does not know, whether its stream is wanted; `required` names the clients that must get
+        a reliable one."""
         if not stream.reliable:
-            owed = ()
+            required = ()
         if not self._end.established or stream.channel_id is None:
             stream.wanted = wanted
             stream.paused = stream.paused or not wanted
             stream.pause_seq = 0
-        elif self._interest.answer(stream.channel_id, stream, wanted, owed, now=now):
+        elif self._interest.answer(stream.channel_id, stream, wanted, required, now=now):
             self.unsaid = self._end.dirty = True
 
     def report(self, stream: InStream, seq: int, reason: DropReason, where: str, count: int = 1) -> None:
@@ -80,8 +80,8 @@ class Answers:
         control = self._control
         self._interest.tell(
             lambda envelope: control.send(envelope, now=now),
-            heard=control.heard,
-            unheard=len(control.out.retained),
+            acked_seq=control.acked_seq,
+            unacked=len(control.out.retained),
             now=now,
         )
         self.unsaid = bool(self._interest or self._reporting)
@@ -95,12 +95,12 @@ class Answers:
         """Say so many reports as the peer can be expected to hear of soon; those that wait grow into runs meanwhile."""
         retained = self._control.out.retained
         for stream in list(self._reporting):
-            slot = stream.channel_id
+            channel_id = stream.channel_id
             reports, runs = stream.reports, self._interest.batches
-            while slot is not None and (report := reports.first(runs=runs)) is not None:
-                if len(retained) >= MAX_REPORTS_UNHEARD:
+            while channel_id is not None and (report := reports.first(runs=runs)) is not None:
+                if len(retained) >= MAX_REPORTS_UNACKED:
                     return
                 code = DROP_CODES[report.reason]
-                envelope = encode_dropped(slot, report.seq, code, report.where, report.count)
+                envelope = encode_dropped(channel_id, report.seq, code, report.where, report.count)
                 reports.say(report, self._control.send(envelope, now=now))
             del self._reporting[stream]

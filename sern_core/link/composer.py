@@ -56,23 +56,23 @@ class Composer:
         sender, scheduler = self._sender, self._sender.scheduler
         control = self._control
         limit = lane.fragment_bytes - (framing.ACK.size if lane.arrivals.unacked else 0)
-        express = lane is self._lanes.express
+        control_only = lane is self._lanes.priority_lane
         window_open = lane.open_at(now)
-        if not express and self._taking.watermarks:
-            for slot, seq in self._taking.take_watermarks(MAX_WATERMARKS, heard=control.heard):
-                datagram.watermark(slot, seq)
+        if not control_only and self._taking.watermarks:
+            for channel_id, seq in self._taking.take_watermarks(MAX_WATERMARKS, acked_seq=control.acked_seq):
+                datagram.watermark(channel_id, seq)
         served: PriorityClass | None = None
         ride = False  # it is the turn of a little control, behind class 0
         spoke = False
         full = limit - max(framing.DATA_FIRST_BYTES + MIN_SHARE_BYTES, limit // MIN_FILL_DIVISOR)
         while datagram.size <= full:
-            if express:
+            if control_only:
                 chosen = scheduler.pick_control(now=now, window_open=window_open)
             else:
                 chosen = self.pick(now, window_open=window_open)
             channel = sender.channels[chosen] if chosen is not None else None
             urgent = channel is not None and channel.spec.priority is PriorityClass.CONTROL
-            said = control.out.head(now) if not express and control.waits else None
+            said = control.out.head(now) if not control_only and control.waits else None
             if said is not None and (ride or (window_open and not urgent)):
                 end = min(limit, datagram.size + framing.DATA_FIRST_BYTES + RIDE_BYTES) if ride else limit
                 grown = self._put(datagram, control.out, said, end, now)
@@ -117,9 +117,9 @@ class Composer:
         return window_open
 
     def pick(self, now: float, *, window_open: bool) -> int | None:
-        """The channel that the lane with the data would serve next; class control goes over the express lane, if there
+        """The channel that the lane with the data would serve next; class control goes over the priority lane, if there
         is one."""
-        if self._lanes.express is not None:
+        if self._lanes.priority_lane is not None:
             return self._sender.scheduler.pick_rest(now=now) if window_open else None
         return self._sender.pick(now, window_open=window_open)
 
@@ -139,6 +139,6 @@ class Composer:
         if trace.enabled and channel is not self._control.out:
             self.served = channel
             told = self._sender.told
-            if trace.steps or channel.slot in told.holding:
+            if trace.steps or channel.channel_id in told.holding:
                 told.left(channel, out, started, now)
         return grown

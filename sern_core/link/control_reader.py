@@ -8,7 +8,7 @@ from sern_core.link.control_stream import ControlStream
 from sern_core.link.definitions import PeerDefinitions
 from sern_core.link.end import End
 from sern_core.link.events import Events
-from sern_core.link.owed_lists import OwedLists
+from sern_core.link.name_lists import NameLists
 from sern_core.link.sender import Sender
 from sern_core.link.streams_in import StreamsIn
 from sern_core.link.streams_out import StreamsOut
@@ -29,7 +29,7 @@ class ControlReader:
         taking: StreamsIn,
         answers: Answers,
         texts: PeerDefinitions,
-        owed_lists: OwedLists,
+        name_lists: NameLists,
         owner: Events,
         *,
         answered: Callable[[int], None],
@@ -41,7 +41,7 @@ class ControlReader:
         self._taking = taking
         self._answers = answers
         self._texts = texts
-        self._owed_lists = owed_lists
+        self._name_lists = name_lists
         self._owner = owner
         self._answered = answered
 
@@ -60,10 +60,10 @@ class ControlReader:
         """Hand a message to the part it is for; what the link does not know is for its owner."""
         if kind == "announce":
             announcement = decode_announcement(envelope)
-            key = ("announce", announcement.channel)
-            owed = self._owed_lists.add(key, announcement.owed, more=announcement.more, peer=self._end.peer)
-            if owed is not None:
-                self._taking.announced(replace(announcement, owed=owed), now)
+            key = ("announce", announcement.channel_id)
+            required = self._name_lists.add(key, announcement.required, more=announcement.more, peer=self._end.peer)
+            if required is not None:
+                self._taking.announced(replace(announcement, required=required), now)
         elif kind == "want":
             self._outgoing.answered(decode_want(envelope), now)
         elif kind in ("refuse", "dropped"):
@@ -75,8 +75,8 @@ class ControlReader:
             else:
                 self._outgoing.refused(channel, envelope, now)
         elif kind in ("first", "retract"):
-            slot = framing.take_int(envelope, "ch", high=0xFFFF)
-            incoming = self._taking.incoming.get(slot)
+            channel_id = framing.take_int(envelope, "ch", high=0xFFFF)
+            incoming = self._taking.incoming.get(channel_id)
             if incoming is None:
                 return
             if kind == "first":

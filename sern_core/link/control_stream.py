@@ -12,7 +12,7 @@ from sern_core.vocabulary.message import Message, StreamId, StreamInfo, TopicInf
 from sern_core.vocabulary.types import Encoding, PriorityClass, Reliability, TopicName
 from sern_core.wire import framing
 
-CONTROL_CHANNEL: Final = 0
+CONTROL_CHANNEL_ID: Final = 0
 CONTROL_TOPIC: Final = TopicName("/_sern/control")
 MAX_CONTROL_BYTES: Final = 2 + framing.MAX_ENVELOPE_BYTES + framing.MAX_ATTACHMENT_BYTES + 1024
 """A control message: envelope and packed attachment (what cannot be packed grows a little)."""
@@ -36,8 +36,8 @@ class ControlStream:
         self._end = end
         self._reassembly = reassembly
         self._on_message = on_message
-        self._unheard = 0  # answers since the peer acknowledged the one of number `_unheard_seq`
-        self._unheard_seq = 0
+        self._unacked = 0  # answers since the peer acknowledged the one of number `_unacked_seq`
+        self._unacked_seq = 0
         self._attachments_left = float(ATTACHMENT_BURST_BYTES)
         self._attachments_s = 0.0
         self.out, self.incoming = self._streams()
@@ -53,7 +53,7 @@ class ControlStream:
         info = TopicInfo(CONTROL_TOPIC, "", Encoding.RAW)
         stream = StreamInfo(StreamId(self._end.name, self._end.boot, CONTROL_TOPIC), info, spec)
         counters = SendCounters(CONTROL_TOPIC, PriorityClass.CONTROL)
-        out = OutChannel(CONTROL_CHANNEL, stream, counters, lambda _slot, _outs, _reason: None, first=1)
+        out = OutChannel(CONTROL_CHANNEL_ID, stream, counters, lambda _channel_id, _outs, _reason: None, first=1)
         out.wanted = out.ready = True
         incoming = InStream(
             stream,
@@ -68,7 +68,7 @@ class ControlStream:
         """A session has begun."""
         self.incoming.close()
         self.out, self.incoming = self._streams()
-        self._unheard = self._unheard_seq = 0
+        self._unacked = self._unacked_seq = 0
 
     def send(self, envelope: framing.Envelope, attachment: bytes = b"", *, now: float) -> int:
         """Queue a control message: reliable and in order within the session. Returns its number, 0 without a session:
@@ -83,7 +83,7 @@ class ControlStream:
         return seq
 
     @property
-    def heard(self) -> int:
+    def acked_seq(self) -> int:
         """The number of the last control message up to which the peer has acknowledged all."""
         return self.out.watermark
 
@@ -117,8 +117,8 @@ class ControlStream:
     def answered(self, count: int, *, streams: int) -> None:
         """The peer made us say `count` things. Raises WireError if it never reads what it makes us say; `streams` are
         those in both directions."""
-        if self.out.watermark >= self._unheard_seq:
-            self._unheard, self._unheard_seq = 0, self.out.next_seq - 1
-        self._unheard += count
-        if self._unheard > self._end.params.limits.unheard + 4 * streams:
-            raise WireError(f"{self._end.peer} does not read {self._unheard} answers and goes on asking")
+        if self.out.watermark >= self._unacked_seq:
+            self._unacked, self._unacked_seq = 0, self.out.next_seq - 1
+        self._unacked += count
+        if self._unacked > self._end.params.limits.unacked + 4 * streams:
+            raise WireError(f"{self._end.peer} does not read {self._unacked} answers and goes on asking")

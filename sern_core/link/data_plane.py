@@ -5,7 +5,7 @@ from typing import Any, Final
 
 from sern_core.link.answers import Answers
 from sern_core.link.composer import Composer
-from sern_core.link.control_stream import CONTROL_CHANNEL, ControlStream
+from sern_core.link.control_stream import CONTROL_CHANNEL_ID, ControlStream
 from sern_core.link.datagram import Datagram, SentData, SentWatermark
 from sern_core.link.end import End
 from sern_core.link.holds import Holds
@@ -93,7 +93,7 @@ class DataPlane:
 
     def _fill(self, datagram: Datagram, lane: Lane, now: float) -> None:
         lanes = self._lanes
-        if lane is lanes.lane or lane is lanes.express:
+        if lane is lanes.lane or lane is lanes.priority_lane:
             self._end.dirty = False
             try:
                 window_open = self._composer.fill(datagram, lane, now)
@@ -118,7 +118,7 @@ class DataPlane:
         estimator = lane.estimator
         inflight_bytes = nbytes + (flight.inflight_bytes if lane.beside is None else lane.under_way_bytes)
         # What could be picked if window and pacer let it is held back by them; ordering `paper` holds back by itself.
-        waits = (lane is lanes.lane or lane is lanes.express) and bool(
+        waits = (lane is lanes.lane or lane is lanes.priority_lane) and bool(
             self._control.waits or scheduler.pick(now=now, window_open=True) is not None
         )
         path = lane.path
@@ -141,7 +141,7 @@ class DataPlane:
         else:
             end.dirty = watermarks or (waits and self._composer.pick(now, window_open=False) is not None)
         redundant = lane.redundant
-        if redundant or lane is lanes.express:
+        if redundant or lane is lanes.priority_lane:
             lane.spare = not waits or scheduler.within_share(now)
             if (
                 redundant
@@ -152,11 +152,11 @@ class DataPlane:
         return datagram
 
     def may_copy(self, nbytes: int) -> bool:
-        """Whether the express lane's latest datagram, of `nbytes`, may go over its second connection as well; then it
+        """Whether the priority lane's latest datagram, of `nbytes`, may go over its second connection as well; then it
         counts as class control's. While something waits for the link copies come out of that class's share."""
         lanes = self._lanes
-        if lanes.express is not None:
-            if not lanes.express.spare:
+        if lanes.priority_lane is not None:
+            if not lanes.priority_lane.spare:
                 return False
             self._sender.scheduler.charge(PriorityClass.CONTROL, nbytes, now=self._end.now)
             lanes.wire_bytes += nbytes + OVERHEAD_BYTES
@@ -192,7 +192,7 @@ class DataPlane:
                 if type(item) is SentData and item.channel.fragment_acked(item.out, item.generation):
                     if self.on_arrived is not None:
                         self.on_arrived(item.channel.spec, item.out.message, now)
-                    if end.trace.steps and item.channel.slot != CONTROL_CHANNEL:
+                    if end.trace.steps and item.channel.channel_id != CONTROL_CHANNEL_ID:
                         self._sender.told.acked(item.channel, item.out, now)
         control = self._control.out
         if control.retained:
@@ -207,7 +207,7 @@ class DataPlane:
             if type(item) is SentData:
                 lost.setdefault(item.channel, []).append((item.out, item.generation, item.start, item.end))
             elif type(item) is SentWatermark:
-                self._taking.tell_again(item.channel)
+                self._taking.tell_again(item.channel_id)
             else:
                 lane.ping = True
         self._sender.lost(lost, now)
@@ -231,7 +231,7 @@ class DataPlane:
             None if lane.lossless else lane.flight.loss_deadline(),
             self._service_deadline(lane) if lane is self._lanes.lane and self._backlog else None,
             lane.copies[0][0] if lane.copies else None,
-            self._express_deadline(lane) if lane is self._lanes.express else None,
+            self._priority_lane_deadline(lane) if lane is self._lanes.priority_lane else None,
         ):
             if candidate is not None and candidate < deadline:
                 deadline = candidate
@@ -246,7 +246,7 @@ class DataPlane:
             return pacing_s if bucket_s is None or pacing_s < bucket_s else bucket_s
         return scheduler.next_deadline(now=now, window_open=lane.open_at(now))
 
-    def _express_deadline(self, lane: Lane) -> float | None:
+    def _priority_lane_deadline(self, lane: Lane) -> float | None:
         """The same for class control on its own connections."""
         bucket_s = self._sender.scheduler.control_deadline()
         if bucket_s is not None and lane.window_open and not lane.pacer.ready(self._end.now):
@@ -275,4 +275,4 @@ class DataPlane:
 
 
 def _urgent(channel: OutChannel) -> bool:
-    return channel.spec.priority is PriorityClass.CONTROL and channel.slot != CONTROL_CHANNEL
+    return channel.spec.priority is PriorityClass.CONTROL and channel.channel_id != CONTROL_CHANNEL_ID

@@ -24,7 +24,7 @@ class SentData(NamedTuple):
 class SentWatermark(NamedTuple):
     """A delivered watermark that a packet carried."""
 
-    channel: int
+    channel_id: int
 
 
 class SentPing(NamedTuple):
@@ -41,9 +41,9 @@ class Datagram:
         self.items: list[SentData | SentWatermark | SentPing] = []
         self.size = framing.HEADER_BYTES
 
-    def watermark(self, slot: int, seq: int) -> None:
-        self.frames.append(framing.encode_watermark(slot, seq))
-        self.items.append(SentWatermark(slot))
+    def watermark(self, channel_id: int, seq: int) -> None:
+        self.frames.append(framing.encode_watermark(channel_id, seq))
+        self.items.append(SentWatermark(channel_id))
         self.size += framing.WATERMARK.size
 
     def ping(self) -> None:
@@ -55,7 +55,7 @@ class Datagram:
         message = out.message
         start, end = channel.take(out, max(limit - self.size - framing.DATA_FIRST_BYTES, MIN_SHARE_BYTES), now)
         self.items.append(SentData(channel, out, out.generation, start, end))
-        flags = framing.FLAG_TOMBSTONE if message.tombstone else 0
+        flags = framing.FLAG_DROP_MARKER if message.drop_marker else 0
         if message.replay:
             flags |= framing.FLAG_REPLAY
         if channel.spec.priority is PriorityClass.CONTROL:
@@ -64,10 +64,10 @@ class Datagram:
             age_s = now - message.born_s
             error_s = message.error_s + framing.AGE_UNIT_S  # the age itself is cut to its unit
             head = framing.encode_data_first(
-                flags, channel.slot, out.seq, out.size, end, message.stamp_ns, age_s, message.codec, error_s
+                flags, channel.channel_id, out.seq, out.size, end, message.stamp_ns, age_s, message.codec, error_s
             )
         else:
-            head = framing.encode_data_next(flags, channel.slot, out.seq, start, out.size, end - start)
+            head = framing.encode_data_next(flags, channel.channel_id, out.seq, start, out.size, end - start)
         self.frames.append(head)
         self.frames.append(message.body if end - start == out.size else message.body[start:end])
         grown = len(head) + end - start

@@ -34,7 +34,7 @@ class Events(Protocol):
     def message(self, stream: InStream, message: Message, *, now: float) -> None: ...
 
     def discarded(self, stream: InStream, reason: DropReason, nbytes: int, seqs: Sequence[int]) -> None:
-        """Messages on their way in are dropped, and no tombstone follows."""
+        """Messages on their way in are dropped, and no drop marker follows."""
 
     def skipped(self, stream: InStream, count: int, *, now: float) -> None: ...
 

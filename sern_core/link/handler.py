@@ -47,7 +47,7 @@ class LinkHandler(Protocol[L_contra]):
     def on_retract(self, link: L_contra, stream: InStream, *, now: float) -> None: ...
 
     def on_message(self, link: L_contra, stream: InStream, message: Message, *, now: float) -> None:
-        """A message (or tombstone) has its turn."""
+        """A message (or drop marker) has its turn."""
 
     def on_in_drop(self, link: L_contra, stream: InStream, reason: DropReason, nbytes: int, count: int) -> None: ...
 

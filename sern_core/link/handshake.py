@@ -185,10 +185,10 @@ class Handshake:
             self._sessions.end_session("packet numbers used up", now)
             self.send_reset(self._end.tag, now)
 
-    # --- express connections --------------------------------------------------------------------------------------
+    # --- priority connections -------------------------------------------------------------------------------------
 
     def join(self, now: float) -> bytes | None:
-        """What the initiator says first on a connection of the express lane; None without a session."""
+        """What the initiator says first on a connection of the priority lane; None without a session."""
         end = self._end
         if not end.established:
             return None

@@ -12,7 +12,7 @@ from sern_core.link.end import End
 from sern_core.link.lane_set import LaneSet
 from sern_core.link.send_trace import held_back
 from sern_core.link.sender import Sender
-from sern_core.path.lanes import LANE_EXPRESS, Lane
+from sern_core.path.lanes import LANE_PRIORITY, Lane
 from sern_core.stream.coding import Coding
 from sern_core.stream.out_channel import OutChannel
 from sern_core.stream.scheduler import WaitReason
@@ -77,13 +77,13 @@ class Holds:
         if lane.stalled:
             return HoldReason.SILENT, {}
         served, closed = self.served, not lane.open_at(now)
-        if served is None or served is channel or self._sender.channels.get(served.slot) is not served:
+        if served is None or served is channel or self._sender.channels.get(served.channel_id) is not served:
             served = None
         if closed and served is not None and served.spec.priority < channel.spec.priority:
-            return HoldReason.CLASS, self._before(served.slot)
-        beside = self._lanes.express is not None
+            return HoldReason.CLASS, self._before(served.channel_id)
+        beside = self._lanes.priority_lane is not None
         # As if there were room, for that says who would take it; the room itself is what the first in line waits for.
-        wait, chosen = self._sender.scheduler.waits_for(channel.slot, now, beside=beside)
+        wait, chosen = self._sender.scheduler.waits_for(channel.channel_id, now, beside=beside)
         if wait is not None and wait is not WaitReason.WINDOW:
             return _REASONS[wait], self._before(chosen)
         if self._control.waits and channel.spec.priority is not PriorityClass.CONTROL:
@@ -91,7 +91,7 @@ class Holds:
         if not closed:
             return None
         if served is not None and served.spec.priority is channel.spec.priority:
-            return HoldReason.OUTRANKED, self._before(served.slot)
+            return HoldReason.OUTRANKED, self._before(served.channel_id)
         rate_bps = lane.estimator.rate_bps
         known: dict[str, Field] = {} if rate_bps is None else {"rate_bps": round(rate_bps)}
         if lane.window_open:
@@ -99,13 +99,13 @@ class Holds:
         return HoldReason.WINDOW, {"inflight_bytes": lane.flight.inflight_bytes, **known}
 
     def _lane_of(self, channel: OutChannel) -> Lane:
-        express = self._lanes.express
+        own = self._lanes.priority_lane
         control = channel.spec.priority is PriorityClass.CONTROL
-        return express if control and express is not None and express.id == LANE_EXPRESS else self._lanes.lane
+        return own if control and own is not None and own.id == LANE_PRIORITY else self._lanes.lane
 
-    def _before(self, slot: int | None) -> dict[str, Field]:
+    def _before(self, channel_id: int | None) -> dict[str, Field]:
         """Who goes first."""
-        channel = None if slot is None else self._sender.channels.get(slot)
+        channel = None if channel_id is None else self._sender.channels.get(channel_id)
         if channel is None:
             return {}
         return {"after": channel.stream.id.topic, "after_class": CLASS_LABELS[channel.spec.priority]}
@@ -123,7 +123,7 @@ class Holds:
             "age_s": now - out.message.born_s,
             "unsent_bytes": out.unsent_bytes,
         }
-        standing = sender.scheduler.explain(channel.slot, now)
+        standing = sender.scheduler.explain(channel.channel_id, now)
         gate = channel.gate
         if gate is not None and out is gate.newest:
             reason = HoldReason.ADAPTATION if gate.newest_thinned else HoldReason.RATE_CAP

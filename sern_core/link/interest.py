@@ -17,7 +17,7 @@ from sern_core.wire.announce import MAX_STRINGS, encode_want
 
 PAUSE_MIN_S: Final = 0.1
 PAUSE_MAX_S: Final = 2.0
-MAX_UNHEARD_ANSWERS: Final = 256
+MAX_UNACKED_ANSWERS: Final = 256
 """Control messages that may wait for the peer's acknowledgement before first answers wait as well."""
 NEVER: Final = float("inf")
 
@@ -27,7 +27,7 @@ Send = Callable[[framing.Envelope], int]
 
 class _Answer(NamedTuple):
     on: bool
-    owed: tuple[str, ...]
+    required: tuple[str, ...]
 
 
 class _Change(NamedTuple):
@@ -38,10 +38,10 @@ class _Change(NamedTuple):
 
 
 class _Group(NamedTuple):
-    """What is said of several channels alike. `owed` None: by difference."""
+    """What is said of several channels alike. `required` None: by difference."""
 
     on: bool
-    owed: tuple[str, ...] | None
+    required: tuple[str, ...] | None
     add: tuple[str, ...]
     drop: tuple[str, ...]
 
@@ -55,7 +55,7 @@ class Interest:
         self._told: dict[int, _Answer] = {}
         self._changes: dict[int, _Change] = {}
         self._due_s = NEVER
-        self._held = False  # until the peer has heard what was told last
+        self._held = False  # until the peer has acknowledged what was told last
         self._last_s = -NEVER
         self._last_seq = 0
         self._pause_s = PAUSE_MIN_S
@@ -80,77 +80,79 @@ class Interest:
         self._last_seq = 0
         self._pause_s = PAUSE_MIN_S
 
-    def forget(self, slot: int) -> None:
+    def forget(self, channel_id: int) -> None:
         """The channel is closed, or was refused."""
-        self._told.pop(slot, None)
-        self._changes.pop(slot, None)
+        self._told.pop(channel_id, None)
+        self._changes.pop(channel_id, None)
 
-    def answer(self, slot: int, stream: InStream, wanted: bool, owed: tuple[str, ...], *, now: float) -> bool:
+    def answer(self, channel_id: int, stream: InStream, wanted: bool, required: tuple[str, ...], *, now: float) -> bool:
         """The answer to a stream, as it is now. Returns whether that is news."""
-        answer = _Answer(wanted, owed)
-        told = self._told.get(slot)
+        answer = _Answer(wanted, required)
+        told = self._told.get(channel_id)
         if told is None:
-            change = self._changes.get(slot)
+            change = self._changes.get(channel_id)
             was_paused = stream.paused if change is None else change.was_paused
             stream.wanted = wanted
             stream.paused = was_paused or not wanted
             stream.pause_seq = 0
-            self._changes[slot] = _Change(stream, answer, was_paused)
-        elif told.on == wanted and (told.owed == owed or set(told.owed) == set(owed)):
-            self._changes.pop(slot, None)
+            self._changes[channel_id] = _Change(stream, answer, was_paused)
+        elif told.on == wanted and (told.required == required or set(told.required) == set(required)):
+            self._changes.pop(channel_id, None)
             return False
         else:
-            self._changes[slot] = _Change(stream, answer, stream.paused)
-        self._due_s = min(self._due_s, self._due_of(slot, now))
+            self._changes[channel_id] = _Change(stream, answer, stream.paused)
+        self._due_s = min(self._due_s, self._due_of(channel_id, now))
         self._held = False  # that is for `tell` to find out
         return True
 
-    def _due_of(self, slot: int, now: float) -> float:
+    def _due_of(self, channel_id: int, now: float) -> float:
         """When the change of a channel is to be told."""
-        told = self._told.get(slot)
+        told = self._told.get(channel_id)
         if told is None:
             return now
-        turns_on = self._changes[slot].answer.on and not told.on
+        turns_on = self._changes[channel_id].answer.on and not told.on
         return self._last_s + (PAUSE_MIN_S if turns_on else self._pause_s)
 
-    def tell(self, send: Send, *, heard: int, unheard: int, now: float) -> None:
-        """Say what is due. `heard`: the number of the last control message that the peer has acknowledged, `unheard`
-        how many it has not."""
+    def tell(self, send: Send, *, acked_seq: int, unacked: int, now: float) -> None:
+        """Say what is due. `acked_seq`: the number of the last control message that the peer has acknowledged,
+        `unacked` how many it has not."""
         if now < self._due_s:
             return
         changes = self._changes
-        self._held = unheard > MAX_UNHEARD_ANSWERS or self._last_seq > heard
+        self._held = unacked > MAX_UNACKED_ANSWERS or self._last_seq > acked_seq
         if self._held:
             # What the peer has not been told at all does not wait for it, unless it never reads.
-            changes = {slot: change for slot, change in changes.items() if slot not in self._told}
-            if not changes or unheard > MAX_UNHEARD_ANSWERS:
+            changes = {channel_id: change for channel_id, change in changes.items() if channel_id not in self._told}
+            if not changes or unacked > MAX_UNACKED_ANSWERS:
                 return
-        elif any(slot in self._told for slot in changes):
+        elif any(channel_id in self._told for channel_id in changes):
             quiet = now - self._last_s >= 2.0 * self._pause_s
             self._pause_s = PAUSE_MIN_S if quiet else min(PAUSE_MAX_S, 2.0 * self._pause_s)
         self._last_s = now
         groups: dict[_Group, list[int]] = {}
-        for slot, change in changes.items():
+        for channel_id, change in changes.items():
             if self.batches:
-                group = _difference(self._told.get(slot), change.answer)
+                group = _difference(self._told.get(channel_id), change.answer)
             else:
-                group = _Group(change.answer.on, change.answer.owed, (), ())
-            groups.setdefault(group, []).append(slot)
-        for group, slots in groups.items():
-            self._say(group, sorted(slots), changes, send)
-        self._changes = {slot: change for slot, change in self._changes.items() if slot not in changes}
-        self._due_s = min((self._due_of(slot, now) for slot in self._changes), default=NEVER)
+                group = _Group(change.answer.on, change.answer.required, (), ())
+            groups.setdefault(group, []).append(channel_id)
+        for group, channel_ids in groups.items():
+            self._say(group, sorted(channel_ids), changes, send)
+        self._changes = {
+            channel_id: change for channel_id, change in self._changes.items() if channel_id not in changes
+        }
+        self._due_s = min((self._due_of(channel_id, now) for channel_id in self._changes), default=NEVER)
 
-    def _say(self, group: _Group, slots: Sequence[int], changes: dict[int, _Change], send: Send) -> None:
-        for some in _chunks(slots) if self.batches else [[slot] for slot in slots]:
+    def _say(self, group: _Group, channel_ids: Sequence[int], changes: dict[int, _Change], send: Send) -> None:
+        for some in _chunks(channel_ids) if self.batches else [[channel_id] for channel_id in channel_ids]:
             seq = 0
             for envelope in _messages(group, some):
                 seq = send(envelope)
             self._last_seq = seq
-            for slot in some:
-                stream, answer, _was_paused = changes[slot]
-                told = self._told.get(slot)
-                self._told[slot] = answer
+            for channel_id in some:
+                stream, answer, _was_paused = changes[channel_id]
+                told = self._told.get(channel_id)
+                self._told[channel_id] = answer
                 if told is None or told.on != answer.on:
                     stream.wanted = answer.on
                     stream.paused = stream.paused or not answer.on
@@ -160,12 +162,12 @@ class Interest:
 def _difference(told: _Answer | None, answer: _Answer) -> _Group:
     """The shorter of the whole list and what is new in it."""
     if told is None:
-        return _Group(answer.on, answer.owed, (), ())
-    before, after = set(told.owed), set(answer.owed)
-    add = tuple(name for name in answer.owed if name not in before)
-    drop = tuple(name for name in told.owed if name not in after)
-    if _names_bytes(answer.owed) <= _names_bytes(add) + _names_bytes(drop):
-        return _Group(answer.on, answer.owed, (), ())
+        return _Group(answer.on, answer.required, (), ())
+    before, after = set(told.required), set(answer.required)
+    add = tuple(name for name in answer.required if name not in before)
+    drop = tuple(name for name in told.required if name not in after)
+    if _names_bytes(answer.required) <= _names_bytes(add) + _names_bytes(drop):
+        return _Group(answer.on, answer.required, (), ())
     return _Group(answer.on, None, add, drop)
 
 
@@ -173,39 +175,39 @@ def _names_bytes(names: Sequence[str]) -> int:
     return sum(len(name) + 1 for name in names)
 
 
-def _chunks(slots: Sequence[int]) -> list[list[int]]:
+def _chunks(channel_ids: Sequence[int]) -> list[list[int]]:
     """Rising channels, in so many parts that the runs of each fit into one message."""
     parts: list[list[int]] = [[]]
     runs = 0
-    for slot in slots:
+    for channel_id in channel_ids:
         part = parts[-1]
-        if part and slot != part[-1] + 1:
+        if part and channel_id != part[-1] + 1:
             runs += 1
             if 2 * (runs + 1) > MAX_STRINGS:
                 parts.append([])
                 part, runs = parts[-1], 0
-        part.append(slot)
+        part.append(channel_id)
     return parts
 
 
-def _messages(group: _Group, slots: Sequence[int]) -> list[framing.Envelope]:
+def _messages(group: _Group, channel_ids: Sequence[int]) -> list[framing.Envelope]:
     """What says this of these channels; of a long list of names, several messages."""
-    if group.owed is None:
+    if group.required is None:
         signed = [*((name, True) for name in group.add), *((name, False) for name in group.drop)]
         rows = [signed[i : i + MAX_STRINGS] for i in range(0, max(1, len(signed)), MAX_STRINGS)]
         return [
             encode_want(
-                slots,
+                channel_ids,
                 group.on,
                 add=[name for name, more in row if more],
                 drop=[name for name, more in row if not more],
             )
             for row in rows
         ]
-    owed = group.owed
+    required = group.required
     messages: list[framing.Envelope] = []
-    for start in range(0, max(1, len(owed)), MAX_STRINGS):
-        more = start + MAX_STRINGS < len(owed)
-        part = owed[start : start + MAX_STRINGS]
-        messages.append(encode_want(slots[:1] if more else slots, group.on, owed=part, more=more))
+    for start in range(0, max(1, len(required)), MAX_STRINGS):
+        more = start + MAX_STRINGS < len(required)
+        part = required[start : start + MAX_STRINGS]
+        messages.append(encode_want(channel_ids[:1] if more else channel_ids, group.on, required=part, more=more))
     return messages

@@ -7,7 +7,7 @@ from sern_core.link.end import End
 from sern_core.path.capacity import AckSample
 from sern_core.path.clocksync import ClockSync
 from sern_core.path.flight import Packet
-from sern_core.path.lanes import LANE_EXPRESS, LANE_UDP, LANE_ZMQ, PROVEN_ACKS, Lane
+from sern_core.path.lanes import LANE_PRIORITY, LANE_UDP, LANE_ZMQ, PROVEN_ACKS, Lane
 from sern_core.vocabulary.errors import WireError
 from sern_core.vocabulary.trace import LINK, Field, TraceEvent
 
@@ -43,7 +43,7 @@ class LaneSet:
         self.lane = Lane(LANE_ZMQ, end.params, lossless=lossless)
         """The lane that carries data now."""
         self.by_id = {LANE_ZMQ: self.lane}
-        self.express: Lane | None = None
+        self.priority_lane: Lane | None = None
         """The lane that carries class control beside it, if there is one."""
         self.wire_bytes = 0
         """Bytes of numbered datagrams sent so far, second copies and headers included."""
@@ -76,14 +76,14 @@ class LaneSet:
     def leave(self) -> bool:
         """The other lanes end with the session. Returns whether there was a datagram lane."""
         udp = self.by_id.pop(LANE_UDP, None)  # its keys end with the session
-        if (express := self.by_id.pop(LANE_EXPRESS, None)) is not None:
-            express.leave()
-        self.express = None
+        if (priority_lane := self.by_id.pop(LANE_PRIORITY, None)) is not None:
+            priority_lane.leave()
+        self.priority_lane = None
         return udp is not None
 
     def open(self, lane_id: int, now: float) -> None:
         """A lane beside the stream has a transport: ask whether it works, then use it."""
-        beside = self.stream if lane_id == LANE_EXPRESS else None
+        beside = self.stream if lane_id == LANE_PRIORITY else None
         if (old := self.by_id.get(lane_id)) is not None:
             old.leave()
         lane = self.by_id[lane_id] = Lane(lane_id, self._end.params, lossless=False, beside=beside)
@@ -100,7 +100,7 @@ class LaneSet:
         """A lane's transport is gone, and it is in `by_id` no more."""
         if self.lane is lane:
             self._use(self.stream, now)
-        self._choose_express(now)
+        self._choose_priority_lane(now)
         self.recall(lane, now)
         lane.leave()
 
@@ -109,7 +109,7 @@ class LaneSet:
         self.stream.up = False
         self.recall(self.stream, now)
         self._use(udp, now)
-        self._choose_express(now)
+        self._choose_priority_lane(now)
 
     # --- which carries what ---------------------------------------------------------------------------------------
 
@@ -122,17 +122,17 @@ class LaneSet:
                 self._use(udp, now)
         elif zmq.usable:
             self._use(zmq, now)
-        self._choose_express(now)
+        self._choose_priority_lane(now)
 
-    def _choose_express(self, now: float) -> None:
+    def _choose_priority_lane(self, now: float) -> None:
         """Class control goes beside the stream while that works; what the peer was told must be there before it."""
-        lane = self.by_id.get(LANE_EXPRESS)
+        lane = self.by_id.get(LANE_PRIORITY)
         if lane is not None and (self.lane.id != LANE_ZMQ or self._paper or not lane.usable):
             lane = None
-        if lane is not None and lane is not self.express and (lane.proofs < PROVEN_ACKS or not self._settled()):
+        if lane is not None and lane is not self.priority_lane and (lane.proofs < PROVEN_ACKS or not self._settled()):
             return
-        if lane is not self.express:
-            left, self.express = self.express, lane
+        if lane is not self.priority_lane:
+            left, self.priority_lane = self.priority_lane, lane
             if left is not None:
                 self.recall(left, now)
             self._tell(now, TraceEvent.LANE_USED, lane=(lane or self.lane).name, what="class control")
@@ -177,7 +177,7 @@ class LaneSet:
         """The lane that an acknowledgement is about; None: one that was closed meanwhile. Raises WireError."""
         lane = self.by_id.get(lane_id)
         if lane is None:
-            if lane_id in (LANE_UDP, LANE_EXPRESS):
+            if lane_id in (LANE_UDP, LANE_PRIORITY):
                 return None
             raise WireError(f"acknowledgement of unknown lane {lane_id}")
         if highest >= lane.flight.next_number:
@@ -223,7 +223,7 @@ class LaneSet:
                     )
                 )
                 lane.pacer.paced(now=now, pacing_bps=lane.estimator.pacing_bps)
-                if (lane is self.lane or lane is self.express) and now >= self._rate_due_s:
+                if (lane is self.lane or lane is self.priority_lane) and now >= self._rate_due_s:
                     self._rate_known(now)
         if packets:
             lane.resolved(acked=len(packets))

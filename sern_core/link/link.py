@@ -33,7 +33,7 @@ from sern_core.link.end import End
 from sern_core.link.handler import LinkHandler, Owner
 from sern_core.link.handshake import Handshake
 from sern_core.link.lane_set import LaneSet
-from sern_core.link.owed_lists import OwedLists
+from sern_core.link.name_lists import NameLists
 from sern_core.link.reading import Reading
 from sern_core.link.receiver import Receiver
 from sern_core.link.send_trace import SendTrace
@@ -102,10 +102,10 @@ class Link:
             on_rate=self._rate_known,
             now=now,
         )
-        self._owed_lists = OwedLists(link.limits.owed)
+        self._name_lists = NameLists(link.limits.required)
         answers = self.answers = Answers(end, control, reassembly)
         self.outgoing = StreamsOut(
-            end, control, sender, self.texts, self._owed_lists, reassembly, owner, at_once=self._at_once
+            end, control, sender, self.texts, self._name_lists, reassembly, owner, at_once=self._at_once
         )
         taking = self.taking = StreamsIn(
             end,
@@ -127,7 +127,7 @@ class Link:
             taking,
             answers,
             self.texts,
-            self._owed_lists,
+            self._name_lists,
             owner,
             answered=self._answered,
         )
@@ -163,7 +163,7 @@ class Link:
             lanes.lane.lossless
             and self.end.resumed
             and channel.wanted
-            and not (channel.spec.priority is PriorityClass.CONTROL and lanes.express is not None)
+            and not (channel.spec.priority is PriorityClass.CONTROL and lanes.priority_lane is not None)
         )
 
     def _finished(self, now: float) -> bool:
@@ -175,7 +175,7 @@ class Link:
     def _sweep(self, now: float) -> bool:
         """What is done now and then. True: all of it is done."""
         done = self.sender.sweep(now)
-        self.taking.sweep_heard()
+        self.taking.sweep_acked()
         if now >= self._tidy_due_s:
             self._tidy_due_s = now + TIDY_S
             self.sender.ledger.tidy({channel.counters.topic for channel in self.sender.channels.values()}, now=now)
@@ -265,7 +265,7 @@ class Link:
         self.texts.peer = self.end.peer
         self.texts.begin()
         self.answers.begin()
-        self._owed_lists.begin()
+        self._name_lists.begin()
         self.outgoing.forget_announced()
         self.taking.begin(resumed=self.end.resumed, now=now)
         self._owner.up(now=now)

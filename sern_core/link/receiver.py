@@ -4,7 +4,7 @@ from collections.abc import Callable
 from typing import Final
 
 from sern_core.bodies.codecs import KNOWN_CODECS
-from sern_core.link.control_stream import CONTROL_CHANNEL, MAX_CONTROL_BYTES, ControlStream
+from sern_core.link.control_stream import CONTROL_CHANNEL_ID, MAX_CONTROL_BYTES, ControlStream
 from sern_core.link.data_plane import DataPlane
 from sern_core.link.end import End
 from sern_core.link.events import Events
@@ -70,13 +70,13 @@ class Receiver:
             if not arrivals.arrived(number, stamp_us, len(data) + OVERHEAD_BYTES, now=now):
                 return 0
             if arrivals.due or arrivals.unacked <= 2:
-                self._end.dirty = True  # an acknowledgement is owed; of the third and later ones the deadline is known
+                self._end.dirty = True  # an acknowledgement is due; of the third and later ones the deadline is known
         return framing.decode_frames(data, self, position or framing.HEADER_BYTES)
 
     def on_data(
         self,
         flags: int,
-        channel: int,
+        channel_id: int,
         seq: int,
         offset: int,
         total: int,
@@ -88,16 +88,18 @@ class Receiver:
     ) -> bool | None:
         """FrameSink: one fragment."""
         now = self._end.now
-        if codec and (codec not in KNOWN_CODECS or channel == CONTROL_CHANNEL or flags & framing.FLAG_TOMBSTONE):
+        if codec and (
+            codec not in KNOWN_CODECS or channel_id == CONTROL_CHANNEL_ID or flags & framing.FLAG_DROP_MARKER
+        ):
             raise WireError(f"codec {codec} has no place there")
         if flags & framing.FLAG_URGENT:
             self._lane.arrivals.due = True
-        if channel == CONTROL_CHANNEL:
+        if channel_id == CONTROL_CHANNEL_ID:
             stream = self._control.incoming
             if total > MAX_CONTROL_BYTES:
                 raise WireError(f"control message of {total} bytes exceeds {MAX_CONTROL_BYTES}")
         else:
-            known = self._taking.incoming.get(channel)
+            known = self._taking.incoming.get(channel_id)
             if known is None:
                 self.strays += 1
                 if offset == 0 and self.on_stray is not None:
@@ -127,7 +129,7 @@ class Receiver:
         except RemoteError:
             raise
         except Exception as error:
-            if channel == CONTROL_CHANNEL:
+            if channel_id == CONTROL_CHANNEL_ID:
                 raise  # what follows it depends on it: the session ends
             self._events.fault(error)
             stream.fail(wide, total, now)
@@ -138,15 +140,15 @@ class Receiver:
         self._delay = None  # it may tell more of the peer's clock
         self._plane.acknowledged(lane, highest, sack, echo_us, received_us, cum_bytes, self._stamp_us)
 
-    def on_watermark(self, channel: int, delivered: int) -> bool | None:
+    def on_watermark(self, channel_id: int, delivered: int) -> bool | None:
         """FrameSink: everything of a reliable channel up to `delivered` has had its turn at the far side."""
-        out_channel = self._sender.channels.get(channel)
-        if out_channel is None or not out_channel.reliable:
+        channel = self._sender.channels.get(channel_id)
+        if channel is None or not channel.reliable:
             return None
         # It may lie beyond what was submitted here: the peer had more from an earlier relay (`OutChannel.submit`).
-        wide = framing.widen_seq(delivered, out_channel.watermark)
-        if wide > out_channel.watermark:
-            done = self._sender.watermark(out_channel, wide, self._end.now)
+        wide = framing.widen_seq(delivered, channel.watermark)
+        if wide > channel.watermark:
+            done = self._sender.watermark(channel, wide, self._end.now)
             self._reassembly.work_us += WATERMARK_US + done // DONE_PER_US
         return self._reassembly.work_us > self._reassembly.slice_us
 

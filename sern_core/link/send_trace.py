@@ -32,8 +32,8 @@ class SendTrace:
         self._end = end
         self._texts = texts
         self.holding: dict[int, dict[HoldReason, float]] = {}
-        """What was told of a channel, by slot, since something of it was sent last: why it waits, and when that was."""
-        self._told: dict[int, dict[str, float]] = {}  # without steps: what was told of a slot, and when
+        """What was told of a channel, by id, since something of it was sent last: why it waits, and when that was."""
+        self._told: dict[int, dict[str, float]] = {}  # without steps: what was told of a channel, and when
 
     @property
     def steps(self) -> bool:
@@ -41,8 +41,8 @@ class SendTrace:
 
     def forget(self, channel: OutChannel) -> None:
         """The channel is closed."""
-        self.holding.pop(channel.slot, None)
-        self._told.pop(channel.slot, None)
+        self.holding.pop(channel.channel_id, None)
+        self._told.pop(channel.channel_id, None)
 
     # --- on the way in --------------------------------------------------------------------------------------------
 
@@ -73,7 +73,7 @@ class SendTrace:
 
     def unready(self, channel: OutChannel, now: float, *, again: bool = True) -> None:
         """Something may wait in a channel of which nothing may be sent yet. `again`: say it once more in time."""
-        if not again and self.unready_reason(channel) in self.holding.get(channel.slot, ()):
+        if not again and self.unready_reason(channel) in self.holding.get(channel.channel_id, ()):
             return
         out = channel.active[0] if channel.active else channel.queue[0] if channel.queue else None
         if out is not None:
@@ -83,7 +83,7 @@ class SendTrace:
         """Why nothing of it may be sent yet."""
         if not self._end.established:
             return HoldReason.LINK_DOWN
-        return HoldReason.DEFINITION if self._texts.peer_asked(channel.slot) else HoldReason.ANNOUNCEMENT
+        return HoldReason.DEFINITION if self._texts.peer_asked(channel.channel_id) else HoldReason.ANNOUNCEMENT
 
     def replayed(self, channel: OutChannel, outs: Sequence[OutMessage], now: float) -> None:
         """Latched messages wait to be sent again."""
@@ -112,7 +112,7 @@ class SendTrace:
     def left(self, channel: OutChannel, out: OutMessage, started: bool, now: float) -> None:
         """A fragment left, `started`: not the first. What was held is told of in any case."""
         if not out.has_unsent:
-            held = self.holding.pop(channel.slot, None)
+            held = self.holding.pop(channel.channel_id, None)
             if held or self.steps:
                 self._record(channel, TraceEvent.SENT, out.seq, now, size_bytes=out.size)
         elif not started and self.steps:
@@ -147,7 +147,7 @@ class SendTrace:
 
     def _news(self, channel: OutChannel, reason: HoldReason, now: float) -> bool:
         """Whether the reason is new since something of the channel was sent last, or was told long ago."""
-        told = self.holding.setdefault(channel.slot, {})
+        told = self.holding.setdefault(channel.channel_id, {})
         told_s = told.get(reason)
         if told_s is not None and now - told_s < AGAIN_S:
             return False
@@ -156,7 +156,7 @@ class SendTrace:
 
     def _again(self, channel: OutChannel, what: str, now: float) -> bool:
         """Whether something of this kind may be told of the channel again."""
-        told = self._told.setdefault(channel.slot, {})
+        told = self._told.setdefault(channel.channel_id, {})
         told_s = told.get(what)
         if told_s is not None and now - told_s < AGAIN_S:
             return False

@@ -70,13 +70,13 @@ class Sender:
             self.reject(channel, message, DropReason.TOO_LARGE, now=now)
             return True
         if channel.spec.priority is PriorityClass.CONTROL and not message.replay:
-            self.cadences.arrived(channel.slot, now=now)
+            self.cadences.arrived(channel.channel_id, now=now)
         backlog = channel.offered
         gate = channel.gate
         thinned = 0 if gate is None else gate.thinned
         accepted = channel.submit(message, now=now, forced=forced)
         if gate is not None and gate.newest is not None:
-            self._held_back.add(channel.slot)
+            self._held_back.add(channel.channel_id)
             self.held_back_due_s = min(self.held_back_due_s, gate.newest_due_s)
             end.dirty = True  # the owner looks at the deadline again
         trace = end.trace
@@ -92,20 +92,20 @@ class Sender:
     def release_held_back(self, now: float) -> None:
         """Messages that a rate cap held back, and that nothing newer has replaced, go on when their time comes."""
         due_s = inf
-        for slot in list(self._held_back):
-            channel = self.channels.get(slot)
+        for channel_id in list(self._held_back):
+            channel = self.channels.get(channel_id)
             if channel is not None and channel.release(now):
                 if self._end.trace.steps:
                     self.told.queued(channel, channel.queue[-1].seq, channel.queue[-1].size, now)
                 self.refresh(channel, now)
             if channel is None or channel.newest is None:
-                self._held_back.discard(slot)
+                self._held_back.discard(channel_id)
             else:
                 due_s = min(due_s, channel.newest_due_s)
         self.held_back_due_s = due_s
 
     def reject(self, channel: OutChannel, message: Message, reason: DropReason, *, now: float) -> None:
-        """Drop a message on its way in; of a reliable stream a tombstone goes on in its place."""
+        """Drop a message on its way in; of a reliable stream a drop marker goes on in its place."""
         self._end.now = now
         channel.reject(message, reason)
         self.refresh(channel, now)
@@ -142,9 +142,9 @@ class Sender:
         end = self._end
         for channel, some in fragments.items():
             again = channel.fragments_lost(some, now=now)
-            if end.trace.enabled and self.channels.get(channel.slot) is channel:
+            if end.trace.enabled and self.channels.get(channel.channel_id) is channel:
                 self.told.lost(channel, again, now)
-            if self.channels.get(channel.slot) is channel:
+            if self.channels.get(channel.channel_id) is channel:
                 self.refresh(channel, now)
 
     def sweep(self, now: float) -> bool:
@@ -172,14 +172,14 @@ class Sender:
         if out is None:
             if channel.offered:
                 channel.offered = False
-                self.scheduler.withdraw(channel.slot)
+                self.scheduler.withdraw(channel.channel_id)
             return
         size_bytes = float(out.unsent_bytes)
         codec = channel.codec
         if codec is not None and out.coding is not Coding.DONE:
             if out.withheld:
                 channel.offered = True
-                self.scheduler.withdraw(channel.slot, encoding=True)
+                self.scheduler.withdraw(channel.channel_id, encoding=True)
                 return
             size_bytes *= codec.ratio
         spec = channel.spec
@@ -190,7 +190,7 @@ class Sender:
         channel.offered = True
         self._end.dirty = True
         self.scheduler.offer(
-            channel.slot,
+            channel.channel_id,
             priority=class_of(channel, out),
             weight=spec.weight,
             size_bytes=size_bytes,
@@ -200,13 +200,13 @@ class Sender:
 
     def pick(self, now: float, *, window_open: bool) -> int | None:
         """The scheduler's choice; under `ordering: paper` what it found stale is dropped first."""
-        slot = self.scheduler.pick(now=now, window_open=window_open)
+        channel_id = self.scheduler.pick(now=now, window_open=window_open)
         if self.paper:
             for stale in self.scheduler.take_stale(now):
                 channel = self.channels[stale]
                 channel.drop_head(DropReason.STALE, now)
                 self.refresh(channel, now)
-        return slot
+        return channel_id
 
     @property
     def pending(self) -> bool:
@@ -260,7 +260,7 @@ class Sender:
     def _recoded(self, channel: OutChannel, now: float) -> None:
         """A body is encoded, or may be now."""
         self._end.now = now
-        if self.channels.get(channel.slot) is channel:
+        if self.channels.get(channel.channel_id) is channel:
             self.refresh(channel, now)
 
     def validate(self, check: Callable[[bool, str], None]) -> None:

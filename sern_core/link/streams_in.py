@@ -100,10 +100,12 @@ class StreamsIn:
     def announced(self, announcement: Announcement, now: float) -> None:
         """The peer has a stream. Raises WireError where that cannot be."""
         identity = announcement.stream.id
-        slot = announcement.channel
+        channel_id = announcement.channel_id
         stream = self.streams.get(identity)
-        if self.incoming.get(slot, stream) is not stream or (stream and stream.channel_id not in (None, slot)):
-            raise WireError(f"channel {slot} or its stream {identity.topic!r} is announced twice")
+        if self.incoming.get(channel_id, stream) is not stream or (
+            stream and stream.channel_id not in (None, channel_id)
+        ):
+            raise WireError(f"channel {channel_id} or its stream {identity.topic!r} is announced twice")
         if stream is not None and not _same_type(stream.stream, announcement):
             self.retract(stream, now)  # the name came back with another type: that is another stream
             stream = None
@@ -118,9 +120,9 @@ class StreamsIn:
                 replaced.close()
             self.streams[identity] = stream
         self._missing.pop(identity, None)
-        stream.channel_id = slot
-        self.incoming[slot] = stream
-        self._answers.expect(stream, slot)
+        stream.channel_id = channel_id
+        self.incoming[channel_id] = stream
+        self._answers.expect(stream, channel_id)
         digest = stream.stream.definition_hash = announcement.definition_hash
         self._texts.use_incoming(identity, digest)
         if digest and self._texts.lacks(digest):
@@ -128,18 +130,18 @@ class StreamsIn:
         try:
             wanted = self._offer(stream, announcement, now)
         except RefusedError as refusal:
-            self.incoming.pop(slot, None)
+            self.incoming.pop(channel_id, None)
             self.streams.pop(identity, None)
             self._answers.forget(stream)
             self._texts.use_incoming(identity, "")
-            self.watermarks.pop(slot, None)
+            self.watermarks.pop(channel_id, None)
             stream.channel_id = None
             stream.close()
-            self._say_refused(slot, refusal.code, str(refusal), now)
+            self._say_refused(channel_id, refusal.code, str(refusal), now)
             return
         self.skip(stream, announcement.first, now)
         if stream.reliable and stream.confirmed >= announcement.first:
-            self.watermarks[slot] = stream.confirmed  # it may not know: ours was lost with the session
+            self.watermarks[channel_id] = stream.confirmed  # it may not know: ours was lost with the session
         if wanted is not None:
             self._answers.answer(stream, wanted, now=now)
 
@@ -165,8 +167,8 @@ class StreamsIn:
             self._answers.forget(stream)
             self._say_refused(stream.channel_id, code, text, now)
 
-    def _say_refused(self, slot: int, code: str, text: str, now: float) -> None:
-        self._control.send({"t": "refuse", "ch": slot, "code": code, "why": text[:WHY_CHARS]}, now=now)
+    def _say_refused(self, channel_id: int, code: str, text: str, now: float) -> None:
+        self._control.send({"t": "refuse", "ch": channel_id, "code": code, "why": text[:WHY_CHARS]}, now=now)
 
     def synced(self, now: float) -> None:
         """The peer has announced all it has. What it left out is gone, unless it is a relay that is still learning:
@@ -232,13 +234,13 @@ class StreamsIn:
                 self._undelivered(stream, message, error)
 
     def _undelivered(self, stream: InStream, message: Message, error: Exception) -> None:
-        """The owner failed at a message: it is given up, and its tombstone has the turn."""
+        """The owner failed at a message: it is given up, and its drop marker has the turn."""
         self._events.fault(error)
-        if message.tombstone:
+        if message.drop_marker:
             lost = message
         elif stream.reliable:
             self._in_drop(stream, DropReason.FAULT, len(message.body), (message.seq,), reported=True)
-            lost = stream.tombstone(message.seq, DropReason.FAULT, message.stamp_ns, message.born_s)
+            lost = stream.drop_marker(message.seq, DropReason.FAULT, message.stamp_ns, message.born_s)
         else:
             self._in_drop(stream, DropReason.FAULT, len(message.body), (message.seq,), reported=False)
             return
@@ -250,7 +252,7 @@ class StreamsIn:
     def _in_drop(self, stream: InStream, reason: DropReason, nbytes: int, seqs: Sequence[int], reported: bool) -> None:
         if reported:
             for seq in seqs:
-                self._answers.report(stream, seq, reason, self._end.name)  # its tombstone tells the owner
+                self._answers.report(stream, seq, reason, self._end.name)  # its drop marker tells the owner
                 self._answered(1)
         else:
             self._events.discarded(stream, reason, nbytes, seqs)
@@ -289,17 +291,18 @@ class StreamsIn:
         stream.unhandled = oldest
         self._confirm_own(stream)
 
-    def take_watermarks(self, limit: int, *, heard: int) -> Iterator[tuple[int, int]]:
-        """Up to `limit` of (channel, delivered) to be told, each taken when it is asked for. `heard`: the number of
+    def take_watermarks(self, limit: int, *, acked_seq: int) -> Iterator[tuple[int, int]]:
+        """Up to `limit` of (channel, delivered) to be told, each taken when it is asked for. `acked_seq`: the number of
         the last control message that the peer has acknowledged."""
-        for slot in list(self.watermarks)[:limit]:
-            if self.incoming[slot].reports.heard(heard):  # of drops first: else it would take them for delivered
-                yield slot, self.watermarks.pop(slot)
+        for channel_id in list(self.watermarks)[:limit]:
+            # Of drops first: else it would take them for delivered.
+            if self.incoming[channel_id].reports.acknowledged(acked_seq):
+                yield channel_id, self.watermarks.pop(channel_id)
 
-    def tell_again(self, slot: int) -> None:
+    def tell_again(self, channel_id: int) -> None:
         """The watermark of a channel was lost on the way."""
-        if slot in self.incoming:
-            self.watermarks[slot] = self.incoming[slot].confirmed
+        if channel_id in self.incoming:
+            self.watermarks[channel_id] = self.incoming[channel_id].confirmed
 
     # --- in slices, and by time -----------------------------------------------------------------------------------
 
@@ -323,12 +326,12 @@ class StreamsIn:
             self.retract(self._gone.popleft(), now)
         return self._finished(now)
 
-    def sweep_heard(self) -> None:
+    def sweep_acked(self) -> None:
         """Let go of reports, and of what is half received of streams that are not wanted, once the peer knows."""
-        heard = self._control.heard
+        acked_seq = self._control.acked_seq
         for stream in self.incoming.values():
-            stream.reports.heard(heard)
-            if 0 < stream.pause_seq <= heard:
+            stream.reports.acknowledged(acked_seq)
+            if 0 < stream.pause_seq <= acked_seq:
                 stream.forget(DropReason.UNWANTED)  # the peer has given up what is half received or waits here
                 self._skipping.pop(stream, None)  # it is where it was to go on, and nobody is to hear of it later
 
@@ -352,9 +355,9 @@ class StreamsIn:
         streams = self.streams.values()
         for stream in streams:
             stream.validate(check)
-        unheard, reports = self._reassembly.unheard, [stream.reports for stream in streams]
-        check(unheard.reports == sum(map(len, reports)), "reports of drops do not add up")
-        check(unheard.said == sum(each.said for each in reports), "reports of drops that were said do not add up")
+        unacked, reports = self._reassembly.unacked_reports, [stream.reports for stream in streams]
+        check(unacked.reports == sum(map(len, reports)), "reports of drops do not add up")
+        check(unacked.said == sum(each.said for each in reports), "reports of drops that were said do not add up")
         check(self.watermarks.keys() <= self.incoming.keys(), "watermarks of streams that are gone")
 
 

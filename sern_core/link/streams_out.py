@@ -10,7 +10,7 @@ from sern_core.link.control_stream import ControlStream
 from sern_core.link.definitions import PeerDefinitions
 from sern_core.link.end import End
 from sern_core.link.events import Events
-from sern_core.link.owed_lists import OwedLists
+from sern_core.link.name_lists import NameLists
 from sern_core.link.sender import Sender
 from sern_core.stream.in_stream import Reassembly
 from sern_core.stream.out_channel import OutChannel
@@ -28,7 +28,7 @@ ANSWER_PRICE: Final = 16
 """What an answer about an open channel costs, next to one about a channel that is closed."""
 NAMED_PER_US: Final = 16
 ANSWER_US: Final = 6
-OWED_PER_US: Final = 16
+NAMES_PER_US: Final = 16
 """What naming channels, answers about open ones, and lists of names are charged with (`Reassembly.work_us`)."""
 RETAINED_PER_US: Final = 16
 """What a report of drops is charged with, for what it looks through."""
@@ -47,7 +47,7 @@ class StreamsOut:
         control: ControlStream,
         sender: Sender,
         texts: PeerDefinitions,
-        owed_lists: OwedLists,
+        name_lists: NameLists,
         reassembly: Reassembly,
         events: Events,
         *,
@@ -57,12 +57,12 @@ class StreamsOut:
         self._control = control
         self._sender = sender
         self._texts = texts
-        self._owed_lists = owed_lists
+        self._name_lists = name_lists
         self._reassembly = reassembly
         self._events = events
         self._at_once = at_once
         self.by_stream: dict[StreamId, OutChannel] = {}
-        self._next_channel = 1
+        self._next_channel_id = 1
         self._on_dropped = self._dropped  # one for all channels
         self._announcing: deque[tuple[int, OutChannel]] = deque()  # may send once that control message is on its way
         self._price = self._priced_us = 0  # of the answers that came at this time
@@ -86,7 +86,7 @@ class StreamsOut:
         *,
         first: int,
         now: float,
-        owed: tuple[str, ...] = (),
+        required: tuple[str, ...] = (),
         wanted: bool | None = None,
         replays: Sequence[Message] = (),
     ) -> OutChannel:
@@ -101,21 +101,21 @@ class StreamsOut:
             raise UsageError(f"the definition of {stream.id.topic} exceeds {framing.MAX_ATTACHMENT_BYTES} bytes")
         if len(channels) >= 0xFFFF:
             raise UsageError(f"all 65535 channels towards {peer} are in use")
-        slot = self._next_channel
-        while slot in channels:
-            slot = slot % 0xFFFF + 1
-        self._next_channel = slot % 0xFFFF + 1
+        channel_id = self._next_channel_id
+        while channel_id in channels:
+            channel_id = channel_id % 0xFFFF + 1
+        self._next_channel_id = channel_id % 0xFFFF + 1
         counters = self._sender.ledger.topic(stream.id.topic, stream.spec.priority)
         codec = self._sender.new_codec(stream)
-        channel = OutChannel(slot, stream, counters, self._on_dropped, first=first, codec=codec)
-        channel.owed = owed
+        channel = OutChannel(channel_id, stream, counters, self._on_dropped, first=first, codec=codec)
+        channel.required = required
         channel.wanted = wanted
         if self._end.fates is not None:
             channel.drops.on_count = partial(self._counted, self._end.fates, stream)
-        channels[slot] = channel
+        channels[channel_id] = channel
         self.prime(channel, replays, now=now)
         self.by_stream[stream.id] = channel
-        self._texts.use_outgoing(slot, _digest(stream), stream.info.definition)
+        self._texts.use_outgoing(channel_id, _digest(stream), stream.info.definition)
         if self._end.established:
             self.announce(channel, now)
         return channel
@@ -129,8 +129,8 @@ class StreamsOut:
     def _counted(self, fates: Fates, stream: StreamInfo, seq: int, reason: DropReason) -> None:
         fates.dropped(stream, seq, reason, self._end.peer)
 
-    def _dropped(self, slot: int, outs: Sequence[OutMessage], reason: DropReason) -> None:
-        channel = self._sender.channels.get(slot)
+    def _dropped(self, channel_id: int, outs: Sequence[OutMessage], reason: DropReason) -> None:
+        channel = self._sender.channels.get(channel_id)
         if channel is not None:
             if self._end.trace.enabled:
                 self._sender.told.dropped(channel, outs, reason, self._end.now)
@@ -142,21 +142,21 @@ class StreamsOut:
         channel.clear(reason)
         channel.ready = False
         self._sender.refresh(channel, now)
-        self._sender.channels.pop(channel.slot, None)
+        self._sender.channels.pop(channel.channel_id, None)
         self._sender.told.forget(channel)
-        self._sender.cadences.forget(channel.slot)
+        self._sender.cadences.forget(channel.channel_id)
         if self.by_stream.get(channel.stream.id) is channel:
             del self.by_stream[channel.stream.id]
-        self._texts.use_outgoing(channel.slot, "")
-        self._control.send({"t": "retract", "ch": channel.slot}, now=now)
+        self._texts.use_outgoing(channel.channel_id, "")
+        self._control.send({"t": "retract", "ch": channel.channel_id}, now=now)
 
     def announce(self, channel: OutChannel, now: float) -> None:
         """Tell the peer that the stream is there, on its channel."""
         stream = channel.stream
         digest = _digest(stream)
-        self._texts.use_outgoing(channel.slot, digest)  # in another session its origin may say another
-        owed = channel.owed if channel.reliable else ()
-        announcement = Announcement(channel.slot, stream, digest, channel.first_seq, owed)
+        self._texts.use_outgoing(channel.channel_id, digest)  # in another session its origin may say another
+        required = channel.required if channel.reliable else ()
+        announcement = Announcement(channel.channel_id, stream, digest, channel.first_seq, required)
         channel.ready = False
         seq = 0
         for envelope in announcement_parts(announcement):
@@ -169,7 +169,7 @@ class StreamsOut:
         """Control message `seq` is on the wire."""
         while self._announcing and self._announcing[0][0] <= seq:
             channel = self._announcing.popleft()[1]
-            if self._sender.channels.get(channel.slot) is channel:
+            if self._sender.channels.get(channel.channel_id) is channel:
                 channel.ready = True
                 self._sender.refresh(channel, self._end.now)
 
@@ -197,7 +197,7 @@ class StreamsOut:
     def _tell_gap(self, channel: OutChannel, now: float) -> None:
         first = channel.next_gap()
         if first is not None:
-            self._control.send({"t": "first", "ch": channel.slot, "seq": first}, now=now)
+            self._control.send({"t": "first", "ch": channel.channel_id, "seq": first}, now=now)
 
     def delivered(self, channel: OutChannel) -> None:
         """The peer's watermark of a channel has moved."""
@@ -212,42 +212,42 @@ class StreamsOut:
         """The peer has said whether it wants streams of ours. Raises WireError for more answers than questions."""
         end, reassembly = self._end, self._reassembly
         if not end.initiator:
-            # Who is owed is for origins to remember: a client that takes a stream is owed it itself, and no more.
-            want = replace(want, owed=(), add=(), drop=())
+            # Who is required is for origins to remember: a client that takes a stream speaks for itself alone.
+            want = replace(want, required=(), add=(), drop=())
             if want.more:
                 return
         first = want.runs[0][0]
         if want.more:
-            self._owed_lists.add(("want", first), want.owed or (), more=True, peer=end.peer)
+            self._name_lists.add(("want", first), want.required or (), more=True, peer=end.peer)
             return
-        owed = None
-        if want.owed is not None:
-            owed = self._owed_lists.add(("want", first), want.owed, more=False, peer=end.peer)
-        changed: dict[int, tuple[tuple[str, ...], tuple[str, ...]]] = {}  # by identity: what was owed, what is now
+        required = None
+        if want.required is not None:
+            required = self._name_lists.add(("want", first), want.required, more=False, peer=end.peer)
+        changed: dict[int, tuple[tuple[str, ...], tuple[str, ...]]] = {}  # by identity: who was required, who is now
         for first, last in want.runs:
             self._charge(last - first + 1, now)
             reassembly.work_us += (last - first + 1) // NAMED_PER_US
-            for slot in range(first, last + 1):
-                channel = self._sender.channels.get(slot)
+            for channel_id in range(first, last + 1):
+                channel = self._sender.channels.get(channel_id)
                 if channel is not None:  # else closed meanwhile
                     self._charge(ANSWER_PRICE, now)
                     reassembly.work_us += ANSWER_US
-                    if owed is None:
-                        before = channel.owed
-                        if id(before) not in changed:  # channels that are owed alike share one list
+                    if required is None:
+                        before = channel.required
+                        if id(before) not in changed:  # channels with the same required clients share one list
                             changed[id(before)] = before, self._changed(before, want)
-                        channel.owed = changed[id(before)][1]
+                        channel.required = changed[id(before)][1]
                     else:
-                        channel.owed = owed
+                        channel.required = required
                     self._answer_came(channel, want, now)
 
     def _changed(self, before: tuple[str, ...], want: Want) -> tuple[str, ...]:
         """What an answer by difference makes of a list of names."""
-        self._reassembly.work_us += len(before) // OWED_PER_US
+        self._reassembly.work_us += len(before) // NAMES_PER_US
         names = dict.fromkeys(before) | dict.fromkeys(want.add)
         for name in want.drop:
             names.pop(name, None)
-        most = self._end.params.limits.owed
+        most = self._end.params.limits.required
         if len(names) > most:
             raise WireError(f"{self._end.peer} owes a stream to more than {most} names")
         return tuple(names)
@@ -264,7 +264,7 @@ class StreamsOut:
 
     def _answer_came(self, channel: OutChannel, want: Want, now: float) -> None:
         if want.on and channel.wanted is False and channel.reliable:
-            self._control.send({"t": "first", "ch": channel.slot, "seq": channel.first_seq}, now=now)
+            self._control.send({"t": "first", "ch": channel.channel_id, "seq": channel.first_seq}, now=now)
         self._set_wanted(channel, want.on, DropReason.UNWANTED)
         channel.ready = True
         self._sender.refresh(channel, now)

@@ -61,7 +61,7 @@ class LinkView(NamedTuple):
     """The lane of the connection on which the session began is there and answers."""
     datagrams_pass: bool
     """The peer answers over the datagram lane."""
-    express: bool
+    priority_lane: bool
     """Class control goes over connections of its own."""
     wire_bytes: int
     """Bytes of numbered datagrams sent so far, second copies and headers included."""
@@ -207,7 +207,7 @@ def observe(end: End, lanes: LaneSet, receiver: Receiver, now: float) -> LinkVie
         waiting_s=None if waiting_since_s is None else now - waiting_since_s,
         stream_usable=lanes.stream.usable,
         datagrams_pass=datagrams is not None and datagrams.usable and datagrams.answered,
-        express=lanes.express is not None,
+        priority_lane=lanes.priority_lane is not None,
         wire_bytes=lanes.wire_bytes,
         strays=receiver.strays,
         clock_offset_s=clock.offset_s,

@@ -63,10 +63,10 @@ class Flight:
         self.packets: dict[int, Packet] = {}  # in order of number, which dicts keep
         self.next_number = 1
         self.highest_acked = 0
-        self._heard = [0] * len(CLASSES)
+        self._acked_by_class = [0] * len(CLASSES)
         """The highest number that was acknowledged of a packet of a class, or of a less urgent one, by class."""
         self.rtt = RttEstimator()
-        self.waiting_since_s: float | None = None  # last acknowledgement, or the first packet since nothing is owed
+        self.waiting_since_s: float | None = None  # last acknowledgement, or the first packet since all were acked
 
     def sent(
         self,
@@ -107,13 +107,13 @@ class Flight:
                 behind = highest - number - 1
                 if behind < SACK_BITS and sack >> behind & 1:
                     result.append(packet)
-        heard = self._heard
+        by_class = self._acked_by_class
         for packet in result:
             del packets[packet.number]
             self.inflight_bytes -= packet.nbytes
             for priority in range(packet.priority + 1):
-                if packet.number > heard[priority]:
-                    heard[priority] = packet.number
+                if packet.number > by_class[priority]:
+                    by_class[priority] = packet.number
         if not packets:
             self.waiting_since_s = None
         return result
@@ -131,11 +131,11 @@ class Flight:
         if self.lossless or not self.packets:
             return []
         sent_before_s = now - self.loss_timeout_s()
-        heard = self._heard
+        by_class = self._acked_by_class
         last = self.highest_acked - REORDER_THRESHOLD
         gone = []
         for packet in self.packets.values():
-            if packet.number <= heard[packet.priority] - REORDER_THRESHOLD or packet.sent_s <= sent_before_s:
+            if packet.number <= by_class[packet.priority] - REORDER_THRESHOLD or packet.sent_s <= sent_before_s:
                 gone.append(packet)
             elif packet.number > last:
                 break

@@ -12,9 +12,9 @@ from sern_core.vocabulary.types import PriorityClass
 
 LANE_ZMQ: Final = 0
 LANE_UDP: Final = 1
-LANE_EXPRESS: Final = 2
+LANE_PRIORITY: Final = 2
 """Class control alone, over TCP connections of its own: behind no bulk byte, and no retransmission of one."""
-LANE_NAMES: Final = {LANE_ZMQ: "zmq", LANE_UDP: "udp", LANE_EXPRESS: "express"}
+LANE_NAMES: Final = {LANE_ZMQ: "zmq", LANE_UDP: "udp", LANE_PRIORITY: "priority"}
 
 DATAGRAM_BYTES: Final = 1171
 """A datagram of the UDP lane: with seal, session and kind it is 1200 bytes of UDP payload, which every path carries."""
@@ -51,7 +51,7 @@ def _estimator(params: LinkParams) -> CapacityEstimator:
 class Path:
     """What the lanes over one path have in common: one window, one pace, and one count of what has arrived.
 
-    The express lane shares the path of the stream that it is beside. With a window of its own each of them would take
+    The priority lane shares the path of the stream that it is beside. With a window of its own each of them would take
     the other's traffic for a slower link, and class control would have none while the stream has nothing to send.
     """
 
@@ -99,7 +99,7 @@ class Lane:
         self._copied_packets = 0  # so many more will have copies
         self.copies_wanted: bool | None = None
         """What the adaptation says of them, where the configuration leaves it open (`auto`); None: the loss decides."""
-        self._unheard_bytes = 0.0
+        self._unacked_bytes = 0.0
         """What arrives between two acknowledgements of a fast stream, beyond the two fragments that make one due."""
         self.priority = PriorityClass.STATE
         """The most urgent class in the latest datagram; acknowledgements, questions and control messages are STATE."""
@@ -119,7 +119,7 @@ class Lane:
         """Adopt the rate that the path carries at least; returns it."""
         rate_bps = self.estimator.bound_bps
         self.fragment_bytes = self._fragment_bytes(rate_bps)
-        self._unheard_bytes = max(0.0, self.arrivals.spacing_s * (rate_bps or 0.0) / 8 - 2 * self.fragment_bytes)
+        self._unacked_bytes = max(0.0, self.arrivals.spacing_s * (rate_bps or 0.0) / 8 - 2 * self.fragment_bytes)
         return rate_bps
 
     def leave(self) -> None:
@@ -149,7 +149,7 @@ class Lane:
         if self.stalled:
             return False
         nbytes = self.flight.inflight_bytes if self.beside is None else self.under_way_bytes
-        return nbytes < self.estimator.window_bytes + self._unheard_bytes
+        return nbytes < self.estimator.window_bytes + self._unacked_bytes
 
     def open_at(self, now: float) -> bool:
         """Whether a datagram below class 0 may leave now."""
@@ -177,8 +177,8 @@ class Lane:
 
     @property
     def redundant(self) -> bool:
-        """Whether class control is sent twice here; the express lane's connections see to that themselves."""
-        if self.lossless or self.id == LANE_EXPRESS or self._redundancy is Redundancy.OFF:
+        """Whether class control is sent twice here; the priority lane's connections see to that themselves."""
+        if self.lossless or self.id == LANE_PRIORITY or self._redundancy is Redundancy.OFF:
             return False
         if self._redundancy is Redundancy.ALWAYS:
             return True

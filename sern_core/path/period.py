@@ -88,16 +88,16 @@ class Cadences:
         self._due_s = -1.0
         """The next one, as of the last search; passed, or a new message came: search again."""
 
-    def arrived(self, slot: int, *, now: float) -> None:
-        cadence = self._topics.get(slot)
+    def arrived(self, channel_id: int, *, now: float) -> None:
+        cadence = self._topics.get(channel_id)
         if cadence is None:
-            self._topics[slot] = Cadence(now)
+            self._topics[channel_id] = Cadence(now)
         else:
             cadence.arrived(now)
         self._due_s = -1.0
 
-    def forget(self, slot: int) -> None:
-        self._topics.pop(slot, None)
+    def forget(self, channel_id: int) -> None:
+        self._topics.pop(channel_id, None)
         self._due_s = -1.0
 
     def share(self, now: float, datagram_s: float) -> float:

@@ -21,7 +21,7 @@ UNKNOWN: Final = math.inf
 FULL_S: Final = 0.01
 """A message that found no room speaks so long for those of its size and class that come after it: adding up what a link
 holds is too dear to be done for each."""
-TOMBSTONE_BYTES: Final = 1 + CLIENT_OVERHEAD_BYTES
+DROP_MARKER_BYTES: Final = 1 + CLIENT_OVERHEAD_BYTES
 ADDED_UP_PER_US: Final = 2
 """Channels of a link that are added up in a microsecond. That and what is given up are charged to whoever sent the
 message that needs room (`Reassembly.work_us`)."""
@@ -45,16 +45,16 @@ class QueueBound:
 
     def submit(self, link: Link, channel: OutChannel, message: Message, *, now: float) -> int:
         """Make room for `message` of `channel` and submit it; without room it is dropped as `queue_full`. A reliable
-        one leaves a tombstone if there is room for that, else a gap. Returns what making room cost, in microseconds."""
+        one leaves a drop marker if there is room for it, else a gap. Returns what making room cost, in microseconds."""
         self._work_us = 0
         size = len(message.body) + CLIENT_OVERHEAD_BYTES
         if self._at_most_bytes + size <= self.max_bytes:
             self._at_most_bytes += size
             link.sender.submit(channel, message, now=now, forced=True)
-        elif self._makes_room(link, channel, size, now, shed=not message.tombstone):
+        elif self._makes_room(link, channel, size, now, shed=not message.drop_marker):
             link.sender.submit(channel, message, now=now, forced=True)
         elif not channel.reliable or (
-            not message.tombstone and self._makes_room(link, channel, TOMBSTONE_BYTES, now, shed=False)
+            not message.drop_marker and self._makes_room(link, channel, DROP_MARKER_BYTES, now, shed=False)
         ):
             link.sender.reject(channel, message, DropReason.QUEUE_FULL, now=now)
         else:
@@ -91,7 +91,9 @@ class QueueBound:
                 if reliable and lowest is priority:
                     continue  # among equals, who came first stays
                 # The largest queues first: fewest streams lose anything.
-                chosen = sorted((c for c in rows if c.reliable is reliable), key=lambda c: (-c.unbegun_bytes, c.slot))
+                chosen = sorted(
+                    (c for c in rows if c.reliable is reliable), key=lambda c: (-c.unbegun_bytes, c.channel_id)
+                )
                 for channel in chosen:
                     if excess_bytes <= 0:
                         return excess_bytes

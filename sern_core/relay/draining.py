@@ -1,4 +1,4 @@
-"""Channels of streams that have ended while a client was still owed reliable messages of them. Pure.
+"""Channels of streams that have ended while a client was still to get reliable messages of them. Pure.
 
 They go on until the client has confirmed everything, within bounds for each client. Whatever else would end them ends
 them as well: the right to the stream, the interest in it, the client itself, and another stream of the same name.
@@ -101,7 +101,9 @@ class Draining:
             assert sum(_held_bytes(channel) for _link, channel in entries.values()) <= MAX_DRAINING_BYTES, client
             for identity, (link, channel) in entries.items():
                 assert links.get(client) is link, f"{identity.topic} drains towards a link that is gone"
-                assert link.sender.channels.get(channel.slot) is channel, f"{identity.topic}: a closed channel drains"
+                assert link.sender.channels.get(channel.channel_id) is channel, (
+                    f"{identity.topic}: a closed channel drains"
+                )
                 assert channel.reliable and channel.stream.id == identity, f"{identity.topic} is not to be drained"
                 channels.add(id(channel))
         return channels

@@ -39,7 +39,7 @@ class Forwarding:
         """Told what becomes of each message here; set before the first client comes."""
 
     def message(self, link: Link, stream: InStream, message: Message, now: float) -> None:
-        """A message (or tombstone) of a client has its turn."""
+        """A message (or drop marker) of a client has its turn."""
         relayed = self._streams.by_id.get(stream.stream.id)
         if relayed is None:
             return
@@ -55,7 +55,7 @@ class Forwarding:
             code = DROP_CODES[DropReason.RATE_CAP]
             message = Message(message.stream, message.seq, bytes([code]), message.stamp_ns, message.born_s, code)
             link.answers.report(stream, message.seq, DropReason.RATE_CAP, self._name)
-        elif message.tombstone:
+        elif message.drop_marker:
             self._discarded(link, stream, message.seq, message.drop_reason)
         else:
             self.received.of(stream.stream).arrived(nbytes, now - message.born_s, now)
@@ -101,7 +101,7 @@ class Forwarding:
             except Exception as error:  # noqa: BLE001  (of that client's link: the others get theirs)
                 self._not_taken(relayed, out_link, channel, message, error, now)
             behind = behind or channel.watermark >= message.seq
-        if not message.tombstone:
+        if not message.drop_marker:
             self._keep(relayed, message, now)
         return behind
 

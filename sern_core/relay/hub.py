@@ -3,11 +3,11 @@
 Messages arrive whole and in their turn from one link and are offered, unchanged, to the links of all subscribers, each
 with a scheduler and a window of its own: a slow subscriber sheds only its own traffic, by class.
 
-Reliable streams: the origin is told "delivered up to n" when every client that is owed the stream has confirmed n.
-An origin remembers who is owed; a relay that starts anew learns it from the announcement and holds messages for
-those clients before they have come back (they are *awaited*). A client that stays away longer than `resume_s` is
-dropped, and what it was owed is reported to the origins. One that says goodbye and is owed nothing is dropped at once,
-and so is one whose name is revoked.
+Reliable streams: the origin is told "delivered up to n" when all *required* clients, those that subscribe to the
+stream, have confirmed n. An origin remembers their names; a relay that starts anew learns them from the announcement
+and holds messages for those clients before they have come back (they are *absent*). A client that stays away longer
+than `resume_s` is dropped, and what it has not confirmed is reported to the origins. One that says goodbye and has
+confirmed everything is dropped at once, and so is one whose name is revoked.
 """
 
 from collections import Counter, defaultdict
@@ -18,9 +18,9 @@ from typing import Final
 
 from sern_core.link.definitions import DefinitionStore
 from sern_core.link.link import TIDY_S, Link
-from sern_core.path.lanes import LANE_EXPRESS
+from sern_core.path.lanes import LANE_PRIORITY
+from sern_core.relay.absent import AbsentClients
 from sern_core.relay.access import AccessTable
-from sern_core.relay.awaited import Awaited
 from sern_core.relay.clients import Clients
 from sern_core.relay.forwarding import Forwarding
 from sern_core.relay.hub_events import GuardedEvents, HubEvents, Relayed
@@ -126,7 +126,7 @@ class Hub:
         self.local = LocalStreams(
             boot, self.local_owners, clients.links, self.routing, self._numbering, streams, self.forwarding
         )
-        self.awaited = Awaited(clients, streams, self.routing, self.events, known, link.limits)
+        self.absent = AbsentClients(clients, streams, self.routing, self.events, known, link.limits)
 
     # --- how the parts hang together ------------------------------------------------------------------------------
 
@@ -217,7 +217,7 @@ class Hub:
         self.traces.forget(client)
         self._subscriptions.pop(client, None)
         self.matching.forget(client)
-        self.awaited.forget(client)
+        self.absent.forget(client)
         self.objects.delete_owned(client)
 
     def revoke(self, access: AccessTable, *, now: float) -> None:
@@ -241,7 +241,7 @@ class Hub:
         link.open_lane(now=now)
 
     def join(self, client: ClientName, data: bytes, *, now: float) -> bool:
-        """A connection says that it belongs to the client's session: open the express lane, unless it is open. `client`
+        """A connection belongs to the session of the client: open the priority lane, unless it is open. `client`
         is bound to the connection's key. False: there is no such session. Raises WireError."""
         header = framing.decode_header(data)
         envelope = framing.decode_handshake(data)
@@ -250,8 +250,8 @@ class Hub:
             return False
         if not link.handshake.joins(envelope, header.tag):
             return False
-        if LANE_EXPRESS not in link.lanes.by_id:
-            link.open_lane(now=now, lane_id=LANE_EXPRESS)
+        if LANE_PRIORITY not in link.lanes.by_id:
+            link.open_lane(now=now, lane_id=LANE_PRIORITY)
         return True
 
     # --- LinkHandler ----------------------------------------------------------------------------------------------
@@ -292,10 +292,10 @@ class Hub:
             self.events.refused(link.peer, refusal.code, str(refusal))
             raise
         if stream.reliable:
-            relayed.source = None  # one answer for all who are awaited
-            self.awaited.hold(announcement.owed, identity, link, now)
+            relayed.source = None  # one answer for all who are absent
+            self.absent.hold(announcement.required, identity, link, now)
         relayed.source = link
-        link.answers.answer(stream, self.streams.wanted(relayed), now=now, owed=relayed.owed())
+        link.answers.answer(stream, self.streams.wanted(relayed), now=now, required=relayed.required())
         return None
 
     def on_retract(self, link: Link, stream: InStream, *, now: float) -> None:
@@ -374,7 +374,7 @@ class Hub:
             self.presence.watch(client, now=now)
 
     def _subscribed(self, client: ClientName, parts: list[str], now: float) -> None:
-        self.awaited.heard(client)
+        self.absent.subscribed(client)
         # What is a name and no pattern is denied by name: that gives nothing away about what there is.
         names = {TopicName(part) for part in parts if name_problem(part) is None}
         patterns = [part for part in parts if part not in names]
@@ -432,4 +432,4 @@ class Hub:
         for client, link in self.links.items():
             for channel in link.sender.channels.values():
                 assert id(channel) in held_channels, f"{channel.stream.id.topic}: nobody's channel to {client}"
-        self.awaited.validate(self.links)
+        self.absent.validate(self.links)

@@ -24,7 +24,7 @@ class HubEvents(Protocol):
     def stream_removed(self, stream: StreamInfo) -> None: ...
 
     def message(self, stream: StreamInfo, message: Message, *, now: float) -> None:
-        """A message passed; the plain feed takes it. Tombstones are not reported."""
+        """A message passed; the plain feed takes it. Drop markers are not reported."""
 
     def refused(self, client: ClientName, code: str, text: str) -> None: ...
 
@@ -99,7 +99,7 @@ class Relayed:
         self.cache: LatchedCache | None = None
         self.keep_latched(replays)
 
-    def owed(self) -> tuple[ClientName, ...]:
+    def required(self) -> tuple[ClientName, ...]:
         """Who gets the stream, and who is about to."""
         return tuple(dict.fromkeys((*self.outs, *self.waiting)) if self.waiting else self.outs)
 

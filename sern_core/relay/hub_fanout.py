@@ -89,7 +89,7 @@ class Fanout:
         if pair is None:
             return
         link, channel = pair
-        if link.sender.channels.get(channel.slot) is channel:  # else the client has gone meanwhile
+        if link.sender.channels.get(channel.channel_id) is channel:  # else the client has gone meanwhile
             self._end(client, link, channel, now)
 
     def forget(self, origin: ClientName, *, now: float) -> None:

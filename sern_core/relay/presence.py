@@ -41,7 +41,7 @@ class PeerControl(Protocol):
     """The control messages to a client."""
 
     @property
-    def heard(self) -> int:
+    def acked_seq(self) -> int:
         """The number of the last one up to which the client has acknowledged all."""
 
     def send(self, envelope: framing.Envelope, attachment: bytes = b"", *, now: float) -> int: ...
@@ -112,40 +112,40 @@ class Presence:
         self._after = after
         self._told_at_once = limits.told_at_once
         self._taken: dict[ClientName, Counter[ClientName]] = {}  # streams that a client takes, by origin
-        self._takers: dict[ClientName, set[ClientName]] = {}  # the same the other way round
-        self._states: dict[ClientName, _State] = {}  # of those in `_takers`, as they were looked at last
+        self._subscribers: dict[ClientName, set[ClientName]] = {}  # the same the other way round
+        self._states: dict[ClientName, _State] = {}  # of those in `_subscribers`, as they were looked at last
         self._watchers: dict[ClientName, _Watcher] = {}
         self._asked: dict[ClientName, set[ClientName]] = {}  # of whom a client asked, until it is known what it takes
 
     # --- who takes whose streams ----------------------------------------------------------------------------------
 
-    def joined(self, origin: ClientName, taker: ClientName) -> None:
-        """One more stream of `origin` goes to `taker`."""
+    def joined(self, origin: ClientName, subscriber: ClientName) -> None:
+        """One more stream of `origin` goes to `subscriber`."""
         if origin in self._local:
             return
-        origins = self._taken.setdefault(taker, Counter())
+        origins = self._taken.setdefault(subscriber, Counter())
         origins[origin] += 1
         if origins[origin] == 1:
-            self._takers.setdefault(origin, set()).add(taker)
-            self._due(taker, origin)
+            self._subscribers.setdefault(origin, set()).add(subscriber)
+            self._due(subscriber, origin)
 
-    def parted(self, origin: ClientName, taker: ClientName) -> None:
+    def parted(self, origin: ClientName, subscriber: ClientName) -> None:
         """One stream less."""
         if origin in self._local:
             return
-        origins = self._taken[taker]
+        origins = self._taken[subscriber]
         origins[origin] -= 1
         if origins[origin]:
             return
         del origins[origin]
         if not origins:
-            del self._taken[taker]
-        takers = self._takers[origin]
-        takers.remove(taker)
-        if not takers:
-            del self._takers[origin]
+            del self._taken[subscriber]
+        subscribers = self._subscribers[origin]
+        subscribers.remove(subscriber)
+        if not subscribers:
+            del self._subscribers[origin]
             self._states.pop(origin, None)
-        self._due(taker, origin)
+        self._due(subscriber, origin)
 
     def _due(self, watcher: ClientName, peer: ClientName) -> None:
         watching = self._watchers.get(watcher)
@@ -177,15 +177,15 @@ class Presence:
                     watching.back[client] = now
                 else:
                     watching.back.pop(client, None)
-        if client in self._takers:
+        if client in self._subscribers:
             self._look(client, now)
-            for taker in self._takers[client]:
-                self._tell(taker, now)
+            for subscriber in self._subscribers[client]:
+                self._tell(subscriber, now)
 
     def sweep(self, *, now: float) -> None:
         """See whose path has fallen silent or answers again, and say what is due. Call about once a second, and then
         `tell`."""
-        for client in self._takers:
+        for client in self._subscribers:
             self._look(client, now)
         self.tell(now=now)
 
@@ -227,15 +227,15 @@ class Presence:
         state = _State(up, since_s, lane, rtt_s, rtt_at_s)
         if state != old:
             self._states[client] = state
-            for taker in self._takers[client]:
-                self._due(taker, client)
+            for subscriber in self._subscribers[client]:
+                self._due(subscriber, client)
 
     def _tell(self, client: ClientName, now: float) -> int:
         """Returns how many messages it took."""
         watching, link = self._watchers.get(client), self._links.get(client)
         if watching is None or link is None or not watching.due or not link.established:
             return 0
-        if link.control.heard < watching.seq:
+        if link.control.acked_seq < watching.seq:
             return 0  # it is told the latest once it has heard of what was said before
         count = ceil(len(watching.due) / MAX_TOLD)
         self._attempt(client, now, partial(self._say, client, watching, link, now))
@@ -273,9 +273,9 @@ class Presence:
     def validate(self, taken: Mapping[ClientName, Counter[ClientName]]) -> None:
         """Internal consistency, for tests: `taken` is how many streams each client takes of each, counted anew."""
         assert self._taken == taken, f"streams are taken {self._taken} but routes say {taken}"
-        takers = {(origin, taker) for origin, some in self._takers.items() for taker in some}
-        assert takers == {(origin, taker) for taker, origins in taken.items() for origin in origins}
-        assert self._states.keys() <= self._takers.keys(), "states of clients of whom nobody takes anything"
+        subscribers = {(origin, subscriber) for origin, some in self._subscribers.items() for subscriber in some}
+        assert subscribers == {(origin, subscriber) for subscriber, origins in taken.items() for origin in origins}
+        assert self._states.keys() <= self._subscribers.keys(), "states of clients of whom nobody takes anything"
         assert self._watchers.keys() <= self._links.keys(), "clients are told that are gone"
         assert self._asked.keys() <= self._links.keys(), "clients ask that are gone"
 

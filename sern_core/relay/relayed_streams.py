@@ -59,7 +59,7 @@ class RelayedStreams:
         self.draining = Draining(self._end_channel, limits)
         self.tap: Callable[[StreamInfo], bool] = lambda _stream: False
         """Whether the relay itself wants a stream (a subscriber of the feed); set by the shell."""
-        self._unsubscribed: OutChannel | None = None  # is being closed because its taker wants it no more
+        self._unsubscribed: OutChannel | None = None  # is being closed because its subscriber wants it no more
         self._room: tuple[ClientName, float, int] | None = None  # for replays to a client at this time
 
     # --- streams come and go --------------------------------------------------------------------------------------
@@ -113,7 +113,7 @@ class RelayedStreams:
         reason: DropReason = DropReason.UNWANTED,
         source: Link | None = None,
     ) -> None:
-        """Open and close channels as the routes have changed; `reason`: of dropping what no longer has a taker;
+        """Open and close channels as the routes have changed; `reason`: of dropping what no longer has a subscriber;
         `source`: whose announcement it was, so that subscribers are told of it in slices."""
         touched: set[StreamId] = set(change.wanted) | set(change.unwanted)
         for identity in change.removed:
@@ -146,7 +146,7 @@ class RelayedStreams:
             self._clients.tell(denied.client, said, now)
 
     def _remove(self, identity: StreamId, now: float, *, drain: bool = True, source: Link | None = None) -> None:
-        """The stream has ended. `drain`: what was owed of it is still delivered; `source`: who said so, so that
+        """The stream has ended. `drain`: what waits of it is still delivered; `source`: who said so, so that
         subscribers are told in slices."""
         relayed = self.by_id.pop(identity, None)
         if relayed is None:
@@ -258,7 +258,7 @@ class RelayedStreams:
         self._clients.attempt(client, now, partial(link.outgoing.close, channel, reason, now=now))
 
     def _let_go(self, client: ClientName, link: Link, channel: OutChannel, now: float) -> None:
-        """The channel's stream has ended: deliver what is still owed, or close it."""
+        """The channel's stream has ended: deliver what still waits, or close it."""
         stream = channel.stream.id
         if not channel.reliable or not channel.retained:
             self._end_channel(client, link, channel, DropReason.DISCONNECTED, now)
@@ -319,7 +319,8 @@ class RelayedStreams:
         """Tell the origin whether anybody wants its stream."""
         source = relayed.source
         if source is not None:
-            answer = partial(source.answers.answer, relayed.stream, self.wanted(relayed), now=now, owed=relayed.owed())
+            wanted, required = self.wanted(relayed), relayed.required()
+            answer = partial(source.answers.answer, relayed.stream, wanted, now=now, required=required)
             self._clients.attempt(source.peer, now, answer)
 
     def wanted(self, relayed: Relayed) -> bool:
@@ -340,7 +341,7 @@ class RelayedStreams:
                 self._answer(relayed, now)
 
     def confirm(self, relayed: Relayed) -> None:
-        """Tell the origin how far everybody who is owed has got."""
+        """Tell the origin how far all required clients have got."""
         stream, source = relayed.stream, relayed.source
         if source is None or not stream.reliable:
             return
@@ -355,5 +356,5 @@ class RelayedStreams:
         if not channel.reliable or relayed is None or relayed.source is None:
             return None
         if channel is self._unsubscribed or (reason is DropReason.UNWANTED and link.peer not in relayed.outs):
-            return None  # it is owed nothing any more, also of what was sent whole, and others may have the message
+            return None  # it is not required any more, also for what was sent whole, and others may have the message
         return relayed

@@ -130,11 +130,11 @@ class _Interest:
 class _Topic:
     """One global name: its streams by origin, and the clients that want it and may have it, origins included."""
 
-    __slots__ = ("streams", "takers")
+    __slots__ = ("streams", "subscribers")
 
     def __init__(self) -> None:
         self.streams: dict[ClientName, StreamId] = {}
-        self.takers: set[ClientName] = set()
+        self.subscribers: set[ClientName] = set()
 
 
 class RoutingTable:
@@ -294,7 +294,7 @@ class RoutingTable:
             change.denied.add(Denied(client, topic))
         elif topic in self._topics and topic not in interest.topics:
             interest.topics.add(topic)
-            self._set_taker(client, topic, change, takes=True)
+            self._set_subscriber(client, topic, change, takes=True)
         return change.result(self._routes)
 
     def go_on(self, client: ClientName) -> RouteChange:
@@ -341,7 +341,7 @@ class RoutingTable:
             for name in sorted(interest.topics):
                 if not access.may_subscribe(client, name):
                     interest.topics.discard(name)
-                    self._set_taker(client, name, change, takes=False)
+                    self._set_subscriber(client, name, change, takes=False)
             interest.left = self._to_look_at(interest)
             self._match_some(client, interest, change)
         return change.result(self._routes)
@@ -403,10 +403,10 @@ class RoutingTable:
             for client, interest in self._interests.items():
                 if self._takes(client, interest, name):
                     interest.topics.add(name)
-                    topic.takers.add(client)
+                    topic.subscribers.add(client)
         topic.streams[origin] = stream.id
         change.before.setdefault(stream.id, ())
-        self._routes[stream.id] = tuple(sorted(topic.takers - {origin}))
+        self._routes[stream.id] = tuple(sorted(topic.subscribers - {origin}))
 
     def _remove(self, stream: StreamId, change: "_Collector") -> None:
         change.removed.add(stream)
@@ -416,7 +416,7 @@ class RoutingTable:
         topic = self._topics[stream.topic]
         del topic.streams[stream.origin]
         if not topic.streams:
-            for client in topic.takers:
+            for client in topic.subscribers:
                 self._interests[client].topics.discard(stream.topic)
             del self._topics[stream.topic]
 
@@ -429,7 +429,7 @@ class RoutingTable:
             self._match_some(client, interest, change)
         elif old is not None:
             for name in old.topics:
-                self._set_taker(client, name, change, takes=False)
+                self._set_subscriber(client, name, change, takes=False)
 
     def _to_look_at(self, interest: _Interest) -> deque[TopicName]:
         """The names that may come to the interest or leave it, those that it names itself first."""
@@ -459,7 +459,7 @@ class RoutingTable:
             takes = self._takes(client, interest, name)
             if takes != (name in interest.topics):
                 (interest.topics.add if takes else interest.topics.discard)(name)
-                self._set_taker(client, name, change, takes=takes)
+                self._set_subscriber(client, name, change, takes=takes)
                 self.spent_units += ROUTE_UNITS
                 if takes:
                     self.spent_units += sum(map(self.route_units, self._topics[name].streams.values()))
@@ -468,9 +468,9 @@ class RoutingTable:
         if not interest.patterns.texts and not interest.exact:
             del self._interests[client]
 
-    def _set_taker(self, client: ClientName, name: TopicName, change: "_Collector", *, takes: bool) -> None:
+    def _set_subscriber(self, client: ClientName, name: TopicName, change: "_Collector", *, takes: bool) -> None:
         topic = self._topics[name]
-        (topic.takers.add if takes else topic.takers.discard)(client)
+        (topic.subscribers.add if takes else topic.subscribers.discard)(client)
         for stream in topic.streams.values():
             if stream.origin != client:
                 route = self._routes[stream]
@@ -505,8 +505,8 @@ class RoutingTable:
             assert topic.streams, f"{name} has no stream"
             alone = len(topic.streams) == 1
             assert alone or all(self._infos[held].spec.many_writers for held in topic.streams.values()), name
-            takers = {client for client, interest in self._interests.items() if name in interest.topics}
-            assert topic.takers == takers, f"{name}: takers differ"
+            subscribers = {client for client, interest in self._interests.items() if name in interest.topics}
+            assert topic.subscribers == subscribers, f"{name}: subscribers differ"
         for interest in self._interests.values():
             assert interest.topics <= self._topics.keys(), "interest in unknown names"
 

@@ -166,11 +166,11 @@ class ClientCore:
         *,
         now: float,
         attributes: dict[str, str] | None = None,
-        owed: tuple[ClientName, ...] = (),
+        required: tuple[ClientName, ...] = (),
     ) -> OutChannel:
         """Offer a topic under its global name. Offering it again after `unpublish` goes on counting where it ended.
-        `attributes` travel with its announcement. `owed`: of a reliable topic, clients that it is for: a relay that has
-        not heard of them yet keeps it for them.
+        `attributes` travel with its announcement. `required`: of a reliable topic, clients that it is for: a relay
+        that does not know them yet keeps it for them.
 
         Raises UsageError if it is offered already, or no relay would accept it.
         """
@@ -178,7 +178,7 @@ class ClientCore:
         first = self._numbering.last(identity) + 1
         stream = StreamInfo(identity, info, spec, dict(attributes or {}))
         check_stream(stream)
-        channel = self.link.outgoing.open(stream, first=first, owed=owed, now=now)
+        channel = self.link.outgoing.open(stream, first=first, required=required, now=now)
         if spec.latched:
             self._latched[identity] = LatchedCache(spec.depth, spec.max_queue_bytes)
         return channel
@@ -409,7 +409,7 @@ class ClientCore:
         if stream.unhandled and not stream.reliable and lifespan_s is not None and message.age_s(now) > lifespan_s:
             self._failed(stream, message, DropReason.LIFESPAN, "", now)  # while it was decoded
             return
-        if message.tombstone:
+        if message.drop_marker:
             reason = message.drop_reason
             self.received.of(stream.stream).drop_arrived(reason)
             self._tell(self.events.expired, stream.stream, message.seq, reason)

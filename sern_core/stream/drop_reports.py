@@ -21,7 +21,7 @@ STEP_S: Final = 1.0
 """What the pause between two of its messages counts for that at most: if we were held up, its words wait as well."""
 
 
-class Unheard:
+class UnackedReports:
     """How much is to be reported to one peer, of all its streams, and whether it reads."""
 
     __slots__ = ("_last_s", "_unread_s", "limits", "reports", "said")
@@ -41,7 +41,7 @@ class Unheard:
         """A session has begun: nothing was said in it."""
         self._unread_s = 0.0
 
-    def heard(self, count: int) -> None:
+    def acknowledged(self, count: int) -> None:
         self.reports -= count
         self.said -= count
         self._unread_s = 0.0
@@ -86,10 +86,10 @@ _END: Final = attrgetter("end")
 class DropReports:
     """The reports of one stream."""
 
-    __slots__ = ("_said", "_unheard", "_unsaid")
+    __slots__ = ("_said", "_unacked", "_unsaid")
 
-    def __init__(self, unheard: Unheard) -> None:
-        self._unheard = unheard
+    def __init__(self, unacked: UnackedReports) -> None:
+        self._unacked = unacked
         self._said: list[DropReport] = []  # as they were said
         self._unsaid: list[DropReport] = []  # by seq; none overlaps another
 
@@ -109,7 +109,7 @@ class DropReports:
         high = bisect_left(unsaid, end, lo=low, key=_SEQ)
         if low < high and unsaid[low].seq <= seq and end <= unsaid[low].end:
             return
-        if low < high and self._unheard.crowded:
+        if low < high and self._unacked.crowded:
             first, last = unsaid[low], unsaid[high - 1]
             start, end = min(first.seq, seq), max(last.end, end)
             reason = first.reason if reason is DropReason.UNWANTED else reason  # the worse news of the two
@@ -124,10 +124,10 @@ class DropReports:
             high += 1
         parts = self._joined(parts)
         more = len(parts) - (high - low)
-        if more > 0 and self._unheard.reports + more > self._unheard.limits.kept_reports:
+        if more > 0 and self._unacked.reports + more > self._unacked.limits.kept_reports:
             return
         unsaid[low:high] = parts
-        self._unheard.reports += more
+        self._unacked.reports += more
 
     def _joined(self, parts: list[DropReport]) -> list[DropReport]:
         """The same with neighbours that say the same as one."""
@@ -135,7 +135,7 @@ class DropReports:
         for report in parts[1:]:
             last = joined[-1]
             alike = last.where == report.where
-            if last.end == report.seq and last.reason is report.reason and (alike or self._unheard.crowded):
+            if last.end == report.seq and last.reason is report.reason and (alike or self._unacked.crowded):
                 last.count += report.count
                 last.where = last.where if alike else ""
             else:
@@ -157,32 +157,32 @@ class DropReports:
         else:
             whole.seq += report.count
             whole.count -= report.count
-            self._unheard.reports += 1
+            self._unacked.reports += 1
         report.control_seq = control_seq
         self._said.append(report)
-        self._unheard.said += 1
+        self._unacked.said += 1
 
-    def heard(self, control_seq: int) -> bool:
+    def acknowledged(self, control_seq: int) -> bool:
         """The peer has the control messages up to this one. Returns whether it knows of all drops."""
         said = self._said
         if said and said[0].control_seq <= control_seq:
             count = next((index for index, each in enumerate(said) if each.control_seq > control_seq), len(said))
             del said[:count]
-            self._unheard.heard(count)
+            self._unacked.acknowledged(count)
         return not said and not self._unsaid
 
     def unsay(self) -> None:
-        """The session is over: what the peer has not heard is to be said again."""
+        """The session is over: what the peer has not acknowledged is to be said again."""
         said, self._said = self._said, []
-        self._unheard.reports -= len(said)
-        self._unheard.said -= len(said)
+        self._unacked.reports -= len(said)
+        self._unacked.said -= len(said)
         for report in said:
             self.add(report.seq, report.reason, report.where, report.count)
 
     def clear(self) -> None:
         """The stream is gone, or what it was has been replaced."""
-        self._unheard.reports -= len(self)
-        self._unheard.said -= len(self._said)
+        self._unacked.reports -= len(self)
+        self._unacked.said -= len(self._said)
         self._said.clear()
         self._unsaid.clear()
 

@@ -89,7 +89,7 @@ class Encoder:
         """The scheduler has chosen `out`, whose body nobody has looked at: may it go now? False: not yet."""
         message = out.message
         size = out.size
-        if size < MIN_BYTES or message.tombstone or message.codec:
+        if size < MIN_BYTES or message.drop_marker or message.codec:
             out.coding = Coding.DONE
             return True
         if codec.messages_to_probe <= 0 and not codec.probing:

@@ -1,8 +1,8 @@
-"""The receiving side of a stream on one hop: reassembly, duplicates, order, tombstones.
+"""The receiving side of a stream on one hop: reassembly, duplicates, order, drop markers.
 
 Best effort is delivered in increasing seq (a late older sample is dropped as superseded); reliable is delivered
-once and in order, a tombstone taking its message's turn. A reliable message that cannot be kept here (too late, too
-large, no room) becomes a tombstone as well, and the sender is told: nothing waits for it for ever.
+once and in order, a drop marker taking its message's turn. A reliable message that cannot be kept here (too late, too
+large, no room) becomes a drop marker as well, and the sender is told: nothing waits for it for ever.
 State is kept per `StreamId`, across sessions and peers: that is what makes "once" hold when a relay comes back as a
 new process and everything is sent again.
 """
@@ -13,12 +13,12 @@ from collections.abc import Callable, Sequence
 from heapq import heappop, heappush
 from typing import Final
 
-from sern_core.stream.drop_reports import DropReports, Unheard
+from sern_core.stream.drop_reports import DropReports, UnackedReports
 from sern_core.vocabulary.errors import WireError
 from sern_core.vocabulary.limits import LIMITS, PeerLimits
 from sern_core.vocabulary.message import Message, StreamInfo
 from sern_core.vocabulary.types import DROP_CODES, DROP_REASONS, DropReason, PriorityClass
-from sern_core.wire.framing import FLAG_REPLAY, FLAG_TOMBSTONE, Datagram
+from sern_core.wire.framing import FLAG_DROP_MARKER, FLAG_REPLAY, Datagram
 
 PARTIAL_IDLE_S: Final = 10.0
 """A half-received best-effort message with a newer one behind it that gets no fragment for so long was given up. The
@@ -153,12 +153,22 @@ class Partial:
 class Reassembly:
     """Memory that half-received and waiting messages of one link may hold in all, and how much is to be reported."""
 
-    __slots__ = ("behind", "held_bytes", "holders", "latest", "limit_bytes", "limits", "slice_us", "unheard", "work_us")
+    __slots__ = (
+        "behind",
+        "held_bytes",
+        "holders",
+        "latest",
+        "limit_bytes",
+        "limits",
+        "slice_us",
+        "unacked_reports",
+        "work_us",
+    )
 
     def __init__(self, limit_bytes: int, limits: PeerLimits = LIMITS) -> None:
         self.limits = limits
         self.slice_us = limits.slice_us
-        self.unheard = Unheard(limits)
+        self.unacked_reports = UnackedReports(limits)
         self.limit_bytes = limit_bytes
         self.held_bytes = 0
         self.holders: OrderedDict[InStream, None] = OrderedDict()
@@ -193,7 +203,7 @@ class Reassembly:
 Deliver = Callable[["InStream", Message], None]
 OnInDrop = Callable[["InStream", DropReason, int, Sequence[int], bool], None]
 """`on_drop(stream, reason, nbytes, seqs, reported)`, `nbytes` of all of them together."""
-"""Stream, reason, bytes, seq, and whether its tombstone follows: a reliable message that was given up here."""
+"""Stream, reason, bytes, seq, and whether its drop marker follows: a reliable message that was given up here."""
 
 
 class InStream:
@@ -222,7 +232,7 @@ class InStream:
         self.paused = False  # it was not wanted, and the peer has not said yet where it goes on
         self.pause_seq = 0  # the control message of the session that said so
         self.known = False  # something has had its turn, or an earlier session announced it: a gap is then a gap
-        self.reports = DropReports(reassembly.unheard)  # drops that the peer may not know of yet
+        self.reports = DropReports(reassembly.unacked_reports)  # drops that the peer may not know of yet
         self._seen = 0  # best effort: bit i set when seq delivered-1-i arrived
         self._partials: dict[int, Partial] = {}  # best effort: untouched for longest first
         self._lowest = 0  # no half-received message has a seq below it
@@ -266,12 +276,12 @@ class InStream:
         if seq <= self.delivered:
             self._late(seq, len(body))
             return
-        if self._partials and (flags & FLAG_TOMBSTONE or len(body) == total):
+        if self._partials and (flags & FLAG_DROP_MARKER or len(body) == total):
             self._discard_partial(seq)
         if self._waiting and seq in self._waiting:
             self._on_drop(self, DropReason.DUPLICATE, len(body), (seq,), False)
             return
-        if flags & FLAG_TOMBSTONE:
+        if flags & FLAG_DROP_MARKER:
             code = body[0] if body[0] in DROP_REASONS else DROP_CODES[DropReason.LOST]
             self._arrived(Message(self.stream.id, seq, bytes(body), stamp_ns, born_s, code))
             return
@@ -323,9 +333,9 @@ class InStream:
                 )
             )
 
-    def _check_heard(self) -> None:
+    def _check_reports_read(self) -> None:
         if self.channel_id is not None:  # not of the control stream
-            self._reassembly.unheard.check(self._now)
+            self._reassembly.unacked_reports.check(self._now)
 
     def _pay(self, seq: int, partial: Partial) -> bool:
         """Take the pieces of a message into account. False: there was no room for them, and it is lost."""
@@ -342,17 +352,17 @@ class InStream:
         return False
 
     def give_up(self, seq: int, reason: DropReason, nbytes: int, now: float) -> None:
-        """Message `seq` cannot be taken here: best effort loses it, of a reliable stream a tombstone takes its turn."""
+        """Message `seq` cannot be taken: best effort loses it, of a reliable stream a drop marker takes its turn."""
         self._now = now
         if seq <= self.delivered or seq in self._waiting:
             return
         if not self.reliable:
             self._on_drop(self, reason, nbytes, (seq,), False)
             return
-        if self._reassembly.unheard.crowded:
-            self._check_heard()
+        if self._reassembly.unacked_reports.crowded:
+            self._check_reports_read()
         self._on_drop(self, reason, nbytes, (seq,), True)
-        self._arrived(self.tombstone(seq, reason, 0, now))
+        self._arrived(self.drop_marker(seq, reason, 0, now))
 
     def fail(self, seq: int, nbytes: int, now: float) -> None:
         """Message `seq` met an error of ours: it is given up, and what waited behind it goes on."""
@@ -360,7 +370,7 @@ class InStream:
         self.give_up(seq, DropReason.FAULT, nbytes, now)
         self._advance()
 
-    def tombstone(self, seq: int, reason: DropReason, stamp_ns: int, born_s: float) -> Message:
+    def drop_marker(self, seq: int, reason: DropReason, stamp_ns: int, born_s: float) -> Message:
         """What takes the turn of a reliable message that was dropped."""
         code = DROP_CODES[reason]
         return Message(self.stream.id, seq, bytes([code]), stamp_ns, born_s, code)
@@ -409,8 +419,8 @@ class InStream:
                 self._lowest = min(self._partials, default=0)
             self._turn(message)
             return
-        if self._reassembly.unheard.crowded:
-            self._check_heard()
+        if self._reassembly.unacked_reports.crowded:
+            self._check_reports_read()
         if seq == self.delivered + 1:
             self.delivered = seq
             self._turn(message)
@@ -419,10 +429,10 @@ class InStream:
             return
         size = len(message.body)
         if not self._reassembly.make_room(size + HELD_OVERHEAD_BYTES):
-            # Without the message before it this one cannot be kept; its tombstone can.
-            if not message.tombstone:
+            # Without the message before it this one cannot be kept; its drop marker can.
+            if not message.drop_marker:
                 self._on_drop(self, DropReason.REASSEMBLY, size, (seq,), True)
-                message = self.tombstone(seq, DropReason.REASSEMBLY, message.stamp_ns, message.born_s)
+                message = self.drop_marker(seq, DropReason.REASSEMBLY, message.stamp_ns, message.born_s)
             if not self._reassembly.make_room(len(message.body) + HELD_OVERHEAD_BYTES):
                 raise WireError(f"more messages out of order than {self._reassembly.limit_bytes} bytes hold")
         self._waiting[seq] = message
@@ -469,7 +479,7 @@ class InStream:
         lifespan_s = self.lifespan_s
         if (
             lifespan_s is not None
-            and not message.tombstone
+            and not message.drop_marker
             and self._now - message.born_s + message.error_s > lifespan_s
         ):
             # Late as far as can be known: where the clocks' offset is uncertain, the worst of it counts.
@@ -478,7 +488,7 @@ class InStream:
                 self._on_drop(self, DropReason.LIFESPAN, size, (message.seq,), False)
                 return
             self._on_drop(self, DropReason.LIFESPAN, size, (message.seq,), True)
-            message = self.tombstone(message.seq, DropReason.LIFESPAN, message.stamp_ns, message.born_s)
+            message = self.drop_marker(message.seq, DropReason.LIFESPAN, message.stamp_ns, message.born_s)
         self.known = True
         self._deliver(self, message)
 

@@ -1,5 +1,5 @@
 """What a reliable channel keeps: every message until the peer's delivered watermark passes it, or until its lifespan or
-retention ends. Then a one-byte tombstone takes its place, so that order survives and nothing is lost silently. A full
+retention ends. Then a one-byte drop marker takes its place, so that order survives and nothing is lost silently. A full
 queue refuses messages to its caller."""
 
 from bisect import bisect_left, bisect_right
@@ -46,7 +46,7 @@ class KeepAll:
         self._lapses = Lapses(spec)
         self.depth = spec.depth
         self.retained: deque[OutMessage] = NOTHING
-        """Everything above the watermark, tombstones included, in its order."""
+        """Everything above the watermark, drop markers included, in its order."""
         self.retained_bytes = 0
         self.watermark = first - 1
         self.next_seq = first
@@ -69,14 +69,14 @@ class KeepAll:
             counters.deliver(size)  # the peer has it already, from an earlier run of this relay
             return True
         if unwanted and not self.retained:
-            reason = DROP_REASONS[message.tombstone] if message.tombstone else DropReason.UNWANTED
+            reason = DROP_REASONS[message.drop_marker] if message.drop_marker else DropReason.UNWANTED
             drops.count(message.seq, reason, size)
             self.watermark = message.seq
             return True
         out = OutMessage(message)
-        if message.tombstone:
+        if message.drop_marker:
             out.counted = True
-            drops.count(message.seq, DROP_REASONS[message.tombstone], size)
+            drops.count(message.seq, DROP_REASONS[message.drop_marker], size)
         self._keep(out)
         return True
 
@@ -86,7 +86,7 @@ class KeepAll:
         return self.retained_bytes + size_bytes + overhead_bytes <= self._spec.max_queue_bytes
 
     def reject(self, message: Message, reason: DropReason) -> None:
-        """Drop a message that cannot travel at all; the stream goes on over its tombstone."""
+        """Drop a message that cannot travel at all; the stream goes on over its drop marker."""
         drops = self._drops
         size = len(message.body)
         drops.counters.offer(size)
@@ -101,13 +101,13 @@ class KeepAll:
         drops.tell(out, reason)
 
     def leave_out(self, message: Message, reason: DropReason) -> None:
-        """There is no room for this message, nor for a tombstone: the stream goes on behind it."""
+        """There is no room for this message, nor for a drop marker: the stream goes on behind it."""
         drops = self._drops
         size = len(message.body)
         drops.counters.offer(size)
         if message.seq <= self.watermark:
             drops.counters.deliver(size)
-        elif message.tombstone:
+        elif message.drop_marker:
             drops.count(message.seq, message.drop_reason, size)  # reported where it was dropped
         else:
             drops.count(message.seq, reason, size)
@@ -177,7 +177,7 @@ class KeepAll:
     # --- service --------------------------------------------------------------------------------------------------
 
     def head(self, now: float) -> OutMessage | None:
-        """The message to serve next: a tombstone if its time is over."""
+        """The message to serve next: a drop marker if its time is over."""
         transit = self._transit
         if transit.active:
             out = transit.active[0]
@@ -186,7 +186,7 @@ class KeepAll:
         else:
             return None
         message, spec = out.message, self._spec
-        if not message.tombstone:
+        if not message.drop_marker:
             if now - out.retain_from_s > spec.retention_s:
                 self.give_up(out, DropReason.RETENTION)
             elif spec.lifespan_s is not None and now - message.born_s + message.error_s > spec.lifespan_s:
@@ -194,7 +194,7 @@ class KeepAll:
         return out
 
     def give_up(self, out: OutMessage, reason: DropReason) -> None:
-        """A tombstone takes the place of a message; it is reported unless that was done before. The tombstone has the
+        """A drop marker takes the place of a message; it is reported unless that was done before. The marker has the
         reason itself: it is read by those alone who did not get the message."""
         drops, transit = self._drops, self._transit
         size = out.size
@@ -209,11 +209,11 @@ class KeepAll:
         if not reported:
             drops.tell(out, told)
         if out.started:
-            # What is in flight of the old body is harmless: the receiver takes the tombstone in its place.
+            # What is in flight of the old body is harmless: the receiver takes the drop marker in its place.
             transit.activate(out)
 
     def entomb(self, outs: list[OutMessage], reason: DropReason) -> None:
-        """Tombstones take the places of messages. Those that were not counted are told of together."""
+        """Drop markers take the places of messages. Those that were not counted are told of together."""
         drops, transit = self._drops, self._transit
         lost = [out for out in outs if not out.counted]
         told = [(run, drops.reason_of(run[0], reason, len(run))) for run in drops.runs(lost)]
@@ -228,9 +228,9 @@ class KeepAll:
             drops.drop_run(run, why)
 
     def abandon(self, seq: int, reason: DropReason) -> bool:
-        """Give up message `seq`; a tombstone stays. False: it has been begun, or is not here."""
+        """Give up message `seq`; a drop marker stays. False: it has been begun, or is not here."""
         for out in reversed(self._transit.queue):
-            if out.seq == seq and not out.message.tombstone:
+            if out.seq == seq and not out.message.drop_marker:
                 self.give_up(out, reason)
                 return True
         return False
@@ -334,7 +334,7 @@ class KeepAll:
         if not up and self.retained:
             spent = self._leave_behind(now, room)
         if self.retained and spent < room:
-            spent += self._lapses.bury(self, now, room - spent)
+            spent += self._lapses.mark(self, now, room - spent)
         return spent
 
     def _leave_behind(self, now: float, room: int) -> int:
@@ -352,7 +352,7 @@ class KeepAll:
         """The peer is a new process: everything waits to be sent again. `alone`: one at most is to get it."""
         if alone:
             for out in self.retained:  # reported as dropped to the only one: then it shall not get it now
-                if out.counted and not out.message.tombstone:
+                if out.counted and not out.message.drop_marker:
                     self.retained_bytes -= out.size - 1
                     out.entomb(DropReason.LOST)
         self._transit.restart(self.retained)

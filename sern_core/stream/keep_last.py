@@ -123,7 +123,11 @@ class KeepLast:
         while transit.active:
             out = transit.active[0]
             message = out.message
-            if lifespan_s is not None and now - message.born_s + message.error_s > lifespan_s and not message.tombstone:
+            if (
+                lifespan_s is not None
+                and now - message.born_s + message.error_s > lifespan_s
+                and not message.drop_marker
+            ):
                 self.give_up_begun(out, DropReason.LIFESPAN)
             elif out.seq < self._acked_seq:
                 self.give_up_begun(out, DropReason.SUPERSEDED)
@@ -133,7 +137,7 @@ class KeepLast:
             return None
         out = transit.queue[0]
         message = out.message
-        if lifespan_s is None or now - message.born_s + message.error_s <= lifespan_s or message.tombstone:
+        if lifespan_s is None or now - message.born_s + message.error_s <= lifespan_s or message.drop_marker:
             return out
         self._drop_expired(now)
         return transit.queue[0] if transit.queue else None

@@ -19,7 +19,7 @@ SEEN_PER_LAPSED: Final = 8
 
 
 def lapsed(out: OutMessage, spec: TopicSpec, now: float) -> DropReason | None:
-    """Why a reliable message that is no tombstone is to be given up now; None if it is not."""
+    """Why a reliable message that is no drop marker is to be given up now; None if it is not."""
     if now - out.retain_from_s > spec.retention_s:
         return DropReason.RETENTION
     # Lifespan stops a message from being sent; once the peer has it whole, the peer watches it.
@@ -35,7 +35,7 @@ class Kept(Protocol):
     watermark: int
 
     def entomb(self, outs: list[OutMessage], reason: DropReason) -> None:
-        """Put tombstones in the places of messages."""
+        """Put drop markers in the places of messages."""
 
 
 class LeftBehind(NamedTuple):
@@ -47,14 +47,14 @@ class LeftBehind(NamedTuple):
 
 
 def left_behind(retained: Iterable[OutMessage], spec: TopicSpec, now: float, room: int) -> LeftBehind:
-    """The oldest of what is kept that have lapsed, and the tombstones between them, as many as there is `room` for."""
+    """The oldest of what is kept that have lapsed, with the drop markers between them, as many as `room` takes."""
     runs: list[tuple[DropReason, list[OutMessage]]] = []
     known: DropReason | None = None
     count = seen = last_seq = 0
     for out in retained:
         if count + seen // SEEN_PER_LAPSED >= room:
             break
-        if out.message.tombstone:
+        if out.message.drop_marker:
             seen += 1
         else:
             reason = lapsed(out, spec, now)
@@ -73,40 +73,40 @@ def left_behind(retained: Iterable[OutMessage], spec: TopicSpec, now: float, roo
 class Lapses:
     """How far the messages of one reliable channel were looked at."""
 
-    __slots__ = ("_buried_to", "_replays_buried_to", "_replays_to", "_settled_to", "_spec")
+    __slots__ = ("_marked_to", "_replays_marked_to", "_replays_to", "_settled_to", "_spec")
 
     def __init__(self, spec: TopicSpec) -> None:
         self._spec = spec
-        self._buried_to = 0  # every message that is kept up to this seq, and is no replay, is a tombstone
-        self._replays_buried_to = 0  # the same of replays
+        self._marked_to = 0  # every message that is kept up to this seq, and is no replay, is a drop marker
+        self._replays_marked_to = 0  # the same of replays
         self._replays_to = 0  # the newest that was a replay
-        self._settled_to = 0  # every message that is kept up to this seq is a tombstone, or the peer has it whole
+        self._settled_to = 0  # every message that is kept up to this seq is a drop marker, or the peer has it whole
 
     def primed(self, last_seq: int) -> None:
         """Replays up to `last_seq` were put ahead of all that is kept."""
         self._replays_to = max(self._replays_to, last_seq)
-        self._replays_buried_to = self._settled_to = 0
+        self._replays_marked_to = self._settled_to = 0
 
     def restart(self) -> None:
         """The peer has none of them any more."""
         self._settled_to = 0
 
-    def bury(self, kept: Kept, now: float, room: int) -> int:
-        """Put tombstones in the places of messages that have lapsed. Returns what of `room` it took."""
+    def mark(self, kept: Kept, now: float, room: int) -> int:
+        """Put drop markers in the places of messages that have lapsed. Returns what of `room` it took."""
         spent = 0
         if self._replays_to > kept.watermark:  # they are kept from later on than what is behind them
-            spent, self._replays_buried_to = self._bury_behind(kept, self._replays_buried_to, now, room, None)
+            spent, self._replays_marked_to = self._mark_behind(kept, self._replays_marked_to, now, room, None)
         if spent < room:
-            behind = max(self._buried_to, self._replays_to)
-            more, self._buried_to = self._bury_behind(kept, behind, now, room - spent, None)
+            behind = max(self._marked_to, self._replays_to)
+            more, self._marked_to = self._mark_behind(kept, behind, now, room - spent, None)
             spent += more
         lifespan_s = self._spec.lifespan_s
         if spent < room and lifespan_s is not None:
-            more, self._settled_to = self._bury_behind(kept, self._settled_to, now, room - spent, lifespan_s)
+            more, self._settled_to = self._mark_behind(kept, self._settled_to, now, room - spent, lifespan_s)
             spent += more
         return spent
 
-    def _bury_behind(self, kept: Kept, seq: int, now: float, room: int, lifespan_s: float | None) -> tuple[int, int]:
+    def _mark_behind(self, kept: Kept, seq: int, now: float, room: int, lifespan_s: float | None) -> tuple[int, int]:
         """The same behind `seq`, up to the first whose retention or lifespan is not over. Returns what of `room` it
         took, and the seq that it came to."""
         retained, retention_s = kept.retained, self._spec.retention_s
@@ -119,7 +119,7 @@ class Lapses:
         for out in islice(retained, start, None):
             if count + seen // SEEN_PER_LAPSED >= room or self._young(out, now, lifespan_s):
                 break
-            if out.message.tombstone:
+            if out.message.drop_marker:
                 seen += 1
             else:
                 reason: DropReason | None = None
@@ -142,10 +142,10 @@ class Lapses:
         return count + seen // SEEN_PER_LAPSED, seq
 
     def _young(self, out: OutMessage, now: float, lifespan_s: float | None) -> bool:
-        """Whether a reliable message is no tombstone, and its lifespan, or without one its retention, goes on. They are
-        in the order of their birth, and but for replays in that of their retention."""
+        """Whether a reliable message is no drop marker, and its lifespan, or without one its retention, goes on. They
+        are in the order of their birth, and but for replays in that of their retention."""
         message = out.message
-        if message.tombstone:
+        if message.drop_marker:
             return False
         if lifespan_s is None:
             return now - out.retain_from_s <= self._spec.retention_s

@@ -65,8 +65,8 @@ class LatchedCache:
         """Whether the stream has more depth than is kept."""
 
     def add(self, message: Message) -> None:
-        """Keep `message`; tombstones have nothing to replay."""
-        if message.tombstone:
+        """Keep `message`; drop markers have nothing to replay."""
+        if message.drop_marker:
             return
         messages = self._messages
         if len(messages) == messages.maxlen:
@@ -144,7 +144,7 @@ class ReplayStore:
             self._shrink(cache, -1)  # replayed as the latest, what came before it would be wrong
             return
         before_bytes = cache.held_bytes
-        self.evicted += cache.cut and cache.full and not message.tombstone
+        self.evicted += cache.cut and cache.full and not message.drop_marker
         cache.add(message)
         self.held_bytes += cache.held_bytes - before_bytes
         for least_used in self._by_use:

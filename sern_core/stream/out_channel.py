@@ -28,21 +28,22 @@ from sern_core.vocabulary.types import DropReason
 
 
 class OutChannel:
-    """One stream towards one peer. The link serves it through `head` and `take`; `slot` is its scheduler slot."""
+    """One stream towards one peer. The link serves it through `head` and `take`; `channel_id` is its number in the
+    session, by which the scheduler names it as well."""
 
     __slots__ = (
         "_all",
         "_kept",
         "_transit",
+        "channel_id",
         "codec",
         "counters",
         "drops",
         "last_sent_s",
         "offered",
-        "owed",
         "ready",
         "reliable",
-        "slot",
+        "required",
         "spec",
         "stream",
         "wanted",
@@ -50,7 +51,7 @@ class OutChannel:
 
     def __init__(
         self,
-        slot: int,
+        channel_id: int,
         stream: StreamInfo,
         counters: SendCounters,
         on_drop: OnDrop,
@@ -59,14 +60,14 @@ class OutChannel:
         codec: ChannelCodec | None = None,
     ) -> None:
         spec = stream.spec
-        self.slot = slot
+        self.channel_id = channel_id
         self.stream = stream
         self.spec = spec
         self.counters = counters
         self.codec = codec
         """None: bodies go as they come."""
         self.reliable = spec.reliable
-        self.drops = OutDrops(slot, counters, on_drop, reliable=spec.reliable)
+        self.drops = OutDrops(channel_id, counters, on_drop, reliable=spec.reliable)
         self._transit = Transit(coded=codec is not None)
         self._all = KeepAll(spec, self._transit, self.drops, first=first) if spec.reliable else None
         self._kept = self._all or KeepLast(spec, self._transit, self.drops, first=first)
@@ -78,7 +79,7 @@ class OutChannel:
         """Whether it was announced in the session."""
         self.offered = False
         """Whether the scheduler knows of a pending message."""
-        self.owed: tuple[str, ...] = ()
+        self.required: tuple[str, ...] = ()
         """Reliable subscribers behind the peer, as it told us."""
 
     # --- what is where --------------------------------------------------------------------------------------------
@@ -141,11 +142,11 @@ class OutChannel:
         return self._kept.submit(message, now, forced=forced, unwanted=self.wanted is False)
 
     def reject(self, message: Message, reason: DropReason) -> None:
-        """Drop a message that cannot travel at all; a reliable stream goes on over its tombstone."""
+        """Drop a message that cannot travel at all; a reliable stream goes on over its drop marker."""
         self._kept.reject(message, reason)
 
     def leave_out(self, message: Message, reason: DropReason) -> None:
-        """There is no room for this reliable message, nor for a tombstone: the stream goes on behind it."""
+        """There is no room for this reliable message, nor for a drop marker: the stream goes on behind it."""
         if self._all is not None:
             self._all.leave_out(message, reason)
 
@@ -269,9 +270,9 @@ class OutChannel:
         out.size = size
 
     def drop_head(self, reason: DropReason, now: float) -> None:
-        """Give up the message that would go next (best effort); a reliable one becomes a tombstone."""
+        """Give up the message that would go next (best effort); a reliable one becomes a drop marker."""
         out = self.head(now)
-        if out is not None and not out.message.tombstone:
+        if out is not None and not out.message.drop_marker:
             self._kept.give_up(out, reason)
 
     def shed(self, room_bytes: int, reason: DropReason) -> int:
@@ -284,7 +285,7 @@ class OutChannel:
         return self._kept.shed(room_bytes, reason)
 
     def abandon(self, seq: int, reason: DropReason) -> bool:
-        """Give up reliable message `seq`; a tombstone stays. False: it has been begun, or is not here."""
+        """Give up reliable message `seq`; a drop marker stays. False: it has been begun, or is not here."""
         return self._all is not None and self._all.abandon(seq, reason)
 
     def sweep(self, now: float, *, up: bool, room: int = LIMITS.lapsed_a_sweep) -> int:
@@ -363,7 +364,7 @@ class OutChannel:
 
     def peer_restarted(self) -> None:
         """A new process at the other end has nothing of what we sent: everything waits to be sent again."""
-        self._kept.restart(alone=len(self.owed) < 2)
+        self._kept.restart(alone=len(self.required) < 2)
 
     def clear(self, reason: DropReason) -> int:
         """The stream ends: whatever is left is dropped for `reason`. Returns what that costs, in microseconds."""
@@ -374,7 +375,7 @@ class OutChannel:
 
     @property
     def kept(self) -> int:
-        """How many messages wait here or are under way, tombstones included."""
+        """How many messages wait here or are under way, drop markers included."""
         return self._kept.kept
 
     @property
@@ -398,12 +399,12 @@ class OutChannel:
         return self._kept.unbegun_bytes
 
     def undelivered(self) -> list[OutMessage]:
-        """What is queued or in flight; counted tombstones are neither."""
+        """What is queued or in flight; counted drop markers are neither."""
         return self._kept.undelivered()
 
     def held(self) -> tuple[int, int, int, int]:
         """(messages queued, bytes queued, messages in flight, bytes in flight), bytes as they were offered; counted
-        tombstones are neither."""
+        drop markers are neither."""
         queued, flying = self._kept.split()
         queued_bytes, flying_bytes = sum(o.offered_bytes for o in queued), sum(o.offered_bytes for o in flying)
         return len(queued), queued_bytes, len(flying), flying_bytes

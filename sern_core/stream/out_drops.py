@@ -10,22 +10,22 @@ from sern_core.vocabulary.ledger import LOSSES, SendCounters
 from sern_core.vocabulary.types import DropReason
 
 OnDrop = Callable[[int, Sequence[OutMessage], DropReason], None]
-"""`on_drop(slot, outs, reason)`: these messages of the channel, in their order, are counted as dropped now. Of a
+"""`on_drop(channel_id, outs, reason)`: these messages of the channel, in order, are counted as dropped now. Of a
 reliable stream what lies between two of them was dropped before, or never comes: the whole span may be told onwards."""
 
 
 class OutDrops:
     """Counts what a channel drops, and tells `on_drop` of it."""
 
-    __slots__ = ("_on_drop", "_reliable", "_slot", "counters", "live_from", "on_count")
+    __slots__ = ("_channel_id", "_on_drop", "_reliable", "counters", "live_from", "on_count")
 
-    def __init__(self, slot: int, counters: SendCounters, on_drop: OnDrop, *, reliable: bool) -> None:
-        self._slot = slot
+    def __init__(self, channel_id: int, counters: SendCounters, on_drop: OnDrop, *, reliable: bool) -> None:
+        self._channel_id = channel_id
         self._on_drop = on_drop
         self._reliable = reliable
         self.counters = counters
         self.live_from = 0
-        """Reliable: what is kept below this seq are replays, and between them lies what the peer is not owed."""
+        """Reliable: what is kept below this seq are replays, and between them lies what the peer is not to get."""
         self.on_count: Callable[[int, DropReason], None] | None = None
         """Told of every drop that is counted, by seq; for audits."""
 
@@ -36,7 +36,7 @@ class OutDrops:
 
     def tell(self, out: OutMessage, reason: DropReason) -> None:
         """Tell of one message that is counted already."""
-        self._on_drop(self._slot, (out,), reason)
+        self._on_drop(self._channel_id, (out,), reason)
 
     def drop(self, out: OutMessage, reason: DropReason) -> None:
         """Count one message, and tell of it."""
@@ -44,7 +44,7 @@ class OutDrops:
             reason = self.reason_of(out, reason)
         out.coding = Coding.DONE  # whatever another thread makes of it
         self.count(out.seq, reason, out.offered_bytes)
-        self._on_drop(self._slot, (out,), reason)
+        self._on_drop(self._channel_id, (out,), reason)
 
     def drop_run(self, run: Sequence[OutMessage], reason: DropReason) -> None:
         """Count messages that are dropped together, and tell of them at once: there may be a hundred thousand."""
@@ -52,7 +52,7 @@ class OutDrops:
         if self.on_count is not None:
             for out in run:
                 self.on_count(out.seq, reason)
-        self._on_drop(self._slot, run, reason)
+        self._on_drop(self._channel_id, run, reason)
 
     def drop_all(self, lost: list[OutMessage], reason: DropReason) -> int:
         """Count what is given up and tell of it; returns in how many runs."""

@@ -47,7 +47,7 @@ class OutMessage:
         self.fragments_inflight = 0
         self.started = False
         self.active = False  # in the list of those that were begun and have bytes still to send
-        self.counted = False  # already accounted as dropped (a tombstone now)
+        self.counted = False  # already accounted as dropped (a drop marker now)
         self.lost_to = ""  # the client further on that will not get it; empty: nobody did, or nobody was named
         self.retain_from_s = message.born_s  # retention counts from here
 
@@ -67,9 +67,11 @@ class OutMessage:
         return self.ranges is None or bool(self.ranges)
 
     def expired(self, lifespan_s: float | None, now: float) -> bool:
-        """Whether the lifespan of its topic is over. A tombstone has none."""
+        """Whether the lifespan of its topic is over. A drop marker has none."""
         message = self.message
-        return lifespan_s is not None and not message.tombstone and now - message.born_s + message.error_s > lifespan_s
+        return (
+            lifespan_s is not None and not message.drop_marker and now - message.born_s + message.error_s > lifespan_s
+        )
 
     def restart(self) -> None:
         """Forget what was sent: the peer is a new process, or the body is another."""
@@ -79,10 +81,10 @@ class OutMessage:
         self.fragments_inflight = 0
 
     def entomb(self, reason: DropReason) -> None:
-        """Become a tombstone: one byte that says why."""
+        """Become a drop marker: one byte that says why."""
         old = self.message
         self.message = Message(
-            old.stream, old.seq, bytes([DROP_CODES[reason]]), old.stamp_ns, old.born_s, tombstone=DROP_CODES[reason]
+            old.stream, old.seq, bytes([DROP_CODES[reason]]), old.stamp_ns, old.born_s, drop_marker=DROP_CODES[reason]
         )
         self.size = 1
         self.coding = Coding.DONE

@@ -139,30 +139,30 @@ class _Lines:
 
 
 class PendingClass:
-    """Pending messages, at most one a slot. `slots` may be read: its truth says whether anything is pending.
+    """Pending messages, at most one a channel. `channel_ids` may be read: its truth says whether anything is pending.
 
     Equal scores: the older message first when η = 0, else the first in table order; the same operations always make
     the same choice.
     """
 
-    __slots__ = ("_a_max_s", "_eta", "_gains", "_index", "_lines", "_origin_s", "_sinces", "slots")
+    __slots__ = ("_a_max_s", "_eta", "_gains", "_index", "_lines", "_origin_s", "_sinces", "channel_ids")
 
     def __init__(self, *, eta: float, a_max_s: float, origin_s: float) -> None:
         self._eta = max(eta, _TIE_ETA)  # 1/s
         self._a_max_s = a_max_s
         self._origin_s = origin_s
-        self.slots: list[int] = []
+        self.channel_ids: list[int] = []
         self._gains: list[float] = []  # g = κ/(s + ε), 1/bytes
         self._sinces: list[float] = []
         self._index: dict[int, int] = {}
         self._lines: _Lines | None = None
 
     def __len__(self) -> int:
-        return len(self.slots)
+        return len(self.channel_ids)
 
-    def put(self, slot: int, gain: float, since_s: float) -> None:
-        """Add the message of `slot`, or replace it. `gain` is κ/(s + ε) > 0; age counts from `since_s`; both finite."""
-        index = self._index.get(slot)
+    def put(self, channel_id: int, gain: float, since_s: float) -> None:
+        """Add a channel's message, or replace it. `gain` is κ/(s + ε) > 0; age counts from `since_s`; both finite."""
+        index = self._index.get(channel_id)
         lines = self._lines
         if index is not None:
             self._gains[index] = gain
@@ -170,54 +170,54 @@ class PendingClass:
                 lines.put(index, gain, since_s, same_age=self._sinces[index] == since_s)
             self._sinces[index] = since_s
             return
-        slots = self.slots
-        self._index[slot] = len(slots)
-        slots.append(slot)
+        channel_ids = self.channel_ids
+        self._index[channel_id] = len(channel_ids)
+        channel_ids.append(channel_id)
         self._gains.append(gain)
         self._sinces.append(since_s)
         if lines is not None:
             lines.append(gain, since_s)
-        elif len(slots) > FEW:
+        elif len(channel_ids) > FEW:
             self._lines = lines = _Lines(eta=self._eta, a_max_s=self._a_max_s, origin_s=self._origin_s)
             for gain, since_s in zip(self._gains, self._sinces, strict=True):
                 lines.append(gain, since_s)
 
-    def remove(self, slot: int) -> None:
-        """Take out the message of `slot`, which must be pending."""
-        index = self._index.pop(slot)
-        slots, gains, sinces = self.slots, self._gains, self._sinces
-        moved, gain, since_s = slots.pop(), gains.pop(), sinces.pop()
-        if moved != slot:
-            slots[index], gains[index], sinces[index] = moved, gain, since_s
+    def remove(self, channel_id: int) -> None:
+        """Take out the message of a channel, which must be pending."""
+        index = self._index.pop(channel_id)
+        channel_ids, gains, sinces = self.channel_ids, self._gains, self._sinces
+        moved, gain, since_s = channel_ids.pop(), gains.pop(), sinces.pop()
+        if moved != channel_id:
+            channel_ids[index], gains[index], sinces[index] = moved, gain, since_s
             self._index[moved] = index
         if self._lines is not None:
-            if len(slots) < FEW // 2:
+            if len(channel_ids) < FEW // 2:
                 self._lines = None
             else:
                 self._lines.swap_remove(index)
 
     def best(self, now: float) -> int:
-        """The slot with the highest score; something must be pending."""
-        slots = self.slots
-        if len(slots) == 1:
-            return slots[0]
+        """The channel with the highest score; something must be pending."""
+        channel_ids = self.channel_ids
+        if len(channel_ids) == 1:
+            return channel_ids[0]
         if self._lines is not None:
-            return slots[self._lines.best(now, self._gains)]
+            return channel_ids[self._lines.best(now, self._gains)]
         eta, a_max_s = self._eta, self._a_max_s
         best, highest = -1, -_INF
-        for slot, gain, since_s in zip(slots, self._gains, self._sinces, strict=True):
+        for channel_id, gain, since_s in zip(channel_ids, self._gains, self._sinces, strict=True):
             age_s = now - since_s
             score = gain * (1.0 + eta * (age_s if age_s < a_max_s else a_max_s))
             if score > highest:
-                best, highest = slot, score
+                best, highest = channel_id, score
         return best
 
     def validate(self) -> None:
         """Raise AssertionError unless the lists, the index and the lines agree."""
-        assert len(self.slots) == len(self._gains) == len(self._sinces) == len(self._index)
-        assert all(self.slots[index] == slot for slot, index in self._index.items())
+        assert len(self.channel_ids) == len(self._gains) == len(self._sinces) == len(self._index)
+        assert all(self.channel_ids[index] == channel_id for channel_id, index in self._index.items())
         if self._lines is None:
-            assert len(self.slots) <= FEW
+            assert len(self.channel_ids) <= FEW
         else:
-            assert len(self.slots) >= FEW // 2
+            assert len(self.channel_ids) >= FEW // 2
             self._lines.validate(self._gains, self._sinces)

@@ -1,8 +1,9 @@
 """Which topic may send its next fragment: the paper's eq. (priority_score) and Alg. prioritize, made to hold a link.
 
-The scheduler holds no messages. The link names each topic by a small integer, its *slot*, says what is pending there
-(`offer`, `withdraw`), asks whose turn it is each time the link can take one more fragment (`pick`), and says what went
-out (`charge`). A choice is late and cheap: P is evaluated at every fragment, so a newcomer preempts within one.
+The scheduler holds no messages. The link names each topic by a small integer, the *id* of its channel, says what is
+pending there (`offer`, `withdraw`), asks whose turn it is each time the link can take one more fragment (`pick`), and
+says what went out (`charge`). A choice is late and cheap: P is evaluated at every fragment, so a newcomer preempts
+within one.
 
 Ordering `class` (the reading of "priority first" that delivers it; P alone divides by size and starves a large
 urgent message) serves by (class, −P). A class is served ahead of a backlogged more urgent one only
@@ -55,13 +56,13 @@ class WaitReason(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Standing:
-    """What the scheduler thinks of one slot at one time, for people and for the decision log.
+    """What the scheduler thinks of one channel at one time, for people and for the decision log.
 
     `score` is P in 1/bytes with the clipped age; `age_s` is not clipped. `rank` counts the pending messages that go
-    before it: by (class, −P), or by −P in ordering `paper`. `waits_for` is None when this slot is the next one.
+    before it: by (class, −P), or by −P in ordering `paper`. `waits_for` is None when this channel is the next one.
     """
 
-    slot: int
+    channel_id: int
     priority: PriorityClass
     weight: float
     age_s: float
@@ -149,35 +150,35 @@ class _Interval:
         if self._next_s <= now:  # the quotient was rounded down across a boundary
             self._next_s = now + interval_s
         waiting = [
-            (-score(entry, now, self._params), slot, entry)
-            for slot, entry in entries.items()
-            if slot not in self.marked
+            (-score(entry, now, self._params), channel_id, entry)
+            for channel_id, entry in entries.items()
+            if channel_id not in self.marked
         ]
         waiting.sort()
         used_bytes = 0.0
-        for _, slot, entry in waiting:
+        for _, channel_id, entry in waiting:
             if used_bytes + entry.size_bytes <= self.budget_bytes:
-                self.marked[slot] = None
-                self.stale.pop(slot, None)
+                self.marked[channel_id] = None
+                self.stale.pop(channel_id, None)
                 used_bytes += entry.size_bytes
             elif (
                 entry.priority == PriorityClass.BULK
                 and entry.stale_after_s is not None
                 and now - entry.since_s > entry.stale_after_s
             ):
-                self.stale[slot] = None
+                self.stale[channel_id] = None
 
-    def offered(self, slot: int, old: _Entry | None, new: _Entry, *, encoded: bool) -> None:
-        self.stale.pop(slot, None)
-        if slot in self.marked and not encoded:
+    def offered(self, channel_id: int, old: _Entry | None, new: _Entry, *, encoded: bool) -> None:
+        self.stale.pop(channel_id, None)
+        if channel_id in self.marked and not encoded:
             same_message = old is not None and old.since_s == new.since_s and new.size_bytes <= old.size_bytes
             if not same_message:
-                del self.marked[slot]
+                del self.marked[channel_id]
 
-    def withdrawn(self, slot: int, *, encoding: bool) -> None:
-        self.stale.pop(slot, None)
+    def withdrawn(self, channel_id: int, *, encoding: bool) -> None:
+        self.stale.pop(channel_id, None)
         if not encoding:
-            self.marked.pop(slot, None)
+            self.marked.pop(channel_id, None)
 
 
 def score(entry: _Entry, now: float, params: SchedulerParams) -> float:
@@ -187,7 +188,7 @@ def score(entry: _Entry, now: float, params: SchedulerParams) -> float:
 
 
 class Scheduler:
-    """Decides which slot sends next. Times are seconds on one monotonic clock; `now` must not go back.
+    """Decides which channel sends next. Times are seconds on one monotonic clock; `now` must not go back.
 
     `quantum_bytes` is the credit that lets a lower class go next; a lane with larger fragments may raise it.
     """
@@ -214,7 +215,7 @@ class Scheduler:
 
     def offer(
         self,
-        slot: int,
+        channel_id: int,
         *,
         priority: PriorityClass,
         weight: float,
@@ -222,7 +223,7 @@ class Scheduler:
         since_s: float,
         stale_after_s: float | None = None,
     ) -> None:
-        """The slot has a pending message: a new head, or less of the same one left to send.
+        """The channel has a pending message: a new head, or less of the same one left to send.
 
         `weight` is κ(t), `size_bytes` the remaining size s(m) (an estimate will do). Age counts from `since_s`: the
         message's birth, or for a coalesced topic the time the topic was last sent; not later than the next `pick`.
@@ -234,58 +235,58 @@ class Scheduler:
         gain = weight / (size_bytes + self._epsilon_bytes) if size_bytes >= 0.0 else 0.0
         if not (0.0 < gain < _INF and -_INF < since_s < _INF):
             raise UsageError(
-                f"Scheduler.offer: slot {slot}: weight = {weight!r} must be above 0, size_bytes = {size_bytes!r} not "
-                f"negative, since_s = {since_s!r} finite"
+                f"Scheduler.offer: channel {channel_id}: weight = {weight!r} must be above 0, size_bytes = "
+                f"{size_bytes!r} not negative, since_s = {since_s!r} finite"
             )
         entries = self._entries
-        old = entries.get(slot)
-        entries[slot] = entry = _new_entry(_Entry, (priority, weight, size_bytes, since_s, stale_after_s))
+        old = entries.get(channel_id)
+        entries[channel_id] = entry = _new_entry(_Entry, (priority, weight, size_bytes, since_s, stale_after_s))
         if old is not None and old[0] is not priority:
-            self._remove(slot, old[0])
-        self._tables[priority].put(slot, gain, since_s)
+            self._remove(channel_id, old[0])
+        self._tables[priority].put(channel_id, gain, since_s)
         if self._encoding or self._interval is not None:
-            encoded = self._release(slot)
+            encoded = self._release(channel_id)
             if encoded is not None and encoded.priority is not priority:
                 self._settle_credit(encoded.priority)
             if self._interval is not None:
-                self._interval.offered(slot, old, entry, encoded=encoded is not None)
+                self._interval.offered(channel_id, old, entry, encoded=encoded is not None)
 
-    def withdraw(self, slot: int, *, encoding: bool = False) -> None:
-        """Nothing of the slot can be sent now. Idempotent.
+    def withdraw(self, channel_id: int, *, encoding: bool = False) -> None:
+        """Nothing of the channel can be sent now. Idempotent.
 
         With `encoding` the message will be back: meanwhile others are served, its class keeps the credit of its floor,
         and (ordering `paper`) it keeps its place in the interval. Without it, a class that has nothing else pending
         loses its credit.
         """
-        entry = self._entries.pop(slot, None)
+        entry = self._entries.pop(channel_id, None)
         if encoding and entry is not None:
-            self._encoding[slot] = entry
+            self._encoding[channel_id] = entry
             self._held[entry.priority] += 1
         elif self._encoding and not encoding:
-            held = self._release(slot)
+            held = self._release(channel_id)
             if held is not None:
                 self._settle_credit(held.priority)
         if entry is not None:
-            self._remove(slot, entry[0])
+            self._remove(channel_id, entry[0])
         if self._interval is not None:
-            self._interval.withdrawn(slot, encoding=encoding)
+            self._interval.withdrawn(channel_id, encoding=encoding)
 
-    def _remove(self, slot: int, priority: PriorityClass) -> None:
+    def _remove(self, channel_id: int, priority: PriorityClass) -> None:
         table = self._tables[priority]
-        table.remove(slot)
-        if not table.slots:
+        table.remove(channel_id)
+        if not table.channel_ids:
             self._settle_credit(priority)
 
-    def _release(self, slot: int) -> _Entry | None:
+    def _release(self, channel_id: int) -> _Entry | None:
         """The message is no longer being encoded."""
-        entry = self._encoding.pop(slot, None)
+        entry = self._encoding.pop(channel_id, None)
         if entry is not None:
             self._held[entry.priority] -= 1
         return entry
 
     def _settle_credit(self, priority: PriorityClass) -> None:
         """Credit is for backlog only: a class without any starts from nothing (debts stay)."""
-        if not self._tables[priority].slots and not self._held[priority]:
+        if not self._tables[priority].channel_ids and not self._held[priority]:
             if priority == 1:
                 self._state_credit = min(self._state_credit, 0.0)
             elif priority == 2:
@@ -293,108 +294,108 @@ class Scheduler:
 
     def pending(self, priority: PriorityClass) -> int:
         """Slots of the class that could be served; those being encoded are not counted."""
-        return len(self._tables[priority].slots)
+        return len(self._tables[priority].channel_ids)
 
     # Whose turn it is
 
     def pick(self, *, now: float, window_open: bool = True) -> int | None:
-        """The slot to serve next, or None. Asking changes nothing: it may be asked again, or not be followed."""
+        """The channel to serve next, or None. Asking changes nothing: it may be asked again, or not be followed."""
         if self._interval is not None:
             return self._pick_marked(self._interval, now, window_open=window_open)
         control = self._control
-        if control.slots and now >= self._bucket.ready_s:
+        if control.channel_ids and now >= self._bucket.ready_s:
             if not window_open:
                 return control.best(now)
-            if self._state_credit >= self._quantum_bytes and self._state.slots:
+            if self._state_credit >= self._quantum_bytes and self._state.channel_ids:
                 return self._state.best(now)
-            if self._bulk_credit >= self._quantum_bytes and self._bulk.slots:
+            if self._bulk_credit >= self._quantum_bytes and self._bulk.channel_ids:
                 return self._bulk.best(now)
             return control.best(now)
         if not window_open:
             return None
         bulk = self._bulk
-        if self._state.slots:
-            if self._bulk_credit >= self._quantum_bytes and bulk.slots:
+        if self._state.channel_ids:
+            if self._bulk_credit >= self._quantum_bytes and bulk.channel_ids:
                 return bulk.best(now)
             return self._state.best(now)
-        if bulk.slots:
+        if bulk.channel_ids:
             return bulk.best(now)
-        return control.best(now) if control.slots else None  # spent, but nobody else wants the link
+        return control.best(now) if control.channel_ids else None  # spent, but nobody else wants the link
 
     def pick_control(self, *, now: float, window_open: bool) -> int | None:
-        """The slot of class control to serve next on a connection of its own: beyond its share of the link it goes by
-        the window, and only where nobody else wants the link.
+        """The channel of class control to serve next on a connection of its own: beyond its share of the link it goes
+        by the window, and only where nobody else wants the link.
 
         Ordering `class` only, like `pick_rest`.
         """
         control = self._control
-        if control.slots and (
-            now >= self._bucket.ready_s or (window_open and not (self._state.slots or self._bulk.slots))
+        if control.channel_ids and (
+            now >= self._bucket.ready_s or (window_open and not (self._state.channel_ids or self._bulk.channel_ids))
         ):
             return control.best(now)
         return None
 
     def control_deadline(self) -> float | None:
-        """When `pick_control`, None by now with the window closed, can name a slot by time alone."""
-        return self._bucket.ready_s if self._control.slots else None
+        """When `pick_control`, None by now with the window closed, can name a channel by time alone."""
+        return self._bucket.ready_s if self._control.channel_ids else None
 
     def within_share(self, now: float) -> bool:
         """Whether class 0 has something left of its share of the link."""
         return now >= self._bucket.ready_s
 
     def pick_rest(self, *, now: float) -> int | None:
-        """The slot to serve next when class control has a connection of its own."""
+        """The channel to serve next when class control has a connection of its own."""
         state, bulk = self._state, self._bulk
-        if bulk.slots and (not state.slots or self._bulk_credit >= self._quantum_bytes):
+        if bulk.channel_ids and (not state.channel_ids or self._bulk_credit >= self._quantum_bytes):
             return bulk.best(now)
-        return state.best(now) if state.slots else None
+        return state.best(now) if state.channel_ids else None
 
     def _pick_marked(self, interval: _Interval, now: float, *, window_open: bool) -> int | None:
         interval.advance(self._entries, now)
         return self._first_marked(interval, now, window_open=window_open)
 
     def _first_marked(self, interval: _Interval, now: float, *, window_open: bool) -> int | None:
-        for slot in interval.marked:
-            entry = self._entries.get(slot)
+        for channel_id in interval.marked:
+            entry = self._entries.get(channel_id)
             if entry is None:
                 continue  # being encoded
             if window_open or (entry.priority == 0 and now >= self._bucket.ready_s):
-                return slot
+                return channel_id
         return None
 
     def best(self, priority: PriorityClass, *, now: float) -> int | None:
-        """The slot of the class with the highest score, or None; neither window nor bucket nor floors are asked.
+        """The channel of the class with the highest score, or None; neither window nor bucket nor floors are asked.
 
         For a link that probes a stalled path with single fresh messages.
         """
         table = self._tables[priority]
-        return table.best(now) if table.slots else None
+        return table.best(now) if table.channel_ids else None
 
-    def charge(self, slot_priority: PriorityClass, nbytes: int, *, now: float) -> None:
+    def charge(self, priority: PriorityClass, nbytes: int, *, now: float) -> None:
         """`nbytes` of that class were put on the wire, overhead included, whether or not `pick` had named it."""
         bucket = self._bucket
-        if slot_priority == 0:
+        if priority == 0:
             urgent_waits = True
             bucket.take(nbytes, now)
         else:
-            urgent_waits = bool(self._control.slots) and now >= bucket.ready_s
+            urgent_waits = bool(self._control.channel_ids) and now >= bucket.ready_s
         earned = self._floor * nbytes
         # Served in its own right, a class pays nothing and saves nothing; served from its floor, it pays. What a
         # fragment larger than the credit left as a debt is paid off by later traffic, backlog or not: else a class
         # of single large messages would get more than its floor.
         held = self._held
         credit = self._state_credit + earned
-        limit = self._credit_max if self._state.slots or held[1] else 0.0
-        if slot_priority == 1:
+        limit = self._credit_max if self._state.channel_ids or held[1] else 0.0
+        if priority == 1:
             if urgent_waits:
                 credit -= nbytes
             else:
                 limit = 0.0
         self._state_credit = credit if credit < limit else limit
         credit = self._bulk_credit + earned
-        limit = self._credit_max if self._bulk.slots or held[2] else 0.0
-        if slot_priority == 2:
-            if urgent_waits or self._state.slots:
+        limit = self._credit_max if self._bulk.channel_ids or held[2] else 0.0
+        if priority == 2:
+            if urgent_waits or self._state.channel_ids:
                 credit -= nbytes
             else:
                 limit = 0.0
@@ -421,21 +422,23 @@ class Scheduler:
         return self._bucket.tokens_bytes(now)
 
     def next_deadline(self, *, now: float, window_open: bool) -> float | None:
-        """When `pick`, None by now, can name a slot by time alone; None if only another call can change that."""
+        """When `pick`, None by now, can name a channel by time alone; None if only another call can change that."""
         if self.pick(now=now, window_open=window_open) is not None:
             return None
         interval = self._interval
         if interval is None:
-            return self._bucket.ready_s if self._control.slots else None
+            return self._bucket.ready_s if self._control.channel_ids else None
         deadline = None
-        if any(slot not in interval.marked for slot in self._entries):
+        if any(channel_id not in interval.marked for channel_id in self._entries):
             deadline = interval.next_s
-        if any(self._entries[slot].priority == 0 for slot in interval.marked if slot in self._entries):
+        if any(
+            self._entries[channel_id].priority == 0 for channel_id in interval.marked if channel_id in self._entries
+        ):
             deadline = self._bucket.ready_s if deadline is None else min(deadline, self._bucket.ready_s)
         return deadline
 
     def take_stale(self, now: float) -> list[int]:
-        """Ordering `paper`: the slots whose message the last interval found stale, of class bulk, and not fitting.
+        """Ordering `paper`: the channels whose message the last interval found stale, of class bulk, and not fitting.
 
         Each is named once per interval; the caller drops the message (reason `stale`) and withdraws or offers anew.
         """
@@ -454,17 +457,17 @@ class Scheduler:
         return bool(self._entries or self._encoding)
 
     def waiting(self) -> list[int]:
-        """The slots of which something waits, those whose message is being encoded included."""
+        """The channels of which something waits, those whose message is being encoded included."""
         return [*self._entries, *self._encoding]
 
     def waits_for(
-        self, slot: int, now: float, *, window_open: bool = True, beside: bool = False
+        self, channel_id: int, now: float, *, window_open: bool = True, beside: bool = False
     ) -> tuple[WaitReason | None, int | None]:
-        """What a slot of `waiting` waits for, None: it is the next one; and which slot is the next one, None: nobody
+        """What a channel of `waiting` waits for, None: it is the next; and which channel is the next, None: nobody
         is. `beside`: class control has a connection of its own (`pick_control`, `pick_rest`). It changes nothing."""
-        if slot not in self._entries:
+        if channel_id not in self._entries:
             return WaitReason.ENCODING, None
-        entry = self._entries[slot]
+        entry = self._entries[channel_id]
         if beside and self._interval is None:
             if entry.priority == 0:
                 chosen = self.pick_control(now=now, window_open=window_open)
@@ -474,40 +477,40 @@ class Scheduler:
             chosen = self._first_marked(self._interval, now, window_open=window_open)
         else:
             chosen = self.pick(now=now, window_open=window_open)
-        return self._reason(slot, entry, chosen, now, window_open=window_open), chosen
+        return self._reason(channel_id, entry, chosen, now, window_open=window_open), chosen
 
-    def explain(self, slot: int, now: float, *, window_open: bool = True) -> Standing | None:
-        """How the slot stands at `now`, and what it waits for; None when nothing of it is pending. O(n)."""
-        entry = self._entries.get(slot) or self._encoding.get(slot)
+    def explain(self, channel_id: int, now: float, *, window_open: bool = True) -> Standing | None:
+        """How the channel stands at `now`, and what it waits for; None when nothing of it is pending. O(n)."""
+        entry = self._entries.get(channel_id) or self._encoding.get(channel_id)
         if entry is None:
             return None
         return Standing(
-            slot=slot,
+            channel_id=channel_id,
             priority=entry.priority,
             weight=entry.weight,
             age_s=now - entry.since_s,
             size_bytes=entry.size_bytes,
             score=score(entry, now, self.params),
-            rank=self._rank(slot, entry, now),
-            waits_for=self.waits_for(slot, now, window_open=window_open)[0],
+            rank=self._rank(channel_id, entry, now),
+            waits_for=self.waits_for(channel_id, now, window_open=window_open)[0],
         )
 
-    def _rank(self, slot: int, entry: _Entry, now: float) -> int:
+    def _rank(self, channel_id: int, entry: _Entry, now: float) -> int:
         by_class = self._interval is None
         own = score(entry, now, self.params)
         return sum(
             (by_class and other.priority < entry.priority)
             or ((not by_class or other.priority == entry.priority) and score(other, now, self.params) > own)
-            for other_slot, other in self._entries.items()
-            if other_slot != slot
+            for other_id, other in self._entries.items()
+            if other_id != channel_id
         )
 
     def _reason(
-        self, slot: int, entry: _Entry, chosen: int | None, now: float, *, window_open: bool
+        self, channel_id: int, entry: _Entry, chosen: int | None, now: float, *, window_open: bool
     ) -> WaitReason | None:
-        if chosen == slot:
+        if chosen == channel_id:
             return None
-        if self._interval is not None and slot not in self._interval.marked:
+        if self._interval is not None and channel_id not in self._interval.marked:
             return WaitReason.INTERVAL
         spent = entry.priority == 0 and now < self._bucket.ready_s
         if chosen is None:
@@ -529,12 +532,14 @@ class Scheduler:
             table.validate()
         assert not self._entries.keys() & self._encoding.keys()
         assert self._held == [sum(entry.priority == c for entry in self._encoding.values()) for c in CLASSES]
-        assert sum(len(table.slots) for table in self._tables) == len(self._entries)
-        for slot, entry in self._entries.items():
-            assert slot in self._tables[entry.priority].slots, f"slot {slot} is not in the table of its class"
+        assert sum(len(table.channel_ids) for table in self._tables) == len(self._entries)
+        for channel_id, entry in self._entries.items():
+            assert channel_id in self._tables[entry.priority].channel_ids, (
+                f"channel {channel_id} is not in the table of its class"
+            )
         for priority, credit in ((PriorityClass.STATE, self._state_credit), (PriorityClass.BULK, self._bulk_credit)):
             assert credit <= self._credit_max
-            backlog = self._tables[priority].slots or self._held[priority]
+            backlog = self._tables[priority].channel_ids or self._held[priority]
             assert credit <= 0.0 or backlog, f"class {priority} has credit without backlog"
         if self._interval is not None:
             known = self._entries.keys() | self._encoding.keys()

@@ -96,7 +96,7 @@ class Message:
     `seq` counts from 1 per stream without gaps as assigned by the origin. `stamp_ns` is the wall time at which the
     origin's endpoint took it (never used for expiry). `born_s` is its birth on *this* process's monotonic clock:
     arrival time minus the age it had gathered, so that age needs no common clock.
-    A `tombstone` has a body of one byte and stands for a reliable message that was dropped for `reason` upstream.
+    A `drop_marker` has a body of one byte and stands for a reliable message that was dropped for `reason` upstream.
     `body` is encoded as `codec` says, from the origin to whoever publishes it; relays pass it on as it is.
     """
 
@@ -105,7 +105,7 @@ class Message:
     body: bytes
     stamp_ns: int
     born_s: float
-    tombstone: int = 0  # 0, or a DROP_CODES value
+    drop_marker: int = 0  # 0, or a DROP_CODES value
     replay: bool = False  # a transient_local message sent again to a late joiner
     error_s: float = 0.0  # the message may be older than `born_s` says by as much: clock offsets of the hops so far
     codec: int = Codec.NONE
@@ -115,8 +115,8 @@ class Message:
 
     @property
     def drop_reason(self) -> DropReason:
-        """Why the message that this tombstone stands for was dropped."""
-        return DROP_REASONS.get(self.tombstone, DropReason.LOST)
+        """Why the message that this drop marker stands for was dropped."""
+        return DROP_REASONS.get(self.drop_marker, DropReason.LOST)
 
 
 @dataclass(slots=True)

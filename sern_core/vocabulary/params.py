@@ -52,7 +52,7 @@ class SchedulerParams:
 class WindowAlgorithm(StrEnum):
     """Who decides how many bytes may be in flight."""
 
-    DELAY = "delay"  # measured: keeps the standing queue near a few milliseconds
+    HYBRID = "hybrid"  # by measured delay and rate: keeps the standing queue near a few milliseconds
     FIXED = "fixed"  # `fixed_bytes`, for experiments and for links whose capacity is known
 
 
@@ -60,7 +60,7 @@ class WindowAlgorithm(StrEnum):
 class WindowParams:
     """The window of bytes in flight on one lane."""
 
-    algorithm: WindowAlgorithm = WindowAlgorithm.DELAY
+    algorithm: WindowAlgorithm = WindowAlgorithm.HYBRID
     fixed_bytes: int = 25_000
     """W of algorithm `fixed`: 4 Mbit/s × 50 ms, the link of the measurements in the documentation."""
 

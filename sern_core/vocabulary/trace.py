@@ -43,7 +43,7 @@ class TraceEvent(StrEnum):
     SENT = "sent"  # its last fragment left
     LOST = "lost"  # a fragment was lost on the way, and goes again
     ACKED = "acked"  # the other end has it whole
-    CONFIRMED = "confirmed"  # reliable: everybody who is owed the stream has everything up to it
+    CONFIRMED = "confirmed"  # reliable: all required clients have everything up to it
     # On both
     DROPPED = "dropped"  # for a DropReason
     # On the way in

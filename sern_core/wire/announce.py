@@ -28,7 +28,7 @@ MAX_ATTRIBUTES: Final = 16
 MAX_ATTRIBUTE_CHARS: Final = 256
 MAX_ATTRIBUTE_BYTES: Final = 1024
 """All attributes of a stream. With the bounds on the names every announcement fits into an envelope."""
-MAX_CHANNEL: Final = 0xFFFF
+MAX_CHANNEL_ID: Final = 0xFFFF
 _ENCODINGS: Final = frozenset(Encoding)
 _DIGEST: Final = re.compile(rf"(?:[0-9a-f]{{{DEFINITION_HASH_CHARS}}})?")
 
@@ -42,24 +42,24 @@ def definition_hash(definition: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Announcement:
-    """A stream on a channel of the session. `first`: nothing below this seq will come. `owed`: who must get it.
-    `more`: only `owed` counts, and goes on in another part."""
+    """A stream on a channel of the session. `first`: nothing below this seq will come. `required`: who must get it.
+    `more`: only `required` counts, and goes on in another part."""
 
-    channel: int
+    channel_id: int
     stream: StreamInfo
     definition_hash: str
     first: int
-    owed: tuple[str, ...] = ()
+    required: tuple[str, ...] = ()
     more: bool = False
 
 
 def encode_announcement(announcement: Announcement) -> framing.Envelope:
-    """The envelope of an announcement. Of `owed`, as many names as it has room for."""
+    """The envelope of an announcement. Of `required`, as many names as it has room for."""
     stream = announcement.stream
     info, spec = stream.info, stream.spec
     envelope: framing.Envelope = {
         "t": "announce",
-        "ch": announcement.channel,
+        "ch": announcement.channel_id,
         "or": stream.id.origin,
         "boot": stream.id.boot,
         "topic": stream.id.topic,
@@ -68,7 +68,7 @@ def encode_announcement(announcement: Announcement) -> framing.Envelope:
         "hash": info.type_hash,
         "dh": announcement.definition_hash,
         "first": announcement.first,
-        "owed": list(announcement.owed[:MAX_STRINGS]),
+        "owed": list(announcement.required[:MAX_STRINGS]),
         "cls": int(spec.priority),
         "w": spec.weight,
         "rel": spec.reliable,
@@ -87,17 +87,17 @@ def encode_announcement(announcement: Announcement) -> framing.Envelope:
 
 
 def announcement_parts(announcement: Announcement) -> list[framing.Envelope]:
-    """The envelopes of an announcement, so many that all of `owed` has room."""
+    """The envelopes of an announcement, so many that all of `required` has room."""
     parts: list[framing.Envelope] = []
     stream = announcement.stream
     part = replace(announcement, stream=StreamInfo(stream.id, stream.info, stream.spec), more=True)
-    owed = announcement.owed
+    required = announcement.required
     while True:
-        last = encode_announcement(replace(announcement, owed=owed))
-        if len(last["owed"]) == len(owed):
+        last = encode_announcement(replace(announcement, required=required))
+        if len(last["owed"]) == len(required):
             return [*parts, last]
-        parts.append(encode_announcement(replace(part, owed=owed)))  # without attributes: names fit for certain
-        owed = owed[len(parts[-1]["owed"]) :]
+        parts.append(encode_announcement(replace(part, required=required)))  # without attributes: names fit for certain
+        required = required[len(parts[-1]["owed"]) :]
 
 
 def check_stream(stream: StreamInfo) -> None:
@@ -113,7 +113,7 @@ def check_onwards(stream: StreamInfo) -> None:
     and `first` it has there. Types are ASCII, like the names of ROS."""
     if not (stream.info.type_name.isascii() and stream.info.type_hash.isascii()):
         raise WireError(f"type {stream.info.type_name[:80]!r} or its hash holds something else than ASCII")
-    onwards = Announcement(MAX_CHANNEL, stream, stream.definition_hash, framing.MAX_SEQ)
+    onwards = Announcement(MAX_CHANNEL_ID, stream, stream.definition_hash, framing.MAX_SEQ)
     envelope = encode_announcement(onwards)
     framing.encode_envelope(envelope)  # it is not too long; what was packed is what would be unpacked
     decode_announcement(envelope)
@@ -167,52 +167,52 @@ def decode_announcement(envelope: framing.Envelope) -> Announcement:
     )
     origin = ClientName(framing.take_str(envelope, "or", max_length=64))
     return Announcement(
-        channel=framing.take_int(envelope, "ch", low=1, high=MAX_CHANNEL),
+        channel_id=framing.take_int(envelope, "ch", low=1, high=MAX_CHANNEL_ID),
         stream=StreamInfo(StreamId(origin, framing.take_int(envelope, "boot"), topic), info, spec, attributes),
         definition_hash=digest,
         first=framing.take_int(envelope, "first", low=1, high=framing.MAX_SEQ),
-        owed=tuple(framing.take_strings(envelope, "owed", max_length=64)),
+        required=tuple(framing.take_strings(envelope, "owed", max_length=64)),
         more=framing.take_bool(envelope, "more"),
     )
 
 
 @dataclass(frozen=True, slots=True)
 class Want:
-    """Whether streams are wanted. `runs`: first and last of the channels it is said of, rising. `owed`: who is to get
-    them if they are reliable; None: `add` and `drop` are the difference to what was said before. `more`: only `owed`
-    counts, and goes on in another part."""
+    """Whether streams are wanted. `runs`: first and last of the channels it is said of, rising. `required`: who is to
+    get them if they are reliable; None: `add` and `drop` are the difference to what was said before. `more`: only
+    `required` counts, and goes on in another part. On the wire its key is `owed`."""
 
     runs: tuple[tuple[int, int], ...]
     on: bool
-    owed: tuple[str, ...] | None
+    required: tuple[str, ...] | None
     add: tuple[str, ...]
     drop: tuple[str, ...]
     more: bool
 
 
 def encode_want(
-    slots: Sequence[int],
+    channel_ids: Sequence[int],
     on: bool,
     *,
-    owed: Sequence[str] = (),
+    required: Sequence[str] = (),
     add: Sequence[str] | None = None,
     drop: Sequence[str] | None = None,
     more: bool = False,
 ) -> framing.Envelope:
-    """The envelope that says the same of rising `slots`: the first, and runs of the others. A peer that knows neither
-    `chs` nor differences is told each channel by itself, and whole lists."""
+    """The envelope that says the same of rising `channel_ids`: the first, and runs of the others. A peer that knows
+    neither `chs` nor differences is told each channel by itself, and whole lists."""
     runs: list[int] = []
-    for slot in slots[1:]:
-        if runs and slot == runs[-1] + 1:
-            runs[-1] = slot
+    for channel_id in channel_ids[1:]:
+        if runs and channel_id == runs[-1] + 1:
+            runs[-1] = channel_id
         else:
-            runs += [slot, slot]
+            runs += [channel_id, channel_id]
     envelope: framing.Envelope = {
         "t": "want",
-        "ch": slots[0],
+        "ch": channel_ids[0],
         "on": on,
         "chs": runs or None,
-        "owed": list(owed) or None,
+        "owed": list(required) or None,
         "add": None if add is None else list(add),
         "drop": list(drop) if drop else None,
         "more": more or None,
@@ -235,17 +235,17 @@ def decode_want(envelope: framing.Envelope) -> Want:
     return Want(
         runs=tuple(runs),
         on=framing.take_bool(envelope, "on"),
-        owed=None if difference else tuple(framing.take_strings(envelope, "owed", max_length=64)),
+        required=None if difference else tuple(framing.take_strings(envelope, "owed", max_length=64)),
         add=tuple(framing.take_strings(envelope, "add", max_length=64)),
         drop=tuple(framing.take_strings(envelope, "drop", max_length=64)),
         more=framing.take_bool(envelope, "more"),
     )
 
 
-def encode_dropped(channel: int, seq: int, code: int, where: str, count: int = 1) -> framing.Envelope:
+def encode_dropped(channel_id: int, seq: int, code: int, where: str, count: int = 1) -> framing.Envelope:
     """The envelope that says that `count` messages from `seq` on were dropped; more than one only to a peer that
     understands runs. `where`: the client that will not get them, empty: several."""
-    envelope: framing.Envelope = {"t": "dropped", "ch": channel, "seq": seq, "code": code, "to": where, "n": count}
+    envelope: framing.Envelope = {"t": "dropped", "ch": channel_id, "seq": seq, "code": code, "to": where, "n": count}
     if count == 1:
         del envelope["n"]
     return envelope

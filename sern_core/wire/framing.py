@@ -18,10 +18,10 @@ the UDP lane. All integers are big endian.
 Frames of a kind-16 datagram, each starting with its type:
 
    type 1 DATA (18 bytes, +14 when offset is 0, then `length` body bytes)
-   +------+-------+---------+-------+----------+---------+--------+
-   | type | flags | channel | seq   | offset   | total   | length |
-   |  u8  |  u8   |  u16    |  u32  |  u32     |  u32    |  u16   |
-   +------+-------+---------+-------+----------+---------+--------+
+   +------+-------+------------+-------+----------+---------+--------+
+   | type | flags | channel_id | seq   | offset   | total   | length |
+   |  u8  |  u8   |  u16       |  u32  |  u32     |  u32    |  u16   |
+   +------+-------+------------+-------+----------+---------+--------+
    | stamp_ns i64 | age u32 (100 us) | codec u8 | age error u8    |   only when offset is 0
    +--------------+------------------+----------+-----------------+
        the true age is at most `age` + AGE_ERRORS_S[age error]: 0 for none, n for 100 us * 2^((n-1)/8), 255 unknown
@@ -29,7 +29,7 @@ Frames of a kind-16 datagram, each starting with its type:
    type 2 ACK (38 bytes): lane u8, highest u32, sack u64, echo stamp u64, receive stamp u64, cumulative bytes u64
        bit i of sack: packet highest-1-i has arrived; the stamps belong to packet `highest`, in microseconds;
        at most 4 ACK frames a datagram
-   type 3 WATERMARK (7 bytes): channel u16, delivered u32: every seq up to it is delivered, expired or refused
+   type 3 WATERMARK (7 bytes): channel_id u16, delivered u32: every seq up to it is delivered, expired or refused
    type 4 PING (1 byte): asks for an acknowledgement
 
 `seq` is the low 32 bits of a 64-bit count; the receiver widens it next to what it expects (RFC 1982 style).
@@ -91,10 +91,10 @@ MAX_AGE_S: Final = AGE_UNIT_S * 0xFFFFFFFF
 AGE_ERRORS_S: Final = (0.0, *(AGE_UNIT_S * 2.0 ** (code / 8) for code in range(254)), float("inf"))
 """How much too young an age may be, by its code: every hop adds the uncertainty of its own clock offset."""
 
-FLAG_TOMBSTONE: Final = 0x01  # the message was dropped upstream; the body is one byte, its DROP_CODES value
+FLAG_DROP_MARKER: Final = 0x01  # the message was dropped upstream; the body is one byte, its DROP_CODES value
 FLAG_REPLAY: Final = 0x02  # a transient_local sample for a late joiner
 FLAG_URGENT: Final = 0x04  # class control: acknowledge at once
-KNOWN_FLAGS: Final = FLAG_TOMBSTONE | FLAG_REPLAY | FLAG_URGENT
+KNOWN_FLAGS: Final = FLAG_DROP_MARKER | FLAG_REPLAY | FLAG_URGENT
 
 
 class Kind(IntEnum):
@@ -134,7 +134,7 @@ class FrameSink(Protocol):
     def on_data(
         self,
         flags: int,
-        channel: int,
+        channel_id: int,
         seq: int,
         offset: int,
         total: int,
@@ -147,7 +147,7 @@ class FrameSink(Protocol):
 
     def on_ack(self, lane: int, highest: int, sack: int, echo_us: int, received_us: int, cum_bytes: int) -> None: ...
 
-    def on_watermark(self, channel: int, delivered: int) -> bool | None: ...
+    def on_watermark(self, channel_id: int, delivered: int) -> bool | None: ...
 
     def on_ping(self) -> None: ...
 
@@ -191,7 +191,7 @@ def decode_frames(data: Datagram, sink: FrameSink, position: int = HEADER_BYTES)
         if kind == FRAME_DATA:
             if position + DATA_BYTES > end:
                 raise WireError("truncated DATA frame")
-            _, flags, channel, seq, offset, total, length = unpack_data(data, position)
+            _, flags, channel_id, seq, offset, total, length = unpack_data(data, position)
             position += DATA_BYTES
             stamp_ns, age, codec, error = 0, 0, 0, 0
             if offset == 0:
@@ -212,11 +212,11 @@ def decode_frames(data: Datagram, sink: FrameSink, position: int = HEADER_BYTES)
             if length < SMALL_BODY_BYTES and type(data) is memoryview:
                 data = data.tobytes()  # small bodies, of which a datagram has many, are quicker cut from bytes
             body = data[position : position + length]
-            if flags & FLAG_TOMBSTONE and total != 1:
-                raise WireError("a tombstone carries exactly one byte")
+            if flags & FLAG_DROP_MARKER and total != 1:
+                raise WireError("a tombstone carries exactly one byte")  # a drop marker, in the words of the vectors
             position += length
             if sink.on_data(
-                flags, channel, seq, offset, total, body, stamp_ns, age * AGE_UNIT_S, codec, AGE_ERRORS_S[error]
+                flags, channel_id, seq, offset, total, body, stamp_ns, age * AGE_UNIT_S, codec, AGE_ERRORS_S[error]
             ):
                 return position
         elif kind == FRAME_ACK:
@@ -231,9 +231,9 @@ def decode_frames(data: Datagram, sink: FrameSink, position: int = HEADER_BYTES)
         elif kind == FRAME_WATERMARK:
             if position + WATERMARK.size > end:
                 raise WireError("truncated WATERMARK frame")
-            _, channel, delivered = WATERMARK.unpack_from(data, position)
+            _, channel_id, delivered = WATERMARK.unpack_from(data, position)
             position += WATERMARK.size
-            if sink.on_watermark(channel, delivered):
+            if sink.on_watermark(channel_id, delivered):
                 return position
         elif kind == FRAME_PING:
             position += 1
@@ -245,7 +245,7 @@ def decode_frames(data: Datagram, sink: FrameSink, position: int = HEADER_BYTES)
 
 def encode_data_first(
     flags: int,
-    channel: int,
+    channel_id: int,
     seq: int,
     total: int,
     length: int,
@@ -260,12 +260,14 @@ def encode_data_first(
     """
     age = 0xFFFFFFFF if age_s >= MAX_AGE_S else int(age_s / AGE_UNIT_S) if age_s > 0.0 else 0
     error = bisect_left(AGE_ERRORS_S, error_s) if error_s else 0
-    return DATA_FIRST.pack(FRAME_DATA, flags, channel, seq & 0xFFFFFFFF, 0, total, length, stamp_ns, age, codec, error)
+    return DATA_FIRST.pack(
+        FRAME_DATA, flags, channel_id, seq & 0xFFFFFFFF, 0, total, length, stamp_ns, age, codec, error
+    )
 
 
-def encode_data_next(flags: int, channel: int, seq: int, offset: int, total: int, length: int) -> bytes:
+def encode_data_next(flags: int, channel_id: int, seq: int, offset: int, total: int, length: int) -> bytes:
     """Header of a fragment at `offset` > 0 (18 bytes); the body follows it."""
-    return DATA_FIXED.pack(FRAME_DATA, flags, channel, seq & 0xFFFFFFFF, offset, total, length)
+    return DATA_FIXED.pack(FRAME_DATA, flags, channel_id, seq & 0xFFFFFFFF, offset, total, length)
 
 
 def encode_ack(lane: int, highest: int, sack: int, echo_us: int, received_us: int, cum_bytes: int) -> bytes:
@@ -274,8 +276,8 @@ def encode_ack(lane: int, highest: int, sack: int, echo_us: int, received_us: in
     )
 
 
-def encode_watermark(channel: int, delivered: int) -> bytes:
-    return WATERMARK.pack(FRAME_WATERMARK, channel, delivered & 0xFFFFFFFF)
+def encode_watermark(channel_id: int, delivered: int) -> bytes:
+    return WATERMARK.pack(FRAME_WATERMARK, channel_id, delivered & 0xFFFFFFFF)
 
 
 PING_FRAME: Final = bytes([FRAME_PING])

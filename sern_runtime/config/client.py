@@ -97,7 +97,7 @@ class RelayConnection(Section):
     """This client's secret key file (.key)."""
     udp: bool = True
     """Use the datagram lane when the relay offers it and it gets through: a lost packet then delays nothing else."""
-    express: bool = True
+    priority_connections: bool = True
     """Where data goes over TCP, give class control two connections of its own: a command or pose then waits neither
     behind bulk bytes nor for the retransmission of one, and goes over both while TCP loses packets (see
     `link.redundancy`)."""

@@ -246,7 +246,7 @@ class Ros1Endpoint(EndpointBase):
     """Longer messages of local nodes are dropped and counted, longer service calls fail."""
     tcp_nodelay: bool = True
     """Ask local publishers to send small messages at once."""
-    heed_sern: bool = False
+    accept_bridged: bool = False
     """Take what other SERN endpoints publish and serve at this master for its own nodes'. For a chain of two links with
     the master in the middle; with two of them side by side it makes a loop."""
 
@@ -312,7 +312,7 @@ class DdsEndpoint(EndpointBase):
     offer_lifespan: bool = False
     """Offer what is published here with its lifespan: readers then drop what is older, by their own clocks, which must
     agree with this host's."""
-    heed_sern: bool = False
+    accept_bridged: bool = False
     """Take what other SERN endpoints publish in this domain for this site's own. For a chain of two links with the
     domain in the middle; with two of them side by side it makes a loop."""
 

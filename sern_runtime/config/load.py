@@ -15,6 +15,7 @@ from pydantic_core import ErrorDetails
 
 from sern_core.vocabulary.errors import ConfigError
 from sern_runtime.config.base import FileModel, Section, resolve
+from sern_runtime.config.renamed import renamed_key, renamed_value
 from sern_runtime.config.yaml import Document, Loc, Node, parse_document, read_document
 
 M = TypeVar("M", bound=FileModel)
@@ -168,7 +169,10 @@ def _render(document: Document, model: type[Section], details: ErrorDetails) -> 
     if kind == "extra_forbidden":
         parent = _trace(document, model, loc[:-1])
         key = str(loc[-1])
-        return document.error((*parent.loc, key), _unknown("key", key, accepted_keys(parent.models), quiet=True))
+        accepted = accepted_keys(parent.models)
+        new = renamed_key(key, accepted)
+        problem = _unknown("key", key, accepted, quiet=True) if new is None else f"is called {new} now"
+        return document.error((*parent.loc, key), problem)
     place = _trace(document, model, loc)
     if kind == "fault":
         return document.error((*place.loc, *context["at"]), str(context["problem"]))
@@ -217,6 +221,10 @@ def _expected(what: str) -> Callable[[dict[str, Any], _Place], str]:
 def _choice(context: dict[str, Any], place: _Place) -> str:
     words = [word.strip().strip("'") for word in str(context["expected"]).replace(" or ", ", ").split(",")]
     value = place.node.value
+    if isinstance(value, str) and place.loc:
+        new = renamed_value(str(place.loc[-1]), value, words)
+        if new is not None:
+            return f"{_shown(place)} is called {new} now"
     close = difflib.get_close_matches(value, words, n=1) if isinstance(value, str) else []
     hint = f" (did you mean {close[0]}?)" if close else ""
     return f"{_shown(place)} is not accepted{hint}; accepted: {', '.join(words)}"

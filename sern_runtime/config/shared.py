@@ -78,7 +78,7 @@ class WindowSection(Section):
     """How many bytes may be in flight."""
 
     algorithm: WindowAlgorithm = _LINK.window.algorithm
-    """`delay`: measured, keeps the standing queue short; `fixed`: always `fixed_bytes`."""
+    """`hybrid`: by measured delay and rate, keeps the standing queue short; `fixed`: always `fixed_bytes`."""
     fixed_bytes: Bytes = _LINK.window.fixed_bytes
     """The window of algorithm `fixed`: capacity × round-trip time."""
 
@@ -131,8 +131,8 @@ class LinkSection(Section):
     max_message_bytes: Annotated[int, Field(ge=1024, le=1 << 30)] = _LINK.max_message_bytes
     """Larger messages are dropped and counted as `too_large`."""
     drain_s: Annotated[float, Field(ge=0, le=3600)] = 20.0
-    """How long a daemon that is stopped goes on with what it owes, at the most: it ends before when nothing is left or
-    nothing moves any more. A service manager must allow for it (systemd: TimeoutStopSec)."""
+    """How long a daemon that is stopped goes on delivering what waits, at the most: it ends before when nothing is left
+    or nothing moves any more. A service manager must allow for it (systemd: TimeoutStopSec)."""
 
     def params(self) -> LinkParams:
         return LinkParams(

@@ -7,10 +7,11 @@ from typing import Final
 import pytest
 
 from sern_client import latest
-from sern_client.endpoints.common import first
-from sern_client.endpoints.ros1 import Ros1Options, hold
+from sern_client.endpoints.common import first_messages
+from sern_client.endpoints.ros1 import Ros1Options
+from sern_client.endpoints.ros1 import first_messages as ros1_first_messages
 from sern_core.link import control_stream, definitions
-from sern_core.relay import access, awaited, draining, routing
+from sern_core.relay import absent, access, draining, routing
 from sern_core.relay.object_values import ObjectLimits
 from sern_core.site import peers
 from sern_core.stream import decoding, drop_reports, in_stream, latched, prices
@@ -18,7 +19,7 @@ from sern_core.vocabulary import ledger
 from sern_core.vocabulary.limits import LIMITS
 from sern_core.wire import numbering
 from sern_relay import server, transforms
-from sern_runtime import express, feed_inflow, feed_subscriptions
+from sern_runtime import feed_inflow, feed_subscriptions, priority_paths
 from sern_runtime.config.relay import RelaySection, ReplaySection
 
 ROOT: Final = Path(__file__).resolve().parents[2]
@@ -51,7 +52,7 @@ BOUNDS: Final[dict[str, tuple[str, ...]]] = {
     "patterns and names subscribed to": (f"{ROUTING.max_patterns} and {ROUTING.max_exact:,}",),
     "parts of an unfinished subscription": (
         f"{ROUTING.max_exact:,} patterns",
-        f"{LIMITS.owed:,} names",
+        f"{LIMITS.required:,} names",
     ),
     "definitions (": (
         nbytes(LIMITS.peer_definition_bytes),
@@ -65,7 +66,7 @@ BOUNDS: Final[dict[str, tuple[str, ...]]] = {
         f"for {drop_reports.UNREAD_S:g} s",
     ),
     "control messages to a client": (
-        f"{LIMITS.unheard:,} answers",
+        f"{LIMITS.unacked:,} answers",
         f"{nbytes(control_stream.MAX_TOLD_BYTES)} + {nbytes(control_stream.MAX_TOLD_CHANNEL_BYTES)} a channel",
     ),
     "objects (": (
@@ -74,22 +75,25 @@ BOUNDS: Final[dict[str, tuple[str, ...]]] = {
     ),
     "large values of objects": (f"{nbytes(OBJECTS.max_held_per_owner)}, of {nbytes(OBJECTS.max_held_bytes)} in all",),
     "transforms as objects": (f"{transforms.MAX_PAIRS:,} pairs", f"{transforms.MAX_WAITING} messages"),
-    "clients that are waited for": (f"{awaited.MAX_AWAITED_CLIENTS:,};", f"{LIMITS.awaited_topics:,} each"),
+    "clients that are waited for": (f"{absent.MAX_ABSENT_CLIENTS:,};", f"{LIMITS.absent_topics:,} each"),
     "boots of a client": (f"| {routing.RETIRED_BOOTS} |",),
     "numbers of streams": (f"{numbering.MAX_ENDED:,},",),
     "counters by topic": (f"{ledger.MAX_TOPICS:,} ",),
     "decisions of the access rules": (f"{access.CACHE_ENTRIES:,} ",),
     "bodies that are being decoded": (nbytes(decoding.MAX_WAITING_BYTES),),
     "connections, half-open ones": (f"{default(RelaySection, 'max_connections')} |",),
-    "connections of one client": (f"{server.MAX_PORTS}; {express.CONNECTIONS} |",),
+    "connections of one client": (f"{server.MAX_PORTS}; {priority_paths.CONNECTIONS} |",),
     "connections of the plain feed": (f"{feed_inflow.MAX_CONNECTIONS} |",),
     "latest values at a client": (f"{latest.MAX_TOPICS:,} streams", f"{latest.MAX_VALUE_BYTES // 1024} kB each"),
 }
 """What the rows of the table in docs/operations.md say, by their beginning."""
 TIMES: Final = {
-    "docs/ros2-dds.md": (f"{first.HOLD_S:g} s at most", f"For {first.LEARN_S:g} s after its start"),
+    "docs/ros2-dds.md": (
+        f"{first_messages.FIRST_MESSAGES_S:g} s at most",
+        f"For {first_messages.LEARN_S:g} s after its start",
+    ),
     "docs/ros1.md": (
-        f"for {hold.HOLD_S:g} s at most",
+        f"for {ros1_first_messages.FIRST_MESSAGES_S:g} s at most",
         f"`poll_hz`, {1 / Ros1Options('http://localhost:1', 'localhost', 'x').poll_hz:g} s",
     ),
     "docs/operations.md": (

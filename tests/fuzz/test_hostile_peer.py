@@ -59,30 +59,30 @@ class Hostile:
 
     def announce(
         self,
-        channel: int,
+        channel_id: int,
         topic: str,
         *,
         first: int = 1,
         digest: str = "",
         reliable: bool = False,
         depth: int = 1,
-        owed: tuple[str, ...] = (),
+        required: tuple[str, ...] = (),
         priority: PriorityClass = PriorityClass.STATE,
     ) -> None:
         identity = StreamId(self.name, self.boot, TopicName(topic))
         info = TopicInfo(identity.topic, "a/b", Encoding.CDR)
         stream = StreamInfo(identity, info, spec(priority, reliable=reliable, depth=depth))
-        self.control(encode_announcement(Announcement(channel, stream, digest, first, owed)))
+        self.control(encode_announcement(Announcement(channel_id, stream, digest, first, required)))
 
 
-def _whole(channel: int, seq: int, body: bytes = b"x", *, flags: int = 0) -> bytes:
-    return framing.encode_data_first(flags, channel, seq, len(body), len(body), 0, 0.0, 0) + body
+def _whole(channel_id: int, seq: int, body: bytes = b"x", *, flags: int = 0) -> bytes:
+    return framing.encode_data_first(flags, channel_id, seq, len(body), len(body), 0, 0.0, 0) + body
 
 
-def _piece(channel: int, seq: int, offset: int, total: int, body: bytes = b"x") -> bytes:
+def _piece(channel_id: int, seq: int, offset: int, total: int, body: bytes = b"x") -> bytes:
     if offset:
-        return framing.encode_data_next(0, channel, seq, offset, total, len(body)) + body
-    return framing.encode_data_first(0, channel, seq, total, len(body), 0, 0.0, 0) + body
+        return framing.encode_data_next(0, channel_id, seq, offset, total, len(body)) + body
+    return framing.encode_data_first(0, channel_id, seq, total, len(body), 0, 0.0, 0) + body
 
 
 Attack = Callable[[Hostile], Iterator[None]]
@@ -207,10 +207,10 @@ def empty_messages_that_wait(peer: Hostile) -> Iterator[None]:
 
 
 @attack
-def tombstones_that_wait(peer: Hostile) -> Iterator[None]:
+def drop_markers_that_wait(peer: Hostile) -> Iterator[None]:
     peer.announce(1, "/robot/a", reliable=True)
     for seq in range(0, 60_000, 60):
-        peer.say(*(_whole(1, seq + i + 3, b"\x01", flags=framing.FLAG_TOMBSTONE) for i in range(60)))
+        peer.say(*(_whole(1, seq + i + 3, b"\x01", flags=framing.FLAG_DROP_MARKER) for i in range(60)))
         yield
 
 
@@ -328,7 +328,7 @@ ALLOWED_BYTES: Final = 18 * 2**20
 
 @pytest.mark.parametrize("name", ATTACKS)
 def test_state_stays_bounded(name: str) -> None:
-    peer = Hostile(World(link=limited(unheard=300, peer_definition_bytes=2 * 2**20)))
+    peer = Hostile(World(link=limited(unacked=300, peer_definition_bytes=2 * 2**20)))
     gc.collect()
     tracemalloc.start()
     try:
@@ -395,17 +395,17 @@ def test_a_client_that_connects_again_and_again_has_its_session_each_time() -> N
 
 
 def test_origins_cannot_have_any_number_of_streams_kept_for_an_absent_client() -> None:
-    peer = Hostile(World(link=limited(awaited_topics=50)))
+    peer = Hostile(World(link=limited(absent_topics=50)))
     for index in range(100):
-        peer.announce(1, f"/robot/t{index}", reliable=True, owed=("absent",))
+        peer.announce(1, f"/robot/t{index}", reliable=True, required=("absent",))
         peer.control({"t": "retract", "ch": 1})
-    assert len(peer.hub.awaited._topics[ClientName("absent")]) <= 50
+    assert len(peer.hub.absent._topics[ClientName("absent")]) <= 50
     peer.hub.validate()
 
 
 def test_an_honest_peer_is_not_taken_for_a_hostile_one() -> None:
     """One that reads what it is told may ask for ever."""
-    duet = Duet(limited(unheard=10))
+    duet = Duet(limited(unacked=10))
     for index in range(100):
         duet.site.core.subscribe((".*",) if index % 2 else (), now=duet.now)
         duet.settle(0.05)

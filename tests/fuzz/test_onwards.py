@@ -157,11 +157,11 @@ GREATEST: dict[str, list[object]] = {
 """What may be said and is at an edge."""
 
 
-def _announcement(topic: str, channel: int, reliable: bool, latched: bool, digest: str) -> framing.Envelope:
+def _announcement(topic: str, channel_id: int, reliable: bool, latched: bool, digest: str) -> framing.Envelope:
     identity = StreamId(ClientName("robot"), 77, TopicName(topic))
     info = TopicInfo(identity.topic, "a/b", Encoding.CDR, "RIHS01_0")
     stream = StreamInfo(identity, info, spec(reliable=reliable, latched=latched, depth=3, many_writers=topic == "/tf"))
-    return encode_announcement(Announcement(channel, stream, digest, 1))
+    return encode_announcement(Announcement(channel_id, stream, digest, 1))
 
 
 def _control(envelope: framing.Envelope, attachment: bytes = b"") -> Action:
@@ -219,15 +219,15 @@ RARELY = st.sampled_from([False] * 19 + [True])
 @st.composite
 def frames(draw: st.DrawFn) -> bytes:
     """A message or a part of one, with whatever its header can say; rarely something that no client sends."""
-    channel, seq = draw(CHANNELS), draw(SEQS)
+    channel_id, seq = draw(CHANNELS), draw(SEQS)
     stamp_ns = draw(st.sampled_from([0, 1, -1, 2**63 - 1, -(2**63)]))
     age, error = draw(st.sampled_from([0, 1, 10_000, 2**32 - 1])), draw(st.sampled_from([0, 1, 254, 255]))
     flags, codec, offset = draw(st.sampled_from([0, 0, framing.FLAG_REPLAY, framing.FLAG_URGENT])), 0, 0
-    match draw(st.sampled_from(["whole", "whole", "codec", "tombstone", "piece", "watermark"])):
+    match draw(st.sampled_from(["whole", "whole", "codec", "drop marker", "piece", "watermark"])):
         case "watermark":
-            return framing.encode_watermark(channel, seq)
-        case "tombstone":
-            flags |= framing.FLAG_TOMBSTONE
+            return framing.encode_watermark(channel_id, seq)
+        case "drop marker":
+            flags |= framing.FLAG_DROP_MARKER
             body = bytes([draw(st.sampled_from([0, 1, 255, *DROP_CODES.values()]))])
             total = 1
         case "piece":
@@ -240,8 +240,8 @@ def frames(draw: st.DrawFn) -> bytes:
         flags, codec = draw(st.integers(0, 255)), draw(st.integers(0, 255))
         total = draw(st.sampled_from([0, 1, 2**32 - 1]))
     if offset:
-        return framing.DATA_FIXED.pack(framing.FRAME_DATA, flags, channel, seq, offset, total, len(body)) + body
-    head = (framing.FRAME_DATA, flags, channel, seq, 0, total, len(body), stamp_ns, age, codec, error)
+        return framing.DATA_FIXED.pack(framing.FRAME_DATA, flags, channel_id, seq, offset, total, len(body)) + body
+    head = (framing.FRAME_DATA, flags, channel_id, seq, 0, total, len(body), stamp_ns, age, codec, error)
     return framing.DATA_FIRST.pack(*head) + body
 
 
@@ -324,7 +324,7 @@ def test_a_stream_cannot_count_beyond_what_can_be_announced(reliable: bool) -> N
 
 
 def test_names_that_no_client_has_are_not_waited_for() -> None:
-    """All names that are owed a stream are said to its origin in one message: they must fit."""
+    """All names that a stream requires are said to its origin in one message: they must fit."""
     yard = Yard()
     for number in range(3):
         owed = [f"{number}{index:02}".ljust(64, "\U0001f916") for index in range(12)]

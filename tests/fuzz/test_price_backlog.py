@@ -113,9 +113,9 @@ def plain(seq: int) -> bytes:
     return _whole(1, seq)
 
 
-def buried(seq: int) -> bytes:
-    """Every second one is a tombstone."""
-    return _whole(1, seq, b"\x01", flags=framing.FLAG_TOMBSTONE) if seq % 2 == 0 else _whole(1, seq)
+def every_second_dropped(seq: int) -> bytes:
+    """Every second one is a drop marker."""
+    return _whole(1, seq, b"\x01", flags=framing.FLAG_DROP_MARKER) if seq % 2 == 0 else _whole(1, seq)
 
 
 def filled_backlog(count: int, frame: Callable[[int], bytes] = plain) -> tuple[Hostile, Hostile, OutChannel]:
@@ -187,7 +187,7 @@ def backlog_that_lapses() -> Input:
         if more:
             sweep()
         else:
-            assert channel.kept == BACKLOG and all(out.message.tombstone for out in channel.retained)
+            assert channel.kept == BACKLOG and all(out.message.drop_marker for out in channel.retained)
         return more
 
     return Input(0, sweep, rest=rest)
@@ -211,8 +211,8 @@ def backlog_that_lapses_while_its_reader_is_away() -> Input:
 
 
 def client_that_is_forgotten() -> Input:
-    """A client is revoked for which an origin has filled all there is room for, every second message a tombstone."""
-    _origin, reader, channel = filled_backlog(BACKLOG, buried)
+    """A client is revoked for which an origin has filled all there is room for, every second message a drop marker."""
+    _origin, reader, channel = filled_backlog(BACKLOG, every_second_dropped)
     reader.port.disconnected(now=reader.now)
 
     def take() -> None:
@@ -251,7 +251,7 @@ EVENTS = (
     backlog_that_ends("backlog_unsubscribed", {"t": "subscribe", "patterns": [], "more": False}),
     backlog_that_ends("backlog_confirmed"),
     backlog_that_ends("all_but_one_confirmed", confirmed=BACKLOG - 1),
-    backlog_that_ends("backlog_of_tombstones", UNWANTED, fill=partial(filled_backlog, BACKLOG, buried)),
+    backlog_that_ends("backlog_of_drop_markers", UNWANTED, fill=partial(filled_backlog, BACKLOG, every_second_dropped)),
     backlog_that_ends("backlog_with_gaps", UNWANTED, fill=partial(backlog_with_gaps, GAPS)),
     backlog_that_lapses,
     backlog_that_lapses_while_its_reader_is_away,

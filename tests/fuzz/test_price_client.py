@@ -77,7 +77,7 @@ def told(name: str, **envelope: object) -> Make:
     def make() -> Input:
         robot = Robot()
         robot.keeps(BACKLOG)
-        robot.relay.control.send({"t": name, "ch": robot.channel.slot, **envelope}, now=robot.now)
+        robot.relay.control.send({"t": name, "ch": robot.channel.channel_id, **envelope}, now=robot.now)
 
         def rest() -> bool:
             more = robot.one_more_slice()
@@ -96,7 +96,7 @@ def told_that_a_client_is_forgotten() -> Input:
     robot = Robot()
     robot.keeps(BACKLOG)
     (stream,) = robot.relay.taking.streams.values()
-    dropped = {"t": "dropped", "ch": robot.channel.slot, "seq": 1, "code": LOST, "to": "site", "n": BACKLOG}
+    dropped = {"t": "dropped", "ch": robot.channel.channel_id, "seq": 1, "code": LOST, "to": "site", "n": BACKLOG}
     robot.relay.control.send(dropped, now=robot.now)
 
     def rest() -> bool:
@@ -138,7 +138,7 @@ async def test_the_log_has_a_line_for_a_run(
 ) -> None:
     robot = Robot()
     robot.keeps(10)
-    dropped = {"t": "dropped", "ch": robot.channel.slot, "seq": first, "code": LOST, "to": "site", "n": count}
+    dropped = {"t": "dropped", "ch": robot.channel.channel_id, "seq": first, "code": LOST, "to": "site", "n": count}
     robot.relay.control.send(dropped, now=robot.now)
     caplog.clear()
     with caplog.at_level(logging.WARNING):

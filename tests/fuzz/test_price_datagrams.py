@@ -169,9 +169,9 @@ def messages_out_of_order(peer: Hostile) -> list[bytes]:
 
 
 @datagram
-def tombstones(peer: Hostile) -> list[bytes]:
+def drop_markers(peer: Hostile) -> list[bytes]:
     peer.announce(1, "/robot/a", reliable=True)
-    return filled(lambda index: _whole(1, index + 1, b"\x01", flags=framing.FLAG_TOMBSTONE))
+    return filled(lambda index: _whole(1, index + 1, b"\x01", flags=framing.FLAG_DROP_MARKER))
 
 
 @datagram
@@ -281,7 +281,7 @@ def answers_about_many_channels(peer: Hostile) -> list[bytes]:
 
 
 def hello_after_long_lists() -> Input:
-    """A subscriber that has said of all its streams that it owes them to thousands of others greets anew."""
+    """A subscriber that has said of all its streams that thousands of others require them greets anew."""
     peer = Hostile()
     with_channels(peer, 300)
     names = [f"{index:x}" for index in range(8190)]
@@ -297,14 +297,14 @@ def hello_after_long_lists() -> Input:
 INPUTS["datagram: HELLO after long lists"] = FEWER["datagram: HELLO after long lists"] = hello_after_long_lists
 
 
-def streams_owed_to_absent_clients() -> Input:
-    """An origin says of each of its streams that clients are owed it that have not come back yet."""
+def streams_that_require_absent_clients() -> Input:
+    """An origin says of each of its streams that it requires clients that have not come back yet."""
     peer = Hostile()
-    peer.hub.awaited.known = lambda _client: True
+    peer.hub.absent.known = lambda _client: True
     peer.hub.links[peer.name].reassembly.limit_bytes = 64 * 2**20
     absent = tuple(f"site{number}" for number in range(48))
 
-    def owed(index: int) -> bytes:
+    def required(index: int) -> bytes:
         identity = StreamId(peer.name, peer.boot, TopicName(f"/robot/t{index}"))
         stream = StreamInfo(identity, TopicInfo(identity.topic, "a/b", Encoding.CDR), spec(reliable=True))
         return control(
@@ -312,14 +312,14 @@ def streams_owed_to_absent_clients() -> Input:
         )
 
     for index in range(100):
-        said(peer, owed(index))
-    frames = [owed(index) for index in range(100, 160)]
+        said(peer, required(index))
+    frames = [required(index) for index in range(100, 160)]
 
     return Input(sum(map(len, frames)), lambda: peer.say(*frames), len(absent), lambda: one_more_slice(peer))
 
 
-AWAITED: Final = "datagram: streams owed to absent clients"
-INPUTS[AWAITED] = FEWER[AWAITED] = streams_owed_to_absent_clients
+ABSENT: Final = "datagram: streams that require absent clients"
+INPUTS[ABSENT] = FEWER[ABSENT] = streams_that_require_absent_clients
 
 
 @for_fifty

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from sern_client.endpoints.ros1.endpoint import Ros1Endpoint, Ros1Options
-from sern_client.endpoints.ros1.hold import Hold
+from sern_client.endpoints.ros1.first_messages import FirstMessages
 from sern_client.endpoints.ros1.subscription import Topic
 from sern_core.summaries.patches import PatchParams
 from sern_core.summaries.spec import SummarySpec, VoxelParams
@@ -101,16 +101,16 @@ async def has_missed_what_was_held(messages: int) -> Callable[[], None]:
     def dropped(why: DropReason, count: int = 1) -> None:
         told[why] = told.get(why, 0) + count
 
-    hold = Hold(
+    first_messages = FirstMessages(
         "/chat", max_messages=1, max_bytes=100, overflow=DropReason.QUEUE_FULL, dropped=dropped, done=lambda: None
     )
     for _ in range(messages + 1):
-        hold.keep(b"x", 10.0)
+        first_messages.keep(b"x", 10.0)
 
     def registered() -> None:
-        hold.registered(["/listener"])
+        first_messages.registered(["/listener"])
         assert told == {DropReason.QUEUE_FULL: messages}
-        hold.close()
+        first_messages.close()
 
     return registered
 

@@ -34,7 +34,7 @@ def crowded(*, first: int = FIRST) -> tuple[Hostile, Hostile, DropReports]:
         stream.reports.add(seq, DropReason.LOST, "site")
     for seq in range(FIRST + BACKLOG, FIRST + BACKLOG + 10, 2):
         stream.reports.add(seq, DropReason.LOST, "site")
-    assert link.reassembly.unheard.reports == len(stream.reports) == LIMITS.kept_reports
+    assert link.reassembly.unacked_reports.reports == len(stream.reports) == LIMITS.kept_reports
     return reader, origin, stream.reports
 
 

@@ -164,7 +164,7 @@ class Stage:
             command_lifespans_s={COMMAND_TOPIC: self.scenario.command_lifespan_s},
             pose_topic=POSE_TOPIC,
             relay=RELAY,
-            takers={ROBOT: SITE, SITE: ROBOT},
+            subscribers={ROBOT: SITE, SITE: ROBOT},
         )
         logs = read_logs([(name, self.files[name].with_suffix(".csv")) for name in (ROBOT, RELAY, SITE)])
         counters = read_counters([file.with_suffix(".summary.json") for file in self.files.values()])

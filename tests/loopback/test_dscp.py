@@ -17,7 +17,7 @@ from sern_relay.daemon import RelayDaemon
 from sern_runtime import clock
 from sern_runtime.config.shared import DscpSection
 from sern_runtime.dscp import Marks
-from sern_runtime.express import CONNECTIONS
+from sern_runtime.priority_paths import CONNECTIONS
 from sern_runtime.udp import UdpServer
 from sern_runtime.udp_client import UdpClient
 from sern_runtime.zmq_socket import SendResult
@@ -309,35 +309,34 @@ def _pipe_to(port: int) -> Any:
 async def test_connections_have_the_marks_of_the_file(tmp_path: Path) -> None:
     """Both ends of the stream, and of the connections for class control alone."""
     dscp = {"control": "cs5", "state": 18}
-    express, stream = 40 << 2, 18 << 2
+    priority_lane, stream = 40 << 2, 18 << 2
     async with Lab(tmp_path, "robot1") as lab:
         relay = await lab.relay(lab.relay_file(link={"dscp": dscp}))
         file = lab.client_file(
             "robot1", {"kind": "synthetic", "role": "robot"}, relay={"udp": False}, link={"dscp": dscp}
         )
         robot = await lab.connected(file)
-        await until(
-            lambda: robot.connection.express is not None and len(robot.connection.express.paths) == CONNECTIONS,
-            "all are joined",
-        )
+        lane = robot.connection.priority_lane
+        assert lane is not None
+        await until(lambda: len(lane.paths) == CONNECTIONS, "all are joined")
         server = relay.server
         assert server is not None
-        await until(lambda: len(server.express.joined) == CONNECTIONS, "the relay knows that they are")
+        await until(lambda: len(server.priority_lanes.joined) == CONNECTIONS, "the relay knows that they are")
         marked = []
         for handle in server.connections.handles():
             with handle._connection() as socket:
                 assert socket is not None
                 marked.append(socket.getsockopt(socketlib.IPPROTO_IP, socketlib.IP_TOS))
-        assert sorted(marked) == [stream, express, express]
-        assert robot.connection.transport is not None and robot.connection.express is not None
-        ours = [robot.connection.transport.dialer, *(each.dialer for each in robot.connection.express.connections)]
+        assert sorted(marked) == [stream, priority_lane, priority_lane]
+        assert robot.connection.transport is not None
+        ours = [robot.connection.transport.dialer, *(each.dialer for each in lane.connections)]
         marked = []
         for dialer in ours:
             assert dialer._handle is not None
             with dialer._handle._connection() as socket:
                 assert socket is not None
                 marked.append(socket.getsockopt(socketlib.IPPROTO_IP, socketlib.IP_TOS))
-        assert marked == [stream, express, express]
+        assert marked == [stream, priority_lane, priority_lane]
 
 
 def test_the_marks_of_a_file() -> None:

@@ -32,8 +32,8 @@ def read(directory: Path) -> Result:
     logs = read_logs([(name, directory / f"{name}.csv") for name in NAMES])
     counters = read_counters([directory / f"{name}.summary.json" for name in NAMES])
     reliable = frozenset(name for name, log in logs.items() if log.priority == "state")
-    takers = {ROBOT: SITE, SITE: ROBOT}
-    return analyse("SERN", logs, RunFacts(0, 1.0, {}, reliable_topics=reliable, takers=takers), counters)
+    subscribers = {ROBOT: SITE, SITE: ROBOT}
+    return analyse("SERN", logs, RunFacts(0, 1.0, {}, reliable_topics=reliable, subscribers=subscribers), counters)
 
 
 async def test_every_message_has_one_fate_whatever_is_cut(tmp_path: Path) -> None:

@@ -88,7 +88,7 @@ async def driving(tmp_path: Path) -> AsyncIterator[Scene]:
     script.write_text(CLIENT)
     try:
         async with (
-            running(master, "driver", heed_sern=True) as (driver, events),
+            running(master, "driver", accept_bridged=True) as (driver, events),
             Lab(tmp_path, "robot1", "site") as lab,
         ):
             endpoint = {"kind": "ros1", "master_uri": master.uri, "host": HOST, "poll_hz": 20}

@@ -217,9 +217,9 @@ async def test_nobody_joins_the_session_of_another(tmp_path: Path, caplog: pytes
                 await impostor.send(datagram)
                 await impostor.cut()
                 assert impostor.received == []
-            assert server.express.refused == number
+            assert server.priority_lanes.refused == number
         await world.refused("join")
-        assert not any(joined.client == "robot2" for joined in server.express.joined)
+        assert not any(joined.client == "robot2" for joined in server.priority_lanes.joined)
 
 
 async def test_one_client_has_a_few_connections(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -251,7 +251,7 @@ async def test_connections_for_class_control_count_over_all_sessions(
         assert server is not None
         keys = load_secret(world.lab.directory / "robot2.key")
         lane = await stack.enter_async_context(Stranger(world.lab, keys))
-        server_express = server.express
+        priority_lanes = server.priority_lanes
         for tag in range(1, 4):
             await lane.send(hello("robot2", tag))
             await until(lambda: "robot2" in world.relay.hub.links, "a session")
@@ -259,18 +259,18 @@ async def test_connections_for_class_control_count_over_all_sessions(
             join = framing.encode_handshake(framing.Kind.JOIN, tag, 0, envelope)
 
             def joined(count: int) -> bool:
-                lanes = server_express._lanes
+                lanes = priority_lanes._lanes
                 lane = lanes.get(ClientName("robot2"))
                 return lane is not None and len(lane.paths) == count
 
             for count in (1, 2):
-                express = await stack.enter_async_context(Stranger(world.lab, keys))
-                await express.send(join)
+                another = await stack.enter_async_context(Stranger(world.lab, keys))
+                await another.send(join)
                 await until(partial(joined, count), "it has joined")
             await lane.send(framing.encode_handshake(framing.Kind.CLOSE, tag, 0, {"code": "bye", "why": "bye"}))
             await until(lambda: "robot2" not in world.relay.hub.links, "it is forgotten")
-            assert sum(each.client == "robot2" for each in server.express.joined) <= 2
-        assert server.express.refused == 0
+            assert sum(each.client == "robot2" for each in server.priority_lanes.joined) <= 2
+        assert server.priority_lanes.refused == 0
 
 
 async def test_a_client_is_given_a_lane_now_and_then(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

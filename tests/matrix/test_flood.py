@@ -12,7 +12,7 @@ from itertools import product
 import pytest
 
 from sern_core.link.lane_port import LanePort
-from sern_core.path.lanes import LANE_EXPRESS, LANE_UDP, OVERHEAD_BYTES
+from sern_core.path.lanes import LANE_PRIORITY, LANE_UDP, OVERHEAD_BYTES
 from sern_core.vocabulary.types import ClientName, PriorityClass
 from sern_core.wire import framing
 from sern_sim.models import LinkModel
@@ -35,7 +35,7 @@ FLOOD, BEAT, CLOUD = "/robot/flood", "/robot/beat", "/robot/points"
 
 class Lanes(StrEnum):
     STREAM = "stream"
-    EXPRESS = "express"
+    PRIORITY = "priority"
     DATAGRAM = "datagram"
 
 
@@ -50,7 +50,7 @@ class Cell:
 
     @property
     def in_every_run(self) -> bool:
-        return self.times == (2.0 if self.clouds else 1.3) or (self.times == 13.0 and self.lanes is Lanes.EXPRESS)
+        return self.times == (2.0 if self.clouds else 1.3) or (self.times == 13.0 and self.lanes is Lanes.PRIORITY)
 
 
 CELLS = [Cell(*axes) for axes in product(Lanes, (1.3, 2.0, 4.0, 13.0), (False, True))]
@@ -67,7 +67,7 @@ class Flood:
         self.site = world.client("site", patterns=["/robot/.*"])
         self.far = world.relay.hub.clients.link(ROBOT, world.relay.now)
         if cell.lanes is not Lanes.STREAM:
-            self._join(LANE_EXPRESS if cell.lanes is Lanes.EXPRESS else LANE_UDP)
+            self._join(LANE_PRIORITY if cell.lanes is Lanes.PRIORITY else LANE_UDP)
         self.flood = self.robot.publish(FLOOD, spec(PriorityClass.CONTROL, lifespan_s=1.0))
         self.beat = self.robot.publish(BEAT, spec(PriorityClass.CONTROL, lifespan_s=1.0))
         self.cloud = self.robot.publish(CLOUD, spec(PriorityClass.BULK, lifespan_s=5.0))
@@ -78,13 +78,13 @@ class Flood:
         near, beyond = LanePort(link, lane_id), LanePort(self.far, lane_id)
         self.robot.more_ports.append(near)
         world.relay.more_ports.append(beyond)
-        path = PATH.as_stream() if lane_id == LANE_EXPRESS else PATH
+        path = PATH.as_stream() if lane_id == LANE_PRIORITY else PATH
         world.network.join(near, self.robot, beyond, world.relay, path, path, name="beside", beside=world.hops["robot"])
         world.network.at(SETTLE_S / 3, lambda _now: self._open(lane_id))
 
     def _open(self, lane_id: int) -> None:
         link, hub = self.robot.core.link, self.world.relay.hub
-        if lane_id == LANE_EXPRESS:
+        if lane_id == LANE_PRIORITY:
             said = link.handshake.join(self.robot.now)
             assert said is not None
             assert hub.join(ROBOT, said, now=self.world.relay.now)
@@ -95,7 +95,7 @@ class Flood:
     def play(self) -> "Flood":
         world, link = self.world, self.robot.core.link
         world.run(SETTLE_S)
-        assert (link.lanes.express is not None) is (self.cell.lanes is Lanes.EXPRESS)
+        assert (link.lanes.priority_lane is not None) is (self.cell.lanes is Lanes.PRIORITY)
         assert (link.lane.id == LANE_UDP) is (self.cell.lanes is Lanes.DATAGRAM)
         world.watch(0.5)
         stops = [

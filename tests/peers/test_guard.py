@@ -28,7 +28,7 @@ def dds() -> tuple[sections.DdsEndpoint, sections.DdsEndpoint]:
     from tests.peers.dds.peer import free_domain
 
     where: dict[str, Any] = {"kind": "dds", "domain": free_domain(), "localhost_only": True}
-    return sections.DdsEndpoint(**where), sections.DdsEndpoint(**where, node_name="driver", heed_sern=True)
+    return sections.DdsEndpoint(**where), sections.DdsEndpoint(**where, node_name="driver", accept_bridged=True)
 
 
 def zenoh() -> tuple[sections.ZenohEndpoint, sections.ZenohEndpoint]:

@@ -38,7 +38,7 @@ async def agree(endpoint: Endpoint, events: Events, seed: int) -> None:
 @pytest.mark.parametrize("seed", SEEDS)
 async def test_dds(seed: int) -> None:
     domain = DomainOptions(free_domain(), localhost_only=True, lease_s=LEASE_S)
-    endpoint, observer = DdsEndpoint(DdsOptions(domain)), DdsEndpoint(DdsOptions(domain, heed_sern=True))
+    endpoint, observer = DdsEndpoint(DdsOptions(domain)), DdsEndpoint(DdsOptions(domain, accept_bridged=True))
     events = Events()
     await endpoint.start(Events())
     await observer.start(events)

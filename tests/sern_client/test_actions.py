@@ -112,7 +112,7 @@ class Site:
         spec = TopicSpec(PriorityClass.CONTROL, lifespan_s=0.0)
         stream = StreamInfo(StreamId(ClientName("site"), 1, GOAL.name), GOAL, spec)
         self.channel = OutChannel(
-            0, stream, SendCounters(GOAL.name, spec.priority), lambda _slot, _outs, _reason: None, first=1
+            0, stream, SendCounters(GOAL.name, spec.priority), lambda _channel_id, _outs, _reason: None, first=1
         )
         self.give: Sink = self.watch.outgoing(GOAL, self.channel, self._send)
         self.watch.outgoing(topic("cancel"), self.channel, self._cancel)

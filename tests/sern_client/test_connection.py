@@ -66,7 +66,7 @@ class Part:
 def with_parts(said: list[str], core: ClientCore | None = None, *, broken: tuple[str, ...] = ()) -> Any:
     """A connection all of whose parts are there; those in `broken` cannot be closed."""
     connection: Any = connection_to(NOBODY, core)
-    for name in ("transport", "lane", "express", "name"):
+    for name in ("transport", "lane", "priority_lane", "name"):
         setattr(connection, name, Part(name, said, error=OSError(f"{name} is broken") if name in broken else None))
     return connection
 
@@ -74,11 +74,11 @@ def with_parts(said: list[str], core: ClientCore | None = None, *, broken: tuple
 @pytest.mark.parametrize(
     ("endpoint", "secure", "options", "opened"),
     [
-        (NOBODY, True, {}, {"lane", "express"}),
-        (NOBODY, True, {"udp": False}, {"express"}),
-        (NOBODY, True, {"express": False}, {"lane"}),
-        (NOBODY, False, {}, {"express"}),  # datagrams are sealed with keys that come over a proven stream
-        (LOCAL, False, {}, {"express", "name"}),
+        (NOBODY, True, {}, {"lane", "priority_lane"}),
+        (NOBODY, True, {"udp": False}, {"priority_lane"}),
+        (NOBODY, True, {"priority_connections": False}, {"lane"}),
+        (NOBODY, False, {}, {"priority_lane"}),  # datagrams are sealed with keys that come over a proven stream
+        (LOCAL, False, {}, {"priority_lane", "name"}),
         ("ipc://nobody", True, {}, set()),
     ],
 )
@@ -98,7 +98,7 @@ async def test_what_is_opened_is_what_the_file_wants_and_the_address_allows(
     connection = connection_to(endpoint, **options)
     connection.open(zmq_context, keys, (relay_keys.public_key,) if secure else ())
     assert connection.transport is not None
-    assert {name for name in ("lane", "express", "name") if getattr(connection, name) is not None} == opened
+    assert {name for name in ("lane", "priority_lane", "name") if getattr(connection, name) is not None} == opened
     connection.close()
 
 
@@ -120,7 +120,7 @@ async def test_a_relay_hears_from_it_and_what_is_no_frame_is_counted(zmq_context
     try:
         port = router.bind_to_random_port("tcp://127.0.0.1")
         reasons: list[str] = []
-        connection = connection_to(f"tcp://127.0.0.1:{port}", down=reasons.append, express=False)
+        connection = connection_to(f"tcp://127.0.0.1:{port}", down=reasons.append, priority_connections=False)
         connection.open(zmq_context, None, ())
         await until(lambda: router.poll(0), "says HELLO")
         peer, data = router.recv_multipart()
@@ -136,7 +136,7 @@ async def test_waking_wakes_every_lane() -> None:
     said: list[str] = []
     connection = with_parts(said)
     connection.wake()
-    assert said == ["transport kick", "lane kick", "express kick"]
+    assert said == ["transport kick", "lane kick", "priority_lane kick"]
     assert connection.waiting and connection.bad_frames == 3
 
 
@@ -148,11 +148,13 @@ async def test_a_session_asks_for_datagrams_before_it_gives_class_control_its_ow
     connection.lane_closed()
     connection.tick()
     assert said == [
-        "lane ask", "express begin", "lane offered", "lane closed", "lane tick", "express tick", "name tick"
+        "lane ask", "priority_lane begin", "lane offered", "lane closed", "lane tick", "priority_lane tick", "name tick"
     ]  # fmt: skip
 
 
-@pytest.mark.parametrize("broken", [(), ("name",), ("lane",), ("express",), ("transport",), ("name", "express")])
+@pytest.mark.parametrize(
+    "broken", [(), ("name",), ("lane",), ("priority_lane",), ("transport",), ("name", "priority_lane")]
+)
 async def test_all_of_it_ends_whatever_fails(broken: tuple[str, ...]) -> None:
     said: list[str] = []
     connection = with_parts(said, broken=broken)
@@ -161,7 +163,7 @@ async def test_all_of_it_ends_whatever_fails(broken: tuple[str, ...]) -> None:
             connection.close()
     else:
         connection.close()
-    assert said == ["name close", "lane closed", "express close", "transport close"]
+    assert said == ["name close", "lane closed", "priority_lane close", "transport close"]
 
 
 # Draining -------------------------------------------------------------------------------------------------------------
@@ -173,7 +175,7 @@ async def test_a_client_that_owes_nothing_stops_at_once() -> None:
     await connection.drain(lambda: 0, limit_s=3600.0)
     assert said == []
     await connection.leave()
-    assert said == ["transport kick", "lane kick", "express kick", "transport run", "transport run"]
+    assert said == ["transport kick", "lane kick", "priority_lane kick", "transport run", "transport run"]
 
 
 async def test_what_is_still_being_made_is_waited_for() -> None:

@@ -44,10 +44,10 @@ class Bench:
         assert stream == STREAM and seq in self.held and seq not in self.released
         self.released[seq] = lost
 
-    def publish(self, seq: int, *takers: int) -> None:
+    def publish(self, seq: int, *took: int) -> None:
         mark = self.keeping.mark()
-        for taker in takers:
-            self.keepers[taker].taken += 1
+        for keeper in took:
+            self.keepers[keeper].taken += 1
         self.keeping.published(STREAM, seq, mark)
 
 
@@ -56,7 +56,7 @@ def test_without_keepers_nothing_waits() -> None:
     assert not bench.keeping and bench.keeping.pending == 0
 
 
-def test_only_what_was_taken_waits_and_all_takers_must_have_kept_it() -> None:
+def test_only_what_was_taken_waits_and_all_keepers_that_took_it_must_have_kept_it() -> None:
     bench = Bench(2)
     bench.keepers[0].taken += 3  # best effort, before
     bench.publish(1, 0, 1)
@@ -98,14 +98,14 @@ def test_a_message_that_did_not_get_into_the_buffer_is_lost_before_those_ahead_o
 
 
 @given(
-    takers=st.lists(st.sets(st.integers(0, 1)), max_size=20),
+    took=st.lists(st.sets(st.integers(0, 1)), max_size=20),
     steps=st.lists(st.tuples(st.integers(0, 1), st.integers(0, 25), st.sets(st.integers(1, 25))), max_size=10),
 )
 def test_each_message_is_let_go_once_however_it_is_kept(
-    takers: list[set[int]], steps: list[tuple[int, int, set[int]]]
+    took: list[set[int]], steps: list[tuple[int, int, set[int]]]
 ) -> None:
     bench = Bench(2)
-    for seq, who in enumerate(takers, start=1):
+    for seq, who in enumerate(took, start=1):
         bench.publish(seq, *who)
     reached = [0, 0]
     for keeper, upto, lost in steps:

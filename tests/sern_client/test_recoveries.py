@@ -14,18 +14,18 @@ from typing import Any, Final, NamedTuple
 
 import pytest
 
-from sern_client import express, guard, relay_name
+from sern_client import guard, priority_lane, relay_name
 from sern_client.checks import CHECK_S, CONFIRM_S, TableCheck
 from sern_client.daemon import ClientDaemon
 from sern_client.endpoints.ros1 import services, subscription
 from sern_client.endpoints.ros1.header import encode_header
-from sern_client.express import ClientExpress
 from sern_client.guard import Guard
 from sern_client.link_news import SILENT
 from sern_client.link_topics import LinkTopics
+from sern_client.priority_lane import ClientPriorityLane
 from sern_client.relay_name import RelayName, UnresolvedError
 from sern_client.withdrawal import Withdrawal
-from sern_core.path.lanes import LANE_EXPRESS, LANE_ZMQ
+from sern_core.path.lanes import LANE_PRIORITY, LANE_ZMQ
 from sern_core.vocabulary.errors import ConfigError
 from sern_core.vocabulary.message import StreamId
 from sern_core.vocabulary.params import Redundancy
@@ -205,7 +205,7 @@ async def difference_of_tables(scene: Scene) -> None:
 
 
 class Link:
-    """A session over the stream lane, as the express lane sees it."""
+    """A session over the stream lane, as the priority lane sees it."""
 
     def __init__(self) -> None:
         self.established = True
@@ -213,7 +213,7 @@ class Link:
         self.handshake = SimpleNamespace(reads=True, join=lambda _now: b"join")
         self.plane = SimpleNamespace(may_copy=lambda _nbytes: False)
         self.lane = SimpleNamespace(id=LANE_ZMQ)
-        self.lanes = SimpleNamespace(by_id={LANE_ZMQ}, express=None)
+        self.lanes = SimpleNamespace(by_id={LANE_ZMQ}, priority_lane=None)
 
     def open_lane(self, *, now: float, lane_id: int) -> None:
         self.lanes.by_id.add(lane_id)
@@ -222,7 +222,7 @@ class Link:
         self.lanes.by_id.discard(lane_id)
 
     def receive(self, data: bytes, *, now: float, lane: int) -> None:
-        assert lane == LANE_EXPRESS
+        assert lane == LANE_PRIORITY
 
 
 class Dialed:
@@ -254,24 +254,24 @@ class Transport:
         return Dialed()
 
 
-async def _express(scene: Scene, lose: Callable[[Transport], None]) -> None:
+async def _priority_connections(scene: Scene, lose: Callable[[Transport], None]) -> None:
     link, transport, now = Link(), Transport(), scene.clock()
     core: Any = SimpleNamespace(link=link)
     any_transport: Any = transport
-    lane = ClientExpress(core, any_transport, Redundancy.OFF, datagrams=False, kick=lambda: None)
+    lane = ClientPriorityLane(core, any_transport, Redundancy.OFF, datagrams=False, kick=lambda: None)
     lane.begin()
     lose(transport)
     lane.tick()
     if transport.made:
-        for _ in range(express.ATTEMPTS):
+        for _ in range(priority_lane.ATTEMPTS):
             for connection in transport.made:
                 connection.up(None)
                 connection.down("closed")
         await asyncio.sleep(0)  # it gives up outside their calls
-    assert LANE_EXPRESS not in link.lanes.by_id
+    assert LANE_PRIORITY not in link.lanes.by_id
     transport.problem = ""
     transport.made.clear()
-    now.go_on(express.ASK_AGAIN_S)
+    now.go_on(priority_lane.ASK_AGAIN_S)
     lane.tick()
     for connection in transport.made:
         connection.up(None)
@@ -282,15 +282,15 @@ async def _express(scene: Scene, lose: Callable[[Transport], None]) -> None:
     lane.close()
 
 
-async def no_express_connections(scene: Scene) -> None:
+async def no_priority_connections(scene: Scene) -> None:
     def lose(transport: Transport) -> None:
         transport.problem = "out of file descriptors"
 
-    await _express(scene, lose)
+    await _priority_connections(scene, lose)
 
 
-async def refused_express_connections(scene: Scene) -> None:
-    await _express(scene, lambda _transport: None)
+async def refused_priority_connections(scene: Scene) -> None:
+    await _priority_connections(scene, lambda _transport: None)
 
 
 async def state_on_ros(scene: Scene) -> None:
@@ -450,8 +450,8 @@ PAIRS: Final = (
     Pair(withdrawn_topics, logging.WARNING, "2 of its topics end here", "jackal1 is there again"),
     Pair(withdrawn_topics_one_by_one, logging.WARNING, "2 of its topics end here", "jackal1 is there again"),
     Pair(difference_of_tables, logging.ERROR, "not what should be: /odom", "what should be again: /odom"),
-    Pair(no_express_connections, logging.WARNING, "no connection of its own", "connections of its own again"),
-    Pair(refused_express_connections, logging.WARNING, "takes no connection", "connections of its own again"),
+    Pair(no_priority_connections, logging.WARNING, "no connection of its own", "connections of its own again"),
+    Pair(refused_priority_connections, logging.WARNING, "takes no connection", "connections of its own again"),
     Pair(state_on_ros, logging.WARNING, "the state of the link is not published", "is published now"),
     Pair(watchdog, logging.ERROR, "no progress in socket", "progress again everywhere"),
     Pair(zenoh_router, logging.WARNING, "nobody answers at", "somebody answers at"),

@@ -13,8 +13,8 @@ from sern_relay import server as servers
 from sern_relay.server import MAX_PORTS, REFUSED_KEY, RelayServer
 from sern_runtime import clock
 from sern_runtime.config.keys import KeyStatus, SecretKey, user_id
-from sern_runtime.express import CONNECTIONS
 from sern_runtime.monitor import Connection
+from sern_runtime.priority_paths import CONNECTIONS
 from sern_runtime.zmq_socket import PeerDetails, SendResult
 from tests.sern_client.sessions import Ignored
 from tests.world import OPEN_ACCESS
@@ -266,17 +266,17 @@ async def test_connections_for_class_control_belong_to_a_session_of_their_own_cl
     join = robot.link.handshake.join(clock.now())
     assert join is not None
     stranger = relay.says(SITE, join)
-    assert relay.table.cuts == [stranger] and relay.server.express.joined == []
+    assert relay.table.cuts == [stranger] and relay.server.priority_lanes.joined == []
     joined = [relay.says(ROBOT, join) for _ in range(CONNECTIONS + 1)]
     assert relay.table.cuts == [stranger, joined[0]], "the oldest gives way"
-    assert [each.fd for each in relay.server.express.joined] == joined[1:]
+    assert [each.fd for each in relay.server.priority_lanes.joined] == joined[1:]
     assert relay.users == ["robot"] and relay.server.surplus == 0
     relay.socket.deliver(joined[1], ROBOT, join)  # said again
     relay.socket.deliver(joined[1], SITE, b"anything")
     assert relay.table.cuts[-1] == joined[1]
     assert "connection of robot for class control closed: its identity changed" in caplog.text
     relay.socket.deliver(joined[2], ROBOT, b"no frame")
-    assert relay.server.express.joined == [] and relay.users == ["robot"]
+    assert relay.server.priority_lanes.joined == [] and relay.users == ["robot"]
     relay.server.close()
 
 
@@ -286,7 +286,8 @@ async def test_a_join_of_no_session_is_counted(relay: Relay) -> None:
     assert join is not None
     relay.hub.links[robot.name].close("bye", now=clock.now())
     fd = relay.says(ROBOT, join)
-    assert relay.table.cuts == [fd] and relay.server.express.refused == 1 and relay.server.express.joined == []
+    lanes = relay.server.priority_lanes
+    assert relay.table.cuts == [fd] and lanes.refused == 1 and lanes.joined == []
     relay.server.close()
 
 
@@ -297,7 +298,7 @@ async def test_all_connections_of_a_client_are_cut_together(relay: Relay) -> Non
     assert join is not None
     control = relay.says(ROBOT, join)
     assert relay.server.cut_client("robot") == 2
-    assert relay.table.cuts == [fd, control] and relay.users == ["site"] and relay.server.express.joined == []
+    assert relay.table.cuts == [fd, control] and relay.users == ["site"] and relay.server.priority_lanes.joined == []
     relay.server.close()
 
 
@@ -325,7 +326,7 @@ async def test_nothing_is_served_after_the_end(relay: Relay) -> None:
     assert join is not None
     relay.says(ROBOT, join)
     relay.server.close()
-    assert relay.users == [] and relay.server.express.joined == [] and relay.socket.closed and relay.table.closed
+    assert relay.users == [] and relay.server.priority_lanes.joined == [] and relay.socket.closed and relay.table.closed
     relay.socket.sent.clear()
     relay.server.flush()
     relay.server.run_all()

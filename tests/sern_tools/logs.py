@@ -20,7 +20,7 @@ FACTS = RunFacts(
     reliable_topics=frozenset({MAP}),
     command_lifespans_s={COMMAND: 0.3},
     pose_topic=POSE,
-    takers={"robot": "site", "site": "robot"},
+    subscribers={"robot": "site", "site": "robot"},
 )
 
 
@@ -65,12 +65,12 @@ class Run:
                 self.drop(topic, seq, "lifespan")
 
     def drop(self, topic: str, seq: int, reason: str, *, at: str = "origin", counted: bool = True) -> None:
-        """A drop in a log and in the counters. `at`: origin, onward (at the relay), inward (there too), or taker."""
+        """A drop in a log and in the counters. `at`: origin, onward or inward (at the relay), or subscriber."""
         sender, receiver = ends(topic)
         place, peer, event, index = {
             "origin": (sender, "relay", Event.DROPPED, 0),
             "onward": ("relay", receiver, Event.DROPPED, 1),
-            "taker": (receiver, "relay", Event.DISCARDED, 2),
+            "subscriber": (receiver, "relay", Event.DISCARDED, 2),
             "inward": ("relay", sender, Event.DISCARDED, 3),
         }[at]
         log = self.logs[topic]

@@ -142,6 +142,11 @@ def test_summary_names_what_matters(deployed: Path) -> None:
             "f.yaml:1: client.name: is missing\nf.yaml:1: relay: is missing\nf.yaml:1: endpoint: is missing",
         ),
         (
+            "client: {name: a}\nrelay: {endpoint: 'ipc:///x', insecure: true}\n"
+            "endpoint: {kind: ros1, heed_sern: true}\n",
+            "f.yaml:3: endpoint.heed_sern: is called accept_bridged now",
+        ),
+        (
             "sern_key: open\n",
             "f.yaml:1: sern_key: is not accepted as it is; accepted: public, secret",
         ),

@@ -264,7 +264,7 @@ def test_what_the_sender_could_not_know_the_next_place_does() -> None:
     run.drop(POSE, 4, "unconfirmed")
     run.lose(POSE, 5, received=True)
     run.drop(POSE, 5, "unconfirmed", at="onward")
-    run.drop(POSE, 5, "lifespan", at="taker")
+    run.drop(POSE, 5, "lifespan", at="subscriber")
     run.drop(POSE, 6, "unconfirmed", at="onward")  # it was delivered
     result = run.analyse()
     assert (result.accounting_gap, result.accounting_notes) == (0, [])
@@ -294,7 +294,7 @@ def test_a_part_that_arrived_is_dropped_once_where_its_sender_gave_it_up() -> No
     assert result.accounting_gap == 0 and result.topics[CLOUD].dropped == {"lifespan": 10}
 
 
-@pytest.mark.parametrize(("at", "direction"), [("origin", "send"), ("onward", "onward"), ("taker", "receive")])
+@pytest.mark.parametrize(("at", "direction"), [("origin", "send"), ("onward", "onward"), ("subscriber", "receive")])
 def test_a_line_that_no_counter_has_counted_is_seen(at: str, direction: str) -> None:
     run = good_run()
     run.lose(CLOUD, 1, received=at != "origin")

@@ -71,7 +71,7 @@ OBJECTS = {
 
 def test_a_relay_has_the_sum_of_its_links() -> None:
     odom = parse_topics(relay_view(1))["/r/odom"]
-    assert (odom.received, odom.delivered, odom.queued, odom.takers, odom.age_s) == (10, 10, 4, 1, 0.25)
+    assert (odom.received, odom.delivered, odom.queued, odom.subscribers, odom.age_s) == (10, 10, 4, 1, 0.25)
     assert odom.reasons == {"superseded": 2, "lifespan": 1}  # a duplicate is no loss
 
 
@@ -287,7 +287,7 @@ async def test_a_real_relay_and_its_client(tmp_path: Path) -> None:
             ("/robot1/text", "robot1", "state", False),
         ]
         assert {row["type_name"] for row in rows} == {"std_msgs/msg/String"}
-        assert rows[1]["takers"] == 1
+        assert rows[1]["subscribers"] == 1
         await site.until(lambda: "/robot1/text" in site.json("/api/topics"), "has the topic")
         for client in (site, robot):
             (row,) = listed(client.port, pattern=".*/text")

@@ -4,7 +4,7 @@ from collections import Counter
 from math import inf
 from typing import Generic, Protocol, TypeVar
 
-from sern_client.endpoints.common.first import FirstMessages
+from sern_client.endpoints.common.first_messages import FirstMessages
 from sern_core.vocabulary.types import DropReason, TopicName
 
 
@@ -22,18 +22,18 @@ W = TypeVar("W", bound=Writer)
 class Stream(Generic[W]):
     """The `AgingPublisher` of a stream: a writer, and what waits for its first readers, if anything does."""
 
-    def __init__(self, name: TopicName, writer: W, first: FirstMessages | None, owner: "Streams[W]") -> None:
+    def __init__(self, name: TopicName, writer: W, first_messages: FirstMessages | None, owner: "Streams[W]") -> None:
         self.name = name
         self.writer = writer
         self.closed = False
         """It takes no more; its writer lasts until the first messages are written."""
-        self._first = first
+        self._first_messages = first_messages
         self._owner = owner
 
     @property
     def waits(self) -> bool:
         """Whether its first messages wait."""
-        return self._first is not None and not self._first.over
+        return self._first_messages is not None and not self._first_messages.over
 
     def publish(self, body: bytes, stamp_ns: int) -> None:
         self.publish_within(body, stamp_ns, inf)
@@ -41,19 +41,19 @@ class Stream(Generic[W]):
     def publish_within(self, body: bytes, stamp_ns: int, left_s: float) -> None:
         if self.closed:
             self._owner.drop(DropReason.DISCONNECTED)
-        elif self._first is None or self._first.over:
+        elif self._first_messages is None or self._first_messages.over:
             self.writer.publish(body, stamp_ns)
         else:
-            self._first.publish(body, stamp_ns, left_s)
+            self._first_messages.publish(body, stamp_ns, left_s)
 
     def close(self) -> None:
         """What was published before is still written: the last of it may be a stop command."""
         if not self.closed:
             self.closed = True
-            if self._first is None:
+            if self._first_messages is None:
                 self._end()
             else:
-                self._first.end(self._end)
+                self._first_messages.end(self._end)
 
     def _end(self) -> None:
         self.writer.close()
@@ -61,8 +61,8 @@ class Stream(Generic[W]):
 
     def hurry(self) -> None:
         """Write the first messages now."""
-        if self._first is not None:
-            self._first.close()
+        if self._first_messages is not None:
+            self._first_messages.close()
 
 
 class Streams(Generic[W]):
@@ -73,8 +73,8 @@ class Streams(Generic[W]):
         """First messages that nobody got, and messages that came to a stream after its end."""
         self._open: list[Stream[W]] = []
 
-    def open(self, name: TopicName, writer: W, first: FirstMessages | None) -> Stream[W]:
-        stream = Stream(name, writer, first, self)
+    def open(self, name: TopicName, writer: W, first_messages: FirstMessages | None) -> Stream[W]:
+        stream = Stream(name, writer, first_messages, self)
         self._open.append(stream)
         return stream
 

@@ -1,8 +1,8 @@
 """The `dds` endpoint: what a ROS 2 domain publishes goes to the link, what comes from the link is published there.
 
 What another SERN endpoint publishes in the same domain came over a link already and is not offered again, so that two
-of them beside each other make no loop; they know each other by the USER_DATA of their participants. `heed_sern` turns
-that off, for a chain of two links with a domain in the middle.
+of them beside each other make no loop; they know each other by the USER_DATA of their participants. `accept_bridged`
+turns that off, for a chain of two links with a domain in the middle.
 """
 
 import asyncio
@@ -25,7 +25,7 @@ from sern_client.endpoints.base import (
     Sink,
     TopicEvents,
 )
-from sern_client.endpoints.common.first import LEARN_S, FirstMessages
+from sern_client.endpoints.common.first_messages import LEARN_S, FirstMessages
 from sern_client.endpoints.common.interest import Subscriptions
 from sern_client.endpoints.common.saying import SayOnce
 from sern_client.endpoints.common.stream import Stream, Streams
@@ -69,7 +69,7 @@ class DdsOptions:
     queue_depth: int = 100
     max_buffer_bytes: int = 64 * 2**20
     offer_lifespan: bool = False
-    heed_sern: bool = False
+    accept_bridged: bool = False
 
 
 class DdsEndpoint:
@@ -78,7 +78,7 @@ class DdsEndpoint:
     def __init__(self, options: DdsOptions) -> None:
         self.options = options
         self.counters = DdsCounters()
-        self.graph = Graph(UUID(int=0), self, heed_sern=options.heed_sern)
+        self.graph = Graph(UUID(int=0), self, accept_bridged=options.accept_bridged)
         self.graph.own_guard = options.node_name + GUARD_SUFFIX
         self.types = Definitions(options.type_paths)
         self.entities = Entities(
@@ -139,7 +139,7 @@ class DdsEndpoint:
         depth = info.depth or (RELIABLE_DEPTH if offered.reliable else 1)
         topic = names.to_dds(info.name)
         writer = self.entities.open_writer(topic, resolved, offered, depth=depth)
-        first = FirstMessages(
+        first_messages = FirstMessages(
             info.name,
             readers=lambda: writer.readers(self._waiting_readers(topic, names.type_to_dds(resolved.name), offered)),
             write=writer.publish,
@@ -149,7 +149,7 @@ class DdsEndpoint:
             overflow=DropReason.QUEUE_FULL if offered.reliable else DropReason.SUPERSEDED,
             learning_s=self._started_s + LEARN_S - asyncio.get_running_loop().time(),
         )
-        return self._streams.open(info.name, writer, first)
+        return self._streams.open(info.name, writer, first_messages)
 
     def _waiting_readers(self, topic: str, type_name: str, offered: EndpointQos) -> set[int]:
         """The readers of others that will match such a writer and get nothing that was written before, by handle."""

@@ -14,7 +14,7 @@ from cyclonedds.pub import DataWriter, Publisher
 from cyclonedds.sub import DataReader, Subscriber
 from cyclonedds.topic import Topic
 
-from sern_client.endpoints.common.first import Readers
+from sern_client.endpoints.common.first_messages import Readers
 from sern_client.endpoints.dds import names, node_info, raw
 from sern_client.endpoints.dds.counters import DdsCounters
 from sern_client.endpoints.dds.domain import DomainOptions, close_domain, open_domain

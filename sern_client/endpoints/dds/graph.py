@@ -82,11 +82,11 @@ class GraphEvents(Protocol):
 
 @dataclass
 class Graph:
-    """`heed_sern`: topics of other SERN endpoints count as topics of this site, but those of `own_guard` never do."""
+    """`accept_bridged`: topics of other SERN endpoints count as topics of this site; those of `own_guard` never do."""
 
     own: UUID
     events: GraphEvents
-    heed_sern: bool = False
+    accept_bridged: bool = False
     own_guard: str = ""
     participants: dict[UUID, Participant] = field(default_factory=dict)
     remotes: dict[UUID, Remote] = field(default_factory=dict)
@@ -224,7 +224,7 @@ class Graph:
         participant = self.participants.get(remote.participant)
         if participant is None or not participant.sern:
             return True
-        return self.heed_sern and participant.sern != self.own_guard
+        return self.accept_bridged and participant.sern != self.own_guard
 
     def _put_in(self, remote: Remote) -> None:
         self.remotes[remote.guid] = remote

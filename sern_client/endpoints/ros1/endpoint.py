@@ -6,8 +6,8 @@ them. What comes from the far side is published at the master, and subscribers c
 
 No loops. A SERN endpoint says in every connection header that it is one. Publishers and services that say so are
 never announced, by this or any other SERN endpoint, on this host or another one, whatever their names are: what came
-over a link does not go back to it. Where local nodes publish on a topic too, only theirs goes out. `heed_sern` lifts
-that, for a chain of two links through one master.
+over a link does not go back to it. Where local nodes publish on a topic too, only theirs goes out. `accept_bridged`
+lifts that, for a chain of two links through one master.
 
 Simulated time (/clock, use_sim_time) is carried like any topic. Time stamps given to the link are wall time, and ages
 are counted on monotonic clocks, so a stopped or fast simulation expires nothing.
@@ -74,7 +74,7 @@ class Ros1Options:
     queue_bytes: int = 64 * 2**20
     max_message_bytes: int = 64 * 2**20
     tcp_nodelay: bool = True
-    heed_sern: bool = False
+    accept_bridged: bool = False
 
 
 class Ros1Endpoint:
@@ -103,7 +103,7 @@ class Ros1Endpoint:
         self.counters = ReceiveCounters()
         self.max_message_bytes = options.max_message_bytes
         self.tcp_nodelay = options.tcp_nodelay
-        self.heed_sern = options.heed_sern
+        self.accept_bridged = options.accept_bridged
         self.publishes_only = False
         """Whether topics and services of other nodes are no concern of ours: set by a guard, before the start."""
         self.problem: str | None = None
@@ -122,7 +122,7 @@ class Ros1Endpoint:
         self._graph = Graph(self._master, self, self._graph_changed, poll_s=1 / options.poll_hz)
         self._ended = Ended(self._publications, self._graph.poll_now)
         self._services = ServiceWatch(
-            self._master, self._graph, self._local, options.max_message_bytes, heed_sern=options.heed_sern
+            self._master, self._graph, self._local, options.max_message_bytes, accept_bridged=options.accept_bridged
         )
         self._tcpros = TcprosServer(
             self.caller, self._publications, self._host_of_services, max_frame_bytes=options.max_message_bytes
@@ -180,7 +180,7 @@ class Ros1Endpoint:
     @property
     def waited_for(self) -> int:
         """Topics that we publish whose first messages wait for subscribers."""
-        return sum(not publication.hold.over for publication in self._publications.values())
+        return sum(not publication.first_messages.over for publication in self._publications.values())
 
     # Endpoint
 

@@ -3,7 +3,8 @@
 Every subscriber has a bounded queue of its own: one that does not keep up loses its oldest messages, which is counted,
 and holds up nobody. What several streams of the link have in common by name (/tf_static of two robots) is one topic
 here: `Publication` joins them, and a late subscriber gets the last message of each, static transforms as one. Its first
-messages wait for the subscribers that there are (`hold`), also when the far side has ended the topic meanwhile.
+messages wait for the subscribers that there are (`first_messages`), also when the far side has ended the topic
+meanwhile.
 """
 
 import asyncio
@@ -15,9 +16,9 @@ from math import inf
 from typing import Final
 
 from sern_client.endpoints.common.queue import BoundedQueue
+from sern_client.endpoints.ros1.first_messages import FirstMessages
 from sern_client.endpoints.ros1.frames import LENGTH, Frames
 from sern_client.endpoints.ros1.header import BRIDGE_FIELD, shown
-from sern_client.endpoints.ros1.hold import Hold
 from sern_client.tf_latch import TfLatch, is_static_tf
 from sern_core.vocabulary.errors import ConfigError
 from sern_core.vocabulary.message import TopicInfo
@@ -142,7 +143,7 @@ class Publication:
         self._unreadable = False
         self._over = over
         newest_only = info.reliable is False and not self.latched
-        self.hold = Hold(
+        self.first_messages = FirstMessages(
             topic,
             max_messages=min(info.depth or 1, limits.messages) if newest_only else limits.messages,
             max_bytes=limits.bytes,
@@ -151,7 +152,7 @@ class Publication:
             done=self._judge,
         )
         if self._static is not None:
-            self.hold.close()  # one message says it all, to everybody who comes
+            self.first_messages.close()  # one message says it all, to everybody who comes
         self.answer = {
             "callerid": caller,
             "topic": topic,
@@ -182,13 +183,13 @@ class Publication:
 
     def registered(self, subscribers: Iterable[str]) -> None:
         """The master lists us as its publisher, and these nodes as its subscribers."""
-        self.hold.registered(subscribers)
+        self.first_messages.registered(subscribers)
 
     def join(self, feed: Feed) -> None:
-        """A new subscriber: it gets what is latched, and what was held for it."""
+        """A new subscriber: it gets what is latched, and the first messages that it has missed."""
         self.feeds.add(feed)
-        held = self.hold.joined(feed.caller)
-        for body in [*(body for body in self.kept() if not any(body is other for other in held)), *held]:
+        missed = self.first_messages.joined(feed.caller)
+        for body in [*(body for body in self.kept() if not any(body is other for other in missed)), *missed]:
             feed.send(body, None)
 
     def kept(self) -> list[bytes]:
@@ -204,7 +205,7 @@ class Publication:
             return
         if self.latched:
             self._latch(handle, body)
-        self.hold.keep(body, left_s)
+        self.first_messages.keep(body, left_s)
         frame = LENGTH.pack(len(body)) + body if len(body) <= JOIN_BYTES else None
         for feed in self.feeds:
             feed.send(body, frame)
@@ -233,10 +234,10 @@ class Publication:
         """Without a stream it ends, once the subscribers it has messages for have come or are given up."""
         if self.handles:
             return
-        if self.hold.over or not len(self.hold):
+        if self.first_messages.over or not len(self.first_messages):
             self._over(self)
         else:
-            self.hold.hurry()
+            self.first_messages.hurry()
 
     def left(self, feed: Feed) -> None:
         """A subscriber has gone."""
@@ -247,7 +248,7 @@ class Publication:
     def close(self) -> None:
         """Send what was published, and nothing more."""
         self.closed = True
-        self.hold.close()
+        self.first_messages.close()
         for feed in list(self.feeds):
             feed.finish()
 

@@ -93,7 +93,7 @@ class Provider:
             try:
                 async with asyncio.timeout(PROBE_S):
                     fields = await self._probe()
-                if BRIDGE_FIELD not in fields or self._owner.heed_sern:
+                if BRIDGE_FIELD not in fields or self._owner.accept_bridged:
                     self.info = self._describe(fields)
                     self._owner.announce(self)
                 self._trouble.over()
@@ -134,11 +134,11 @@ class ServiceWatch:
     """Finds the services of local nodes for `events`, and calls them."""
 
     def __init__(
-        self, master: Master, graph: Graph, local: Callable[[str], str], max_message_bytes: int, *, heed_sern: bool
+        self, master: Master, graph: Graph, local: Callable[[str], str], max_message_bytes: int, *, accept_bridged: bool
     ) -> None:
         self.master = master
         self.local = local
-        self.heed_sern = heed_sern
+        self.accept_bridged = accept_bridged
         self.providers: dict[str, Provider] = {}
         self.known: Table = {}
         """The services at the master, ours too, and the nodes they are of."""

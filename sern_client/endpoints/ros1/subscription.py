@@ -55,7 +55,7 @@ class Owner(Protocol):
     counters: ReceiveCounters
     max_message_bytes: int
     tcp_nodelay: bool
-    heed_sern: bool
+    accept_bridged: bool
 
     def next_number(self) -> int:
         """A connection's id for the tools."""
@@ -241,7 +241,7 @@ class Source:
         if "error" in fields:
             raise WireError(f"refused: {' '.join(fields['error'].split())[:300]}")
         self.fields = fields
-        ours = BRIDGE_FIELD in fields and not self.topic.owner.heed_sern
+        ours = BRIDGE_FIELD in fields and not self.topic.owner.accept_bridged
         self.info = None if ours else self._describe(fields)
         self._trouble.over()
         self.topic.sources_changed()

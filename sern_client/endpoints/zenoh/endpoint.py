@@ -22,7 +22,7 @@ from sern_client.endpoints.base import (
     Sink,
     TopicEvents,
 )
-from sern_client.endpoints.common.first import LEARN_S, FirstMessages
+from sern_client.endpoints.common.first_messages import LEARN_S, FirstMessages
 from sern_client.endpoints.common.interest import OnDemand, Subscriptions
 from sern_client.endpoints.common.saying import SayOnce
 from sern_client.endpoints.common.stream import Stream, Streams
@@ -45,7 +45,7 @@ ROUTER_WAIT_S: Final = 3.0
 LOOK_S: Final = 1.0
 """How often it is looked whether there is one."""
 MAX_COMPLAINTS: Final = 256
-FIRST_MESSAGES: Final = 100
+MAX_FIRST_MESSAGES: Final = 100
 """Messages of a reliable topic that may wait for its first subscribers."""
 
 _log = logging.getLogger(__name__)
@@ -170,19 +170,19 @@ class ZenohEndpoint:
             )
         writer = Writer(self.node, info, type_hash, lambda: self.readers(info.name, dds_name, type_hash))
         best_effort = info.reliable is False
-        first: FirstMessages | None = None
+        first_messages: FirstMessages | None = None
         if not info.latched:  # else whoever comes later gets what it has missed from a cache
-            first = FirstMessages(
+            first_messages = FirstMessages(
                 info.name,
                 readers=writer.readers,
                 write=writer.publish,
                 dropped=self._streams.drop,
-                max_messages=(info.depth or 1) if best_effort else FIRST_MESSAGES,
+                max_messages=(info.depth or 1) if best_effort else MAX_FIRST_MESSAGES,
                 max_bytes=MAX_WAITING_BYTES,
                 overflow=DropReason.SUPERSEDED if best_effort else DropReason.QUEUE_FULL,
                 learning_s=max(0.0, self._started_s + LEARN_S - self._loop.time()),
             )
-        return self._streams.open(info.name, writer, first)
+        return self._streams.open(info.name, writer, first_messages)
 
     def readers(self, name: TopicName, dds_name: str, type_hash: str) -> int:
         """How many subscribers of others the graph knows."""

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable
 from typing import Any, Final
 
-from sern_client.endpoints.common.first import Readers
+from sern_client.endpoints.common.first_messages import Readers
 from sern_client.endpoints.common.saying import SayOnce
 from sern_client.endpoints.zenoh import names
 from sern_client.endpoints.zenoh.names import Kind, Qos

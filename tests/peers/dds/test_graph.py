@@ -38,7 +38,7 @@ async def test_we_are_a_node(domain: int, make_peer: MakePeer, make_endpoint: Ma
 
 async def test_nodes_of_others_are_named(domain: int, make_peer: MakePeer, make_endpoint: MakeEndpoint) -> None:
     one, _ = await make_endpoint(domain, node_name="one")
-    two, _ = await make_endpoint(domain, node_name="two", heed_sern=True)
+    two, _ = await make_endpoint(domain, node_name="two", accept_bridged=True)
     one.advertise(topic_info("/chat", "std_msgs/msg/String", Encoding.CDR))
     await until(lambda: [two.graph.owner(writer) for writer in two.graph.writers("rt/chat")] == ["node /one"])
 

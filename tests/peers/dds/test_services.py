@@ -94,7 +94,7 @@ async def test_between_two_endpoints(domain: int, make_endpoint: MakeEndpoint) -
     """A SERN endpoint beside another sees its services only when told to."""
     one, _ = await make_endpoint(domain, node_name="one")
     _, beside = await make_endpoint(domain, node_name="two")
-    chained, recorder = await make_endpoint(domain, node_name="three", heed_sern=True)
+    chained, recorder = await make_endpoint(domain, node_name="three", accept_bridged=True)
 
     async def handler(request: bytes) -> bytes:
         await asyncio.sleep(0)
@@ -125,7 +125,7 @@ async def test_requests_beyond_the_limit_are_counted(
 ) -> None:
     monkeypatch.setattr(services, "MAX_CALLS", 2)
     one, _ = await make_endpoint(domain, node_name="one")
-    other, recorder = await make_endpoint(domain, node_name="two", heed_sern=True)
+    other, recorder = await make_endpoint(domain, node_name="two", accept_bridged=True)
     release = asyncio.Event()
 
     async def handler(request: bytes) -> bytes:

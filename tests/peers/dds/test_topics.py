@@ -228,7 +228,7 @@ async def test_two_sern_endpoints_beside_each_other_make_no_loop(
     peer = await make_peer(domain)
     one, heard_one = await make_endpoint(domain, node_name="sern_one")
     two, heard_two = await make_endpoint(domain, node_name="sern_two")
-    chain, heard_chain = await make_endpoint(domain, node_name="chain", heed_sern=True)
+    chain, heard_chain = await make_endpoint(domain, node_name="chain", accept_bridged=True)
     await peer.do(f"pub a rt/tf {STRING} reliable")
     for recorder in (heard_one, heard_two, heard_chain):
         await until(lambda recorder=recorder: TopicName("/tf") in recorder.infos)  # type: ignore[misc]

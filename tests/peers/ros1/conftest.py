@@ -2,10 +2,10 @@
 
 import pytest
 
-from sern_client.endpoints.ros1 import hold
+from sern_client.endpoints.ros1 import first_messages
 
 
 @pytest.fixture(autouse=True)
 def patient(monkeypatch: pytest.MonkeyPatch) -> None:
     """A node that a busy machine lets connect late misses nothing: endpoints of this process wait for it longer."""
-    monkeypatch.setattr(hold, "HOLD_S", 60.0)
+    monkeypatch.setattr(first_messages, "FIRST_MESSAGES_S", 60.0)

@@ -194,14 +194,14 @@ async def test_failures_leave_nothing_running(events: Any) -> None:
 
 
 async def test_the_far_side_s_interest_reaches_those_that_give_the_topic(events: Any) -> None:
-    giver, other = Fake(), Fake()
-    endpoint = CompositeEndpoint([giver, other])
+    provider, other = Fake(), Fake()
+    endpoint = CompositeEndpoint([provider, other])
     await endpoint.start(events)
-    assert giver.events is not None
-    giver.events.topic_added(STRING)
+    assert provider.events is not None
+    provider.events.topic_added(STRING)
     endpoint.interest(STRING.name, True)
     endpoint.interest(TopicName("/unknown"), True)
-    assert giver.interests == [(STRING.name, True)]
+    assert provider.interests == [(STRING.name, True)]
     assert other.interests == []
     endpoint.interest(STRING.name, False)
     endpoint.subscribe(STRING.name, lambda _body, _stamp_ns: True)
@@ -209,10 +209,10 @@ async def test_the_far_side_s_interest_reaches_those_that_give_the_topic(events:
     other.events.topic_added(STRING)
     assert other.interests == [(STRING.name, False)], "one that joins later is told what the others were"
     endpoint.interest(STRING.name, True)
-    assert giver.interests[-1] == other.interests[-1] == (STRING.name, True)
+    assert provider.interests[-1] == other.interests[-1] == (STRING.name, True)
 
     endpoint.interest(STRING.name, False)
-    giver.events.topic_removed(STRING.name)
+    provider.events.topic_removed(STRING.name)
     other.events.topic_removed(STRING.name)
     other.interests.clear()
     other.events.topic_added(STRING)

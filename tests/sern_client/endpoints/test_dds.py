@@ -282,7 +282,7 @@ async def test_a_loop_that_is_too_slow_loses_the_oldest(domain_id: int, monkeypa
 
     domain = DomainOptions(domain_id, localhost_only=True)
     one = DdsEndpoint(DdsOptions(domain))
-    two = DdsEndpoint(DdsOptions(domain, heed_sern=True, queue_depth=5))
+    two = DdsEndpoint(DdsOptions(domain, accept_bridged=True, queue_depth=5))
     await one.start(Silent())
     await two.start(Silent())
     try:

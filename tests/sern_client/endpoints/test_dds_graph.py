@@ -45,10 +45,10 @@ def remote(number: int, participant: UUID = OTHER, topic: str = "rt/chat", **cha
     return replace(Remote(UUID(int=number), participant, True, topic, STRING, EndpointQos(), number), **changed)
 
 
-@pytest.mark.parametrize("heed_sern", [False, True])
-def test_the_graph_counts_what_is_of_this_site(heed_sern: bool) -> None:
+@pytest.mark.parametrize("accept_bridged", [False, True])
+def test_the_graph_counts_what_is_of_this_site(accept_bridged: bool) -> None:
     heard = Heard()
-    graph = Graph(OWN, heard, heed_sern=heed_sern)
+    graph = Graph(OWN, heard, accept_bridged=accept_bridged)
     graph.participant_added(Participant(OTHER, "robot"))
     graph.participant_added(Participant(SERN, "bridge", "sern_two"))
     for number, participant in ((10, OWN), (11, OTHER), (12, SERN)):
@@ -57,8 +57,8 @@ def test_the_graph_counts_what_is_of_this_site(heed_sern: bool) -> None:
     graph.remote_added(remote(13, topic="not_ros"))
     graph.remote_added(remote(14, topic="rq/set_boolRequest", writer=False))
     found = [writer.handle for writer in graph.writers("rt/chat")]
-    assert found == ([11, 12] if heed_sern else [11])
-    assert graph.ignored == (set() if heed_sern else {12})
+    assert found == ([11, 12] if accept_bridged else [11])
+    assert graph.ignored == (set() if accept_bridged else {12})
     assert heard.topics == ["/chat"] * len(found) and heard.services == ["/set_bool"]
     graph.participant_removed(SERN)
     graph.participant_removed(OTHER)
@@ -316,9 +316,9 @@ def test_the_last_words_of_a_writer_of_sern_are_not_taken_for_a_robots() -> None
 class Network:
     """What discovery may tell, in any order, of three participants; and what follows from it, from scratch."""
 
-    def __init__(self, *, heed_sern: bool) -> None:
+    def __init__(self, *, accept_bridged: bool) -> None:
         self.heard: dict[str, list[Remote]] = {}
-        self.graph = Graph(OWN, self, heed_sern=heed_sern, own_guard="guard")
+        self.graph = Graph(OWN, self, accept_bridged=accept_bridged, own_guard="guard")
         self.participants: dict[UUID, Participant] = {}
         self.remotes: dict[UUID, Remote] = {}
 
@@ -348,14 +348,14 @@ class Network:
         def foreign(one: Remote) -> bool:
             owner = self.participants.get(one.participant)
             sern = owner.sern if owner is not None else ""
-            return not sern or (self.graph.heed_sern and sern != "guard")
+            return not sern or (self.graph.accept_bridged and sern != "guard")
 
         here = [one for one in self.remotes.values() if one.topic == topic and foreign(one)]
         return sorted(here, key=lambda one: one.guid.bytes)
 
 
 @given(
-    heed_sern=st.booleans(),
+    accept_bridged=st.booleans(),
     acts=st.lists(
         st.tuples(
             st.sampled_from(["participant", "no participant", "remote", "remote", "no remote"]),
@@ -367,8 +367,8 @@ class Network:
     ),
 )
 @STEADY
-def test_in_whatever_order_discovery_tells_it(heed_sern: bool, acts: list[tuple[str, int, int, int]]) -> None:
-    network = Network(heed_sern=heed_sern)
+def test_in_whatever_order_discovery_tells_it(accept_bridged: bool, acts: list[tuple[str, int, int, int]]) -> None:
+    network = Network(accept_bridged=accept_bridged)
     graph = network.graph
     for number in (1, 2):
         qos = EndpointQos(reliable=number == 1)

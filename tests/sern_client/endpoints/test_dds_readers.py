@@ -106,7 +106,7 @@ async def pair(monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[Pair]:
     monkeypatch.setattr(module, "LEARN_S", 0.0)  # nobody is waited for
     domain = DomainOptions(free_domain(), localhost_only=True)
     opened: list[EndpointQos] = []
-    one, two = DdsEndpoint(DdsOptions(domain)), DdsEndpoint(DdsOptions(domain, heed_sern=True, queue_depth=500))
+    one, two = DdsEndpoint(DdsOptions(domain)), DdsEndpoint(DdsOptions(domain, accept_bridged=True, queue_depth=500))
     open_reader = two.entities.open_reader
 
     def counted(topic: str, resolved: Any, qos: EndpointQos, *rest: Any, **options: Any) -> Any:

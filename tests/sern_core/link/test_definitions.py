@@ -47,7 +47,7 @@ def test_a_topic_that_comes_again_has_its_definition_again() -> None:
     assert [stream.info.definition for stream in site.opened] == ["uint8 x\n"] * 5
 
 
-def test_a_stream_that_is_still_owed_keeps_its_definition() -> None:
+def test_a_stream_of_which_messages_wait_keeps_its_definition() -> None:
     world = World().watch()
     robot = world.client("robot")
     site = world.client("site", patterns=[".*"])

@@ -80,9 +80,8 @@ def test_a_hundred_plain_subscribers_cost_a_robot_next_to_nothing(every_s: float
     world.run(20.0)
     assert all(not c.patterns for c in (client.core for client in world.clients.values()) if c.name.startswith("site"))
     assert control.nbytes < ROBOT_BYTES, control.kinds
-    assert all(
-        channel.wanted and channel.owed in ((), ("operator",)) for channel in robot.core.link.sender.channels.values()
-    )
+    channels = robot.core.link.sender.channels.values()
+    assert all(channel.wanted and channel.required in ((), ("operator",)) for channel in channels)
     assert len(operator.opened) == 30
 
 
@@ -205,7 +204,7 @@ def test_a_relay_keeps_no_names_that_a_subscriber_says_it_owes() -> None:
         peer.control({"t": "want", "ch": 1, "on": True, "owed": ["x"] * 48, "more": True})
     peer.control({"t": "want", "ch": 1, "on": True, "owed": ["y"], "chs": [2, 3]})
     peer.control({"t": "want", "ch": 1, "on": True, "add": ["z"], "chs": [2, 3]})
-    assert [(channel.wanted, channel.owed) for channel in channels] == [(True, ())] * 3
+    assert [(channel.wanted, channel.required) for channel in channels] == [(True, ())] * 3
 
 
 def told_robot(topics: int, link: LinkParams | None = None) -> tuple[SimClient, Callable[[framing.Envelope], None]]:
@@ -223,40 +222,40 @@ def told_robot(topics: int, link: LinkParams | None = None) -> tuple[SimClient, 
     return robot, tell
 
 
-def test_channels_that_are_owed_alike_share_one_list() -> None:
+def test_channels_with_the_same_required_clients_share_one_list() -> None:
     robot, tell = told_robot(50)
     channels = list(robot.core.link.sender.channels.values())
-    slots = sorted(channel.slot for channel in channels)
-    runs = [slots[0] + 1, slots[-1]]
-    tell({"t": "want", "ch": slots[0], "on": True, "chs": runs, "owed": ["site1", "site2"]})
-    tell({"t": "want", "ch": slots[0], "on": True, "chs": runs, "add": ["site3"], "drop": ["site1"]})
-    assert {channel.owed for channel in channels} == {("site2", "site3")}
-    assert len({id(channel.owed) for channel in channels}) == 1
+    channel_ids = sorted(channel.channel_id for channel in channels)
+    runs = [channel_ids[0] + 1, channel_ids[-1]]
+    tell({"t": "want", "ch": channel_ids[0], "on": True, "chs": runs, "owed": ["site1", "site2"]})
+    tell({"t": "want", "ch": channel_ids[0], "on": True, "chs": runs, "add": ["site3"], "drop": ["site1"]})
+    assert {channel.required for channel in channels} == {("site2", "site3")}
+    assert len({id(channel.required) for channel in channels}) == 1
 
 
 def test_lists_that_are_finished_leave_room_for_others() -> None:
-    robot, tell = told_robot(1, limited(owed=10))
+    robot, tell = told_robot(1, limited(required=10))
     channel = next(iter(robot.core.link.sender.channels.values()))
     for row in range(5):
         names = [f"site{row}{index}" for index in range(6)]
-        tell({"t": "want", "ch": channel.slot, "on": True, "owed": names[:5], "more": True})
-        tell({"t": "want", "ch": channel.slot, "on": True, "owed": names[5:]})
-        assert channel.owed == tuple(names)
-    for slot in (1, 2):
-        tell({"t": "want", "ch": slot, "on": True, "owed": ["a"] * 5, "more": True})
+        tell({"t": "want", "ch": channel.channel_id, "on": True, "owed": names[:5], "more": True})
+        tell({"t": "want", "ch": channel.channel_id, "on": True, "owed": names[5:]})
+        assert channel.required == tuple(names)
+    for channel_id in (1, 2):
+        tell({"t": "want", "ch": channel_id, "on": True, "owed": ["a"] * 5, "more": True})
     with pytest.raises(WireError, match="unfinished"):
         tell({"t": "want", "ch": 3, "on": True, "owed": ["a"], "more": True})
 
 
-def test_a_stream_is_owed_to_no_more_names_than_fit() -> None:
+def test_a_stream_requires_no_more_names_than_fit() -> None:
     robot, tell = told_robot(1)
     channel = next(iter(robot.core.link.sender.channels.values()))
-    names = [f"site{index}" for index in range(LIMITS.owed)]
+    names = [f"site{index}" for index in range(LIMITS.required)]
     for start in range(0, len(names), MAX_STRINGS):
-        tell({"t": "want", "ch": channel.slot, "on": True, "add": names[start : start + MAX_STRINGS]})
-    assert len(channel.owed) == LIMITS.owed
+        tell({"t": "want", "ch": channel.channel_id, "on": True, "add": names[start : start + MAX_STRINGS]})
+    assert len(channel.required) == LIMITS.required
     with pytest.raises(WireError, match="owes a stream to more than"):
-        tell({"t": "want", "ch": channel.slot, "on": True, "add": ["one_more"]})
+        tell({"t": "want", "ch": channel.channel_id, "on": True, "add": ["one_more"]})
 
 
 @pytest.mark.parametrize("bad", [[1], [3, 2], [1, 1], [5, 6, 6, 7], [2, 70_000], ["2", "3"], [True, True], 7, None])
@@ -278,9 +277,9 @@ def test_whatever_changes_the_peer_ends_up_with_what_is(seed: int, batches: bool
     interest = Interest()
     interest.begin()
     interest.batches = batches
-    streams = {slot: in_stream(slot) for slot in random.sample(range(1, 400), 60)}
+    streams = {channel_id: in_stream(channel_id) for channel_id in random.sample(range(1, 400), 60)}
     names = [f"site{index}" for index in range(120)]
-    now, seq, heard = 0.0, 0, 0
+    now, seq, acked_seq = 0.0, 0, 0
     truth: dict[int, tuple[bool, frozenset[str]]] = {}
     peer: dict[int, tuple[bool, frozenset[str]]] = {}
     parts: dict[int, tuple[str, ...]] = {}
@@ -289,30 +288,30 @@ def test_whatever_changes_the_peer_ends_up_with_what_is(seed: int, batches: bool
         nonlocal seq
         seq += 1
         want = decode_want(framing.decode_envelope(framing.encode_envelope(envelope)))  # which refuses what is too long
-        assert batches or (want.owed is not None and len(want.runs) == 1)
+        assert batches or (want.required is not None and len(want.runs) == 1)
         first = want.runs[0][0]
         if want.more:
-            parts[first] = parts.get(first, ()) + (want.owed or ())
+            parts[first] = parts.get(first, ()) + (want.required or ())
             return seq
-        owed = None if want.owed is None else frozenset(parts.pop(first, ()) + want.owed)
+        required = None if want.required is None else frozenset(parts.pop(first, ()) + want.required)
         for low, high in want.runs:
-            for slot in range(low, high + 1):
-                had = peer.get(slot, (False, frozenset()))[1]
-                peer[slot] = (want.on, (had | set(want.add)) - set(want.drop) if owed is None else owed)
+            for channel_id in range(low, high + 1):
+                had = peer.get(channel_id, (False, frozenset()))[1]
+                peer[channel_id] = (want.on, (had | set(want.add)) - set(want.drop) if required is None else required)
         return seq
 
     for _ in range(100):
         now += random.choice([0.0, 0.01, 0.3])
-        for slot in random.sample(sorted(streams), random.choice([1, 5, 60])):
-            owed = tuple(random.sample(names, random.choice([0, 1, 3, 100])))
-            on = bool(owed) or random.random() < 0.3
-            interest.answer(slot, streams[slot], on, owed, now=now)
-            truth[slot] = (on, frozenset(owed))
+        for channel_id in random.sample(sorted(streams), random.choice([1, 5, 60])):
+            required = tuple(random.sample(names, random.choice([0, 1, 3, 100])))
+            on = bool(required) or random.random() < 0.3
+            interest.answer(channel_id, streams[channel_id], on, required, now=now)
+            truth[channel_id] = (on, frozenset(required))
         if random.random() < 0.7:
-            heard = seq
-        interest.tell(send, heard=heard, unheard=seq - heard, now=now)
+            acked_seq = seq
+        interest.tell(send, acked_seq=acked_seq, unacked=seq - acked_seq, now=now)
     for _ in range(3):
         now += PAUSE_MAX_S
-        interest.tell(send, heard=seq, unheard=0, now=now)
+        interest.tell(send, acked_seq=seq, unacked=0, now=now)
     assert not interest and peer == truth
-    assert all(stream.wanted == truth[slot][0] for slot, stream in streams.items() if slot in truth)
+    assert all(stream.wanted == truth[channel_id][0] for channel_id, stream in streams.items() if channel_id in truth)

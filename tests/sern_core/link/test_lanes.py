@@ -238,8 +238,8 @@ class _Carried:
         self.channels: set[int] = set()
         framing.decode_frames(datagram, self)
 
-    def on_data(self, _flags: int, channel: int, *_: object) -> None:
-        self.channels.add(channel)
+    def on_data(self, _flags: int, channel_id: int, *_: object) -> None:
+        self.channels.add(channel_id)
 
     def on_ack(self, *_: object) -> None: ...
 
@@ -251,13 +251,13 @@ class _Carried:
 def test_a_datagram_has_the_class_of_the_most_urgent_message_in_it(monkeypatch: pytest.MonkeyPatch) -> None:
     """Second copies too; what carries no message, or only control messages, is state."""
     seen: dict[frozenset[str], set[PriorityClass]] = {}
-    slots: dict[int, str] = {0: "control messages"}
+    channel_ids: dict[int, str] = {0: "control messages"}
 
     def noted(port: LanePort, *, now: float) -> bytes | None:
         datagram = port.link.next_datagram(now=now, lane=port.lane)
         if datagram is not None and port.link.end.name == "robot":
-            slots.update((c.slot, c.spec.priority.name) for c in port.link.sender.channels.values())
-            carried = frozenset(slots[slot] for slot in _Carried(datagram).channels)
+            channel_ids.update((c.channel_id, c.spec.priority.name) for c in port.link.sender.channels.values())
+            carried = frozenset(channel_ids[channel_id] for channel_id in _Carried(datagram).channels)
             seen.setdefault(carried, set()).add(port.priority)
         return datagram
 

@@ -33,13 +33,13 @@ def link_of(peer: Hostile) -> Link:
 def announced(peer: Hostile, count: int = STREAMS, *, reliable: bool = False) -> bytes:
     """Announcements, each with the first message of its stream behind it."""
     frames = b""
-    for slot in range(1, count + 1):
-        info = TopicInfo(TopicName(f"/robot/t{slot}"), "a/b", Encoding.CDR)
+    for channel_id in range(1, count + 1):
+        info = TopicInfo(TopicName(f"/robot/t{channel_id}"), "a/b", Encoding.CDR)
         stream = StreamInfo(StreamId(peer.name, peer.boot, info.name), info, spec(reliable=reliable))
         peer.control_seq += 1
-        body = framing.encode_control(encode_announcement(Announcement(slot, stream, "", 1, ())))
+        body = framing.encode_control(encode_announcement(Announcement(channel_id, stream, "", 1, ())))
         frames += framing.encode_data_first(0, 0, peer.control_seq, len(body), len(body), 0, 0.0, 0) + body
-        frames += _whole(slot, 1)
+        frames += _whole(channel_id, 1)
     return frames
 
 
@@ -81,7 +81,7 @@ def acknowledges(peer: Hostile) -> bool:
         def on_ack(self, _lane: int, highest: int, *_: int) -> None:
             acks.append(highest)
 
-        def on_watermark(self, _channel: int, _delivered: int) -> None: ...
+        def on_watermark(self, _channel_id: int, _delivered: int) -> None: ...
 
         def on_ping(self) -> None: ...
 
@@ -99,7 +99,7 @@ def test_a_datagram_that_costs_much_is_read_in_slices_and_in_order(monkeypatch: 
     assert 0 < len(got) < STREAMS
     peer.say(_whole(1, 2))  # it came later: its turn is later, too
     assert read_all(peer) > 3
-    assert got == [*((f"/robot/t{slot}", 1) for slot in range(1, STREAMS + 1)), ("/robot/t1", 2)]
+    assert got == [*((f"/robot/t{channel_id}", 1) for channel_id in range(1, STREAMS + 1)), ("/robot/t1", 2)]
     assert link_of(peer).receiver.strays == 0
     peer.hub.validate()
 
@@ -142,7 +142,7 @@ def test_a_session_that_ends_meanwhile_loses_nothing(monkeypatch: pytest.MonkeyP
     peer.tag, peer.control_seq, peer.number = 2, 0, 0
     peer.say(announced(peer, reliable=True))
     read_all(peer)
-    assert got == [(f"/robot/t{slot}", 1) for slot in range(1, STREAMS + 1)]
+    assert got == [(f"/robot/t{channel_id}", 1) for channel_id in range(1, STREAMS + 1)]
     peer.hub.validate()
 
 
@@ -230,8 +230,8 @@ def test_what_is_released_goes_on_when_the_session_has_ended(
 
 def test_streams_that_were_left_out_are_retracted_in_slices() -> None:
     peer = robot_and_readers()
-    for slot in range(1, STREAMS + 1):
-        peer.announce(slot, f"/robot/t{slot}")
+    for channel_id in range(1, STREAMS + 1):
+        peer.announce(channel_id, f"/robot/t{channel_id}")
         read_all(peer)
     peer.hello(2)
     peer.tag, peer.control_seq, peer.number = 2, 0, 0

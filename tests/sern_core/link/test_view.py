@@ -26,7 +26,7 @@ def test_a_link_in_use_is_seen_as_its_parts_are() -> None:
     seen = link.observe(now=now)
     assert (seen.peer, seen.up, seen.established, seen.stalled) == (link.peer, True, True, False)
     assert (seen.lane_id, seen.lane, seen.lossless) == (LANE_UDP, "udp", False)
-    assert seen.datagrams_pass and seen.stream_usable and not seen.express
+    assert seen.datagrams_pass and seen.stream_usable and not seen.priority_lane
     lane = link.lane
     assert (seen.rate_bps, seen.window_bytes) == (lane.estimator.rate_bps, lane.estimator.window_bytes)
     assert (seen.inflight_bytes, seen.srtt_s) == (lane.flight.inflight_bytes, lane.flight.rtt.srtt_s)

@@ -97,9 +97,9 @@ def test_topics_that_leave_no_room_together_hold_nothing_back() -> None:
 
     def share(datagram_s: float) -> float:
         cadences = Cadences()
-        for slot in range(5):
+        for channel_id in range(5):
             for at_s in every(PERIOD_S, 20):
-                cadences.arrived(slot, now=at_s + 0.004 * slot)
+                cadences.arrived(channel_id, now=at_s + 0.004 * channel_id)
         return cadences.share(10.0 + 20 * PERIOD_S + 0.0167, datagram_s)
 
     assert share(DATAGRAM_S) == 1.0
@@ -109,8 +109,8 @@ def test_topics_that_leave_no_room_together_hold_nothing_back() -> None:
 def test_among_many_topics_there_is_no_gap() -> None:
     cadences = Cadences()
     for at_s in every(PERIOD_S, 20):
-        for slot in range(MAX_TOPICS + 1):
-            cadences.arrived(slot, now=at_s)
+        for channel_id in range(MAX_TOPICS + 1):
+            cadences.arrived(channel_id, now=at_s)
     assert cadences.share(10.0 + 20 * PERIOD_S + 0.0007, DATAGRAM_S) == 1.0
 
 

@@ -1,4 +1,4 @@
-"""The end of what waits for a subscriber: tombstones and gaps in it, and exactly the messages in between are lost."""
+"""The end of what waits for a subscriber: drop markers and gaps in it, and exactly the messages in between are lost."""
 
 import pytest
 from hypothesis import Phase, given, settings
@@ -109,7 +109,7 @@ def test_what_lapses_in_many_sweeps_is_reported_once_and_never_sent(monkeypatch:
     take = OutChannel.take
 
     def taken(channel: OutChannel, out: OutMessage, room: int, now: float) -> tuple[int, int]:
-        sent.append(not out.message.tombstone and now - out.retain_from_s > channel.spec.retention_s)
+        sent.append(not out.message.drop_marker and now - out.retain_from_s > channel.spec.retention_s)
         return take(channel, out, room, now)
 
     monkeypatch.setattr(OutChannel, "take", taken)

@@ -9,7 +9,7 @@ import pytest
 from sern_core.link.link import Link
 from sern_core.path.congestion.fixed import FixedWindow
 from sern_core.relay.access import DEFAULT_QUEUE_BYTES, AccessRule, AccessTable
-from sern_core.relay.bound import TOMBSTONE_BYTES
+from sern_core.relay.bound import DROP_MARKER_BYTES
 from sern_core.stream.out_channel import OutChannel
 from sern_core.stream.prices import CLIENT_OVERHEAD_BYTES, MESSAGE_OVERHEAD_BYTES
 from sern_core.vocabulary.message import TopicSpec
@@ -21,7 +21,7 @@ from tests.fuzz.test_hostile_peer import Hostile, _whole
 from tests.world import World, spec
 
 LARGE_BYTES = 20_000 + CLIENT_OVERHEAD_BYTES
-LIMIT_BYTES = 5 * LARGE_BYTES + 7 * TOMBSTONE_BYTES
+LIMIT_BYTES = 5 * LARGE_BYTES + 7 * DROP_MARKER_BYTES
 BOUNDED = AccessTable(
     [
         AccessRule(client="site", subscribe=(".*",), max_queue_bytes=LIMIT_BYTES),
@@ -288,7 +288,7 @@ def test_a_client_that_is_away_holds_no_more_than_its_bound_whatever_comes() -> 
     peer.announce(2, "/robot/b", reliable=True)
     link = to_site(world)
     for seq in range(1, 3000):
-        peer.say(_whole(1, seq, b"x" * (seq % 3)), _whole(2, seq, b"\x01", flags=framing.FLAG_TOMBSTONE))
+        peer.say(_whole(1, seq, b"x" * (seq % 3)), _whole(2, seq, b"\x01", flags=framing.FLAG_DROP_MARKER))
         while (data := peer.port.next_datagram(now=peer.now)) is not None:
             peer.say(framing.encode_ack(0, framing.decode_header(data).number, 2**64 - 1, 0, 0, 10**6))
         assert waiting(world) <= LIMIT_BYTES
@@ -305,7 +305,7 @@ def test_what_was_left_out_is_skipped_in_its_turn_and_reported() -> None:
     world.run(1.0)
     world.hops["site"].break_connection(reconnect_s=30.0)
     world.run(0.5)
-    for _ in range(400):  # so many that not even a tombstone of each has room
+    for _ in range(400):  # so many that not even a drop marker of each has room
         robot.send(log, b"l" * 200)
         world.run(0.02)
     world.run(60.0)

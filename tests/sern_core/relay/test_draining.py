@@ -1,4 +1,4 @@
-"""Streams that ended while somebody was still owed messages of them."""
+"""Streams that ended while somebody was still to get messages of them."""
 
 from collections.abc import Callable
 
@@ -14,7 +14,7 @@ from tests.world import OPEN_ACCESS, SimClient, World, limited, spec
 
 
 class Ended:
-    """A reliable topic that ended while its subscriber was away and owed two messages."""
+    """A reliable topic that ended while its subscriber was away and had two messages to get."""
 
     def __init__(self, access: AccessTable = OPEN_ACCESS, *, reconnect_s: float = 8.0) -> None:
         self.world = World(access=access, hub_params=HubParams(resume_s=60.0)).watch()
@@ -39,7 +39,7 @@ class Ended:
         return sum(counters.by_reason[reason] for counters in link.sender.ledger.topics.values())
 
 
-def test_what_was_owed_of_an_ended_stream_is_delivered() -> None:
+def test_what_waits_of_an_ended_stream_is_delivered() -> None:
     case = Ended()
     case.world.run(20.0)
     assert case.bodies() == [b"last", b"words"]
@@ -85,7 +85,7 @@ def test_another_stream_of_the_name_does_not_go_on_in_its_channel(again: Again) 
 
 
 def test_a_subscriber_that_was_away_is_told_of_another_type() -> None:
-    """Also where nothing was owed: the subscriber knows the stream by its name."""
+    """Also where nothing was left to deliver: the subscriber knows the stream by its name."""
     world = World().watch()
     robot, site = world.client("robot"), world.client("site", patterns=[".*"])
     first = robot.publish("/robot/log", spec(), "int32 x\n")

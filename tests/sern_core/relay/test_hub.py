@@ -79,7 +79,7 @@ def test_the_list_of_what_is_denied_has_an_end() -> None:
 # --- who is let go ----------------------------------------------------------------------------------------------------
 
 
-def test_a_client_that_says_goodbye_and_is_owed_nothing_is_forgotten_at_once() -> None:
+def test_a_client_that_says_goodbye_and_has_nothing_to_get_is_forgotten_at_once() -> None:
     world = World().watch()
     robot = world.client("robot")
     site = world.client("site", patterns=["/robot/.*"])
@@ -98,7 +98,7 @@ def test_a_client_that_says_goodbye_and_is_owed_nothing_is_forgotten_at_once() -
     world.until(lambda: site.seqs("/robot/odom") == [1])
 
 
-def test_a_client_that_is_owed_a_reliable_stream_or_has_its_own_is_waited_for() -> None:
+def test_a_client_that_is_required_or_has_reliable_streams_is_waited_for() -> None:
     world = World().watch()
     robot = world.client("robot")
     site = world.client("site", patterns=["/robot/.*"])
@@ -121,7 +121,7 @@ def test_a_connection_that_breaks_is_no_goodbye() -> None:
     assert site.name in world.relay.hub.links
 
 
-def test_a_revoked_name_is_forgotten_and_what_it_was_owed_is_reported() -> None:
+def test_a_revoked_name_is_forgotten_and_what_waits_for_it_is_reported() -> None:
     world = World().watch()
     hub = world.relay.hub
     robot = world.client("robot")
@@ -161,7 +161,7 @@ def test_a_new_relay_holds_for_every_one_of_many_subscribers() -> None:
     sites = [world.client(f"s{n:03d}_" + "x" * 40, away, patterns=["/robot/.*"]) for n in range(120)]
     log = robot.publish("/robot/log", spec(reliable=True))
     world.run(4.0)
-    assert set(log.owed) == {site.name for site in sites}
+    assert set(log.required) == {site.name for site in sites}
     world.run(2.0)
     world.restart_relay()
     world.until(lambda: len(robot.ups) == 2, within_s=3.0)
@@ -172,5 +172,5 @@ def test_a_new_relay_holds_for_every_one_of_many_subscribers() -> None:
     assert log.retained
     world.until(lambda: all(site.seqs("/robot/log") == [1] for site in sites))
     world.until(lambda: not log.retained)
-    assert set(log.owed) == {site.name for site in sites}
+    assert set(log.required) == {site.name for site in sites}
     world.validate()

@@ -73,13 +73,13 @@ def test_one_announcement_for_many_is_told_in_slices() -> None:
     peer.hub.validate()
 
 
-def test_clients_that_have_not_come_back_are_awaited_in_slices() -> None:
+def test_absent_clients_are_waited_for_in_slices() -> None:
     peer = Hostile()
-    peer.hub.awaited.known = lambda _client: True
+    peer.hub.absent.known = lambda _client: True
     absent = tuple(f"site{number:02}" for number in range(48))
-    for slot in range(1, 11):
-        peer.announce(slot, f"/robot/t{slot}", reliable=True, owed=absent)
-        peer.say(_whole(slot, 1))
+    for channel_id in range(1, 11):
+        peer.announce(channel_id, f"/robot/t{channel_id}", reliable=True, required=absent)
+        peer.say(_whole(channel_id, 1))
     slices = 0
     before = opened = 0
     while due_s(peer) is not None:
@@ -90,14 +90,14 @@ def test_clients_that_have_not_come_back_are_awaited_in_slices() -> None:
         before = opened
         slices += 1
     assert slices > 5 and opened == 480
-    for slot in range(1, 11):
-        relayed = stream_of(peer, f"/robot/t{slot}")
+    for channel_id in range(1, 11):
+        relayed = stream_of(peer, f"/robot/t{channel_id}")
         assert set(relayed.outs) == set(absent)
         assert all([out.seq for out in channel.retained] == [1] for _link, channel in relayed.outs.values())
     peer.hub.validate()
 
 
-def test_the_origin_is_told_at_once_who_is_owed() -> None:
+def test_the_origin_is_told_at_once_who_is_required() -> None:
     world = World()
     reading(world, READERS)
     peer = Hostile(world)
@@ -105,11 +105,11 @@ def test_the_origin_is_told_at_once_who_is_owed() -> None:
     relayed = stream_of(peer, "/robot/a")
     assert relayed.waiting and relayed.stream.wanted
     (change,) = peer.hub.links[peer.name].answers._interest._changes.values()
-    assert len(change.answer.owed) == READERS
+    assert len(change.answer.required) == READERS
     while due_s(peer) is not None:
         turn(peer)
     (change,) = peer.hub.links[peer.name].answers._interest._changes.values()
-    assert change.answer.owed == tuple(relayed.outs)
+    assert change.answer.required == tuple(relayed.outs)
 
 
 def test_other_properties_are_told_in_slices_too() -> None:
@@ -234,7 +234,7 @@ def test_the_streams_of_a_process_that_was_started_anew_end_in_slices() -> None:
         while due_s(peer) is not None:
             turn(peer)
     peer.say(_whole(1, 1))
-    hub, owed = peer.hub, stream_of(peer, "/robot/t1")
+    hub, kept = peer.hub, stream_of(peer, "/robot/t1")
     links = [hub.links[reader.name] for reader in readers]
     peer.boot, peer.control_seq, peer.tag = 78, 0, 2
     peer.hello(2)
@@ -253,9 +253,9 @@ def test_the_streams_of_a_process_that_was_started_anew_end_in_slices() -> None:
             left[-1] = sum(len(link.sender.channels) for link in links)
     hub.validate()
     assert len(left) > 3
-    identity = owed.stream.stream.id
+    identity = kept.stream.stream.id
     assert all(len(link.sender.channels) == 2 and link.outgoing.by_stream[identity].retained for link in links), (
-        "what is owed is kept"
+        "what waits is kept"
     )
 
 

@@ -409,7 +409,7 @@ class RoutingMachine(RuleBasedStateMachine):
         assert set(change.added) == self.streams.keys() - streams_before
         assert set(change.removed) == streams_before - self.streams.keys()
         if self.sliced:
-            return  # the last taker may go in one slice, and the first come in another
+            return  # the last subscriber may go in one slice, and the first come in another
         had, has = {match.stream for match in before}, {match.stream for match in after}
         assert set(change.wanted) == has - had
         assert set(change.unwanted) == (had - has) & self.streams.keys()

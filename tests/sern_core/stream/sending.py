@@ -23,14 +23,14 @@ class Sender:
         self.channel = OutChannel(1, self.stream, counters, self._drop, first=first)
         self.channel.wanted = self.channel.ready = True
 
-    def _drop(self, _slot: int, outs: Sequence[OutMessage], reason: DropReason) -> None:
+    def _drop(self, _channel_id: int, outs: Sequence[OutMessage], reason: DropReason) -> None:
         self.drops += [(out.seq, reason) for out in outs]
         self.told.append((outs[0].seq, outs[-1].seq, reason))
 
     def message(self, seq: int, size: int = 100, *, now: float = 0.0, replay: bool = False) -> Message:
         return Message(self.stream.id, seq, bytes(size), 0, now, 0, replay)
 
-    def tombstone(self, seq: int) -> Message:
+    def drop_marker(self, seq: int) -> Message:
         return Message(self.stream.id, seq, b"\x01", 0, 0.0, 1)
 
     def submit(self, count: int = 1, size: int = 100, *, now: float = 0.0) -> list[bool]:

@@ -1,4 +1,4 @@
-"""Reassembly: pieces in any order, repeated, overlapping; order, once, limits and tombstones."""
+"""Reassembly: pieces in any order, repeated, overlapping; order, once, limits and drop markers."""
 
 import random
 import tracemalloc
@@ -23,7 +23,7 @@ from sern_core.vocabulary.errors import WireError
 from sern_core.vocabulary.limits import LIMITS
 from sern_core.vocabulary.message import Message, StreamId, StreamInfo, TopicInfo
 from sern_core.vocabulary.types import DROP_CODES, ClientName, DropReason, Encoding, TopicName
-from sern_core.wire.framing import FLAG_TOMBSTONE
+from sern_core.wire.framing import FLAG_DROP_MARKER
 from tests.exploring import cases
 from tests.world import spec
 
@@ -65,8 +65,8 @@ class Receiver:
         self.check()
         return self.stream.left_out
 
-    def tombstone(self, seq: int, reason: DropReason) -> None:
-        self.stream.fragment(FLAG_TOMBSTONE, seq, 0, 1, bytes([DROP_CODES[reason]]), 0, 0.0, 0.0, 0.0)
+    def drop_marker(self, seq: int, reason: DropReason) -> None:
+        self.stream.fragment(FLAG_DROP_MARKER, seq, 0, 1, bytes([DROP_CODES[reason]]), 0, 0.0, 0.0, 0.0)
         self.check()
 
     def check(self) -> None:
@@ -108,7 +108,7 @@ def test_reliable_is_once_and_in_order_best_effort_rises(arrivals: list[tuple[in
     for seq, dead in arrivals:
         best.whole(seq)
         if dead:
-            reliable.tombstone(seq, DropReason.LIFESPAN)
+            reliable.drop_marker(seq, DropReason.LIFESPAN)
         else:
             reliable.whole(seq)
     arrived = {seq for seq, _ in arrivals}
@@ -152,13 +152,13 @@ def test_a_message_that_grew_old_waiting_for_the_one_before_it_is_late() -> None
     receiver = Receiver(reliable=True, lifespan_s=1.0)
     receiver.whole(2, now=0.1)
     receiver.whole(1, now=5.0, born_s=4.9)
-    assert [bool(message.tombstone) for message in receiver.turns] == [False, True]
+    assert [bool(message.drop_marker) for message in receiver.turns] == [False, True]
 
 
-def test_a_tombstone_takes_the_place_of_what_is_half_received() -> None:
+def test_a_drop_marker_takes_the_place_of_what_is_half_received() -> None:
     receiver = Receiver(reliable=True)
     receiver.piece(1, 0, 50, 100)
-    receiver.tombstone(1, DropReason.RETENTION)
+    receiver.drop_marker(1, DropReason.RETENTION)
     receiver.piece(1, 50, 100, 100)
     assert receiver.seqs == [1] and receiver.turns[0].drop_reason is DropReason.RETENTION
     assert receiver.room.held_bytes == 0

@@ -21,7 +21,7 @@ def test_a_reported_message_is_dropped_once_and_not_sent_to_a_new_peer() -> None
     assert sender.drops == [(1, DropReason.RATE_CAP)]
     sender.check()
     sender.channel.peer_restarted()
-    assert [bool(out.message.tombstone) for out in sender.channel.queue] == [True, False]
+    assert [bool(out.message.drop_marker) for out in sender.channel.queue] == [True, False]
     sender.check()
 
 
@@ -87,7 +87,7 @@ def test_what_makes_room_and_was_reported_before_is_not_reported_again() -> None
     sender.submit(3)
     channel.reported(6, DropReason.RATE_CAP)
     assert channel.abandon(7, DropReason.UNWANTED) and not channel.abandon(7, DropReason.UNWANTED)
-    assert [bool(out.message.tombstone) for out in channel.queue] == [False, False, True]
+    assert [bool(out.message.drop_marker) for out in channel.queue] == [False, False, True]
     for size in (1, 100, 100):
         assert channel.shed(1, DropReason.QUEUE_FULL) == size + CLIENT_OVERHEAD_BYTES
     assert sender.drops == [(6, DropReason.RATE_CAP), (7, DropReason.UNWANTED), (5, DropReason.QUEUE_FULL)]
@@ -122,12 +122,12 @@ def test_many_that_are_dropped_at_once_are_told_as_one_span() -> None:
     sender.check()
 
 
-def test_a_backlog_of_tombstones_and_gaps_ends_as_one_span() -> None:
+def test_a_backlog_of_drop_markers_and_gaps_ends_as_one_span() -> None:
     sender = Sender(spec(reliable=True))
     channel = sender.channel
     for _ in range(100):
         sender.submit()
-        channel.submit(sender.tombstone(channel.next_seq), now=0.0, forced=True)
+        channel.submit(sender.drop_marker(channel.next_seq), now=0.0, forced=True)
         channel.skip_to(channel.next_seq + 3)
     assert channel.kept == 200 and channel.counters.dropped == 100
     channel.clear(DropReason.DISCONNECTED)
@@ -137,7 +137,7 @@ def test_a_backlog_of_tombstones_and_gaps_ends_as_one_span() -> None:
 
 
 def test_what_lies_between_replays_is_not_told_of() -> None:
-    """It was never owed to who joined late, and others may have it yet."""
+    """Who joined late was never to get it, and others may have it yet."""
     sender = Sender(spec(reliable=True, latched=True, depth=3), first=12)
     sender.channel.prime([sender.message(seq, replay=True) for seq in (2, 3, 6, 9)], now=0.0)
     sender.submit()

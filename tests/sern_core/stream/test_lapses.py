@@ -13,13 +13,13 @@ from tests.steps import steps
 from tests.world import spec
 
 
-def test_an_expired_reliable_message_becomes_a_tombstone_and_is_reported_once() -> None:
+def test_an_expired_reliable_message_becomes_a_drop_marker_and_is_reported_once() -> None:
     sender = Sender(spec(reliable=True, lifespan_s=1.0, retention_s=5.0))
     sender.submit(2, 3000)
     taken = sender.take()
     assert taken is not None
     head = sender.channel.head(2.0)
-    assert head is not None and head.message.tombstone and head.unsent_bytes == 1
+    assert head is not None and head.message.drop_marker and head.unsent_bytes == 1
     sender.channel.fragment_acked(taken[0], taken[1])  # of the body that is no more
     assert sender.channel.head(2.0) is head
     for at_s in (2.0, 3.0, 10.0):
@@ -59,7 +59,7 @@ def test_what_lapses_in_a_sweep_is_bounded_and_the_rest_is_not_sent_meanwhile() 
     sender.check()
     for _ in range(15):
         part = sender.take(now=2.0)
-        assert part is not None and part[0].message.tombstone
+        assert part is not None and part[0].message.drop_marker
     assert [channel.sweep(2.0, up=True, room=10) for _ in range(3)] == [10, 5, 0]
     assert [span[:2] for span in sender.told] == [(1, 10), *((seq, seq) for seq in range(11, 16)), (16, 25), (26, 30)]
     assert {reason for _, reason in sender.drops} == {DropReason.RETENTION} and channel.kept == 30
@@ -78,11 +78,11 @@ def test_what_lapses_around_a_message_that_goes_on_is_told_around_it() -> None:
     sender.check()
 
 
-def test_without_a_link_what_has_lapsed_goes_together_and_becomes_no_tombstone_first() -> None:
+def test_without_a_link_what_has_lapsed_goes_together_and_becomes_no_drop_marker_first() -> None:
     sender = Sender(spec(reliable=True, retention_s=10.0, lifespan_s=100.0))
     channel = sender.channel
     sender.submit(8)
-    channel.submit(sender.tombstone(9), now=0.0, forced=True)
+    channel.submit(sender.drop_marker(9), now=0.0, forced=True)
     sender.submit(8)
     sender.submit(3, now=9.0)
     part = sender.take()
@@ -94,7 +94,7 @@ def test_without_a_link_what_has_lapsed_goes_together_and_becomes_no_tombstone_f
         20,
     ] == [out.seq for out in channel.retained]
     assert channel.watermark == 17 and channel.first_seq == 18 and not channel.flying and not channel.active
-    assert channel.counters.dropped == 17 and not part[0].message.tombstone
+    assert channel.counters.dropped == 17 and not part[0].message.drop_marker
     sender.check()
 
 
@@ -110,9 +110,9 @@ def test_a_replay_lapses_where_others_had_lapsed_before_it() -> None:
     channel.prime([sender.message(seq, now=0.0, replay=True) for seq in range(3, 11)], now=11.0)
     for now in (11.0, 33.0):
         sender.send_all(now=now)
-        assert [out.message.tombstone for out in channel.retained] == [0] * 8
+        assert [out.message.drop_marker for out in channel.retained] == [0] * 8
         channel.sweep(now + 11.0, up=True)
-        assert len(channel.retained) == 8 and all(out.message.tombstone for out in channel.retained)
+        assert len(channel.retained) == 8 and all(out.message.drop_marker for out in channel.retained)
         channel.delivered_to(10)
         channel.peer_restarted()
         channel.prime([sender.message(seq, now=0.0, replay=True) for seq in range(3, 11)], now=33.0)
@@ -134,7 +134,7 @@ def test_a_sweep_looks_at_no_more_than_it_has_room_for_and_once_at_what_the_peer
     assert (few[1], many[1]) == (3, 38), "eight that stay are looked at for one that is given up"
 
 
-def test_tombstones_behind_one_that_stays_are_not_looked_at_in_each_sweep() -> None:
+def test_drop_markers_behind_one_that_stays_are_not_looked_at_in_each_sweep() -> None:
     def cost(count: int) -> int:
         sender = Sender(spec(reliable=True, lifespan_s=10.0, retention_s=3600.0))
         sender.submit(count, 2, now=0.0)
@@ -143,7 +143,7 @@ def test_tombstones_behind_one_that_stays_are_not_looked_at_in_each_sweep() -> N
         sender.channel.fragment_acked(part[0], part[1])
         while sender.channel.sweep(11.0, up=True, room=100):
             pass
-        assert [out.seq for out in sender.channel.retained if not out.message.tombstone] == [1]
+        assert [out.seq for out in sender.channel.retained if not out.message.drop_marker] == [1]
         return steps(lambda: sender.channel.sweep(11.25, up=True))
 
     assert cost(3000) <= 1.2 * cost(200)
@@ -165,7 +165,7 @@ def test_what_the_peer_had_whole_lapses_when_a_new_process_takes_its_place() -> 
     assert channel.sweep(11.0, up=True) == 0 and not sender.drops
     channel.peer_restarted()
     assert channel.sweep(11.5, up=True) == 5
-    assert sender.told == [(1, 5, DropReason.UNCONFIRMED)] and all(out.message.tombstone for out in channel.retained)
+    assert sender.told == [(1, 5, DropReason.UNCONFIRMED)] and all(out.message.drop_marker for out in channel.retained)
     sender.check()
 
 
@@ -185,7 +185,7 @@ def test_what_is_given_up_as_it_goes_is_a_loss_once() -> None:
     sender.send_all()
     sender.channel.peer_restarted()
     head = sender.channel.head(11.0)
-    assert head is not None and head.message.tombstone and sender.drops == [(1, DropReason.UNCONFIRMED)]
+    assert head is not None and head.message.drop_marker and sender.drops == [(1, DropReason.UNCONFIRMED)]
     sender.channel.clear(DropReason.SHUTDOWN)
     counters = sender.channel.counters
     assert counters.reliable_unconfirmed == counters.by_reason[DropReason.UNCONFIRMED] == 1
@@ -232,7 +232,7 @@ def test_sweeps_that_look_once_give_up_what_a_look_at_all_would(seed: int) -> No
             while channel.sweep(now, up=action == "sweep", room=3) >= 3:
                 sender.check()
             given_up += channel.counters.dropped - before
-            left = [out for out in channel.retained if not out.message.tombstone]
+            left = [out for out in channel.retained if not out.message.drop_marker]
             replays = [out for out in left if out.message.replay]
             over = [(out, reason) for out in left if (reason := lapsed(out, channel.spec, now)) is not None]
             # Of replays the newer ones may be ahead: the retention of the older ends behind them.
@@ -242,8 +242,8 @@ def test_sweeps_that_look_once_give_up_what_a_look_at_all_would(seed: int) -> No
     assert given_up
 
 
-def test_what_may_have_arrived_is_unconfirmed_whatever_its_time_and_its_tombstone_says_why() -> None:
-    """Begun and sent whole is not the same, and the next place takes the tombstone for what it did not get."""
+def test_what_may_have_arrived_is_unconfirmed_whatever_its_time_and_its_drop_marker_says_why() -> None:
+    """Begun and sent whole is not the same, and the next place takes the drop marker for what it did not get."""
     for up in (True, False):
         sender = Sender(spec(reliable=True, retention_s=10.0))
         channel = sender.channel

@@ -84,10 +84,10 @@ class Channel(RuleBasedStateMachine):
 
     @precondition(lambda self: self.sender.channel.reliable)
     @rule()
-    def submit_a_tombstone(self) -> None:
+    def submit_a_drop_marker(self) -> None:
         channel = self.sender.channel
         self.lost_before.add(channel.next_seq)
-        channel.submit(self.sender.tombstone(channel.next_seq), now=self.now, forced=True)
+        channel.submit(self.sender.drop_marker(channel.next_seq), now=self.now, forced=True)
 
     @precondition(lambda self: self.sender.channel.reliable)
     @rule(ahead=st.integers(1, 3))
@@ -103,7 +103,7 @@ class Channel(RuleBasedStateMachine):
             self.flying.append(part)
             out = part[0]
             lapsed = self.sender.channel.reliable and self.now - out.retain_from_s > retention_s_of(self.sender)
-            assert not lapsed or out.message.tombstone, "what has lapsed is sent"
+            assert not lapsed or out.message.drop_marker, "what has lapsed is sent"
 
     @precondition(lambda self: bool(self.flying))
     @rule(data=st.data(), lost=st.booleans())

@@ -19,8 +19,10 @@ T0 = 1000.0  # monotonic clocks do not start at zero
 FRAGMENT_BYTES = 1200
 
 
-def offer(scheduler: Scheduler, slot: int, priority: PriorityClass, size_bytes: float, since_s: float = T0) -> None:
-    scheduler.offer(slot, priority=priority, weight=1.0, size_bytes=size_bytes, since_s=since_s)
+def offer(
+    scheduler: Scheduler, channel_id: int, priority: PriorityClass, size_bytes: float, since_s: float = T0
+) -> None:
+    scheduler.offer(channel_id, priority=priority, weight=1.0, size_bytes=size_bytes, since_s=since_s)
 
 
 @dataclass
@@ -37,25 +39,25 @@ class Traffic:
     def run(self, fragments: int, message_bytes: dict[int, int], classes: dict[int, PriorityClass]) -> None:
         left = dict(message_bytes)
         since = dict.fromkeys(message_bytes, self.now)
-        for slot, size in left.items():
-            offer(self.scheduler, slot, classes[slot], size, since[slot])
+        for channel_id, size in left.items():
+            offer(self.scheduler, channel_id, classes[channel_id], size, since[channel_id])
         for _ in range(fragments):
             picked = self.scheduler.pick(now=self.now)
             assert picked is not None, "work conservation: something is pending and the window is open"
-            slot = picked
-            nbytes = min(left[slot], self.fragment_bytes.get(classes[slot], FRAGMENT_BYTES))
-            self.scheduler.charge(classes[slot], nbytes, now=self.now)
+            channel_id = picked
+            nbytes = min(left[channel_id], self.fragment_bytes.get(classes[channel_id], FRAGMENT_BYTES))
+            self.scheduler.charge(classes[channel_id], nbytes, now=self.now)
             self.now += nbytes * 8.0 / self.rate_bps
-            left[slot] -= nbytes
-            if left[slot] == 0:
-                left[slot], since[slot] = message_bytes[slot], self.now
-            offer(self.scheduler, slot, classes[slot], left[slot], since[slot])
-            self.sent_bytes[slot] = self.sent_bytes.get(slot, 0) + nbytes
-            self.order.append(slot)
+            left[channel_id] -= nbytes
+            if left[channel_id] == 0:
+                left[channel_id], since[channel_id] = message_bytes[channel_id], self.now
+            offer(self.scheduler, channel_id, classes[channel_id], left[channel_id], since[channel_id])
+            self.sent_bytes[channel_id] = self.sent_bytes.get(channel_id, 0) + nbytes
+            self.order.append(channel_id)
         self.scheduler.validate()
 
-    def share(self, slot: int) -> float:
-        return self.sent_bytes.get(slot, 0) / sum(self.sent_bytes.values())
+    def share(self, channel_id: int) -> float:
+        return self.sent_bytes.get(channel_id, 0) / sum(self.sent_bytes.values())
 
 
 def test_nothing_pending() -> None:
@@ -75,9 +77,9 @@ def test_more_urgent_class_goes_first_whatever_its_size() -> None:
     offer(scheduler, 2, STATE, 4_000)
     offer(scheduler, 1, CONTROL, 20_000)
     served = []
-    while (slot := scheduler.pick(now=T0)) is not None:
-        served.append(slot)
-        scheduler.withdraw(slot)
+    while (channel_id := scheduler.pick(now=T0)) is not None:
+        served.append(channel_id)
+        scheduler.withdraw(channel_id)
     assert served == [1, 2, 3]
     scheduler.validate()
 
@@ -131,8 +133,8 @@ def test_bulk_gets_its_floor_beside_saturating_state() -> None:
     longest_wait = max(
         second - first
         for first, second in zip(
-            (i for i, slot in enumerate(traffic.order) if slot == 3),
-            [i for i, slot in enumerate(traffic.order) if slot == 3][1:],
+            (i for i, channel_id in enumerate(traffic.order) if channel_id == 3),
+            [i for i, channel_id in enumerate(traffic.order) if channel_id == 3][1:],
             strict=False,
         )
     )
@@ -323,8 +325,8 @@ def test_coalesced_topic_that_ages_since_it_was_last_sent_is_not_starved() -> No
             now = T0 + step * 0.002
             offer(scheduler, 1, BULK, 1_000, since_s=now)  # always another small one, newly born
             offer(scheduler, 2, BULK, 4_000, since_s=T0 if by_last_sent else now)  # sampled again each time
-            slot = scheduler.pick(now=now)
-            if slot == 2:
+            channel_id = scheduler.pick(now=now)
+            if channel_id == 2:
                 return now - T0
         return None
 
@@ -337,7 +339,7 @@ def test_coalesced_topic_that_ages_since_it_was_last_sent_is_not_starved() -> No
 def test_no_topic_starves_within_its_class() -> None:
     """Ageing is clipped, yet every topic within the ratio 1 + η·a_max of the strongest is served."""
     random = Random(5)
-    sizes = {slot: random.randint(100, 1_000) for slot in range(60)}
+    sizes = {channel_id: random.randint(100, 1_000) for channel_id in range(60)}
     traffic = Traffic(Scheduler(SchedulerParams(a_max_s=30.0), now=T0), rate_bps=1e6)
     traffic.run(20_000, sizes, dict.fromkeys(sizes, BULK))
     assert set(traffic.order[-5_000:]) == set(sizes)
@@ -352,13 +354,13 @@ def test_no_topic_starves_within_its_class() -> None:
 def test_eta_zero_is_smiths_rule(sizes: list[int], weights: list[float], waited_s: float) -> None:
     params = SchedulerParams(eta=0.0)
     scheduler = Scheduler(params, now=T0)
-    for slot, (size, weight) in enumerate(zip(sizes, weights, strict=False)):
-        scheduler.offer(slot, priority=BULK, weight=weight, size_bytes=size, since_s=T0 - slot)
+    for channel_id, (size, weight) in enumerate(zip(sizes, weights, strict=False)):
+        scheduler.offer(channel_id, priority=BULK, weight=weight, size_bytes=size, since_s=T0 - channel_id)
     ratios = [w / (s + params.epsilon_bytes) for s, w in zip(sizes, weights, strict=False)]
     served = []
-    while (slot_or_none := scheduler.pick(now=T0 + waited_s)) is not None:
-        served.append(ratios[slot_or_none])
-        scheduler.withdraw(slot_or_none)
+    while (id_or_none := scheduler.pick(now=T0 + waited_s)) is not None:
+        served.append(ratios[id_or_none])
+        scheduler.withdraw(id_or_none)
     assert served == pytest.approx(sorted(ratios, reverse=True), rel=1e-6)
 
 
@@ -366,15 +368,15 @@ def test_eta_zero_is_smiths_rule(sizes: list[int], weights: list[float], waited_
 def test_equals_are_served_oldest_first_without_ageing(count: int) -> None:
     """Twenty robots send the same type: with η = 0 all scores are equal, and none may starve the others."""
     scheduler = Scheduler(SchedulerParams(eta=0.0), now=T0)
-    for slot in range(count):
-        offer(scheduler, slot, STATE, 300, since_s=T0 + slot * 1e-3)
+    for channel_id in range(count):
+        offer(scheduler, channel_id, STATE, 300, since_s=T0 + channel_id * 1e-3)
     served = []
     for step in range(3 * count):
         now = T0 + 1.0 + step * 1e-3
-        slot_or_none = scheduler.pick(now=now)
-        assert slot_or_none is not None
-        served.append(slot_or_none)
-        offer(scheduler, slot_or_none, STATE, 300, since_s=now)
+        id_or_none = scheduler.pick(now=now)
+        assert id_or_none is not None
+        served.append(id_or_none)
+        offer(scheduler, id_or_none, STATE, 300, since_s=now)
     assert served == list(range(count)) * 3
 
 
@@ -395,14 +397,14 @@ def test_class_order_is_the_plain_formula_when_the_weights_are_far_enough_apart(
     ratio = 1.01 * (1.0 + eta * a_max_s) * (2_000 + epsilon) / (100 + epsilon)
     scheduler = Scheduler(params, now=T0)
     scores = []
-    for slot, (priority, size, age_s) in enumerate(messages):
+    for channel_id, (priority, size, age_s) in enumerate(messages):
         weight = ratio ** (BULK - priority)
-        scheduler.offer(slot, priority=priority, weight=weight, size_bytes=size, since_s=T0 - age_s)
+        scheduler.offer(channel_id, priority=priority, weight=weight, size_bytes=size, since_s=T0 - age_s)
         scores.append(weight * (1.0 + eta * min(age_s, a_max_s)) / (size + epsilon))
     served = []
-    while (slot_or_none := scheduler.pick(now=T0)) is not None:
-        served.append(scores[slot_or_none])
-        scheduler.withdraw(slot_or_none)
+    while (id_or_none := scheduler.pick(now=T0)) is not None:
+        served.append(scores[id_or_none])
+        scheduler.withdraw(id_or_none)
     assert served == pytest.approx(sorted(scores, reverse=True), rel=1e-6)
 
 
@@ -422,28 +424,28 @@ def test_explanations_name_the_reason() -> None:
     scheduler = Scheduler(SchedulerParams(), now=T0)
     scheduler.set_rate(1e6, now=T0)
 
-    def reason(slot: int, *, window_open: bool = True) -> WaitReason | None:
-        standing = scheduler.explain(slot, T0, window_open=window_open)
+    def reason(channel_id: int, *, window_open: bool = True) -> WaitReason | None:
+        standing = scheduler.explain(channel_id, T0, window_open=window_open)
         assert standing is not None
         return standing.waits_for
 
     offer(scheduler, 1, CONTROL, 1_000)
     offer(scheduler, 2, CONTROL, 2_000, since_s=T0 - 0.5)
     offer(scheduler, 3, BULK, 500, since_s=T0 - 20.0)
-    assert [reason(slot) for slot in (1, 2, 3)] == [None, WaitReason.OUTRANKED, WaitReason.CLASS]
+    assert [reason(channel_id) for channel_id in (1, 2, 3)] == [None, WaitReason.OUTRANKED, WaitReason.CLASS]
     assert reason(3, window_open=False) is WaitReason.WINDOW
     standing = scheduler.explain(3, T0)
     assert standing is not None
-    assert (standing.slot, standing.priority, standing.weight) == (3, BULK, 1.0)
+    assert (standing.channel_id, standing.priority, standing.weight) == (3, BULK, 1.0)
     assert (standing.age_s, standing.size_bytes, standing.rank) == (20.0, 500, 2)
     assert standing.score == pytest.approx(11.0 / 564)
     offer(scheduler, 4, STATE, 500)
     for _ in range(3):
         scheduler.charge(STATE, 4_200, now=T0)  # more than its credit: only bulk has a floor to use
-    assert [reason(slot) for slot in (1, 3, 4)] == [WaitReason.FLOOR, None, WaitReason.FLOOR]
+    assert [reason(channel_id) for channel_id in (1, 3, 4)] == [WaitReason.FLOOR, None, WaitReason.FLOOR]
     scheduler.charge(CONTROL, 10_000, now=T0)
     scheduler.charge(BULK, 10_000, now=T0)
-    assert [reason(slot) for slot in (1, 3)] == [WaitReason.BUCKET, WaitReason.CLASS]
+    assert [reason(channel_id) for channel_id in (1, 3)] == [WaitReason.BUCKET, WaitReason.CLASS]
     assert reason(1, window_open=False) is WaitReason.BUCKET
 
 
@@ -463,7 +465,7 @@ def test_explanations_name_the_reason() -> None:
 )
 def test_offers_that_cannot_be_ranked_are_refused(weight: float, size_bytes: float, since_s: float) -> None:
     scheduler = Scheduler(SchedulerParams(), now=T0)
-    with pytest.raises(UsageError, match=r"Scheduler\.offer: slot 9"):
+    with pytest.raises(UsageError, match=r"Scheduler\.offer: channel 9"):
         scheduler.offer(9, priority=BULK, weight=weight, size_bytes=size_bytes, since_s=since_s)
     assert scheduler.pick(now=T0) is None
     scheduler.validate()
@@ -485,8 +487,8 @@ def test_clip_times_do_not_pile_up() -> None:
     table = PendingClass(eta=1.0, a_max_s=1e9, origin_s=0.0)
     for step in range(5_000):
         table.put(step % 100, 0.01, float(step))
-    for slot in range(0, 100, 3):
-        table.remove(slot)
+    for channel_id in range(0, 100, 3):
+        table.remove(channel_id)
     table.validate()
     assert table._lines is not None
     assert len(table._lines._clips) <= 64 + 4 * 100

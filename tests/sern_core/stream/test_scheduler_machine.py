@@ -14,7 +14,7 @@ CONTROL, STATE, BULK = CLASSES
 SLOTS = 3 * FEW
 Message = tuple[PriorityClass, float, float, float]  # class, κ, s, since
 
-slots = st.integers(0, SLOTS - 1)
+channel_ids = st.integers(0, SLOTS - 1)
 priorities = st.sampled_from([CONTROL, STATE, BULK, BULK, BULK])
 weights = st.sampled_from([0.5, 1.0, 3.0, 10.0])
 sizes = st.integers(0, 100_000).map(float)
@@ -69,8 +69,8 @@ class SchedulerMachine(RuleBasedStateMachine):
             return order[0]
         return CONTROL if self.waiting(CONTROL) else None
 
-    def score(self, slot: int) -> float:
-        _, weight, size_bytes, since_s = self.pending[slot]
+    def score(self, channel_id: int) -> float:
+        _, weight, size_bytes, since_s = self.pending[channel_id]
         age_s = min(self.now - since_s, self.params.a_max_s)
         return weight * (1.0 + self.params.eta * age_s) / (size_bytes + self.params.epsilon_bytes)
 
@@ -78,47 +78,49 @@ class SchedulerMachine(RuleBasedStateMachine):
 
     @rule(
         target=touched,
-        slot=slots,
+        channel_id=channel_ids,
         priority=priorities,
         weight=weights,
         size_bytes=sizes,
         waited_s=st.sampled_from([0.0, 0.0, 0.01, 0.49, 3.0, 30.0]),
     )
-    def offer(self, slot: int, priority: PriorityClass, weight: float, size_bytes: float, waited_s: float) -> int:
-        self.put(slot, (priority, weight, size_bytes, self.now - waited_s))
-        return slot
+    def offer(self, channel_id: int, priority: PriorityClass, weight: float, size_bytes: float, waited_s: float) -> int:
+        self.put(channel_id, (priority, weight, size_bytes, self.now - waited_s))
+        return channel_id
 
-    @rule(target=touched, first=slots, count=st.integers(FEW // 2, 2 * FEW), priority=priorities, size_bytes=sizes)
+    @rule(
+        target=touched, first=channel_ids, count=st.integers(FEW // 2, 2 * FEW), priority=priorities, size_bytes=sizes
+    )
     def offer_many(self, first: int, count: int, priority: PriorityClass, size_bytes: float) -> int:
         for step in range(count):
-            slot = (first + step) % SLOTS
-            self.put(slot, (priority, 1.0 + step % 3, size_bytes + 37.0 * (step % 7), self.now - 0.11 * step))
+            channel_id = (first + step) % SLOTS
+            self.put(channel_id, (priority, 1.0 + step % 3, size_bytes + 37.0 * (step % 7), self.now - 0.11 * step))
         return first
 
-    def put(self, slot: int, message: Message) -> None:
+    def put(self, channel_id: int, message: Message) -> None:
         priority, weight, size_bytes, since_s = message
-        self.scheduler.offer(slot, priority=priority, weight=weight, size_bytes=size_bytes, since_s=since_s)
-        self.encoding.pop(slot, None)
-        self.pending[slot] = message
+        self.scheduler.offer(channel_id, priority=priority, weight=weight, size_bytes=size_bytes, since_s=since_s)
+        self.encoding.pop(channel_id, None)
+        self.pending[channel_id] = message
         self.forget_credit()
 
-    @rule(slot=touched, share=st.floats(0.0, 1.0))
-    def shrink(self, slot: int, share: float) -> None:
-        assume(slot in self.pending)
-        priority, weight, size_bytes, since_s = self.pending[slot]
-        self.put(slot, (priority, weight, size_bytes * share, since_s))
+    @rule(channel_id=touched, share=st.floats(0.0, 1.0))
+    def shrink(self, channel_id: int, share: float) -> None:
+        assume(channel_id in self.pending)
+        priority, weight, size_bytes, since_s = self.pending[channel_id]
+        self.put(channel_id, (priority, weight, size_bytes * share, since_s))
 
-    @rule(slot=touched, encoding=st.booleans())
-    def withdraw(self, slot: int, encoding: bool) -> None:
-        self.scheduler.withdraw(slot, encoding=encoding)
-        message = self.pending.pop(slot, None)
+    @rule(channel_id=touched, encoding=st.booleans())
+    def withdraw(self, channel_id: int, encoding: bool) -> None:
+        self.scheduler.withdraw(channel_id, encoding=encoding)
+        message = self.pending.pop(channel_id, None)
         if message is not None and encoding:
-            self.encoding[slot] = message
+            self.encoding[channel_id] = message
         elif not encoding:
-            self.encoding.pop(slot, None)
+            self.encoding.pop(channel_id, None)
         self.forget_credit()
 
-    @rule(first=slots, count=st.integers(1, SLOTS))
+    @rule(first=channel_ids, count=st.integers(1, SLOTS))
     def withdraw_many(self, first: int, count: int) -> None:
         for step in range(count):
             self.withdraw((first + step) % SLOTS, encoding=False)
@@ -160,16 +162,16 @@ class SchedulerMachine(RuleBasedStateMachine):
     @rule(fragment_bytes=st.sampled_from([300.0, 1200.0, 8192.0]), window_open=st.booleans())
     def serve(self, fragment_bytes: float, window_open: bool) -> None:
         """What the link does: pick, send one fragment, charge, offer the rest."""
-        slot = self.scheduler.pick(now=self.now, window_open=window_open)
-        if slot is None:
+        channel_id = self.scheduler.pick(now=self.now, window_open=window_open)
+        if channel_id is None:
             return
-        priority, weight, size_bytes, since_s = self.pending[slot]
+        priority, weight, size_bytes, since_s = self.pending[channel_id]
         sent_bytes = min(size_bytes, fragment_bytes)
         self.charge(priority, int(sent_bytes))
         if sent_bytes == size_bytes:
-            self.withdraw(slot, encoding=False)
+            self.withdraw(channel_id, encoding=False)
         else:
-            self.put(slot, (priority, weight, size_bytes - sent_bytes, since_s))
+            self.put(channel_id, (priority, weight, size_bytes - sent_bytes, since_s))
 
     # What must hold in every state
 
@@ -180,18 +182,18 @@ class SchedulerMachine(RuleBasedStateMachine):
         if any(abs(credit - DEFAULT_QUANTUM_BYTES) < 1e-6 for credit in self.credit.values()):
             return
         for window_open in (True, False):
-            slot = self.scheduler.pick(now=self.now, window_open=window_open)
-            assert slot == self.scheduler.pick(now=self.now, window_open=window_open), "asking changes nothing"
+            channel_id = self.scheduler.pick(now=self.now, window_open=window_open)
+            assert channel_id == self.scheduler.pick(now=self.now, window_open=window_open), "asking changes nothing"
             expected = self.served_class(window_open=window_open)
             if expected is None:
-                assert slot is None
+                assert channel_id is None
                 continue
-            assert slot is not None
-            assert self.pending[slot][0] is expected
+            assert channel_id is not None
+            assert self.pending[channel_id][0] is expected
             best = max(self.score(other) for other, m in self.pending.items() if m[0] is expected)
             # Rounding of α + β·t, and for η = 0 the slow ageing that separates equals.
-            assert self.score(slot) >= best * (1.0 - 1e-7)
-            standing = self.scheduler.explain(slot, self.now, window_open=window_open)
+            assert self.score(channel_id) >= best * (1.0 - 1e-7)
+            standing = self.scheduler.explain(channel_id, self.now, window_open=window_open)
             assert standing is not None and standing.waits_for is None
 
     @invariant()

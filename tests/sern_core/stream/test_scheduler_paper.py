@@ -34,48 +34,48 @@ class Pending:
 
 
 def transcription(pending: dict[int, Pending], now: float, available_bytes: float) -> tuple[list[int], list[int]]:
-    """Lines 1-12 of Alg. prioritize: what is transmitted, in order, and what is dropped. Equals: lower slot first."""
+    """Lines 1-12 of Alg. prioritize: what is transmitted, in order, and what is dropped. Equals: lower id first."""
     scored = []
-    for slot, m in pending.items():
+    for channel_id, m in pending.items():
         age_s = min(now - m.since_s, PARAMS.a_max_s)
         p = m.weight / (m.size_bytes + PARAMS.epsilon_bytes) * (1.0 + PARAMS.eta * age_s)
-        scored.append((-p, slot))
+        scored.append((-p, channel_id))
     scored.sort()
     used_bytes = 0.0
     transmit, drop = [], []
-    for _, slot in scored:
-        m = pending[slot]
+    for _, channel_id in scored:
+        m = pending[channel_id]
         stale = m.lifespan_s is not None and now - m.since_s > m.lifespan_s
         if used_bytes + m.size_bytes <= available_bytes:
-            transmit.append(slot)
+            transmit.append(channel_id)
             used_bytes += m.size_bytes
         elif stale and m.priority is BULK:
-            drop.append(slot)
+            drop.append(channel_id)
     return transmit, drop
 
 
 def drain(scheduler: Scheduler, now: float, sizes: dict[int, float]) -> list[int]:
-    """Send everything marked, in fragments of up to 1200 bytes; the slots in the order they were finished."""
+    """Send everything marked, in fragments of up to 1200 bytes; the channels in the order they were finished."""
     sent = []
-    while (slot := scheduler.pick(now=now)) is not None:
-        standing = scheduler.explain(slot, now)
+    while (channel_id := scheduler.pick(now=now)) is not None:
+        standing = scheduler.explain(channel_id, now)
         assert standing is not None and standing.waits_for is None
-        left = sizes[slot]
+        left = sizes[channel_id]
         while left > 0:
-            assert scheduler.pick(now=now) == slot, "a marked message is sent whole"
+            assert scheduler.pick(now=now) == channel_id, "a marked message is sent whole"
             fragment = min(left, 1200.0)
             scheduler.charge(standing.priority, int(fragment), now=now)
             left -= fragment
             if left > 0:
                 scheduler.offer(
-                    slot,
+                    channel_id,
                     priority=standing.priority,
                     weight=standing.weight,
                     size_bytes=left,
                     since_s=now - standing.age_s,
                 )
-        scheduler.withdraw(slot)
-        sent.append(slot)
+        scheduler.withdraw(channel_id)
+        sent.append(channel_id)
     return sent
 
 
@@ -94,26 +94,26 @@ messages = st.builds(
 def test_each_interval_does_what_the_algorithm_says(rounds: list[list[Pending]]) -> None:
     scheduler = paper_scheduler()
     pending: dict[int, Pending] = {}
-    next_slot = 0
+    next_id = 0
     for number, arrivals in enumerate(rounds):
         now = T0 + number * 0.05 + 0.001
         for message in arrivals:
-            pending[next_slot] = message
+            pending[next_id] = message
             scheduler.offer(
-                next_slot,
+                next_id,
                 priority=message.priority,
                 weight=message.weight,
                 size_bytes=message.size_bytes,
                 since_s=message.since_s,
                 stale_after_s=message.lifespan_s,
             )
-            next_slot += 1
+            next_id += 1
         transmit, drop = transcription(pending, now, BUDGET_BYTES)
         assert sorted(scheduler.take_stale(now)) == sorted(drop)
         assert scheduler.take_stale(now) == [], "each is named once an interval"
-        for slot in drop:
-            scheduler.withdraw(slot)
-            del pending[slot]
+        for channel_id in drop:
+            scheduler.withdraw(channel_id)
+            del pending[channel_id]
         sent = drain_in_whole(scheduler, now, pending)
         assert sent == transmit
         scheduler.validate()
@@ -121,11 +121,11 @@ def test_each_interval_does_what_the_algorithm_says(rounds: list[list[Pending]])
 
 def drain_in_whole(scheduler: Scheduler, now: float, pending: dict[int, Pending]) -> list[int]:
     sent = []
-    while (slot := scheduler.pick(now=now)) is not None:
-        message = pending.pop(slot)
+    while (channel_id := scheduler.pick(now=now)) is not None:
+        message = pending.pop(channel_id)
         scheduler.charge(message.priority, int(message.size_bytes), now=now)
-        scheduler.withdraw(slot)
-        sent.append(slot)
+        scheduler.withdraw(channel_id)
+        sent.append(channel_id)
     return sent
 
 
@@ -222,11 +222,11 @@ def test_unfinished_message_stays_marked_into_the_next_interval() -> None:
 
 def test_only_stale_bulk_that_does_not_fit_is_reported() -> None:
     scheduler = paper_scheduler()
-    for slot, (priority, size_bytes, lifespan_s) in enumerate(
+    for channel_id, (priority, size_bytes, lifespan_s) in enumerate(
         [(BULK, 9_000, 1.0), (STATE, 9_000, 1.0), (BULK, 9_000, 5.0), (BULK, 9_000, None), (BULK, 100, 1.0)]
     ):
         scheduler.offer(
-            slot, priority=priority, weight=1.0, size_bytes=size_bytes, since_s=T0 - 2.0, stale_after_s=lifespan_s
+            channel_id, priority=priority, weight=1.0, size_bytes=size_bytes, since_s=T0 - 2.0, stale_after_s=lifespan_s
         )
     assert scheduler.take_stale(T0) == [0]
     assert scheduler.take_stale(T0 + 0.01) == []
@@ -251,8 +251,8 @@ def test_closed_window_lets_only_marked_control_within_its_bucket_pass() -> None
     scheduler.charge(CONTROL, 5_000, now=T0)
     assert scheduler.pick(now=T0, window_open=False) is None
     reasons = []
-    for slot in (1, 2):
-        standing = scheduler.explain(slot, T0, window_open=False)
+    for channel_id in (1, 2):
+        standing = scheduler.explain(channel_id, T0, window_open=False)
         assert standing is not None
         reasons.append(standing.waits_for)
     assert reasons == [WaitReason.WINDOW, WaitReason.BUCKET]

@@ -15,8 +15,8 @@ from sern_core.vocabulary.params import SchedulerParams
 from sern_core.vocabulary.trace import LINK, HoldReason, TraceEvent, TraceRecord
 from sern_core.vocabulary.types import ClientName, DropReason, Ordering, PriorityClass, TopicName
 from sern_sim.models import LinkModel, RateStep, Window
-from tests.sern_core.link.test_express import Express, stream
 from tests.sern_core.link.test_lanes import TwoLanes, models
+from tests.sern_core.link.test_priority_lane import PriorityScene, stream
 from tests.world import SimClient, World, spec
 
 THIN = LinkModel(rate_bps=500e3, delay_s=0.02).as_stream()
@@ -384,12 +384,12 @@ def test_a_client_that_is_forgotten_leaves_no_trace() -> None:
 
 
 def test_class_control_beside_the_stream_waits_for_no_bulk() -> None:
-    express = Express(second=stream())
-    express.run(4.0)
-    held = [each for each in records(express.robot, "/robot/pose") if each.event is TraceEvent.HELD]
+    scene = PriorityScene(second=stream())
+    scene.run(4.0)
+    held = [each for each in records(scene.robot, "/robot/pose") if each.event is TraceEvent.HELD]
     assert all(each.fields["reason"] != HoldReason.CLASS for each in held)
-    used = [each for each in records(express.robot, LINK) if each.event is TraceEvent.LANE_USED]
-    assert {"peer": "relay", "lane": "express", "what": "class control"} in [each.fields for each in used]
+    used = [each for each in records(scene.robot, LINK) if each.event is TraceEvent.LANE_USED]
+    assert {"peer": "relay", "lane": "priority", "what": "class control"} in [each.fields for each in used]
 
 
 def test_how_a_stream_stands_is_told_without_changing_anything() -> None:

@@ -44,7 +44,7 @@ def test_a_new_relay_waits_for_whom_the_origin_owes_its_stream() -> None:
     robot, site = pair(world)
     log = robot.publish("/robot/log", spec(reliable=True))
     world.run(2.0)
-    assert log.owed == ("site",)
+    assert log.required == ("site",)
     world.network.crash_node(site)
     world.restart_relay()
     world.run(2.0)
@@ -102,7 +102,7 @@ def test_overflow_is_refused_and_accepted_again_later() -> None:
     assert site.seqs("/robot/log") == [1, 2, 3, 4, 5, 6]
 
 
-def test_expired_messages_leave_tombstones_in_their_turn_and_are_reported() -> None:
+def test_expired_messages_leave_drop_markers_in_their_turn_and_are_reported() -> None:
     world = World().watch()
     robot, site = pair(world, robot=THIN)
     log = robot.publish("/robot/log", spec(reliable=True, lifespan_s=0.5))
@@ -351,7 +351,7 @@ def test_a_message_too_large_for_the_origin_or_the_relay_is_reported_and_passed_
     assert site.seqs("/robot/cloud") == [1, 4]
 
 
-def test_a_topic_withdrawn_with_messages_still_owed_is_delivered_first() -> None:
+def test_a_topic_withdrawn_with_messages_still_waiting_is_delivered_first() -> None:
     """The robot's process is gone; what the relay has taken over is still delivered."""
     world = World().watch()
     robot, site = pair(world, site=LinkModel(rate_bps=100e3, delay_s=0.05).as_stream())

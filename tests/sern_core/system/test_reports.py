@@ -87,12 +87,12 @@ def test_a_peer_that_reads_now_and_then_is_not_cut() -> None:
     peer.announce(1, "/robot/a", reliable=True)
     peer.control({"t": "synced", "batch": True})
     said(peer)
-    unheard = peer.hub.links[peer.name].reassembly.unheard
+    unacked = peer.hub.links[peer.name].reassembly.unacked_reports
     crowded = 0
     for seq in range(1, 1501):
         peer.now += 0.0999 if seq % 2 else 0.0
         peer.say(_whole(1, seq, b"x"))
-        crowded += unheard.crowded
+        crowded += unacked.crowded
         said(peer, acknowledge=seq % 50 == 0)
     assert crowded > 500
     peer.hub.validate()
@@ -121,11 +121,11 @@ def test_what_others_report_does_not_end_the_session_of_an_origin() -> None:
         envelope = {"t": "dropped", "ch": stream.channel_id, "seq": seq, "code": 1, "to": "other"}
         other.core.link.control.send(envelope, now=other.now)
     world.run(15.0)
-    unheard = world.relay.hub.links[robot.name].reassembly.unheard
-    assert unheard.reports == len(given_up) > 600
+    unacked = world.relay.hub.links[robot.name].reassembly.unacked_reports
+    assert unacked.reports == len(given_up) > 600
     world.until(lambda: len(robot.ups) == 2, within_s=10.0)
     first = pose.next_seq
-    world.until(lambda: unheard.reports == 0, within_s=5.0)
+    world.until(lambda: unacked.reports == 0, within_s=5.0)
     told = [drop for drop in robot.dropped_out if drop.topic == "/robot/log"]
     assert sorted(drop.seq for drop in told) == sorted(given_up)
     assert {drop.where for drop in told} == {"other"}
@@ -184,9 +184,9 @@ def test_what_several_will_not_get_is_reported_once_above_the_limit() -> None:
             envelope = {"t": "dropped", "ch": stream.channel_id, "seq": seq, "code": 1, "to": site.name}
             site.core.link.control.send(envelope, now=site.now)
         world.run(1.0)
-    unheard = world.relay.hub.links[robot.name].reassembly.unheard
-    assert unheard.reports < 10 + len(sites)
-    world.until(lambda: bool(robot.dropped_out) and unheard.reports == 0, within_s=30.0)
+    unacked = world.relay.hub.links[robot.name].reassembly.unacked_reports
+    assert unacked.reports < 10 + len(sites)
+    world.until(lambda: bool(robot.dropped_out) and unacked.reports == 0, within_s=30.0)
     assert sorted(drop.seq for drop in robot.dropped_out) == list(range(1, 201))
     assert SEVERAL in {drop.where for drop in robot.dropped_out}
 

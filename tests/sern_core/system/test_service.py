@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import pytest
 
-from sern_core.link.control_stream import CONTROL_CHANNEL
+from sern_core.link.control_stream import CONTROL_CHANNEL_ID
 from sern_core.link.link import Link
 from sern_core.relay.access import AccessRule, AccessTable
 from sern_core.stream.out_channel import OutChannel
@@ -24,7 +24,7 @@ class Piece(NamedTuple):
     """One DATA frame as it left."""
 
     at_s: float
-    channel: int
+    channel_id: int
     seq: int
     offset: int
     nbytes: int
@@ -49,7 +49,7 @@ class Tap:
     def on_data(
         self,
         flags: int,
-        channel: int,
+        channel_id: int,
         seq: int,
         offset: int,
         total: int,
@@ -59,17 +59,17 @@ class Tap:
         codec: int,
         error_s: float,
     ) -> None:
-        self.pieces.append(Piece(self._now, channel, seq, offset, len(body)))
+        self.pieces.append(Piece(self._now, channel_id, seq, offset, len(body)))
 
     def on_ack(self, lane: int, highest: int, sack: int, echo_us: int, received_us: int, cum_bytes: int) -> None: ...
 
-    def on_watermark(self, channel: int, delivered: int) -> None: ...
+    def on_watermark(self, channel_id: int, delivered: int) -> None: ...
 
     def on_ping(self) -> None:
         self.pings += 1
 
     def of(self, channel: OutChannel) -> Iterator[Piece]:
-        return (piece for piece in self.pieces if piece.channel == channel.slot)
+        return (piece for piece in self.pieces if piece.channel_id == channel.channel_id)
 
 
 def overloaded(
@@ -142,7 +142,9 @@ def test_a_newcomer_goes_ahead_at_the_next_fragment_and_the_rest_resumes() -> No
     tap = Tap(robot)
     robot.send(plan, bytes(1000))
     world.run(3.0)
-    before = [piece for piece in tap.pieces if piece.channel == cloud.slot and piece.at_s < next(tap.of(plan)).at_s]
+    before = [
+        piece for piece in tap.pieces if piece.channel_id == cloud.channel_id and piece.at_s < next(tap.of(plan)).at_s
+    ]
     assert len(before) <= 1, "at most the fragment that was due"
     assert site.got[0].topic == "/robot/plan" and site.got[1].body == bytes(100_000)
     offsets = [piece.offset for piece in tap.of(cloud)]
@@ -180,7 +182,7 @@ def test_control_messages_keep_to_the_window_and_let_class_0_pass() -> None:
     for number in range(600):
         robot.publish(f"/robot/t{number}", spec(PriorityClass.BULK))
     world.until(lambda: len(world.relay.hub.relayed) == 601)
-    assert sum(p.nbytes for p in tap.pieces if p.channel == CONTROL_CHANNEL) > 100_000
+    assert sum(p.nbytes for p in tap.pieces if p.channel_id == CONTROL_CHANNEL_ID) > 100_000
     ages = [g.age_s for g in site.got if g.at_s > began_s]
     assert len(ages) > 50 and max(ages) < 0.5, "the window at its start; all at once they would take 4 s"
 
@@ -291,7 +293,7 @@ def test_definitions_travel_once_and_are_there_before_the_stream_opens() -> None
     world.run(3.0)
     for site in sites:
         assert len(site.opened) == 6 and all(stream.info.definition == text for stream in site.opened)
-    control = [sum(p.nbytes for p in tap.pieces if p.channel == CONTROL_CHANNEL) for tap in taps]
+    control = [sum(p.nbytes for p in tap.pieces if p.channel_id == CONTROL_CHANNEL_ID) for tap in taps]
     assert control[1] < control[0], "the relay has it from the first robot"
 
 

@@ -1,7 +1,7 @@
 """Weeks of clients that come and go: what is kept of them ends as small as it began, and is bounded under way.
 
 Time is virtual and jumps between visits. Each visit is of clients with new boots, stream names, definitions, objects
-and subscriptions, of which some leave without a word, some are owed what they never fetch, and some are refused.
+and subscriptions, of which some leave without a word, some never fetch what waits for them, and some are refused.
 """
 
 import gc

@@ -64,11 +64,11 @@ def announcements(draw: st.DrawFn) -> Announcement:
     )
     identity = StreamId(ClientName(draw(NAMES)), draw(st.integers(0, 2**63 - 1)), topic)
     return Announcement(
-        channel=draw(st.integers(1, 0xFFFF)),
+        channel_id=draw(st.integers(1, 0xFFFF)),
         stream=StreamInfo(identity, info, spec, draw(st.dictionaries(PRINTABLE, PRINTABLE, max_size=3))),
         definition_hash=draw(st.just("") | st.from_regex(r"\A[0-9a-f]{32}\Z")),
         first=draw(st.integers(1, framing.MAX_SEQ)),
-        owed=tuple(draw(st.lists(NAMES, max_size=8))),
+        required=tuple(draw(st.lists(NAMES, max_size=8))),
     )
 
 
@@ -152,7 +152,7 @@ def test_bounds(key: str, good: list[object], bad: list[object]) -> None:
 
 
 def test_what_was_accepted_can_be_passed_on() -> None:
-    """Whatever channel and `first` it has at the next hop, and whoever is owed it."""
+    """Whatever channel and `first` it has at the next hop, and whoever is required."""
     topic = "/" + "t" * (NAME_MAX_CHARS - 1)
     greatest = plain(
         ch=0xFFFF,
@@ -173,31 +173,31 @@ def test_what_was_accepted_can_be_passed_on() -> None:
         sum(len(k.encode()) + len(v.encode()) for k, v in announcement.stream.attributes.items()) == MAX_ATTRIBUTE_BYTES
     )
     check_onwards(announcement.stream)
-    passed_on = replace(announcement, owed=("a" * 63,))
+    passed_on = replace(announcement, required=("a" * 63,))
     assert len(framing.encode_envelope(encode_announcement(passed_on))) <= framing.MAX_ENVELOPE_BYTES
 
 
 @pytest.mark.parametrize("name_chars", [1, 40, 63])
-def test_owed_is_cut_to_what_fits(name_chars: int) -> None:
+def test_required_names_are_cut_to_what_fits(name_chars: int) -> None:
     announcement = decode_announcement(plain(type="x" * NAME_MAX_CHARS, attr={"a": "b" * 256}))
-    owed = tuple(f"{i:02}".rjust(name_chars, "a") for i in range(60))
-    envelope = encode_announcement(replace(announcement, owed=owed))
+    required = tuple(f"{i:02}".rjust(name_chars, "a") for i in range(60))
+    envelope = encode_announcement(replace(announcement, required=required))
     assert len(framing.encode_envelope(envelope)) <= framing.MAX_ENVELOPE_BYTES
-    assert tuple(envelope["owed"]) == owed[: len(envelope["owed"])]
+    assert tuple(envelope["owed"]) == required[: len(envelope["owed"])]
     assert len(envelope["owed"]) == MAX_STRINGS if name_chars <= 40 else len(envelope["owed"]) > 40
 
 
 @pytest.mark.parametrize("count", [0, 1, 48, 49, 500])
-def test_owed_travels_in_as_many_parts_as_it_takes(count: int) -> None:
+def test_required_names_travel_in_as_many_parts_as_it_takes(count: int) -> None:
     announcement = decode_announcement(plain(type="x" * NAME_MAX_CHARS, attr={f"{i}": "b" * 200 for i in range(5)}))
-    announcement = replace(announcement, owed=tuple(f"{i:03}".rjust(63, "a") for i in range(count)))
+    announcement = replace(announcement, required=tuple(f"{i:03}".rjust(63, "a") for i in range(count)))
     parts = [
         decode_announcement(framing.decode_envelope(framing.encode_envelope(e)))
         for e in announcement_parts(announcement)
     ]
     assert [part.more for part in parts] == [True] * (len(parts) - 1) + [False]
-    assert tuple(name for part in parts for name in part.owed) == announcement.owed
-    assert replace(parts[-1], owed=announcement.owed) == announcement
+    assert tuple(name for part in parts for name in part.required) == announcement.required
+    assert replace(parts[-1], required=announcement.required) == announcement
     assert len(parts) <= 1 + count // 20
 
 

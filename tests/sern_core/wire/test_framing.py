@@ -108,7 +108,7 @@ def test_datagram_size_limit() -> None:
 
 @STEADY
 @given(
-    st.integers(0, framing.KNOWN_FLAGS).filter(lambda flags: not flags & framing.FLAG_TOMBSTONE),
+    st.integers(0, framing.KNOWN_FLAGS).filter(lambda flags: not flags & framing.FLAG_DROP_MARKER),
     U16,
     st.integers(0, 2**64),
     st.binary(max_size=40),
@@ -119,10 +119,18 @@ def test_datagram_size_limit() -> None:
     st.sampled_from(framing.AGE_ERRORS_S),
 )
 def test_data_round_trip(
-    flags: int, channel: int, seq: int, body: bytes, more: int, stamp_ns: int, age_s: float, codec: int, error_s: float
+    flags: int,
+    channel_id: int,
+    seq: int,
+    body: bytes,
+    more: int,
+    stamp_ns: int,
+    age_s: float,
+    codec: int,
+    error_s: float,
 ) -> None:
     total = len(body) + more if body else 0
-    head = framing.encode_data_first(flags, channel, seq, total, len(body), stamp_ns, age_s, codec, error_s)
+    head = framing.encode_data_first(flags, channel_id, seq, total, len(body), stamp_ns, age_s, codec, error_s)
     got: list[tuple[Any, ...]] = []
 
     class Sink(Frames):
@@ -131,7 +139,7 @@ def test_data_round_trip(
 
     framing.decode_frames(HEADER + head + body, Sink())
     assert len(got) == 1
-    assert got[0][:7] == (flags, channel, seq % 2**32, 0, total, body, stamp_ns)
+    assert got[0][:7] == (flags, channel_id, seq % 2**32, 0, total, body, stamp_ns)
     assert got[0][8:] == (codec, error_s)
     assert age_s - framing.AGE_UNIT_S <= got[0][7] <= age_s + 1e-9 * (1 + age_s)
 
@@ -152,13 +160,13 @@ def test_a_view_says_what_its_bytes_say(sizes: tuple[int, ...]) -> None:
 
 @STEADY
 @given(U16, st.integers(0, 2**64), st.integers(1, 2**31), st.binary(min_size=1, max_size=40), st.integers(0, 2**30))
-def test_later_fragment_round_trip(channel: int, seq: int, offset: int, body: bytes, more: int) -> None:
+def test_later_fragment_round_trip(channel_id: int, seq: int, offset: int, body: bytes, more: int) -> None:
     total = offset + len(body) + more
-    (frame,) = frames(framing.encode_data_next(0, channel, seq, offset, total, len(body)) + body)
+    (frame,) = frames(framing.encode_data_next(0, channel_id, seq, offset, total, len(body)) + body)
     assert frame == {
         "type": "DATA",
         "flags": [],
-        "channel": channel,
+        "channel": channel_id,
         "seq": seq % 2**32,
         "offset": offset,
         "total": total,
@@ -175,9 +183,9 @@ def test_ack_round_trip(lane: int, highest: int, sack: int, echo_us: int, receiv
 
 @STEADY
 @given(U16, st.integers(0, 2**64))
-def test_watermark_round_trip(channel: int, delivered: int) -> None:
-    (frame,) = frames(framing.encode_watermark(channel, delivered))
-    assert (frame["channel"], frame["delivered"]) == (channel, delivered % 2**32)
+def test_watermark_round_trip(channel_id: int, delivered: int) -> None:
+    (frame,) = frames(framing.encode_watermark(channel_id, delivered))
+    assert (frame["channel"], frame["delivered"]) == (channel_id, delivered % 2**32)
 
 
 @pytest.mark.parametrize(

@@ -176,8 +176,8 @@ async def test_what_another_sern_endpoint_publishes_is_not_announced(master: Fak
         await until(lambda: events.removed == [CHAT])
 
 
-async def test_a_chain_of_two_links_heeds_sern(master: FakeMaster) -> None:
-    async with running(master, heed_sern=True) as (_, events), FakePublisher(master, **{BRIDGE_FIELD: "/x"}):
+async def test_a_chain_of_two_links_accepts_what_is_bridged(master: FakeMaster) -> None:
+    async with running(master, accept_bridged=True) as (_, events), FakePublisher(master, **{BRIDGE_FIELD: "/x"}):
         await until(lambda: CHAT in events.infos)
 
 

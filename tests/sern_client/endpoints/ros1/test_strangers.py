@@ -101,7 +101,7 @@ async def test_a_service_with_a_field_without_end_is_not_announced(
     """Another endpoint's, for it serves whatever hash it is told."""
     async with (
         running(master) as (endpoint, events),
-        running(master, "other", heed_sern=True) as (other, seen),
+        running(master, "other", accept_bridged=True) as (other, seen),
     ):
         watched: Any = seen
         other.watch_services(watched)

@@ -8,8 +8,8 @@ from sern_client.daemon import ClientDaemon
 from sern_core.vocabulary.params import Redundancy
 from sern_core.vocabulary.types import ClientName
 from sern_relay.daemon import RelayDaemon
-from sern_runtime.express import CONNECTIONS, MIN_SEGMENTS, ExpressPaths
 from sern_runtime.monitor import TcpHandle, TcpInfo
+from sern_runtime.priority_paths import CONNECTIONS, MIN_SEGMENTS, PriorityPaths
 from sern_runtime.zmq_socket import SendResult
 from tests.daemons import Lab, bodies, delivered, under, write_bag
 from tests.support import until
@@ -24,15 +24,16 @@ def player(lab: Lab, bag: Path, **relay: object) -> Path:
     return lab.player_file("robot1", bag, play={"rate": 1}, topics=COMMANDS, relay={**STREAM, **relay})
 
 
-def uses_express(robot: ClientDaemon, relay: RelayDaemon) -> bool:
+def uses_priority_lane(robot: ClientDaemon, relay: RelayDaemon) -> bool:
     link = relay.hub.links.get(ROBOT)
-    return robot.core.link.lanes.express is not None and link is not None and link.lanes.express is not None
+    near = robot.core.link.lanes.priority_lane
+    return near is not None and link is not None and link.lanes.priority_lane is not None
 
 
 def joined(relay: RelayDaemon, client: str = ROBOT) -> list[int]:
     """File descriptors of the client's connections for class control."""
     assert relay.server is not None
-    return [each.fd for each in relay.server.express.joined if each.client == client]
+    return [each.fd for each in relay.server.priority_lanes.joined if each.client == client]
 
 
 @pytest.mark.parametrize("secure", [True, False], ids=["keys", "insecure"])
@@ -42,7 +43,7 @@ async def test_commands_arrive_over_it_whatever_becomes_of_its_connections(tmp_p
         relay = await lab.relay()
         site = await lab.connected(lab.recorder_file("site", "/.*", relay=STREAM))
         robot = await lab.client(player(lab, bag))
-        await until(lambda: uses_express(robot, relay) and delivered(site) > 100, "class control goes there")
+        await until(lambda: uses_priority_lane(robot, relay) and delivered(site) > 100, "class control goes there")
         assert len(joined(relay)) == CONNECTIONS
         server = relay.server
         assert server is not None
@@ -50,8 +51,9 @@ async def test_commands_arrive_over_it_whatever_becomes_of_its_connections(tmp_p
             connection = server.connections.by_fd(fd)
             assert connection is not None and connection.handle is not None and connection.user == ROBOT
             connection.handle.cut()
-        await until(lambda: joined(relay) == [] or robot.core.link.lanes.express is None, "the connections are lost")
-        await until(lambda: uses_express(robot, relay) and len(joined(relay)) == CONNECTIONS, "they come back")
+        lanes = robot.core.link.lanes
+        await until(lambda: joined(relay) == [] or lanes.priority_lane is None, "the connections are lost")
+        await until(lambda: uses_priority_lane(robot, relay) and len(joined(relay)) == CONNECTIONS, "they come back")
         await until(lambda: delivered(site) == COUNT, "every command arrives")
         assert robot.core.link.established
         for daemon in (robot, site, relay):
@@ -65,10 +67,10 @@ async def test_it_is_joined_again_after_a_restart_of_the_relay(tmp_path: Path) -
         relay = await lab.relay()
         site = await lab.connected(lab.recorder_file("site", "/.*", relay=STREAM))
         robot = await lab.client(player(lab, bag))
-        await until(lambda: uses_express(robot, relay) and delivered(site) > 100)
+        await until(lambda: uses_priority_lane(robot, relay) and delivered(site) > 100)
         await lab.end(relay)
         relay = await lab.relay(tmp_path / "relay.yaml")
-        await until(lambda: uses_express(robot, relay), "it joins the new session")
+        await until(lambda: uses_priority_lane(robot, relay), "it joins the new session")
         await until(lambda: delivered(site) == COUNT, "every command arrives")
         for daemon in (robot, site, relay):
             await lab.end(daemon)
@@ -80,7 +82,7 @@ async def test_it_can_be_switched_off(tmp_path: Path) -> None:
     async with Lab(tmp_path, "robot1", "site") as lab:
         relay = await lab.relay()
         site = await lab.connected(lab.recorder_file("site", "/.*", relay=STREAM))
-        robot = await lab.client(player(lab, bag, express=False))
+        robot = await lab.client(player(lab, bag, priority_connections=False))
         await until(lambda: delivered(site) == 100 and joined(relay, "site"))
         assert joined(relay) == []
         for daemon in (robot, site, relay):
@@ -108,7 +110,7 @@ class Paths:
         self.answers = dict.fromkeys("ab", SendResult.OK)
         self.sent: list[str] = []
         self.spare = True
-        self.paths: ExpressPaths[str] = ExpressPaths(redundancy, lambda nbytes: nbytes == 1 and self.spare)
+        self.paths: PriorityPaths[str] = PriorityPaths(redundancy, lambda nbytes: nbytes == 1 and self.spare)
         for name, handle in self.handles.items():
             self.paths.add(name, lambda _data, name=name: self._send(name), handle)  # type: ignore[misc]
 

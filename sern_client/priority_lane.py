@@ -1,4 +1,4 @@
-"""The client's express lane: class control on TCP connections of its own, where data goes over the stream lane."""
+"""The client's priority lane: class control on TCP connections of its own, where data goes over the stream lane."""
 
 import asyncio
 import logging
@@ -7,14 +7,14 @@ from typing import Final
 
 from sern_client.transport import Dialer, RelayTransport
 from sern_core.link.lane_port import LanePort
-from sern_core.path.lanes import LANE_EXPRESS, LANE_ZMQ
+from sern_core.path.lanes import LANE_PRIORITY, LANE_ZMQ
 from sern_core.site.client import ClientCore
 from sern_core.vocabulary.errors import ConfigError, RemoteError
 from sern_core.vocabulary.params import Redundancy
 from sern_core.wire import framing
 from sern_runtime import clock
-from sern_runtime.express import CONNECTIONS, ExpressPaths
 from sern_runtime.monitor import TcpHandle
+from sern_runtime.priority_paths import CONNECTIONS, PriorityPaths
 from sern_runtime.pump import Pump
 
 DATAGRAMS_FIRST_S: Final = 3.0
@@ -26,7 +26,7 @@ ASK_AGAIN_S: Final = 30.0
 _log = logging.getLogger(__name__)
 
 
-class ClientExpress:
+class ClientPriorityLane:
     """Opens the connections when they are of use and joins each to the session. `kick` is called when the core may have
     something to send. Call `tick` about twice a second."""
 
@@ -41,7 +41,7 @@ class ClientExpress:
     ) -> None:
         self.core = core
         self.bad_frames = 0
-        self.paths: ExpressPaths[_Connection] = ExpressPaths(redundancy, core.link.plane.may_copy)
+        self.paths: PriorityPaths[_Connection] = PriorityPaths(redundancy, core.link.plane.may_copy)
         self._transport = transport
         self._wait_s = DATAGRAMS_FIRST_S if datagrams else 0.0
         self._kick = kick
@@ -69,7 +69,7 @@ class ClientExpress:
 
     def _open(self) -> None:
         self._failures = 0
-        self._pump = Pump(LanePort(self.core.link, LANE_EXPRESS), self.paths.send, on_gone=lambda: None)
+        self._pump = Pump(LanePort(self.core.link, LANE_PRIORITY), self.paths.send, on_gone=lambda: None)
         try:
             for _ in range(CONNECTIONS):
                 self.connections.append(_Connection(self, self._transport))
@@ -95,7 +95,7 @@ class ClientExpress:
             connection.dialer.close()
         self.connections.clear()
         self.paths.clear()
-        self.core.link.close_lane(now=clock.now(), lane_id=LANE_EXPRESS)
+        self.core.link.close_lane(now=clock.now(), lane_id=LANE_PRIORITY)
 
     def kick(self) -> None:
         if self._pump is not None:
@@ -104,19 +104,19 @@ class ClientExpress:
     def joined(self, connection: "_Connection", handle: TcpHandle | None) -> None:
         self.paths.add(connection, connection.dialer.send, handle)
         link = self.core.link
-        if LANE_EXPRESS not in link.lanes.by_id:
+        if LANE_PRIORITY not in link.lanes.by_id:
             if self._pump is not None:
                 self._pump.reset()
-            link.open_lane(now=clock.now(), lane_id=LANE_EXPRESS)
+            link.open_lane(now=clock.now(), lane_id=LANE_PRIORITY)
         self._kick()
 
     def lost(self, connection: "_Connection", *, answered: bool) -> None:
         self.paths.discard(connection)
         if not self.paths:
-            self.core.link.close_lane(now=clock.now(), lane_id=LANE_EXPRESS)
+            self.core.link.close_lane(now=clock.now(), lane_id=LANE_PRIORITY)
         self._failures = 0 if answered else self._failures + 1
         link = self.core.link
-        if self._failures >= ATTEMPTS * CONNECTIONS and link.established and link.lanes.express is None:
+        if self._failures >= ATTEMPTS * CONNECTIONS and link.established and link.lanes.priority_lane is None:
             self._failures = 0
             _log.warning("the relay takes no connection for class control alone; asking again in %g s", ASK_AGAIN_S)
             self._said()
@@ -127,7 +127,7 @@ class ClientExpress:
         if not self.core.link.handshake.reads:
             return
         try:
-            self.core.link.receive(data, now=clock.now(), lane=LANE_EXPRESS)
+            self.core.link.receive(data, now=clock.now(), lane=LANE_PRIORITY)
         except RemoteError as error:
             self.bad_frames += 1
             _log.warning("the relay sent a bad frame for class control (%s); reconnecting", error)
@@ -143,7 +143,7 @@ class ClientExpress:
 class _Connection:
     """One connection of the lane."""
 
-    def __init__(self, lane: ClientExpress, transport: RelayTransport) -> None:
+    def __init__(self, lane: ClientPriorityLane, transport: RelayTransport) -> None:
         self._lane = lane
         self._handle: TcpHandle | None = None
         self._up = False

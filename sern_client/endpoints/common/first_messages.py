@@ -14,7 +14,7 @@ from typing import Final, NamedTuple
 from sern_client.endpoints.common.queue import BoundedQueue
 from sern_core.vocabulary.types import DropReason
 
-HOLD_S: Final = 1.0
+FIRST_MESSAGES_S: Final = 1.0
 """How long subscribers are waited for, from the publisher's beginning or when the graph is learned. To connect takes
 some 10 ms; a subscriber that is known and does not come is a node that crashed."""
 SETTLE_S: Final = 0.1
@@ -40,7 +40,7 @@ class _Kept(NamedTuple):
 
 
 class FirstMessages:
-    """Keeps what one publisher writes first, until `over`, when everything kept has been given to `write`.
+    """The first-message buffer of a publisher, until `over`, when everything kept has been given to `write`.
 
     At most `max_messages` and `max_bytes` are kept, the newest; what is above is told to `dropped` as `overflow`, what
     is too old meanwhile as LIFESPAN, what `write` does not take as FAULT. `learning_s`: how much longer the graph may
@@ -61,7 +61,7 @@ class FirstMessages:
         self._loop = asyncio.get_running_loop()
         self._since_s = self._loop.time()
         self._learned_s = self._since_s + learning_s
-        self._give_up_s = max(self._since_s + HOLD_S, self._learned_s) + SETTLE_S
+        self._give_up_s = max(self._since_s + FIRST_MESSAGES_S, self._learned_s) + SETTLE_S
         self._connected_s: float | None = None
         self._done: Callable[[], None] | None = None
         self._kept: BoundedQueue[_Kept] = BoundedQueue(max_bytes=max_bytes, max_items=max_messages)

@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import pytest
 
-from sern_client.endpoints.common import first
+from sern_client.endpoints.common import first_messages
 from sern_core.vocabulary.message import TopicInfo
 from sern_core.vocabulary.types import DropReason, Encoding
 from sern_runtime.ros_types import topic_info
@@ -21,10 +21,10 @@ FOREVER_S = 600.0
 def patient(monkeypatch: pytest.MonkeyPatch) -> Callable[[float], None]:
     """Nothing is written by the clock: `patient(0.0)` says that the subscriber knows, where the product waits."""
     monkeypatch.setattr("sern_client.endpoints.dds.endpoint.LEARN_S", FOREVER_S)
-    monkeypatch.setattr(first, "HOLD_S", FOREVER_S)
+    monkeypatch.setattr(first_messages, "FIRST_MESSAGES_S", FOREVER_S)
 
     def settle(after_s: float) -> None:
-        monkeypatch.setattr(first, "SETTLE_S", after_s)
+        monkeypatch.setattr(first_messages, "SETTLE_S", after_s)
 
     settle(FOREVER_S)
     return settle

@@ -1,4 +1,4 @@
-"""The connections under one express lane: class control over TCP, apart from everything else, twice where TCP loses.
+"""The connections under one priority lane: class control over TCP, apart from everything else, twice where TCP loses.
 
 TCP delivers what was lost one round trip late or more, and whatever follows waits for it. Two connections seldom wait
 at the same time: so while segments are lost, each datagram goes over both, and the one that arrives first counts. Both
@@ -45,7 +45,7 @@ class SegmentLoss:
         return self._again / self._sent if self._sent >= MIN_SEGMENTS else 0.0
 
 
-class ExpressPaths(Generic[Key]):
+class PriorityPaths(Generic[Key]):
     """Sends each datagram over the first connection that takes it, or over all of them. Call `look` now and then.
 
     `may_copy(nbytes)` is asked before each copy: on a full link copies would make the losses that they are sent for.

@@ -1,4 +1,4 @@
-"""The relay's end of the express lanes: further connections of a client, for class control alone."""
+"""The relay's end of the priority lanes: further connections of a client, for class control alone."""
 
 from collections.abc import Callable
 from functools import partial
@@ -6,7 +6,7 @@ from typing import Final, NamedTuple
 
 from sern_core.link.lane_port import LanePort
 from sern_core.link.link import Link
-from sern_core.path.lanes import LANE_EXPRESS
+from sern_core.path.lanes import LANE_PRIORITY
 from sern_core.relay.hub import Hub
 from sern_core.vocabulary.errors import WireError
 from sern_core.vocabulary.params import Redundancy
@@ -14,7 +14,7 @@ from sern_core.vocabulary.types import ClientName
 from sern_core.wire import framing
 from sern_relay.connections import ClientConnection, ClientConnections
 from sern_runtime import clock
-from sern_runtime.express import CONNECTIONS, ExpressPaths
+from sern_runtime.priority_paths import CONNECTIONS, PriorityPaths
 from sern_runtime.pump import Pump
 from sern_runtime.zmq_socket import SendResult
 
@@ -24,11 +24,11 @@ JOIN: Final = bytes((framing.Kind.JOIN,))
 
 class _Lane(NamedTuple):
     link: Link
-    paths: ExpressPaths[bytes]
+    paths: PriorityPaths[bytes]
     pump: Pump
 
 
-class RelayExpress:
+class RelayPriorityLanes:
     """Joins connections to the sessions of the clients whose keys they have. Those of `clients` that are for class
     control alone are its own. `after` as in `RelayServer`."""
 
@@ -72,8 +72,8 @@ class RelayExpress:
         lane = self._lanes.get(client)
         if lane is None or lane.link is not link:
             self._drop(client)
-            paths: ExpressPaths[bytes] = ExpressPaths(self._redundancy, link.plane.may_copy)
-            pump = Pump(LanePort(link, LANE_EXPRESS), paths.send, on_gone=lambda: None)
+            paths: PriorityPaths[bytes] = PriorityPaths(self._redundancy, link.plane.may_copy)
+            pump = Pump(LanePort(link, LANE_PRIORITY), paths.send, on_gone=lambda: None)
             lane = self._lanes[client] = _Lane(link, paths, pump)
         older = None
         others = [each for each in self.joined if each.client == client and each is not connection]
@@ -96,7 +96,7 @@ class RelayExpress:
             return
         link = self.hub.links.get(connection.client)
         if link is not None:
-            link.receive(data, now=clock.now(), lane=LANE_EXPRESS)
+            link.receive(data, now=clock.now(), lane=LANE_PRIORITY)
 
     def left(self, connection: ClientConnection) -> None:
         """The connection is gone. Idempotent."""
@@ -120,7 +120,7 @@ class RelayExpress:
         lane = self._lanes.pop(client, None)
         if lane is not None:
             lane.pump.close()
-            lane.link.close_lane(now=clock.now(), lane_id=LANE_EXPRESS)
+            lane.link.close_lane(now=clock.now(), lane_id=LANE_PRIORITY)
 
     def look(self) -> None:
         """See what TCP loses. Call about once a second."""

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 
-from sern_client.endpoints.ros1 import hold, returning
+from sern_client.endpoints.ros1 import first_messages, returning
 from sern_client.endpoints.ros1.xmlrpc import XmlRpcClient
 from sern_core.vocabulary.types import DropReason
 from tests.sern_client.endpoints.ros1.fakes import STRING, FakeMaster, listening, running, text
@@ -24,7 +24,7 @@ def known(master: FakeMaster) -> FakeMaster:
 @pytest.fixture(autouse=True)
 def patient(monkeypatch: pytest.MonkeyPatch) -> None:
     """A busy machine must not make a subscriber come too late."""
-    monkeypatch.setattr(hold, "HOLD_S", 60.0)
+    monkeypatch.setattr(first_messages, "FIRST_MESSAGES_S", 60.0)
     monkeypatch.setattr(returning, "TOLD_S", 60.0)
 
 
@@ -198,7 +198,7 @@ async def test_a_dead_subscriber_is_waited_for_only_so_long(
         stream.close()
         assert endpoint.drops == {} and known.tables[0]["/chat"] == ["/sern"]
         with caplog.at_level(logging.WARNING):
-            publication.hold._timed_out()  # as after HOLD_S
+            publication.first_messages._timed_out()  # as after FIRST_MESSAGES_S
             await until(lambda: not known.tables[0])
         assert endpoint.drops == {DropReason.DISCONNECTED: 1}
     assert "/chat: /listener has not connected within 60 s; it missed 1 message" in caplog.messages

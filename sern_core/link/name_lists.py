@@ -3,7 +3,7 @@
 from sern_core.vocabulary.errors import WireError
 
 
-class OwedLists:
+class NameLists:
     """Lists of a session, by the message that they are in and its channel."""
 
     def __init__(self, max_names: int) -> None:

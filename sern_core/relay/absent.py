@@ -1,4 +1,4 @@
-"""Clients that an earlier run of the relay owed messages to, and that have not come back yet. Pure."""
+"""Clients that reliable streams require and that have not come back since an earlier run of the relay. Pure."""
 
 from collections.abc import Callable, Container, Sequence
 from typing import Final
@@ -14,15 +14,15 @@ from sern_core.vocabulary.message import StreamId
 from sern_core.vocabulary.names import is_client_name
 from sern_core.vocabulary.types import ClientName, TopicName
 
-AWAIT_US: Final = 50
-OWED_PER_US: Final = 2
-"""What an origin is charged with, in microseconds: to wait for a client that is owed a stream, and how many names of
+ABSENT_US: Final = 50
+NAMES_PER_US: Final = 2
+"""What an origin is charged with, in microseconds: to wait for a client that a stream requires, and how many names of
 such clients are looked at in one."""
-MAX_AWAITED_CLIENTS: Final = 1024
+MAX_ABSENT_CLIENTS: Final = 1024
 """Clients that have not come back yet and are waited for."""
 
 
-class Awaited:
+class AbsentClients:
     """`known` says whether a name is in the directory of clients."""
 
     def __init__(
@@ -39,39 +39,39 @@ class Awaited:
         self._routing = routing
         self._events = events
         self.known = known
-        self._most_topics = limits.awaited_topics
+        self._most_topics = limits.absent_topics
         self._topics: dict[ClientName, set[TopicName]] = {}
-        self._heard: set[ClientName] = set()  # said what they want, to this run of the relay
+        self._subscribed: set[ClientName] = set()  # said what they want, to this run of the relay
 
     def __len__(self) -> int:
         return len(self._topics)
 
-    def heard(self, client: ClientName) -> None:
+    def subscribed(self, client: ClientName) -> None:
         """The client has said what it wants."""
         self._topics.pop(client, None)
-        self._heard.add(client)
+        self._subscribed.add(client)
 
     def forget(self, client: ClientName) -> None:
         """The client is given up."""
         self._topics.pop(client, None)
-        self._heard.discard(client)
+        self._subscribed.discard(client)
 
-    def hold(self, owed: Sequence[str], identity: StreamId, source: Link, now: float) -> None:
-        """Hold a reliable stream for the clients of these names to whom an earlier run of this relay owed it."""
-        source.reassembly.work_us += len(owed) // OWED_PER_US
+    def hold(self, required: Sequence[str], identity: StreamId, source: Link, now: float) -> None:
+        """Hold a reliable stream for the clients of these names, which an earlier run of this relay required."""
+        source.reassembly.work_us += len(required) // NAMES_PER_US
         own: list[Match] = []
         others: list[Match] = []  # of the same name (many_writers)
         denied: list[Denied] = []
-        for text in owed:
+        for text in required:
             client = ClientName(text)
             # Connected is not enough: it may not have come to say what it wants yet.
-            if client in self._heard or client == identity.origin:
+            if client in self._subscribed or client == identity.origin:
                 continue
             if not is_client_name(client) or not self.known(client):
                 continue
-            if client not in self._clients.links and len(self._topics) >= MAX_AWAITED_CLIENTS:
+            if client not in self._clients.links and len(self._topics) >= MAX_ABSENT_CLIENTS:
                 continue
-            source.reassembly.work_us += AWAIT_US
+            source.reassembly.work_us += ABSENT_US
             self._clients.link(client, now)
             topics = self._topics.setdefault(client, set())
             if len(topics) >= self._most_topics and identity.topic not in topics:
@@ -92,6 +92,6 @@ class Awaited:
 
     def validate(self, clients: Container[ClientName]) -> None:
         """Internal consistency, for tests."""
-        for table in (self._topics, self._heard):
+        for table in (self._topics, self._subscribed):
             assert all(client in clients for client in table), "something is kept for clients that are forgotten"
-        assert all(len(topics) <= self._most_topics for topics in self._topics.values()), "too much is awaited"
+        assert all(len(topics) <= self._most_topics for topics in self._topics.values()), "too much is held"

@@ -5,8 +5,8 @@ from math import inf
 
 import pytest
 
-from sern_client.endpoints.common import first
-from sern_client.endpoints.common.first import FirstMessages, Readers
+from sern_client.endpoints.common import first_messages
+from sern_client.endpoints.common.first_messages import FirstMessages, Readers
 from sern_core.vocabulary.types import DropReason
 from tests.support import until
 
@@ -36,8 +36,8 @@ class Topic:
 @pytest.fixture(autouse=True)
 def unhurried(monkeypatch: pytest.MonkeyPatch) -> None:
     """Times out when a test says so only."""
-    monkeypatch.setattr(first, "HOLD_S", 600.0)
-    monkeypatch.setattr(first, "SETTLE_S", 0.0)
+    monkeypatch.setattr(first_messages, "FIRST_MESSAGES_S", 600.0)
+    monkeypatch.setattr(first_messages, "SETTLE_S", 0.0)
 
 
 async def test_without_subscribers_nothing_waits() -> None:
@@ -96,7 +96,7 @@ async def test_what_is_kept_is_bounded_and_every_drop_counted() -> None:
     late.publish(b"old", left_s=0.0)
     late.publish(b"new")
     assert not late.first.over and late.dropped == []
-    late.first._give_up_s = 0.0  # its subscriber has crashed: HOLD_S is over
+    late.first._give_up_s = 0.0  # its subscriber has crashed: FIRST_MESSAGES_S is over
     await until(lambda: late.first.over)
     assert late.written == [b"new"]
     assert late.dropped == [DropReason.LIFESPAN]  # the other was written: it is in no count of what was not

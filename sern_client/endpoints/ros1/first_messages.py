@@ -15,19 +15,19 @@ from typing import Final
 from sern_client.endpoints.common.queue import BoundedQueue
 from sern_core.vocabulary.types import DropReason
 
-HOLD_S: Final = 2.0
+FIRST_MESSAGES_S: Final = 2.0
 """How long a message is kept, and how long after our registration a subscriber is waited for. They connect within some
 10 ms; what is registered and does not is a node that crashed."""
 
 _log = logging.getLogger(__name__)
 
 
-class Hold:
-    """Holds what one publication has from its beginning until `over`.
+class FirstMessages:
+    """The first-message buffer of a publication: it keeps what is published from the beginning until `over`.
 
-    At most `max_messages` and `max_bytes` are kept, each for `HOLD_S` and no longer than it has left. What a subscriber
-    has missed for good is told to `dropped(reason, count)`, for what is above the limits `overflow`; `done` is called
-    once, when nobody is waited for any more.
+    At most `max_messages` and `max_bytes` are kept, each for `FIRST_MESSAGES_S` and no longer than it has left. What a
+    subscriber has missed for good is told to `dropped(reason, count)`, for what is above the limits `overflow`; `done`
+    is called once, when nobody is waited for any more.
     """
 
     def __init__(
@@ -71,8 +71,8 @@ class Hold:
             return
         now = self._loop.time()
         self._forget_old(now)
-        why = DropReason.LIFESPAN if left_s < HOLD_S else DropReason.DISCONNECTED
-        for _ in self._kept.put((body, now + min(HOLD_S, left_s), why), len(body)):
+        why = DropReason.LIFESPAN if left_s < FIRST_MESSAGES_S else DropReason.DISCONNECTED
+        for _ in self._kept.put((body, now + min(FIRST_MESSAGES_S, left_s), why), len(body)):
             self._lose(self._overflow)
 
     def joined(self, caller: str) -> list[bytes]:
@@ -90,9 +90,9 @@ class Hold:
         return bodies
 
     def hurry(self) -> None:
-        """It shall be over in `HOLD_S` at the latest."""
+        """It shall be over in `FIRST_MESSAGES_S` at the latest."""
         if self._timer is None and not self.over:
-            self._timer = self._loop.call_later(HOLD_S, self._timed_out)
+            self._timer = self._loop.call_later(FIRST_MESSAGES_S, self._timed_out)
 
     def close(self) -> None:
         """Nobody is waited for any more."""
@@ -118,7 +118,7 @@ class Hold:
         if count and self._waited_for:
             _log.warning(
                 "%s: %s has not connected within %g s; it missed %d message%s",
-                self._topic, ", ".join(sorted(self._waited_for)), HOLD_S, count, "" if count == 1 else "s",
+                self._topic, ", ".join(sorted(self._waited_for)), FIRST_MESSAGES_S, count, "" if count == 1 else "s",
             )  # fmt: skip
         while self._kept:
             self._lose(self._kept.pop()[2])
