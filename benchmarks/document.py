@@ -20,7 +20,7 @@ README: Final = ROOT / "README.md"
 DOCUMENT: Final = ROOT / "docs" / "performance.md"
 THEORY: Final = ROOT / "docs" / "adaptation-theory.md"
 DOCUMENTS: Final = {
-    **dict.fromkeys(("link", "robots", "endpoints", "mmcf_lab", "thin_link", "codecs"), DOCUMENT),
+    **dict.fromkeys(("link", "robots", "footprint", "endpoints", "mmcf_lab", "thin_link", "codecs"), DOCUMENT),
     **dict.fromkeys(("mmcf", "mmcf_replay", "mmcf_recovery"), THEORY),
     "summaries": ROOT / "docs" / "summaries.md",
     "matrix": ROOT / "docs" / "lab.md",
@@ -35,7 +35,7 @@ IN_README: Final[Mapping[str, Mapping[str, tuple[str, ...]]]] = {
     "demo": {"control": ("delivered_messages", "latency_p50_s", "latency_p99_s")},
 }
 """Cases and metrics that README.md shows. What the demo writes has the shape of a benchmark."""
-TOGETHER: Final = frozenset({"codecs", "summaries", "thin_link", "mmcf_replay", "matrix"})
+TOGETHER: Final = frozenset({"codecs", "footprint", "summaries", "thin_link", "mmcf_replay", "matrix"})
 """Benchmarks whose cases are rows of one table, as far as they have a metric in common."""
 BY_POLICY: Final = frozenset({"mmcf"})
 """Benchmarks whose cases are a mission profile and a trace: a table for each profile, a column for each policy."""
@@ -47,6 +47,10 @@ TITLES: Final = {
     "fresh_s": "first fresh pose, s",
     "messages_hz": "messages/s",
     "relay_cpu_us": "relay CPU a message, µs",
+    "relay_rss_MB": "relay memory (RSS), MB",
+    "ready_s": "ready after, s",
+    "rss_MB": "resident, MB",
+    "own_MB": "its own, MB",
     "datagrams_hz": "datagrams/s",
     "datagram_us": "CPU a datagram, µs",
     "cost_1": "cost J",

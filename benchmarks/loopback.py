@@ -12,7 +12,9 @@ import psutil
 import zmq
 
 from benchmarks.child import Worker, await_workers
+from sern_client.connection import Connection
 from sern_client.transport import RelayTransport
+from sern_core.path.lanes import LANE_NAMES
 from sern_core.site.client import ClientCore
 from sern_core.vocabulary.message import Message, StreamInfo
 from sern_core.vocabulary.params import LinkParams, SchedulerParams
@@ -20,8 +22,10 @@ from sern_core.vocabulary.types import ClientName, DropReason
 from sern_core.wire import framing
 from sern_relay.daemon import RelayDaemon
 from sern_runtime import clock, logs
-from sern_runtime.config.keys import SecretKey
+from sern_runtime.config.client import RelayConnection
+from sern_runtime.config.keys import SecretKey, load_public, load_secret
 from sern_runtime.config.relay import load_relay
+from sern_runtime.config.shared import LinkSection
 from sern_runtime.loop import Shutdown, run
 
 
@@ -108,6 +112,48 @@ def connect(
     return core, transport
 
 
+class Member(IdleSite):
+    """A client's core with all the connections that its daemon would give it, with keys. `tick` twice a second."""
+
+    def __init__(
+        self,
+        context: "zmq.Context[zmq.Socket[bytes]]",
+        folder: Path,
+        address: str,
+        name: ClientName,
+        *,
+        udp: bool,
+    ) -> None:
+        """Its keys and the relay's are in `folder`. `udp`: whether it asks for the datagram lane."""
+        link = LinkSection()
+        section = RelayConnection(endpoint=address, server_key_file="-", secret_key_file="-", udp=udp)
+        self.core = ClientCore(
+            name=name,
+            boot=random.getrandbits(63),
+            events=self,
+            link=link.params(),
+            scheduler=SchedulerParams(),
+            now=clock.now(),
+        )
+        self.connection = Connection(self.core, section, link, on_down=lambda _reason: None)
+        valid = load_public(folder / "relay.pub").valid_at(time.time())
+        self.connection.open(context, load_secret(folder / f"{name}.key"), [key.key for key in valid])
+
+    @property
+    def lane(self) -> str:
+        """Which lane its data takes now: a name of LANE_NAMES."""
+        return LANE_NAMES[self.core.link.lanes.lane.id]
+
+    def link_up(self, *, resumed: bool) -> None:
+        self.connection.session_began()
+
+    def lane_offered(self, parameters: framing.Envelope) -> None:
+        self.connection.lane_offered(parameters)
+
+    def lane_closed(self) -> None:
+        self.connection.lane_closed()
+
+
 @contextmanager
 def running(
     relay: Worker, ends: Sequence[Worker], ready: Event, stopped: Any, within_s: float
@@ -129,11 +175,12 @@ def running(
 
 
 class Carried(NamedTuple):
-    """What a relay did for some time. `cpu_s`: its process's, all threads."""
+    """What a relay did for some time. `cpu_s`: its process's, all threads; `rss_bytes`: its memory, afterwards."""
 
     messages: int
     seconds: float
     cpu_s: float
+    rss_bytes: int
 
     @property
     def messages_hz(self) -> float:
@@ -158,7 +205,7 @@ def watch(workers: Sequence[Worker], received: Any, duration_s: float, measuring
     for worker in workers:
         worker.check()
     end_s, end, end_cpu_s = clock.now(), received.value, _cpu_s(watched)
-    return Carried(end - start, end_s - start_s, end_cpu_s - start_cpu_s)
+    return Carried(end - start, end_s - start_s, end_cpu_s - start_cpu_s, watched.memory_info().rss)
 
 
 def _cpu_s(process: psutil.Process) -> float:

@@ -1,8 +1,11 @@
-"""One relay and 1 to 50 robots of 20 topics each, and one site that receives everything, over loopback with CURVE.
+"""One relay and 1 to 100 robots of 20 topics each, and one site that receives everything, over loopback with keys.
 
-The robots are client cores with transports of their own, several in each process; relay and site are one process each.
+The robots are client cores with connections of their own, several in each process; relay and site are one process each.
+They connect as daemons do: over TCP with CURVE, and then over the datagram lane. Measuring begins when everybody's data
+takes that lane. `--tcp` leaves it off.
 All clocks are one, so an age is the difference of two readings. Latency is from `send` at the robot to the site's
 callback, through the relay; CPU is the relay process's, I/O threads included, for each message that reached the site.
+Memory is the relay's (RSS) when a fleet has been measured.
 
 A robot sends 56 messages a second: 2 topics of class control (100 B, 20 and 10 Hz), 8 of class state (300 B, 2 Hz) and
 10 of class bulk (1 kB, 1 Hz).
@@ -16,12 +19,12 @@ import random
 import struct
 import sys
 import tempfile
-import time
 from array import array
-from contextlib import ExitStack
+from collections.abc import AsyncIterator, Sequence
+from contextlib import asynccontextmanager
 from ctypes import c_bool, c_uint64
 from functools import partial
-from multiprocessing.sharedctypes import RawValue
+from multiprocessing.sharedctypes import RawArray, RawValue
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -31,25 +34,29 @@ import zmq
 
 from benchmarks import common
 from benchmarks.child import Worker, await_workers
-from benchmarks.loopback import IdleSite, connect, running, serve, watch
-from sern_client.transport import RelayTransport
+from benchmarks.loopback import Member, running, serve, watch
+from sern_core.path.lanes import LANE_NAMES, LANE_UDP, LANE_ZMQ
 from sern_core.site.client import ClientCore
 from sern_core.stream.out_channel import OutChannel
 from sern_core.vocabulary.errors import SernError
 from sern_core.vocabulary.message import Message, StreamInfo, TopicInfo, TopicSpec
 from sern_core.vocabulary.types import CLASS_LABELS, ClientName, Encoding, PriorityClass, TopicName
 from sern_runtime import clock
-from sern_runtime.config.keys import load_public, load_secret
 from sern_tools.harness.files import relay_content, write
 from sern_tools.keygen import make_keys
 from sern_tools.ports import free_ports
 
-FLEETS: Final = (1, 5, 10, 20, 50)
+FLEETS: Final = (1, 5, 10, 20, 50, 100)
 HOSTS: Final = 2
 """Processes that the robots are spread over."""
-START_S: Final = 30.0
+START_S: Final = 60.0
+UDP, ZMQ = LANE_NAMES[LANE_UDP], LANE_NAMES[LANE_ZMQ]
+LOOK_S: Final = 0.5
+"""How often a client looks after its connections, and says whether its data takes the lane that it should."""
 STAMP: Final = struct.Struct("!d")
+PROMPT_ROBOTS: Final = 50
 LATENCY_LIMIT_MS: Final = 10.0
+"""Of so many robots; the cores of a small machine are full with more."""
 CPU_RATIO_LIMIT: Final = 1.2
 
 
@@ -73,9 +80,11 @@ RATE_HZ: Final = sum(kind.topics * kind.rate_hz for kind in ROBOT)
 
 
 class Shared:
-    """What the processes share."""
+    """What the processes share. `ready[i]`: how many clients of process i have their data on the `lane` to measure."""
 
-    def __init__(self) -> None:
+    def __init__(self, lane: str) -> None:
+        self.lane = lane
+        self.ready = RawArray(c_uint64, HOSTS + 1)
         self.opened = RawValue(c_uint64, 0)
         self.received = RawValue(c_uint64, 0)
         self.measuring = RawValue(c_bool, False)
@@ -88,6 +97,7 @@ class Sample(NamedTuple):
     robots: int
     messages_hz: float
     relay_cpu_us: float
+    relay_rss_bytes: int
     ages_s: dict[str, Any]
 
     def percentile_ms(self, label: str, percent: float) -> float:
@@ -98,16 +108,29 @@ def robot_name(number: int) -> ClientName:
     return ClientName(f"robot{number}")
 
 
-def _client(
-    context: "zmq.Context[zmq.Socket[bytes]]", folder: Path, port: int, name: ClientName, events: IdleSite
-) -> tuple[ClientCore, RelayTransport]:
-    key, relay = load_secret(folder / f"{name}.key"), load_public(folder / "relay.pub")
-    server_keys = [key.key for key in relay.valid_at(time.time())]
-    return connect(context, name, events, f"tcp://127.0.0.1:{port}", key, server_keys)
+@asynccontextmanager
+async def _members(shared: Shared, process: int, members: Sequence[Member]) -> AsyncIterator[None]:
+    """Looks after clients that are connected, and says how many of them are as they are to be measured."""
+
+    async def tick() -> None:
+        while True:
+            for member in members:
+                member.connection.tick()
+            shared.ready[process] = sum(member.lane == shared.lane for member in members)
+            await asyncio.sleep(LOOK_S)
+
+    ticks = asyncio.create_task(tick())
+    try:
+        yield
+    finally:
+        ticks.cancel()
+        for member in members:
+            member.connection.close()
 
 
-class _Site(IdleSite):
-    def __init__(self, shared: Shared) -> None:
+class _Site(Member):
+    def __init__(self, context: "zmq.Context[zmq.Socket[bytes]]", folder: Path, address: str, shared: Shared) -> None:
+        super().__init__(context, folder, address, ClientName("site"), udp=shared.lane == UDP)
         self.shared = shared
         self.ages_s = {label: array("d") for label in CLASS_LABELS}
 
@@ -121,17 +144,14 @@ class _Site(IdleSite):
             self.ages_s[CLASS_LABELS[stream.spec.priority]].append(clock.now() - sent_s)
 
 
-def _site(folder: Path, port: int, shared: Shared, result: Any) -> None:
+def _site(folder: Path, address: str, shared: Shared, result: Any) -> None:
     async def main() -> None:
-        site = _Site(shared)
         with zmq.Context() as context:
-            core, transport = _client(context, folder, port, ClientName("site"), site)
-            core.subscribe((".*",), now=clock.now())
-            try:
+            site = _Site(context, folder, address, shared)
+            site.core.subscribe((".*",), now=clock.now())
+            async with _members(shared, HOSTS, [site]):
                 while not shared.stopped.value:  # noqa: ASYNC110  (a flag in shared memory has no event)
                     await asyncio.sleep(0.02)
-            finally:
-                transport.close()
         result.send({label: np.array(ages_s) for label, ages_s in site.ages_s.items()})
 
     with asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:
@@ -147,38 +167,37 @@ def _offer(core: ClientCore) -> list[tuple[OutChannel, Kind]]:
     return channels
 
 
-def _robots(folder: Path, port: int, numbers: range, shared: Shared) -> None:
+def _robots(folder: Path, address: str, numbers: range, process: int, shared: Shared) -> None:
     async def main() -> None:
         rng = random.Random(numbers.start)
-        with zmq.Context() as context, ExitStack() as stack:
-            due: list[tuple[float, int, ClientCore, RelayTransport, OutChannel, Kind]] = []
-            for number in numbers:
-                core, transport = _client(context, folder, port, robot_name(number), IdleSite())
-                stack.callback(transport.close)
-                for channel, kind in _offer(core):
-                    start_s = clock.now() + rng.random() / kind.rate_hz
-                    due.append((start_s, len(due), core, transport, channel, kind))
+        with zmq.Context() as context:
+            members = [
+                Member(context, folder, address, robot_name(number), udp=shared.lane == UDP) for number in numbers
+            ]
+            due: list[tuple[float, int, Member, OutChannel, Kind]] = []
+            for member in members:
+                for channel, kind in _offer(member.core):
+                    due.append((clock.now() + rng.random() / kind.rate_hz, len(due), member, channel, kind))
             heapq.heapify(due)
-            while not shared.stopped.value:
-                now = clock.now()
-                while due[0][0] <= now:
-                    due_s, order, core, transport, channel, kind = due[0]
-                    body = STAMP.pack(clock.now()).ljust(kind.nbytes, b"\0")
-                    core.send(channel, body, 0, now=now)
-                    transport.pump.kick()
-                    heapq.heapreplace(due, (due_s + 1.0 / kind.rate_hz, order, core, transport, channel, kind))
-                await asyncio.sleep(min(0.02, max(0.0, due[0][0] - clock.now())))
+            async with _members(shared, process, members):
+                while not shared.stopped.value:
+                    now = clock.now()
+                    while due[0][0] <= now:
+                        due_s, order, member, channel, kind = due[0]
+                        body = STAMP.pack(clock.now()).ljust(kind.nbytes, b"\0")
+                        member.core.send(channel, body, 0, now=now)
+                        member.connection.wake()
+                        heapq.heapreplace(due, (due_s + 1.0 / kind.rate_hz, order, member, channel, kind))
+                    await asyncio.sleep(min(0.02, max(0.0, due[0][0] - clock.now())))
 
     with asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:
         runner.run(main())
 
 
-def _prepare(folder: Path, robots: int, port: int) -> Path:
+def _prepare(folder: Path, robots: int, address: str, *, udp: bool) -> Path:
     """The relay's file."""
     make_keys(folder, "relay", "site", *map(robot_name, range(robots)))
-    content = relay_content(
-        f"tcp://127.0.0.1:{port}", relay={"udp": False}, http={"listen": None}, log={"level": "error"}
-    )
+    content = relay_content(address, relay={"udp": udp}, http={"listen": None}, log={"level": "error"})
     return write(folder, "relay", content)
 
 
@@ -186,18 +205,18 @@ def _relay(config: Path, ready: Any) -> None:
     serve(config, ready.set)
 
 
-def measure(robots: int, duration_s: float) -> Sample:
-    """Start a fleet, wait until the site has every stream, and measure for `duration_s`."""
+def measure(robots: int, duration_s: float, *, udp: bool) -> Sample:
+    """Start a fleet, wait until the site has every stream and all data its lane, and measure for `duration_s`."""
     processes = multiprocessing.get_context("spawn")
-    shared, ready, port = Shared(), processes.Event(), free_ports(1)[0]
+    shared, ready, address = Shared(UDP if udp else ZMQ), processes.Event(), f"tcp://127.0.0.1:{free_ports(1)[0]}"
     ours, theirs = processes.Pipe(duplex=False)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        relay = Worker("the relay", _relay, _prepare(folder, robots, port), ready)
+        relay = Worker("the relay", _relay, _prepare(folder, robots, address, udp=udp), ready)
         ends = [
-            Worker("site", _site, folder, port, shared, theirs),
+            Worker("site", _site, folder, address, shared, theirs),
             *(
-                Worker(f"robots {numbers.start} to {numbers.stop - 1}", _robots, folder, port, numbers, shared)
+                Worker(f"robots {numbers.start} to {numbers.stop - 1}", _robots, folder, address, numbers, host, shared)
                 for host in range(HOSTS)
                 if len(numbers := range(host * robots // HOSTS, (host + 1) * robots // HOSTS))
             ),
@@ -207,6 +226,9 @@ def measure(robots: int, duration_s: float) -> Sample:
             await_workers(
                 lambda: shared.opened.value == everybody, workers, f"{robots} robots were not all there", START_S
             )
+            await_workers(
+                lambda: sum(shared.ready) == robots + 1, workers, f"not all data took the lane {shared.lane}", START_S
+            )
             settled = shared.received.value + int(robots * RATE_HZ)
             await_workers(lambda: shared.received.value > settled, workers, "messages did not flow", START_S)
             carried = watch(workers, shared.received, duration_s, shared.measuring)
@@ -214,12 +236,13 @@ def measure(robots: int, duration_s: float) -> Sample:
             if not ours.poll(START_S):
                 raise SernError("the site does not answer")
             ages_s = ours.recv()
-    return Sample(robots, carried.messages_hz, carried.cpu_us, ages_s)
+    return Sample(robots, carried.messages_hz, carried.cpu_us, carried.rss_bytes, ages_s)
 
 
 def bench(options: argparse.Namespace, report: common.Report) -> None:
     rounds, duration_s = common.repetitions(options, (3, 10.0), quick=(1, 3.0))
-    samples = common.interleaved({str(n): partial(measure, n, duration_s) for n in options.robots}, rounds)
+    measured = {str(n): partial(measure, n, duration_s, udp=not options.tcp) for n in options.robots}
+    samples = common.interleaved(measured, rounds)
     median: dict[int, dict[str, float]] = {}
     for found in samples.values():
         figures = {
@@ -228,16 +251,20 @@ def bench(options: argparse.Namespace, report: common.Report) -> None:
             "control_p99_ms": [sample.percentile_ms("control", 99) for sample in found],
             "state_p99_ms": [sample.percentile_ms("state", 99) for sample in found],
             "relay_cpu_us": [sample.relay_cpu_us for sample in found],
+            "relay_rss_MB": [sample.relay_rss_bytes / 1e6 for sample in found],
         }
         robots = found[0].robots
         median[robots] = {name: float(np.median(values)) for name, values in figures.items()}
         report.row(f"{robots} robots", "sern", **median[robots])
     most = max(median)
-    report.reach(f"p99 of class control at {most} robots, ms", median[most]["control_p99_ms"], LATENCY_LIMIT_MS)
+    prompt = min(PROMPT_ROBOTS, most)
+    if prompt in median:
+        report.reach(f"p99 of class control at {prompt} robots, ms", median[prompt]["control_p99_ms"], LATENCY_LIMIT_MS)
     if 5 in median and most > 5:
         ratio = median[most]["relay_cpu_us"] / median[5]["relay_cpu_us"]
         report.reach(f"relay CPU a message at {most} robots, times that at 5", ratio, CPU_RATIO_LIMIT)
     report.note(f"{TOPICS} topics and {RATE_HZ:g} messages/s a robot; medians of {rounds} rounds of {duration_s:g} s")
+    report.note("data over TCP" if options.tcp else "data over the datagram lane")
     if options.figure is not None:
         _draw(options.figure, median)
         report.note(f"figure: {options.figure}")
@@ -268,6 +295,7 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--robots", nargs="+", type=common.positive, default=list(FLEETS), metavar="N", help="measure these fleets"
     )
+    parser.add_argument("--tcp", action="store_true", help="leave the datagram lane off")
     parser.add_argument("--figure", type=Path, metavar="FILE", help="also draw the figures (PNG)")
     common.repetition_arguments(parser)
 

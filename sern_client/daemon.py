@@ -9,7 +9,7 @@ from collections.abc import Callable
 from contextlib import AsyncExitStack
 from functools import partial
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import zmq
 from prometheus_client import CollectorRegistry
@@ -43,7 +43,7 @@ from sern_runtime.config.client import ClientFile, ServicesSection, load_client
 from sern_runtime.config.keys import load_secret, load_server_keys
 from sern_runtime.config.load import Loaded
 from sern_runtime.entry import blamed_on, end_tasks, log_warnings, serve
-from sern_runtime.http import Health, HttpServer
+from sern_runtime.http_routes import Health
 from sern_runtime.internal_errors import InternalErrors
 from sern_runtime.loop import Shutdown
 from sern_runtime.message_log import LoggedFates, MessageLog
@@ -53,6 +53,9 @@ from sern_runtime.sdnotify import Notifier, Watchdog
 from sern_runtime.topics_view import TopicView, both_ways
 from sern_runtime.trace_view import of_client, trace_view
 from sern_runtime.transport_watch import NOT_YET, WAITING
+
+if TYPE_CHECKING:
+    from sern_runtime.http import HttpServer
 
 KEEP_PATIENCE_S: Final = 2.0
 """How long a stopping client waits for what it recorded to be flushed."""
@@ -295,7 +298,9 @@ class ClientDaemon:
             now=clock.now(),
         )
 
-    def _make_http(self, listen: str) -> HttpServer:
+    def _make_http(self, listen: str) -> "HttpServer":
+        from sern_runtime.http import HttpServer
+
         registry = CollectorRegistry()
         metrics = Metrics(registry)
         adaptation = self.adaptation

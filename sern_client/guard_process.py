@@ -37,8 +37,7 @@ from pydantic import TypeAdapter
 from sern_client.endpoints.base import Endpoint, Publisher
 from sern_client.endpoints.composite import CompositeEndpoint
 from sern_client.endpoints.conversion import Converter
-from sern_client.endpoints.ros1 import Ros1Endpoint
-from sern_client.factory import make_section
+from sern_client.sections import make_section
 from sern_core.site.lease import GuardLease
 from sern_core.vocabulary.errors import ConfigError
 from sern_core.vocabulary.message import TopicInfo
@@ -186,9 +185,6 @@ def _make_endpoint(said: dict[str, Any]) -> Endpoint:
     folder = Path(said["folder"])
     sections = TypeAdapter(list[EndpointSection]).validate_json(json.dumps(said["endpoints"]))
     made = [make_section(section, lambda text: resolve(folder, text), second=True) for section in sections]
-    for endpoint in made:
-        if isinstance(endpoint, Ros1Endpoint):
-            endpoint.publishes_only = True
     return made[0] if len(made) == 1 else CompositeEndpoint(made)
 
 

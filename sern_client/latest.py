@@ -8,7 +8,7 @@ from sern_core.relay.objects import topic_object_id
 from sern_core.vocabulary.errors import UsageError
 from sern_core.vocabulary.message import StreamId, StreamInfo
 from sern_core.wire.announce import definition_hash
-from sern_runtime.http import JsonQuery
+from sern_runtime.http_routes import JsonQuery
 
 MAX_VALUE_BYTES: Final = 4_096
 """Only the size is known of a larger value, as in the relay's registry."""

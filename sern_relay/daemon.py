@@ -7,7 +7,7 @@ import secrets
 import time
 from contextlib import AsyncExitStack
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import zmq
 from prometheus_client import CollectorRegistry
@@ -40,7 +40,7 @@ from sern_runtime.config.relay import RelayFile, load_relay
 from sern_runtime.datagram_watch import DatagramWatch
 from sern_runtime.draining import Progress
 from sern_runtime.entry import blamed_on, end_tasks, log_warnings, serve
-from sern_runtime.http import Health, HttpServer
+from sern_runtime.http_routes import Health
 from sern_runtime.internal_errors import InternalErrors
 from sern_runtime.link_metrics import AgeHistograms
 from sern_runtime.loop import Shutdown
@@ -52,6 +52,9 @@ from sern_runtime.sdnotify import Notifier, Watchdog
 from sern_runtime.topics_view import announced_summary, link_summary, received_summary
 from sern_runtime.trace_view import trace_view
 from sern_runtime.zap import Refusal, TemporaryRefusal, ZapHandler, self_test
+
+if TYPE_CHECKING:
+    from sern_runtime.http import HttpServer
 
 ZAP_DOMAIN: Final = "sern"
 PATIENCE_S: Final = 5.0
@@ -387,7 +390,9 @@ class RelayDaemon:
             self._unreloaded_s = clock.now()
         self._unreloaded = problem
 
-    def _make_http(self, listen: str) -> HttpServer:
+    def _make_http(self, listen: str) -> "HttpServer":
+        from sern_runtime.http import HttpServer
+
         registry = CollectorRegistry()
         metrics = Metrics(registry)
         adaptation = self.adaptation

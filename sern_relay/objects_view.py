@@ -31,7 +31,7 @@ from sern_core.vocabulary.errors import UsageError
 from sern_core.vocabulary.types import ClientName, ObjectKind, TopicName
 from sern_core.wire.announce import definition_hash
 from sern_runtime import clock
-from sern_runtime.http import JsonParts, JsonQuery
+from sern_runtime.http_routes import JsonParts, JsonQuery
 
 TOO_LARGE = "the answer is too large; ask for one kind, owner or topic, or with values=no or definitions=no"
 

@@ -4,8 +4,8 @@ import asyncio
 import errno
 import json
 import logging
-from collections.abc import Awaitable, Callable, Iterator, Mapping
-from typing import Final, NamedTuple
+from collections.abc import Awaitable, Callable, Mapping
+from typing import Final
 
 from aiohttp import web
 from aiohttp.http_exceptions import HttpProcessingError
@@ -13,36 +13,11 @@ from prometheus_client import CollectorRegistry
 from prometheus_client.exposition import choose_encoder
 
 from sern_core.vocabulary.errors import ConfigError, UsageError
+from sern_runtime.http_routes import HealthCheck, JsonParts, JsonQuery, JsonSource, UnknownError
 from sern_runtime.metrics import exposition
 from sern_runtime.optional import OptionalParts
 
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
-JsonSource = Callable[[], object]
-"""Gives what `json.dumps` takes, from state, at once."""
-
-
-class UnknownError(UsageError):
-    """What was asked for is not here: answered with 404 and one line that says what is."""
-
-
-class JsonParts(NamedTuple):
-    """A large answer: pieces of JSON text, each made when it is asked for, some of them in a turn of the loop. Above
-    MAX_ANSWER_BYTES it is refused with `too_large`, one line."""
-
-    pieces: Iterator[str]
-    too_large: str
-
-
-class JsonQuery(NamedTuple):
-    """A JSON source with parameters, all optional: `?name=value`. `read` gets those that were given, and raises
-    UsageError for a value it does not take; that and unknown names are answered with 400 and one line,
-    UnknownError with 404. What it gives is what `json.dumps` takes, or JsonParts."""
-
-    accepts: tuple[str, ...]
-    read: Callable[[Mapping[str, str]], object]
-    prepare: Callable[[Mapping[str, str]], Awaitable[None]] | None = None
-    """What takes long and has to be done first, elsewhere than on the loop; raises as `read` does."""
-
 
 _SHUTDOWN_S: Final = 1.0
 IDLE_S: Final = 75.0
@@ -79,16 +54,6 @@ class _RequestLog(logging.Logger):
     def isEnabledFor(self, level: int) -> bool:  # noqa: N802
         """aiohttp says some of it at DEBUG: all of it is counted, and written alike."""
         return level >= logging.DEBUG
-
-
-class Health(NamedTuple):
-    """An answer for /healthz or /readyz. `reason` is one line, shown whatever the answer is."""
-
-    ok: bool
-    reason: str
-
-
-HealthCheck = Callable[[], Health]
 
 
 def parse_listen(listen: str) -> tuple[str, int]:

@@ -15,7 +15,7 @@ from sern_core.link.link import Link
 from sern_core.vocabulary.message import StreamInfo
 from sern_core.vocabulary.trace import DecisionTrace, record_json
 from sern_core.vocabulary.types import CLASS_LABELS, TopicName
-from sern_runtime.http import JsonParts, JsonQuery, UnknownError
+from sern_runtime.http_routes import JsonParts, JsonQuery, UnknownError
 
 MAX_STREAMS: Final = 64
 """Streams of one topic that are told of: a relay may have a thousand subscribers of one."""

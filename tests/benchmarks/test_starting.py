@@ -1,5 +1,6 @@
 """Every benchmark starts from anywhere, in an environment that has nothing, and comes to its report."""
 
+import importlib.util
 import json
 import subprocess
 import sys
@@ -13,6 +14,8 @@ from benchmarks import child
 from tests.support import DEADLINE_S
 
 ROUND = ["--rounds", "1", "--seconds", "0.2"]
+KINDS = ["1", *(["2, DDS"] if importlib.util.find_spec("cyclonedds") else [])]
+OF_ROS = {f"robot with ROS {kind}{part}" for kind in KINDS for part in ("", ": guard of its commands")}
 
 
 @pytest.mark.parametrize(
@@ -23,6 +26,7 @@ ROUND = ["--rounds", "1", "--seconds", "0.2"]
             ["--parts", "steady", "cost", "--cases", "4 Mbit/s 50 ms"],
             {"4 Mbit/s 50 ms", "one acknowledgement"},
         ),
+        ("footprint", ["--seconds", "0.2"], {"relay", "simulated robot", "simulated site", *OF_ROS}),
         ("relay", ["--systems", "sern", "--cases", "1 kB", *ROUND], {"1 kB"}),
         ("robots", ["--robots", "1", *ROUND], {"1 robots"}),
         ("scheduler", [], {"10 topics", "100 topics", "1000 topics", "single control", "single bulk"}),

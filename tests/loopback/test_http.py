@@ -11,7 +11,8 @@ from prometheus_client import CollectorRegistry
 from prometheus_client.parser import text_string_to_metric_families
 
 from sern_core.vocabulary.errors import ConfigError, UsageError
-from sern_runtime.http import IDLE_S, Health, HttpServer, parse_listen
+from sern_runtime.http import IDLE_S, HttpServer, parse_listen
+from sern_runtime.http_routes import Health
 from sern_runtime.metrics import Metrics
 from tests.support import until
 

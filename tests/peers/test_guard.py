@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 
 from sern_client.endpoints.base import GUARD_SUFFIX, Endpoint
-from sern_client.factory import make_section
 from sern_client.guard import Guard
+from sern_client.sections import make_section
 from sern_core.vocabulary.types import Encoding, TopicName
 from sern_runtime import clock, ros_types
 from sern_runtime.config import endpoints as sections

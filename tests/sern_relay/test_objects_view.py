@@ -13,7 +13,7 @@ from sern_core.vocabulary.types import ClientName, Encoding, TopicName
 from sern_core.wire.announce import definition_hash
 from sern_relay.objects_view import objects_view
 from sern_runtime import http
-from sern_runtime.http import JsonParts
+from sern_runtime.http_routes import JsonParts
 from tests.world import World, spec
 
 

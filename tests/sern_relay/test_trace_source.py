@@ -7,7 +7,7 @@ import pytest
 
 from sern_core.vocabulary.types import PriorityClass
 from sern_relay.trace_source import of_hub
-from sern_runtime.http import JsonParts, JsonQuery, UnknownError
+from sern_runtime.http_routes import JsonParts, JsonQuery, UnknownError
 from sern_runtime.trace_view import of_client, trace_view
 from sern_sim.models import LinkModel
 from tests.world import World, spec

@@ -62,7 +62,8 @@ _log = logging.getLogger(__name__)
 class Ros1Options:
     """Which master, who we are there, and the limits. None is the default of the environment, as for any ROS node:
     `master_uri` ROS_MASTER_URI, else http://localhost:11311; `host` (the name or address at which other nodes reach
-    us) ROS_HOSTNAME, else ROS_IP, else what this machine has towards the master. `node_name` is sern.
+    us) ROS_HOSTNAME, else ROS_IP, else what this machine has towards the master. `node_name` is sern. With
+    `publishes_only` the node takes no topic from its master: another one of the same client does.
     """
 
     master_uri: str | None = None
@@ -75,6 +76,7 @@ class Ros1Options:
     max_message_bytes: int = 64 * 2**20
     tcp_nodelay: bool = True
     accept_bridged: bool = False
+    publishes_only: bool = False
 
 
 class Ros1Endpoint:
@@ -105,6 +107,7 @@ class Ros1Endpoint:
         self.tcp_nodelay = options.tcp_nodelay
         self.accept_bridged = options.accept_bridged
         self.publishes_only = False
+        self._publishes_only = options.publishes_only
         """Whether topics and services of other nodes are no concern of ours: set by a guard, before the start."""
         self.problem: str | None = None
         """Why this node has left the master for good, in one line; None while all is well."""
@@ -346,7 +349,7 @@ class Ros1Endpoint:
         if self._off or self._events is None:
             return
         self._state = state
-        for name, nodes in () if self.publishes_only else state.publishers.items():
+        for name, nodes in () if self._publishes_only else state.publishers.items():
             others = [node for node in nodes if node not in (self.caller, self.caller + GUARD_SUFFIX)]
             topic = self._topics.get(name)
             if topic is None and others and name_problem(self._local(name)) is None:
@@ -360,7 +363,7 @@ class Ros1Endpoint:
                 self._topics.pop(name).close()
         for publication in list(self._publications.values()):
             self._tell_subscribers(publication)
-        if not self.publishes_only:
+        if not self._publishes_only:
             self._services.update(state.services)
 
     def _tell_subscribers(self, publication: Publication) -> None:

@@ -22,7 +22,7 @@ from sern_client.endpoints.bag import BagEndpoint, BagOptions
 from sern_client.endpoints.bag_files import BagFile, McapFile, RecordFile, active_path
 from sern_client.endpoints.leftovers import finish
 from sern_client.endpoints.record import RecordEndpoint, RecordOptions
-from sern_client.factory import make_section
+from sern_client.sections import make_section
 from sern_core.vocabulary.errors import ConfigError, UsageError
 from sern_core.vocabulary.message import TopicInfo
 from sern_core.vocabulary.types import DropReason, Encoding, TopicName

@@ -16,7 +16,7 @@ from sern_client.endpoints.record import RecordOptions
 from sern_client.endpoints.ros1 import Ros1Options
 from sern_client.endpoints.synthetic import SyntheticOptions
 from sern_client.endpoints.zenoh.options import ZenohOptions
-from sern_client.factory import options_of
+from sern_client.sections import options_of
 from sern_runtime.config.endpoints import (
     MAX_SYNTHETIC_TOPICS,
     BagEndpoint,
@@ -38,7 +38,7 @@ PAIRS = [
     (ZenohEndpoint, ZenohOptions),
     (RclpyEndpoint, RclpyOptions),
 ]
-SAID_BY_NO_FILE = {"second"}
+SAID_BY_NO_FILE = {"second", "publishes_only"}
 OTHERWISE_BY_DEFAULT = {(DdsOptions, "domain")}
 """Which domain it is where the file says nothing, the environment says."""
 

@@ -20,7 +20,7 @@ from sern_client.endpoints.zenoh import session as module
 from sern_client.endpoints.zenoh.endpoint import ZenohEndpoint
 from sern_client.endpoints.zenoh.options import ZenohOptions
 from sern_client.endpoints.zenoh.session import SessionOptions, load_zenoh, make_config
-from sern_client.factory import make_section
+from sern_client.sections import make_section
 from sern_core.vocabulary.errors import ConfigError, ServiceError
 from sern_core.vocabulary.types import DropReason, Encoding, TopicName
 from sern_runtime import ros_types

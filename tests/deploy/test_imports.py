@@ -1,0 +1,32 @@
+"""A daemon imports what its file asks for: a robot's memory and its start are not spent on what is not used."""
+
+import subprocess
+import sys
+
+import pytest
+
+ENDPOINTS = ("bag", "dds", "rclpy", "record", "ros1", "synthetic", "zenoh")
+SHOWN = "import sys, {program}; print(*sys.modules)"
+
+
+def imported_by(program: str) -> set[str]:
+    ended = subprocess.run(
+        [sys.executable, "-c", SHOWN.format(program=program)], capture_output=True, text=True, check=True
+    )
+    return set(ended.stdout.split())
+
+
+@pytest.mark.parametrize(
+    "program", ["sern_client.daemon", "sern_client.guard_process", "sern_relay.daemon", "sern_tools.cli"]
+)
+def test_what_no_file_asked_for_is_not_imported(program: str) -> None:
+    there = imported_by(program)
+    assert program in there
+    for kind in ENDPOINTS:
+        assert not {f"sern_client.endpoints.{kind}", f"sern_client.endpoints.{kind}.endpoint"} & there
+    assert not {"aiohttp", "zenoh", "cyclonedds", "rclpy", "matplotlib", "rosbags.rosbag1", "rosbags.rosbag2"} & there
+
+
+def test_the_guard_needs_neither_link_nor_adaptation() -> None:
+    there = imported_by("sern_client.guard_process")
+    assert not {"zmq", "sern_core.link.link", "sern_core.adaptation.policy", "prometheus_client"} & there
