@@ -106,9 +106,7 @@ class Ros1Endpoint:
         self.max_message_bytes = options.max_message_bytes
         self.tcp_nodelay = options.tcp_nodelay
         self.accept_bridged = options.accept_bridged
-        self.publishes_only = False
         self._publishes_only = options.publishes_only
-        """Whether topics and services of other nodes are no concern of ours: set by a guard, before the start."""
         self.problem: str | None = None
         """Why this node has left the master for good, in one line; None while all is well."""
         self._prefix = "" if options.namespace in (None, "/") else "/" + str(options.namespace).strip("/")
