@@ -20,7 +20,9 @@ README: Final = ROOT / "README.md"
 DOCUMENT: Final = ROOT / "docs" / "performance.md"
 THEORY: Final = ROOT / "docs" / "adaptation-theory.md"
 DOCUMENTS: Final = {
-    **dict.fromkeys(("link", "robots", "footprint", "endpoints", "mmcf_lab", "thin_link", "codecs"), DOCUMENT),
+    **dict.fromkeys(
+        ("link", "robots", "footprint", "endpoints", "mmcf_lab", "thin_link", "cellular", "codecs"), DOCUMENT
+    ),
     **dict.fromkeys(("mmcf", "mmcf_replay", "mmcf_recovery"), THEORY),
     "summaries": ROOT / "docs" / "summaries.md",
     "matrix": ROOT / "docs" / "lab.md",
@@ -47,6 +49,8 @@ TITLES: Final = {
     "fresh_s": "first fresh pose, s",
     "messages_hz": "messages/s",
     "relay_cpu_us": "relay CPU a message, µs",
+    "used_percent": "link used, %",
+    "delivered_percent": "bulk that arrived whole, % of the link",
     "relay_rss_MB": "relay memory (RSS), MB",
     "ready_s": "ready after, s",
     "rss_MB": "resident, MB",

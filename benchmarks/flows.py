@@ -413,7 +413,7 @@ class Cubic(CapacityEstimator):
             self._epoch_s = sample.now
             self._w_max = max(self._w_max, self._window)
         segment = self._segment
-        k = ((self._w_max - self._window_at_cut) / segment / 0.4) ** (1 / 3) if self._w_max else 0.0
+        k = (max(0.0, self._w_max - self._window_at_cut) / segment / 0.4) ** (1 / 3)
         t = sample.now - self._epoch_s + self._srtt_s
         target = (0.4 * (t - k) ** 3) * segment + self._w_max
         reno = self._window_at_cut + 0.53 * segment * (sample.now - self._epoch_s) / self._srtt_s

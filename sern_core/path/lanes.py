@@ -1,11 +1,13 @@
 """One lane of a hop: its flight, its arrivals, its estimator, its fragment size."""
 
 from collections import deque
+from dataclasses import replace
 from typing import Final
 
 from sern_core.path.capacity import CapacityEstimator, Pacer
 from sern_core.path.congestion.fixed import FixedWindow
 from sern_core.path.congestion.hybrid import HybridWindow
+from sern_core.path.congestion.params import DEFAULT_HYBRID
 from sern_core.path.flight import Arrivals, Flight
 from sern_core.vocabulary.params import LinkParams, Redundancy, WindowAlgorithm
 from sern_core.vocabulary.types import PriorityClass
@@ -45,7 +47,8 @@ LOSS_GAIN: Final = 0.01
 def _estimator(params: LinkParams) -> CapacityEstimator:
     if params.window.algorithm is WindowAlgorithm.FIXED:
         return FixedWindow(params.window.fixed_bytes)
-    return HybridWindow(fragment_bytes=MIN_FRAGMENT_BYTES + OVERHEAD_BYTES)
+    hybrid = replace(DEFAULT_HYBRID, variable_queue_s=params.window.variable_rate_queue_s)
+    return HybridWindow(fragment_bytes=MIN_FRAGMENT_BYTES + OVERHEAD_BYTES, params=hybrid)
 
 
 class Path:

@@ -6,6 +6,7 @@ take theirs from these dataclasses.
 
 from dataclasses import dataclass, field
 from enum import StrEnum
+from math import inf
 
 from sern_core.vocabulary.errors import UsageError
 from sern_core.vocabulary.limits import PeerLimits
@@ -63,10 +64,14 @@ class WindowParams:
     algorithm: WindowAlgorithm = WindowAlgorithm.HYBRID
     fixed_bytes: int = 25_000
     """W of algorithm `fixed`: 4 Mbit/s × 50 ms, the link of the measurements in the documentation."""
+    variable_rate_queue_s: float | None = None
+    """The queue that algorithm `hybrid` keeps while the rate of the link swings; None: it follows no swings."""
 
     def __post_init__(self) -> None:
         if self.fixed_bytes < 1:
             raise UsageError(f"WindowParams: fixed_bytes = {self.fixed_bytes!r} must be at least 1")
+        if self.variable_rate_queue_s is not None and not 0.0 < self.variable_rate_queue_s < inf:
+            raise UsageError(f"WindowParams: variable_rate_queue_s = {self.variable_rate_queue_s!r} must be above 0")
 
 
 class Redundancy(StrEnum):

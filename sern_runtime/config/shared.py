@@ -81,9 +81,13 @@ class WindowSection(Section):
     """`hybrid`: by measured delay and rate, keeps the standing queue short; `fixed`: always `fixed_bytes`."""
     fixed_bytes: Bytes = _LINK.window.fixed_bytes
     """The window of algorithm `fixed`: capacity × round-trip time."""
+    variable_rate_queue_s: Annotated[float, Field(gt=0, le=1)] | None = _LINK.window.variable_rate_queue_s
+    """For links whose rate goes up and down all the time, as cellular ones do to a robot that drives: while it does,
+    keep so long a queue, which shows what the link can do now. Bulk uses more of it, and poses wait so much longer;
+    0.01 is a good value. Beside other traffic that keeps a queue of its own it may get little. null: no."""
 
     def params(self) -> WindowParams:
-        return WindowParams(algorithm=self.algorithm, fixed_bytes=self.fixed_bytes)
+        return WindowParams(self.algorithm, self.fixed_bytes, self.variable_rate_queue_s)
 
 
 def _name_of(number: int) -> DscpName:

@@ -11,6 +11,7 @@ class Rival:
     """What is known of somebody else who keeps a queue. `cubic` is the window while we compete with him."""
 
     __slots__ = (
+        "_gone",
         "_params",
         "_pinned",
         "_recent",
@@ -34,6 +35,7 @@ class Rival:
         self._recent: deque[float] = deque(maxlen=self._params.stuck_epochs)  # queues of the last epochs
         self.adopted_until_s = -inf
         """The end of a time for which the path was taken for a longer one: short again, it has shown a rival."""
+        self._gone: deque[float] = deque(maxlen=self._params.gone_times)  # when its queue went as we made way
         self.until_s = -inf
         """The end of a time in which a queue that stays is taken for a rival's."""
         self.calm_window = 0.0
@@ -46,6 +48,17 @@ class Rival:
     def remember(self, now: float) -> None:
         """There is one, or was a moment ago."""
         self.until_s = now + self._params.rival_memory_s
+
+    def went_again(self, now: float) -> bool:
+        """Its queue went as we made way; whether it did so again and again of late."""
+        gone = self._gone
+        gone.append(now)
+        return len(gone) == self._params.gone_times and now < gone[0] + self._params.rival_memory_s
+
+    def forget(self) -> None:
+        """There was none."""
+        self.until_s = -inf
+        self._gone.clear()
 
     def stuck(self, now: float, queue_s: float, window: float, fragment: float, peak: float) -> bool:
         """Whether a queue stays though we made way for it, or moves though we are not there."""

@@ -19,6 +19,8 @@ Theory of operation
     What is lost on the way is added. B does not follow what our own pacing made of it.
     *Start-up.* The first packets leave in a train: its dispersion shows the capacity one round trip later, and the
     window goes there in steps of at most `STARTUP_GAIN`.
+    *Swings.* A link whose rate goes up and down all the time (cellular) is followed acknowledgement by acknowledgement,
+    with a queue that shows what it can do now (`variable`), until it keeps a rate again; if `variable_queue_s` says so.
     *Draining.* When no empty queue was seen for a while, one round trip at 0.6 of the product shows it. A queue that
     stays although we made way is either a longer path (constant: taken as the new empty path) or somebody else's:
     then the window follows CUBIC (RFC 9438) until a drain finds the queue gone.
@@ -32,13 +34,14 @@ from sern_core.path.congestion.company import Drain, Rival
 from sern_core.path.congestion.growth import Growth
 from sern_core.path.congestion.link_rate import LinkRate, Slowdown
 from sern_core.path.congestion.losses import Losses
-from sern_core.path.congestion.mode import STARTUP, TRANSITIONS, Event
+from sern_core.path.congestion.mode import STARTUP, STEADY, TRANSITIONS, Event
 from sern_core.path.congestion.pace import Pace
 from sern_core.path.congestion.params import DEFAULT_HYBRID, HybridParams
 from sern_core.path.congestion.parts import Cubic, Eased
 from sern_core.path.congestion.path_delay import PathDelay
 from sern_core.path.congestion.queue_view import QueueView
 from sern_core.path.congestion.start_up import StartUp
+from sern_core.path.congestion.variable import Variability, VariableWindow
 
 
 class HybridWindow(CapacityEstimator):
@@ -72,6 +75,8 @@ class HybridWindow(CapacityEstimator):
         self._rival = Rival(params)
         self._drain = Drain(params)
         self._eased = Eased()
+        self._variability = Variability(params)
+        self._variable = VariableWindow(params)
         self._rtt_s: float | None = None  # with our own queue on the way out empty
         self._restart()
         self._start.begin_round(-inf, self._window, None)
@@ -90,6 +95,8 @@ class HybridWindow(CapacityEstimator):
         self._drain.restart()
         self._slowdown = Slowdown(self._params)
         self._growth.restart(-inf)
+        self._variability.measure_anew()
+        self._variable.restart()
         self._busy_s: float | None = None
         self._high_since_s: float | None = None
         self._hold_until_s = -inf
@@ -131,6 +138,7 @@ class HybridWindow(CapacityEstimator):
             "queue_s": self._view.queue_s,
             "startup": float(self._mode.starting),
             "competing": float(self._mode.competing),
+            "varying": float(self._mode.varying),
         }
 
     # --- what it sees ---------------------------------------------------------------------------------------------
@@ -155,6 +163,8 @@ class HybridWindow(CapacityEstimator):
         rate = self._rate
         if self._receiver.went_back(receiver_s, cum_bytes):
             rate.measure_anew()
+            self._variability.measure_anew()
+            self._variable.restart()
             self._slowdown.not_full()
             self._high_since_s = None
             self._start.measure_anew()
@@ -182,6 +192,8 @@ class HybridWindow(CapacityEstimator):
                 self._rtt_s = rtt_s
             if not sample.app_limited and sent_s >= self._start.since_s:
                 self._ramp(now, receiver_s, cum_bytes, sample.acked_bytes)
+        elif mode.varying:
+            self._follow(sample, queue_s)
         elif queue_s > 3 * high_s and not (mode.competing or mode.draining):
             if self._high_since_s is None:
                 self._high_since_s = receiver_s
@@ -189,6 +201,7 @@ class HybridWindow(CapacityEstimator):
                 self._emergency(now, queue_s)
         else:
             self._high_since_s = None
+        self._look_for_swings(sample, queue_s)
         if queue_s <= high_s or sample.app_limited or mode.competing:
             self._slowdown.not_full()
         else:
@@ -205,6 +218,33 @@ class HybridWindow(CapacityEstimator):
             and len(self._samples) >= self._params.min_epoch_samples
         ):
             self._close_epoch(now)
+
+    def _look_for_swings(self, sample: AckSample, queue_s: float) -> None:
+        """A link is full while every packet meets another one, and waits longer than jitter makes it."""
+        mode = self._mode
+        jitter_s = 0.0 if mode.varying else self._view.jitter_s
+        full = not (sample.app_limited or mode.starting or mode.draining or mode.competing)
+        full = full and self._params.variable_queue_s is not None
+        full = full and not self._drain.lately(sample.now, self._rtt_s or 0.0)
+        if full and queue_s >= jitter_s + self._params.fast_s:
+            rate = self._rate.arrived.rate()
+            if rate is not None and queue_s >= jitter_s + self._fragment / rate:
+                self._variability.queued(sample.now, sample.receiver_s, sample.cum_bytes, jitter_s)
+                return
+        self._variability.passed()
+
+    def _follow(self, sample: AckSample, queue_s: float) -> None:
+        """One acknowledgement of a link whose rate swings."""
+        window = self._variable.steer(self._window, queue_s, sample, rtt_s=self._rtt_s or 0.0, fragment=self._fragment)
+        self._window = min(max(window, self._least_window), self._params.max_window_bytes)
+        self._set_pace()
+
+    def _vary(self, now: float, queue_s: float, rtt_s: float) -> None:
+        """An epoch of a link whose rate swings is over."""
+        if self._variable.close_epoch(now, queue_s, high_s=self._view.high_s, rtt_s=rtt_s):
+            self._variability.forget()  # it was a rival who took more or less of the link
+        if not self._variability.swings(now):
+            self._happens(Event.SETTLED)
 
     def on_loss(self, *, now: float, nbytes: int) -> None:
         self._losses.lost(now, nbytes)
@@ -231,6 +271,7 @@ class HybridWindow(CapacityEstimator):
         # What was sent while draining or with nothing more to send only shows a lower bound.
         bound = span_limited or self._mode.draining or self._drain.lately(now, rtt_s)
         self._rate.saturated = self._rate.saturated or not bound
+        self._variability.at_least(now, rate)
         paced = self._pace.capped and self._view.queue_s <= self._view.target_s
         if rate > (self._rate.value or 0.0) or not (bound or paced):
             self._rate.note(now, rate, rtt_s)
@@ -342,6 +383,8 @@ class HybridWindow(CapacityEstimator):
             if limited and (queue_s > view.high_s / 2 or lost > 0.2):
                 rate = self._rate.arrived.rate()
                 self._end_startup(min(self._window, rate * rtt_s) if rate else self._window / 2)
+        elif self._mode.varying:
+            self._vary(now, queue_s, rtt_s)
         elif limited:
             if rival.cubic is not None:
                 self._growth.room.clear()
@@ -357,6 +400,9 @@ class HybridWindow(CapacityEstimator):
             )
             if stuck and now < rival.until_s:
                 self._compete(now, rtt_s + queue_s)
+            elif self._mode is STEADY and now >= rival.until_s and self._variability.swings(now):
+                self._happens(Event.SWINGS)
+                self._variable.restart()
             elif drain.due(now, interval_s, stuck=stuck):
                 self._make_way(now, rtt_s)
         self._set_pace()
@@ -373,7 +419,7 @@ class HybridWindow(CapacityEstimator):
         count = len(queues)
         early_s = -queues[count // 5]
         if self._rival.cubic is None:
-            window_s = max(params.base_window_s, 2.2 * interval_s)
+            window_s = max(params.base_window_s, 2.2 * interval_s, 2 * params.variable_memory_s * self._mode.varying)
         else:
             window_s = params.compete_max_s + params.base_window_s
         delay.close_epoch(now, window_s)
@@ -421,6 +467,8 @@ class HybridWindow(CapacityEstimator):
             self._pace.start(self._window, self._initial_bytes, self._rtt_s)
         elif self._mode.competing:
             self._pace.compete(self._window, self._rtt_s)
+        elif self._mode.varying:
+            self._pace.vary(self._window, self._rtt_s)
         else:
             probing = None if self._growth.room.trying else self._growth.probing
             self._pace.steer(self._window, self._rtt_s, self._rate, self._view, self._losses.usual, probing)
@@ -448,7 +496,11 @@ class HybridWindow(CapacityEstimator):
                 self._happens(Event.RIVAL_GONE)
                 rival.cubic = None
                 rival.calm_window = self._window
-                rival.remember(now)
+                if rival.went_again(now) and params.variable_queue_s is not None:
+                    rival.forget()  # none comes and goes as we make way: the queue was ours, and the link fades
+                    self._variability.faded(now)
+                else:
+                    rival.remember(now)
                 self._window = min(self._window, (self._rate.value or 0.0) * rtt_s + self._fragment)
         elif cubic is not None:
             if now > cubic.began_s + params.compete_max_s:

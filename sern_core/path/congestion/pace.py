@@ -21,6 +21,12 @@ class Pace:
         if rtt_s is not None:
             self.value = None if window <= initial_bytes else self._params.startup_pacing * window / rtt_s
 
+    def vary(self, window: float, rtt_s: float | None) -> None:
+        """Let the window bound, and spread what it lets go."""
+        self.capped = False
+        if rtt_s is not None:
+            self.value = self._params.variable_pacing * window / (rtt_s + (self._params.variable_queue_s or 0.0))
+
     def compete(self, window: float, rtt_s: float | None) -> None:
         """Let the window alone bound."""
         self.capped = False

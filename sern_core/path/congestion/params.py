@@ -97,11 +97,39 @@ class HybridParams:
     flat_s: float = 0.003
     loss_memory_s: float = 3.0
     rival_memory_s: float = 30.0
+    gone_times: int = 2
+    """A rival whose queue went so often in that time, each time that we made way, is none."""
     compete_max_s: float = 30.0
     compete_queue_s: float = 1.0
     """A stream never loses a packet: its queue would grow without end."""
 
     quicker_epochs: int = 8
+
+    # A link whose rate swings
+    variable_times: float = 1.5
+    """A rate so many times another one is another one."""
+    variable_turns: int = 3
+    variable_memory_s: float = 20.0
+    """The link swings when its rate turned so often in this time..."""
+    variable_fade_s: float = 1.0
+    """... or down and up within this one."""
+    variable_span_s: float = 0.060
+    """Time over which a link that is full is measured for it; longer with jitter."""
+    variable_queue_s: float | None = None
+    """The queue that is kept while it does; None: it is treated as any other link."""
+    variable_rate_s: float = 0.050
+    """Time over which what arrives is what the link carries now."""
+    variable_growth: float = 0.3
+    """Of the bytes that are acknowledged, while nothing queues."""
+    variable_ahead: float = 1.5
+    variable_ahead_packets: float = 6.0
+    """The window is at most so many times what was carried of late, and so many packets."""
+    variable_pacing: float = 1.25
+    variable_patience_s: float = 1.5
+    variable_long: float = 2.0
+    variable_stays: float = 0.7
+    """A queue so many times the wanted one, in so large a share of the last epochs, about `variable_patience_s`, may be
+    somebody else's: the window makes way until it is known."""
 
 
 DEFAULT_HYBRID = HybridParams()
