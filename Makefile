@@ -6,7 +6,7 @@ TEST_PROCESSES ?= 3
 RANDOM_TESTS = $(shell grep -rlE '^(from|import) (hypothesis|tests\.exploring)' tests --include='test_*.py' | grep -v tests/peers)
 PACKAGES := sern_core sern_runtime sern_relay sern_client sern_sim sern_tools benchmarks tests
 
-.PHONY: help setup lint format types test wheel test-compiled explore standstills lab bench performance endpoints figures picture demo schemas clean
+.PHONY: help setup lint format types test wheel test-compiled explore standstills lab bench performance endpoints figures cellular picture demo schemas clean
 
 help:
 	@echo "make setup    create $(VENV) with pinned dependencies"
@@ -18,6 +18,7 @@ help:
 	@echo "make lab      the whole matrix of bad links, and the longer runs over tc netem, which need root"
 	@echo "make performance   as root: measure link, fleet and policies of docs/performance.md anew, two hours of an idle machine"
 	@echo "make endpoints, make figures   the other tables: ROS endpoints, 15 minutes; virtual time, summaries and codecs, 30"
+	@echo "make cellular RECORDINGS=DIR   the table of recorded cellular links, a minute; virtual time"
 	@echo "make picture  the demo, and its picture for README.md"
 	@echo "make bench    the quick benchmarks;  make schemas: regenerate schemas/ and the configuration reference"
 
@@ -112,6 +113,13 @@ figures: setup
 	$(BIN)/python -m benchmarks.mmcf_replay --plots docs/images --json build/mmcf_replay.json
 	$(BIN)/python -m benchmarks.mmcf --plots docs/images --json build/mmcf.json
 	$(BIN)/python -m benchmarks.document $(addprefix build/,$(addsuffix .json,footprint thin_link codecs summaries mmcf_recovery mmcf_replay mmcf))
+
+# The recordings are not ours to ship: make cellular RECORDINGS=DIR.
+RECORDINGS := ../shared/data/cellular
+cellular: setup
+	mkdir -p build
+	$(BIN)/python -m benchmarks.cellular --data $(RECORDINGS) --json build/cellular.json
+	$(BIN)/python -m benchmarks.document build/cellular.json
 
 picture: setup
 	$(BIN)/sern demo --out build/demo --picture docs/images/demo.png
