@@ -45,6 +45,8 @@ SLOT_PACKET_BYTES: Final = 1504
 STEP_SLOTS: Final = 5
 QUEUE_PACKETS: Final = 1000
 POSE_HZ: Final = 50.0
+BULK_SHARE: Final = (DATAGRAM_BYTES - HEADER_BYTES) / (DATAGRAM_BYTES + OVERHEAD_BYTES)
+"""What of a datagram on the wire is a message's."""
 SETTLED_S: Final = 2.0
 """Poses of the first seconds are left out, and those of the last, which may not have arrived."""
 POSE, CLOUD = "/robot/odom", "/robot/points"
@@ -166,7 +168,7 @@ def play_informed(slots: Sequence[int], duration_s: float, queue_s: float) -> Pl
     poses = np.arange(round(SETTLED_S / step_s), count - round(SETTLED_S / step_s), round(1 / POSE_HZ / step_s))
     gone = np.searchsorted(total, total[poses] + queues[poses])
     ages_s = sorted(((gone - poses) * step_s + DELAY_S)[gone < count].tolist())
-    return Played(used / total[-1], used / total[-1] * (DATAGRAM_BYTES - HEADER_BYTES) / DATAGRAM_BYTES, ages_s)
+    return Played(used / total[-1], used / total[-1] * BULK_SHARE, ages_s)
 
 
 def kind(name: str) -> str | None:

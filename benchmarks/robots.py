@@ -56,7 +56,7 @@ LOOK_S: Final = 0.5
 STAMP: Final = struct.Struct("!d")
 PROMPT_ROBOTS: Final = 50
 LATENCY_LIMIT_MS: Final = 10.0
-"""Of so many robots; the cores of a small machine are full with more."""
+"""The limit holds for so many robots; the cores of a small machine are full with more."""
 CPU_RATIO_LIMIT: Final = 1.2
 
 

@@ -30,7 +30,7 @@ DIRECTORY: Final = Path(__file__).resolve().parents[1] / "schemas" / "vectors"
 Vector = dict[str, Any]
 
 FLAGS: Final = {"TOMBSTONE": framing.FLAG_DROP_MARKER, "REPLAY": framing.FLAG_REPLAY, "URGENT": framing.FLAG_URGENT}
-"""By the names that the vectors have for them, which never change."""
+"""The vectors have names of their own for flags, which never change."""
 DEFINITION: Final = "std_msgs/Header header\nfloat64[] ranges\n"
 
 

@@ -202,8 +202,8 @@ class Reassembly:
 
 Deliver = Callable[["InStream", Message], None]
 OnInDrop = Callable[["InStream", DropReason, int, Sequence[int], bool], None]
-"""`on_drop(stream, reason, nbytes, seqs, reported)`, `nbytes` of all of them together."""
-"""Stream, reason, bytes, seq, and whether its drop marker follows: a reliable message that was given up here."""
+"""`on_drop(stream, reason, nbytes, seqs, reported)`, `nbytes` of all of them together. `reported`: drop markers follow,
+for these are reliable messages that were given up here."""
 
 
 class InStream:

@@ -96,7 +96,7 @@ class KeepAll:
             drops.drop(out, reason)
             return
         drops.count(message.seq, reason, size)
-        out.entomb(reason)
+        out.mark_dropped(reason)
         self._keep(out)
         drops.tell(out, reason)
 
@@ -205,14 +205,14 @@ class KeepAll:
         if not reported:
             told = drops.reason_of(out, reason)
             drops.count(out.seq, told, out.offered_bytes)
-        out.entomb(reason)
+        out.mark_dropped(reason)
         if not reported:
             drops.tell(out, told)
         if out.started:
             # What is in flight of the old body is harmless: the receiver takes the drop marker in its place.
             transit.activate(out)
 
-    def entomb(self, outs: list[OutMessage], reason: DropReason) -> None:
+    def mark_dropped(self, outs: list[OutMessage], reason: DropReason) -> None:
         """Drop markers take the places of messages. Those that were not counted are told of together."""
         drops, transit = self._drops, self._transit
         lost = [out for out in outs if not out.counted]
@@ -222,7 +222,7 @@ class KeepAll:
             self.retained_bytes -= freed_bytes
             if not out.started:
                 transit.queued_bytes -= freed_bytes
-            out.entomb(reason)
+            out.mark_dropped(reason)
         transit.activate_all([out for out in outs if out.started])
         for run, why in told:
             drops.drop_run(run, why)
@@ -354,7 +354,7 @@ class KeepAll:
             for out in self.retained:  # reported as dropped to the only one: then it shall not get it now
                 if out.counted and not out.message.drop_marker:
                     self.retained_bytes -= out.size - 1
-                    out.entomb(DropReason.LOST)
+                    out.mark_dropped(DropReason.LOST)
         self._transit.restart(self.retained)
         self._lapses.restart()
 

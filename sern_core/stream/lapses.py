@@ -34,7 +34,7 @@ class Kept(Protocol):
     retained: deque[OutMessage]
     watermark: int
 
-    def entomb(self, outs: list[OutMessage], reason: DropReason) -> None:
+    def mark_dropped(self, outs: list[OutMessage], reason: DropReason) -> None:
         """Put drop markers in the places of messages."""
 
 
@@ -138,7 +138,7 @@ class Lapses:
             seq = out.seq
         for why, run in runs:
             assert why is not None
-            kept.entomb(run, why)
+            kept.mark_dropped(run, why)
         return count + seen // SEEN_PER_LAPSED, seq
 
     def _young(self, out: OutMessage, now: float, lifespan_s: float | None) -> bool:

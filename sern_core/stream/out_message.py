@@ -80,7 +80,7 @@ class OutMessage:
         self.some_acked = False
         self.fragments_inflight = 0
 
-    def entomb(self, reason: DropReason) -> None:
+    def mark_dropped(self, reason: DropReason) -> None:
         """Become a drop marker: one byte that says why."""
         old = self.message
         self.message = Message(

@@ -293,7 +293,7 @@ class Scheduler:
                 self._bulk_credit = min(self._bulk_credit, 0.0)
 
     def pending(self, priority: PriorityClass) -> int:
-        """Slots of the class that could be served; those being encoded are not counted."""
+        """Channels of the class that could be served; those being encoded are not counted."""
         return len(self._tables[priority].channel_ids)
 
     # Whose turn it is

@@ -55,6 +55,7 @@ class HybridWindow(CapacityEstimator):
         params: HybridParams = DEFAULT_HYBRID,
     ) -> None:
         self._params = params
+        self._follows = params.variable_queue_s is not None  # swings of the link's rate
         self._first_fragment_bytes = fragment_bytes
         self._initial_bytes = initial_bytes
         self._receiver = Receiver()
@@ -201,7 +202,8 @@ class HybridWindow(CapacityEstimator):
                 self._emergency(now, queue_s)
         else:
             self._high_since_s = None
-        self._look_for_swings(sample, queue_s)
+        if self._follows:
+            self._look_for_swings(sample, queue_s)
         if queue_s <= high_s or sample.app_limited or mode.competing:
             self._slowdown.not_full()
         else:
@@ -223,12 +225,11 @@ class HybridWindow(CapacityEstimator):
         """A link is full while every packet meets another one, and waits longer than jitter makes it."""
         mode = self._mode
         jitter_s = 0.0 if mode.varying else self._view.jitter_s
-        full = not (sample.app_limited or mode.starting or mode.draining or mode.competing)
-        full = full and self._params.variable_queue_s is not None
-        full = full and not self._drain.lately(sample.now, self._rtt_s or 0.0)
-        if full and queue_s >= jitter_s + self._params.fast_s:
+        tells = not (sample.app_limited or mode.starting or mode.draining or mode.competing)
+        if tells and queue_s >= jitter_s + self._params.fast_s:
             rate = self._rate.arrived.rate()
-            if rate is not None and queue_s >= jitter_s + self._fragment / rate:
+            met = rate is not None and queue_s >= jitter_s + self._fragment / rate
+            if met and not self._drain.lately(sample.now, self._rtt_s or 0.0):
                 self._variability.queued(sample.now, sample.receiver_s, sample.cum_bytes, jitter_s)
                 return
         self._variability.passed()
@@ -271,7 +272,8 @@ class HybridWindow(CapacityEstimator):
         # What was sent while draining or with nothing more to send only shows a lower bound.
         bound = span_limited or self._mode.draining or self._drain.lately(now, rtt_s)
         self._rate.saturated = self._rate.saturated or not bound
-        self._variability.at_least(now, rate)
+        if self._follows:
+            self._variability.at_least(now, rate)
         paced = self._pace.capped and self._view.queue_s <= self._view.target_s
         if rate > (self._rate.value or 0.0) or not (bound or paced):
             self._rate.note(now, rate, rtt_s)
@@ -419,7 +421,9 @@ class HybridWindow(CapacityEstimator):
         count = len(queues)
         early_s = -queues[count // 5]
         if self._rival.cubic is None:
-            window_s = max(params.base_window_s, 2.2 * interval_s, 2 * params.variable_memory_s * self._mode.varying)
+            window_s = max(params.base_window_s, 2.2 * interval_s)
+            if self._mode.varying:  # the queue that is kept must not become the empty path
+                window_s = max(window_s, 2 * params.variable_memory_s)
         else:
             window_s = params.compete_max_s + params.base_window_s
         delay.close_epoch(now, window_s)
@@ -496,7 +500,7 @@ class HybridWindow(CapacityEstimator):
                 self._happens(Event.RIVAL_GONE)
                 rival.cubic = None
                 rival.calm_window = self._window
-                if rival.went_again(now) and params.variable_queue_s is not None:
+                if self._follows and rival.went_again(now):
                     rival.forget()  # none comes and goes as we make way: the queue was ours, and the link fades
                     self._variability.faded(now)
                 else:

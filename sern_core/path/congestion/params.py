@@ -120,7 +120,7 @@ class HybridParams:
     variable_rate_s: float = 0.050
     """Time over which what arrives is what the link carries now."""
     variable_growth: float = 0.3
-    """Of the bytes that are acknowledged, while nothing queues."""
+    """The window grows by this share of the bytes that are acknowledged, while nothing queues."""
     variable_ahead: float = 1.5
     variable_ahead_packets: float = 6.0
     """The window is at most so many times what was carried of late, and so many packets."""

@@ -83,7 +83,7 @@ class Variability:
     def swings(self, now: float) -> bool:
         """Whether it has turned often of late, or faded and come back at once."""
         turns, params = self._turns, self._params
-        if params.variable_queue_s is None or len(turns) < 2 or turns[-1] <= now - params.variable_memory_s:
+        if len(turns) < 2 or turns[-1] <= now - params.variable_memory_s:
             return False
         faded = turns[-1] - turns[-2] <= params.variable_fade_s
         return faded or (len(turns) == params.variable_turns and turns[0] > now - params.variable_memory_s)
