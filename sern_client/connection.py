@@ -30,6 +30,8 @@ PATIENCE_S: Final = 2.0
 STALL_PATIENCE_S: Final = 5.0
 """The same while it has more to send and a session: a path that has stalled often comes back."""
 PATIENCE_RTTS: Final = 4.0
+LINGER_S: Final = 1.0
+"""How long the goodbye, and what is confirmed before it, may take to leave this machine."""
 
 _log = logging.getLogger(__name__)
 
@@ -52,6 +54,7 @@ class Connection:
         self._relay = relay
         self._link = link
         self._on_down = on_down
+        self._linger_s = 0.0
 
     def open(self, ctx: "zmq.Context[zmq.Socket[bytes]]", keys: CurvePair | None, server_keys: Sequence[str]) -> None:
         """Connect, for as long as it takes and again and again. Raises ConfigError when the address is none."""
@@ -162,15 +165,17 @@ class Connection:
         self.wake()
         await asyncio.sleep(0.02)  # what has arrived here is confirmed before we say goodbye
         self.transport.pump.run()
-        self._core.link.close("client stops", now=clock.now())
+        link = self._core.link
+        if link.established and not link.lane.stalled:
+            self._linger_s = LINGER_S
+        link.close("client stops", now=clock.now())
         self.transport.pump.run()
-        await asyncio.sleep(0.05)  # libzmq's thread takes it from here
 
     def close(self) -> None:
         """End whatever was opened, the last first, also when a part of it fails. Idempotent."""
         with ExitStack() as stack:
             if self.transport is not None:
-                stack.callback(self.transport.close)
+                stack.callback(self.transport.close, linger_s=self._linger_s)
             if self.priority_lane is not None:
                 stack.callback(self.priority_lane.close)
             if self.lane is not None:

@@ -94,9 +94,10 @@ class GuardProcess:
             os.write(self._answers, json.dumps(answer).encode() + b"\n")
 
     def parent_gone(self) -> None:
-        """The client ended: what is armed is due now."""
+        """The client ended: what is armed is due now, also by its last word, which may still be in the pipe."""
         if self._gone:
             return
+        self._take()
         self._gone = True
         asyncio.get_running_loop().remove_reader(self._source)
         now = clock.now()
@@ -115,15 +116,18 @@ class GuardProcess:
         self._arm()
 
     def _read(self) -> None:
-        """Take what the client has said so far."""
-        while not self._gone:
+        if not self._gone and not self._take():
+            self.parent_gone()
+
+    def _take(self) -> bool:
+        """Take what the client has said so far. False: that was its last word."""
+        while True:
             try:
                 chunk = os.read(self._source, READ_BYTES)
             except BlockingIOError:
-                return
+                return True
             if not chunk:
-                self.parent_gone()
-                return
+                return False
             *lines, self._rest = (self._rest + chunk).split(b"\n")
             for line in lines:
                 self._told(json.loads(line))

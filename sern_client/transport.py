@@ -119,7 +119,7 @@ class Dialer:
             self._events.down(f"no connection can be made: {error}")
             self._give_up(str(error))
 
-    def _shut(self) -> None:
+    def _shut(self, linger_s: float = 0.0) -> None:
         if self._watch is not None:
             self._watch.close()
             self._watch = None
@@ -127,13 +127,15 @@ class Dialer:
             self._inflow.close()
             self._inflow = None
         if self._socket is not None:
+            self._socket.linger_s = linger_s
             self._socket.close()
             self._socket = None
 
-    def close(self) -> None:
+    def close(self, *, linger_s: float = 0.0) -> None:
+        """What was sent may take `linger_s` to leave."""
         if self._rebuild is not None:
             self._rebuild.cancel()
-        self._shut()
+        self._shut(linger_s)
 
     def send(self, datagram: bytes) -> SendResult:
         if self._socket is None:
@@ -245,9 +247,10 @@ class RelayTransport:
         """Another connection to the same relay, for class control, not opened yet."""
         return self._dial(events, priority_lane=True, attempt=self.dialer.attempt)
 
-    def close(self) -> None:
+    def close(self, *, linger_s: float = 0.0) -> None:
+        """What was sent may take `linger_s` to leave."""
         self.pump.close()
-        self.dialer.close()
+        self.dialer.close(linger_s=linger_s)
 
     # --- DialerEvents -------------------------------------------------------------------------------------------------
 

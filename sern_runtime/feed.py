@@ -62,7 +62,7 @@ HIGH_WATER: Final = 1000
 """Messages that may wait for a slow subscriber; libzmq drops what comes after them, for that subscriber alone."""
 INTEREST_S: Final = 0.05
 """Between two calls of `on_interest`: one message of subscriptions is cheap, and what follows from it is not."""
-RELEASE_S: Final = 0.2
+RELEASE_S: Final = 1.0
 """The longest wait for libzmq to let go of addresses."""
 _MAX_VERDICTS: Final = 4096
 _NOBLOCK: Final = int(zmq.NOBLOCK)

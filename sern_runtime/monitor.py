@@ -412,8 +412,12 @@ class ConnectionTable:
 
         False: not by then. It does so on its own thread, within some milliseconds; the loop is held up meanwhile.
         """
-        while not self.unbound and (left_s := until_s - now()) > 0:
-            self._monitor.wait(left_s)
+        left_s = until_s - now()
+        while not self.unbound:
+            self._monitor.wait(max(0.0, left_s))  # also where the time is over: what is said by now counts
+            if left_s <= 0.0:
+                break
+            left_s = until_s - now()
         return self.unbound
 
     def __len__(self) -> int:

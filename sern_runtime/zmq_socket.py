@@ -115,7 +115,7 @@ def _raise_if_alive(socket: "zmq.Socket[bytes]", error: zmq.ZMQError) -> None:
 class DrainedSocket(ABC):
     """A socket in the running loop. Subclasses say what a message looks like in `_take`.
 
-    All calls on the loop's thread. `close()` once; it closes the socket too (linger 0). `on_writable` is called once
+    All calls on the loop's thread. `close()` once; it closes the socket too. `on_writable` is called once
     after a FULL send, when libzmq reports any change: try again, and be told FULL again if it was another one.
     A handler that raises is reported by the loop's exception handler; the next message is delivered all the same.
     """
@@ -136,6 +136,8 @@ class DrainedSocket(ABC):
         """`send` of the extension type, (data, flags, copy): without the checks of options that SERN does not use.
         May raise zmq.Again; `kick` is the caller's duty."""
         self.on_writable = on_writable
+        self.linger_s = 0.0
+        """How long libzmq may go on with what it has not sent when the socket is closed; its context ends no sooner."""
         self.malformed = 0
         """Messages dropped whole because their frames were not what this socket takes."""
         self.drains = 0
@@ -183,7 +185,8 @@ class DrainedSocket(ABC):
         return SendResult.OK
 
     def close(self) -> None:
-        """Stop watching and close the socket; nothing is flushed. Idempotent; allowed inside a handler."""
+        """Stop watching and close the socket; what libzmq has not sent yet may go on for `linger_s`. Idempotent; allowed
+        inside a handler."""
         if self._closed:
             return
         self._closed = True
@@ -192,7 +195,7 @@ class DrainedSocket(ABC):
             self._scheduled.cancel()
         if not self.socket.closed:
             self._loop.remove_reader(self._fd)
-            self.socket.close(linger=0)
+            self.socket.close(linger=round(1000 * self.linger_s))
 
     @property
     def closed(self) -> bool:

@@ -261,21 +261,25 @@ class Listener:
             self._warn(f"{stream.id.topic} of {stream.id.origin} has ended")
 
     def message(self, stream: StreamInfo, message: Message, *, now: float) -> None:
+        self._print(lambda: self._printer.show(stream, message, message.age_s(now)))
+
+    def _print(self, write: Callable[[], bool | None]) -> None:
+        """`write` says whether that was all."""
         if self.done or self.problem is not None:
             return
         try:
-            self.done = self._printer.show(stream, message, message.age_s(now))
+            self.done = bool(write())
         except SernError as error:
             self.problem = error
-        except BrokenPipeError:
+        except BrokenPipeError:  # nobody reads any more
             drop_output()
             self.done = True
 
     def expired(self, stream: StreamInfo, seq: int, reason: DropReason) -> None:
-        self._printer.lost(stream, 1, str(reason))
+        self._print(lambda: self._printer.lost(stream, 1, str(reason)))
 
     def skipped(self, stream: StreamInfo, count: int) -> None:
-        self._printer.lost(stream, count, "given up before we were told of them")
+        self._print(lambda: self._printer.lost(stream, count, "given up before we were told of them"))
 
     def send_dropped(self, stream: StreamInfo, first: int, count: int, reason: DropReason, where: str) -> None:
         """We send nothing."""
@@ -287,7 +291,7 @@ class Listener:
         """We send nothing."""
 
     def undecodable(self, stream: StreamInfo, problem: str) -> None:
-        self._printer.lost(stream, 1, f"undecodable: {problem}")
+        self._print(lambda: self._printer.lost(stream, 1, f"undecodable: {problem}"))
 
     def fault(self, error: Exception) -> None:
         self._warn(f"an internal error; please report it: {error!r}")

@@ -73,13 +73,14 @@ def free_ports(count: int) -> list[int]:
     with ExitStack() as held:
         found: list[int] = []
         for port in random.SystemRandom().sample(PORTS, len(PORTS)):
+            if not claim(f"port-{port}"):  # before it is tried: its owner could not listen meanwhile
+                continue
             try:
                 for kind in (socket.SOCK_STREAM, socket.SOCK_DGRAM):
                     held.enter_context(socket.socket(type=kind)).bind((HOST, port))
             except OSError:
                 continue
-            if claim(f"port-{port}"):
-                found.append(port)
+            found.append(port)
             if len(found) == count:
                 return found
     raise SernError(f"no {count} free ports on {HOST} between {min(PORTS)} and {max(PORTS)}")

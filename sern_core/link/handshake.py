@@ -39,6 +39,9 @@ SHORT_SESSION_S: Final = 5.0
 DISPLACED_MIN_S: Final = 0.5
 DISPLACED_MAX_S: Final = 10.0
 """First and longest pause after the second short session in a row, and those that follow."""
+CUT_OFF_S: Final = 0.1
+"""A datagram lane that was found silent less than this before its stream ended says nothing: after a standstill of ours
+both are found in one turn of the loop, silence first."""
 DISPLACED: Final = "displaced"
 """The code of the refusal that ends a session because another process connected under its name."""
 NEW_SESSION: Final = "the session could not go on, and another begins"
@@ -73,7 +76,8 @@ class Handshake:
         self.reads = True
         """False: the owner is about to end the session; what comes now is for the process after it."""
         self.cut_off = False
-        """The stream lane ended when the datagram lane was silent already: the path is gone, not the peer's process."""
+        """The stream lane ended when the datagram lane had been silent for a while: the path is gone, not the peer's
+        process."""
         self._out: deque[bytes] = deque()
         self._hello_due_s: float | None = None
         self._hello_stamp_us = -1
@@ -106,7 +110,7 @@ class Handshake:
         udp = self._lanes.by_id.get(LANE_UDP)
         if self._end.established and udp is not None and udp.answered:
             self._end.now = now
-            self.cut_off = udp.stalled
+            self.cut_off = udp.stalled and now - udp.stalled_at_s >= CUT_OFF_S
             self._lanes.lost_stream(udp, now)
             return
         self._sessions.end_session(reason, now)

@@ -255,6 +255,7 @@ class LaneSet:
         if stall_s is None or now < stall_s:
             return
         lane.stalled = True
+        lane.stalled_at_s = now
         lane.proofs = 0
         lane.probe_due_s = now
         if lane.beside is None or not lane.beside.usable:

@@ -89,6 +89,8 @@ class Lane:
         self.flight = Flight(lossless=lossless)
         self.arrivals = Arrivals(lossless=lossless)
         self.stalled = False
+        self.stalled_at_s = 0.0
+        """When it was last found to be."""
         self.probe_due_s = 0.0
         self.up = False  # it has a transport
         self.proofs = 0  # questions answered since it was opened or had stalled

@@ -40,9 +40,12 @@ def await_passing(ways: Sequence[Way], *, within_s: float = PASSING_S) -> None:
             except OSError as error:
                 raise LabError(f"the lab is not ready: {way.name}: {error.strerror or error}") from error
         again_s = time.monotonic() + AGAIN_S
-        while open_ways and (left_s := again_s - time.monotonic()) > 0:
+        while open_ways:  # and once at least, however late: what has come by now has come
             targets = {way.target for way in open_ways.values()}
-            for target in select.select(targets, [], [], left_s)[0]:
+            ready = select.select(targets, [], [], max(0.0, again_s - time.monotonic()))[0]
+            if not ready:
+                break
+            for target in ready:
                 data = target.recv(64)
                 number, count = _NUMBER.unpack(data) if len(data) == _NUMBER.size else (-1, 0)
                 if newest.get(number) == count:

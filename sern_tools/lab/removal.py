@@ -31,13 +31,25 @@ def namespace_name(lab: str, node: str) -> str:
 
 def lock(lab: str) -> int:
     """Take the lock of a new lab; the descriptor is to be kept. LabError when `/run` is not ours to write."""
+    path = RUN_DIR / f"{lab}.lock"
+    while True:
+        try:
+            RUN_DIR.mkdir(mode=0o700, exist_ok=True)
+            descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        except OSError as error:
+            raise LabError(f"{RUN_DIR}: {error.strerror}: the lab needs root") from error
+        fcntl.flock(descriptor, fcntl.LOCK_EX)
+        if _same_file(descriptor, path):
+            return descriptor
+        os.close(descriptor)  # a sweep found it before it was locked, and removed it
+
+
+def _same_file(descriptor: int, path: Path) -> bool:
+    """Whether the file that is open still has that name."""
     try:
-        RUN_DIR.mkdir(mode=0o700, exist_ok=True)
-        descriptor = os.open(RUN_DIR / f"{lab}.lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
-    except OSError as error:
-        raise LabError(f"{RUN_DIR}: {error.strerror}: the lab needs root") from error
-    fcntl.flock(descriptor, fcntl.LOCK_EX)
-    return descriptor
+        return os.path.samestat(os.fstat(descriptor), path.stat())
+    except FileNotFoundError:
+        return False
 
 
 def labs() -> list[str]:
