@@ -101,6 +101,8 @@ class Sample(NamedTuple):
     ages_s: dict[str, Any]
 
     def percentile_ms(self, label: str, percent: float) -> float:
+        if not len(self.ages_s[label]):
+            raise SernError(f"no message of class {label} came in time: measure for longer (--seconds)")
         return float(np.percentile(self.ages_s[label], percent)) * 1e3
 
 

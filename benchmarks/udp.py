@@ -71,6 +71,8 @@ SEAL_LIMITS: Final = {Cipher.AES_256_GCM: 3.0, Cipher.CHACHA20_POLY1305: 3.0}
 WINDOW: Final = 32
 """Datagrams in flight in the closed loop."""
 ECHO_HZ: Final = 100
+ECHO_S: Final = 0.1
+"""An echo that takes longer counts as lost: the next one is not to wait for it."""
 WARM_UP_S: Final = 0.3
 ROBOT: Final = ClientName("robot")
 OFFERED: Final = tuple(Cipher)
@@ -300,6 +302,7 @@ def under_junk(known_id: bool, plain: bool, duration_s: float) -> dict[str, floa
         generator = Worker(
             "the source of junk", send_junk, parameters.port, session_id, WARM_UP_S + duration_s + 0.3, far
         )
+        peer.socket.settimeout(ECHO_S)
         round_trips = []
         with ExitStack() as stack:
             stack.callback(generator.end, patient=True)

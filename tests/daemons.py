@@ -298,9 +298,11 @@ class Lab:
         return daemon
 
     async def connected(self, config: Path) -> ClientDaemon:
-        """Start a client in this process and wait until it has a session."""
+        """Start a client in this process and wait until it has a session and the relay knows what it wants and has:
+        whoever comes after it sends to it from the first message on."""
         daemon = await self.client(config)
-        await until(lambda: daemon.core.link.established, f"{config.stem} is connected")
+        link = daemon.core.link
+        await until(lambda: link.established and link.control.settled, f"{config.stem} is connected, and was heard")
         return daemon
 
     async def end(self, daemon: RelayDaemon | ClientDaemon) -> None:

@@ -3,6 +3,7 @@
 Arrival times are the kernel's, so that they do not depend on when this process is scheduled.
 """
 
+import math
 import socket
 import struct
 import threading
@@ -22,6 +23,7 @@ _TIMESTAMPNS: Final = 35
 _RCVBUFFORCE: Final = 33
 _BUFFER_BYTES: Final = 2**23
 _QUIET_S: Final = 0.4
+_AGAIN_S: Final = 0.05
 _BURST: Final = 20
 
 
@@ -55,12 +57,16 @@ def datagrams(
     gap_s: float = 0.0,
     quiet_s: float = _QUIET_S,
     then: Callable[[], object] = lambda: None,
+    passes: bool = True,
 ) -> list[Arrival]:
     """Send `count` numbered datagrams, `gap_s` apart, then call `then`; what arrives until nothing does for `quiet_s`.
 
     A sender that stood still catches up with `_BURST` at most: queues beside the link's would not hold many more.
+    A link that stands still is waited for: one more datagram is sent behind them, again and again until it has come
+    as well, unless the way is closed (`passes`).
     """
     with _pair(source, target) as (sender, receiver):
+        began_s = time.time()
         due_s = time.monotonic()
         for number in range(count):
             # Busy waiting, because sleeping is too coarse for some thousand a second.
@@ -69,14 +75,27 @@ def datagrams(
             due_s = max(due_s, time.monotonic() - _BURST * gap_s) + gap_s
             sender.send(struct.pack("Id", number, time.time()).ljust(size_bytes, b"\0"))
         then()
-        receiver.settimeout(quiet_s)
+        patience = Patience()
+        again_s = time.monotonic() if passes else math.inf
         arrivals: list[Arrival] = []
         while True:
+            if time.monotonic() >= again_s:
+                assert not patience.over(), f"nothing more comes from {source.name} to {target.name}"
+                sender.send(struct.pack("Id", count, time.time()).ljust(size_bytes, b"\0"))
+                again_s = time.monotonic() + _AGAIN_S
+            receiver.settimeout(quiet_s if again_s == math.inf else _AGAIN_S)
             try:
                 data, control, _, _ = receiver.recvmsg(2048, 128)
             except TimeoutError:
-                return arrivals
+                if again_s == math.inf:
+                    return arrivals
+                continue
             number, sent_s = struct.unpack_from("Id", data)
+            if sent_s < began_s:
+                continue  # it was still under way from an earlier call
+            if number == count:
+                again_s = math.inf
+                continue
             seconds, nanoseconds = struct.unpack("qq", control[0][2])
             arrivals.append(Arrival(number, sent_s, seconds + nanoseconds / 1e9))
 
@@ -89,7 +108,7 @@ def rate_bps(arrivals: list[Arrival], size_bytes: int) -> float:
 
 def reaches(source: Node, target: Node, *, within_s: float = 0.5) -> bool:
     """Whether one datagram gets through. False means little on a machine that stands still: see `comes_to_reach`."""
-    return bool(datagrams(source, target, 1, quiet_s=within_s))
+    return bool(datagrams(source, target, 1, quiet_s=within_s, passes=False))
 
 
 def comes_to_reach(source: Node, target: Node) -> bool:

@@ -33,6 +33,14 @@ def decided(process: Process) -> bool:
     return len(told(process)) >= 2
 
 
+def shown(process: Process) -> bool:
+    """Whether the metrics have a cost, its terms and what was predicted. An interval in which nothing came to be sent
+    has none of them."""
+    _, metrics = process.get("/metrics")
+    names = ("cost", 'term{peer="[^"]+",term="bandwidth"}', "predicted_cost", "prediction_error")
+    return all(re.search(f"^sern_mmcf_{name}", metrics, re.MULTILINE) for name in names)
+
+
 async def test_client_and_relay_adapt_and_tell_of_it(tmp_path: Path) -> None:
     async with Lab(tmp_path, "robot1", "site") as lab:
         relay = await lab.process(lab.relay_file(adaptation=QUICK)).ready()
@@ -47,9 +55,7 @@ async def test_client_and_relay_adapt_and_tell_of_it(tmp_path: Path) -> None:
                 assert set(terms) == {"latency", "unreliability", "compute", "bandwidth"}
                 assert all(0.0 <= value <= 1.0 for value in terms.values())
             assert step["reason"] and step["candidates"]
-            _, metrics = process.get("/metrics")
-            for name in ("cost", 'term{peer="[^"]+",term="bandwidth"}', "predicted_cost", "prediction_error"):
-                assert re.search(f"^sern_mmcf_{name}", metrics, re.MULTILINE), name
+            await until(partial(shown, process), f"{process.name} has it in its metrics")
         assert robot.json("/api/mmcf")["profile"] == "mapping"
         modes = {line for line in robot.get("/metrics")[1].splitlines() if line.startswith("sern_mmcf_codec{")}
         assert len(modes) == 5  # the robot encodes

@@ -62,9 +62,9 @@ class Commands:
                 publish = publisher.publish
 
                 def noted(body: bytes, stamp_ns: int) -> None:
+                    at_s, age_s = time.monotonic(), (time.time_ns() - stamp_ns) / 1e9  # before what takes time
                     twist = ros_types.deserialise(body, info.type_name, info.encoding)
-                    age_s = (time.time_ns() - stamp_ns) / 1e9
-                    self.obeyed.append(Obeyed(time.monotonic(), age_s, (twist.linear.x, twist.angular.z)))
+                    self.obeyed.append(Obeyed(at_s, age_s, (twist.linear.x, twist.angular.z)))
                     publish(body, stamp_ns)
 
                 publisher.publish = noted  # type: ignore[method-assign]

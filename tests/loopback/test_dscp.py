@@ -28,6 +28,9 @@ from tests.loopback.udp_support import OFFERED, ROBOT
 from tests.support import until
 
 INSIDE = "127.0.0.2"
+PATIENT_S = 30.0
+"""A busy machine's pause is no path that is gone: a client that takes it for one tries another address, and what it
+sends for that is as long as data and has another mark."""
 EF, CS0, CS1 = 46 << 2, 0, 8 << 2
 IPV4, ETHERNET_BYTES, UDP_BYTES = 0x0800, 14, 8
 """EtherType, and the headers before and behind that of IP."""
@@ -245,9 +248,15 @@ DSCP: Final[dict[str, Any]] = {"control": "cs5", "state": 18, "bulk": "le"}
     ids=["as they come", "of the file"],
 )
 async def test_the_classes_of_a_session_are_marked_both_ways(
-    tmp_path: Path, ours: dict[str, Any], theirs: dict[str, Any], up: tuple[int, ...], down: tuple[int, ...]
+    tmp_path: Path,
+    ours: dict[str, Any],
+    theirs: dict[str, Any],
+    up: tuple[int, ...],
+    down: tuple[int, ...],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """`ours` is the client's section `link`, `theirs` the relay's: each end marks what it sends."""
+    monkeypatch.setattr("sern_core.path.flight.STALL_MIN_S", PATIENT_S)
     (port,) = free_ports(1)
     async with Lab(tmp_path, "robot1", relay_port=port) as lab:
         relay = await lab.relay(lab.relay_file(link=theirs))
@@ -268,8 +277,11 @@ async def test_the_classes_of_a_session_are_marked_both_ways(
 
 @pytest.mark.root
 @pytest.mark.parametrize("dscp", [{}, DSCP], ids=["as they come", "of the file"])
-async def test_the_classes_are_marked_on_the_wire(tmp_path: Path, dscp: dict[str, Any]) -> None:
+async def test_the_classes_are_marked_on_the_wire(
+    tmp_path: Path, dscp: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """What a switch sees: the header of each packet, and not what the kernel tells a socket of it."""
+    monkeypatch.setattr("sern_core.path.flight.STALL_MIN_S", PATIENT_S)
     marks = DscpSection.model_validate(dscp).marks().tos
     async with Lab(tmp_path, "robot1") as lab:
         try:

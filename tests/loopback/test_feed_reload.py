@@ -14,11 +14,12 @@ from sern_core.topics.rules import FeedRole
 from sern_core.vocabulary.types import TopicName
 from sern_relay.daemon import RelayDaemon
 from sern_runtime import clock
+from sern_runtime import feed as feed_module
 from sern_runtime.feed import Feed
 from sern_tools.ports import free_ports
 from tests.daemons import Lab
 from tests.loopback.test_feed_clients import ROBOT, Programs, send
-from tests.support import until
+from tests.support import DEADLINE_S, until
 
 ODOMETRY = TopicName("/jackal1/odometry/filtered")
 FRAME = b"/jackal1/odometry/filtered\0"
@@ -108,8 +109,11 @@ def at(name: str, endpoint: str, ingest_endpoint: str | None = None) -> FeedRole
 
 
 @pytest.mark.parametrize("transport", ["tcp", "ipc"])
-async def test_endpoints_move_from_role_to_role(tmp_path: Path, programs: Programs, transport: str) -> None:
+async def test_endpoints_move_from_role_to_role(
+    tmp_path: Path, programs: Programs, transport: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """libzmq lets go of an address on its own thread, and takes the file of an ipc address away then."""
+    monkeypatch.setattr(feed_module, "RELEASE_S", DEADLINE_S)  # that thread may have no processor for a while
     first, second = (
         [f"tcp://127.0.0.1:{port}" for port in free_ports(2)]
         if transport == "tcp"

@@ -12,6 +12,7 @@ from typing import Any, Final, NamedTuple
 import pytest
 
 from sern_client.endpoints.ros1 import Ros1Endpoint
+from sern_client.endpoints.ros1.subscription import Source
 from sern_client.guard import Guard
 from sern_core.vocabulary.types import Encoding, TopicName
 from sern_runtime import clock, ros_types
@@ -77,6 +78,7 @@ class Scene(NamedTuple):
     robot: Robot
     client: Process
     operator: Process
+    sources: dict[str, Source]
 
 
 @asynccontextmanager
@@ -100,11 +102,17 @@ async def driving(tmp_path: Path) -> AsyncIterator[Scene]:
             await until(lambda: TopicName("/cmd_vel") in events.infos)
             robot.listen(driver, events)
             await until(lambda: publishers(master) == {"/sern_robot1", "/sern_robot1_guard"})
-            both = driver._topics["/cmd_vel"].sources  # connected to both
-            await until(lambda: len(both) == 2 and len(robot.moving()) > 10)
-            yield Scene(lab, master, robot, client, operator)
+            scene = Scene(lab, master, robot, client, operator, driver._topics["/cmd_vel"].sources)
+            await until(lambda: len(robot.moving()) > 10 and driven(scene), "it is driven")
+            yield scene
     finally:
         await master.stop()
+
+
+def driven(scene: Scene) -> bool:
+    """Whether the robot is connected to the client and to its guard, and moves: then a lease runs that can end."""
+    links = [source.link for source in scene.sources.values()]
+    return len(links) == 2 and all(link is not None and link.open for link in links) and scene.robot.told[-1].moves
 
 
 def publishers(master: FakeMaster) -> set[str]:
@@ -152,11 +160,13 @@ async def test_the_robot_stands_when_its_client_is_no_more(tmp_path: Path, numbe
 async def test_a_guard_that_was_killed_is_started_again_and_knows_what_it_guards(tmp_path: Path) -> None:
     async with driving(tmp_path) as scene:
         robot, client = scene.robot, scene.client
+        await until(lambda: guards(client), "the client has heard of its guard")
         (first,) = guards(client)
         os.kill(first, signal.SIGKILL)
         await client.said("the guard of the command topics has ended (exit code -9)")
         await until(lambda: len(guards(client)) == 2, "another one runs")
         await client.said("ERROR", "the guard of the command topics runs again as process ", ", after ")
+        await until(lambda: driven(scene), "the robot has found the second guard")
         client.signal(signal.SIGSTOP)
         at_s = clock.now()
         await until(lambda: robot.stops(at_s), "the second guard tells the robot to stand")

@@ -13,13 +13,13 @@ from typer.testing import CliRunner
 
 from sern_client.daemon import ClientDaemon
 from sern_core.vocabulary.ledger import LOSSES
-from sern_core.vocabulary.types import CLASS_LABELS, ClientName
+from sern_core.vocabulary.types import CLASS_LABELS, ClientName, TopicName
 from sern_relay.daemon import RelayDaemon
 from sern_runtime.link_metrics import RECEIVED_LOSSES
 from sern_runtime.metrics import check_names
 from sern_tools.commands import app
 from sern_tools.ports import free_ports
-from tests.daemons import Lab, write_bag
+from tests.daemons import Lab, delivered, write_bag
 from tests.loopback.test_udp_client import SIX
 from tests.support import until
 
@@ -72,7 +72,7 @@ async def test_before_anything_is_connected_everything_answers(tmp_path: Path) -
         assert await get(relay, "/readyz") == (200, "listening\n")
         for path in ("/api/link", "/api/objects", "/api/topics"):
             await read(relay, path)
-        await until(lambda: robot.core.link.established)
+        await until(lambda: robot.readiness().ok)
         assert await get(robot, "/readyz") == (200, "connected to relay\n")
         await lab.end(robot)
         await lab.end(relay)
@@ -90,7 +90,11 @@ async def test_metrics_and_json_of_a_running_system(tmp_path: Path) -> None:
         chat = {"match": "/chat", "class": "state", "reliability": "reliable"}
         robot = await lab.connected(lab.client_file("robot1", endpoints, topics=[chat]))
         await until(lambda: len(site.core.received.topics) >= 5)
-        await until(lambda: relay.hub.links[ClientName("site")].lane.flight.rtt.srtt_s is not None)
+        link = relay.hub.links[ClientName("site")]
+        await until(lambda: link.lane.flight.rtt.srtt_s is not None)
+        chat_topic = TopicName("/robot1/chat")
+        await until(lambda: delivered(site, chat_topic) == 50, "the bag has arrived")
+        await until(lambda: link.counters[chat_topic].delivered == 50, "and the relay knows")
 
         for daemon in (relay, site, robot):
             status, text = await get(daemon, "/metrics")

@@ -71,6 +71,7 @@ async def test_forwarding_goes_on(
         relay.hub.validate()
         for name in where:
             listen = daemons[name].loaded.model.http.listen
+            await until(lambda name=name: daemons[name].readiness().ok, f"{name} is ready")  # type: ignore[misc]
             assert (await get(f"http://{listen}/readyz"))[0] == 200
             _, text = await get(f"http://{listen}/metrics")
             (line,) = [

@@ -18,7 +18,7 @@ from sern_client.services import MAX_ERROR_CHARS, ServiceBridge
 from sern_core.site.services import CALL, REPLY, call_name, reply_name
 from sern_core.vocabulary.errors import ConfigError, ServiceError
 from sern_core.vocabulary.message import Message, StreamId, StreamInfo, TopicInfo, TopicSpec
-from sern_core.vocabulary.types import ClientName, DropReason, Encoding, TopicName
+from sern_core.vocabulary.types import ClientName, DropReason, Encoding, Reliability, TopicName
 from sern_runtime import clock
 from sern_runtime.config.client import load_client
 from tests.daemons import Lab
@@ -183,7 +183,8 @@ async def test_a_service_that_does_not_answer_is_an_error_in_time(
     async with offered(tmp_path, monkeypatch, timeout_s=0.3) as (sites, handler):
         site = sites.site_daemon
         sites.robot.answer, _, _ = hold()
-        with pytest.raises(ServiceError, match=r"did not answer within 0.3 s|took too long"):
+        # A machine that stood still for that time may not even have brought the call to the robot, and says so.
+        with pytest.raises(ServiceError, match=r"did not answer within 0.3 s|took too long|way: (lifespan|retention)$"):
             await handler(b"")
         assert sum(outcomes(site).values()) == 1
 
@@ -193,24 +194,28 @@ async def test_a_lost_relay_is_an_error_and_the_call_is_not_executed_later(
 ) -> None:
     async with offered(tmp_path, monkeypatch, timeout_s=0.5) as (sites, handler):
         relay = sites.relay
-        assert await handler(b"before") == b"re: before"
+
+        async def again(request: bytes) -> bytes:
+            try:
+                return await handler(request)
+            except ServiceError:
+                return b""
+
+        async def answered(request: bytes) -> bytes:
+            """A call that has an answer: one that the machine stood still for has none, nor one without a session."""
+            answer = b""
+            while not answer:  # the test's own time limit ends it
+                answer = await again(request)
+            return answer
+
+        assert await answered(b"before") == b"re: before"
 
         await sites.lab.drop(relay)
         with pytest.raises(ServiceError):
             await handler(b"lost")
         await sites.lab.relay(tmp_path / "relay.yaml")
         handler = await sites.served()
-
-        async def again() -> bytes:
-            try:
-                return await handler(b"after")
-            except ServiceError:
-                return b""
-
-        answer = b""
-        while not answer:  # until the sessions are there again; the test's own time limit ends it
-            answer = await again()
-        assert answer == b"re: after"
+        assert await answered(b"after") == b"re: after"
         assert [body for _, body in sites.robot.calls if body == b"lost"] == []
 
 
@@ -299,10 +304,11 @@ async def test_nobody_calls_in_the_name_of_another_site(tmp_path: Path, monkeypa
         robot = await sites.start_robot()
         rogue = await lab.connected(lab.client_file("rogue", {"kind": "synthetic", "role": "operator"}))
         sites.offer()
+        spec = TopicSpec(reliability=Reliability.RELIABLE, lifespan_s=None)  # each is said once, and is to be heard
         forged = TopicInfo(call_name(GLOBAL, ClientName("site")), INFO.type_name, INFO.encoding)
-        channel = rogue.core.publish(forged, TopicSpec(), now=clock.now())
+        channel = rogue.core.publish(forged, spec, now=clock.now())
         honest = TopicInfo(call_name(GLOBAL, ClientName("rogue")), INFO.type_name, INFO.encoding)
-        own = rogue.core.publish(honest, TopicSpec(), now=clock.now())
+        own = rogue.core.publish(honest, spec, now=clock.now())
         rogue.core.send(channel, CALL.pack(1) + b"forged", 0, now=clock.now())
         rogue.core.send(own, CALL.pack(2) + b"own", 0, now=clock.now())
         await until(lambda: (SERVICE, b"own") in sites.robot.calls, "its own call is executed")
@@ -339,12 +345,13 @@ async def test_nobody_else_answers_for_a_service(tmp_path: Path, monkeypatch: py
 
 
 async def test_a_call_whose_caller_leaves_is_not_made_later(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    async with offered(tmp_path, monkeypatch, timeout_s=30.0) as (sites, handler):
+    async with offered(tmp_path, monkeypatch, timeout_s=30.0, relay={"udp": False}) as (sites, handler):
         relay = sites.relay
         site = sites.site_daemon
         assert await handler(b"before") == b"re: before"
         await sites.lab.drop(relay)
-        await until(lambda: not site.core.link.established or site.core.link.lane.stalled, "the link is lost")
+        # Without a session nothing of a call leaves: one that has been begun, as a probe of silent datagrams, is made.
+        await until(lambda: not site.core.link.established, "the link is lost")
         leaves, stays = (asyncio.ensure_future(handler(body)) for body in (b"leaves", b"stays"))
         await until(lambda: len(bridge(site).used[GLOBAL].waiting) == 2, "both wait for the link")
         leaves.cancel()

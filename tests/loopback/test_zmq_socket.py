@@ -24,7 +24,7 @@ from sern_runtime.zmq_socket import (
     make_client,
     make_server,
 )
-from tests.support import until
+from tests.support import DEADLINE_S, until
 
 Context = zmq.Context[zmq.Socket[bytes]]
 FAR_S = 3600.0  # a tick that never comes: what arrives did so without it
@@ -170,6 +170,18 @@ async def test_closing_inside_a_handler_is_allowed(zmq_context: Context) -> None
     router.close()
     dealer.close()
     assert router.socket.closed
+
+
+async def test_what_was_sent_may_leave_after_the_socket_is_closed(zmq_context: Context) -> None:
+    count = 5000
+    seen: list[bytes] = []
+    router, dealer = await pair(zmq_context, lambda _id, _user, body: seen.append(body), lambda _body: None)
+    for number in range(count):
+        await until(partial(dealer.send, b"%d" % number))
+    dealer.linger_s = DEADLINE_S
+    dealer.close()
+    await until(lambda: len(seen) == count + 1, "every message")
+    router.close()
 
 
 async def test_full_and_gone_are_told_apart(zmq_context: Context) -> None:

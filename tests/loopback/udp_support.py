@@ -65,6 +65,7 @@ class RawClient:
         self.parameters = parameters
         self.sealer, self.opener = make_seals(parameters, side)
         self.sockets: list[socketlib.socket] = []
+        self._relay_ports: set[int] = set()
         self.elsewhere()
         self.got: list[tuple[int, int, bytes]] = []
         """(index of the socket, size of the datagram, what was sealed)."""
@@ -86,6 +87,7 @@ class RawClient:
 
     def put(self, datagram: bytes, index: int = 0) -> None:
         """Send bytes as they are."""
+        self._relay_ports.add(self.parameters.port)
         self.sockets[index].sendto(datagram, ("127.0.0.1", self.parameters.port))
 
     def send(self, data: bytes, index: int = 0, kind: bytes = TYPE_DATA) -> bytes:
@@ -97,7 +99,9 @@ class RawClient:
         for index, socket in enumerate(self.sockets):
             with suppress(BlockingIOError):
                 while True:
-                    datagram = socket.recv(65536)
+                    datagram, (_host, port) = socket.recvfrom(65536)
+                    if port not in self._relay_ports:
+                        continue  # meant for whoever had our port before: relays speak to lost clients for a while
                     inner = self.opener.open(datagram)
                     assert inner is not None, "the relay sent what does not open"
                     self.got.append((index, len(datagram), inner))

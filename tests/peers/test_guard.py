@@ -85,7 +85,8 @@ async def test_a_node_of_ros2_is_told_to_stand_by_the_guard(kind: Any, tmp_path:
 
             await until(armed, "the stop command arrives")
             assert set(got) == {STOP}
-            assert guard.ready and guard.stopped > 0 and guard.restarts == 0
+            await until(lambda: guard.stopped > 0, "the guard has said so")
+            assert guard.ready and guard.restarts == 0
             assert COMMANDS not in heard.infos, "to its own client the guard is no node of this site"
             guard.lease(key, None)
             guard.closed(key)

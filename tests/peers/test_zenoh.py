@@ -10,6 +10,7 @@ from typing import Any, Self
 import pytest
 
 from sern_client.endpoints.base import Endpoint, Held, ServiceEndpoint, ServiceInfo
+from sern_client.endpoints.common import first_messages
 from sern_client.endpoints.zenoh import names
 from sern_client.endpoints.zenoh.endpoint import ZenohEndpoint
 from sern_client.endpoints.zenoh.options import ZenohOptions
@@ -19,7 +20,7 @@ from sern_core.vocabulary.message import TopicInfo
 from sern_core.vocabulary.types import Encoding, TopicName
 from sern_runtime import ros_services, ros_types
 from sern_tools.ports import free_ports
-from tests.daemons import Lab, bodies, under, write_bag
+from tests.daemons import Lab, bodies, endpoint_of, under, write_bag
 from tests.support import DEADLINE_S, Events, until
 
 zenoh = pytest.importorskip("zenoh", reason="the library eclipse-zenoh is missing: pip install eclipse-zenoh")
@@ -116,6 +117,12 @@ class Peer:
             self.process.kill()
         await self.process.wait()
         await self._reader
+
+
+@pytest.fixture(autouse=True)
+def patient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A subscriber that a busy machine lets connect late misses nothing."""
+    monkeypatch.setattr(first_messages, "FIRST_MESSAGES_S", DEADLINE_S)
 
 
 @pytest.fixture
@@ -219,6 +226,7 @@ async def test_what_is_published_here_reaches_a_node(endpoint: tuple[ZenohEndpoi
     async def heard() -> None:
         while not peer.got:
             publisher.publish(text("hello"), 1)
+            await until(lambda: not publisher.waits, "first messages wait no more")  # only so many may
             await asyncio.sleep(0.01)
 
     await asyncio.wait_for(heard(), DEADLINE_S)
@@ -430,8 +438,13 @@ async def test_from_a_ros_1_recording_to_a_ros_2_node(tmp_path: Path, router: Ro
         section = {
             "kind": "zenoh", "connect": [router.locator], "listen": ["tcp/127.0.0.1:0"], "domain": DOMAIN,
         }  # fmt: skip
-        await lab.connected(lab.client_file("site", section, client={"namespace": "/"}, subscribe=["/robot1/.*"]))
-        await peer.do("subscriber", name="/robot1/chatter", latched=True, depth=100)
+        file = lab.client_file("site", section, client={"namespace": "/"}, subscribe=["/robot1/.*"])
+        site = endpoint_of(await lab.connected(file), ZenohEndpoint)
+        name = TopicName("/robot1/chatter")
+        await peer.do("subscriber", name=name, latched=True, depth=100)
+        kind = names.dds_type("std_msgs/msg/String"), chat().type_hash
+        # What nobody is known to read is written at once, and reaches nobody.
+        await until(lambda: site.readers(name, *kind), "the subscriber is known")
         await lab.connected(lab.player_file("robot1", bag))
         await until(lambda: len(peer.got) == 20, "all of the recording is there")
     expected = [body[4:].decode() for body in under("robot1", bodies(bag))["/robot1/chatter"]]

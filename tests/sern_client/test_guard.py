@@ -1,6 +1,9 @@
 """The client's end of its guard: when a guard that says nothing is given up. Processes that answer as a test wants."""
 
 import asyncio
+import base64
+import json
+import os
 import sys
 from asyncio.subprocess import Process
 from collections.abc import Callable
@@ -11,6 +14,8 @@ import uvloop
 
 from sern_client import guard
 from sern_client.guard import Guard
+from sern_client.guard_process import GuardProcess
+from sern_core.vocabulary.message import TopicInfo
 from sern_core.vocabulary.types import Encoding
 from sern_runtime import clock, ros_types
 from sern_runtime.config.endpoints import Ros1Endpoint
@@ -89,6 +94,42 @@ def test_a_client_that_stood_still_keeps_its_guard(runs: Callable[[str], Guard])
 
     with asyncio.Runner(loop_factory=Skipping) as runner:
         runner.run(stand_still())
+
+
+class Stops:
+    """An endpoint that notes what is published; `TopicEvents` are not asked of it."""
+
+    encoding = None
+
+    def __init__(self) -> None:
+        self.published: list[bytes] = []
+
+    def advertise(self, _info: TopicInfo) -> "Stops":
+        return self
+
+    def publish(self, body: bytes, _stamp_ns: int) -> None:
+        self.published.append(body)
+
+    def close(self) -> None: ...
+
+
+async def test_the_last_word_of_a_client_counts_also_when_its_end_is_seen_first() -> None:
+    """It armed a lease, published the command and was killed: the command is the last that the robot has heard."""
+    told, telling = os.pipe()
+    heard, answering = os.pipe()
+    endpoint = Stops()
+    process = GuardProcess(endpoint, told, answering)  # type: ignore[arg-type]
+    info = {"name": "/cmd_vel", "type_name": "geometry_msgs/msg/Twist", "encoding": "cdr"}
+    opened = {"open": 1, "info": info, "stop": base64.b64encode(b"stop").decode()}
+    for said in (opened, {"lease": 1, "due": clock.now() + 3600.0}):
+        os.write(telling, json.dumps(said).encode() + b"\n")
+    os.close(telling)
+    process.parent_gone()
+    assert endpoint.published == [b"stop"]
+    assert json.loads(os.read(heard, 100)) == {"stopped": 1}
+    process.close()
+    for descriptor in (told, heard, answering):
+        os.close(descriptor)
 
 
 async def test_a_guard_that_answers_no_ping_is_started_again(

@@ -209,6 +209,13 @@ def test_what_is_not_open_as_it_should_be_is_opened_anew() -> None:
 # --- what is said -----------------------------------------------------------------------------------------------------
 
 
+@pytest.fixture
+def still(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What ages are counted by stands still, at whole seconds: nobody is away for longer because a test takes long."""
+    now = float(int(clock.now()))
+    monkeypatch.setattr(clock, "now", lambda: now)
+
+
 class Withdrawn:
     def __init__(self) -> None:
         self.names: set[str] = set()
@@ -298,6 +305,7 @@ async def test_it_is_published_again_each_period() -> None:
     site.state.close()
 
 
+@pytest.mark.usefixtures("still")
 async def test_rows_and_detail_name_who_is_away() -> None:
     site = Site()
     assert site.state.detail() == ""
@@ -319,6 +327,7 @@ async def test_rows_and_detail_name_who_is_away() -> None:
     site.state.close()
 
 
+@pytest.mark.usefixtures("still")
 async def test_who_is_given_up_is_said_and_stays_away(caplog: pytest.LogCaptureFixture) -> None:
     site = Site()
     site.state.start()
@@ -360,6 +369,7 @@ async def test_who_is_forgotten_is_said_once_if_it_was_gone(caplog: pytest.LogCa
     site.state.close()
 
 
+@pytest.mark.usefixtures("still")
 async def test_topics_are_withdrawn_when_nothing_was_heard_for_so_long_and_come_back() -> None:
     site = Site(withdraw_after_s=5.0)
     site.state.start()

@@ -325,15 +325,15 @@ async def zenoh_router(scene: Scene) -> None:
     scene.patch.setattr(module, "LOOK_S", 0.02)
     there = f"tcp/127.0.0.1:{free_ports(1)[0]}"
     zenoh = module.ZenohEndpoint(ZenohOptions(SessionOptions(connect=(there,))))
+    other = ZenohSession(SessionOptions(connect=(), listen=(there,)))
     await zenoh.start(Events())
     try:
         await scene.until_said("nobody answers at")
-        other = ZenohSession(SessionOptions(connect=(), listen=(there,)))
         await other.open()
         await scene.until_said("somebody answers at")
-        await other.close()
     finally:
-        await zenoh.stop()
+        await zenoh.stop()  # it would say that the other has gone
+        await other.close()
 
 
 async def name_of_the_relay(scene: Scene) -> None:

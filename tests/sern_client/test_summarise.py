@@ -344,7 +344,7 @@ async def test_the_last_of_a_capped_series_goes_when_its_time_comes(bench: Bench
 
 
 async def test_merged_transforms_wait_while_one_is_queued_and_none_is_lost(bench: Bench) -> None:
-    channel = bench.channel("/tf")
+    channel = bench.channel("/tf", lifespan_s=None)  # else what waits for too long is left out
     merged = MergedTransforms(
         bench.core, channel, bench.send, TopicName("/tf"), Encoding.CDR, max_rate_hz=1000.0
     )  # fmt: skip

@@ -210,6 +210,27 @@ async def test_what_a_listener_is_told() -> None:
     assert str(listener.problem) == "the relay refuses us: r may not subscribe to /x"
 
 
+@pytest.mark.parametrize("told", ["expired", "skipped", "undecodable"])
+async def test_a_listener_whose_reader_has_gone_is_done(told: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """`sern echo ... | head`, and what comes next is no message."""
+
+    class Gone(StringIO):
+        def write(self, text: str, /) -> int:
+            raise BrokenPipeError
+
+    left: list[str] = []
+    monkeypatch.setattr(echo, "drop_output", lambda: left.append("output"))
+    stream = stream_of()
+    listener = Listener(Printer(SAY["plain"], Gone(), count=None), left.append)
+    tell = {
+        "expired": lambda: listener.expired(stream, 4, DropReason.RETENTION),
+        "skipped": lambda: listener.skipped(stream, 2),
+        "undecodable": lambda: listener.undecodable(stream, "damaged"),
+    }
+    tell[told]()
+    assert listener.done and listener.problem is None and left == ["output"]
+
+
 # --- who it is --------------------------------------------------------------------------------------------------------
 
 

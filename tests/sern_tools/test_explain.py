@@ -129,6 +129,12 @@ async def test_a_running_robot_is_explained(tmp_path: Path) -> None:
         assert "Topics, and what became of the last message of each" in text
         assert "  chosen    " in text
         topic = next(iter(robot.json("/api/topics")))
+
+        def arrived() -> bool:
+            records = robot.json(f"/api/trace?topic={topic}")["records"]
+            return any(record["topic"] == topic and record["event"] == "acked" for record in records)
+
+        await until(arrived, "the relay has acknowledged a message of it")  # an interval is measured by what is offered
         text = explain(topic, "--api", api)
         assert text.startswith(f"{topic} of robot1, to relay: class ")
         assert "  now       " in text and "  so far    of " in text and "  the last messages, and how long ago:" in text

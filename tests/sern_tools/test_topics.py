@@ -34,6 +34,7 @@ from sern_tools.topics import (
     table,
 )
 from tests.daemons import Lab, write_bag
+from tests.support import DEADLINE_S
 
 URL = "http://daemon"
 
@@ -232,8 +233,16 @@ def test_a_daemon_that_hangs_is_not_taken_for_none(
 ) -> None:
     """The kernel takes the connection, and nobody reads it: so does a relay that was stopped."""
     monkeypatch.setattr(api, "PROBE_S", 0.05)
+    get_json = api.get_json
     with socket.create_server(("127.0.0.1", 0)) as hung:
         port = hung.getsockname()[1]
+
+        def get(address: str, path: str, *, timeout_s: float) -> Any:
+            """Wait for what answers however long this machine gives it no time."""
+            hangs = address == f"http://127.0.0.1:{port}"
+            return get_json(address, path, timeout_s=timeout_s if hangs else DEADLINE_S)
+
+        monkeypatch.setattr(api, "get_json", get)
         silent = f"127.0.0.1:{port} takes connections and is silent: its daemon hangs, or it is none of SERN"
         monkeypatch.setattr(api, "PROBED", "/api/empty")
         if others == "answers":
@@ -272,7 +281,14 @@ async def test_a_real_relay_and_its_client(tmp_path: Path) -> None:
         robot = lab.process(lab.player_file("robot1", bag, play=play))
         for process in (relay, robot, site):
             await process.ready()
-        await relay.until(lambda: relay.json("/api/topics")["received"].get("/robot1/text"), "has the topic")
+
+        def passed_on() -> bool:
+            """Messages come, and the site has said that it takes them: the robot is asked for them before it does."""
+            told = relay.json("/api/topics")
+            onward = told["links"]["site"].get("/robot1/text", {})
+            return "/robot1/text" in told["received"] and bool(onward.get("wanted"))
+
+        await relay.until(passed_on, "has the topic")
 
         def listed(port: int, *, pattern: str | None = None) -> Any:
             out = StringIO()

@@ -43,6 +43,12 @@ def domain() -> int:
 
 
 @pytest.fixture
+def other_domain() -> int:
+    """One more, for the other side of a link."""
+    return free_domain()
+
+
+@pytest.fixture
 async def stack() -> AsyncIterator[AsyncExitStack]:
     async with AsyncExitStack() as stack:
         yield stack

@@ -68,7 +68,8 @@ class Side:
         await self.peer.do(f"write {part}-request {(HEAD + struct.pack('<Qq', 99, number) + body).hex()}")
 
     async def answer(self, part: str, request: bytes, body: bytes) -> None:
-        """To a request as it came, whose header says to whom."""
+        """To a request as it came, whose header says to whom. Its reader may be found after its writer."""
+        await self.peer.line(f"matched {part}-reply 1")
         await self.peer.do(f"write {part}-reply {(HEAD + request[4:20] + body).hex()}")
 
     async def got(self, what: str, number: int = 0) -> bytes:
@@ -92,31 +93,32 @@ def patient(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sern_runtime.config.client.SERVICE_TIMEOUT_S", DEADLINE_S)
 
 
-async def _sites(lab: Lab, domain: int, timeout_s: float) -> ClientDaemon:
-    """The robot's client in `domain`, the site's in the next; the site's is returned."""
+async def _sites(lab: Lab, domain: int, other_domain: int, timeout_s: float) -> ClientDaemon:
+    """The robot's client in `domain`, the site's in the other one; the site's is returned."""
     manual = {"mode": "manual"}
     offer = {"offer": [{"match": "/fibonacci", "timeout_s": timeout_s}]}
     await lab.connected(lab.client_file("robot1", _dds(domain), discovery=manual, actions=offer))
     use = {"use": [{"match": "/robot1/fibonacci", "timeout_s": timeout_s}]}
     return await lab.connected(
-        lab.client_file("site", _dds(domain + 1), client={"namespace": "/"}, discovery=manual, actions=use)
+        lab.client_file("site", _dds(other_domain), client={"namespace": "/"}, discovery=manual, actions=use)
     )
 
 
 async def _heard(site: ClientDaemon) -> None:
-    """Until the site's endpoint has found the client: a request that comes before is lost, and not repeated."""
+    """Until the site's endpoint has found the client: a request that comes before is lost, and not repeated, and so is
+    an answer."""
     servers = endpoint_of(site, DdsEndpoint).services._servers
-    await until(lambda: all(server.reader is not None and server.reader.matched == 1 for server in servers))
+    await until(lambda: all(side is not None and side.matched == 1 for s in servers for side in (s.reader, s.writer)))
 
 
 async def test_a_goal_from_the_site_to_the_robot_and_what_comes_back(
-    tmp_path: Path, domain: int, make_peer: MakePeer
+    tmp_path: Path, domain: int, other_domain: int, make_peer: MakePeer
 ) -> None:
     server = Side(await make_peer(domain), "fibonacci", serves=True)
-    client = Side(await make_peer(domain + 1), "robot1/fibonacci", serves=False)
+    client = Side(await make_peer(other_domain), "robot1/fibonacci", serves=False)
     async with Lab(tmp_path, "robot1", "site") as lab:
         await lab.process(lab.relay_file()).ready()
-        site = await _sites(lab, domain, 60)
+        site = await _sites(lab, domain, other_domain, 60)
         await server.open()
         await client.open()
         await client.matched()
@@ -153,14 +155,14 @@ async def test_a_goal_from_the_site_to_the_robot_and_what_comes_back(
 
 
 async def test_without_a_link_a_goal_is_refused_and_a_result_unknown(
-    tmp_path: Path, domain: int, make_peer: MakePeer
+    tmp_path: Path, domain: int, other_domain: int, make_peer: MakePeer
 ) -> None:
     server = Side(await make_peer(domain), "fibonacci", serves=True)
-    client = Side(await make_peer(domain + 1), "robot1/fibonacci", serves=False)
+    client = Side(await make_peer(other_domain), "robot1/fibonacci", serves=False)
     async with Lab(tmp_path, "robot1", "site") as lab:
         relay = lab.process(lab.relay_file())
         await relay.ready()
-        site = await _sites(lab, domain, 8.0)
+        site = await _sites(lab, domain, other_domain, 8.0)
         await server.open()
         await client.open()
         await client.matched()

@@ -151,10 +151,9 @@ async def test_rospy_calls_a_service_of_ros2(tmp_path: Path, domain: int, make_p
         await ros.until_printed("caller", "['no', 'yes', 'no', 'yes']")
 
 
-async def test_two_ros2_sites(tmp_path: Path, domain: int, make_peer: MakePeer) -> None:
+async def test_two_ros2_sites(tmp_path: Path, domain: int, other_domain: int, make_peer: MakePeer) -> None:
     """Two domains with a relay between them: bytes as they were, latched ones for whoever comes late."""
-    other = domain + 1
-    robot, site = await make_peer(domain), await make_peer(other)
+    robot, site = await make_peer(domain), await make_peer(other_domain)
     info: TopicInfo = topic_info("/odom", ODOM, Encoding.CDR)
     body = ros_types.serialise(made_up(ros_types.typestore(info.encoding), ODOM, Random(3)), ODOM, Encoding.CDR)
     await robot.do(f"pub odom rt/odom {ODOMETRY} reliable transient_local depth=1")
@@ -164,7 +163,11 @@ async def test_two_ros2_sites(tmp_path: Path, domain: int, make_peer: MakePeer) 
         await lab.connected(lab.client_file("robot1", dds(domain), topics=list(RELIABLE)))
         daemon = await lab.connected(
             lab.client_file(
-                "site", dds(other), client={"namespace": "/"}, subscribe=["/robot1/.*"], discovery={"mode": "manual"}
+                "site",
+                dds(other_domain),
+                client={"namespace": "/"},
+                subscribe=["/robot1/.*"],
+                discovery={"mode": "manual"},
             )
         )
         await site.do(f"sub odom rt/robot1/odom {ODOMETRY} reliable transient_local")

@@ -76,6 +76,7 @@ async def test_they_call_our_server(domain: int, make_peer: MakePeer, make_endpo
     await peer.line("matched answers 1")
     await peer.line("matched calls 1")
     await until(lambda: server.reader is not None and server.reader.matched == 1)
+    await until(lambda: server.writer is not None and server.writer.matched == 1)
     for number, value in enumerate((1, 0, 1)):
         await peer.do(f"write calls {(HEAD + struct.pack('<Qq', 99, number) + bytes([value])).hex()}")
     await peer.line("got answers ", 1)
@@ -163,6 +164,7 @@ async def test_a_call_that_is_told_how_it_ends_answers_before_its_service_is_gon
     await peer.line("matched answers 1")
     await peer.line("matched calls 1")
     await until(lambda: server.reader is not None and server.reader.matched == 1)
+    await until(lambda: server.writer is not None and server.writer.matched == 1)
     await peer.do(f"write calls {(HEAD + struct.pack('<Qq', 99, 1) + bytes([1])).hex()}")
     await asyncio.wait_for(asked.wait(), DEADLINE_S)
     outcome.set_result(RESPONSE)

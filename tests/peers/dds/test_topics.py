@@ -162,8 +162,9 @@ async def test_a_peer_that_crashes_is_missed(domain: int, make_peer: MakePeer, m
     await other.do(f"pub b rt/other {STRING}")
     await until(lambda: len(recorder.infos) == 2)
     await peer.crash()
-    await until(lambda: recorder.removed == [TopicName("/chat")])
-    assert list(recorder.infos) == [TopicName("/other")]
+    await until(lambda: list(recorder.infos) == [TopicName("/other")])
+    # On a busy machine it may have been missed before, and have come back.
+    assert set(recorder.removed) == {TopicName("/chat")}
 
 
 async def test_policies_that_do_not_match_are_named(

@@ -211,6 +211,7 @@ async def test_restarted_master_is_told_everything_again(tmp_path: Path, caplog:
         await until(lambda: len(got) > seen + 3, "what is connected goes on without a master")
         await ros.start_master()
         await until(lambda: ros.publishers("/back") == ["/sern_test"], "we are registered again")
+        await until(lambda: endpoint.connected, "the master has answered all that was asked")
         assert "here" in await ros.tool("rostopic", "echo", "-n", "1", "/back")
         said = [r.getMessage() for r in caplog.records if "ROS master" in r.getMessage() and r.levelname == "WARNING"]
         lost, found = said

@@ -271,24 +271,19 @@ async def test_a_loop_that_is_too_slow_loses_the_oldest(domain_id: int, monkeypa
     """Writer and reader in two domain participants of this process; the loop does not run while they are busy."""
     from sern_client.endpoints.dds import endpoint
     from sern_client.endpoints.dds.endpoint import DdsEndpoint, DdsOptions
-    from tests.support import Patience, until
+    from tests.support import Events, Patience, until
 
     monkeypatch.setattr(endpoint, "LEARN_S", 0.0)  # nobody is waited for
-
-    class Silent:
-        def topic_added(self, info: TopicInfo) -> None: ...
-
-        def topic_removed(self, name: TopicName) -> None: ...
-
     domain = DomainOptions(domain_id, localhost_only=True)
     one = DdsEndpoint(DdsOptions(domain))
     two = DdsEndpoint(DdsOptions(domain, accept_bridged=True, queue_depth=5))
-    await one.start(Silent())
-    await two.start(Silent())
+    heard = Events()
+    await one.start(Events())
+    await two.start(heard)
     try:
         info = topic_info("/chat", "std_msgs/msg/String", Encoding.CDR, reliable=True)
         publisher = one.advertise(replace(info, depth=200))
-        await until(lambda: two.graph.writers("rt/chat"))
+        await until(lambda: info.name in heard.infos)  # its graph has the writer a little earlier
         got: list[bytes] = []
 
         def sink(body: bytes, stamp_ns: int) -> bool:

@@ -5,6 +5,7 @@ import logging
 import pytest
 
 from sern_client.endpoints.common.saying import SayOnce, Trouble
+from sern_runtime import clock
 
 LOG = logging.getLogger(__name__)
 
@@ -43,7 +44,11 @@ def test_what_nobody_expects_comes_with_its_traceback(caplog: pytest.LogCaptureF
     assert record.levelname == "ERROR" and "ValueError: no number" in caplog.text
 
 
-def test_a_trouble_is_said_until_it_is_another_and_its_end_with_it(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_trouble_is_said_until_it_is_another_and_its_end_with_it(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    times_s = iter((10.0, 17.0))
+    monkeypatch.setattr(clock, "now", lambda: next(times_s))
     trouble = Trouble(LOG, "/talker")
     trouble.over()
     for problem in ("refused", "refused", "no answer", "refused"):
@@ -53,7 +58,7 @@ def test_a_trouble_is_said_until_it_is_another_and_its_end_with_it(caplog: pytes
     assert trouble.say("refused"), "again: it had answered"
     trouble.over()
     assert said(caplog) == [
-        "/talker: refused", "/talker: no answer", "/talker: refused", "/talker answers again, after 0 s",
+        "/talker: refused", "/talker: no answer", "/talker: refused", "/talker answers again, after 7 s",
         "/talker: refused",
     ]  # fmt: skip
     trouble.forget()

@@ -140,6 +140,22 @@ def test_a_client_that_was_killed_is_away_after_the_heartbeat() -> None:
     assert not link.established
 
 
+@pytest.mark.parametrize("silent_s", [0.001, 1.0])
+def test_a_relay_that_stood_still_while_a_client_was_killed_takes_it_for_no_blackout(silent_s: float) -> None:
+    """Its timers find the lane silent, and a moment later its socket says that the stream has ended."""
+    lanes = TwoLanes(stream=models()[0], datagrams=models()[1])
+    lanes.run(5.0)
+    link, now = lanes.world.relay.hub.links[ClientName("robot")], lanes.world.relay.now + 1.0
+    link.handle_timeout(now=now, lane=LANE_UDP)
+    assert link.next_datagram(now=now, lane=LANE_UDP), "it asks"
+    now += 10.0
+    link.handle_timeout(now=now, lane=LANE_UDP)
+    assert link.lanes.by_id[LANE_UDP].stalled
+    link.disconnected(now=now + silent_s, reason="the connection ended")
+    assert link.established
+    assert link.handshake.cut_off is (silent_s == 1.0)
+
+
 def test_a_client_in_a_blackout_is_waited_for() -> None:
     stream, datagrams = models(Window(5.0, 50.0))
     lanes = TwoLanes(stream=stream, datagrams=datagrams)

@@ -68,22 +68,23 @@ async def test_whoever_is_left_at_the_end_is_stopped(tmp_path: Path, monkeypatch
 
 async def test_cancelling_twice_kills_and_leaves_nothing(tmp_path: Path) -> None:
     started: list[Child] = []
+    stubborn = asyncio.Event()
 
     async def work() -> None:
         async with Children(tmp_path) as children:
             started.append(await children.start("stubborn", python("-c", STUBBORN), talks=True))
             await started[0].read_object()
+            stubborn.set()
             await asyncio.Event().wait()
 
     task = asyncio.create_task(work())
-    await until(lambda: started and started[0].process.stdout is not None and not task.done())
-    await until(lambda: Path(f"/proc/{started[0].process.pid}").exists())
-    await asyncio.sleep(0)
+    await until(stubborn.is_set, "the child ignores SIGTERM")
     task.cancel()  # SIGTERM, which the child ignores
     await until(lambda: started[0].stopping)
     task.cancel()  # SIGKILL
     with pytest.raises(asyncio.CancelledError):
         await task
+    assert started[0].process.returncode == -signal.SIGKILL
     assert gone(started[0])
 
 
