@@ -2,9 +2,9 @@
 
 The recordings say what LTE, UMTS and EV-DO links could deliver to a car that drives (`--data`). They are played in
 steps of 0.1 s, with 25 ms each way and a queue that holds what it must. Bulk without end goes beside a pose of 100
-bytes every 20 ms. `sern` is the real core, robot to relay, with clouds and `link.window.variable_rate_queue_s: 0.01`;
-`sern, default` is without that, `poses alone` without clouds. `hybrid`, `bbr-like` and `cubic` are windows alone, as
-`benchmarks.flows` models a flow: that of `sern`, and two others beside it.
+bytes every 20 ms. `sern` is the real core, robot to relay, with clouds; `sern, not following` has
+`link.window.variable_rate_queue_s: null`, `poses alone` no clouds. `hybrid`, `bbr-like` and `cubic` are windows
+alone, as `benchmarks.flows` models a flow: that of `sern`, and two others beside it.
 
 `used` is the share of what the link could carry that went over it; bulk's share is that of `sern` less that of `poses
 alone`. Ages are of poses that arrived; in a gap of the link they are as long as it, whoever sends. A sender learns of a
@@ -16,8 +16,6 @@ keeps the same queue.
 import argparse
 import sys
 from collections.abc import Callable, Sequence
-from functools import partial
-from itertools import pairwise
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -26,24 +24,17 @@ import numpy as np
 from benchmarks.common import Report, main, percentile
 from benchmarks.flows import DATAGRAM_BYTES, HEADER_BYTES, OVERHEAD_BYTES, POSE_BYTES, BbrLike, Cubic
 from benchmarks.flows import World as Flows
-from benchmarks.recordings import DATA
+from benchmarks.recorded_links import CELLULAR, DELAY_S, SLOT_PACKET_BYTES, SLOT_S, STEP_SLOTS, read, recorded
 from sern_core.path.capacity import CapacityEstimator
 from sern_core.path.congestion.hybrid import HybridWindow
-from sern_core.path.congestion.params import HybridParams
 from sern_core.vocabulary.errors import ConfigError
 from sern_core.vocabulary.params import LinkParams, WindowParams
 from sern_core.vocabulary.types import PriorityClass
-from sern_sim.models import LinkModel, RateStep
+from sern_sim.models import LinkModel
 from tests.world import World, spec
 
-CELLULAR: Final = DATA / "cellular"
-DELAY_S: Final = 0.025
 QUEUE_S: Final = 0.010
-"""`link.window.variable_rate_queue_s`."""
-SLOT_S: Final = 0.020
-SLOT_PACKET_BYTES: Final = 1504
-STEP_SLOTS: Final = 5
-QUEUE_PACKETS: Final = 1000
+"""The default of `link.window.variable_rate_queue_s`."""
 POSE_HZ: Final = 50.0
 BULK_SHARE: Final = (DATAGRAM_BYTES - HEADER_BYTES) / (DATAGRAM_BYTES + OVERHEAD_BYTES)
 """What of a datagram on the wire is a message's."""
@@ -55,7 +46,6 @@ OFFERED: Final = 4.0
 """Times the mean of the link: it must not be the load that leaves it idle."""
 LIMITS: Final = {"lte": 0.80, "umts": 0.65, "evdo": 0.65}
 AGE_LIMIT: Final = 2.0
-SWINGS: Final = HybridParams(variable_queue_s=QUEUE_S)
 BACK: Final = LinkModel(delay_s=DELAY_S)
 
 
@@ -74,37 +64,6 @@ class Played(NamedTuple):
             "pose_p95_ms": 1e3 * percentile(self.ages_s, 0.95),
             "pose_p99_ms": 1e3 * percentile(self.ages_s, 0.99),
         }
-
-
-def read(path: Path) -> list[int]:
-    """Packets that the link could deliver in each slot. ConfigError of one line for a file that is none."""
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-        return [int(line) for line in lines if line and not line.startswith("#")]
-    except (OSError, ValueError) as error:
-        raise ConfigError(f"is no recording of a link: {error}", file=str(path)) from None
-
-
-def recorded(slots: Sequence[int], seconds: float | None) -> tuple[LinkModel, float]:
-    """The link, and how long it lasts. Where it delivers nothing what was sent waits."""
-    step_s = STEP_SLOTS * SLOT_S
-    count = len(slots) // STEP_SLOTS
-    if seconds is not None:
-        count = min(count, round(seconds / step_s))
-    rates_bps = [
-        max(1.0, sum(slots[n * STEP_SLOTS : (n + 1) * STEP_SLOTS]) * SLOT_PACKET_BYTES * 8 / step_s)
-        for n in range(count)
-    ]
-    steps = [RateStep(n * step_s, rate_bps) for n, rate_bps in enumerate(rates_bps)]
-    changes = tuple(after for before, after in pairwise(steps) if after.rate_bps != before.rate_bps)
-    model = LinkModel(
-        rate_bps=rates_bps[0],
-        delay_s=DELAY_S,
-        overhead_bytes=OVERHEAD_BYTES,
-        rate_steps=changes,
-        queue_packets=QUEUE_PACKETS,
-    )
-    return model, count * step_s
 
 
 def play_core(model: LinkModel, duration_s: float, *, bulk: bool, queue_s: float | None = QUEUE_S) -> Played:
@@ -191,8 +150,8 @@ def bench(options: argparse.Namespace, report: Report) -> None:
         rows = {
             "poses alone": alone,
             "sern": sern,
-            "sern, default": play_core(model, duration_s, bulk=True, queue_s=None),
-            "hybrid": play_window(model, duration_s, partial(HybridWindow, params=SWINGS)),
+            "sern, not following": play_core(model, duration_s, bulk=True, queue_s=None),
+            "hybrid": play_window(model, duration_s, HybridWindow),
             "bbr-like": play_window(model, duration_s, BbrLike),
             "cubic": play_window(model, duration_s, Cubic),
             "informed": play_informed(slots, duration_s, QUEUE_S),

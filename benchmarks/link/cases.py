@@ -5,7 +5,8 @@ import asyncio
 import importlib.util
 import tempfile
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -16,9 +17,10 @@ from benchmarks.link.forwarder import FORWARDER
 from benchmarks.link.junk import Junk
 from benchmarks.link.load import Kind, Load
 from benchmarks.link.runs import Outcome, Step, run
+from benchmarks.recorded_links import CELLULAR, SLOT_S, read, recorded
 from sern_core.vocabulary.errors import SernError
 from sern_runtime.seal import ROOM_BYTES
-from sern_sim.models import LinkModel
+from sern_sim.models import LinkModel, RateStep
 from sern_tools.lab.lab import Lab
 
 SERN: Final = ("sern-udp", "sern-zmq")
@@ -42,6 +44,9 @@ FLOODS: Final = (1.3, 2.0, 4.0, 13.0)
 """Class control, times what the link carries."""
 FLOOD_AGE_S: Final = 0.2
 """Four round trips."""
+LTE: Final = CELLULAR / "att_lte_driving_up.csv"
+LTE_FROM_S: Final = 60.0
+"""A minute without gaps: netem gives a packet its time when it comes, so that one of a gap would wait for ever."""
 CPU_LIMIT: Final = 4.0
 """CPU of the busier side, times that of a bare forwarder for the same datagrams in the same run."""
 CPU_LIMIT_FAST: Final = 3.1
@@ -355,6 +360,44 @@ def flood(bench: Bench) -> None:
             bench.report.reach(name, share, 0.9, at_least=True)
 
 
+def cellular(bench: Bench) -> None:
+    """A minute of an LTE link to a car that drives, recorded, another rate every 0.1 s; 4 Mbit/s of clouds."""
+    if not LTE.is_file():
+        bench.report.note(f"cellular: without {LTE.name}, a recording that is not ours to ship")
+        return
+    slots = read(LTE)[round(LTE_FROM_S / SLOT_S) :]
+    model, played_s = recorded(slots, 20.0 if bench.quick else 60.0)
+    mean_bps = model.capacity_bits(0.0, played_s) / played_s
+    changes = [RateStep(0.0, model.rate_bps), *model.rate_steps]
+    script = [Step(change.at_s, f"{change.at_s:g} s", partial(_carry, change.rate_bps)) for change in changes]
+    case = f"LTE, {mean_bps / MEGABIT:.1f} Mbit/s in the mean, 50 ms"
+    link = replace(model, rate_bps=mean_bps, rate_steps=(), overhead_bytes=0)
+
+    def used(outcome: Outcome) -> float:
+        return 8 * outcome.wire_bytes / outcome.duration_s / mean_bps
+
+    def extra(outcome: Outcome) -> dict[str, float]:
+        late_ns = max(outcome.events[step.name][1] - outcome.start_ns - step.at_s * 1e9 for step in script)
+        p95_ms = figures.quantile(figures.latencies_ms(outcome), 0.95)
+        return {"pose_p95_ms": p95_ms, "used_percent": 100 * used(outcome), "step_late_ms": late_ns / 1e6}
+
+    def play(name: str, system: str, load: Load) -> Outcome:
+        return bench.run(name, system, link, load, played_s, script=script, extra=extra)
+
+    for system in bench.wanted(("sern-udp",) if bench.quick else QUICK):
+        outcome = bench.attempt(case, system, partial(play, case, system, Load(cloud_bytes=50_000)))
+        if outcome is not None and system == "sern-udp":
+            alone = play(f"{case}, poses alone", system, Load())
+            share = used(outcome) - used(alone)
+            bench.report.reach(f"{case}, {system}: share of the link that bulk uses", share, 0.80, at_least=True)
+            p95s = [figures.quantile(figures.latencies_ms(each), 0.95) for each in (outcome, alone)]
+            bench.report.reach(f"{case}, {system}: pose p95, times that of poses alone", p95s[0] / p95s[1], 2.0)
+
+
+def _carry(rate_bps: float | None, lab: Lab) -> None:
+    lab.change("up", rate_bps=rate_bps)
+
+
 CASES: Final[dict[str, Callable[[Bench], None]]] = {
     "idle": idle,
     "overload": overload,
@@ -365,6 +408,7 @@ CASES: Final[dict[str, Callable[[Bench], None]]] = {
     "long": long_path,
     "junk": junk,
     "flood": flood,
+    "cellular": cellular,
 }
 QUICK_CASES: Final = ("idle", "overload", "loss", "steps", "blackout-10", "long", "junk")
 

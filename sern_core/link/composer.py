@@ -7,13 +7,14 @@ from sern_core.link.control_stream import ControlStream
 from sern_core.link.datagram import MIN_SHARE_BYTES, Datagram
 from sern_core.link.end import End
 from sern_core.link.lane_set import LaneSet
+from sern_core.link.outlook import Outlook
 from sern_core.link.sender import Sender, class_of
 from sern_core.link.streams_in import StreamsIn
 from sern_core.path.lanes import OVERHEAD_BYTES, Lane
 from sern_core.stream.coding import Coding
 from sern_core.stream.out_channel import OutChannel
 from sern_core.stream.out_message import OutMessage
-from sern_core.vocabulary.types import PriorityClass
+from sern_core.vocabulary.types import DropReason, PriorityClass
 from sern_core.wire import framing
 
 MIN_FILL_DIVISOR: Final = 32
@@ -35,6 +36,8 @@ class Composer:
         sender: Sender,
         taking: StreamsIn,
         control_sent: Callable[[int], None],
+        *,
+        now: float,
     ) -> None:
         self._end = end
         self._lanes = lanes
@@ -42,6 +45,7 @@ class Composer:
         self._sender = sender
         self._taking = taking
         self._control_sent = control_sent
+        self._outlook = Outlook(now)
         self.served: OutChannel | None = None
         """What left last, while decisions are traced; control messages aside."""
 
@@ -58,6 +62,8 @@ class Composer:
         limit = lane.fragment_bytes - (framing.ACK.size if lane.arrivals.unacked else 0)
         control_only = lane is self._lanes.priority_lane
         window_open = lane.open_at(now)
+        if not window_open and sender.pending:
+            self._outlook.full(now)
         if not control_only and self._taking.watermarks:
             for channel_id, seq in self._taking.take_watermarks(MAX_WATERMARKS, acked_seq=control.acked_seq):
                 datagram.watermark(channel_id, seq)
@@ -91,6 +97,10 @@ class Composer:
                 continue
             if out.coding is Coding.RAW and channel.codec is not None and not sender.encoded(channel, out, now):
                 continue
+            if not self._outlook.in_time(channel, out, lane, now):
+                channel.drop_head(DropReason.TOO_SLOW, now)
+                sender.refresh(channel, now)
+                continue
             priority = class_of(channel, out)
             if served is None and priority is not PriorityClass.CONTROL:
                 limit = self._cut(lane, limit, now)
@@ -109,6 +119,7 @@ class Composer:
             grown = self._put(datagram, channel, out, end, now)
             ride = shared and not window_open
             scheduler.charge(priority, grown, now=now)
+            self._outlook.sent(priority, grown, now)
             sender.refresh(channel, now)
             if lane.stalled:
                 break

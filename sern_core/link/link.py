@@ -131,7 +131,7 @@ class Link:
             owner,
             answered=self._answered,
         )
-        composer = Composer(end, lanes, control, sender, taking, self.outgoing.control_sent)
+        composer = Composer(end, lanes, control, sender, taking, self.outgoing.control_sent, now=now)
         plane = self.plane = DataPlane(
             end, lanes, control, sender, taking, answers, composer, sweep=self._sweep, now=now
         )

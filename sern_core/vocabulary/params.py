@@ -64,7 +64,7 @@ class WindowParams:
     algorithm: WindowAlgorithm = WindowAlgorithm.HYBRID
     fixed_bytes: int = 25_000
     """W of algorithm `fixed`: 4 Mbit/s × 50 ms, the link of the measurements in the documentation."""
-    variable_rate_queue_s: float | None = None
+    variable_rate_queue_s: float | None = 0.01
     """The queue that algorithm `hybrid` keeps while the rate of the link swings; None: it follows no swings."""
 
     def __post_init__(self) -> None:

@@ -86,6 +86,7 @@ class DropReason(StrEnum):
     UNCONFIRMED = "unconfirmed"  # sent whole, given up without an acknowledgement: it may have arrived
     FAULT = "fault"  # an error of the program where it was taken; it may have been acted on in part
     STORAGE = "storage"  # the recording could not take it: disk full or gone
+    TOO_SLOW = "too_slow"  # the link is too slow for it to arrive whole within the topic's lifespan
 
 
 _UNUSED_CODE: Final = 14  # a stream that comes back to its origin is not wanted there: no message is dropped for that

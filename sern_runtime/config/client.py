@@ -189,8 +189,8 @@ class TopicSection(Section):
         Annotated[float, Field(gt=0, le=1e7)] | Literal["auto"] | None,
         described("a number of seconds above 0, null (for ever) or auto"),
     ] = "auto"
-    """Older messages are not sent and not delivered; null: for ever; `auto`: 0.3 for velocity commands in class
-    control, for ever if reliable or transient_local, else 1."""
+    """Older messages are not sent and not delivered, nor is a large one begun that cannot arrive by then; null: for
+    ever; `auto`: 0.3 for velocity commands in class control, for ever if reliable or transient_local, else 1."""
     deadline_s: Seconds | None = None
     """Expected time between messages: longer gaps are reported; null: no expectation."""
     max_rate_hz: Hertz | None = None

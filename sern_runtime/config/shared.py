@@ -82,9 +82,10 @@ class WindowSection(Section):
     fixed_bytes: Bytes = _LINK.window.fixed_bytes
     """The window of algorithm `fixed`: capacity × round-trip time."""
     variable_rate_queue_s: Annotated[float, Field(gt=0, le=1)] | None = _LINK.window.variable_rate_queue_s
-    """For links whose rate goes up and down all the time, as cellular ones do to a robot that drives: while it does,
-    keep so long a queue, which shows what the link can do now. Bulk uses more of it, and poses wait so much longer;
-    0.01 is a good value. Beside other traffic that keeps a queue of its own it may get little. null: no."""
+    """How long a queue to keep while the rate of the link goes up and down all the time, as that of a cellular one does
+    to a robot that drives: the queue shows what the link can do now. With a longer one bulk uses more of the link, and
+    poses wait so much longer. null: treat such a link as any other; bulk gets less, and fades may be taken for other
+    traffic, which makes poses seconds old."""
 
     def params(self) -> WindowParams:
         return WindowParams(self.algorithm, self.fixed_bytes, self.variable_rate_queue_s)

@@ -6,14 +6,21 @@ from pathlib import Path
 import pytest
 
 from benchmarks import cellular
-from benchmarks.cellular import SLOT_PACKET_BYTES, bench, play_core, play_informed, read, recorded
+from benchmarks.cellular import bench, play_core, play_informed
 from benchmarks.common import Report
 from benchmarks.flows import OVERHEAD_BYTES
+from benchmarks.recorded_links import SLOT_PACKET_BYTES, read, recorded
+from sern_core.path.congestion.params import DEFAULT_HYBRID
 from sern_core.vocabulary.errors import ConfigError
+from sern_core.vocabulary.params import WindowParams
 
 EVEN = [4] * 500
 """10 s of a link of 2.4 Mbit/s."""
 FADING = ([20] * 10 + [2] * 10) * 25
+
+
+def test_what_is_measured_is_the_default() -> None:
+    assert cellular.QUEUE_S == WindowParams().variable_rate_queue_s == DEFAULT_HYBRID.variable_queue_s
 
 
 def test_a_recording_is_packets_in_each_slot(tmp_path: Path) -> None:
@@ -66,7 +73,7 @@ def test_a_folder_of_recordings_becomes_rows_and_figures(tmp_path: Path) -> None
     assert [row.system for row in report.rows] == [
         "poses alone",
         "sern",
-        "sern, default",
+        "sern, not following",
         "hybrid",
         "bbr-like",
         "cubic",

@@ -20,7 +20,7 @@ Theory of operation
     *Start-up.* The first packets leave in a train: its dispersion shows the capacity one round trip later, and the
     window goes there in steps of at most `STARTUP_GAIN`.
     *Swings.* A link whose rate goes up and down all the time (cellular) is followed acknowledgement by acknowledgement,
-    with a queue that shows what it can do now (`variable`), until it keeps a rate again; if `variable_queue_s` says so.
+    with a queue that shows what it can do now (`variable`), until it keeps a rate again.
     *Draining.* When no empty queue was seen for a while, one round trip at 0.6 of the product shows it. A queue that
     stays although we made way is either a longer path (constant: taken as the new empty path) or somebody else's:
     then the window follows CUBIC (RFC 9438) until a drain finds the queue gone.
@@ -500,8 +500,10 @@ class HybridWindow(CapacityEstimator):
                 self._happens(Event.RIVAL_GONE)
                 rival.cubic = None
                 rival.calm_window = self._window
-                if self._follows and rival.went_again(now):
-                    rival.forget()  # none comes and goes as we make way: the queue was ours, and the link fades
+                # A rival that has just cut its window leaves a short queue; one of our own goes to the last packet.
+                emptied = queue_s <= params.fast_s + self._view.serialise_s
+                if self._follows and emptied and rival.went_again(now):
+                    rival.forget()  # none comes and goes as we make way: the link fades
                     self._variability.faded(now)
                 else:
                     rival.remember(now)

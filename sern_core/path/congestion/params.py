@@ -98,7 +98,7 @@ class HybridParams:
     loss_memory_s: float = 3.0
     rival_memory_s: float = 30.0
     gone_times: int = 2
-    """A rival whose queue went so often in that time, each time that we made way, is none."""
+    """A rival whose queue went so often in that time, each time that we made way and to the last packet, is none."""
     compete_max_s: float = 30.0
     compete_queue_s: float = 1.0
     """A stream never loses a packet: its queue would grow without end."""
@@ -115,7 +115,7 @@ class HybridParams:
     """... or down and up within this one."""
     variable_span_s: float = 0.060
     """Time over which a link that is full is measured for it; longer with jitter."""
-    variable_queue_s: float | None = None
+    variable_queue_s: float | None = 0.01
     """The queue that is kept while it does; None: it is treated as any other link."""
     variable_rate_s: float = 0.050
     """Time over which what arrives is what the link carries now."""
