@@ -185,8 +185,8 @@ class DrainedSocket(ABC):
         return SendResult.OK
 
     def close(self) -> None:
-        """Stop watching and close the socket; what libzmq has not sent yet may go on for `linger_s`. Idempotent; allowed
-        inside a handler."""
+        """Stop watching and close the socket; what libzmq has not sent yet may go on for `linger_s`. Idempotent;
+        allowed inside a handler."""
         if self._closed:
             return
         self._closed = True
