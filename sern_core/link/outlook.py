@@ -65,7 +65,7 @@ class Outlook:
         self._try_s = max(self._try_s, now + MIN_PAUSE_S)
 
     def _fade(self, now: float) -> None:
-        elapsed_s, self._urgent_at_s = now - self._urgent_at_s, now
+        elapsed_s, self._urgent_at_s = max(0.0, now - self._urgent_at_s), now
         kept = exp(-elapsed_s / URGENT_S)
         self._urgent_bytes[0] *= kept
         self._urgent_bytes[1] *= kept
