@@ -97,7 +97,12 @@ class GuardProcess:
         """The client ended: what is armed is due now, also by its last word, which may still be in the pipe."""
         if self._gone:
             return
-        self._take()
+        try:
+            self._take()
+        finally:  # what is wrong with it, too, keeps nothing from being stopped
+            self._end()
+
+    def _end(self) -> None:
         self._gone = True
         asyncio.get_running_loop().remove_reader(self._source)
         now = clock.now()

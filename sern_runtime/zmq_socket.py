@@ -115,8 +115,8 @@ def _raise_if_alive(socket: "zmq.Socket[bytes]", error: zmq.ZMQError) -> None:
 class DrainedSocket(ABC):
     """A socket in the running loop. Subclasses say what a message looks like in `_take`.
 
-    All calls on the loop's thread. `close()` once; it closes the socket too. `on_writable` is called once
-    after a FULL send, when libzmq reports any change: try again, and be told FULL again if it was another one.
+    All calls on the loop's thread. `close()` once; it closes the socket too. `on_writable` is called once after a FULL
+    send, when libzmq reports any change: try again, and be told FULL again if it was another one.
     A handler that raises is reported by the loop's exception handler; the next message is delivered all the same.
     """
 

@@ -18,6 +18,8 @@ LARGE_FRAGMENTS: Final = 8
 """A message of fewer is sent before anything could be said of it."""
 URGENT_S: Final = 1.0
 """Time over which the traffic of more urgent classes is averaged: so much of the link is not to be had."""
+FADE_S: Final = 0.05
+"""How often that average fades: more often would cost every datagram an exponential."""
 SURE: Final = 0.9
 """The rate is known to a tenth: what would need so much more than the time it has may still arrive."""
 TRY_S: Final = 0.25
@@ -55,7 +57,8 @@ class Outlook:
         """Bytes of a class went on the wire."""
         if priority is PriorityClass.BULK:
             return
-        self._fade(now)
+        if now > self._urgent_at_s + FADE_S:
+            self._fade(now)
         self._urgent_bytes[1] += nbytes
         if priority is PriorityClass.CONTROL:
             self._urgent_bytes[0] += nbytes

@@ -454,6 +454,7 @@ async def test_an_address_that_was_let_go_of_counts_as_such_also_when_the_time_i
     server = Server(zmq_context)
     server.router.socket.unbind(server.endpoint)
     await until(lambda: server.table.await_unbound(-math.inf))
+    assert server.table.unbound
     server.close()
 
 

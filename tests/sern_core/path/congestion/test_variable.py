@@ -209,7 +209,7 @@ def test_a_link_of_one_rate_is_never_taken_for_one_that_swings(change: dict[str,
 
 @pytest.mark.parametrize(("rate_bps", "seed"), [(4e6, 1), (20e6, 1), (20e6, 6)])
 def test_a_rival_still_leaves_us_a_share(rate_bps: float, seed: int) -> None:
-    """Of seed 6 he cuts his window twice just as we make way: his queue is short then, but there."""
+    """With seed 6 the rival cuts its window twice just as we make way: its queue is short then, but there."""
     world = World(LinkModel(rate_bps=rate_bps, delay_s=0.02, overhead_bytes=60), seed=seed)
     world.flow(HybridWindow(params=PARAMS))
     world.flow(Cubic(), poses=False, start_s=3.0)
