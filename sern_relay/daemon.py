@@ -23,9 +23,11 @@ from sern_core.vocabulary.errors import ConfigError
 from sern_core.vocabulary.ledger import MAX_TOPICS
 from sern_core.vocabulary.message import Message, StreamInfo
 from sern_core.vocabulary.types import ClientName, DropReason, TopicName
+from sern_relay.admission import ZAP_DOMAIN, Admission, read_directory
 from sern_relay.feed import RelayFeed
 from sern_relay.objects_view import objects_view
 from sern_relay.relay_metrics import register_relay
+from sern_relay.reload_state import ReloadState
 from sern_relay.server import RelayServer
 from sern_relay.trace_source import of_hub
 from sern_relay.transforms import TransformObjects
@@ -34,7 +36,7 @@ from sern_runtime import clock, ros_types
 from sern_runtime.adaptation import Adaptation
 from sern_runtime.codec_pool import CodecPool, make_coder
 from sern_runtime.collector import CollectorWatch
-from sern_runtime.config.keys import KeyDirectory, KeyStatus, clock_says, load_secret, user_id
+from sern_runtime.config.keys import KeyDirectory, load_secret
 from sern_runtime.config.load import Loaded
 from sern_runtime.config.relay import RelayFile, load_relay
 from sern_runtime.datagram_watch import DatagramWatch
@@ -51,12 +53,11 @@ from sern_runtime.outages import Outages
 from sern_runtime.sdnotify import Notifier, Watchdog
 from sern_runtime.topics_view import announced_summary, link_summary, received_summary
 from sern_runtime.trace_view import trace_view
-from sern_runtime.zap import Refusal, TemporaryRefusal, ZapHandler, self_test
+from sern_runtime.zap import ZapHandler, self_test
 
 if TYPE_CHECKING:
     from sern_runtime.http import HttpServer
 
-ZAP_DOMAIN: Final = "sern"
 PATIENCE_S: Final = 5.0
 """How long a stopping relay waits for the next sign that what it holds for connected clients gets further."""
 SWEEP_S: Final = 1.0
@@ -100,20 +101,17 @@ class RelayDaemon:
         self.loaded = loaded
         model = loaded.model
         self.notifier = Notifier.from_environment()
-        self.directory = self._directory(loaded)
+        self.admission = Admission(self._directory(loaded))
         self.ages = AgeHistograms()
         self.errors = InternalErrors()
         self.collector = CollectorWatch()
         self.refusals = dict.fromkeys((*sorted(REFUSAL_CODES), OTHER_CODE), 0)
-        self.reloads_failed = 0
-        self._unreloaded: str | None = None  # what the last reload did not put in force, and why
-        self._unreloaded_s: float | None = None  # since when there is something
-        self._feed_problem = ""  # as far as it is of the feed
+        self.reloads = ReloadState()
         self.hub = Hub(
             name=model.name,
             boot=secrets.randbits(63),
             access=AccessTable(model.access_rules()),
-            known=self._known,
+            known=self.admission.known,
             events=self,
             link=model.link.params(),
             scheduler=model.scheduler.params(),
@@ -161,24 +159,13 @@ class RelayDaemon:
         self._ctx: zmq.Context[zmq.Socket[bytes]] | None = None
         self._http: HttpServer | None = None
         self.tasks: list[asyncio.Task[None]] = []
-        self._valid = self._valid_keys()
         self._ready = False
         self._flush_due: asyncio.Handle | None = None
 
     @staticmethod
     def _directory(loaded: Loaded[RelayFile]) -> KeyDirectory | None:
         clients_dir = loaded.model.relay.clients_dir
-        return None if clients_dir is None else KeyDirectory(loaded.resolve(clients_dir))
-
-    def _known(self, client: ClientName) -> bool:
-        return self.directory is None or client in self.directory.names
-
-    def _key_status(self, client: ClientName, public_key: str) -> KeyStatus:
-        """Whether what comes over a connection that was made with this key is taken: if it is VALID."""
-        if self.directory is None:
-            return KeyStatus.VALID
-        match = self.directory.lookup(public_key, at_s=time.time())
-        return match.status if match.name == client else KeyStatus.UNKNOWN
+        return read_directory(None if clients_dir is None else loaded.resolve(clients_dir))
 
     async def start(self) -> None:
         self.errors.watch(asyncio.get_running_loop())
@@ -195,7 +182,7 @@ class RelayDaemon:
         self.transforms = TransformObjects(self.hub.objects, parts=self.parts)
         if keys is not None:
             self.zap = ZapHandler(self._ctx)
-            self.zap.add_domain(ZAP_DOMAIN, self._lookup)
+            self.zap.add_domain(ZAP_DOMAIN, self.admission.lookup)
         with blamed_on(self.loaded.path, "relay", "listen"):
             self.server = RelayServer(
                 self._ctx,
@@ -203,7 +190,7 @@ class RelayDaemon:
                 relay.listen,
                 keys,
                 ZAP_DOMAIN,
-                key_status=self._key_status,
+                key_status=self.admission.status,
                 heartbeat_timeout_s=model.link.heartbeat_timeout_s,
                 handshake_interval_s=relay.handshake_interval_s,
                 max_connections=relay.max_connections,
@@ -236,32 +223,10 @@ class RelayDaemon:
         self.notifier.ready(f"{model.name} on {', '.join(relay.listen)}")
         _log.info("relay %s listens on %s", model.name, ", ".join(relay.listen))
 
-    def _lookup(self, public_key: str, _address: str) -> str | Refusal | TemporaryRefusal | None:
-        assert self.directory is not None
-        at_s = time.time()
-        match = self.directory.lookup(public_key, at_s=at_s)
-        if match.name is None or match.key is None:
-            return None
-        if match.status is KeyStatus.VALID:
-            return user_id(match.name, public_key)
-        refusal = TemporaryRefusal if match.status is KeyStatus.NOT_YET else Refusal
-        return refusal(f"the key of {match.name} {match.key.lapse(at_s)}, and {clock_says(at_s)}")
-
-    def _valid_keys(self) -> dict[ClientName, frozenset[str]]:
-        """The keys that hold now, by client."""
-        if self.directory is None:
-            return {}
-        now_s = time.time()
-        return {
-            name: frozenset(key.key for key in self.directory.keys_of(name) if key.status(now_s) is KeyStatus.VALID)
-            for name in self.directory.names
-        }
-
     def _end_lapsed(self) -> None:
         """Cut the connections of every client of which a key was taken away or has expired; one with a key that still
         holds is back at once. Whose those are that have not said anything yet is not known: they go, too."""
-        before, self._valid = self._valid, self._valid_keys()
-        lapsed = [client for client, keys in before.items() if keys - self._valid.get(client, frozenset())]
+        lapsed = self.admission.take_lapsed()
         if not lapsed or self.server is None:
             return
         self.server.cut_unbound()
@@ -330,24 +295,15 @@ class RelayDaemon:
 
     def _status(self) -> str:
         """One line for `systemctl status`."""
-        return self._and_reload(f"{self.clients_up()} clients, {len(self.hub.relayed)} streams")
+        return self.reloads.beside(f"{self.clients_up()} clients, {len(self.hub.relayed)} streams")
 
     def readiness(self) -> Health:
         """What `/readyz` says."""
-        return Health(ok=self._ready, reason=self._and_reload("listening" if self._ready else "starting"))
-
-    def _and_reload(self, state: str) -> str:
-        """A failed reload stays beside the state until a good one; it changes nothing of what the relay does."""
-        return state if self._unreloaded is None else f"{state}; {self._unreloaded}"
+        return Health(ok=self._ready, reason=self.reloads.beside("listening" if self._ready else "starting"))
 
     def clients_up(self) -> int:
         """Clients with a session."""
         return sum(link.established for link in self.hub.links.values())
-
-    @property
-    def reload_failed(self) -> bool:
-        """Whether what the last reload read is not all in force."""
-        return self._unreloaded is not None
 
     def reload(self) -> None:
         """SIGHUP: read keys, access rules and the feed's roles anew; all or nothing. What was revoked ends now."""
@@ -357,14 +313,13 @@ class RelayDaemon:
             directory = self._directory(loaded)
             access = AccessTable(loaded.model.access_rules())
         except ConfigError as error:
-            self.reloads_failed += 1
+            self.reloads.failed(str(error), now=clock.now())
             _log.error("reload failed, the old configuration stays: %s", error)
-            self._not_in_force(f"reload failed, the old configuration stays: {error}")
             self.notifier.ready(self._status())
             return
-        self._unreloaded = None
+        self.reloads.read()
         log_warnings(_log, loaded.warnings)
-        self.directory = directory
+        self.admission.replace(directory)
         now = clock.now()
         self.hub.revoke(access, now=now)
         with self.parts.survive("feed"):
@@ -372,7 +327,7 @@ class RelayDaemon:
         if self.server is not None:
             self.server.cut_unbound()  # admitted by the old keys, and silent so far
         self._end_lapsed()
-        for client in [name for name in self.hub.links if not self._known(name)]:
+        for client in [name for name in self.hub.links if not self.admission.known(name)]:
             _log.warning("%s is in the directory no more; what was held for it is dropped", client)
             self.hub.forget(client, "the name is revoked", now=now)
         self._after()
@@ -381,14 +336,9 @@ class RelayDaemon:
         _log.info("reloaded keys, access rules and feed roles; other changes need a restart")
 
     def _in_force(self, now: float) -> None:
-        if self._unreloaded is None and self._unreloaded_s is not None:
-            failed_s, self._unreloaded_s = now - self._unreloaded_s, None
+        failed_s = self.reloads.take_recovery_s(now=now)
+        if failed_s is not None:
             _log.error("the reload works again: what had failed before is in force, after %.0f s", failed_s)
-
-    def _not_in_force(self, problem: str) -> None:
-        if self._unreloaded_s is None:
-            self._unreloaded_s = clock.now()
-        self._unreloaded = problem
 
     def _make_http(self, listen: str) -> "HttpServer":
         from sern_runtime.http import HttpServer
@@ -427,16 +377,13 @@ class RelayDaemon:
         try:
             self.feed.update(roles, now=now)
         except ConfigError as error:
-            self.reloads_failed += 1
-            self._feed_problem = f"reload failed in part, not all of feed.roles are in force: {error}"
-            self._not_in_force(self._feed_problem)
+            self.reloads.failed_in_part("feed.roles", str(error), now=now)
             _log.error("%s: feed.roles: not all of them are in force: %s", self.loaded.path, error)
 
     def _retry_feed(self, now: float) -> None:
         """What was in use at a reload may be free by now; that it was not has been said and counted."""
         if self.feed is not None and self.feed.feed.missing and self.feed.open_missing():
-            if self._unreloaded == self._feed_problem:  # else a later reload failed
-                self._unreloaded = None
+            self.reloads.part_in_force()
             self._in_force(now)
 
     def topics(self) -> dict[str, object]:

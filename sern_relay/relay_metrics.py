@@ -6,6 +6,7 @@ from typing import Protocol
 from sern_core.bodies.codecs import Coder
 from sern_core.relay.hub import Hub
 from sern_relay.feed import RelayFeed
+from sern_relay.reload_state import ReloadState
 from sern_relay.server import RelayServer
 from sern_relay.transforms import TransformObjects
 from sern_runtime.adaptation import Adaptation
@@ -33,15 +34,11 @@ class Counting(Protocol):
     zap: ZapHandler | None
     feed: RelayFeed | None
     transforms: TransformObjects | None
-    reloads_failed: int
+    reloads: ReloadState
 
     @property
     def refusals(self) -> Mapping[str, int]:
         """Refusals by code."""
-
-    @property
-    def reload_failed(self) -> bool:
-        """Whether what the last reload read is not all in force."""
 
     def clients_up(self) -> int:
         """Clients with a session."""
@@ -84,9 +81,9 @@ def register_relay(metrics: Metrics, relay: Counting) -> None:
     metrics.counter("sern_feed_messages_total", "Messages of the plain feed, by role and what became of them.",
                     ("role", "result"), lambda: _fed(relay.feed))  # fmt: skip
     metrics.gauge("sern_relay_reload_failed", "1 while what the last reload read is not all in force.",
-                  read=lambda: [((), float(relay.reload_failed))])  # fmt: skip
+                  read=lambda: [((), float(relay.reloads.failing))])  # fmt: skip
     metrics.counter("sern_relay_reload_failures_total", "Reloads that kept the old configuration.",
-                    read=lambda: [((), float(relay.reloads_failed))])  # fmt: skip
+                    read=lambda: [((), float(relay.reloads.failures))])  # fmt: skip
 
 
 def _auth(zap: ZapHandler | None) -> list[tuple[tuple[str, ...], float]]:

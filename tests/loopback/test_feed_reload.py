@@ -172,7 +172,7 @@ async def test_an_endpoint_that_is_in_use_is_taken_when_it_is_free(
         await comes(programs.subscriber(b""), FRAME)
         assert set(relay.feed.feed.endpoints()) == {"viewer", "other"}
         assert "in force" not in relay._status()
-        assert relay.reloads_failed == 1
+        assert relay.reloads.failures == 1
         assert caplog.text.count("not all of them are in force") == 1
         assert caplog.text.count("what had failed before is in force") == 1
         await lab.end(robot)

@@ -191,7 +191,7 @@ async def test_a_reload_that_fails_twice_says_what_is_wrong_now_until_one_works(
         for number, bad in enumerate((good.replace('"access"', '"acces"'), good.replace('"clients"', '"nobody"')), 1):
             relay.loaded.path.write_text(bad)
             relay.reload()
-            assert relay.reloads_failed == number
+            assert relay.reloads.failures == number
         assert relay._status().endswith(f"relay.clients_dir: {tmp_path}/nobody: no such directory")
         assert "acces:" not in relay._status()
         assert "\nsern_relay_reload_failed 1.0\n" in (await get(relay, "/metrics"))[1]

@@ -502,14 +502,14 @@ async def test_a_bad_file_at_reload_keeps_the_old_rules(tmp_path: Path, caplog: 
         world.relay.reload()
         config.write_text(good.replace(json.dumps(ALLOW_ALL[0]["client"]), '"*"'))
         world.relay.reload()
-        assert world.relay.reloads_failed == 2
+        assert world.relay.reloads.failures == 2
         told = [m for m in caplog.messages if m.startswith("reload failed, the old configuration stays: ")]
         assert len(told) == 2
         assert all(str(config) in message for message in told)
         config.write_text(good)
         (world.lab.clients_dir / "robot2.pub").write_text("nonsense")
         world.relay.reload()
-        assert world.relay.reloads_failed == 3
+        assert world.relay.reloads.failures == 3
         await world.go_on()
 
 

@@ -128,7 +128,7 @@ async def test_refusals_are_counted_by_known_codes_and_metrics_read_them(tmp_pat
     register_relay(Metrics(registry), daemon)
     for code in ("forbidden", "forbidden", "made_up"):
         daemon.refused(ClientName("robot1"), code, "no")
-    daemon.reloads_failed = 1
+    daemon.reloads.failures = 1
     text = generate_latest(registry).decode()
     for line in (
         'sern_relay_refusals_total{code="forbidden"} 2.0',
@@ -150,15 +150,15 @@ async def test_a_reload_that_fails_keeps_the_old_file_and_is_shown(
     await daemon.start()
     good = daemon.loaded.path.read_text()
     daemon.loaded.path.write_text(good.replace('"clients"', '"nobody"'))
-    directory = daemon.directory
+    directory = daemon.admission.directory
     daemon.reload()
-    failed = [daemon.reload_failed]
-    assert daemon.reloads_failed == 1 and daemon.directory is directory
+    failed = [daemon.reloads.failing]
+    assert daemon.reloads.failures == 1 and daemon.admission.directory is directory
     ready = daemon.readiness()
     assert ready.ok and "reload failed, the old configuration stays" in ready.reason
     daemon.loaded.path.write_text(good)
     daemon.reload()
-    failed.append(daemon.reload_failed)
+    failed.append(daemon.reloads.failing)
     assert failed == [True, False] and daemon.readiness() == (True, "listening")
     assert "the reload works again" in caplog.text
     await daemon.stop()

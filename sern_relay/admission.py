@@ -1,0 +1,69 @@
+"""Who may come in: the relay's directory of client keys, as it holds now.
+
+Without a directory (`insecure: true`) everybody may.
+"""
+
+import time
+from pathlib import Path
+from typing import Final
+
+from sern_core.vocabulary.types import ClientName
+from sern_runtime.config.keys import KeyDirectory, KeyStatus, clock_says, user_id
+from sern_runtime.zap import Refusal, TemporaryRefusal
+
+ZAP_DOMAIN: Final = "sern"
+
+
+class Admission:
+    """Answers for names, keys and connections by one directory; `replace` puts another in force."""
+
+    def __init__(self, directory: KeyDirectory | None) -> None:
+        self.directory = directory
+        self._valid = self._valid_keys()
+
+    def replace(self, directory: KeyDirectory | None) -> None:
+        """Put `directory` in force. What it takes away is told by the next `take_lapsed`."""
+        self.directory = directory
+
+    def known(self, client: ClientName) -> bool:
+        """Whether the name is in the directory."""
+        return self.directory is None or client in self.directory.names
+
+    def status(self, client: ClientName, public_key: str) -> KeyStatus:
+        """Whether what comes over a connection that was made with this key is taken: if it is VALID."""
+        if self.directory is None:
+            return KeyStatus.VALID
+        match = self.directory.lookup(public_key, at_s=time.time())
+        return match.status if match.name == client else KeyStatus.UNKNOWN
+
+    def lookup(self, public_key: str, _address: str) -> str | Refusal | TemporaryRefusal | None:
+        """The user id for ZAP of who holds the key, a refusal with its reason, or None for a stranger."""
+        assert self.directory is not None
+        at_s = time.time()
+        match = self.directory.lookup(public_key, at_s=at_s)
+        if match.name is None or match.key is None:
+            return None
+        if match.status is KeyStatus.VALID:
+            return user_id(match.name, public_key)
+        refusal = TemporaryRefusal if match.status is KeyStatus.NOT_YET else Refusal
+        return refusal(f"the key of {match.name} {match.key.lapse(at_s)}, and {clock_says(at_s)}")
+
+    def take_lapsed(self) -> list[ClientName]:
+        """The clients of which a key was taken away or has expired since this was last asked."""
+        before, self._valid = self._valid, self._valid_keys()
+        return [client for client, keys in before.items() if keys - self._valid.get(client, frozenset())]
+
+    def _valid_keys(self) -> dict[ClientName, frozenset[str]]:
+        """The keys that hold now, by client."""
+        if self.directory is None:
+            return {}
+        now_s = time.time()
+        return {
+            name: frozenset(key.key for key in self.directory.keys_of(name) if key.status(now_s) is KeyStatus.VALID)
+            for name in self.directory.names
+        }
+
+
+def read_directory(path: Path | None) -> KeyDirectory | None:
+    """The keys in the folder; None where there is none. Raises ConfigError that names the file at fault."""
+    return None if path is None else KeyDirectory(path)
