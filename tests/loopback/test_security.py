@@ -19,7 +19,7 @@ from typing import Any
 import pytest
 import zmq
 
-import sern_relay.daemon
+import sern_relay.admission
 from sern_client.daemon import ClientDaemon
 from sern_core.vocabulary.types import ClientName, TopicName
 from sern_core.wire import framing
@@ -483,7 +483,7 @@ async def test_a_silent_connection_does_not_outlive_its_key(
             relay._end_lapsed()
             assert zmq.Event.DISCONNECTED not in (*silent.events, *loud.events)
             wall = SimpleNamespace(time=lambda: end_s + 1.0, time_ns=time.time_ns)
-            monkeypatch.setattr(sern_relay.daemon, "time", wall)
+            monkeypatch.setattr(sern_relay.admission, "time", wall)
             table = relay.server.connections._connections
             assert len(table) == 2 and not any(connection.ended for connection in table.values())
             relay._end_lapsed()

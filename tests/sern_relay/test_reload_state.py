@@ -5,16 +5,19 @@ from sern_relay.reload_state import ReloadState
 
 def test_a_failure_stays_until_a_file_is_read_and_tells_once_how_long_it_lasted() -> None:
     state = ReloadState()
-    assert not state.failing and state.beside("listening") == "listening"
+    failing = [state.failing]
+    assert state.beside("listening") == "listening"
     state.failed("relay.yaml:3: no such key", now=10.0)
     state.failed("relay.yaml:4: no such key", now=12.0)
-    assert state.failing and state.failures == 2
+    failing.append(state.failing)
+    assert state.failures == 2
     assert state.beside("listening") == (
         "listening; reload failed, the old configuration stays: relay.yaml:4: no such key"
     )
     assert state.take_recovery_s(now=13.0) is None
     state.read()
-    assert not state.failing and state.take_recovery_s(now=15.0) == 5.0
+    failing.append(state.failing)
+    assert failing == [False, True, False] and state.take_recovery_s(now=15.0) == 5.0
     assert state.take_recovery_s(now=16.0) is None
     assert state.failures == 2
 
