@@ -1,16 +1,18 @@
 """Waiting by polling a condition, and what an endpoint announces, for tests with real sockets."""
 
 import asyncio
+import subprocess
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from sern_client.endpoints.base import ServiceInfo
 from sern_core.vocabulary.message import TopicInfo
 from sern_core.vocabulary.types import TopicName
 
-DEADLINE_S: Final = 60.0
+DEADLINE_S: Final = 240.0
 """Long enough for a machine that is busy with much else; reached only when something is broken."""
 _POLL_S: Final = 0.002
 _STEP_S: Final = 0.5
@@ -39,6 +41,19 @@ async def until(condition: Callable[[], object], what: str = "", *, deadline_s: 
         if patience.over():
             raise AssertionError(f"not within {deadline_s:g} s: {what or condition}")
         await asyncio.sleep(_POLL_S)
+
+
+@contextmanager
+def child(command: Sequence[str], **options: Any) -> Iterator["subprocess.Popen[Any]"]:
+    """A process that is killed at the end of the block, so that a test that fails there does not wait for it for ever.
+
+    `options` are those of `subprocess.Popen`.
+    """
+    with subprocess.Popen(command, **options) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
 
 
 def ended(pid: int) -> bool:

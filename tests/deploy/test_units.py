@@ -10,6 +10,8 @@ from typing import Final
 
 import pytest
 
+from tests.support import child
+
 UNITS: Final = Path(__file__).resolve().parents[2] / "deploy" / "systemd"
 NAMES: Final = ("sern-relay.service", "sern-client.service", "sern-client@.service")
 ONCE: Final = {
@@ -82,7 +84,7 @@ def test_libzmq_is_not_locked_out(name: str) -> None:
 def test_reload_is_for_the_relay_and_needs_no_program_but_the_shell() -> None:
     command = shlex.split(values("sern-relay.service", "ExecReload")[0])
     assert command[:2] == ["/bin/sh", "-c"]
-    with subprocess.Popen(["/bin/cat"], stdin=subprocess.PIPE) as daemon:
+    with child(["/bin/cat"], stdin=subprocess.PIPE) as daemon:
         # As systemd runs it, with nothing to be found on the path.
         environment = {"MAINPID": str(daemon.pid), "PATH": "/nowhere"}
         assert subprocess.run(command, env=environment, timeout=60, check=False).returncode == 0

@@ -17,6 +17,7 @@ from sern_tools.lab.control import Control, ask
 from sern_tools.lab.lab import Lab
 from sern_tools.lab.removal import labs
 from tests.lab.traffic import datagrams
+from tests.support import child
 
 COMMAND = [sys.executable, "-P", "-m", "sern_tools.lab.cli"]
 
@@ -108,7 +109,7 @@ def test_two_commands() -> None:
 @pytest.mark.lab_long
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_up_until_a_signal(possible: None, number: int) -> None:
-    with subprocess.Popen([*COMMAND, "up", "--profile", "flap"], stdout=subprocess.PIPE, text=True) as process:
+    with child([*COMMAND, "up", "--profile", "flap"], stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         words = [process.stdout.readline() for _ in range(10)]
         assert str(process.pid) in words[0]
@@ -122,6 +123,6 @@ def test_up_until_a_signal(possible: None, number: int) -> None:
 @pytest.mark.lab_long
 def test_run_two_commands(possible: None) -> None:
     words = ["run", "wifi", "--", "sh", "-c", "exit 7", "--", "sleep", "1000"]
-    with subprocess.Popen([*COMMAND, *words]) as process:
+    with child([*COMMAND, *words]) as process:
         assert process.wait() == 7
     assert str(process.pid) not in labs()

@@ -15,7 +15,7 @@ import uvloop
 
 from sern_runtime import clock
 from sern_runtime.loop import OPEN_FILES, BlockDetector, Shutdown, Timer, raise_open_files, run
-from tests.support import DEADLINE_S, Patience, until
+from tests.support import DEADLINE_S, Patience, child, until
 
 
 class FakeHandle:
@@ -214,7 +214,7 @@ raise SystemExit(run(main))
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_the_second_signal_ends_a_stuck_drain(number: signal.Signals) -> None:
-    with subprocess.Popen([sys.executable, "-c", PROGRAM], stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+    with child([sys.executable, "-c", PROGRAM], stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
         assert process.stdout is not None
         assert process.stdout.readline() == b"started\n"
         process.send_signal(number)

@@ -42,7 +42,7 @@ from sern_tools.echo import (
 from sern_tools.echo_text import Decoder, hex_text, scalar, text_of
 from sern_tools.ports import free_ports
 from tests.daemons import Lab, write_bag
-from tests.support import DEADLINE_S, until
+from tests.support import DEADLINE_S, child, until
 
 TEXT = "std_msgs/msg/String"
 ROS1 = Encoding.ROS1
@@ -498,9 +498,7 @@ async def test_ctrl_c_and_a_closed_pipe_are_quiet(tmp_path: Path) -> None:
             "0",
         ]
         for closes in (False, True):
-            with subprocess.Popen(  # noqa: ASYNC220  (a moment, and the loop has nothing else to do)
-                command, stdout=subprocess.PIPE, stderr=subprocess.PIPE
-            ) as process:
+            with child(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
                 assert process.stdout is not None
                 assert process.stderr is not None
                 os.set_blocking(process.stdout.fileno(), False)
