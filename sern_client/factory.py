@@ -1,6 +1,7 @@
 """Makes a client's endpoint, and what publishes the state of its link, from its file."""
 
-from collections.abc import Callable
+import os
+from collections.abc import Callable, Sequence
 from typing import Final
 
 from sern_client.endpoints.base import Endpoint, Publisher
@@ -16,8 +17,30 @@ from sern_runtime.config.load import Loaded
 
 def make_endpoint(loaded: Loaded[ClientFile]) -> Endpoint:
     """The endpoint of a client: the one its file names, or several as one. Raises ConfigError."""
-    made = [make_section(section, loaded.resolve) for section in named_sections(loaded.model)]
-    return made[0] if len(made) == 1 else CompositeEndpoint(made)
+    named = named_sections(loaded.model)
+    made = [make_section(section, loaded.resolve) for section in named]
+    if len(made) == 1:
+        return made[0]
+    elsewhere = services_elsewhere(named)
+    return CompositeEndpoint(made, no_services_of=[made[index] for index in elsewhere])
+
+
+def services_elsewhere(named: Sequence[sections.EndpointSection]) -> list[int]:
+    """The `dds` endpoints, by index, whose domain's services another section is there for. With both a call would be
+    answered twice."""
+    served = {
+        _domain(section) for section in named if isinstance(section, sections.RclpyEndpoint) and section.services_only
+    }
+    return [
+        index
+        for index, section in enumerate(named)
+        if isinstance(section, sections.DdsEndpoint) and _domain(section) in served
+    ]
+
+
+def _domain(section: sections.DdsEndpoint | sections.RclpyEndpoint) -> str:
+    number = os.environ.get("ROS_DOMAIN_ID") or "0"
+    return number if section.domain is None else str(section.domain)
 
 
 ROS_SECTIONS: Final = (

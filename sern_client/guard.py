@@ -84,7 +84,7 @@ class Guard:
         joins = [
             section.model_copy(update={"node_name": f"{section.node_name}{GUARD_SUFFIX}"})
             for section in named_sections(model)
-            if isinstance(section, DrivesRobots)
+            if isinstance(section, DrivesRobots) and not _services_only(section)
         ]
         return cls(joins, loaded.path.parent.resolve(), model.log) if joins else None
 
@@ -239,6 +239,11 @@ def _answer(line: bytes) -> dict[str, object] | None:
     except (ValueError, RecursionError):
         return None
     return said if isinstance(said, dict) and not ANSWERS.isdisjoint(said) else None
+
+
+def _services_only(section: DrivesRobots) -> bool:
+    """Whether it publishes nothing, and so no command that could be stopped."""
+    return isinstance(section, sections.RclpyEndpoint) and section.services_only
 
 
 def _opening(key: int, topic: _Topic) -> dict[str, object]:

@@ -9,7 +9,7 @@ Of an action `pkg/action/Name` ROS 2 makes messages (`Name_Goal`, `Name_Result`,
 """
 
 import re
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Final
 
@@ -35,10 +35,13 @@ _KNOWN_ACTIONS: Final = {
 
 
 class TypeFiles:
-    """Definition texts by type name. The directories are searched once, when the first type is asked for."""
+    """Definition texts by type name. The directories are searched once, when the first type is asked for.
 
-    def __init__(self, paths: Iterable[Path] = ()) -> None:
+    `share`: where an installation has the files of a package (`msg/`, `srv/`, `action/` in it), for what they lack."""
+
+    def __init__(self, paths: Iterable[Path] = (), share: Callable[[str], Path | None] | None = None) -> None:
         self._paths = tuple(paths)
+        self._share = share
         self._files: dict[str, Path] | None = None
 
     def message(self, type_name: str, encoding: Encoding = Encoding.CDR) -> str | None:
@@ -89,13 +92,19 @@ class TypeFiles:
                 for kind in _KINDS:
                     for file in sorted(root.rglob(f"{kind}/*.{kind}")):
                         self._files.setdefault(f"{file.parent.parent.name}/{kind}/{file.stem}", file)
-        path = self._files.get(name)
+        path = self._files.get(name) or self._shared(name)
         if path is None:
             return None
         try:
             return path.read_text(encoding="utf-8")
         except (OSError, UnicodeDecodeError) as error:
             raise ConfigError(f"{path}: cannot be read ({ros_types.one_line(error)})") from None
+
+    def _shared(self, name: str) -> Path | None:
+        package, kind, base = name.split("/")
+        share = None if self._share is None else self._share(package)
+        path = None if share is None else share / kind / f"{base}.{kind}"
+        return path if path is not None and path.is_file() else None
 
     def _below(self, name: str, texts: list[str], encoding: Encoding) -> str:
         """Every type that the texts use, each once, as sections of a definition."""

@@ -139,14 +139,16 @@ class CompositeEndpoint:
     """An `Endpoint` made of others, which it starts and stops.
 
     A topic that several members give is announced once, as the first of them describes it, and removed with the last;
-    a member that gives it with another type or encoding is left out of it, with a warning.
+    a member that gives it with another type or encoding is left out of it, with a warning. `no_services_of`: members
+    that have topics only, since the services of their nodes are another member's.
     """
 
-    def __init__(self, endpoints: Sequence[Endpoint]) -> None:
+    def __init__(self, endpoints: Sequence[Endpoint], *, no_services_of: Sequence[Endpoint] = ()) -> None:
         if not endpoints:
             raise UsageError("a composite endpoint needs at least one member")
         self.converter = Converter()
         self._members = list(endpoints)
+        self._topics_only = list(no_services_of)
         self._events: TopicEvents | None = None
         self._started: list[Endpoint] = []
         self._providers: dict[TopicName, dict[int, TopicInfo]] = {}  # members in the order they announced
@@ -312,7 +314,9 @@ class CompositeEndpoint:
         return bool(self._service_members())
 
     def _service_members(self) -> list[ServiceEndpoint]:
-        return [member for member in self._members if isinstance(member, ServiceEndpoint)]
+        """Compared by identity: endpoints are none but themselves."""
+        with_services = [member for member in self._members if isinstance(member, ServiceEndpoint)]
+        return [each for each in with_services if not any(each is one for one in self._topics_only)]
 
     # For the parts of this module
 

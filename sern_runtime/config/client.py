@@ -51,7 +51,7 @@ from sern_runtime.config.base import (
     place,
     socket_problems,
 )
-from sern_runtime.config.endpoints import EndpointSection
+from sern_runtime.config.endpoints import EndpointSection, RclpyEndpoint
 from sern_runtime.config.link_state import LinkStateSection
 from sern_runtime.config.load import Loaded, load
 from sern_runtime.config.shared import (
@@ -521,7 +521,7 @@ class ClientFile(FileModel):
         several = isinstance(self.endpoint, tuple)
         for index, endpoint in enumerate(self.endpoints):
             yield from endpoint.file_problems(base_dir, ("endpoint", index) if several else ("endpoint",))
-        yield from self._action_problems()
+        yield from self._services_only_problems()
         yield from self._pattern_problems()
         for index, section in enumerate(self.topics):
             if section.commands:
@@ -532,15 +532,12 @@ class ClientFile(FileModel):
         yield from output_problems(base_dir, self.message_log, ("message_log",))
         yield from output_problems(base_dir, self.summary, ("summary",))
 
-    def _action_problems(self) -> Iterator[FileProblem]:
-        """A warning of actions where no endpoint has their goals."""
-        kinds = {endpoint.kind for endpoint in self.endpoints}
-        if self.actions != ActionsSection() and "rclpy" in kinds and not kinds & {"ros1", "dds", "zenoh"}:
-            problem = (
-                "an endpoint of kind rclpy has topics only, and goals of ROS 2 are services: none gets through; use "
-                "kind dds or zenoh"
-            )
-            yield FileProblem(("actions",), problem, warning=True)
+    def _services_only_problems(self) -> Iterator[FileProblem]:
+        """A warning of endpoints that leave topics to others, where there are none."""
+        others = [each for each in self.endpoints if not (isinstance(each, RclpyEndpoint) and each.services_only)]
+        if not others:
+            problem = "services_only leaves topics to another endpoint, such as one of kind dds, and there is none"
+            yield FileProblem(("endpoint",), problem, warning=True)
 
     def _pattern_problems(self) -> Iterator[FileProblem]:
         """Warnings of patterns that match no name."""

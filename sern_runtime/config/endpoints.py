@@ -14,6 +14,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Discriminator, Field, Tag
 
+from sern_runtime import ros_installation
 from sern_runtime.config.base import (
     Bytes,
     Count,
@@ -322,7 +323,8 @@ class DdsEndpoint(EndpointBase):
 
 
 class RclpyEndpoint(EndpointBase):
-    """ROS 2 through rclpy, where an installation is sourced; topics only. Kinds `dds` and `zenoh` need none."""
+    """ROS 2 through rclpy, where an installation is sourced, whatever its middleware is; services and actions too. Runs
+    with the Python of that installation (docs/ros2.md). Kinds `dds` and `zenoh` need none."""
 
     kind: Literal["rclpy"]
     """ROS 2 through a sourced installation."""
@@ -331,12 +333,21 @@ class RclpyEndpoint(EndpointBase):
     domain: Annotated[int, Field(ge=0, le=232)] | None = None
     """ROS_DOMAIN_ID of the nodes; null: the environment's."""
     poll_hz: Annotated[float, Field(ge=0.5, le=20)] = 4.0
-    """How often the graph is asked what there is: new topics are found within one period."""
+    """How often the graph is asked what there is: new topics and services are found within one period."""
+    services_only: bool = False
+    """Only services and actions are taken and served here, and those of endpoints of kind `dds` for the same nodes are
+    not: `[{kind: dds}, {kind: rclpy, services_only: true}]` has topics at the price of `dds`, and services of any
+    middleware."""
     type_paths: tuple[PathText, ...] = ()
-    """Directories with .msg files of types beyond those of a ROS 2 install (searched at any depth)."""
+    """Directories with .msg, .srv and .action files in place of those of the installation (searched at any depth)."""
+    max_buffer_bytes: Bytes = 64 * 2**20
+    """Bytes that may wait for the link, of all topics together."""
+    accept_bridged: bool = False
+    """Take what other SERN endpoints publish and serve in this domain for this site's own. For a chain of two links
+    with the domain in the middle; with two of them side by side it makes a loop."""
 
     def file_problems(self, base_dir: Path, loc: Loc) -> Iterator[FileProblem]:
-        yield from missing_package("rclpy", "source the setup file of a ROS 2 installation", loc)
+        yield from missing_package("rclpy", ros_installation.remedy(), loc)
         yield from missing_directories(base_dir, self.type_paths, (*loc, "type_paths"))
 
 

@@ -1,4 +1,4 @@
-# The part of rclpy (ROS 2 Jazzy) that sern_client/endpoints/rclpy.py uses, for the type checker.
+# The part of rclpy (ROS 2 Jazzy) that sern_client/endpoints/rclpy uses, for the type checker.
 from collections.abc import Sequence
 
 from rclpy.context import Context

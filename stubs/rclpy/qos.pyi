@@ -1,5 +1,7 @@
 from enum import Enum
 
+from rclpy.duration import Duration
+
 class HistoryPolicy(Enum):
     KEEP_LAST = ...
     KEEP_ALL = ...
@@ -17,6 +19,8 @@ class QoSProfile:
     depth: int
     reliability: ReliabilityPolicy
     durability: DurabilityPolicy
+    lifespan: Duration
+    deadline: Duration
     def __init__(
         self,
         *,

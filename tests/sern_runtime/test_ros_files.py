@@ -123,3 +123,19 @@ def test_a_file_that_cannot_be_read(share: Path) -> None:
     (share / "my_msgs/msg/Part.msg").write_bytes(b"\xff\xfe")
     with pytest.raises(ConfigError, match=r"Part.msg: cannot be read"):
         TypeFiles([share]).message("my_msgs/msg/Part")
+
+
+def test_what_the_paths_lack_comes_from_an_installation(share: Path, tmp_path: Path) -> None:
+    installed = tmp_path / "installed" / "robot_msgs"
+    (installed / "msg").mkdir(parents=True)
+    (installed / "msg" / "Arm.msg").write_text("my_msgs/Part part\n")
+    asked: list[str] = []
+
+    def of(package: str) -> Path | None:
+        asked.append(package)
+        return installed if package == "robot_msgs" else None
+
+    files = TypeFiles([share], of)
+    text = files.message("robot_msgs/msg/Arm")
+    assert text is not None and text.startswith("my_msgs/Part part\n") and "MSG: other_msgs/Leaf" in text
+    assert files.message("robot_msgs/msg/Leg") is None and "my_msgs" not in asked

@@ -13,6 +13,7 @@ from rich.console import Console
 from typer.testing import CliRunner
 
 from sern_client.relay_name import UnresolvedError, resolve
+from sern_runtime import ros_installation
 from sern_runtime.config import endpoints
 from sern_tools import check
 from sern_tools.keygen import run_keygen
@@ -265,7 +266,7 @@ ENDPOINT = "endpoint: {kind: synthetic, role: robot}\n"
         (
             "endpoint: {kind: rclpy}\n",
             "3: endpoint.kind: needs the Python package rclpy, which is not on this machine: "
-            "source the setup file of a ROS 2 installation",
+            f"{ros_installation.remedy()}",
         ),
     ],
 )
@@ -280,27 +281,24 @@ def test_what_is_accepted_and_does_not_do_what_it_seems(
 
 
 @pytest.mark.parametrize(
-    ("endpoint", "key", "said"),
+    ("endpoint", "said"),
     [
-        ("{kind: rclpy}", "actions", True),
-        ("[{kind: rclpy}, {kind: record, path: made/}]", "actions", True),
-        ("[{kind: rclpy}, {kind: ros1}]", "actions", False),
-        ("[{kind: rclpy}, {kind: dds}]", "actions", False),
-        ("{kind: record, path: made/}", "actions", False),
-        ("{kind: rclpy}", "subscribe", False),
+        ("{kind: rclpy, services_only: true}", True),
+        ("[{kind: rclpy, services_only: true}, {kind: rclpy, domain: 1, services_only: true}]", True),
+        ("[{kind: dds}, {kind: rclpy, services_only: true}]", False),
+        ("{kind: rclpy}", False),
     ],
 )
-def test_goals_that_reach_no_action_of_ros_2_are_a_warning(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, endpoint: str, key: str, said: bool
+def test_topics_that_nobody_takes_are_a_warning(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, endpoint: str, said: bool
 ) -> None:
     monkeypatch.setattr(endpoints, "installed", lambda _package: True)
     path = tmp_path / "f.yaml"
-    more = {"actions": "actions: {use: [{match: /r/go}]}\n", "subscribe": "subscribe: [/r/go]\n"}[key]
-    path.write_text(f"{HERE}endpoint: {endpoint}\n{more}", encoding="utf-8")
+    path.write_text(f"{HERE}endpoint: {endpoint}\n", encoding="utf-8")
     code, _, err = ran(path)
     problem = (
-        f"warning: {path}:4: actions: an endpoint of kind rclpy has topics only, and goals of ROS 2 are services: none "
-        "gets through; use kind dds or zenoh\n"
+        f"warning: {path}:3: endpoint: services_only leaves topics to another endpoint, such as one of kind dds, and "
+        "there is none\n"
     )
     assert (code, err) == (0, problem if said else "")
 

@@ -7,7 +7,7 @@ from typing import Final, Protocol
 from uuid import UUID
 
 from sern_client.endpoints.dds.graph import Participant, Remote
-from sern_client.endpoints.dds.names import SERN_KEY, read_user_data
+from sern_client.endpoints.dds.names import SERN_ENCLAVE, SERN_KEY, read_user_data
 from sern_client.endpoints.dds.qos import read_qos
 from sern_client.endpoints.dds.raw import Change
 
@@ -88,7 +88,8 @@ class Discovery:
         if said is None:
             self.found.append(partial(self._events.participant_removed, change.guid))
             return
-        sern = read_user_data(said.user_data).get(SERN_KEY, "")
+        told = read_user_data(said.user_data)
+        sern = told.get(SERN_KEY, "") or ("sern" if told.get("enclave") == SERN_ENCLAVE else "")
         self.found.append(partial(self._events.participant_added, Participant(change.guid, said.name, sern)))
 
     def _endpoint(self, change: Change, *, writer: bool) -> None:

@@ -20,7 +20,7 @@ from sern_client.endpoints.dds.counters import DdsCounters
 from sern_client.endpoints.dds.domain import DomainOptions, close_domain, open_domain
 from sern_client.endpoints.dds.graph import Graph, Local
 from sern_client.endpoints.dds.idl import TypeMaker
-from sern_client.endpoints.dds.names import DISCOVERY_TOPIC, SERN_KEY, user_data
+from sern_client.endpoints.dds.names import DISCOVERY_TOPIC, SERN_ENCLAVE, SERN_KEY, user_data
 from sern_client.endpoints.dds.qos import EndpointQos, to_policies
 from sern_client.endpoints.dds.raw import INFINITE_NS
 from sern_client.endpoints.dds.worker import Inbox, Sample, Worker
@@ -139,7 +139,7 @@ class Entities:
         domain = self._domain.domain
         open_domain(self._domain)
         try:
-            said = user_data(enclave="/", **{SERN_KEY: self._node_name})
+            said = user_data(enclave=SERN_ENCLAVE, **{SERN_KEY: self._node_name})
             participant = DomainParticipant(domain, Qos(Policy.EntityName(self._node_name), Policy.Userdata(said)))
         except DDSException as error:
             close_domain(domain)

@@ -15,14 +15,16 @@ from sern_core.vocabulary.errors import WireError
 from sern_core.vocabulary.names import name_problem
 from sern_core.vocabulary.types import TopicName
 
-__all__ = ["DISCOVERY_TOPIC", "SERN_KEY", "Role", "RosName", "cut", "from_dds", "read_user_data", "to_dds"]
-__all__ += ["type_from_dds", "type_to_dds", "user_data"]
+__all__ = ["DISCOVERY_TOPIC", "SERN_ENCLAVE", "SERN_KEY", "Role", "RosName", "cut", "from_dds", "read_user_data"]
+__all__ += ["to_dds", "type_from_dds", "type_to_dds", "user_data"]
 
 DISCOVERY_TOPIC: Final = "ros_discovery_info"
 """Which nodes a participant has: rmw_dds_common/msg/ParticipantEntitiesInfo."""
 SERN_KEY: Final = "sern"
 """This key stands in the USER_DATA of our participants: other SERN endpoints know by it what came over a link
 already."""
+SERN_ENCLAVE: Final = "/sern"
+"""The enclave of our nodes, which stands there too: endpoints of kind `rclpy` can say and see no more than that."""
 
 
 class Role(StrEnum):

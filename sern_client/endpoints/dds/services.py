@@ -201,10 +201,12 @@ class DdsServices:
     def _understood(self, name: TopicName, remote: Remote) -> bool:
         if puts_header(remote):
             return True
-        self._say_once(
-            f"service {name}: {self._entities.graph.owner(remote)} uses rmw_fastrtps, whose calls Cyclone DDS cannot "
-            "carry; run that node with RMW_IMPLEMENTATION=rmw_cyclonedds_cpp to have its services bridged"
-        )
+        if self._events is not None:  # else they are not ours: an endpoint of kind rclpy has them
+            self._say_once(
+                f"service {name}: {self._entities.graph.owner(remote)} uses rmw_fastrtps, whose calls Cyclone DDS "
+                "cannot carry; an endpoint of kind rclpy beside this one (services_only) bridges them, or run "
+                "that node with RMW_IMPLEMENTATION=rmw_cyclonedds_cpp"
+            )
         return False
 
     # Client

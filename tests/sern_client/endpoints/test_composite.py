@@ -28,6 +28,7 @@ from sern_core.vocabulary.message import TopicInfo
 from sern_core.vocabulary.types import DropReason, Encoding, TopicName
 from sern_runtime.ros_types import topic_info
 from tests.fake_services import Services
+from tests.support import Events as SeenServices
 
 Make = Callable[..., Path]
 Until = Callable[[Callable[[], bool]], Awaitable[None]]
@@ -308,6 +309,24 @@ async def test_a_member_that_fails_keeps_no_message_from_the_others() -> None:
     with pytest.raises(OSError, match="no way"):
         publisher.close()
     assert composite.validate(Held()) == []
+
+
+async def test_a_member_whose_services_are_anothers_has_topics_only() -> None:
+    topics, both = Services(), Services()
+    composite = CompositeEndpoint([topics, both], no_services_of=[topics])
+    heard = SeenServices()
+    composite.watch_services(heard)
+    assert topics.events is None and both.events is not None
+
+    async def handler(request: bytes) -> bytes:
+        return request
+
+    mode = ServiceInfo(TopicName("/mode"), "std_srvs/srv/Trigger", Encoding.ROS1, "")
+    composite.serve(mode, handler)
+    assert (list(topics.served), list(both.served)) == ([], [mode.name]), "a call is answered once"
+    both.events.service_added(mode)
+    assert list(heard.services) == [mode.name]
+    assert not CompositeEndpoint([topics], no_services_of=[topics]).has_services
 
 
 def test_services_need_a_member_that_knows_them() -> None:

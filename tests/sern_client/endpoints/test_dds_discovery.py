@@ -265,8 +265,11 @@ async def test_a_participant_changes_what_it_says_of_itself() -> None:
         other = DomainParticipant(options.domain, Qos(Policy.Userdata(b"enclave=/;")))
         writer = DataWriter(Publisher(other), Topic(other, "rt/chat", string_type()), Qos(Policy.Userdata(b"a")))
         await until(lambda: list(heard.infos) == ["/chat"])
-        other.set_qos(Qos(Policy.Userdata(b"sern=other;")))
-        await until(lambda: heard.infos == {} and len(endpoint.graph.ignored) == 1)
+        for sern in (b"sern=other;", b"enclave=/sern;"):  # an endpoint of kind dds, one of kind rclpy
+            other.set_qos(Qos(Policy.Userdata(sern)))
+            await until(lambda: heard.infos == {} and len(endpoint.graph.ignored) == 1)
+            other.set_qos(Qos(Policy.Userdata(b"enclave=/;")))
+            await until(lambda: list(heard.infos) == ["/chat"] and not endpoint.graph.ignored)
         other.set_qos(Qos(Policy.Userdata(b"enclave=/;")))
         await until(lambda: list(heard.infos) == ["/chat"] and not endpoint.graph.ignored)
         writer.set_qos(Qos(Policy.Userdata(b"typehash=RIHS01_0;")))

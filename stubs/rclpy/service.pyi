@@ -1,0 +1,5 @@
+from collections.abc import Callable
+from typing import Any
+
+class Service:
+    send_response: Callable[[Any, Any], None]
