@@ -36,7 +36,36 @@ IN_README: Final[Mapping[str, Mapping[str, tuple[str, ...]]]] = {
     "endpoints": {"ros1 1 kHz + 20 MB/s": ("odom_p50_ms", "cloud_p50_ms", "cpu_percent")},
     "demo": {"control": ("delivered_messages", "latency_p50_s", "latency_p99_s")},
 }
-"""Cases and metrics that README.md shows. What the demo writes has the shape of a benchmark."""
+"""Cases and metrics that README.md shows, one table a benchmark. What the demo writes has the shape of a benchmark."""
+README_TITLES: Final = {
+    "pose_p50_ms": "a pose takes, ms",
+    "pose_p99_ms": "one in a hundred takes over, ms",
+    "poses_percent": "poses that arrive, %",
+    "goodput_Mbps": "all that arrives, Mbit/s",
+    "fresh_s": "blackout of 10 s: a fresh pose after, s",
+    "odom_p50_ms": "odometry takes, ms",
+    "cloud_p50_ms": "a cloud takes, ms",
+    "cpu_percent": "CPU, % of a core",
+    "latency_p50_s": "a pose or command takes, s",
+    "latency_p99_s": "one in a hundred takes over, s",
+    "delivered_messages": "delivered",
+}
+README_SYSTEMS: Final = {
+    "sern-udp": "**SERN**",
+    "sern-zmq": "SERN, TCP alone",
+    "zmq": "plain ZMQ",
+    "zenoh": "zenoh, as it comes",
+    "zenoh-multilink": "zenoh, two connections",
+    "zenoh-multilink-bbr": "zenoh, two connections, TCP with BBR",
+    "tcpros": "ROS 1 (TCPROS)",
+    "direct": "nothing between, one master",
+    "sern-chain": "**SERN**: client, relay, client",
+    "sern-in-process": "SERN's two endpoints alone",
+    "topic_tools": "topic_tools, one master",
+    "rospy": "rospy, one master",
+    "rospy+zenoh": "rospy, zenoh, rospy",
+}
+"""Words for people in a hurry, in place of the names that the other documents explain."""
 TOGETHER: Final = frozenset({"codecs", "footprint", "summaries", "thin_link", "mmcf_replay", "matrix"})
 """Benchmarks whose cases are rows of one table, as far as they have a metric in common."""
 BY_POLICY: Final = frozenset({"mmcf"})
@@ -143,23 +172,29 @@ def _by_policy(rows: Sequence[Mapping[str, Any]]) -> Iterator[list[str]]:
 
 
 def headline(document: Mapping[str, Any]) -> str:
-    """What README.md shows of a benchmark in IN_README: its commit, and a table for each of the cases there.
+    """What README.md shows of a benchmark in IN_README: its commit, and one table with a row for each system.
 
-    Raises ConfigError when one of them was not measured.
+    Raises ConfigError when a case of it was not measured.
     """
-    lines = [f"Commit {document['commit']}:"]
-    for case, metrics in IN_README[document["benchmark"]].items():
-        rows = [
-            {name: value for name, value in row.items() if name in (*FIXED, *metrics)}
-            for row in document["rows"]
-            if row["case"] == case
-        ]
-        if not any(_metrics(row) for row in rows):
+    shown: dict[str, dict[str, Any]] = {}
+    metrics: list[str] = []
+    for case, wanted in IN_README[document["benchmark"]].items():
+        rows = [row for row in document["rows"] if row["case"] == case]
+        found = [name for name in wanted if any(name in row for row in rows)]
+        if not found:
             raise ConfigError(
                 f"{document['benchmark']} has no figures of {case!r}, which README.md shows: measure all of it"
             )
-        lines += ["", *_figures(rows, {"system": case})]
-    return "\n".join(lines)
+        metrics += found
+        for row in rows:
+            shown.setdefault(row["system"], {}).update((name, row[name]) for name in found if name in row)
+    head = ["", *(README_TITLES[name] for name in metrics)]
+    body = [
+        [README_SYSTEMS.get(system, system), *(_cell(name, row.get(name)) for name in metrics)]
+        for system, row in shown.items()
+        if row
+    ]
+    return "\n".join([f"Commit {document['commit']}:", "", *_table(head, body)])
 
 
 def render(document: Mapping[str, Any]) -> str:

@@ -135,13 +135,14 @@ class Connection:
         `pending`: messages that are still to be offered to the link.
 
         The relay must get everything; whether all subscribers confirm it is waited for as long as confirmations come,
-        because a subscriber that is away is the relay's to wait for.
+        because a subscriber that is away is the relay's to wait for. Nothing is sent any more once another process has
+        our name: it may well be the one that is to go on.
         """
         link = self._core.link
         now = clock.now()
         progress = Progress()
         give_up_s = now + limit_s
-        while now < give_up_s:
+        while now < give_up_s and not link.handshake.displaced:
             channels = [channel for channel in link.sender.channels.values() if channel.wanted is not False]
             unsent = sum(len(c.queue) + len(c.flying) + (c.newest is not None) for c in channels) + pending()
             unconfirmed = sum(len(channel.retained) for channel in channels)

@@ -250,6 +250,7 @@ class RelayDaemon:
         progress = {"socket": lambda: self.server.socket.drains if self.server else 0}
         if self.zap is not None:
             progress["zap"] = lambda: self.zap.counters.pings if self.zap else 0
+            self.zap.ping()  # answered by the first sweep, which would else take it for stuck
         watchdog = Watchdog(self.notifier, progress)
         while True:
             await asyncio.sleep(SWEEP_S)

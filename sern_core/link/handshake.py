@@ -78,6 +78,8 @@ class Handshake:
         self.cut_off = False
         """The stream lane ended when the datagram lane had been silent for a while: the path is gone, not the peer's
         process."""
+        self.displaced = False
+        """The relay has said that another process has our name now, and there was no session since."""
         self._out: deque[bytes] = deque()
         self._hello_due_s: float | None = None
         self._hello_stamp_us = -1
@@ -279,7 +281,8 @@ class Handshake:
             self._welcomed(header, envelope, now)
         elif kind is framing.Kind.REFUSE:
             code, text = framing.take_str(envelope, "code", max_length=64), framing.take_str(envelope, "why")
-            if code == DISPLACED:
+            self.displaced = code == DISPLACED
+            if self.displaced:
                 pause_s = self._yield_s(now) if end.established else REFUSED_INTERVAL_S
                 self._sessions.end_session(text, now)
             else:
@@ -291,6 +294,7 @@ class Handshake:
 
     def _welcomed(self, header: framing.Header, envelope: framing.Envelope, now: float) -> None:
         end, stream = self._end, self._lanes.stream
+        self.displaced = False
         end.version = framing.take_int(envelope, "version", low=framing.VERSION_MIN, high=framing.VERSION_MAX)
         end.peer = ClientName(framing.take_str(envelope, "name", max_length=64))
         echo_us = framing.take_int(envelope, "echo", high=2**64 - 1)

@@ -1,13 +1,26 @@
 """Benchmarks write their figures into the documentation themselves."""
 
 import json
+import re
 import sys
 from pathlib import Path
 
 import pytest
 
 from benchmarks.common import Report
-from benchmarks.document import DOCUMENT, DOCUMENTS, IN_README, README, contents, headline, insert, main, render
+from benchmarks.document import (
+    DOCUMENT,
+    DOCUMENTS,
+    IN_README,
+    README,
+    README_SYSTEMS,
+    README_TITLES,
+    contents,
+    headline,
+    insert,
+    main,
+    render,
+)
 from benchmarks.link.figures import NEVER_S
 from sern_core.vocabulary.errors import ConfigError
 
@@ -108,18 +121,31 @@ def test_the_readme_gets_what_it_shows_of_a_case() -> None:
     found = Report("link")
     found.row("4 Mbit/s 50 ms, idle", "sern-udp", pose_p50_ms=1.0)
     found.row("4 Mbit/s 50 ms, 2x", "sern-udp", pose_p50_ms=28.44, goodput_Mbps=3.612, relay_cpu_percent=5.0)
+    found.row("4 Mbit/s 50 ms, 2x", "tcpros", pose_p50_ms=239.0, goodput_Mbps=3.77)
     found.row("4 Mbit/s 50 ms, blackout 10 s", "sern-udp", fresh_s=0.2)
+    found.row("4 Mbit/s 50 ms, blackout 30 s", "zenoh", fresh_s=0.3)
     assert headline({**found.as_json(), "commit": "abc"}).splitlines() == [
         "Commit abc:",
         "",
-        "| 4 Mbit/s 50 ms, 2x | pose p50, ms | goodput, Mbit/s |",
-        "| --- | --- | --- |",
-        "| sern-udp | 28.4 | 3.61 |",
-        "",
-        "| 4 Mbit/s 50 ms, blackout 10 s | first fresh pose, s |",
-        "| --- | --- |",
-        "| sern-udp | 0.20 |",
+        "|  | a pose takes, ms | all that arrives, Mbit/s | blackout of 10 s: a fresh pose after, s |",
+        "| --- | --- | --- | --- |",
+        "| **SERN** | 28.4 | 3.61 | 0.20 |",
+        "| ROS 1 (TCPROS) | 239.0 | 3.77 | – |",
     ]
+
+
+def test_a_person_in_a_hurry_can_read_the_readme() -> None:
+    """Words for every figure and system that it shows, and one number a cell."""
+    assert {name for cases in IN_README.values() for names in cases.values() for name in names} == set(README_TITLES)
+    text = README.read_text(encoding="utf-8")
+    assert text.count("![") == 1
+    for name in ("link", "endpoints"):
+        table = text.partition(f"<!-- {name} begin -->")[2].partition(f"<!-- {name} end -->")[0]
+        rows = [line.strip("| ").split(" | ") for line in table.splitlines() if line.startswith("| ")]
+        assert len(rows) > 3
+        for system, *cells in rows[2:]:  # below the head and its line
+            assert system in README_SYSTEMS.values()
+            assert all(re.fullmatch(r"[\d,.]+|never|–", cell) for cell in cells), cells
 
 
 def test_a_part_of_a_benchmark_does_not_empty_the_readme() -> None:
@@ -135,7 +161,7 @@ def test_what_the_demo_writes_goes_into_the_readme_alone() -> None:
     ((into, text),) = contents(document)
     assert into == README
     assert text.splitlines()[2:] == [
-        "| control | delivered, messages | latency p99, s |",
+        "|  | delivered | one in a hundred takes over, s |",
         "| --- | --- | --- |",
         "| SERN | 800 | 0.050 |",
     ]

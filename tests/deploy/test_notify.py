@@ -67,6 +67,7 @@ async def test_the_relay(tmp_path: Path, systemd: Systemd) -> None:
         # Nobody is connected: an idle relay must not look like one that hangs.
         await until(lambda: systemd.count("WATCHDOG=1") >= 3, "pings")
         assert systemd.status("0 clients")
+        assert "no progress" not in relay.log.read_text()
         relay.signal(signal.SIGHUP)
         await until(lambda: systemd.count("READY=1") == 2, "reloaded")
         assert systemd.count("RELOADING=1") == 1

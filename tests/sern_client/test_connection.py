@@ -8,6 +8,7 @@ import zmq
 
 from sern_client import connection as connections
 from sern_client.connection import Connection
+from sern_core.link.handshake import DISPLACED
 from sern_core.site.client import ClientCore
 from sern_core.vocabulary.params import LinkParams, SchedulerParams
 from sern_core.vocabulary.types import ClientName, Encoding
@@ -203,3 +204,22 @@ async def test_what_gets_nowhere_is_given_up_and_said(
     assert len(channel.retained) == 2
     await with_parts([], core).drain(lambda: 0, limit_s=limit_s)
     assert "stopping with 2 reliable messages that not everyone has confirmed" in caplog.text
+
+
+async def test_who_stops_does_not_take_the_session_back_from_another_of_its_name(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """Told to end one of the two, a person ends this one: the other is left alone, whatever is owed here."""
+    core = new_core()
+    now = clock.now()
+    core.link.connected(now=now)
+    channel = core.publish(ros_types.topic_info("/robot/log", "std_msgs/msg/String", Encoding.CDR),
+                           spec(reliable=True, depth=10), now=now)  # fmt: skip
+    core.send(channel, b"kept", 1, now=now)
+    end = core.link.end
+    refusal = {"code": DISPLACED, "why": "another process connected as robot"}
+    core.link.receive(framing.encode_handshake(framing.Kind.REFUSE, end.tag, 0, refusal), now=now)
+    said: list[str] = []
+    await with_parts(said, core).drain(lambda: 0, limit_s=1.0)
+    assert said == [], "nobody is asked for a session"
+    assert "stopping with 1 reliable messages that not everyone has confirmed" in caplog.text

@@ -66,6 +66,7 @@ def test_of_two_with_one_name_neither_flaps_for_ever() -> None:
         code, why = told.last["rejected"]
         assert code == "displaced" and why.startswith(text.format(1 - boot))
         assert told.last["link_down"] == (why,)
+    assert [core.link.handshake.displaced for core in cores] == [not core.link.established for core in cores]
     assert hub_told.last["refused"][:2] == ("site", "displaced")
     assert set(re.findall(r"10\.0\.0\.\d", hub_told.last["refused"][2])) == {"10.0.0.0", "10.0.0.1"}
     run(2.0, 40.0)
@@ -80,6 +81,7 @@ def test_of_two_with_one_name_neither_flaps_for_ever() -> None:
     cores.pop()
     run(100.0, 115.0)
     assert cores[0].link.established and hub.links[ClientName("site")].end.peer_boot == 0
+    assert not cores[0].link.handshake.displaced
     ups = events[0].calls["link_up"]
     run(115.0, 130.0)
     assert events[0].calls["link_up"] == ups
