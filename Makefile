@@ -6,6 +6,10 @@ TEST_PROCESSES ?= 3
 RANDOM_TESTS = $(shell grep -rlE '^(from|import) (hypothesis|tests\.exploring)' tests --include='test_*.py' | grep -v tests/peers)
 PACKAGES := sern_core sern_runtime sern_relay sern_client sern_sim sern_tools benchmarks tests
 
+# What a process compiles it keeps (__pycache__) for the next one, whatever the environment says: a daemon starts with a
+# quarter less of CPU, and each worker of the tests would rewrite all of them anew.
+unexport PYTHONDONTWRITEBYTECODE
+
 .PHONY: help setup lint format types test wheel test-compiled explore standstills lab bench performance endpoints figures cellular picture demo schemas clean
 
 help:

@@ -7,11 +7,12 @@ found that way becomes an example of its own.
 
 import os
 from random import Random
-from typing import Final
+from typing import Final, TypeVar
 
 from hypothesis import HealthCheck, settings
 from hypothesis.internal.conjecture import providers
 
+Case = TypeVar("Case")
 SEED: Final = os.environ.get("SERN_EXPLORE", "")
 TIMES: Final = 10
 """How many times the cases of a usual run are tried."""
@@ -30,6 +31,12 @@ def seeds(count: int) -> list[int]:
         return list(range(count))
     random = Random(SEED)
     return [random.randrange(2**32) for _ in range(cases(count))]
+
+
+def also(*more: Case) -> tuple[Case, ...]:
+    """Cases of a table that only `make explore` tries: next to those of a usual run they have another draw, not
+    another promise."""
+    return more if SEED else ()
 
 
 def load_profile() -> None:

@@ -11,8 +11,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Final, Self
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, WrapValidator
-from pydantic_core import PydanticCustomError
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    GetJsonSchemaHandler,
+    ValidationError,
+    WrapValidator,
+)
+from pydantic_core import CoreSchema, PydanticCustomError
 
 from sern_core.relay.access import LONGEST_NAME, with_self
 from sern_core.topics.patterns import compile_pattern, matches_a_name
@@ -40,9 +48,24 @@ class Section(BaseModel):
         frozen=True,
         strict=True,
         allow_inf_nan=False,
-        use_attribute_docstrings=True,
         hide_input_in_errors=True,
     )
+
+    @classmethod
+    def __get_pydantic_json_schema__(cls, core_schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
+        """The schema with what each key means. (pydantic's own `use_attribute_docstrings` reads the source of every
+        class when it is imported.)"""
+        from sern_runtime.config.meanings import meaning
+
+        schema = handler(core_schema)
+        keys = handler.resolve_ref_schema(schema)["properties"]
+        for name, field in cls.model_fields.items():
+            key = keys[field.alias or name]
+            text = meaning(cls, name)
+            # What a section says of itself need not be said again where it is referred to.
+            if text is not None and handler.resolve_ref_schema(key).get("description") != text:
+                key.setdefault("description", text)
+        return schema
 
 
 @dataclass(frozen=True, slots=True)

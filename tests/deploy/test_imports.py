@@ -25,6 +25,7 @@ def test_what_no_file_asked_for_is_not_imported(program: str) -> None:
     for kind in ENDPOINTS:
         assert not {f"sern_client.endpoints.{kind}", f"sern_client.endpoints.{kind}.endpoint"} & there
     assert not {"aiohttp", "zenoh", "cyclonedds", "rclpy", "matplotlib", "rosbags.rosbag1", "rosbags.rosbag2"} & there
+    assert "sern_runtime.config.meanings" not in there, "the source is read for schemas, not for a daemon"
 
 
 def test_the_guard_needs_neither_link_nor_adaptation() -> None:

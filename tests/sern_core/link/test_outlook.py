@@ -97,7 +97,7 @@ def test_what_can_arrive_is_never_held_back(rate_bps: float) -> None:
 
 
 def test_a_link_that_got_faster_is_found_out() -> None:
-    robot = Robot(2e6, 1_200_000, RateStep(20.0, 20e6))
+    robot = Robot(1e6, 600_000, RateStep(20.0, 10e6))
     robot.world.run(20.0)
     assert robot.site.on(CLOUD) == []
     robot.world.run(6.0)
