@@ -21,7 +21,7 @@ DOCUMENT: Final = ROOT / "docs" / "performance.md"
 THEORY: Final = ROOT / "docs" / "adaptation-theory.md"
 DOCUMENTS: Final = {
     **dict.fromkeys(
-        ("link", "robots", "footprint", "endpoints", "mmcf_lab", "thin_link", "cellular", "codecs"), DOCUMENT
+        ("link", "sensors", "robots", "footprint", "endpoints", "mmcf_lab", "thin_link", "cellular", "codecs"), DOCUMENT
     ),
     **dict.fromkeys(("mmcf", "mmcf_replay", "mmcf_recovery"), THEORY),
     "summaries": ROOT / "docs" / "summaries.md",
@@ -101,7 +101,7 @@ TITLES: Final = {
 PURE: Final = "1"
 """The unit of a number without one."""
 COUNT: Final = "count"
-UNITS: Final = {"percent": "%", "Mbps": "Mbit/s", "us": "µs"}
+UNITS: Final = {"percent": "%", "Mbps": "Mbit/s", "us": "µs", "hz": "Hz"}
 FIXED: Final = ("case", "system")
 OURS: Final = "mmcf"
 

@@ -326,7 +326,7 @@ class ClientDaemon:
             health=lambda: Health(ok=True, reason="running"),
             ready=self.readiness,
             json_routes={
-                "/api/link": lambda: [{**self.core.link.snapshot(), "now_s": clock.now()}],
+                "/api/link": self._link_view,
                 "/api/peers": self.link_state.to_json,
                 "/api/topics": self.topics,
                 "/api/trace": trace_view(of_client(self.core.link, self.core.trace), clock.now),
@@ -335,6 +335,11 @@ class ClientDaemon:
             },
             parts=self.parts,
         )
+
+    def _link_view(self) -> list[dict[str, object]]:
+        now = clock.now()
+        summaries = self.bridge.outbound.summaries.to_json(now)
+        return [{**self.core.link.snapshot(), "summaries": summaries, "now_s": now}]
 
     def readiness(self) -> Health:
         """What `/readyz` says."""

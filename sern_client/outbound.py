@@ -175,8 +175,9 @@ class Outbound:
     def _offer(self, info: TopicInfo, resolved: ResolvedTopic, name: TopicName) -> tuple[OutChannel, Source | None]:
         """Offer a topic to the link, with what its rule makes of it. UsageError when it cannot be."""
         core, spec = self._core, resolved.spec
-        if resolved.rule is not None and resolved.summaries:
-            opened = self.summaries.open(core, info, resolved, self._site.rules.rules[resolved.rule], name)
+        if resolved.summaries:
+            rule = None if resolved.rule is None else self._site.rules.rules[resolved.rule]
+            opened = self.summaries.open(core, info, resolved, rule, name)
             if opened is not None:
                 return opened
         merge = resolved.merge_tf and info.encoding is not Encoding.RAW

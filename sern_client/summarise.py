@@ -3,7 +3,8 @@
 A summary is a stream of its own, announced with the attributes `summary` (its kind) and `summary_of` (the topic). Two
 kinds take the topic itself: a voxel-thinned cloud `in_place`, and patches, whose whole grids go out under the topic's
 name. Every one has a level, `raw` or `summary`, that may be switched at any time: each message is sent once, as the
-level was when it came, and the messages of a stream keep their order.
+level was when it came, and the messages of a stream keep their order. With `level: auto` what the link carries
+switches it (`Fit`).
 
 Bodies above INLINE_BYTES are worked on in a thread, one after the other. While one is, the newest that comes waits and
 those it replaces are counted as `superseded`; of a reliable stream they are refused to the source instead. A patch is
@@ -23,6 +24,7 @@ from dataclasses import replace
 from typing import Final, NamedTuple, Protocol
 
 from sern_core.site.client import ClientCore
+from sern_core.site.fit import Fit
 from sern_core.stream.out_channel import OutChannel
 from sern_core.stream.rate_cap import RateCap
 from sern_core.summaries.grids import UPDATE_TYPE
@@ -31,6 +33,7 @@ from sern_core.summaries.patches import PatchMaker, PatchParams
 from sern_core.summaries.scan import ScanMaker, ScanParams
 from sern_core.summaries.spec import (
     BEST_EFFORT_KEYFRAME_S,
+    STAND_IN,
     SummaryKind,
     SummaryLevel,
     SummaryProfile,
@@ -112,12 +115,16 @@ class TopicSummary:
         self.level = self.level_by_rule = spec.level
         self.adapt = spec.adapt
         """Whether the adaptation may choose the level."""
+        self.fit: Fit | None = None
+        """What chooses the level of the topic, where the link does."""
         self.source = source
         self.profile = SummaryProfile()
         self.undecodable = 0
         self.bytes_in = 0
         self.bytes_out = 0
         self.cpu_s = 0.0
+        self.by_link = spec.by_link
+        """Whether the level is what the link carries."""
         self.beside = spec.beside
         self.shares_topic = spec.shares_topic
         self._parts = parts or OptionalParts(PART)
@@ -178,12 +185,14 @@ class TopicSummary:
 
     # --- entry ------------------------------------------------------------------------------------------------------
 
-    def offer(self, body: bytes, stamp_ns: int, now: float) -> bool:
-        """A raw message has come. False: refused."""
+    def offer(self, body: bytes, stamp_ns: int, now: float, level: SummaryLevel | None = None) -> bool:
+        """A raw message has come; it is sent as `level` says, or else as the one in force. False: refused."""
         self._arrivals_s.append(now)
         self._offers += 1
-        job = Job(body, stamp_ns, now, self.level)
-        if self.level is SummaryLevel.RAW:
+        job = Job(body, stamp_ns, now, level or self.level)
+        if job.level is SummaryLevel.RAW and self.fit is not None:
+            return not self.shares_topic or self._take(job)
+        if job.level is SummaryLevel.RAW:
             # To be weighed against the raw messages a summary must have been seen.
             unknown = self.adapt and not self.profile.messages and not self.undecodable
             if (unknown or self._offers % PROBE_EVERY == 0) and self._maker is None:
@@ -237,6 +246,8 @@ class TopicSummary:
 
     def _start(self, job: Job) -> bool:
         if self._maker is None and job.level is SummaryLevel.RAW:
+            if self.fit is not None:
+                self.fit.sent(self.source.next_seq)
             return self._sends[0](job.body, job.stamp_ns, job.born_s)
         if len(job.body) <= INLINE_BYTES:
             return self._finish(job, self._run(job))
@@ -455,6 +466,9 @@ class SummarisedTopic:
         self, core: ClientCore, channel: OutChannel, raw: Send, outputs: list[TopicSummary], cap: RateCap
     ) -> None:
         self.outputs = outputs
+        self.fit = Fit(channel) if any(output.by_link for output in outputs) else None
+        for output in outputs:
+            output.fit = self.fit
         self._core = core
         self._channel = channel
         self._raw = raw
@@ -468,6 +482,34 @@ class SummarisedTopic:
         if any(output.shares_topic for output in self.outputs):
             return False
         return all(o.level is SummaryLevel.RAW for o in self.outputs) or any(o.beside for o in self.outputs)
+
+    def _level(self, fit: Fit, now: float) -> SummaryLevel:
+        """What the message that comes now is sent as, by what the link carries and who is there to take it."""
+        source = self._channel
+        shared = any(output.shares_topic for output in self.outputs)
+        if not shared and not any(output.channel.wanted for output in self.outputs):
+            return SummaryLevel.RAW
+        if not shared and source.wanted is False:
+            return SummaryLevel.SUMMARY
+        before = fit.level
+        level = fit.choose(now, self._core.link.lane.estimator.rate_bps)
+        if fit.level is not before:
+            for output in self.outputs:
+                output.set_level(fit.level)
+            self._core.level_changed(source, fit.level, now=now)
+            self._say(fit.level)
+        return level
+
+    def _say(self, level: SummaryLevel) -> None:
+        topic, lifespan_s = self.outputs[0].topic, self._channel.spec.lifespan_s or 0.0
+        if level is SummaryLevel.SUMMARY:
+            kinds = " and ".join(str(output.kind) for output in self.outputs)
+            _log.warning("%s: the link is too slow for a message to arrive within %g s; its %s goes instead", topic,
+                         lifespan_s, kinds)  # fmt: skip
+        else:
+            _log.warning(
+                "%s: the link carries whole messages within %g s again; they go as they come", topic, lifespan_s
+            )
 
     def sink(self, body: bytes, stamp_ns: int) -> bool:
         """A `Sink`. False: what counts most was refused, the topic itself or its only summary."""
@@ -488,11 +530,22 @@ class SummarisedTopic:
             self._pass(*newest)
 
     def _pass(self, body: bytes, stamp_ns: int, born_s: float) -> bool:
+        if self.fit is not None:
+            return self._pass_by_link(self.fit, body, stamp_ns, born_s)
         raw = self.sends_raw
         if raw and not self._raw(body, stamp_ns, born_s):
             return False
         accepted = [output.offer(body, stamp_ns, born_s) for output in self.outputs]
         return raw or len(accepted) > 1 or accepted[0]
+
+    def _pass_by_link(self, fit: Fit, body: bytes, stamp_ns: int, born_s: float) -> bool:
+        """As `_pass`, with the level that the link allows."""
+        level = self._level(fit, clock.now())
+        if level is SummaryLevel.RAW and not any(output.shares_topic for output in self.outputs):
+            fit.sent(self._channel.next_seq)
+            return self._raw(body, stamp_ns, born_s)
+        accepted = [output.offer(body, stamp_ns, born_s, level) for output in self.outputs]
+        return len(accepted) > 1 or accepted[0]
 
     def _drop_newest(self, reason: DropReason) -> None:
         newest, self._newest = self._newest, None
@@ -549,7 +602,7 @@ class Summaries:
         return [output for topic in self._topics for output in topic.outputs]
 
     def open(
-        self, core: ClientCore, info: TopicInfo, resolved: ResolvedTopic, rule: TopicRule, name: TopicName
+        self, core: ClientCore, info: TopicInfo, resolved: ResolvedTopic, rule: TopicRule | None, name: TopicName
     ) -> tuple[OutChannel, SummarisedTopic] | None:
         """Offer a topic under its global `name`, and the summaries that its rule asks for. None: it has none.
 
@@ -563,10 +616,10 @@ class Summaries:
         updates = spec
         patches = next((item.params for item in specs if isinstance(item.params, PatchParams)), None)
         attributes = None
-        if patches is not None:
+        if patches is not None and rule is not None:
             spec, updates, patches = patch_specs(resolved.spec, patches, rule)
             attributes = attributes_of(SummaryKind.PATCHES, name)
-        elif specs[0].shares_topic:
+        elif specs[0].shares_topic and specs[0] is not STAND_IN:  # which the topic seldom is
             attributes = attributes_of(specs[0].kind, name)
         info = replace(info, latched=spec.latched)
         channel = core.publish(replace(info, name=name), spec, attributes=attributes, now=now)
@@ -611,6 +664,21 @@ class Summaries:
         type_name = UPDATE_TYPE if item.kind is SummaryKind.PATCHES else item.kind.result_type
         return ros_types.topic_info(name, type_name, info.encoding, latched=spec.latched, reliable=info.reliable)
 
+    def to_json(self, now: float) -> list[dict[str, object]]:
+        """What /api/link says of them: what each topic is sent as, and for how long where the link has changed it."""
+        return [
+            {
+                "topic": item.topic,
+                "stream": item.stream,
+                "kind": str(item.kind),
+                "level": str(item.level),
+                "by_link": item.by_link,
+                "switches": 0 if item.fit is None else item.fit.switches,
+                "since_s": None if item.fit is None or item.fit.changed_s is None else now - item.fit.changed_s,
+            }
+            for item in self.topics
+        ]
+
     def forget(self, topic: Source) -> None:
         """The topic is gone and closed."""
         self._topics = [known for known in self._topics if known is not topic]
@@ -637,6 +705,12 @@ def register_summaries(metrics: Metrics, summaries: Summaries) -> None:
     )
     for name, text, read in counters:
         metrics.counter(f"sern_summary_{name}_total", text, labels, per_topic(read))
+    metrics.counter(
+        "sern_summary_switches_total",
+        "Times that what the link carries changed the level.",
+        labels,
+        per_topic(lambda item: 0.0 if item.fit is None else float(item.fit.switches)),
+    )
     metrics.gauge(
         "sern_summary_level",
         "1 while summaries are sent, 0 while messages go as they come.",

@@ -20,7 +20,7 @@ BRIEF_S: Final = 0.02
 
 LINK_EVENTS: Final = frozenset({
     TraceEvent.LINK_UP, TraceEvent.LINK_DOWN, TraceEvent.LANE_USED, TraceEvent.LANE_SILENT, TraceEvent.LANE_ANSWERS,
-    TraceEvent.CAPACITY, TraceEvent.LEASE_EXPIRED,
+    TraceEvent.CAPACITY, TraceEvent.LEASE_EXPIRED, TraceEvent.SUMMARISED, TraceEvent.WHOLE,
 })  # fmt: skip
 """What is about no single message."""
 
@@ -87,7 +87,7 @@ ADVICE: Final[Mapping[str, str]] = {
     DropReason.QUEUE_FULL: "see access.max_queue_bytes in the relay's file",
     DropReason.REFUSED: "the link has not carried it away: a thinner topic, or a larger max_queue_bytes",
     DropReason.STORAGE: "make room where the recording goes",
-    DropReason.TOO_SLOW: "thin it, send a summary of it (docs/adaptation.md), or give it a longer lifespan_s",
+    DropReason.TOO_SLOW: "thin it, send a summary of it (docs/summaries.md), or give it a longer lifespan_s",
 }
 """What to do about it, by the reason of what is held or dropped now."""
 
@@ -312,7 +312,7 @@ def sentence(life: Life) -> str:
 
 
 def link_sentence(record: Record) -> str:
-    """What happened to the link, or to a lease."""
+    """What happened to the link, to a lease, or to what a topic is sent as."""
     lane = record.get("lane", "")
     match TraceEvent(record["event"]):
         case TraceEvent.LINK_UP:
@@ -329,6 +329,11 @@ def link_sentence(record: Record) -> str:
             return f"carries about {rate(record['rate_bps'])}, round trip {span(record['rtt_s'])}"
         case TraceEvent.LEASE_EXPIRED:
             return f"no fresh command for {span(record['after_s'])}: the stop command was published"
+        case TraceEvent.SUMMARISED:
+            late = f"within the topic's lifespan of {span(record['lifespan_s'])}"
+            return f"too slow for {record['name']} to arrive {late}: its summary goes in its place from here on"
+        case TraceEvent.WHOLE:
+            return f"carries {record['name']} in time: it goes as it comes from here on"
     return str(record["event"])
 
 

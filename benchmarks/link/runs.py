@@ -86,7 +86,7 @@ async def run(
     """`directory` must be empty. Raises SernError when an end does not work."""
     lab.reset()
     lab.link(model, model)
-    _congestion(lab, "bbr" if system.endswith("-bbr") else "cubic")
+    congestion(lab, "bbr" if system.endswith("-bbr") else "cubic")
     async with killed(directory) as children:
         between = []
         if system.startswith("sern"):
@@ -187,8 +187,12 @@ async def _start_master(children: Children, node: Node) -> None:
 
 
 async def _start_end(children: Children, node: Node, spec: Spec) -> Child:
-    command = python("-m", "benchmarks.link.end", json.dumps(asdict(spec)))
-    return await _start(children, node, spec.role, command, talks=True)
+    return await start_program(children, node, spec.role, "benchmarks.link.end", asdict(spec))
+
+
+async def start_program(children: Children, node: Node, name: str, program: str, spec: Mapping[str, Any]) -> Child:
+    """A module of ours that talks, told what to do."""
+    return await _start(children, node, name, python("-m", program, json.dumps(spec)), talks=True)
 
 
 async def until_ready(end: Child) -> None:
@@ -216,7 +220,7 @@ async def sleep_until(at_ns: int) -> None:
             time.sleep(left_s)  # noqa: ASYNC251  nothing else is to be done so shortly before
 
 
-def _congestion(lab: Lab, name: str) -> None:
+def congestion(lab: Lab, name: str) -> None:
     """What TCP in both namespaces uses from now on."""
     for node in lab.nodes:
         words = f"ip route replace {NETWORK}.0.0/{PREFIX} dev {DEVICE} proto kernel scope link src {node.address}"

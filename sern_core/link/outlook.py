@@ -96,7 +96,7 @@ class Outlook:
             self._tried, self._try_s, self._vain_bytes = None, now + self._pause_s, lane.estimator.window_bytes
             self._pause_s = min(2 * self._pause_s, MAX_PAUSE_S)
             return False
-        if now < self._try_s:
+        if now < self._try_s and out.seq != channel.probe_seq:
             return False
         self._tried, self._try_s = (channel.channel_id, out.seq), now + MIN_PAUSE_S
         self._judge_later(lane, now)

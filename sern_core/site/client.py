@@ -18,12 +18,13 @@ from sern_core.stream.in_stream import InStream
 from sern_core.stream.latched import LatchedCache
 from sern_core.stream.out_channel import OutChannel
 from sern_core.stream.out_message import OutMessage, in_sequence
+from sern_core.summaries.spec import SummaryLevel
 from sern_core.vocabulary.codec_names import Compression
 from sern_core.vocabulary.errors import ConfigError, WireError
 from sern_core.vocabulary.ledger import MAX_TOPICS, ReceiveLedger
 from sern_core.vocabulary.message import Message, StreamId, StreamInfo, TopicInfo, TopicSpec
 from sern_core.vocabulary.params import LinkParams, SchedulerParams
-from sern_core.vocabulary.trace import DecisionTrace, TraceEvent
+from sern_core.vocabulary.trace import LINK, DecisionTrace, TraceEvent
 from sern_core.vocabulary.types import ClientName, DropReason, ObjectKind, TopicName
 from sern_core.wire import framing
 from sern_core.wire.announce import MAX_STRINGS, Announcement, check_stream
@@ -210,6 +211,12 @@ class ClientCore:
         channel.counters.offer(size_bytes)
         channel.counters.drop(reason, size_bytes)
         self.trace.record(now, channel.stream.id.topic, TraceEvent.DROPPED, reason=reason)
+
+    def level_changed(self, channel: OutChannel, level: SummaryLevel, *, now: float) -> None:
+        """By what the link carries, this topic's messages go as they come from now on, or their summary does."""
+        event = TraceEvent.SUMMARISED if level is SummaryLevel.SUMMARY else TraceEvent.WHOLE
+        name, lifespan_s = channel.stream.id.topic, channel.spec.lifespan_s or 0.0
+        self.trace.record(now, LINK, event, name=name, lifespan_s=lifespan_s)  # a topic forgets in seconds
 
     # --- receiving ------------------------------------------------------------------------------------------------
 

@@ -41,6 +41,7 @@ class OutChannel:
         "drops",
         "last_sent_s",
         "offered",
+        "probe_seq",
         "ready",
         "reliable",
         "required",
@@ -79,6 +80,8 @@ class OutChannel:
         """Whether it was announced in the session."""
         self.offered = False
         """Whether the scheduler knows of a pending message."""
+        self.probe_seq = 0
+        """This message is begun to see whether the link carries it, whatever is known of the link."""
         self.required: tuple[str, ...] = ()
         """Reliable subscribers behind the peer, as it told us."""
 

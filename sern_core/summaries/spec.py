@@ -10,7 +10,8 @@ from sern_core.summaries.mask import MaskParams
 from sern_core.summaries.patches import PatchParams
 from sern_core.summaries.scan import SCAN_TYPE, ScanParams
 from sern_core.summaries.voxel import VoxelPoint
-from sern_core.vocabulary.types import PriorityClass
+from sern_core.vocabulary.message import TopicInfo, TopicSpec
+from sern_core.vocabulary.types import Encoding, PriorityClass, Reliability
 
 BEST_EFFORT_KEYFRAME_S: Final = 10.0
 """How often a changed grid is repeated whole where patches can be lost without a word."""
@@ -35,6 +36,13 @@ class SummaryKind(StrEnum):
 class SummaryLevel(StrEnum):
     RAW = "raw"  # messages as they come
     SUMMARY = "summary"
+
+
+class TooLarge(StrEnum):
+    """What becomes of a cloud that cannot arrive within its lifespan at what the link carries."""
+
+    SUMMARY = "summary"  # a thinner one goes in its place
+    DROP = "drop"
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +75,8 @@ class VoxelParams:
 class SummarySpec:
     """One summary of a topic. `name`: what is put behind the topic's name, or a whole name if it begins with `/`;
     None: its kind's. `priority` None: state for scans and masks, else as the topic. `beside`: the raw topic is sent as
-    well, whatever the level. `adapt`: the adaptation may choose the level."""
+    well, whatever the level. `adapt`: the adaptation may choose the level. `by_link`: the level is raw while the link
+    carries the messages within their lifespan, else summary."""
 
     params: VoxelParams | ScanParams | MaskParams | PatchParams = field(default_factory=VoxelParams)
     level: SummaryLevel = SummaryLevel.SUMMARY
@@ -75,6 +84,7 @@ class SummarySpec:
     priority: PriorityClass | None = None
     beside: bool = False
     adapt: bool = False
+    by_link: bool = False
 
     @property
     def kind(self) -> SummaryKind:
@@ -101,3 +111,15 @@ class SummarySpec:
             return topic
         name = self.name or {SummaryKind.OCCUPANCY_MASK: "mask"}.get(self.kind, str(self.kind))
         return name if name.startswith("/") else f"{topic}/{name}"
+
+
+STAND_IN: Final = SummarySpec(VoxelParams(voxel_m=0.2, in_place=True), SummaryLevel.RAW, by_link=True)
+"""What goes in the place of a cloud whose rule has no summary, while the link is too slow for the cloud."""
+
+
+def stand_ins(info: TopicInfo, spec: TopicSpec) -> tuple[SummarySpec, ...]:
+    """STAND_IN where it can be of use to a topic without a summary of its own."""
+    clouds = info.type_name == CLOUD_TYPE and info.encoding is not Encoding.RAW
+    best_effort = spec.reliability is Reliability.BEST_EFFORT and not spec.latched
+    bulk = spec.priority is PriorityClass.BULK and spec.lifespan_s is not None
+    return (STAND_IN,) if clouds and best_effort and bulk else ()

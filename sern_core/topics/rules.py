@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from enum import Enum, StrEnum
 from typing import Final
 
-from sern_core.summaries.spec import SummarySpec
+from sern_core.summaries.spec import SummarySpec, TooLarge, stand_ins
 from sern_core.summaries.transforms import TF_TYPES, is_static
 from sern_core.topics.patterns import Pattern, PatternSet, compile_pattern
 from sern_core.vocabulary.codec_names import DEFAULT_LOSSY, Compression, LossyParams
@@ -116,6 +116,7 @@ class TopicRule:
     lease: Lease | None = None
     compression: Compression | None = None
     summaries: tuple[SummarySpec, ...] = ()
+    too_large: TooLarge = TooLarge.SUMMARY
     merge_tf: bool | None = None
     lossy: tuple[Compression, ...] = ()
     lossy_params: LossyParams = DEFAULT_LOSSY
@@ -215,6 +216,7 @@ class RuleSet:
         - depth: 10 if reliable, else 1;
         - lifespan and deadline: the publisher's, where it has any (DDS); else no deadline, and
         - lifespan: 0.3 s for a velocity command in class control; for ever if reliable or latched; else 1 s;
+        - summaries: for clouds of class bulk that are best effort, a thinner one where the link is too slow for them;
         - weight κ: by class; many_writers: true for `/tf` and `/tf_static`;
         - merge_tf: for transforms in class state unless the rule makes them reliable, and for `/tf_static` and other
           latched ones with or without a rule.
@@ -238,7 +240,7 @@ class RuleSet:
                 many_writers=many_writers,
                 retention_s=self.retention_s,
             )
-            return ResolvedTopic(spec, Direction.BOTH, local_name, None, None, merge_tf=static)
+            return ResolvedTopic(spec, Direction.BOTH, local_name, None, None, stand_ins(info, spec), merge_tf=static)
         rule = self.rules[index]
         command = plain_type(info.type_name) in COMMAND_TYPES
         if rule.lease is not None and info.type_name and not command:
@@ -278,7 +280,10 @@ class RuleSet:
         if rule.merge_tf is not None:
             merge_tf = transforms and rule.merge_tf
         name = rule.remap or local_name
-        return ResolvedTopic(spec, rule.direction, name, rule.lease, index, rule.summaries, merge_tf)
+        summaries = rule.summaries
+        if not summaries and rule.too_large is TooLarge.SUMMARY:
+            summaries = stand_ins(info, spec)
+        return ResolvedTopic(spec, rule.direction, name, rule.lease, index, summaries, merge_tf)
 
     def outward(self, info: TopicInfo, *, local_name: TopicName, namespace: str) -> TopicName:
         """The global name of a local topic: `remap`, then the namespace."""

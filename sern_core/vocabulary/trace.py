@@ -56,6 +56,8 @@ class TraceEvent(StrEnum):
     LANE_SILENT = "lane_silent"  # nothing is acknowledged any more
     LANE_ANSWERS = "lane_answers"  # and it is again
     CAPACITY = "capacity"  # the link is known to carry much more, or less, than before
+    SUMMARISED = "summarised"  # a topic's messages are too large for it: their summary goes in their place
+    WHOLE = "whole"  # it carries them in time, and they go as they come again
 
 
 class HoldReason(StrEnum):

@@ -10,6 +10,7 @@ from pydantic import Discriminator, Field, Tag, model_validator
 
 from sern_core.relay.objects import COMMAND_OBJECT_TYPES
 from sern_core.site.services import ServiceRule, subscriptions
+from sern_core.summaries.spec import TooLarge
 from sern_core.topics.patterns import MAX_CLIENT_PROGRAM, PatternError, PatternSet, compile_pattern
 from sern_core.topics.rules import (
     AUTO,
@@ -221,6 +222,9 @@ class TopicSection(Section):
     summary: OneOrMoreSummaries = ()
     """Send something smaller in place of heavy messages, or beside them: one mapping, or a list of them. `kind`
     selects what it is."""
+    too_large: Literal["summary", "drop"] = "summary"
+    """Of point clouds of class bulk that are best effort and have no `summary`, while the link is too slow for one to
+    arrive within its lifespan: `summary` sends each thinned to a point in 0.2 m under the same name, `drop` nothing."""
     merge_tf: bool | None = None
     """For tf2_msgs/TFMessage: many messages become one with the newest transform of each pair of frames, at most
     `max_rate_hz` (20) a second, of /tf_static one with all there are; null: /tf_static always, others in class state
@@ -240,6 +244,8 @@ class TopicSection(Section):
             raise fault("`as` is a whole topic name, which needs a plain name in `match`", "summary")
         if len({spec.adapt for spec in found}) > 1:
             raise fault("sends all its summaries or none: give every one of them the same `adapt`", "summary")
+        if len({spec.by_link for spec in found}) > 1:
+            raise fault("sends all its summaries or none: give every one of them `level: auto`, or none", "summary")
         if found and self.direction is Direction.RECEIVE:
             raise fault("is made where messages leave; direction is receive", "summary")
         return self
@@ -302,6 +308,7 @@ class TopicSection(Section):
             lossy_params=LossyParams(self.voxel_m, self.jpeg_quality),
             lease=None if loss is None else Lease(publish=loss.publish, after_s=loss.after_s),
             summaries=specs(self.summary),
+            too_large=TooLarge(self.too_large),
             merge_tf=self.merge_tf,
         )
 

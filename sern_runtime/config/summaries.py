@@ -46,9 +46,6 @@ Metres = Annotated[float, Field(gt=0, le=1e4)]
 class SummaryBase(Section):
     """What all summaries share."""
 
-    level: SummaryLevel = SummaryLevel.SUMMARY
-    """What is sent at first: `summary`, or `raw`: the messages as they come. May change while it runs."""
-
     def priority_class(self) -> PriorityClass | None:
         word: ClassWord | None = getattr(self, "priority", None)
         return None if word is None else PriorityClass[word.upper()]
@@ -57,6 +54,9 @@ class SummaryBase(Section):
 class BesideBase(SummaryBase):
     """A summary that is a topic of its own."""
 
+    level: Literal["summary", "raw", "auto"] = "summary"
+    """What is sent at first: `summary`, or `raw`: the messages as they come. `auto`: as they come while the link
+    carries them within their lifespan, else the summary; for topics that are best effort."""
     adapt: bool = False
     """Let the section `adaptation` choose the level: the messages as they come where the link carries what is needed
     of them, else the summary. Both topics must be subscribed to at the other side."""
@@ -70,9 +70,25 @@ class BesideBase(SummaryBase):
 
     @model_validator(mode="after")
     def _either(self) -> "BesideBase":
-        if self.adapt and self.beside:
-            raise fault("chooses between the topic and its summary; leave `beside` out", "adapt")
+        for key, chooses in (("adapt", self.adapt), ("level", self.level == "auto")):
+            if chooses and self.beside:
+                raise fault("chooses between the topic and its summary; leave `beside` out", key)
+        if self.adapt and self.level == "auto":
+            raise fault("auto leaves nothing for `adapt` to choose; give one of them", "level")
         return self
+
+    def summary(self, params: VoxelParams | ScanParams | MaskParams) -> SummarySpec:
+        """What is made, with what is said of it here."""
+        auto = self.level == "auto"
+        return SummarySpec(
+            params,
+            SummaryLevel.RAW if auto else SummaryLevel(self.level),
+            self.name,
+            self.priority_class(),
+            self.beside,
+            self.adapt,
+            by_link=auto,
+        )
 
 
 class BandBase(BesideBase):
@@ -125,8 +141,7 @@ class VoxelSummary(BesideBase):
         return self
 
     def spec(self) -> SummarySpec:
-        params = VoxelParams(self.voxel_m, self.point, self.fields, self.in_place)
-        return SummarySpec(params, self.level, self.name, self.priority_class(), self.beside, self.adapt)
+        return self.summary(VoxelParams(self.voxel_m, self.point, self.fields, self.in_place))
 
 
 class ScanSummary(BandBase):
@@ -138,8 +153,7 @@ class ScanSummary(BandBase):
     """Bearings around the robot."""
 
     def spec(self) -> SummarySpec:
-        params = ScanParams(self.band(), self.beams)
-        return SummarySpec(params, self.level, self.name, self.priority_class(), self.beside, self.adapt)
+        return self.summary(ScanParams(self.band(), self.beams))
 
 
 class MaskSummary(BandBase):
@@ -159,8 +173,7 @@ class MaskSummary(BandBase):
         return self
 
     def spec(self) -> SummarySpec:
-        params = MaskParams(self.band(), self.size_m, self.resolution_m)
-        return SummarySpec(params, self.level, self.name, self.priority_class(), self.beside, self.adapt)
+        return self.summary(MaskParams(self.band(), self.size_m, self.resolution_m))
 
 
 class PatchesSummary(SummaryBase):
@@ -168,6 +181,8 @@ class PatchesSummary(SummaryBase):
 
     kind: Literal["patches"]
     """The changed cells of an occupancy grid."""
+    level: SummaryLevel = SummaryLevel.SUMMARY
+    """What is sent at first: `summary`, or `raw`: the messages as they come. May change while it runs."""
     keyframe_updates: Annotated[
         int, Field(ge=2, json_schema_extra={"maximum": MAX_REPLAY_MESSAGES}), AfterValidator(_check_kept)
     ] = _PATCH.keyframe_updates

@@ -4,6 +4,7 @@ import asyncio
 import threading
 from collections.abc import AsyncIterator, Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,21 +15,36 @@ from sern_client.summarise import (
     MAX_WAITING,
     PROBE_EVERY,
     Job,
+    Send,
+    Summaries,
     SummarisedTopic,
     TopicSummary,
     Work,
     patch_work,
+    streams_of,
 )
 from sern_client.tf_merge import LatchedTransforms, MergedTransforms
 from sern_core.site.client import ClientCore
+from sern_core.site.fit import MISSES
 from sern_core.stream.out_channel import OutChannel
 from sern_core.stream.rate_cap import RateCap
 from sern_core.summaries.patches import PatchMaker, PatchParams
-from sern_core.summaries.spec import SummaryLevel, SummarySpec, VoxelParams
+from sern_core.summaries.spec import STAND_IN, SummaryLevel, SummarySpec, VoxelParams
+from sern_core.topics.rules import Direction, ResolvedTopic
 from sern_core.vocabulary.errors import BodyError
 from sern_core.vocabulary.message import TopicInfo, TopicSpec
 from sern_core.vocabulary.params import LinkParams, SchedulerParams
-from sern_core.vocabulary.types import ClientName, DropReason, Durability, Encoding, Reliability, TopicName
+from sern_core.vocabulary.types import (
+    ClientName,
+    DropReason,
+    Durability,
+    Encoding,
+    PriorityClass,
+    Reliability,
+    TopicName,
+)
+from sern_runtime import clock
+from tests.sern_core.summaries import scenes
 from tests.sern_core.summaries.test_patches import grid_body
 from tests.sern_core.summaries.test_transforms import message as tf_message
 from tests.sern_core.summaries.test_transforms import pairs, transform
@@ -45,14 +61,18 @@ class NoEvents:
         return lambda *args, **kwargs: None
 
 
+def core_of() -> ClientCore:
+    events: Any = NoEvents()
+    return ClientCore(
+        name=ClientName("robot1"), boot=1, events=events, link=LinkParams(), scheduler=SchedulerParams(), now=0.0
+    )
+
+
 class Bench:
     """A client core that is never connected, and summaries on it whose work the test holds and lets go."""
 
     def __init__(self, executor: ThreadPoolExecutor) -> None:
-        events: Any = NoEvents()
-        self.core = ClientCore(
-            name=ClientName("robot1"), boot=1, events=events, link=LinkParams(), scheduler=SchedulerParams(), now=0.0
-        )
+        self.core = core_of()
         self.executor = executor
         self.gate = threading.Event()
         self.gate.set()
@@ -371,3 +391,81 @@ async def test_static_transforms_that_were_refused_are_not_forgotten(bench: Benc
     assert [set(pairs(body)) for body in bench.sent] == [{("a", "b")}, {("a", "b"), ("a", "c")}]
     assert static.sink(first, 3) and len(bench.sent) == 2
     assert bench.dropped(channel) == {DropReason.SUPERSEDED: 1}
+
+
+# --- what the link carries --------------------------------------------------------------------------------------------
+
+
+class ByLink:
+    """A cloud topic whose level the link decides, and a core that is connected to nobody."""
+
+    def __init__(self, *specs: SummarySpec) -> None:
+        self.core = core_of()
+        self.summaries = Summaries(self._sender)
+        info = TopicInfo(TopicName("/points"), "sensor_msgs/msg/PointCloud2", Encoding.CDR)
+        spec = TopicSpec(priority=PriorityClass.BULK, lifespan_s=1.0)
+        resolved = ResolvedTopic(spec, Direction.SEND, info.name, None, None, specs)
+        opened = self.summaries.open(self.core, info, resolved, None, TopicName("/robot1/points"))
+        assert opened is not None
+        self.channel, self.topic = opened
+
+    def _sender(self, channel: OutChannel, info: TopicInfo) -> Send:
+        return lambda body, stamp_ns, born_s: self.core.send(channel, body, stamp_ns, born_s=born_s, now=clock.now())
+
+    def come(self, reason: DropReason) -> list[tuple[str, int]]:
+        """One cloud comes; returns what the link has of it, by topic and size, and drops it."""
+        cloud = scenes.cloud_body(scenes.structured(np.zeros((500, 3))), Encoding.CDR)
+        assert self.topic.sink(cloud, 1)
+        found: list[tuple[str, int]] = []
+        for channel in streams_of(self.channel, self.topic):
+            for out in list(channel.queue):
+                found.append((channel.stream.id.topic, len(out.message.body)))
+                channel.drop_head(reason, clock.now())
+        return found
+
+    def close(self) -> None:
+        self.topic.close()
+        self.summaries.close()
+
+
+@pytest.fixture
+async def stand_in() -> AsyncIterator[ByLink]:
+    made = ByLink(STAND_IN)
+    yield made
+    made.close()
+
+
+async def test_what_is_too_large_becomes_a_thinner_one_under_its_name(
+    stand_in: ByLink, caplog: pytest.LogCaptureFixture
+) -> None:
+    whole = [stand_in.come(DropReason.TOO_SLOW) for _ in range(MISSES)]
+    assert all(size > 8000 for ((_, size),) in whole)
+    ((name, size),) = stand_in.come(DropReason.SHUTDOWN)
+    assert name == "/robot1/points" and size < 200
+    (line,) = caplog.messages
+    assert line == "/points: the link is too slow for a message to arrive within 1 s; its voxel goes instead"
+    (told,) = stand_in.summaries.to_json(clock.now())
+    since_s = told.pop("since_s")
+    assert isinstance(since_s, float) and since_s >= 0.0
+    assert (told["topic"], told["stream"], told["kind"]) == ("/points", "/robot1/points", "voxel")
+    assert (told["level"], told["by_link"], told["switches"]) == ("summary", True, 1)
+    assert "summary" not in stand_in.channel.stream.attributes
+
+
+async def test_what_is_dropped_for_another_reason_goes_on_as_it_comes(stand_in: ByLink) -> None:
+    sizes = [stand_in.come(DropReason.SHUTDOWN)[0][1] for _ in range(3 * MISSES)]
+    assert min(sizes) > 8000
+
+
+async def test_a_summary_of_its_own_goes_where_only_it_is_wanted() -> None:
+    made = ByLink(replace(STAND_IN, params=VoxelParams(0.2)))
+    thin, whole = streams_of(made.channel, made.topic)
+    try:
+        assert made.come(DropReason.TOO_SLOW)[0][0] == "/robot1/points", "nobody is known to want the summary"
+        thin.wanted, whole.wanted = True, False
+        assert [name for name, _ in made.come(DropReason.TOO_SLOW)] == ["/robot1/points/voxel"]
+        whole.wanted = True
+        assert [made.come(DropReason.TOO_SLOW)[0][0] for _ in range(MISSES - 1)] == (MISSES - 1) * ["/robot1/points"]
+        assert [name for name, _ in made.come(DropReason.TOO_SLOW)] == ["/robot1/points/voxel"]
+    finally:
+        made.close()

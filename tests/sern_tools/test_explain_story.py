@@ -115,6 +115,8 @@ def test_every_event_can_be_told(event: TraceEvent) -> None:
         "rate_bps": 1e6,
         "rtt_s": 0.1,
         "lane": "udp",
+        "name": SCAN,
+        "lifespan_s": 1.0,
     }
     fields = fields if event is not TraceEvent.HELD else RELAY | {"reason": HoldReason.WINDOW}
     fields = fields if event is not TraceEvent.RATE_CAPPED else RELAY | {"reason": HoldReason.RATE_CAP}

@@ -10,11 +10,13 @@ from sern_core.link.holds import LOOK_S, LOOKED_AT
 from sern_core.link.view import LinkSettings
 from sern_core.site.lease import CommandLease
 from sern_core.stream.out_channel import OutChannel
+from sern_core.summaries.spec import SummaryLevel
 from sern_core.vocabulary.codec_names import Compression
 from sern_core.vocabulary.params import SchedulerParams
 from sern_core.vocabulary.trace import LINK, HoldReason, TraceEvent, TraceRecord
 from sern_core.vocabulary.types import ClientName, DropReason, Ordering, PriorityClass, TopicName
 from sern_sim.models import LinkModel, RateStep, Window
+from tests.sensors import FittedTopic
 from tests.sern_core.link.test_lanes import TwoLanes, models
 from tests.sern_core.link.test_priority_lane import PriorityScene, stream
 from tests.world import SimClient, World, spec
@@ -166,6 +168,17 @@ def capacity() -> tuple[TraceRecord, ...]:
     return records(robot, LINK)
 
 
+@cache
+def levels() -> tuple[TraceRecord, ...]:
+    """A link of 1 Mbit/s and then ten, for clouds of 300 kB."""
+    world = World(lossless=False)
+    robot, _site = pair(world, LinkModel(delay_s=0.025, rate_bps=1e6, rate_steps=(RateStep(3.0, 10e6),)))
+    clouds = FittedTopic(robot, "/robot/points", 300_000, 8_000, 10.0)
+    world.run(20.0)
+    assert clouds.fit.level is SummaryLevel.RAW
+    return records(robot, LINK)
+
+
 EVENTS: Final[dict[TraceEvent, Callable[[], tuple[TraceRecord, ...]]]] = {
     TraceEvent.QUEUED: lambda: robot_of(crossing()),
     TraceEvent.RATE_CAPPED: rate_capped,
@@ -187,6 +200,8 @@ EVENTS: Final[dict[TraceEvent, Callable[[], tuple[TraceRecord, ...]]]] = {
     TraceEvent.LANE_SILENT: lanes,
     TraceEvent.LANE_ANSWERS: lanes,
     TraceEvent.CAPACITY: capacity,
+    TraceEvent.SUMMARISED: levels,
+    TraceEvent.WHOLE: levels,
 }
 
 
