@@ -99,24 +99,23 @@ class ClockedPort:
         self.inner = port
         self.clock = clock
         self.sent: Callable[[bytes, float], object] | None = None
-        self._networks_own = clock == Clock()
 
     @property
     def dirty(self) -> bool:
         return getattr(self.inner, "dirty", True)
 
     def receive(self, data: bytes, *, now: float) -> None:
-        self.inner.receive(data, now=now if self._networks_own else self.clock.local(now))
+        self.inner.receive(data, now=self.clock.local(now))
 
     def next_datagram(self, *, now: float) -> bytes | None:
-        data = self.inner.next_datagram(now=now if self._networks_own else self.clock.local(now))
+        data = self.inner.next_datagram(now=self.clock.local(now))
         if data is not None and self.sent is not None:
             self.sent(data, now)
         return data
 
     def next_deadline(self) -> float | None:
         deadline_s = self.inner.next_deadline()
-        if deadline_s is None or self._networks_own:
+        if deadline_s is None or self.clock == Clock():
             return deadline_s
         # A nanosecond late: converted back it must not lie before the deadline.
         return self.clock.true(deadline_s) + 1e-9
