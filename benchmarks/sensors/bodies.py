@@ -19,7 +19,7 @@ OFFSETS: Final = {"x": 0, "y": 4, "z": 8, "rgb": 16}
 POINT: Final = np.dtype(
     {"names": [*OFFSETS], "formats": ["<f4"] * len(OFFSETS), "offsets": [*OFFSETS.values()], "itemsize": 24}
 )
-"""As depth cameras have it; 7.4 MB in all."""
+"""The layout of depth cameras; 7.4 MB in all."""
 BEAMS: Final = 1080
 NOISE: Final = 6.0
 """Standard deviation of a pixel, of 255: an image without any is too easily compressed."""

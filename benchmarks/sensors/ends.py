@@ -31,7 +31,7 @@ from sern_runtime import ros_types
 
 SERN: Final = "sern"
 ZENOH: Final = "zenoh"
-"""As it comes: one connection, one priority."""
+"""zenoh as it comes: one connection, one priority."""
 ZENOH_TUNED: Final = "zenoh-tuned-bbr"
 """The scan first and at once, then the camera, clouds last; a connection for each half of the priorities, BBR."""
 ALL: Final = (SERN, ZENOH, ZENOH_TUNED)
@@ -42,7 +42,7 @@ PREFIX: Final = "/robot"
 """Before the names of the topics at the site."""
 POLL_S: Final = 0.02
 LARGE_EVERY: Final = 10
-"""Of so many hellos of a scan one is followed by an image's and one by a cloud's."""
+"""How many hellos of a scan there are for each of an image and of a cloud."""
 COLUMNS: Final = ("sensor", "number", "stamp_ns", "at_ns", "nbytes")
 
 Send = Callable[[Sensor, bytes], object]
@@ -65,7 +65,7 @@ class Spec:
 
     @property
     def awaited(self) -> set[Sensor]:
-        """Of which a hello must have come."""
+        """The sensors of which a hello must have come."""
         return set(Sensor) if self.whole else {Sensor.SCAN}
 
     @property
@@ -79,7 +79,7 @@ class Log:
     def __init__(self) -> None:
         self.rows: list[tuple[int, int, int, int, int]] = []
         self.heard: set[Sensor] = set()
-        """Of which sensors a hello has come."""
+        """The sensors of which a hello has come."""
 
     def arrived(self, sensor: Sensor, body: bytes | memoryview) -> None:
         at_ns, tag = time.monotonic_ns(), tag_of(body)
