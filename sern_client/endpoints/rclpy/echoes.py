@@ -36,7 +36,7 @@ class _Topic:
 
 
 def digest(body: bytes) -> int:
-    """A digest of length and ends: with the time of publication that is enough, and it costs the same for every size."""
+    """A digest of length and ends: with the time of publication that is enough, at one price for every size."""
     return hash((len(body), body[:_END_BYTES], body[-_END_BYTES:]))
 
 
