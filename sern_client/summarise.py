@@ -539,7 +539,7 @@ class SummarisedTopic:
         return raw or len(accepted) > 1 or accepted[0]
 
     def _pass_by_link(self, fit: Fit, body: bytes, stamp_ns: int, born_s: float) -> bool:
-        """As `_pass`, with the level that the link allows."""
+        """Send a message as `_pass` does, at the level that the link allows."""
         level = self._level(fit, clock.now())
         if level is SummaryLevel.RAW and not any(output.shares_topic for output in self.outputs):
             fit.sent(self._channel.next_seq)

@@ -9,23 +9,14 @@ from dataclasses import replace
 from itertools import pairwise
 from typing import Final, NamedTuple
 
+from benchmarks.sensors import WIFI
 from sern_core.site.fit import Fit
 from sern_core.stream.out_channel import OutChannel
 from sern_core.summaries.spec import SummaryLevel
 from sern_core.vocabulary.types import PriorityClass
-from sern_sim.models import LinkModel, RateStep
+from sern_sim.models import RateStep
 from tests.world import Got, SimClient, World, spec
 
-WIFI: Final = LinkModel(
-    rate_bps=25e6,
-    delay_s=0.020,
-    jitter_s=0.010,
-    loss=0.005,
-    reorder=0.01,
-    reorder_delay_s=0.010,
-    duplicate=0.001,
-    queue_packets=1000,
-)
 SCAN, CAMERA, CLOUD = "/robot/scan", "/robot/camera", "/robot/points"
 RATES_HZ: Final = {SCAN: 8.0, CAMERA: 11.9, CLOUD: 12.0}
 SCAN_BYTES: Final = 8_700

@@ -22,12 +22,11 @@ import psutil
 from benchmarks import common
 from benchmarks.link import runs
 from benchmarks.link.sern import RELAY_PORT
-from benchmarks.sensors import figures
+from benchmarks.sensors import WIFI, figures
 from benchmarks.sensors.bodies import Sensor
 from benchmarks.sensors.ends import ALL, OUR_PORT, SERN, THEIR_PORT, ZENOH_TUNED, Spec
 from sern_core.vocabulary.errors import SernError
 from sern_runtime.config.yaml import read_document
-from sern_sim.models import LinkModel
 from sern_tools.harness.files import client_content, write
 from sern_tools.harness.processes import Child, Children, killed
 from sern_tools.keygen import make_keys
@@ -35,16 +34,6 @@ from sern_tools.lab.lab import Lab
 
 EXAMPLE: Final = Path(__file__).resolve().parent / "robot.yaml"
 """What the robot is configured by, but for addresses."""
-WIFI: Final = LinkModel(
-    rate_bps=25e6,
-    delay_s=0.020,
-    jitter_s=0.010,
-    loss=0.005,
-    reorder=0.01,
-    reorder_delay_s=0.010,
-    duplicate=0.001,
-    queue_packets=1000,
-)
 WARM_S: Final = 3.0
 CASE: Final = "25 Mbit/s 20±10 ms"
 

@@ -213,7 +213,7 @@ class ClientCore:
         self.trace.record(now, channel.stream.id.topic, TraceEvent.DROPPED, reason=reason)
 
     def level_changed(self, channel: OutChannel, level: SummaryLevel, *, now: float) -> None:
-        """By what the link carries, this topic's messages go as they come from now on, or their summary does."""
+        """Record what the link has this topic sent as from now on: its messages as they come, or their summary."""
         event = TraceEvent.SUMMARISED if level is SummaryLevel.SUMMARY else TraceEvent.WHOLE
         name, lifespan_s = channel.stream.id.topic, channel.spec.lifespan_s or 0.0
         self.trace.record(now, LINK, event, name=name, lifespan_s=lifespan_s)  # a topic forgets in seconds

@@ -22,9 +22,9 @@ if TYPE_CHECKING:
 UNKNOWN_NODES: Final = frozenset({"_NODE_NAME_UNKNOWN_", ""})
 """What rclpy calls nodes whose names it does not know yet."""
 MAX_UNKNOWN_LOOKS: Final = 8
-"""So many looks in a row a topic's unknown nodes are waited for. A writer that is of no node never gets one."""
+"""For how many looks in a row a topic waits for unknown nodes. A writer that is of no node never gets one."""
 EVERY: Final = 4
-"""A topic with as many publishers as before is looked at in every so manyth look."""
+"""One look in so many asks for a topic that has as many publishers as before."""
 
 _HASH: Final = re.compile(r"RIHS01_(?!0{64})[0-9a-f]{64}")
 """Nodes of before Iron do not say the hash of their types."""
@@ -116,8 +116,8 @@ class Graph:
     # --- services ---------------------------------------------------------------------------------------------------
 
     def services(self) -> tuple[dict[TopicName, dict[str, str]], set[str]]:
-        """Of each service of this site: its types, and a node that serves it with that. And the names of all services
-        of which a node is known: discovery tells that a moment later than the services."""
+        """The services of this site, each with its types and a node that serves it with that; and the names of all
+        services of which a node is known: discovery tells that a moment later than the services."""
         bridged = self._bridged()
         found: dict[TopicName, dict[str, str]] = {}
         named: set[str] = set()

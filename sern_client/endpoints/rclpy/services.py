@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 MATCH_POLL_S: Final = 0.005
 """How often a call that waits for its server looks whether it is there: rclpy has no sign of it."""
 AGAIN: Final = 20
-"""In every so manyth look nodes are asked for their services though all seems to be as it was."""
+"""One look in so many asks nodes for their services though all seems to be as it was."""
 MAX_CALLS: Final = 100
 """Calls of one service under way here at a time; more are not answered."""
 
@@ -52,7 +52,7 @@ class Services:
         self._seen: object = None
         self._looks = 0
         self._unnamed = False
-        """Of some service the node is not known yet, and so not whose it is."""
+        """Whether the node of some service is not known yet, and so not whose it is."""
 
     def watch(self, events: ServiceEvents) -> None:
         self._events = events
