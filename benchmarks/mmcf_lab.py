@@ -48,7 +48,7 @@ API: Final = f"http://127.0.0.1:{HTTP_PORT}"
 LINK: Final = LinkModel(rate_bps=4e6, delay_s=0.025, loss=0.01)
 THIN_BPS: Final = 1e6
 """The rate in the second third of a run."""
-RUN_S, QUICK_S = 36, 9
+RUN_S, QUICK_S = 30, 9
 WARM_S: Final = 3.0
 """Not counted: the load begins, and a controller finds out what the link carries."""
 
