@@ -15,7 +15,7 @@ from typing import Final
 
 from sern_core.vocabulary.errors import ConfigError
 from sern_core.vocabulary.types import Encoding
-from sern_runtime import ros_services, ros_text, ros_types
+from sern_runtime import ros_installation, ros_services, ros_text, ros_types
 
 _SEPARATOR: Final = "=" * 80 + "\n"
 _DIVIDER: Final = "---"
@@ -101,8 +101,11 @@ class TypeFiles:
             raise ConfigError(f"{path}: cannot be read ({ros_types.one_line(error)})") from None
 
     def _shared(self, name: str) -> Path | None:
-        package, kind, base = name.split("/")
-        share = None if self._share is None else self._share(package)
+        parts = name.split("/")
+        if self._share is None or len(parts) != 3 or not all(part.isidentifier() for part in parts):
+            return None
+        package, kind, base = parts
+        share = self._share(package)
         path = None if share is None else share / kind / f"{base}.{kind}"
         return path if path is not None and path.is_file() else None
 
@@ -134,6 +137,14 @@ class TypeFiles:
             for part in rest:
                 head, _, body = part.partition("\n")
                 sections.setdefault(ros_types.canonical(head.removeprefix("MSG: ").strip()), body)
+
+
+def installed_files(own: Iterable[Path]) -> list[TypeFiles]:
+    """Definitions by where they may come from, the nearest first: the directories `own` with what is sourced, with each
+    installation of ROS 2 on this machine, and with what is known here."""
+    own = tuple(own)
+    groups = ros_installation.overlays()
+    return [*(TypeFiles(own, ros_installation.share_in(*group)) for group in groups), TypeFiles(own)]
 
 
 def _heading(name: str) -> str:

@@ -3,7 +3,7 @@
 import os
 import re
 import sys
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Final
 
@@ -16,8 +16,20 @@ _LEVELS: Final = 6
 
 def prefixes(environment: Mapping[str, str] = os.environ, system: Path = SYSTEM) -> Iterator[Path]:
     """Prefixes of what is sourced, the nearest overlay first, then of what is installed."""
-    sourced = [Path(text) for text in environment.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if text]
-    yield from dict.fromkeys([*sourced, *(sorted(system.iterdir()) if system.is_dir() else [])])
+    yield from dict.fromkeys([*_sourced(environment), *(sorted(system.iterdir()) if system.is_dir() else [])])
+
+
+def overlays(environment: Mapping[str, str] = os.environ, system: Path = SYSTEM) -> list[tuple[Path, ...]]:
+    """The same prefixes in groups that are complete by themselves: what is sourced, then each installation. ROS 1 may
+    be installed in the same folder and is none of them."""
+    sourced = tuple(_sourced(environment))
+    installed = [place for place in prefixes(environment, system) if (place / "share" / "ament_index").is_dir()]
+    groups = [sourced, *((place,) for place in installed if place not in sourced)]
+    return [group for group in groups if group]
+
+
+def _sourced(environment: Mapping[str, str]) -> list[Path]:
+    return [Path(text) for text in environment.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if text]
 
 
 def pythons(places: Iterable[Path]) -> dict[Path, str]:
@@ -49,6 +61,12 @@ def remedy(environment: Mapping[str, str] = os.environ, system: Path = SYSTEM) -
         f"that of {place} is for Python {python}, and this is {mine}: install SERN with python{python} and source "
         f"{place}/setup.bash (docs/ros2.md); kinds dds and zenoh need no installation"
     )
+
+
+def share_in(*places: Path) -> Callable[[str], Path | None]:
+    """Where the files of a package are: `share/PACKAGE` of the first of these prefixes that has it; None where none
+    has."""
+    return lambda package: next((path for place in places if (path := place / "share" / package).is_dir()), None)
 
 
 def share_of(package_file: str, package: str) -> Path | None:
