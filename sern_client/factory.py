@@ -22,7 +22,12 @@ def make_endpoint(loaded: Loaded[ClientFile]) -> Endpoint:
     if len(made) == 1:
         return made[0]
     elsewhere = services_elsewhere(named)
-    return CompositeEndpoint(made, no_services_of=[made[index] for index in elsewhere])
+    services_only = [
+        endpoint
+        for section, endpoint in zip(named, made, strict=True)
+        if isinstance(section, sections.RclpyEndpoint) and section.services_only
+    ]
+    return CompositeEndpoint(made, no_services_of=[made[index] for index in elsewhere], no_topics_of=services_only)
 
 
 def services_elsewhere(named: Sequence[sections.EndpointSection]) -> list[int]:

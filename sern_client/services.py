@@ -153,6 +153,9 @@ class ServiceBridge:
         _log.info("offering service %s (%s) as %s", info.name, info.type_name, name)
         self._kick()
 
+    def wants_service(self, name: TopicName) -> bool:
+        return find(self._offer, name) is not None
+
     def service_removed(self, name: TopicName) -> None:
         offered = self.offered.pop(to_global(name, self._namespace), None)
         if offered is not None:

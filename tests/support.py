@@ -86,5 +86,8 @@ class Events:
         assert info.name not in self.services, f"{info.name} is announced twice"
         self.services[info.name] = info
 
+    def wants_service(self, name: TopicName) -> bool:
+        return True
+
     def service_removed(self, name: TopicName) -> None:
         del self.services[name]

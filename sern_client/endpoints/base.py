@@ -209,6 +209,9 @@ class ServiceEvents(Protocol):
 
     def service_removed(self, name: TopicName) -> None: ...
 
+    def wants_service(self, name: TopicName) -> bool:
+        """Whether this site has a rule for it: what is wrong with other services is of no interest to anybody."""
+
 
 class ServiceServer(Protocol):
     def close(self) -> None:

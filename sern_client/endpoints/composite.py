@@ -125,6 +125,9 @@ class _ServiceMembers:
     def service_removed(self, name: TopicName) -> None:
         self._owner.service_removed(self._member, name)
 
+    def wants_service(self, name: TopicName) -> bool:
+        return self._owner.wants_service(name)
+
 
 class _Servers:
     def __init__(self, servers: list[ServiceServer]) -> None:
@@ -140,15 +143,25 @@ class CompositeEndpoint:
 
     A topic that several members give is announced once, as the first of them describes it, and removed with the last;
     a member that gives it with another type or encoding is left out of it, with a warning. `no_services_of`: members
-    that have topics only, since the services of their nodes are another member's.
+    that have topics only, since the services of their nodes are another member's. `no_topics_of`: members that have
+    services only.
     """
 
-    def __init__(self, endpoints: Sequence[Endpoint], *, no_services_of: Sequence[Endpoint] = ()) -> None:
+    def __init__(
+        self,
+        endpoints: Sequence[Endpoint],
+        *,
+        no_services_of: Sequence[Endpoint] = (),
+        no_topics_of: Sequence[Endpoint] = (),
+    ) -> None:
         if not endpoints:
             raise UsageError("a composite endpoint needs at least one member")
         self.converter = Converter()
         self._members = list(endpoints)
         self._topics_only = list(no_services_of)
+        self._publishing = {
+            index: member for index, member in enumerate(endpoints) if not any(member is one for one in no_topics_of)
+        }
         self._events: TopicEvents | None = None
         self._started: list[Endpoint] = []
         self._providers: dict[TopicName, dict[int, TopicInfo]] = {}  # members in the order they announced
@@ -209,12 +222,14 @@ class CompositeEndpoint:
             return publishers
         if len(refusals) == 1:
             raise refusals[0]
+        if not refusals:
+            raise ConfigError(f"{info.name}: the endpoints here have services only")
         raise ConfigError("; ".join(dict.fromkeys(str(error) for error in refusals)))
 
     def _offer(self, publishers: _Publishers) -> list[ConfigError]:
         """At the members that have it not yet; the refusals of those that do not take it."""
         refusals: list[ConfigError] = []
-        for index, member in enumerate(self._members):
+        for index, member in self._publishing.items():
             if index not in publishers.parts:
                 try:
                     publishers.add(index, self.converter.advertise(member, publishers.info))
@@ -226,7 +241,7 @@ class CompositeEndpoint:
         """One is no more: a member that refused another of its name, for its sake, may take that now."""
         if publishers in self._opened:
             self._opened.remove(publishers)
-            if any(len(other.parts) < len(self._members) for other in self._opened if other.name == publishers.name):
+            if any(len(other.parts) < len(self._publishing) for other in self._opened if other.name == publishers.name):
                 loop = asyncio.get_running_loop()
                 loop.call_soon(self._offer_again, publishers.name)
                 loop.call_later(AGAIN_S, self._offer_again, publishers.name)
@@ -336,6 +351,9 @@ class CompositeEndpoint:
             if not owners:
                 del self._servers[name]
                 self._service_events.service_removed(name)
+
+    def wants_service(self, name: TopicName) -> bool:
+        return self._service_events is not None and self._service_events.wants_service(name)
 
     def member_added(self, index: int, info: TopicInfo) -> None:
         assert self._events is not None

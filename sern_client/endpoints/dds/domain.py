@@ -13,6 +13,8 @@ from sern_core.vocabulary.errors import ConfigError
 MAX_DOMAIN: Final = 232
 LOOPBACK_FRAGMENT_BYTES: Final = 62_000
 """Larger datagrams than a network takes whole: on loopback every datagram costs a system call, and none is lost."""
+FAST_DDS_VENDOR: Final = "1.15"
+"""The vendor id of eProsima (RTPS 2.5, 9.3.1.2), as Cyclone DDS's configuration has it."""
 PARTICIPANTS_A_HOST: Final = 32
 """How many participants are looked for on each host that multicast does not reach."""
 
@@ -57,7 +59,11 @@ class DomainOptions:
             discovery += f"<LeaseDuration>{round(self.lease_s * 1000)}ms</LeaseDuration>"
         if self.receive_buffer_bytes or self.localhost_only:
             internal += f'<SocketReceiveBufferSize max="{self.receive_buffer_bytes or 4 * 2**20}B"/>'
-        parts = (("General", general), ("Discovery", discovery), ("Internal", internal))
+        # Type objects of Fast DDS 3 (Kilted) are none to Cyclone DDS, which would match half of all types with nothing.
+        compatibility = f"<IgnoreTypeInformation>{FAST_DDS_VENDOR}</IgnoreTypeInformation>"
+        parts = (
+            ("General", general), ("Discovery", discovery), ("Internal", internal), ("Compatibility", compatibility),
+        )  # fmt: skip
         text = "".join(f"<{name}>{content}</{name}>" for name, content in parts if content)
         return f'<Domain id="any">{text}</Domain>'
 

@@ -52,7 +52,7 @@ from sern_core.vocabulary.types import DropReason, Encoding, TopicName
 from sern_runtime import ros_types
 from sern_runtime.ros_types import ResolvedType
 
-RELIABLE_DEPTH: Final = 10
+DEPTH: Final = 10
 """How many messages a writer keeps for its slow readers where the stream names no depth, as ROS 2 does."""
 
 _log = logging.getLogger(__name__)
@@ -101,7 +101,9 @@ class DdsEndpoint:
         """ConfigError when the domain cannot be joined with these settings."""
         self.entities.join(self.settle)
         self._events = events
-        self._started_s = asyncio.get_running_loop().time()
+        loop = asyncio.get_running_loop()
+        self.graph.later = loop.call_later
+        self._started_s = loop.time()
 
     async def stop(self) -> None:
         """Leaves the domain; no thread and no socket stays behind."""
@@ -111,6 +113,7 @@ class DdsEndpoint:
         self.subscriptions.close()
         self._streams.close()
         self._events = None
+        self.graph.end()
         await self.entities.leave()
 
     @property
@@ -136,7 +139,8 @@ class DdsEndpoint:
         """ConfigError for another encoding than CDR, a type nobody defines, or one with another hash than here."""
         resolved = self._resolve(info)
         offered = replace(writer_for(info, lifespan=self.options.offer_lifespan), type_hash=resolved.text.type_hash)
-        depth = info.depth or (RELIABLE_DEPTH if offered.reliable else 1)
+        depth = info.depth or DEPTH
+        best_effort = info.reliable is False and not info.latched
         topic = names.to_dds(info.name)
         writer = self.entities.open_writer(topic, resolved, offered, depth=depth)
         first_messages = FirstMessages(
@@ -144,9 +148,9 @@ class DdsEndpoint:
             readers=lambda: writer.readers(self._waiting_readers(topic, names.type_to_dds(resolved.name), offered)),
             write=writer.publish,
             dropped=self._streams.drop,
-            max_messages=max(depth, self.options.queue_depth) if offered.reliable else depth,
+            max_messages=info.depth or 1 if best_effort else max(depth, self.options.queue_depth),
             max_bytes=self.options.max_buffer_bytes,
-            overflow=DropReason.QUEUE_FULL if offered.reliable else DropReason.SUPERSEDED,
+            overflow=DropReason.SUPERSEDED if best_effort else DropReason.QUEUE_FULL,
             learning_s=self._started_s + LEARN_S - asyncio.get_running_loop().time(),
         )
         return self._streams.open(info.name, writer, first_messages)
@@ -264,7 +268,8 @@ class DdsEndpoint:
                 text = self.types.message(type_name, writer.qos.type_hash)
             except ConfigError as error:
                 why = names.cut(str(error), 600)
-                self.say_once(partial(self._left_alone, name, writer, why), name, kind)
+                line = partial(self._left_alone, name, writer, why)
+                self.graph.when_named(writer, partial(self.say_once, line, name, kind), name, kind)
                 continue
             every = [other.qos for other in writers if other.type_name == writer.type_name]
             offered = within_reach(every) or every

@@ -148,6 +148,7 @@ class Entities:
                 "too many participants on this host, or no such interface"
             ) from None
         self.graph.own = participant.guid
+        self.graph.modern_seen = self._info_changed
         worker = Worker(participant, self.graph, settle, max_buffer_bytes=self._max_buffer_bytes)
         self._joined = _Joined(participant, Publisher(participant), Subscriber(participant), worker)
         info = ros_types.resolve(node_info.TYPE, "", Encoding.CDR)
@@ -322,7 +323,7 @@ class Entities:
 
     def _tell_nodes(self) -> None:
         self._info_due = False
-        if self._info_writer is None:
+        if self._info_writer is None or not self.graph.modern:
             return
         hidden = {self._info_writer.guid}
         writers = [guid for guid in self._writers if guid not in hidden]

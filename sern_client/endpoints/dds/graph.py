@@ -5,8 +5,9 @@ No DDS in here: it is told what came and went, and answers with topics, services
 
 import logging
 from bisect import bisect_left, insort
-from collections.abc import Iterable
+from collections.abc import Callable, Hashable, Iterable
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Final, Protocol
 from uuid import UUID
 
@@ -22,6 +23,12 @@ MAX_COMPLAINTS: Final = 1000
 MAX_IGNORED_BEFORE: Final = 1000
 MAX_EARLY_NODES: Final = 64
 """Participants that are not known, and of whose nodes is kept what was said."""
+
+MAX_UNNAMED: Final = 64
+"""Lines that wait for the name of a node; one more is said without."""
+NAME_WAIT_S: Final = 5.0
+"""How long a line waits for it. A node tells its name after its readers and writers have been found; where the first
+try is lost, Fast DDS asks after 3 s whether all have it."""
 
 _log = logging.getLogger(__name__)
 
@@ -88,6 +95,13 @@ class Graph:
     events: GraphEvents
     accept_bridged: bool = False
     own_guard: str = ""
+    modern: bool = False
+    """Whether anybody of ROS 2 Iron or later was here: they say the hashes of their types, and read our node
+    information. Before Iron it had another layout, and what is in a wrong one may end a node."""
+    modern_seen: Callable[[], None] = lambda: None
+    """Called when the first of them is seen."""
+    later: Callable[[float, Callable[[], None]], object] | None = None
+    """`later(delay_s, call)` calls once after a delay. Without it nothing waits for the name of a node."""
     participants: dict[UUID, Participant] = field(default_factory=dict)
     remotes: dict[UUID, Remote] = field(default_factory=dict)
     locals: dict[UUID, Local] = field(default_factory=dict)
@@ -113,12 +127,16 @@ class Graph:
     """Readers and writers of this site, in the order of their GUIDs; by topic, and whether they write."""
     _locals_on: dict[str, dict[UUID, Local]] = field(default_factory=dict)
     _complained: dict[UUID, set[tuple[UUID, UUID]]] = field(default_factory=dict)
+    _unnamed: dict[tuple[Hashable, ...], tuple[Remote, Callable[[], None]]] = field(default_factory=dict)
+    """What is to be said once it is known of which node these are."""
 
     # What happens
 
     def participant_added(self, participant: Participant) -> None:
         """It came, or says something else of itself than before, which may change whose its readers and writers are."""
         self.participants[participant.guid] = participant
+        if participant.sern:
+            self._is_modern()
         early = self._early_nodes.pop(participant.guid, None)
         if early is not None:
             self._nodes[participant.guid] = early
@@ -179,6 +197,10 @@ class Graph:
         if participant in self.participants:
             self._nodes[participant] = nodes
             self._node_names.pop(participant, None)
+            waiting = [about for about, (remote, _) in self._unnamed.items() if remote.participant == participant]
+            for about in waiting:
+                if self._node(self._unnamed[about][0]) is not None:
+                    self._say(about)
             return
         self._early_nodes.pop(participant, None)
         self._early_nodes[participant] = nodes
@@ -208,16 +230,41 @@ class Graph:
 
     def owner(self, remote: Remote) -> str:
         """Whose it is, in words: the node where that is known, else the participant."""
-        known = self._node_names.get(remote.participant)
-        if known is None and (nodes := self._nodes.get(remote.participant)) is not None:
-            known = self._node_names[remote.participant] = node_info.by_entity(nodes)
-        if known and (node := known.get(remote.guid.bytes)) is not None:
+        node = self._node(remote)
+        if node is not None:
             return f"node {names.cut(node)}"
         participant = self.participants.get(remote.participant)
         name = participant.name if participant is not None and participant.name else "without a name"
         return f"participant {names.cut(name)} ({remote.participant.hex[:24]})"
 
+    def when_named(self, remote: Remote, say: Callable[[], None], *about: Hashable) -> None:
+        """Call `say` as soon as it is known of which node this is, or NAME_WAIT_S from now; once for all that is said
+        `about` the same meanwhile."""
+        if about in self._unnamed:
+            return
+        if self.later is None or self._node(remote) is not None or len(self._unnamed) >= MAX_UNNAMED:
+            say()
+        else:
+            self._unnamed[about] = remote, say
+            self.later(NAME_WAIT_S, partial(self._say, about))
+
+    def end(self) -> None:
+        """Nothing is said any more."""
+        self.later = None
+        self._unnamed.clear()
+
     # In here
+
+    def _node(self, remote: Remote) -> str | None:
+        known = self._node_names.get(remote.participant)
+        if known is None and (nodes := self._nodes.get(remote.participant)) is not None:
+            known = self._node_names[remote.participant] = node_info.by_entity(nodes)
+        return known.get(remote.guid.bytes) if known else None
+
+    def _say(self, about: tuple[Hashable, ...]) -> None:
+        _, say = self._unnamed.pop(about, (None, None))
+        if say is not None:
+            say()
 
     def _is_foreign(self, remote: Remote) -> bool:
         """Whether it would count as of this site by what its participant says now."""
@@ -226,8 +273,15 @@ class Graph:
             return True
         return self.accept_bridged and participant.sern != self.own_guard
 
+    def _is_modern(self) -> None:
+        if not self.modern:
+            self.modern = True
+            self.modern_seen()
+
     def _put_in(self, remote: Remote) -> None:
         self.remotes[remote.guid] = remote
+        if remote.qos.type_hash:
+            self._is_modern()
         self._of_participant.setdefault(remote.participant, {})[remote.guid] = None
         if remote.writer:
             self._writers[remote.handle] = remote
@@ -300,11 +354,20 @@ class Graph:
             return
         ros = names.from_dds(remote.topic)
         what = "subscriber" if local.writer else "publisher"
-        line = (
-            f"{ros.name if ros else remote.topic}: the {what} of {self.owner(remote)} and we do not match: "
-            + "; ".join(found)
-        )
-        self.complaints[local.guid, remote.guid] = line
-        for one in (local.guid, remote.guid):
-            self._complained.setdefault(one, set()).add((local.guid, remote.guid))
-        _log.warning("%s", line)
+        pair = local.guid, remote.guid
+
+        def line() -> str:
+            return (
+                f"{ros.name if ros else remote.topic}: the {what} of {self.owner(remote)} and we do not match: "
+                + "; ".join(found)
+            )
+
+        def say() -> None:
+            if pair in self.complaints:  # neither has gone
+                self.complaints[pair] = line()
+                _log.warning("%s", self.complaints[pair])
+
+        self.complaints[pair] = line()
+        for one in pair:
+            self._complained.setdefault(one, set()).add(pair)
+        self.when_named(remote, say, pair)

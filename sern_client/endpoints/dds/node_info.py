@@ -1,4 +1,7 @@
-"""`ros_discovery_info`: which nodes a participant has, and which readers and writers are whose (since ROS 2 Iron)."""
+"""`ros_discovery_info`: which nodes a participant has, and which readers and writers are whose.
+
+Two layouts are read, that of ROS 2 Iron and later, and that before, with longer ids. Only the former is written.
+"""
 
 import struct
 from collections.abc import Iterable
@@ -14,6 +17,8 @@ TYPE: Final = "rmw_dds_common/msg/ParticipantEntitiesInfo"
 MAX_BODY_BYTES: Final = 2**16
 """The largest body that is looked at: some 4000 readers and writers of one process."""
 GID_BYTES: Final = 16
+OLD_GID_BYTES: Final = 24
+"""Before Iron: a GUID, and zeros."""
 _HEADER_BYTES: Final = 4
 _ALIGNMENT: Final = 4
 _LITTLE: Final = struct.Struct("<I").unpack_from
@@ -50,13 +55,22 @@ def by_entity(nodes: Iterable[Node]) -> dict[bytes, str]:
 
 
 def decode(body: bytes) -> tuple[UUID, list[Node]] | None:
-    """Participant, and its nodes. None for what is larger than `MAX_BODY_BYTES` or does not decode: before Iron, GUIDs
-    were longer. What others send costs no more than its bytes: GUIDs are not looked at one by one."""
+    """Participant, and its nodes. None for what is larger than `MAX_BODY_BYTES` or does not decode in either layout.
+
+    In the other layout there is always something left over: where one has zeros, the other has the number of nodes.
+    """
     if not _HEADER_BYTES <= len(body) <= MAX_BODY_BYTES:
         return None
+    return _decode(body, GID_BYTES) or _decode(body, OLD_GID_BYTES)
+
+
+def _decode(body: bytes, gid_bytes: int) -> tuple[UUID, list[Node]] | None:
+    """What others send costs no more than its bytes: GUIDs of today's layout are not looked at one by one."""
     number = _LITTLE if body[1] & 1 else _BIG
-    at = _HEADER_BYTES + GID_BYTES
-    participant = body[_HEADER_BYTES:at]
+    at = _HEADER_BYTES + gid_bytes
+    participant = body[_HEADER_BYTES : _HEADER_BYTES + GID_BYTES]
+    if len(participant) < GID_BYTES:
+        return None
 
     def part(element_bytes: int) -> bytes:
         """The next sequence: the number of its elements, which is aligned, and they."""
@@ -77,7 +91,10 @@ def decode(body: bytes) -> tuple[UUID, list[Node]] | None:
             if namespace[-1:] != b"\0" or name[-1:] != b"\0":
                 return None
             full = f"{namespace[:-1].decode().rstrip('/')}/{name[:-1].decode()}"
-            nodes.append(Node(full, part(GID_BYTES) + part(GID_BYTES)))
+            gids = part(gid_bytes) + part(gid_bytes)
+            if gid_bytes > GID_BYTES:
+                gids = b"".join(gids[start : start + GID_BYTES] for start in range(0, len(gids), gid_bytes))
+            nodes.append(Node(full, gids))
     except (ValueError, struct.error):
         return None
     return (UUID(bytes=participant), nodes) if len(body) - at < _ALIGNMENT else None

@@ -112,9 +112,10 @@ def reader_for(writers: list[EndpointQos]) -> EndpointQos:
 
 
 def writer_for(info: TopicInfo, *, lifespan: bool) -> EndpointQos:
-    """What a stream that comes in is offered with. A ROS 1 stream does not say how reliable it is: it was all TCP."""
+    """What a stream that comes in is offered with: reliable always, which matches every subscriber. ROS 2 subscribers
+    ask for that by default, also of a topic that is best effort on the link."""
     return EndpointQos(
-        reliable=info.reliable is not False or info.latched,
+        reliable=True,
         durability=1 if info.latched else 0,
         deadline_ns=INFINITE_NS if info.deadline_s is None else round(info.deadline_s * 1e9),
         lifespan_ns=INFINITE_NS if info.lifespan_s is None or not lifespan else round(info.lifespan_s * 1e9),

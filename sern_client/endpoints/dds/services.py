@@ -13,6 +13,7 @@ import struct
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Final
 
 from sern_client.endpoints.base import ServiceEvents, ServiceHandler, ServiceInfo
@@ -177,13 +178,14 @@ class DdsServices:
         graph = self._entities.graph
         repliers = {writer.participant for writer in graph.writers(names.to_dds(name, Role.REPLY))}
         unknown: set[tuple[str, str]] = set()
+        wanted = self._events is not None and self._events.wants_service(name)
         for reader in graph.readers(names.to_dds(name, Role.REQUEST)):
             if reader.participant not in repliers:
                 continue
             type_name = names.type_from_dds(reader.type_name)
             if type_name is None or not type_name.endswith("_Request"):
                 continue
-            if not self._understood(name, reader):
+            if not self._understood(name, reader, wanted=wanted):
                 continue
             type_name = type_name.removesuffix("_Request")
             kind = type_name, reader.qos.type_hash
@@ -193,21 +195,31 @@ class DdsServices:
                 text = self._types.service(*kind)
             except ConfigError as error:
                 unknown.add(kind)
-                self._say_once(f"service {name} of {graph.owner(reader)} is left alone: {names.cut(str(error), 600)}")
+                if wanted:
+                    line = partial(self._left_alone, name, reader, names.cut(str(error), 600))
+                    graph.when_named(reader, partial(self._say_once, line, name, kind), name, kind)
                 continue
             return ServiceInfo(name, type_name, Encoding.CDR, text.type_hash, text.definition)
         return None
 
-    def _understood(self, name: TopicName, remote: Remote) -> bool:
+    def _left_alone(self, name: TopicName, remote: Remote, why: str) -> str:
+        return f"service {name} of {self._entities.graph.owner(remote)} is left alone: {why}"
+
+    def _understood(self, name: TopicName, remote: Remote, *, wanted: bool) -> bool:
         if puts_header(remote):
             return True
-        if self._events is not None:  # else they are not ours: an endpoint of kind rclpy has them
-            self._say_once(
-                f"service {name}: {self._entities.graph.owner(remote)} uses rmw_fastrtps, whose calls Cyclone DDS "
-                "cannot carry; an endpoint of kind rclpy beside this one (services_only) bridges them, or run "
-                "that node with RMW_IMPLEMENTATION=rmw_cyclonedds_cpp"
-            )
+        if wanted:
+            line = partial(self._not_understood, name, remote)
+            about = "rmw_fastrtps", name
+            self._entities.graph.when_named(remote, partial(self._say_once, line, *about), *about)
         return False
+
+    def _not_understood(self, name: TopicName, remote: Remote) -> str:
+        return (
+            f"service {name}: {self._entities.graph.owner(remote)} uses rmw_fastrtps, whose calls Cyclone DDS "
+            "cannot carry; an endpoint of kind rclpy beside this one (services_only) bridges them, or run "
+            "that node with RMW_IMPLEMENTATION=rmw_cyclonedds_cpp"
+        )
 
     # Client
 
@@ -302,7 +314,7 @@ class DdsServices:
 
     def _asked(self, server: _Server, sample: Sample) -> None:
         caller = self._entities.graph.writer(sample.handle)
-        if caller is not None and not self._understood(server.info.name, caller):
+        if caller is not None and not self._understood(server.info.name, caller, wanted=True):
             return
         try:
             request, client, number = Wrapped.split(sample.body)

@@ -85,7 +85,8 @@ class Services:
         try:
             definition, type_hash = self._interfaces.service_text(type_name)
         except ConfigError as error:
-            self._say_once(f"service {name} of {node}: {error}")
+            if self._events is None or self._events.wants_service(name):
+                self._say_once(f"service {name} of {node}: {error}")
         info = self._known[name] = ServiceInfo(name, type_name, Encoding.CDR, type_hash, definition)
         if self._events is not None:
             self._events.service_added(info)

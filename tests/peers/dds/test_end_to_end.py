@@ -49,7 +49,7 @@ async def test_a_ros1_recording_reaches_ros2(
 ) -> None:
     """A real drive in ROS 1, played to a relay; at the site a ROS 2 subscriber gets every message, converted."""
     # The peer may stand still for a second, and the socket of a usual machine holds less than that.
-    monkeypatch.setattr("sern_client.endpoints.dds.endpoint.RELIABLE_DEPTH", 1000)
+    monkeypatch.setattr("sern_client.endpoints.dds.endpoint.DEPTH", 1000)
     bag = recording("husky_gps_imu_odom.bag")
     topic = "/husky_velocity_controller/odom"
     peer = await make_peer(domain)

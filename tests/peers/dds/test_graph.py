@@ -22,6 +22,11 @@ async def test_we_are_a_node(domain: int, make_peer: MakePeer, make_endpoint: Ma
     peer = await make_peer(domain)
     endpoint, _ = await make_endpoint(domain, node_name="sern_jackal")
     await peer.do(f"sub info ros_discovery_info {INFO} reliable transient_local depth=1")
+    await peer.line("matched info 1")
+    await peer.do(f"pub old rt/old {STRING}")
+    await until(lambda: bool(endpoint.graph.writers("rt/old")))
+    assert not peer.got("info"), "nobody said a hash: nodes of before Iron could not read it"
+    await peer.do(f"pub new rt/new {STRING} userdata=typehash=RIHS01_0;")
     await peer.line("got info ")
     publisher = endpoint.advertise(topic_info("/chat", "std_msgs/msg/String", Encoding.CDR))
 

@@ -239,6 +239,9 @@ async def test_services_are_called_where_they_are_and_served_where_they_are_take
         def service_added(self, info: ServiceInfo) -> None:
             added.append(info)
 
+        def wants_service(self, name: TopicName) -> bool:
+            return True
+
         def service_removed(self, name: TopicName) -> None:
             removed.append(name)
 
@@ -329,10 +332,26 @@ async def test_a_member_whose_services_are_anothers_has_topics_only() -> None:
     assert not CompositeEndpoint([topics], no_services_of=[topics]).has_services
 
 
+async def test_a_member_with_services_only_is_given_no_topics(caplog: pytest.LogCaptureFixture) -> None:
+    topics, services = Fake(), Fake()
+    composite = CompositeEndpoint([topics, services], no_topics_of=[services])
+    info = TopicInfo(TopicName("/a"), "std_msgs/msg/String", Encoding.ROS1)
+    with caplog.at_level(logging.INFO):
+        publisher = composite.advertise(info)
+    publisher.publish(b"body", 0)
+    assert (topics.got, services.got, caplog.messages) == ([b"body"], [], [])
+    publisher.close()
+    with pytest.raises(ConfigError, match="/a: the endpoints here have services only"):
+        CompositeEndpoint([services], no_topics_of=[services]).advertise(info)
+
+
 def test_services_need_a_member_that_knows_them() -> None:
     class Nobody:
         def service_added(self, info: ServiceInfo) -> None:
             raise AssertionError(info)
+
+        def wants_service(self, name: TopicName) -> bool:
+            return True
 
         def service_removed(self, name: TopicName) -> None:
             raise AssertionError(name)

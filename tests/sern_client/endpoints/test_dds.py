@@ -36,6 +36,7 @@ from sern_client.endpoints.dds.services import new_service_id
 from sern_core.vocabulary.errors import ConfigError
 from sern_core.vocabulary.message import TopicInfo
 from sern_core.vocabulary.types import Encoding, TopicName
+from sern_runtime import ros_installation, ros_types
 from sern_runtime.ros_types import topic_info
 from tests.exploring import cases
 
@@ -178,14 +179,13 @@ def test_policies_of_others() -> None:
     ]  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    ("reliable", "latched", "offered"),
-    [(None, False, True), (True, False, True), (False, False, False), (None, True, True)],
-)
-def test_what_a_stream_is_offered_with(reliable: bool | None, latched: bool, offered: bool) -> None:
+@pytest.mark.parametrize("reliable", [None, True, False])
+@pytest.mark.parametrize("latched", [False, True])
+def test_what_a_stream_is_offered_with(reliable: bool | None, latched: bool) -> None:
+    """Reliable always: a subscriber asks for that unless told otherwise, and would get nothing."""
     info = TopicInfo(TopicName("/x"), "a/msg/B", Encoding.CDR, latched=latched, reliable=reliable, lifespan_s=1.0)
     qos = writer_for(info, lifespan=False)
-    assert (qos.reliable, qos.transient_local, qos.lifespan_ns) == (offered, latched, INFINITE_NS)
+    assert (qos.reliable, qos.transient_local, qos.lifespan_ns) == (True, latched, INFINITE_NS)
     assert writer_for(info, lifespan=True).lifespan_ns == 10**9
 
 
@@ -265,6 +265,42 @@ def test_definitions_by_hash(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="unknown here"):
         types.service("no_srvs/srv/Such")
     assert types.service("std_srvs/srv/Trigger").definition.startswith("---\n")
+
+
+def test_definitions_of_what_is_installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of what is sourced and, where its hash is another, of an installation beside it; types_paths come before both."""
+    texts = {"sourced": "int8 a\n", "jazzy": "int8 b\n", "own": "int8 c\n"}
+    for name, text in texts.items():
+        folder = tmp_path / name / "share" / "robot_msgs" / "msg"
+        folder.mkdir(parents=True)
+        (folder / "Lamp.msg").write_text(text)
+        (folder / "Old.msg").write_text("int8 x\n" if name == "jazzy" else "nowhere_msgs/Thing x\n")
+        (tmp_path / name / "share" / "ament_index").mkdir()
+    noetic = tmp_path / "noetic" / "share" / "robot_msgs" / "msg"
+    noetic.mkdir(parents=True)
+    (noetic / "Lamp.msg").write_text("int8 ros1\n")
+    found = [(tmp_path / "sourced",), (tmp_path / "jazzy",)]
+    environment = {"AMENT_PREFIX_PATH": str(tmp_path / "sourced")}
+    assert ros_installation.overlays(environment, tmp_path)[0] == found[0]
+    assert found[1] in ros_installation.overlays(environment, tmp_path)
+    assert (tmp_path / "noetic",) not in ros_installation.overlays(environment, tmp_path)
+    monkeypatch.setattr(ros_installation, "overlays", lambda: found)
+    hashes = {name: ros_types.hash_of("robot_msgs/msg/Lamp", text, Encoding.CDR) for name, text in texts.items()}
+
+    installed = Definitions(())
+    assert installed.message("robot_msgs/msg/Lamp").definition == texts["sourced"], "the nearest"
+    for name in ("sourced", "jazzy"):
+        assert installed.message("robot_msgs/msg/Lamp", hashes[name]).definition == texts[name]
+    with pytest.raises(ConfigError, match="add the directory with the right version"):
+        installed.message("robot_msgs/msg/Lamp", hashes["own"])
+    with pytest.raises(ConfigError, match="uses nowhere_msgs/msg/Thing"):
+        installed.message("robot_msgs/msg/Old")
+    old = ros_types.hash_of("robot_msgs/msg/Old", "int8 x\n", Encoding.CDR)
+    assert installed.message("robot_msgs/msg/Old", old).definition == "int8 x\n", "the place before has it broken"
+    assert Definitions([tmp_path / "own"]).message("robot_msgs/msg/Lamp").definition == texts["own"]
+    for name in ("../msg/Lamp", "robot_msgs/../Lamp", "robot_msgs/msg/../../Lamp"):
+        with pytest.raises(ConfigError):
+            installed.message(name)
 
 
 async def test_a_loop_that_is_too_slow_loses_the_oldest(domain_id: int, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,7 +1,10 @@
 """The graph of a DDS domain as the endpoint keeps it: whose readers and writers are, and what nodes say."""
 
 import logging
+from collections import Counter
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 from uuid import UUID
 
@@ -13,7 +16,16 @@ from hypothesis import strategies as st
 pytest.importorskip("cyclonedds", reason="the dds endpoint needs cyclonedds: pip install cyclonedds==11.0.1")
 
 from sern_client.endpoints.dds import node_info
-from sern_client.endpoints.dds.graph import MAX_EARLY_NODES, MAX_IGNORED_BEFORE, Graph, Local, Participant, Remote
+from sern_client.endpoints.dds.graph import (
+    MAX_EARLY_NODES,
+    MAX_IGNORED_BEFORE,
+    MAX_UNNAMED,
+    NAME_WAIT_S,
+    Graph,
+    Local,
+    Participant,
+    Remote,
+)
 from sern_client.endpoints.dds.names import RosName
 from sern_client.endpoints.dds.node_info import Node
 from sern_client.endpoints.dds.qos import EndpointQos
@@ -99,6 +111,39 @@ def test_node_information() -> None:
     assert node_info.decode(body + bytes(4)) is None
 
 
+def test_node_information_of_before_iron() -> None:
+    """As Humble writes it: ids of 24 bytes, of which the last eight are zeros."""
+
+    def old(guid: UUID) -> bytes:
+        return guid.bytes + bytes(8)
+
+    body = b"\0\1\0\0" + old(OTHER) + (1).to_bytes(4, "little")
+    body += (4).to_bytes(4, "little") + b"/ns\0" + (7).to_bytes(4, "little") + b"talker\0\0"
+    body += (1).to_bytes(4, "little") + old(UUID(int=5)) + (2).to_bytes(4, "little")
+    body += old(UUID(int=6)) + old(UUID(int=7))
+    gids = b"".join(UUID(int=number).bytes for number in (5, 6, 7))
+    assert node_info.decode(body) == (OTHER, [Node("/ns/talker", gids)])
+    nobody = 4 + 16 + 4  # an id of 16 bytes and no node, as today's layout has it
+    for length in (*range(nobody), *range(nobody + 4, len(body))):
+        assert node_info.decode(body[:length]) is None
+    assert node_info.decode(body[:nobody]) == (OTHER, [])
+    assert node_info.decode(b"\0\1\0\0" + old(OTHER) + bytes(4)) == (OTHER, [])
+
+
+def test_node_information_is_told_to_iron_and_later_only() -> None:
+    seen: list[bool] = []
+    graph = Graph(OWN, Heard(), modern_seen=lambda: seen.append(graph.modern))
+    graph.participant_added(Participant(OTHER, "robot"))
+    graph.remote_added(remote(11))
+    assert (graph.modern, seen) == (False, [])
+    for number in (12, 13):
+        graph.remote_added(remote(number, qos=EndpointQos(type_hash="RIHS01_1")))
+    assert seen == [True], "once"
+    other = Graph(OWN, Heard())
+    other.participant_added(Participant(SERN, "bridge", "sern_two"))
+    assert other.modern, "another SERN endpoint reads it as well"
+
+
 GUIDS = st.lists(st.uuids(), max_size=4)
 NAMES = st.text(st.characters(exclude_characters="\0", exclude_categories=["Cs"]), max_size=9)
 
@@ -164,6 +209,54 @@ def test_what_is_said_anew_of_nodes_holds() -> None:
         assert graph.owner(remote(11)) == f"node {name}"
     graph.participant_removed(OTHER)
     assert graph.owner(remote(11)).startswith("participant without a name")
+
+
+class Later:
+    """Calls that wait for their time."""
+
+    def __init__(self) -> None:
+        self.calls: list[Callable[[], None]] = []
+
+    def __call__(self, delay_s: float, call: Callable[[], None]) -> None:
+        assert delay_s == NAME_WAIT_S
+        self.calls.append(call)
+
+
+def test_a_line_waits_for_the_name_of_the_node(caplog: pytest.LogCaptureFixture) -> None:
+    """Each pair once: when the node is known, or when its time is over; not of what has gone meanwhile."""
+    later = Later()
+    graph = Graph(OWN, Heard(), later=later)
+    graph.participant_added(Participant(OTHER, "robot"))
+    graph.local_added(Local(UUID(int=20), False, "rt/chat", STRING, EndpointQos(reliable=True)))
+    for number in (11, 12, 13):
+        graph.remote_added(remote(number))
+    assert caplog.messages == [] and len(graph.complaints) == 3
+    graph.nodes_of(OTHER, [Node("/early", UUID(int=99).bytes)])
+    assert caplog.messages == []
+    graph.remote_removed(UUID(int=13))
+    graph.nodes_of(OTHER, [Node("/talker", UUID(int=11).bytes)])
+    (line,) = caplog.messages
+    assert line.startswith("/chat: the publisher of node /talker and we do not match: reliability")
+    assert line in graph.complaints.values()
+    for call in later.calls:
+        call()
+    assert len(caplog.messages) == 2
+    assert caplog.messages[1].startswith("/chat: the publisher of participant robot (")
+
+
+def test_what_is_said_about_the_same_waits_once_and_only_so_much_waits() -> None:
+    later, said = Later(), Counter[int]()
+    graph = Graph(OWN, Heard(), later=later)
+    graph.participant_added(Participant(OTHER, "robot"))
+    for _ in range(3):
+        for number in range(MAX_UNNAMED + 5):
+            graph.when_named(remote(number), partial(said.update, [number]), number)
+    assert said == dict.fromkeys(range(MAX_UNNAMED, MAX_UNNAMED + 5), 3), "for these there is no room"
+    assert len(later.calls) == MAX_UNNAMED
+    for call in later.calls:
+        call()
+        call()
+    assert [said[number] for number in range(MAX_UNNAMED)] == [1] * MAX_UNNAMED
 
 
 def test_bodies_in_the_other_byte_order() -> None:
