@@ -153,7 +153,7 @@ class _Topics:
 async def beside_sern(spec: Spec, orders: Orders, log: Log) -> None:
     listen, connect = f"tcp/127.0.0.1:{spec.our_port}", f"tcp/127.0.0.1:{spec.their_port}"
     session = SessionOptions(connect=(connect,), listen=(listen,))
-    node = ZenohEndpoint(ZenohOptions(session, node_name=f"sensors_{spec.role}"))
+    node = ZenohEndpoint(ZenohOptions(session, node_name=f"sensors_{spec.role}", accept_bridged=True, enclave="/"))
     names = {TopicName(PREFIX + topic.name): sensor for sensor, topic in TOPICS.items()}
 
     def added(info: TopicInfo) -> None:

@@ -271,7 +271,12 @@ class ZenohEndpoint(EndpointBase):
     node_name: Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$", max_length=200)] = "sern"
     """What it is called in `ros2 node list`."""
     type_paths: tuple[PathText, ...] = ()
-    """Directories with .msg and .srv files of types beyond those of a ROS 2 install (searched at any depth)."""
+    """Directories with .msg, .srv and .action files (searched at any depth), for types that are neither in a ROS 2
+    installation of this machine (AMENT_PREFIX_PATH, /opt/ros) nor of Jazzy's desktop, or in another version there."""
+
+    accept_bridged: bool = False
+    """Take what other SERN endpoints publish and serve in this domain for this site's own. For a chain of two links
+    with the domain in the middle; with two of them side by side it makes a loop."""
 
     def file_problems(self, base_dir: Path, loc: Loc) -> Iterator[FileProblem]:
         yield from missing_package("zenoh", installing("eclipse-zenoh"), loc)
@@ -305,7 +310,8 @@ class DdsEndpoint(EndpointBase):
     lease_s: Annotated[float, Field(ge=1, le=3600)] | None = None
     """After so long without a sign of us others take us for gone; null: as Cyclone DDS has it (10 s)."""
     type_paths: tuple[PathText, ...] = ()
-    """Directories with .msg and .srv files of types beyond those of a ROS 2 install (searched at any depth)."""
+    """Directories with .msg, .srv and .action files (searched at any depth), for types that are neither in a ROS 2
+    installation of this machine (AMENT_PREFIX_PATH, /opt/ros) nor of Jazzy's desktop, or in another version there."""
     queue_depth: Count = 100
     """Messages of one topic that may wait for the link; beyond, the oldest are dropped and counted."""
     max_buffer_bytes: Bytes = 64 * 2**20

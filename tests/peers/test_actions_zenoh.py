@@ -47,7 +47,7 @@ class Server:
     """A node that has the action `/fibonacci`. A goal ends with `release`, or when it is cancelled."""
 
     def __init__(self, router: Router) -> None:
-        self.node = ZenohEndpoint(ZenohOptions(router.options, DOMAIN, "server"))
+        self.node = ZenohEndpoint(ZenohOptions(router.options, DOMAIN, "server", accept_bridged=True, enclave="/"))
         self.goals: list[bytes] = []
         self.cancelled: list[bytes] = []
         self.release = asyncio.Event()
@@ -84,7 +84,10 @@ async def test_an_action_of_ros_2_across_the_link(tmp_path: Path, monkeypatch: p
     for router in routers:
         router.start()
     server = Server(routers[0])
-    client, events = ZenohEndpoint(ZenohOptions(routers[1].options, DOMAIN, "client")), Events()
+    client, events = (
+        ZenohEndpoint(ZenohOptions(routers[1].options, DOMAIN, "client", accept_bridged=True, enclave="/")),
+        Events(),
+    )
     client.watch_services(events)
     try:
         async with Lab(tmp_path, "robot1", "site") as lab:

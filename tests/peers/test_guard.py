@@ -37,7 +37,7 @@ def zenoh() -> tuple[sections.ZenohEndpoint, sections.ZenohEndpoint]:
     nowhere = f"tcp/127.0.0.1:{nobody}"
     here: dict[str, Any] = {"kind": "zenoh", "connect": (nowhere,), "listen": (f"tcp/127.0.0.1:{port}",)}
     there: dict[str, Any] = {"kind": "zenoh", "connect": (f"tcp/127.0.0.1:{port}",), "listen": ("tcp/127.0.0.1:0",)}
-    return sections.ZenohEndpoint(**there), sections.ZenohEndpoint(**here, node_name="driver")
+    return sections.ZenohEndpoint(**there), sections.ZenohEndpoint(**here, node_name="driver", accept_bridged=True)
 
 
 def zenoh_listening() -> tuple[sections.ZenohEndpoint, sections.ZenohEndpoint]:
@@ -47,7 +47,10 @@ def zenoh_listening() -> tuple[sections.ZenohEndpoint, sections.ZenohEndpoint]:
     fixed, free = f"tcp/0.0.0.0:{port}", "tcp/127.0.0.1:0"
     nowhere, here = f"tcp/127.0.0.1:{nobody}", f"tcp/127.0.0.1:{port}"
     own = sections.ZenohEndpoint(kind="zenoh", connect=(nowhere,), listen=(fixed,))
-    return own, sections.ZenohEndpoint(kind="zenoh", connect=(here,), listen=(free,), node_name="driver")
+    driver = sections.ZenohEndpoint(
+        kind="zenoh", connect=(here,), listen=(free,), node_name="driver", accept_bridged=True
+    )
+    return own, driver
 
 
 @asynccontextmanager

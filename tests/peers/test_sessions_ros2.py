@@ -53,7 +53,7 @@ async def test_dds(seed: int) -> None:
 async def test_zenoh(seed: int) -> None:
     port = free_ports(1)[0]
     locator = f"tcp/127.0.0.1:{port}"
-    observer = ZenohEndpoint(ZenohOptions(SessionOptions(connect=(), listen=(locator,)), 7))
+    observer = ZenohEndpoint(ZenohOptions(SessionOptions(connect=(), listen=(locator,)), 7, accept_bridged=True))
     endpoint = ZenohEndpoint(ZenohOptions(SessionOptions(connect=(locator,), listen=("tcp/127.0.0.1:0",)), 7))
     events = Events()
     await observer.start(events)

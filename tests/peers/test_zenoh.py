@@ -4,6 +4,7 @@ import asyncio
 import json
 import sys
 from collections.abc import AsyncIterator
+from contextlib import AsyncExitStack
 from pathlib import Path
 from typing import Any, Self
 
@@ -21,7 +22,7 @@ from sern_core.vocabulary.types import Encoding, TopicName
 from sern_runtime import ros_services, ros_types
 from sern_tools.ports import free_ports
 from tests.daemons import Lab, bodies, endpoint_of, under, write_bag
-from tests.support import DEADLINE_S, Events, until
+from tests.support import DEADLINE_S, Events, Patience, until
 
 zenoh = pytest.importorskip("zenoh", reason="the library eclipse-zenoh is missing: pip install eclipse-zenoh")
 pytest.importorskip("zenoh_ros2_sdk", reason="the peer zenoh-ros2-sdk is missing: pip install zenoh-ros2-sdk")
@@ -278,7 +279,7 @@ async def test_late_joiners_get_what_is_latched(endpoint: tuple[ZenohEndpoint, E
 
 
 async def test_a_late_site_gets_what_another_site_latched(router: Router) -> None:
-    first, second = (ZenohEndpoint(ZenohOptions(router.options, DOMAIN)) for _ in range(2))
+    first, second = (ZenohEndpoint(ZenohOptions(router.options, DOMAIN, accept_bridged=True)) for _ in range(2))
     nothing, events = Events(), Events()
     await first.start(nothing)
     await second.start(events)
@@ -299,6 +300,47 @@ async def test_a_late_site_gets_what_another_site_latched(router: Router) -> Non
     finally:
         await first.stop()
         await second.stop()
+
+
+async def test_what_came_over_a_link_is_not_taken(router: Router, peer: Peer) -> None:
+    """Two SERN endpoints side by side: of a topic that a node has too, only the node's messages are taken."""
+    ours, chained, theirs = (
+        ZenohEndpoint(ZenohOptions(router.options, DOMAIN, name, accept_bridged=name == "chained"))
+        for name in ("ours", "chained", "theirs")
+    )
+    events, all_events = Events(), Events()
+    async with AsyncExitStack() as stack:
+        for endpoint, heard in ((ours, events), (chained, all_events), (theirs, Events())):
+            endpoint.watch_services(heard)
+            await endpoint.start(heard)
+            stack.push_async_callback(endpoint.stop)
+        publisher = theirs.advertise(chat())
+        await until(lambda: CHAT in all_events.infos, "a chain of two links takes it")
+        await peer.do("publisher", name=CHAT)
+        await until(lambda: CHAT in events.infos, "the node's")
+        got: list[bytes] = []
+
+        def take(body: bytes, _stamp_ns: int) -> bool:
+            got.append(body)
+            return True
+
+        ours.subscribe(CHAT, take)
+        everything: list[bytes] = []
+
+        def take_all(body: bytes, _stamp_ns: int) -> bool:
+            everything.append(body)
+            return True
+
+        chained.subscribe(CHAT, take_all)
+        patience = Patience()
+        while not got or text("over the link") not in everything:
+            assert not patience.over()
+            publisher.publish(text("over the link"), 7)
+            await peer.do("publish", name=CHAT, data="of the node")
+        assert set(got) == {text("of the node")}
+        await peer.do("close", thing="pub" + CHAT)
+        await until(lambda: CHAT not in events.infos, "only the other endpoint has it")
+        assert CHAT in all_events.infos
 
 
 async def test_services_both_ways(endpoint: tuple[ZenohEndpoint, Events], peer: Peer) -> None:
@@ -337,7 +379,7 @@ async def test_a_server_that_is_known_before_it_can_be_reached_is_waited_for(
     router: Router, endpoint: tuple[ZenohEndpoint, Events]
 ) -> None:
     ours, events = endpoint
-    theirs = ZenohEndpoint(ZenohOptions(router.options, DOMAIN))
+    theirs = ZenohEndpoint(ZenohOptions(router.options, DOMAIN, enclave="/"))  # a node as others are
     await theirs.start(Events())
     try:
         dds_name, type_hash = names.dds_type("std_srvs/srv/SetBool"), "RIHS01_" + 64 * "0"

@@ -1,7 +1,8 @@
 """ROS 2 through zenoh, as rmw_zenoh does it: no ROS installation, bodies pass through as they are.
 
 The graph is what liveliness tokens say (`names`). A topic exists here while some other session has a publisher of it;
-services likewise. Our own session's entities are left out, so that what is published here does not come back.
+services likewise. Our own session's entities are left out, so that what is published here does not come back, and those
+of other SERN endpoints, because what they have came over a link; `accept_bridged` takes these.
 Publishers whose type or hash differs from the topic's first one are left out, with one line that names both.
 """
 
@@ -38,7 +39,7 @@ from sern_core.vocabulary.message import TopicInfo
 from sern_core.vocabulary.types import DropReason, Encoding, TopicName
 from sern_runtime import clock, ros_types
 from sern_runtime.outages import Outages
-from sern_runtime.ros_files import TypeFiles
+from sern_runtime.ros_files import installed_files
 
 ROUTER_WAIT_S: Final = 3.0
 """After so long without a router and without a peer we say so."""
@@ -66,9 +67,9 @@ class ZenohEndpoint:
 
     def __init__(self, options: ZenohOptions) -> None:
         self.options = options
-        self.types = TypeFiles(options.type_paths)
+        self.types = installed_files(options.type_paths)[0]
         self.session = ZenohSession(options.session)
-        self.node = Node(self.session, options.domain, options.node_name)
+        self.node = Node(self.session, options.domain, options.node_name, options.enclave)
         self.services = Services(self.node, self.types)
         self.say_once = SayOnce(_log, most=MAX_COMPLAINTS)
         self.subscriptions: Subscriptions[OnDemand] = Subscriptions(self.say_once)
@@ -143,7 +144,9 @@ class ZenohEndpoint:
         return self.subscriptions.add(OnDemand(topic.info, sink, self._receive, self.subscriptions.remove))
 
     def _receive(self, info: TopicInfo, arrived: Callable[[bytes, int], None]) -> Callable[[], None]:
-        return receive(self.node, info, self._asked(info.name), self.say_once, arrived)
+        return receive(
+            self.node, info, self._asked(info.name), self.say_once, arrived, accept_bridged=self.options.accept_bridged
+        )
 
     def _asked(self, name: TopicName) -> Qos:
         """What to ask for: what any of the publishers offers."""
@@ -215,7 +218,7 @@ class ZenohEndpoint:
     def _token_changed(self, key: str, alive: bool) -> None:
         try:
             entity = names.parse_token(key)
-            if self.node.owns(entity):
+            if self.node.owns(entity) or (entity.bridged and not self.options.accept_bridged):
                 return
             if entity.kind is Kind.PUBLISHER:
                 if alive:
@@ -284,6 +287,9 @@ class ZenohEndpoint:
             return ""
         mine = ros_types.hash_of(type_name, definition, Encoding.CDR)
         if entity.type_hash.startswith("RIHS01_") and entity.type_hash != mine:
+            known = ros_types.describe(type_name, Encoding.CDR)
+            if known is not None and known.type_hash == entity.type_hash:
+                return known.definition  # what is installed here is of another distribution than the robot
             self.say_once(
                 f"{entity.name}: {entity.node} has {type_name} with hash {entity.type_hash}, here it is {mine}; "
                 "its definition is left out"

@@ -1,7 +1,6 @@
 """What our node has for topics: subscribers, and writers."""
 
 import itertools
-import secrets
 import time
 from collections.abc import Callable
 from typing import Any, Final
@@ -19,9 +18,11 @@ CDR: Final = "application/cdr"
 
 
 def receive(
-    node: Node, info: TopicInfo, qos: Qos, say_once: SayOnce, arrived: Callable[[bytes, int], None]
-) -> Callable[[], None]:
-    """Have `arrived(body, stamp_ns)` called on the event loop, until what is returned is called."""
+    node: Node, info: TopicInfo, qos: Qos, say_once: SayOnce, arrived: Callable[[bytes, int], None], *,
+    accept_bridged: bool,
+) -> Callable[[], None]:  # fmt: skip
+    """Have `arrived(body, stamp_ns)` called on the event loop, until what is returned is called. What another SERN
+    endpoint published is left out, unless with `accept_bridged`."""
     session, zenoh = node.session, node.session.zenoh
     dds_name = names.dds_type(info.type_name)
     key = node.key(info.name, dds_name, info.type_hash)
@@ -29,15 +30,18 @@ def receive(
     def came(sample: Any) -> None:  # in a thread of zenoh's
         body = sample.payload.to_bytes()
         attachment = None if sample.attachment is None else sample.attachment.to_bytes()
-        session.handover.put(lambda: arrived(body, stamp_ns(attachment)), len(body) + len(attachment or b""))
+        session.handover.put(lambda: take(body, attachment), len(body) + len(attachment or b""))
 
-    def stamp_ns(attachment: bytes | None) -> int:
+    def take(body: bytes, attachment: bytes | None) -> None:
+        stamp_ns = None
         if attachment is not None:
             try:
-                return names.unpack_attachment(attachment).stamp_ns
+                _, stamp_ns, gid = names.unpack_attachment(attachment)
+                if gid.startswith(names.GID_MARK) and not accept_bridged:
+                    return
             except WireError as error:
                 say_once(f"{info.name}: {error}; its messages are stamped on arrival")
-        return time.time_ns()
+        arrived(body, time.time_ns() if stamp_ns is None else stamp_ns)
 
     try:
         if qos.transient_local:
@@ -60,7 +64,7 @@ class Writer:
         dds_name = names.dds_type(canonical(info.type_name))
         qos = Qos(info.reliable is not False, info.latched)
         self._session = node.session
-        self._gid = secrets.token_bytes(names.GID_BYTES)
+        self._gid = node.new_gid()
         self._seq = itertools.count(1)
         self._known = known
         self._publisher = self._declare(node.key(info.name, dds_name, type_hash), qos)

@@ -11,6 +11,7 @@ In tokens `/` is written `%`. Types are as DDS has them: `nav_msgs::msg::dds_::O
 """
 
 import re
+import secrets
 import struct
 from dataclasses import dataclass
 from enum import StrEnum
@@ -22,6 +23,10 @@ from sern_core.vocabulary.types import TopicName
 
 SPACE: Final = "@ros2_lv"
 GID_BYTES: Final = 16
+ENCLAVE: Final = "/sern"
+"""The security enclave that our nodes say they are in: SERN endpoints know each other by it, also those of `rclpy`."""
+GID_MARK: Final = b"sern"
+"""How the ids of publishers of SERN endpoints begin."""
 DEFAULT_DEPTH: Final = 10
 """The depth of ROS 2's default profile, which an empty one stands for."""
 _ATTACHMENT: Final = struct.Struct("<qqB16s")
@@ -77,6 +82,12 @@ class Entity(NamedTuple):
     dds_type: str
     type_hash: str
     qos: str
+    enclave: str = ""
+
+    @property
+    def bridged(self) -> bool:
+        """Whether it is of a SERN endpoint, and so came over a link."""
+        return self.enclave == ENCLAVE
 
 
 def mangle(name: str) -> str:
@@ -105,15 +116,15 @@ def data_key(domain: int, name: TopicName, dds_name: str, type_hash: str) -> str
     return f"{domain}/{name.lstrip('/')}/{dds_name}/{type_hash}"
 
 
-def node_token(domain: int, session: str, node: str) -> str:
-    return f"{SPACE}/{domain}/{session}/0/0/{Kind.NODE}/%/%/{node}"
+def node_token(domain: int, session: str, node: str, enclave: str) -> str:
+    return f"{SPACE}/{domain}/{session}/0/0/{Kind.NODE}/{mangle(enclave)}/%/{node}"
 
 
 def entity_token(
-    domain: int, session: str, entity: int, kind: Kind, node: str, *,
+    domain: int, session: str, entity: int, kind: Kind, node: str, enclave: str, *,
     name: TopicName, dds_name: str, type_hash: str, qos: Qos,
 ) -> str:  # fmt: skip
-    place = f"{SPACE}/{domain}/{session}/0/{entity}/{kind}/%/%/{node}"
+    place = f"{SPACE}/{domain}/{session}/0/{entity}/{kind}/{mangle(enclave)}/%/{node}"
     return f"{place}/{mangle(name)}/{dds_name}/{type_hash}/{qos.encode()}"
 
 
@@ -130,13 +141,19 @@ def parse_token(text: str) -> Entity:
         raise WireError(f"{text[:120]!r} has not the parts that a {kind} has")
     node = demangle(parts[7]).rstrip("/") + "/" + demangle(parts[8]).lstrip("/")
     key = "/".join(parts[2:5])
+    enclave = demangle(parts[6])
     if kind is Kind.NODE:
-        return Entity(parts[2], key, kind, node, TopicName(""), "", "", "")
+        return Entity(parts[2], key, kind, node, TopicName(""), "", "", "", enclave)
     name = demangle(parts[9])
     problem = name_problem(name)
     if problem is not None:
         raise WireError(f"name {name[:80]!r} {problem}")
-    return Entity(parts[2], key, kind, node, TopicName(name), parts[10], parts[11], parts[12])
+    return Entity(parts[2], key, kind, node, TopicName(name), parts[10], parts[11], parts[12], enclave)
+
+
+def new_gid(enclave: str) -> bytes:
+    """A new id for a publisher of ours."""
+    return (GID_MARK if enclave == ENCLAVE else bytes(len(GID_MARK))) + secrets.token_bytes(GID_BYTES - len(GID_MARK))
 
 
 def pack_attachment(seq: int, stamp_ns: int, gid: bytes) -> bytes:

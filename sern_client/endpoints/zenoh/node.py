@@ -34,17 +34,18 @@ class Declared:
 class Node:
     """What a session says of itself in the graph, once it is open."""
 
-    def __init__(self, session: ZenohSession, domain: int, name: str) -> None:
+    def __init__(self, session: ZenohSession, domain: int, name: str, enclave: str) -> None:
         self.session = session
         self._domain = domain
         self._name = name
+        self._enclave = enclave
         self._entities = itertools.count(1)
         self._zid = ""
         self._token: Any = None
 
     def join(self) -> None:
         self._zid = self.session.zid
-        self._token = self._declare(names.node_token(self._domain, self._zid, self._name))
+        self._token = self._declare(names.node_token(self._domain, self._zid, self._name, self._enclave))
 
     @property
     def others(self) -> str:
@@ -63,10 +64,14 @@ class Node:
         """Tell the others of an entity."""
         return self._declare(
             names.entity_token(
-                self._domain, self._zid, next(self._entities), kind, self._name,
+                self._domain, self._zid, next(self._entities), kind, self._name, self._enclave,
                 name=name, dds_name=dds_name, type_hash=type_hash, qos=qos,
             )
         )  # fmt: skip
+
+    def new_gid(self) -> bytes:
+        """A new id for a publisher of ours."""
+        return names.new_gid(self._enclave)
 
     def _declare(self, token: str) -> Any:
         return self.session.opened.liveliness().declare_token(token)

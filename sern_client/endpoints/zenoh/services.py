@@ -3,7 +3,6 @@
 import asyncio
 import itertools
 import logging
-import secrets
 import time
 from typing import Any, Final
 
@@ -36,7 +35,7 @@ class Services:
         self._present: dict[str, Presence] = {}  # by data key, of services that were called
         self._numbers = itertools.count(1)
         self._pending = PendingCalls()
-        self._gid = secrets.token_bytes(names.GID_BYTES)
+        self._gid = node.new_gid()
         self._serving: list[_Server] = []
 
     def watch(self, events: ServiceEvents) -> None:

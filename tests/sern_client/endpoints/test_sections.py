@@ -38,7 +38,7 @@ PAIRS = [
     (ZenohEndpoint, ZenohOptions),
     (RclpyEndpoint, RclpyOptions),
 ]
-SAID_BY_NO_FILE = {"second", "publishes_only"}
+SAID_BY_NO_FILE = {"second", "publishes_only", "enclave"}
 OTHERWISE_BY_DEFAULT = {(DdsOptions, "domain")}
 """Which domain it is where the file says nothing, the environment says."""
 
@@ -75,6 +75,8 @@ def test_options_are_those_of_the_section() -> None:
         "domain": 7,
         "node_name": "sern",
         "type_paths": (Path("/folder/one"), Path("/folder/two")),
+        "accept_bridged": False,
+        "enclave": "/sern",
     }  # fmt: skip
 
 

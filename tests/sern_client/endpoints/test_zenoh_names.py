@@ -19,21 +19,26 @@ def test_a_token_of_a_publisher() -> None:
     assert (entity.kind, entity.node, entity.name) == (Kind.PUBLISHER, "/robot/talker", "/robot/chatter")
     assert names.ros_type(entity.dds_type) == "std_msgs/msg/String"
     assert Qos.decode(entity.qos) == Qos(True, False, 7)
+    assert entity.enclave == "/" and not entity.bridged
     other = names.parse_token(TOKEN.replace("/0/10/MP", "/0/11/MP"))
     assert other.key != entity.key
 
 
 def test_what_we_write_can_be_read() -> None:
     token = names.entity_token(
-        3, "abc", 5, Kind.SERVER, "sern", name=TopicName("/a/b"), dds_name=names.dds_type("x/srv/Y"),
+        3, "abc", 5, Kind.SERVER, "sern", names.ENCLAVE, name=TopicName("/a/b"), dds_name=names.dds_type("x/srv/Y"),
         type_hash="RIHS01_1", qos=Qos(False, True, 3),
     )  # fmt: skip
     entity = names.parse_token(token)
     assert (entity.session, entity.kind, entity.node, entity.name) == ("abc", Kind.SERVER, "/sern", "/a/b")
     assert (names.ros_type(entity.dds_type), entity.type_hash) == ("x/srv/Y", "RIHS01_1")
     assert Qos.decode(entity.qos) == Qos(False, True, 3)
-    node = names.parse_token(names.node_token(3, "abc", "sern"))
+    node = names.parse_token(names.node_token(3, "abc", "sern", names.ENCLAVE))
     assert (node.kind, node.node) == (Kind.NODE, "/sern")
+    assert entity.bridged and node.bridged, "others of ours know them by their enclave"
+    first, second, other = (names.new_gid(enclave) for enclave in (names.ENCLAVE, names.ENCLAVE, "/"))
+    assert first != second and len(first) == len(other) == names.GID_BYTES
+    assert [gid.startswith(names.GID_MARK) for gid in (first, second, other)] == [True, True, False]
 
 
 @pytest.mark.parametrize(

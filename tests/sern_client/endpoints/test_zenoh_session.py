@@ -177,8 +177,8 @@ async def two() -> AsyncIterator[Two]:
     """One that listens, and one that comes to it."""
     (port,) = free_ports(1)
     here, there = f"tcp/127.0.0.1:{port}", "tcp/127.0.0.1:0"
-    one = ZenohEndpoint(ZenohOptions(SessionOptions(connect=(), listen=(here,))))
-    other = ZenohEndpoint(ZenohOptions(SessionOptions(connect=(here,), listen=(there,))))
+    one = ZenohEndpoint(ZenohOptions(SessionOptions(connect=(), listen=(here,)), accept_bridged=True))
+    other = ZenohEndpoint(ZenohOptions(SessionOptions(connect=(here,), listen=(there,)), accept_bridged=True))
     made = Two(one, other, Events(), Events())
     await one.start(made.events)
     other.watch_services(made.other_events)
