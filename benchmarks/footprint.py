@@ -79,12 +79,14 @@ class _Ready:
 
 
 def _prepare(folder: Path) -> None:
-    """The example files with free ports in place of the usual ones, and the keys that they name."""
+    """The example files with free ports in place of the usual ones, and the keys that they name. Without rclpy, which
+    needs ROS 2 installed."""
     relay, feed, *https = map(str, free_ports(3 + len(CLIENTS)))
     make_keys(folder, "relay", "jackal1", "site1", "j100_0000")
     for name, http in zip(("relay.yaml", *(client.file for client in CLIENTS.values())), https, strict=True):
         text = (EXAMPLES / name).read_text(encoding="utf-8")
         text = re.sub("0.0.0.0:5555|relay.example:5555", f"127.0.0.1:{relay}", text).replace(":5570", f":{feed}")
+        text = re.sub(r"\[({kind: dds[^}]*}), {kind: rclpy[^}]*}\]", r"\1", text)
         (folder / name).write_text(re.sub(":558[0-9]", f":{http}", text), encoding="utf-8")
 
 

@@ -55,7 +55,7 @@ def here(lab: Lab, name: str, endpoint: dict[str, object]) -> Path:
     content.pop("relay")
     content.pop("http")
     own = content.pop("endpoint")
-    assert own["kind"] in {"ros1", "dds"}
+    assert (own if isinstance(own, list) else [own])[0]["kind"] in {"ros1", "dds"}
     # `client_file` adds keys, the address of the relay and a free port for HTTP.
     return lab.client_file(client["name"], endpoint, **{"discovery": {"mode": "manual"}, **content}, client=client)
 
