@@ -74,12 +74,13 @@ class Peer:
         self.publishers[said["topic"]].publish(bytes.fromhex(said["body"]))
 
     def sub(self, said):
-        topic = said["topic"]
+        """With `sized` it tells of each message how much data it has, and nothing else."""
+        topic, sized = said["topic"], said.get("sized")
         self.kept.append(
             self.node.create_subscription(
                 load(said["type"]),
                 topic,
-                lambda message: say(event="got", topic=topic, value=str(message)),
+                lambda message: say(event="got", topic=topic, value=len(message.data) if sized else str(message)),
                 profile(said),
             )
         )
@@ -88,6 +89,13 @@ class Peer:
         return {
             "publishers": self.node.count_publishers(said["topic"]),
             "subscribers": self.node.count_subscribers(said["topic"]),
+        }
+
+    def nodes(self, said):
+        return {
+            "names": [
+                namespace.rstrip("/") + "/" + name for name, namespace in self.node.get_node_names_and_namespaces()
+            ]
         }
 
     def matched(self, said):
@@ -165,17 +173,67 @@ class Peer:
 
     def send_goal(self, said):
         kind = load("test_msgs/action/Fibonacci")
+        goal = kind.Goal()
+        goal.order = said["order"]
+        self.give(
+            said, kind, goal,
+            feedback=lambda feedback: {"sequence": list(feedback.sequence)},
+            result=lambda result: {"sequence": list(result.sequence)},
+        )  # fmt: skip
+
+    def navigator(self, said):
+        """To x below 100 it goes in steps, from 100 on it waits to be cancelled, and to what is behind it does not."""
+        kind = load("nav2_msgs/action/NavigateToPose")
+
+        def execute(handle):
+            x = handle.request.pose.pose.position.x
+            say(event="goal", x=x, frame=handle.request.pose.header.frame_id)
+            if x < 0:
+                handle.abort()
+                return kind.Result()
+            for left in range(3, -1, -1):
+                feedback = kind.Feedback()
+                feedback.distance_remaining = float(left)
+                feedback.current_pose = handle.request.pose
+                handle.publish_feedback(feedback)
+            while x >= 100 and not handle.is_cancel_requested:
+                time.sleep(0.005)
+            if handle.is_cancel_requested:
+                handle.canceled()
+                say(event="cancelled", x=x)
+            else:
+                handle.succeed()
+            return kind.Result()
+
+        self.kept.append(
+            ActionServer(
+                self.node, kind, said["action"], execute, callback_group=self.group,
+                cancel_callback=lambda _: CancelResponse.ACCEPT,
+            )
+        )  # fmt: skip
+
+    def navigate(self, said):
+        kind = load("nav2_msgs/action/NavigateToPose")
+        goal = kind.Goal()
+        goal.pose.header.frame_id = "map"
+        goal.pose.pose.position.x = float(said["x"])
+        self.give(
+            said, kind, goal,
+            feedback=lambda feedback: {"left": feedback.distance_remaining},
+            result=lambda result: {},
+        )  # fmt: skip
+
+    def give(self, said, kind, goal, feedback, result):
+        """Give a goal; what is heard of it is told as `feedback` and `result` make it of their messages."""
         name, key = said["action"], said["key"]
         client = self.actions.get(name)
         if client is None:
             client = self.actions[name] = ActionClient(self.node, kind, name, callback_group=self.group)
         assert client.wait_for_server(60), "no such action"
-        goal = kind.Goal()
-        goal.order = said["order"]
 
         def ended(future):
             answer = future.result()
-            say(event="result", key=key, status=answer.status, sequence=list(answer.result.sequence))
+            say(event="result", key=key, status=answer.status, **result(answer.result))
 
         def accepted(future):
             handle = future.result()
@@ -185,7 +243,7 @@ class Peer:
                 handle.get_result_async().add_done_callback(ended)
 
         def heard(message):
-            say(event="feedback", key=key, sequence=list(message.feedback.sequence))
+            say(event="feedback", key=key, **feedback(message.feedback))
 
         client.send_goal_async(goal, feedback_callback=heard).add_done_callback(accepted)
 

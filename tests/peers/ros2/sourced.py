@@ -17,23 +17,35 @@ from sern_tools.harness.processes import Child, Children
 from tests.support import Patience, until
 
 HERE: Final = Path(__file__).parents[3]
-PLACE: Final = Path(os.environ.get("SERN_ROS2_PEERS") or HERE / ".venv-ros2") / "jazzy"
-"""Where tests/peers/ros2/setup makes the environment: a venv, whose rclpy is for the Python that it was made with."""
+PLACES: Final = Path(os.environ.get("SERN_ROS2_PEERS") or HERE / ".venv-ros2")
+"""Where tests/peers/ros2/setup makes the environments: venvs, whose rclpy is for the Python that made them."""
+PLACE: Final = PLACES / "jazzy"
 PROGRAM: Final = Path(__file__).with_name("rclpy_node.py")
 LOOPBACK: Final = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_STATIC_PEERS": ""}
 
 
-def sourced() -> dict[str, str]:
+def sourced(distro: str = "jazzy") -> dict[str, str]:
     """The variables that its setup file would set. Skips the test where there is none for this Python."""
+    try:
+        return environment(distro)
+    except LookupError as error:
+        pytest.skip(str(error))
+
+
+def environment(distro: str) -> dict[str, str]:
+    """The same; LookupError, which says what to do, where there is none."""
     python = f"python{sys.version_info.major}.{sys.version_info.minor}"
-    packages = PLACE / "lib" / python / "site-packages"
+    place = PLACES / distro
+    packages = place / "lib" / python / "site-packages"
     if not (packages / "rclpy").is_dir():
-        pytest.skip(f"no ROS 2 jazzy with {python} in {PLACE.parent}: PYTHON={python} tests/peers/ros2/setup jazzy")
-    libraries = [PLACE / "lib", *sorted(packages.glob("ros_*.libs"))]
+        raise LookupError(
+            f"no ROS 2 {distro} with {python} in {PLACES}: PYTHON={python} tests/peers/ros2/setup {distro}"
+        )
+    libraries = [place / "lib", *sorted(packages.glob("ros_*.libs"))]
     return {
         "PYTHONPATH": os.pathsep.join([str(packages), str(HERE)]),
         "LD_LIBRARY_PATH": os.pathsep.join(map(str, libraries)),
-        "AMENT_PREFIX_PATH": str(PLACE),
+        "AMENT_PREFIX_PATH": str(place),
         "_ROS_WHEELS_BOOTSTRAP_COMPLETE": "1",  # else its start-up hook would run this Python once more
         **LOOPBACK,
     }
@@ -110,12 +122,13 @@ class RosNode:
 class RosNodes:
     """`async with RosNodes(directory) as nodes:` every node that is left at the end is stopped."""
 
-    def __init__(self, directory: Path) -> None:
+    def __init__(self, directory: Path, distro: str = "jazzy") -> None:
         self._directory = directory
+        self._distro = distro
         self._stack = contextlib.AsyncExitStack()
 
     async def __aenter__(self) -> "RosNodes":
-        self._environment = sourced()
+        self._environment = sourced(self._distro)
         self._children = await self._stack.enter_async_context(Children(self._directory))
         return self
 
