@@ -94,6 +94,8 @@ TITLES: Final = {
     "backward_1": "J, last to first",
     "odom_lost": "odom lost",
     "cloud_lost": "clouds lost",
+    "talk_lost": "talk lost",
+    "talk_doubled": "talk doubled",
     "odom_received": "odom got",
     "cloud_received": "clouds got",
 }

@@ -2,6 +2,7 @@
 
 ros1        from one ROS 1 system to another, beside topic_tools relay, a rospy bridge, and rospy joined by zenoh
 dds         from one DDS domain to another, between Fast DDS peers, beside endpoints joined by zenoh
+ros2        from one ROS 2 domain to another, between rclpy nodes: topics, calls, goals, beside nodes in one domain
 discovery   how soon a new ROS 1 topic is at the other master, and gone there
 
 Limits apply to the whole chain that a user runs, client, relay and client, but where a name says otherwise.
@@ -17,7 +18,7 @@ from benchmarks.common import MissingError
 from benchmarks.endpoints.shared import ROUNDS
 from sern_core.vocabulary.errors import SernError
 
-PARTS: Final = ("ros1", "dds", "discovery")
+PARTS: Final = ("ros1", "dds", "ros2", "discovery")
 
 
 def run_part(name: str, options: argparse.Namespace, report: common.Report) -> None:

@@ -7,6 +7,7 @@ from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Final
 
 from benchmarks import child, common
@@ -36,33 +37,36 @@ async def started() -> AsyncIterator[Children]:
 
 
 async def start_chain(
-    children: Children, endpoints: Mapping[str, Mapping[str, Any]], environment: Environment, **rule: str
-) -> list[Child]:
+    children: Children, endpoints: Mapping[str, object], environment: Environment, *,
+    sections: Mapping[str, Mapping[str, Any]] = MappingProxyType({}), sourced: Environment = MappingProxyType({}),
+    **rule: str,
+) -> list[Child]:  # fmt: skip
     """A relay and two clients as their user starts them, with CURVE keys, and nothing set that a user would not set.
 
     `endpoints`: the section `endpoint` of ROBOT, which offers its topics, and of SITE, which takes them. `rule` goes on
-    top of the rules of both topics.
+    top of the rules of both topics, `sections` of a client's file on top of what is there; `sourced`: variables of a
+    ROS 2 installation.
     """
     folder = children.directory
     make_keys(folder, RELAY, ROBOT, SITE)
     address = f"tcp://{HOST}:{free_ports(1)[0]}"
     files = {RELAY: relay_content(address)}
     for name, endpoint in endpoints.items():
-        files[name] = client_content(
-            name,
-            address,
-            dict(endpoint),
-            client={"namespace": "/"},
-            topics=[
+        content = {
+            "client": {"namespace": "/"},
+            "topics": [
                 {"match": ".*/odom", "class": "control", "depth": 1000, **rule},
                 {"match": ".*/cloud", "class": "bulk", "depth": 10, **rule},
             ],
-            subscribe=["/bench/.*"] if name == SITE else [],
-        )
+            "subscribe": ["/bench/.*"] if name == SITE else [],
+        }
+        files[name] = client_content(name, address, endpoint, **{**content, **sections.get(name, {})})
     daemons = []
     for name, content in files.items():
         command = daemon("relay" if name == RELAY else "client", write(folder, name, content))
-        daemons.append(await children.start(name, command, environment={**environment, **child.environment()}))
+        daemons.append(
+            await children.start(name, command, environment={**environment, **child.environment(), **sourced})
+        )
     return daemons
 
 
@@ -102,12 +106,12 @@ class Rounds:
         return statistics.median(ours[metric] / theirs[metric] for ours, theirs in pairs)
 
     def figures(self, system: str) -> Figures:
-        """One row: medians, but of `_lost` the most of a round; and how far apart the rounds are, if there are more.
-        A figure that a round does not have (nothing of the topic arrived) is left out."""
+        """One row: medians, but of `_lost` and `_doubled` the most of a round; and how far apart the rounds are, if
+        there are more. A figure that a round does not have (nothing of the topic arrived) is left out."""
         runs = self.runs[system]
         row: Figures = {}
         for metric, value in common.medians(runs).items():
-            row[metric] = max(run[metric] for run in runs) if metric.endswith("_lost") else value
+            row[metric] = max(run[metric] for run in runs) if metric.endswith(("_lost", "_doubled")) else value
             if metric == "odom_p50_ms":
                 added_ms = self.added_ms(system, metric)
                 row["odom_added_ms"] = statistics.median(added_ms)
