@@ -21,7 +21,7 @@ help:
 	@echo "make standstills   the tests whose processes stand still for moments, as on a loaded machine; SEED=..."
 	@echo "make lab      the whole matrix of bad links, and the longer runs over tc netem, which need root"
 	@echo "make performance   as root: measure link, fleet and policies of docs/performance.md anew, two hours of an idle machine"
-	@echo "make endpoints, make figures   the other tables: ROS endpoints, 15 minutes; virtual time, summaries and codecs, 30"
+	@echo "make endpoints, make figures   the other tables: ROS endpoints, 20 minutes; virtual time, summaries and codecs, 30"
 	@echo "make cellular RECORDINGS=DIR   the table of recorded cellular links, a minute; virtual time"
 	@echo "make picture  the demo, and its picture for README.md"
 	@echo "make bench    the quick benchmarks;  make schemas: regenerate schemas/ and the configuration reference"
