@@ -120,10 +120,10 @@ def goal_id(body: bytes) -> GoalId:
     return GoalId(secs, nsecs, body[at : at + length].decode(errors="surrogateescape"))
 
 
-def mentioned_goals(body: bytes) -> list[str]:
-    """The texts of the goal ids in a GoalStatusArray of ROS 1. ConfigError for bytes that are none, and for more than
-    MAX_STATUSES."""
-    found: list[str] = []
+def mentioned_goals(body: bytes) -> list[tuple[str, int]]:
+    """The texts of the goal ids in a GoalStatusArray of ROS 1, each with the byte of its status. ConfigError for bytes
+    that are none, and for more than MAX_STATUSES."""
+    found: list[tuple[str, int]] = []
     try:
         (length,) = _LENGTH.unpack_from(body, _HEADER_BYTES)
         at = _HEADER_BYTES + _LENGTH.size + length
@@ -135,11 +135,11 @@ def mentioned_goals(body: bytes) -> list[str]:
             at += _TIME.size
             (length,) = _LENGTH.unpack_from(body, at)
             at += _LENGTH.size
-            found.append(body[at : at + length].decode(errors="surrogateescape"))
-            at += length + 1  # uint8 status
-            (length,) = _LENGTH.unpack_from(body, at)
-            at += _LENGTH.size + length
-    except struct.error:
+            end = at + length
+            found.append((body[at:end].decode(errors="surrogateescape"), body[end]))
+            (length,) = _LENGTH.unpack_from(body, end + 1)
+            at = end + 1 + _LENGTH.size + length
+    except (IndexError, struct.error):
         at = len(body) + 1
     if at > len(body):
         raise ConfigError(f"{len(body)} bytes are no {STATUS_TYPE}")
@@ -331,14 +331,14 @@ class GoalWatch:
 
     def _mentioned(self, action: _Action, body: bytes) -> None:
         try:
-            texts = mentioned_goals(body)
+            mentioned = mentioned_goals(body)
         except ConfigError as error:
             if not action.complained:
                 action.complained = True
                 _log.warning("%s: a status of its goals is not read: %s", action.name, error)
             return
         due_s = clock.now() + action.patience_s
-        for text in texts:
+        for text, _ in mentioned:
             goal = action.goals.get(text)
             if goal is not None:
                 goal.heard = True

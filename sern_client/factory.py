@@ -1,33 +1,68 @@
 """Makes a client's endpoint, and what publishes the state of its link, from its file."""
 
+import logging
 import os
 from collections.abc import Callable, Sequence
 from typing import Final
 
+from sern_client.actions import ACCEPT_S
 from sern_client.endpoints.base import Endpoint, Publisher
-from sern_client.endpoints.composite import CompositeEndpoint
+from sern_client.endpoints.composite import CompositeEndpoint, with_services
 from sern_client.link_topics import LinkTopics
 from sern_client.sections import make_section
+from sern_core.topics.patterns import compile_pattern
 from sern_core.vocabulary.message import TopicInfo
 from sern_core.vocabulary.types import Encoding
 from sern_runtime.config import endpoints as sections
 from sern_runtime.config.client import ClientFile
 from sern_runtime.config.load import Loaded
+from sern_runtime.ros_files import installed_files
+
+_log = logging.getLogger(__name__)
 
 
 def make_endpoint(loaded: Loaded[ClientFile]) -> Endpoint:
     """The endpoint of a client: the one its file names, or several as one. Raises ConfigError."""
     named = named_sections(loaded.model)
     made = [make_section(section, loaded.resolve) for section in named]
-    if len(made) == 1:
-        return made[0]
-    elsewhere = services_elsewhere(named)
-    services_only = [
-        endpoint
-        for section, endpoint in zip(named, made, strict=True)
-        if isinstance(section, sections.RclpyEndpoint) and section.services_only
+    endpoint = made[0]
+    if len(made) > 1:
+        elsewhere = services_elsewhere(named)
+        services_only = [
+            endpoint
+            for section, endpoint in zip(named, made, strict=True)
+            if isinstance(section, sections.RclpyEndpoint) and section.services_only
+        ]
+        endpoint = CompositeEndpoint(
+            made, no_services_of=[made[index] for index in elsewhere], no_topics_of=services_only
+        )
+    return _with_actions(loaded, endpoint)
+
+
+def _with_actions(loaded: Loaded[ClientFile], endpoint: Endpoint) -> Endpoint:
+    """The endpoint with actions of the other ROS, where nodes of one ROS here use actions."""
+    model = loaded.model
+    ros = [section for section in model.endpoints if isinstance(section, ROS_SECTIONS)]
+    encodings = {Encoding.ROS1 if isinstance(section, sections.Ros1Endpoint) else Encoding.CDR for section in ros}
+    services = with_services(endpoint)
+    if not model.actions.use or not encodings or services is None:
+        return endpoint
+    if len(encodings) > 1:
+        _log.info("with endpoints of ROS 1 and of ROS 2 in one client, no action is converted from one to the other")
+        return endpoint
+    from sern_client.action_conversion.endpoint import ActionEndpoint, Rule
+
+    rules = [
+        Rule(compile_pattern(section.match), section.service_rules()[0].timeout_s + 2 * ACCEPT_S)
+        for section in model.actions.use
     ]
-    return CompositeEndpoint(made, no_services_of=[made[index] for index in elsewhere], no_topics_of=services_only)
+    paths = [
+        loaded.resolve(path) for section in ros if not isinstance(section, sections.Ros1Endpoint)
+        for path in section.type_paths
+    ]  # fmt: skip
+    return ActionEndpoint(
+        endpoint, services, encodings.pop(), rules, namespace=model.namespace, files=installed_files(paths)
+    )
 
 
 def services_elsewhere(named: Sequence[sections.EndpointSection]) -> list[int]:

@@ -3,8 +3,7 @@
 from collections.abc import Callable
 
 from sern_client.endpoints.base import Endpoint, Publisher
-from sern_client.endpoints.composite import CompositeEndpoint
-from sern_client.endpoints.conversion import Converter
+from sern_client.endpoints.conversion import Converter, HasConverter
 from sern_client.frames import FramePrefixer
 from sern_client.latest import LatestValues
 from sern_core.topics.rules import RuleSet
@@ -34,7 +33,7 @@ class Site:
         self.log = log
         self.parts = parts or OptionalParts()
         self.frames = FramePrefixer(frame_prefix)
-        self.converter = endpoint.converter if isinstance(endpoint, CompositeEndpoint) else Converter()
+        self.converter = endpoint.converter if isinstance(endpoint, HasConverter) else Converter()
         self.values = LatestValues()
 
     def advertise(self, info: TopicInfo) -> Publisher:

@@ -21,6 +21,7 @@ from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import Reader as Reader2
 from rosbags.typesys import Stores, get_typestore
 
+from sern_client.action_conversion.endpoint import ActionEndpoint
 from sern_client.daemon import ClientDaemon
 from sern_client.endpoints.base import Endpoint
 from sern_core.vocabulary.types import ClientName
@@ -326,6 +327,8 @@ class Lab:
 def endpoint_of(daemon: ClientDaemon, kind: type[Any]) -> Any:
     """The endpoint of a client in this process, when it has one only."""
     endpoint: Endpoint = daemon.site.endpoint
+    if isinstance(endpoint, ActionEndpoint):
+        endpoint = endpoint.inner
     assert isinstance(endpoint, kind)
     return cast("Any", endpoint)
 

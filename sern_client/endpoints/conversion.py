@@ -14,7 +14,7 @@ import struct
 from collections.abc import Callable
 from dataclasses import replace
 from math import inf
-from typing import Any, Final
+from typing import Any, Final, Protocol, runtime_checkable
 
 from rosbags.interfaces import Nodetype
 from rosbags.interfaces.typing import FieldDesc
@@ -122,6 +122,14 @@ class Converter:
         other, convert = converted(info, wanted)
         _log.info("%s: %s is converted from %s to %s", info.name, info.type_name, info.encoding, wanted)
         return _Converting(self, info, endpoint.advertise(other), convert)
+
+
+@runtime_checkable
+class HasConverter(Protocol):
+    """An endpoint that converts what it is given by itself."""
+
+    @property
+    def converter(self) -> Converter: ...
 
 
 def serve(endpoint: ServiceEndpoint, info: ServiceInfo, handler: ServiceHandler) -> ServiceServer:

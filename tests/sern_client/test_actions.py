@@ -218,8 +218,8 @@ async def test_a_goal_that_was_heard_of_and_then_no_more() -> None:
 
 def test_goals_are_read_from_the_bytes_of_a_status() -> None:
     data = status_body("", "/other", IDENT.text)
-    assert mentioned_goals(data) == ["", "/other", IDENT.text]
-    assert mentioned_goals(data.replace(b"/o", b"\xfco")) == ["", "\udcfcother", IDENT.text]
+    assert mentioned_goals(data) == [("", 0), ("/other", 0), (IDENT.text, 0)]
+    assert mentioned_goals(data.replace(b"/o", b"\xfco")) == [("", 0), ("\udcfcother", 0), (IDENT.text, 0)]
     assert mentioned_goals(status_body()) == []
     for size in range(len(data)):
         with pytest.raises(ConfigError, match="are no actionlib_msgs/msg/GoalStatusArray"):
