@@ -11,8 +11,9 @@ from sern_client.action_conversion import bodies
 from sern_client.action_conversion.bodies import GoalInfo, Stamp, StatusPart
 from sern_client.actions import MAX_STATUSES, GoalId
 from sern_core.vocabulary.errors import ConfigError
+from sern_core.vocabulary.types import Encoding
 from sern_runtime import ros_services, ros_types
-from sern_runtime.ros_types import Encoding, ResolvedType
+from sern_runtime.ros_types import ResolvedType
 
 STAMPS = st.builds(Stamp, st.integers(0, 2**31 - 1), st.integers(0, 2**32 - 1))
 UUIDS = st.binary(min_size=16, max_size=16)

@@ -4,16 +4,22 @@ import asyncio
 import struct
 from collections import Counter
 from collections.abc import AsyncIterator
+from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from sern_client.action_conversion import bodies, server_for_ros1
 from sern_client.action_conversion.bodies import HEAD, NO_STAMP, NO_UUID, GoalInfo, Stamp, StatusPart
+from sern_client.action_conversion.server_for_ros1 import ServerForRos1
 from sern_client.action_conversion.statuses import Ros1Status, Ros2Status
 from sern_client.actions import STATUS_TYPE, GoalId, goal_id, mentioned_goals, refusal
 from sern_client.endpoints.base import Held, Publisher, ServiceInfo, ServiceServer
+from sern_client.endpoints.conversion import Converter
 from sern_core.vocabulary.errors import ServiceError
 from sern_core.vocabulary.message import TopicInfo
 from sern_core.vocabulary.types import Encoding, TopicName
@@ -67,9 +73,7 @@ class Robot:
                 text = "" if self._bare else self._files.service(kind)
                 assert text is not None
                 info = ServiceInfo(name, kind, Encoding.CDR, "RIHS01_1", text)
-                self.parts[part] = self.site.endpoint.serve(
-                    info, lambda request, part=part: self._called(part, request)
-                )
+                self.parts[part] = self.site.endpoint.serve(info, partial(self._called, part))
             else:
                 text = "" if self._bare else self._files.message(kind)
                 assert text is not None
@@ -532,3 +536,28 @@ async def test_all_else_passes(site: Site) -> None:
     assert site.events.infos == {odometry.name: odometry} and site.nodes.interests == {odometry.name: False}
     taken.close()
     assert site.endpoint.encoding is None and site.endpoint.drops == {} and site.endpoint.keepers == []
+
+
+@given(
+    st.lists(st.tuples(st.sampled_from(["goal", "cancel", "status", "feedback"]), st.binary(max_size=80)), max_size=5)
+)
+def test_whatever_comes_stops_nothing(said: list[tuple[str, bytes]]) -> None:
+    """Nor what may begin as it should."""
+
+    async def play() -> None:
+        with TemporaryDirectory() as place:
+            types = types_of("count/Count", files(Path(place), count__Count=FIBONACCI))
+        told: list[bytes] = []
+        server = ServerForRos1(
+            "/count", types, {}, publish_status=told.append, publish_feedback=told.append, publish_result=told.append,
+            idle=lambda: None, counts=Converter(),
+        )  # fmt: skip
+        for kind, body in said:
+            begins = {"goal": bodies.ros1_header(1, NO_STAMP), "cancel": bytes(8)}.get(kind, HEAD)
+            getattr(server, kind)(body)
+            getattr(server, kind)(begins + body)
+        await asyncio.sleep(0)
+        server.close()
+        await server.ended()
+
+    asyncio.run(play())

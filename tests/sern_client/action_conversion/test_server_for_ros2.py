@@ -5,16 +5,21 @@ import struct
 from collections import Counter
 from collections.abc import AsyncIterator
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from sern_client.action_conversion import bodies, crossing, server_for_ros2
 from sern_client.action_conversion.bodies import NO_STAMP, NO_UUID, GoalInfo, Stamp
+from sern_client.action_conversion.server_for_ros2 import ServerForRos2
 from sern_client.action_conversion.statuses import Ros1Status, Ros2Status
 from sern_client.action_conversion.types import ActionTypes
 from sern_client.actions import MAX_STATUSES, STATUS_TYPE, GoalId
 from sern_client.endpoints.base import Held, Publisher
+from sern_client.endpoints.conversion import Converter
 from sern_core.vocabulary.types import Encoding, TopicName
 from sern_runtime import clock, ros_types
 from tests.sern_client.action_conversion.files import FIBONACCI, files, types_of
@@ -44,7 +49,11 @@ class Robot:
         self.parts: dict[str, Publisher] = {}
 
     def open(self, *parts: str) -> None:
-        kinds = {"status": (STATUS_TYPE,), "feedback": self.types.feedback.topic, "result": self.types.result.topic}
+        kinds: dict[str, tuple[str, ros_types.TypeText | None]] = {
+            "status": (STATUS_TYPE, None),
+            "feedback": self.types.feedback.topic,
+            "result": self.types.result.topic,
+        }
         for part in parts or kinds:
             self.parts[part] = self.site.endpoint.advertise(ros1_topic(part, *kinds[part]))
 
@@ -98,7 +107,7 @@ def result(status: int, *sequence: int) -> bytes:
     return bodies.HEAD + struct.pack(f"<b3xI{len(sequence)}i", status, len(sequence), *sequence)
 
 
-async def given(site: Site, robot: Robot, uuid: bytes = UUID) -> tuple["asyncio.Task[bytes]", GoalId]:
+async def give(site: Site, robot: Robot, uuid: bytes = UUID) -> tuple["asyncio.Task[bytes]", GoalId]:
     """A goal that waits for an answer, and what it is called in ROS 1."""
     before = len(site.given[GOAL])
     answer = asyncio.ensure_future(site.call("send_goal")(goal(uuid)))
@@ -108,7 +117,7 @@ async def given(site: Site, robot: Robot, uuid: bytes = UUID) -> tuple["asyncio.
 
 async def accepted(site: Site, robot: Robot, uuid: bytes = UUID) -> GoalId:
     """A goal that is under way."""
-    answer, ident = await given(site, robot, uuid)
+    answer, ident = await give(site, robot, uuid)
     robot.says((ident, ACTIVE))
     assert bodies.is_accepted(await answer)
     return ident
@@ -126,11 +135,12 @@ async def test_it_is_shown_as_an_action_of_ros_2(site: Site, robot: Robot) -> No
 
 
 async def test_a_goal_its_feedback_and_its_result(site: Site, robot: Robot) -> None:
-    answer, ident = await given(site, robot)
+    answer, ident = await give(site, robot)
     body = site.given[GOAL][0]
     assert bodies.split_goal(body) == (ident, struct.pack("<i", 5))
     resolved = ros_types.resolve("count/msg/CountActionGoal", robot.types.goal.topic[1].definition, Encoding.ROS1)
-    assert resolved.store.deserialize_ros1(body, resolved.name).goal.order == 5
+    read: Any = resolved.store.deserialize_ros1(body, resolved.name)
+    assert read.goal.order == 5
     await asyncio.sleep(0)
     assert not answer.done() and statuses(site) == {}
     robot.says((GoalId(1, 2, "another's"), ACTIVE), (ident, ACTIVE))
@@ -189,7 +199,7 @@ async def test_how_a_goal_ends(site: Site, robot: Robot, ros1: int, ros2: int) -
 @pytest.mark.parametrize("by_status", [True, False])
 async def test_a_goal_that_is_rejected_was_not_accepted(site: Site, robot: Robot, by_status: bool) -> None:
     """Also by what `GoalWatch` says in the server's place."""
-    answer, ident = await given(site, robot)
+    answer, ident = await give(site, robot)
     if by_status:
         robot.says((ident, Ros1Status.REJECTED))
     robot.result(ident, Ros1Status.REJECTED, b"\0\0\0\0", "SERN: it was dropped on its way")
@@ -199,7 +209,7 @@ async def test_a_goal_that_is_rejected_was_not_accepted(site: Site, robot: Robot
 
 
 async def test_a_goal_of_which_the_result_is_the_first_thing_heard(site: Site, robot: Robot) -> None:
-    answer, ident = await given(site, robot)
+    answer, ident = await give(site, robot)
     robot.result(ident, SUCCEEDED)
     assert bodies.is_accepted(await answer)
     assert await site.call("get_result")(bodies.result_request(UUID)) == result(Ros2Status.SUCCEEDED, 1, 1, 2)
@@ -220,7 +230,7 @@ async def test_a_goal_that_waits_its_turn_is_accepted(
     site: Site, robot: Robot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     time = Clock(monkeypatch)
-    answer, ident = await given(site, robot)
+    answer, ident = await give(site, robot)
     robot.says((ident, PENDING))
     time.now += server_for_ros2.PENDING_S / 2
     robot.says((ident, PENDING))
@@ -240,7 +250,7 @@ async def test_a_goal_of_which_nobody_says_anything_is_refused_and_cancelled(
     site: Site, robot: Robot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     time = Clock(monkeypatch)
-    answer, ident = await given(site, robot)
+    answer, ident = await give(site, robot)
     assert server(site)._timer.deadline_s == 110.0
     time.now = 110.0
     server(site)._due()
@@ -286,9 +296,9 @@ async def test_cancelling_all_means_all_there_are(site: Site, robot: Robot) -> N
 
 
 async def test_cancelling_those_of_before(site: Site, robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(server_for_ros2.time, "time_ns", lambda: 2 * 10**18)
+    monkeypatch.setattr("time.time_ns", lambda: 2 * 10**18)
     ident = await accepted(site, robot)
-    monkeypatch.setattr(server_for_ros2.time, "time_ns", lambda: 2 * 10**18 + 5)
+    monkeypatch.setattr("time.time_ns", lambda: 2 * 10**18 + 5)
     await accepted(site, robot, OTHER)
     meant = Stamp(ident.secs, ident.nsecs + 2)
     answer = await site.call("cancel_goal")(bodies.cancel_request(GoalInfo(NO_UUID, meant)))
@@ -333,7 +343,7 @@ async def test_bodies_that_are_none(site: Site, robot: Robot, caplog: pytest.Log
 
 
 async def test_a_status_of_too_many_goals(site: Site, robot: Robot, caplog: pytest.LogCaptureFixture) -> None:
-    answer, ident = await given(site, robot)
+    answer, ident = await give(site, robot)
     many = [(GoalId(0, 0, ""), 1)] * MAX_STATUSES
     robot.says(*many, (ident, ACTIVE))
     assert f"{ACTION}: a status of its goals is not read: it mentions 4001 goals, more than 4000" in caplog.text
@@ -355,7 +365,7 @@ async def test_the_same_goal_twice_and_too_many_goals(
 
 
 async def test_a_client_that_goes_before_it_is_answered(site: Site, robot: Robot) -> None:
-    answer, ident = await given(site, robot)
+    answer, ident = await give(site, robot)
     answer.cancel()
     await until(lambda: site.given[CANCEL], "its goal is cancelled")
     assert [bodies.split_cancel(body).text for body in site.given[CANCEL]] == [ident.text]
@@ -395,13 +405,13 @@ async def test_whoever_waits_is_answered_when_this_site_stops(tmp_path: Path) ->
     await robot.appears()
     await accepted(site, robot)
     asked = asyncio.ensure_future(site.call("get_result")(bodies.result_request(UUID)))
-    answer, _ = await given(site, robot, OTHER)
+    answer, _ = await give(site, robot, OTHER)
     robot.close()
     await site.endpoint.stop()
     assert await asked == result(Ros2Status.UNKNOWN) and await answer == REFUSED
 
 
-# What is not converted -------------------------------------------------------------------------------------------------
+# What is not converted ----------------------------------------------------------------------------------------------
 
 
 async def test_a_type_that_is_not_known_is_said_once_and_its_topics_pass(
@@ -494,3 +504,38 @@ async def test_the_tables_are_compared_as_they_are(site: Site, robot: Robot) -> 
 
 def _count(*names: str) -> Counter[TopicName]:
     return Counter(TopicName(name) for name in names)
+
+
+@given(
+    st.lists(
+        st.tuples(
+            st.sampled_from(["status", "feedback", "result", "send_goal", "cancel_goal", "get_result"]),
+            st.binary(max_size=80),
+        ),
+        max_size=5,
+    )
+)
+def test_whatever_comes_stops_nothing(said: list[tuple[str, bytes]]) -> None:
+    """Nor what may begin as it should; and every call is answered."""
+
+    async def play() -> None:
+        with TemporaryDirectory() as place:
+            types = types_of("count/Count", files(Path(place), count__Count=FIBONACCI))
+        told: list[bytes] = []
+        made = ServerForRos2(
+            "/count", types, answer_s=5.0, publish_status=told.append, publish_feedback=told.append,
+            idle=lambda: None, counts=Converter(),
+        )  # fmt: skip
+        made.goal_sink = made.cancel_sink = lambda _body, _stamp_ns: True
+        calls = []
+        for kind, body in said:
+            begins = bodies.HEAD if "_" in kind else bodies.ros1_header(1, NO_STAMP)
+            for each in (body, begins + body):
+                done = getattr(made, kind)(each)
+                if done is not None:
+                    calls.append(asyncio.ensure_future(done))
+        await asyncio.sleep(0)
+        made.close()
+        assert all(answer[:2] == b"\0\1" for answer in await asyncio.gather(*calls))
+
+    asyncio.run(play())

@@ -12,8 +12,8 @@ from sern_client.action_conversion.statuses import (
     ros1_status,
     ros2_status,
 )
+from sern_core.vocabulary.types import Encoding
 from sern_runtime import ros_types
-from sern_runtime.ros_types import Encoding
 
 
 @pytest.mark.parametrize(

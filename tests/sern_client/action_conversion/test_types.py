@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from sern_client.action_conversion import types
@@ -19,9 +20,10 @@ from sern_client.action_conversion.types import (
     ros2_texts,
 )
 from sern_core.vocabulary.errors import ConfigError
+from sern_core.vocabulary.types import Encoding
 from sern_runtime import ros_services, ros_types
 from sern_runtime.ros_files import TypeFiles
-from sern_runtime.ros_types import Encoding, ResolvedType
+from sern_runtime.ros_types import ResolvedType
 from tests.sern_client.action_conversion.files import FIBONACCI, NAVIGATE, files, types_of
 
 UUID = bytes(range(16))
@@ -105,7 +107,7 @@ def test_bodies_go_there_and_back(tmp_path: Path) -> None:
     big = bytes(send.request.store.serialize_cdr(read, send.request.name, little_endian=False))
     assert found.goal.to_ros1(big) == (UUID, goal)
 
-    result = bytes_of(found.result.ros1, sequence=ros_types.np.array([1, 1, 2], dtype="int32"))
+    result = bytes_of(found.result.ros1, sequence=np.array([1, 1, 2], dtype="int32"))
     response = found.result.to_ros2(b"\4", result)
     read = message(get.response, response)
     assert (read.status, list(read.result.sequence)) == (4, [1, 1, 2])
@@ -144,7 +146,7 @@ def test_an_action_with_everything_in_it(tmp_path: Path) -> None:
     )
     store = found.goal.ros1.store
     header = ros_types.header(5, "map", Encoding.ROS1, seq=0)
-    side = ros_types.new_in(store, "turn/msg/Side", left=True, far=ros_types.np.array([1.0, 2.0, 3.0]))
+    side = ros_types.new_in(store, "turn/msg/Side", left=True, far=np.array([1.0, 2.0, 3.0]))
     goal = bytes_of(found.goal.ros1, header=header, side=side)
     request = found.goal.to_ros2(UUID, goal)
     read = message(service(known, "turn/action/Turn_SendGoal").request, request)
@@ -220,7 +222,7 @@ def test_every_kind_of_field_changes_its_place(tmp_path: Path) -> None:
     texts = ros2_texts("new/action/Move", files(tmp_path, new__Move=f"{theirs}---\n---\n"))
     assert texts is not None
     found = ActionTypes(names_of_ros1("old/Go", [pair]), texts, {})
-    new, np = ros_types.new, ros_types.np
+    new = ros_types.new
     goal = bytes_of(
         found.goal.ros1, texts=["a", "", "bcd"], one=1.5, few=np.array([1, 2, 3], dtype="int16"),
         points=[new("geometry_msgs/msg/Point32", Encoding.ROS1, x=each) for each in (1.0, 2.0)],
