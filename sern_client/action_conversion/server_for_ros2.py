@@ -182,7 +182,8 @@ class ServerForRos2:
             return None
         loop = asyncio.get_running_loop()
         stamp = Stamp.of(time.time_ns())
-        ident = GoalId(*stamp, str(UUID(bytes=uuid)))
+        # A client may use its id again for another goal, while its server still speaks of the one before.
+        ident = GoalId(*stamp, f"{UUID(bytes=uuid)}-{stamp.secs}.{stamp.nsecs:09d}")
         goal = _Goal(ident, uuid, loop.create_future(), loop.create_future(), clock.now() + self._answer_s)
         problem = self.goals.add(goal)
         if problem:

@@ -269,7 +269,9 @@ async def test_a_goal_that_ended_is_forgotten_after_a_while(
     server(site)._due()
     assert statuses(site) == {} and server(site)._timer.deadline_s is None
     assert await site.call("get_result")(bodies.result_request(UUID)) == result(Ros2Status.UNKNOWN)
-    await accepted(site, robot)  # the same id is another goal now
+    again, _ = await give(site, robot)  # the same id is another goal now
+    robot.says((ident, Ros1Status.REJECTED), (robot.given(), ACTIVE))
+    assert bodies.is_accepted(await again)
 
 
 async def test_cancelling_one(site: Site, robot: Robot) -> None:
