@@ -41,7 +41,7 @@ class Passing(Protocol):
 
 
 class Stage(Protocol):
-    """How nodes here see an action: `begin`, then any calls, then `end`, again and again."""
+    """How nodes here see an action: `prepare`, `begin`, then any calls, then `end`, again and again."""
 
     needed: frozenset[str]
     """The parts that it is made of."""
@@ -51,8 +51,13 @@ class Stage(Protocol):
         """Whether a goal is under way."""
         ...
 
-    def begin(self, parts: "Mapping[str, Part]") -> None:
-        """Show the action. ConfigError, in one line without its name, where it cannot be; nothing is open then."""
+    def prepare(self, parts: "Mapping[str, Part]") -> Iterator[None]:
+        """Find out how it is shown, in steps of some milliseconds. ConfigError, in one line without the action's name,
+        where it cannot be."""
+        ...
+
+    def begin(self) -> None:
+        """Show the action as was found out. ConfigError as `prepare`; nothing is open then."""
         ...
 
     def refresh(self, parts: "Mapping[str, Part]", away: str) -> None:
@@ -132,7 +137,8 @@ class Crossing:
         self._to = to
         self._said = said
         self._parts: dict[str, list[Part]] = {}  # of each kind, the newest last
-        self._shown: tuple[object, ...] = ()  # what the parts were that nodes here see it by
+        self._shown: tuple[object, ...] = ()  # what the parts were that nodes here see it by, or soon will
+        self._preparing: Iterator[None] | None = None
         self._failed = False
         self._closed = False
         self._settling = False
@@ -201,16 +207,23 @@ class Crossing:
             self._end()
             self.settle_soon()
             return
+        if self._preparing is None or shown != self._shown:
+            self._shown = shown
+            self._preparing = self.stage.prepare(parts)
         try:
-            self.stage.begin(parts)
+            if next(self._preparing, self) is not self:
+                self.settle_soon()
+                return
+            self._preparing = None
+            self.stage.begin()
         except ConfigError as error:
+            self._preparing = None
             self._failed = True
             self._said(f"action {self.name} is not converted: {error}")
             for part in list(self):
                 part.pass_on(self._to)
             return
         self.active = True
-        self._shown = shown
 
     def _end(self) -> None:
         if self.active:

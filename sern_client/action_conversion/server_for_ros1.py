@@ -40,6 +40,8 @@ EARLY_S: Final = 5.0
 MAX_EARLY: Final = 64
 """Cancellings that came before their goals, on another connection: how long, and how many, are remembered."""
 MAX_SAID: Final = 20
+_ON_ITS_WAY: Final = (Ros1Status.PENDING, Ros1Status.ACTIVE, Ros1Status.PREEMPTING)
+"""What a goal is before it ends; it never goes back, which actionlib's clients take for an error."""
 
 _log = logging.getLogger(__name__)
 
@@ -184,7 +186,7 @@ class ServerForRos1:
             goal, status = self.goals.of_uuid(uuid), ros2_status(value)
             if goal is None or self.goals.has_ended(goal) or status in ENDED_ROS2 or status is Ros2Status.UNKNOWN:
                 continue  # what ends a goal is its result
-            goal.status = ROS1_STATUS[status]
+            goal.status = max(goal.status, ROS1_STATUS[status], key=_ON_ITS_WAY.index)  # feedback overtakes a status
         if [goal.status for goal in self.goals] != before:
             self._tell()
 

@@ -281,7 +281,9 @@ class ServerForRos2:
         if status in ENDED_ROS1:
             return
         said = ROS2_STATUS[status]
-        goal.status = Ros2Status.CANCELING if goal.asked and said is Ros2Status.EXECUTING else said
+        if goal.asked and said is Ros2Status.EXECUTING:
+            said = Ros2Status.CANCELING
+        goal.status = max(goal.status, said)  # feedback overtakes a status, and a goal does not go back
 
     def _decide(self, goal: _Goal, accepted: bool) -> None:
         goal.decide_s = None

@@ -3,7 +3,7 @@
 import asyncio
 import logging
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from functools import partial
 from typing import Final, Protocol
@@ -15,6 +15,7 @@ from sern_client.action_conversion.types import (
     ActionTypes,
     Names,
     Pair,
+    in_steps,
     names_of_ros1,
     names_of_ros2,
     ros1_action,
@@ -76,14 +77,16 @@ class Ros2Stage:
         self._answer_s = answer_s
         self._idle = idle
         self._server: ServerForRos2 | None = None
+        self._types: ActionTypes | None = None
         self._opened = ExitStack()
 
     @property
     def busy(self) -> bool:
         return self._server is not None and self._server.busy
 
-    def begin(self, parts: Mapping[str, Part]) -> None:
-        types = self._types(parts)
+    def begin(self) -> None:
+        assert self._types is not None
+        types = self._types
         with ExitStack() as stack:
             server = self._open(types, stack)
             self._opened = stack.pop_all()
@@ -111,7 +114,7 @@ class Ros2Stage:
     async def ended(self) -> None:
         await asyncio.sleep(0)
 
-    def _types(self, parts: Mapping[str, Part]) -> ActionTypes:
+    def prepare(self, parts: Mapping[str, Part]) -> Iterator[None]:
         found = {part: ros1_action(parts[part].info.type_name, part) for part in ("result", "feedback")}
         action = found["result"]
         if action is None or found["feedback"] != action:
@@ -121,7 +124,8 @@ class Ros2Stage:
         if ros2 is None:
             raise _unknown(names)
         ros1 = {part: ros1_text(action, part, _own(parts[part]), parts[part].info.definition) for part in found}
-        return ActionTypes(names, ros2, ros1)
+        yield
+        self._types = yield from in_steps(names, ros2, ros1)
 
     def _open(self, types: ActionTypes, stack: ExitStack) -> ServerForRos2:
         here, action = self._here, types.names.ros2
@@ -180,14 +184,16 @@ class Ros1Stage:
         self._calls: dict[str, ServiceHandler] = {}
         self._server: ServerForRos1 | None = None
         self._last: ServerForRos1 | None = None
+        self._types: ActionTypes | None = None
         self._opened = ExitStack()
 
     @property
     def busy(self) -> bool:
         return self._server is not None and self._server.busy
 
-    def begin(self, parts: Mapping[str, Part]) -> None:
-        types = self._types(parts)
+    def begin(self) -> None:
+        assert self._types is not None
+        types = self._types
         with ExitStack() as stack:
             server = self._open(types, stack)
             self._opened = stack.pop_all()
@@ -215,7 +221,7 @@ class Ros1Stage:
         if self._last is not None:
             await self._last.ended()
 
-    def _types(self, parts: Mapping[str, Part]) -> ActionTypes:
+    def prepare(self, parts: Mapping[str, Part]) -> Iterator[None]:
         sources = (("goal", "send_goal", "SendGoal"), ("result", "get_result", "GetResult"),
                    ("feedback", "feedback", "FeedbackMessage"))  # fmt: skip
         found = {part: ros2_action(parts[kind].info.type_name, end) for part, kind, end in sources}
@@ -233,7 +239,8 @@ class Ros1Stage:
             if known is None:
                 raise _unknown(names)
             ros2 = known
-        return ActionTypes(names, ros2, {})
+        yield
+        self._types = yield from in_steps(names, ros2, {})
 
     def _open(self, types: ActionTypes, stack: ExitStack) -> ServerForRos1:
         here = self._here

@@ -6,7 +6,7 @@ when their parts have the same fields (as `ros_types.counterpart` has it). Two t
 fields, correspond when PAIRS says so.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Generator, Iterable, Mapping
 from dataclasses import dataclass
 from hashlib import sha256
 from struct import Struct
@@ -182,12 +182,10 @@ class Part:
     def __init__(self, names: Names, part: str, ros2: str, ros1: str | None) -> None:
         """`ros2`: its definition there; `ros1`: that of ROS 1, where it is known. ConfigError in one line where they do
         not correspond."""
-        package, name = names.ros2.split("/action/")
-        own = f"{package}/msg/{name}{part.capitalize()}"
-        before, self._before_bytes = _BEFORE.get(part, _BEFORE_RESULT)
-        text = f"{before}{ros_types.ros1_name(own)} {part}\n{_BELOW}{ros_types.ros1_name(own)}\n{ros2}"
-        there = ros_types.resolve(f"{own}Sent", text, Encoding.CDR)
-        here = ros_types.counterpart(f"{own}Sent", text, Encoding.CDR)
+        self._before_bytes = _BEFORE.get(part, _BEFORE_RESULT)[1]
+        own, sent, text = _sent(names, part, ros2)
+        there = ros_types.resolve(sent, text, Encoding.CDR)
+        here = ros_types.counterpart(sent, text, Encoding.CDR)
         self._to_ros1 = body_converter(there, here)
         self._to_ros2 = body_converter(here.type, Counterpart(there, here.same_layout))
         inner = ros_types.counterpart(own, ros2, Encoding.CDR).type
@@ -246,18 +244,56 @@ class Part:
         return _zero((Nodetype.NAME, self.ros1.name), self.ros1.store.fielddefs)
 
 
-class ActionTypes:
+class ActionTypes(NamedTuple):
     """The three parts of two actions that stand for each other."""
 
-    def __init__(self, names: Names, ros2: Mapping[str, str], ros1: Mapping[str, str]) -> None:
-        """Definitions by part: all in `ros2`, those that are known in `ros1`. ConfigError in one line where the actions
-        do not correspond."""
-        self.names = names
-        self.goal, self.result, self.feedback = (Part(names, part, ros2[part], ros1.get(part)) for part in PARTS)
+    names: Names
+    goal: Part
+    result: Part
+    feedback: Part
 
     def no_result(self, status: int) -> bytes:
         """The answer of `get_result` with this status and nothing in it."""
         return self.result.to_ros2(bytes((status,)), self.result.zero)
+
+
+def in_steps(names: Names, ros2: Mapping[str, str], ros1: Mapping[str, str]) -> Generator[None, None, ActionTypes]:
+    """The types, from definitions by part: all in `ros2`, those that are known in `ros1`. They may be a peer's, and as
+    large as it likes, so what is done with them is done in steps of some milliseconds. ConfigError in one line where
+    the actions do not correspond."""
+    parts = []
+    for part in PARTS:
+        own, sent, text = _sent(names, part, ros2[part])
+        for read, name, definition in (
+            (ros_types.resolve, sent, text),
+            (ros_types.counterpart, sent, text),
+            (ros_types.counterpart, own, ros2[part]),
+        ):
+            read(name, definition, Encoding.CDR)  # both keep what they have found
+            yield
+        parts.append(Part(names, part, ros2[part], ros1.get(part)))
+        yield
+    return ActionTypes(names, *parts)
+
+
+def action_types(names: Names, ros2: Mapping[str, str], ros1: Mapping[str, str]) -> ActionTypes:
+    """The types, as `in_steps` makes them, at once."""
+    steps = in_steps(names, ros2, ros1)
+    while True:
+        try:
+            next(steps)
+        except StopIteration as done:
+            types: ActionTypes = done.value
+            return types
+
+
+def _sent(names: Names, part: str, ros2: str) -> tuple[str, str, str]:
+    """What a part is called here as a type, and the name and definition of a body of ROS 2 that has it in it."""
+    package, name = names.ros2.split("/action/")
+    own = f"{package}/msg/{name}{part.capitalize()}"
+    before, _ = _BEFORE.get(part, _BEFORE_RESULT)
+    short = ros_types.ros1_name(own)
+    return own, f"{own}Sent", f"{before}{short} {part}\n{_BELOW}{short}\n{ros2}"
 
 
 def _by_field(source: ResolvedType, target: ResolvedType, fields: Fields) -> Convert:

@@ -8,6 +8,7 @@ from typing import Final
 import pytest
 
 from sern_client import actions
+from sern_client.action_conversion.bodies import split_statuses
 from sern_client.endpoints import conversion
 from sern_client.frames import FramePrefixer
 from sern_client.tf_latch import TfLatch
@@ -185,7 +186,19 @@ def statuses_of(count: int) -> None:
 
         return Input(len(data), take)
 
+    def make_ros2() -> Input:
+        data = b"\0\1\0\0" + struct.pack("<I", count) + bytes(28) * count
+
+        def take() -> object:
+            try:
+                return split_statuses(data)
+            except ConfigError:
+                return None
+
+        return Input(len(data), take)
+
     INPUTS[f"body: {count} goals in a status"] = make
+    INPUTS[f"body: {count} goals in a status of ROS 2"] = make_ros2
 
 
 statuses_of(actions.MAX_STATUSES)

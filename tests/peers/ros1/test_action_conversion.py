@@ -293,9 +293,17 @@ async def test_clients_of_ros_1_give_goals_to_a_real_server_of_ros_2(tmp_path: P
         relay.kill()
         await until(lambda: site.core.link.lane.stalled, "the link is lost")
         client.tell("cancel")
-        await lab.process(relay.config).ready()
+        relay = lab.process(relay.config)
+        await relay.ready()
         await client.until("ended", 101, preempted, sequence)
         assert len(machine.of("cancelled")) == 2
+
+        # A goal that the link does not take there in time is refused.
+        relay.kill()
+        await until(lambda: site.core.link.lane.stalled, "the link is lost")
+        client.tell("goal 7")
+        await client.until("ended", 7, rejected, [])
+        await lab.process(relay.config).ready()
         await robot.stop()
 
 

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Final
 
-from sern_client.action_conversion.types import ActionTypes, names_of_ros1, ros2_texts
+from sern_client.action_conversion.types import ActionTypes, action_types, names_of_ros1, ros2_texts
 from sern_runtime.ros_files import TypeFiles
 
 FIBONACCI: Final = "int32 order\n---\nint32[] sequence\n---\nint32[] sequence\n"
@@ -42,4 +42,4 @@ def types_of(action: str, known: list[TypeFiles], ros1: dict[str, str] | None = 
     names = names_of_ros1(action)
     texts = ros2_texts(names.ros2, known)
     assert texts is not None
-    return ActionTypes(names, texts, ros1 or {})
+    return action_types(names, texts, ros1 or {})

@@ -212,6 +212,11 @@ async def test_feedback_of_a_goal_shows_that_it_is_under_way(site: Site, robot: 
     uuid = await accepted(site, robot)
     robot.publish("feedback", HEAD + uuid + SEQUENCE)
     assert statuses(site) == {IDENT.text: Ros1Status.ACTIVE}
+    robot.says((uuid, Ros2Status.ACCEPTED))  # from before
+    assert statuses(site) == {IDENT.text: Ros1Status.ACTIVE}
+    robot.says((uuid, Ros2Status.CANCELING))
+    robot.says((uuid, Ros2Status.EXECUTING))
+    assert statuses(site) == {IDENT.text: Ros1Status.PREEMPTING}
 
 
 @pytest.mark.parametrize(

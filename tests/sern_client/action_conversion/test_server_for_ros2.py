@@ -173,6 +173,8 @@ async def test_a_status_is_published_when_it_changes(site: Site, robot: Robot) -
     for _ in range(3):
         robot.says((ident, ACTIVE))
     assert len(site.nodes.published[STATUS].bodies) == count
+    robot.says((ident, PENDING))  # from before what a feedback has said
+    assert statuses(site) == {UUID: Ros2Status.EXECUTING}
     robot.says((ident, Ros1Status.PREEMPTING))
     assert statuses(site) == {UUID: Ros2Status.CANCELING}
 

@@ -8,9 +8,9 @@ import pytest
 
 from sern_client.action_conversion import types
 from sern_client.action_conversion.types import (
-    ActionTypes,
     Names,
     Pair,
+    action_types,
     names_of_ros1,
     names_of_ros2,
     ros1_action,
@@ -203,7 +203,7 @@ def test_another_pair_is_a_line(tmp_path: Path) -> None:
         "new/action/Move", files(tmp_path, new__Move="string why\nfloat64 distance\n---\nuint8 code\n---\n")
     )
     assert texts is not None
-    found = ActionTypes(names_of_ros1("old/Go", [pair]), texts, {})
+    found = action_types(names_of_ros1("old/Go", [pair]), texts, {})
     assert found.goal.to_ros1(found.goal.to_ros2(UUID, bytes_of(found.goal.ros1, far=2.5)))[1] == bytes_of(
         found.goal.ros1, far=2.5
     )
@@ -221,7 +221,7 @@ def test_every_kind_of_field_changes_its_place(tmp_path: Path) -> None:
     pair = Pair("old/Go", "new/action/Move", f"{fields}---\n---\n", goal=same)
     texts = ros2_texts("new/action/Move", files(tmp_path, new__Move=f"{theirs}---\n---\n"))
     assert texts is not None
-    found = ActionTypes(names_of_ros1("old/Go", [pair]), texts, {})
+    found = action_types(names_of_ros1("old/Go", [pair]), texts, {})
     new = ros_types.new
     goal = bytes_of(
         found.goal.ros1, texts=["a", "", "bcd"], one=1.5, few=np.array([1, 2, 3], dtype="int16"),
@@ -239,7 +239,7 @@ def test_bodies_with_too_many_parts_are_not_read_value_by_value(tmp_path: Path) 
     pair = Pair("old/Go", "new/action/Move", "string[] words\n---\n---\n", goal=(("words", "texts"),))
     texts = ros2_texts("new/action/Move", files(tmp_path, new__Move="string[] texts\n---\n---\n"))
     assert texts is not None
-    found = ActionTypes(names_of_ros1("old/Go", [pair]), texts, {})
+    found = action_types(names_of_ros1("old/Go", [pair]), texts, {})
     with pytest.raises(ConfigError, match=r"type old/msg/GoGoal: .* have too many parts"):
         found.goal.to_ros2(UUID, b"\0\0\1\0" + bytes(4 * 2**16))
 
