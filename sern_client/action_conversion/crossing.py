@@ -2,7 +2,7 @@
 
 import asyncio
 import logging
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from math import inf
 from typing import Final, Protocol
 
@@ -51,6 +51,11 @@ class Stage(Protocol):
         """Whether a goal is under way."""
         ...
 
+    @property
+    def pending(self) -> bool:
+        """Whether something goes on that no goal here waits for."""
+        ...
+
     def prepare(self, parts: "Mapping[str, Part]") -> Iterator[None]:
         """Find out how it is shown, in steps of some milliseconds. ConfigError, in one line without the action's name,
         where it cannot be."""
@@ -68,8 +73,8 @@ class Stage(Protocol):
 
     def end(self) -> None: ...
 
-    async def ended(self) -> None:
-        """Return when nothing goes on any more; after `end`."""
+    async def stop(self) -> None:
+        """Return when nothing goes on any more; after the last `end`."""
         ...
 
 
@@ -127,15 +132,17 @@ class Part:
 
 
 class Crossing:
-    """An action that one rule of `use` is about. `said`: where what is wrong is told."""
+    """An action that one rule of `use` is about. `said`: where what is wrong is told. `gone` is called when nothing is
+    left of it."""
 
-    def __init__(self, name: TopicName, stage: Stage, to: Passing, said: SayOnce) -> None:
+    def __init__(self, name: TopicName, stage: Stage, to: Passing, said: SayOnce, gone: Callable[[], None]) -> None:
         self.name = name
         self.stage = stage
         self.active = False
         """Whether nodes here see it."""
         self._to = to
         self._said = said
+        self._gone = gone
         self._parts: dict[str, list[Part]] = {}  # of each kind, the newest last
         self._shown: tuple[object, ...] = ()  # what the parts were that nodes here see it by, or soon will
         self._preparing: Iterator[None] | None = None
@@ -179,9 +186,9 @@ class Crossing:
         self._incomplete.close()
         self._end()
 
-    async def ended(self) -> None:
+    async def stop(self) -> None:
         """Return when nothing goes on any more; after `close`."""
-        await self.stage.ended()
+        await self.stage.stop()
 
     def _settle(self) -> None:
         self._settling = False
@@ -194,10 +201,13 @@ class Crossing:
         self._watch_for_the_rest(bool(parts) and not complete and not self.active and not self._failed)
         if complete and not self._failed:
             self._show(parts)
-        if self.active:
-            self.stage.refresh(parts, "" if complete else GONE)
-            if not complete and not self.stage.busy:
-                self._end()
+        self.stage.refresh(parts, "" if complete else GONE)
+        if self.active and not complete and not self.stage.busy:
+            self._end()
+        if not (parts or self.active or self.stage.pending):
+            self._closed = True
+            self._incomplete.close()
+            self._gone()
 
     def _show(self, parts: Mapping[str, Part]) -> None:
         shown = tuple((part.info.type_name, part.info.definition) for _, part in sorted(parts.items()))

@@ -170,7 +170,7 @@ class ActionEndpoint:
         for action in self._actions.values():
             action.close()
         for action in self._actions.values():
-            await action.ended()
+            await action.stop()
         self._events = None
         await self.inner.stop()
 
@@ -287,14 +287,18 @@ class ActionEndpoint:
 
     def _make(self, name: TopicName, rule: Rule) -> Crossing:
         def idle() -> None:
-            self._actions[name].settle_soon()
+            if name in self._actions:
+                self._actions[name].settle_soon()
+
+        def gone() -> None:
+            del self._actions[name]
 
         stage: Ros1Stage | Ros2Stage
         if self._ros2:
             stage = Ros2Stage(name, self, answer_s=rule.answer_s, idle=idle)
         else:
             stage = Ros1Stage(name, self, idle=idle)
-        return Crossing(name, stage, self, self._said)
+        return Crossing(name, stage, self, self._said, gone)
 
     def _rule(self, name: str) -> Rule | None:
         return next((rule for rule in self._rules if rule.match.fullmatch(name)), None)

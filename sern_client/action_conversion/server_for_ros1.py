@@ -5,17 +5,16 @@ these calls is answered, also where the link is gone (`sern_client.services`), a
 client as REJECTED or ABORTED, with a cancel after the goal: what its client believes dead must not drive a robot.
 """
 
-import asyncio
 import logging
 import secrets
 import time
 from collections.abc import Callable, Mapping
-from contextlib import suppress
 from dataclasses import dataclass
 from typing import Final
 
 from sern_client.action_conversion import bodies
 from sern_client.action_conversion.bodies import NO_STAMP, NO_UUID, GoalInfo, Stamp
+from sern_client.action_conversion.cancelling import Cancelling
 from sern_client.action_conversion.goals import MAX_LIVE, GoalTable
 from sern_client.action_conversion.statuses import ENDED_ROS2, ROS1_STATUS, Ros1Status, Ros2Status, ros2_status
 from sern_client.action_conversion.types import ActionTypes
@@ -32,10 +31,6 @@ KEEP_S: Final = 5.0
 """How long the status speaks of a goal that ended, as actionlib has it."""
 STATUS_S: Final = 0.2
 """How often the status is said, as actionlib has it: its clients look whether they hear it."""
-CANCEL_S: Final = 600.0
-"""How long it is tried to cancel a goal: the link may be away."""
-CANCEL_AGAIN_S: Final = (1.0, 30.0)
-"""First and longest pause before a goal that was not cancelled is cancelled again."""
 EARLY_S: Final = 5.0
 MAX_EARLY: Final = 64
 """Cancellings that came before their goals, on another connection: how long, and how many, are remembered."""
@@ -66,6 +61,7 @@ class ServerForRos1:
         name: str,
         types: ActionTypes,
         calls: Mapping[str, ServiceHandler],
+        cancelling: Cancelling,
         *,
         publish_status: Callable[[bytes], None],
         publish_feedback: Callable[[bytes], None],
@@ -92,7 +88,7 @@ class ServerForRos1:
         self._said = SayOnce(_log, most=MAX_SAID)
         self._timer = Timer(self._due)
         self._running = Tasks(MAX_LIVE)
-        self._cancelling = Tasks(2 * MAX_LIVE)
+        self._cancelling = cancelling
         self._closed = False
 
     @property
@@ -112,12 +108,10 @@ class ServerForRos1:
         self._closed = True
         self._timer.close()
         self._running.cancel()
-        self._cancelling.cancel()
 
     async def ended(self) -> None:
         """Return when nothing goes on any more; after `close`."""
         await self._running.ended()
-        await self._cancelling.ended()
 
     # --- from nodes here --------------------------------------------------------------------------------------------
 
@@ -159,13 +153,13 @@ class ServerForRos1:
         stamp = Stamp(meant.secs, meant.nsecs)
         every = not meant.text and stamp == NO_STAMP
         if every:  # those of other sites as well; once, because later it would mean goals that are not given yet
-            self._begin_cancel(GoalInfo(NO_UUID, NO_STAMP), once=True)
+            self._cancelling.begin(GoalInfo(NO_UUID, NO_STAMP), lambda: True, once=True)
         for goal in self.goals.live:
             if not (every or goal.ident.text == meant.text or NO_STAMP < _given(goal) <= stamp):
                 continue
             goal.cancelled = True
             if goal.accepted:
-                self._begin_cancel(GoalInfo(goal.uuid, NO_STAMP), goal)
+                self._cancel(goal)
         if meant.text and self.goals.of_text(meant.text) is None:
             now = clock.now()
             self._early = {text: until_s for text, until_s in self._early.items() if until_s > now}
@@ -217,7 +211,7 @@ class ServerForRos1:
             self._reject(goal, "its server does not accept it, or did not answer in time")
             return
         if goal.cancelled:
-            self._begin_cancel(GoalInfo(goal.uuid, NO_STAMP), goal)
+            self._cancel(goal)
         status, why = Ros2Status.UNKNOWN, "nothing is known of its result"
         own = self._types.result.zero
         try:
@@ -233,7 +227,7 @@ class ServerForRos1:
             return
         _log.warning("%s: goal %s is given up and cancelled: %s", self._name, goal.ident.shown, why)
         self._end(goal, Ros1Status.ABORTED, f"SERN: {why}", self._types.result.zero)
-        self._begin_cancel(GoalInfo(goal.uuid, NO_STAMP))
+        self._cancelling.begin(GoalInfo(goal.uuid, NO_STAMP), lambda: True)
 
     def _reject(self, goal: _Goal, why: str) -> None:
         _log.warning("%s: goal %s is rejected: %s", self._name, goal.ident.shown, why)
@@ -258,26 +252,9 @@ class ServerForRos1:
             raise ServiceError(f"its service {part} is gone")
         return await handler(request)
 
-    def _begin_cancel(self, info: GoalInfo, goal: _Goal | None = None, *, once: bool = False) -> None:
-        """`goal`: the one that it is about, whose end is the end of it. None: until it is answered."""
-        if self._closed:
-            return
-        if self._cancelling.full:
-            self._said(f"{self._name}: a goal is not cancelled: {2 * MAX_LIVE} cancellings are under way already")
-            return
-        self._cancelling.begin(self._cancel(bodies.cancel_request(info), goal, once=once), name="cancel")
-
-    async def _cancel(self, request: bytes, goal: _Goal | None, *, once: bool) -> None:
-        """Until its server takes it: who refuses it, the link or the server, is not told."""
-        until_s, pause_s = clock.now() + CANCEL_S, CANCEL_AGAIN_S[0]
-        while clock.now() < until_s and (goal is None or not self.goals.has_ended(goal)):
-            with suppress(ServiceError, ConfigError):
-                if bodies.cancel_code(await self._call("cancel_goal", request)) != bodies.REJECTED:
-                    return
-            if once:
-                return
-            await asyncio.sleep(pause_s)
-            pause_s = min(2 * pause_s, CANCEL_AGAIN_S[1])
+    def _cancel(self, goal: _Goal) -> None:
+        """Until it has ended."""
+        self._cancelling.begin(GoalInfo(goal.uuid, NO_STAMP), lambda: not self.goals.has_ended(goal))
 
     # --- time -------------------------------------------------------------------------------------------------------
 

@@ -8,6 +8,7 @@ from contextlib import ExitStack
 from functools import partial
 from typing import Final, Protocol
 
+from sern_client.action_conversion.cancelling import Cancelling
 from sern_client.action_conversion.crossing import GONE, Part
 from sern_client.action_conversion.server_for_ros1 import ServerForRos1
 from sern_client.action_conversion.server_for_ros2 import ServerForRos2
@@ -84,6 +85,10 @@ class Ros2Stage:
     def busy(self) -> bool:
         return self._server is not None and self._server.busy
 
+    @property
+    def pending(self) -> bool:
+        return False
+
     def begin(self) -> None:
         assert self._types is not None
         types = self._types
@@ -111,7 +116,7 @@ class Ros2Stage:
         asyncio.get_running_loop().call_soon(self._opened.close)
         self._opened = ExitStack()
 
-    async def ended(self) -> None:
+    async def stop(self) -> None:
         await asyncio.sleep(0)
 
     def prepare(self, parts: Mapping[str, Part]) -> Iterator[None]:
@@ -182,6 +187,7 @@ class Ros1Stage:
         self._here = here
         self._idle = idle
         self._calls: dict[str, ServiceHandler] = {}
+        self._cancelling = Cancelling(name, self._calls, idle)
         self._server: ServerForRos1 | None = None
         self._last: ServerForRos1 | None = None
         self._types: ActionTypes | None = None
@@ -190,6 +196,10 @@ class Ros1Stage:
     @property
     def busy(self) -> bool:
         return self._server is not None and self._server.busy
+
+    @property
+    def pending(self) -> bool:
+        return self._cancelling.count > 0
 
     def begin(self) -> None:
         assert self._types is not None
@@ -217,9 +227,10 @@ class Ros1Stage:
         self._opened.close()
         self._opened = ExitStack()
 
-    async def ended(self) -> None:
+    async def stop(self) -> None:
         if self._last is not None:
             await self._last.ended()
+        await self._cancelling.stop()
 
     def prepare(self, parts: Mapping[str, Part]) -> Iterator[None]:
         sources = (("goal", "send_goal", "SendGoal"), ("result", "get_result", "GetResult"),
@@ -256,6 +267,7 @@ class Ros1Stage:
             self._name,
             types,
             self._calls,
+            self._cancelling,
             publish_status=_publish(topic("status", STATUS_TYPE, status, latched=True), stack),
             publish_feedback=_publish(topic("feedback", *types.feedback.topic), stack),
             publish_result=_publish(topic("result", *types.result.topic), stack),

@@ -7,6 +7,7 @@ from typing import Final
 import pytest
 
 from sern_client import latest
+from sern_client.action_conversion import cancelling, goals, server_for_ros1, server_for_ros2
 from sern_client.endpoints.common import first_messages
 from sern_client.endpoints.ros1 import Ros1Options
 from sern_client.endpoints.ros1 import first_messages as ros1_first_messages
@@ -85,6 +86,11 @@ BOUNDS: Final[dict[str, tuple[str, ...]]] = {
     "connections of one client": (f"{server.MAX_PORTS}; {priority_paths.CONNECTIONS} |",),
     "connections of the plain feed": (f"{feed_inflow.MAX_CONNECTIONS} |",),
     "latest values at a client": (f"{latest.MAX_TOPICS:,} streams", f"{latest.MAX_VALUE_BYTES // 1024} kB each"),
+    "goals of an action of the other ROS": (
+        f"{goals.MAX_LIVE} under way, {goals.MAX_GOALS} in all; results {nbytes(goals.MAX_RESULT_BYTES)}",
+        f"{server_for_ros2.KEEP_S:g} s after",
+        f"{server_for_ros1.KEEP_S:g} s where",
+    ),
 }
 """What the rows of the table in docs/operations.md say, by their beginning."""
 TIMES: Final = {
@@ -100,6 +106,8 @@ TIMES: Final = {
         f"`replay.resume_s`, {default(ReplaySection, 'resume_s') // 60} minutes",
         f"of more than {peers.MAX_GIVEN_UP} such clients",
         f"than {LIMITS.draining} of them or {nbytes(draining.MAX_DRAINING_BYTES)}",
+        f"A goal that its server keeps pending* for {server_for_ros2.PENDING_S:g} s",
+        f"sent again for {cancelling.CANCEL_S / 60:g} minutes",
     ),
 }
 

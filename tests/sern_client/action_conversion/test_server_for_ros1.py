@@ -13,8 +13,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sern_client.action_conversion import bodies, server_for_ros1
+from sern_client.action_conversion import bodies, cancelling, server_for_ros1
 from sern_client.action_conversion.bodies import HEAD, NO_STAMP, NO_UUID, GoalInfo, Stamp, StatusPart
+from sern_client.action_conversion.cancelling import Cancelling
 from sern_client.action_conversion.server_for_ros1 import ServerForRos1
 from sern_client.action_conversion.statuses import Ros1Status, Ros2Status
 from sern_client.actions import STATUS_TYPE, GoalId, goal_id, mentioned_goals, refusal
@@ -281,7 +282,7 @@ async def test_a_result_that_nobody_knows(
 
 async def test_cancelling_one(site: Site, robot: Robot, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As long as nobody takes it: the link may be away."""
-    monkeypatch.setattr(server_for_ros1, "CANCEL_AGAIN_S", (0.001, 0.002))
+    monkeypatch.setattr(cancelling, "CANCEL_AGAIN_S", (0.001, 0.002))
     client_appears(site, tmp_path)
     uuid = await accepted(site, robot)
     await accepted(site, robot, OTHER, 2)
@@ -301,7 +302,7 @@ async def test_cancelling_one(site: Site, robot: Robot, tmp_path: Path, monkeypa
 async def test_a_goal_that_ends_is_cancelled_no_more(
     site: Site, robot: Robot, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(server_for_ros1, "CANCEL_AGAIN_S", (0.0, 0.0))
+    monkeypatch.setattr(cancelling, "CANCEL_AGAIN_S", (0.0, 0.0))
     client_appears(site, tmp_path)
     await accepted(site, robot)
     cancel(site, GoalId(0, 0, IDENT.text))
@@ -309,7 +310,7 @@ async def test_a_goal_that_ends_is_cancelled_no_more(
     (await robot.call("get_result")).answer.set_result(response(Ros2Status.SUCCEEDED))
     await until(lambda: results(site), "it has ended")
     call.answer.set_result(bodies.cancel_response(bodies.REJECTED))
-    await until(lambda: not server(site)._cancelling._tasks, "nothing goes on")
+    await until(lambda: server(site)._cancelling.count == 0, "nothing goes on")
     assert len([call for call in robot.calls if call.part == "cancel_goal"]) == 1
 
 
@@ -329,7 +330,7 @@ async def test_cancelling_all_means_all_there_are_once(site: Site, robot: Robot,
     calls = [await robot.call("cancel_goal", number) for number in (1, 2, 3)]
     assert {call.uuid for call in calls} == {NO_UUID} | uuids
     next(call for call in calls if call.uuid == NO_UUID).answer.set_result(bodies.cancel_response(bodies.REJECTED))
-    await until(lambda: len(server(site)._cancelling._tasks) == 2, "what means all is not said again")
+    await until(lambda: server(site)._cancelling.count == 2, "what means all is not said again")
 
 
 async def test_cancelling_those_of_before(site: Site, robot: Robot, tmp_path: Path) -> None:
@@ -338,7 +339,7 @@ async def test_cancelling_those_of_before(site: Site, robot: Robot, tmp_path: Pa
     await accepted(site, robot, OTHER, 2)
     cancel(site, GoalId(8, 0, ""))
     assert (await robot.call("cancel_goal")).uuid == uuid
-    assert len(server(site)._cancelling._tasks) == 1
+    assert server(site)._cancelling.count == 1
 
 
 async def test_a_goal_whose_cancelling_came_first_is_not_given(
@@ -443,6 +444,29 @@ async def test_a_server_that_goes_is_shown_until_its_goals_have_ended(site: Site
     await until(lambda: len(site.nodes.published) == 3, "it comes back")
     assert site.events.infos == {} and set(site.nodes.sinks) == {GOAL, CANCEL}
     await accepted(site, robot, number=2)
+
+
+async def test_a_goal_is_cancelled_when_its_server_comes_back(
+    site: Site, robot: Robot, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its client was told that it has failed, and it may be under way still."""
+    monkeypatch.setattr(cancelling, "CANCEL_AGAIN_S", (0.001, 0.002))
+    client_appears(site, tmp_path)
+    uuid = await accepted(site, robot)
+    call = await robot.call("get_result")
+    robot.close()
+    call.answer.set_exception(ServiceError("is gone"))
+    refused = await robot.call("cancel_goal")
+    refused.answer.set_exception(ServiceError("is gone"))
+    await until(lambda: not site.nodes.published, "it is withdrawn")
+    robot.calls.clear()
+    robot.open("cancel_goal")
+    cancelled = await robot.call("cancel_goal")
+    cancelled.answer.set_result(bodies.cancel_response(bodies.NONE))
+    assert cancelled.uuid == uuid
+    assert ACTION in site.endpoint._actions
+    robot.close()
+    await until(lambda: not site.endpoint._actions, "nothing is left of it")
 
 
 async def test_clients_come_before_and_after(site: Site, tmp_path: Path) -> None:
@@ -554,8 +578,8 @@ def test_whatever_comes_stops_nothing(said: list[tuple[str, bytes]]) -> None:
             types = types_of("count/Count", files(Path(place), count__Count=FIBONACCI))
         told: list[bytes] = []
         server = ServerForRos1(
-            "/count", types, {}, publish_status=told.append, publish_feedback=told.append, publish_result=told.append,
-            idle=lambda: None, counts=Converter(),
+            "/count", types, {}, Cancelling("/count", {}, lambda: None), publish_status=told.append,
+            publish_feedback=told.append, publish_result=told.append, idle=lambda: None, counts=Converter(),
         )  # fmt: skip
         for kind, body in said:
             begins = {"goal": bodies.ros1_header(1, NO_STAMP), "cancel": bytes(8)}.get(kind, HEAD)

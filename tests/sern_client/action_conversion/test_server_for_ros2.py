@@ -388,6 +388,7 @@ async def test_a_server_that_goes_is_shown_until_its_goals_have_ended(site: Site
     robot.close("result")
     assert await asked == result(Ros2Status.ABORTED)
     await until(lambda: not site.nodes.served and not site.nodes.published, "it is withdrawn")
+    assert not site.endpoint._actions
     assert GOAL not in site.events.infos and CANCEL not in site.events.infos
     robot.open()
     await until(lambda: len(site.nodes.served) == 3, "it comes back")
