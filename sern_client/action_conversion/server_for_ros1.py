@@ -203,35 +203,45 @@ class ServerForRos1:
     async def _run(self, goal: _Goal, request: bytes) -> None:
         """Give it, wait for its result, tell its client."""
         try:
+            if await self._give(goal, request):
+                await self._wait(goal)
+        except Exception:  # noqa: BLE001  (a fault of one goal; its client must hear of it all the same)
+            _log.exception("%s: goal %s has failed", self._name, goal.ident.shown)
+            self._give_up(goal, Ros1Status.ABORTED, "it failed at its client's site")
+
+    async def _give(self, goal: _Goal, request: bytes) -> bool:
+        """Whether it is accepted."""
+        try:
             goal.accepted = bodies.is_accepted(await self._call("send_goal", request))
         except (ServiceError, ConfigError) as error:
-            self._reject(goal, str(error))
-            return
+            self._give_up(goal, Ros1Status.REJECTED, str(error))
+            return False
         if not goal.accepted:
-            self._reject(goal, "its server does not accept it, or did not answer in time")
-            return
-        if goal.cancelled:
+            why = "its server does not accept it, or did not answer in time"
+            _log.warning("%s: goal %s is rejected: %s", self._name, goal.ident.shown, why)
+            self._end(goal, Ros1Status.REJECTED, f"SERN: {why}")
+        elif goal.cancelled:
             self._cancel(goal)
-        status, why = Ros2Status.UNKNOWN, "nothing is known of its result"
-        own = self._types.result.zero
+        return goal.accepted
+
+    async def _wait(self, goal: _Goal) -> None:
         try:
             response = await self._call("get_result", bodies.result_request(goal.uuid))
             before, own = self._types.result.to_ros1(response)
-            status = ros2_status(before[0])
         except (ServiceError, ConfigError) as error:
-            if isinstance(error, ConfigError):
-                self._counts.failures += 1
-            why = str(error)
+            self._give_up(goal, Ros1Status.ABORTED, str(error))
+            return
+        status = ros2_status(before[0])
         if status in ENDED_ROS2:
             self._end(goal, ROS1_STATUS[status], "", own)
-            return
-        _log.warning("%s: goal %s is given up and cancelled: %s", self._name, goal.ident.shown, why)
-        self._end(goal, Ros1Status.ABORTED, f"SERN: {why}", self._types.result.zero)
-        self._cancelling.begin(GoalInfo(goal.uuid, NO_STAMP), lambda: True)
+        else:
+            self._give_up(goal, Ros1Status.ABORTED, "nothing is known of its result")
 
-    def _reject(self, goal: _Goal, why: str) -> None:
-        _log.warning("%s: goal %s is rejected: %s", self._name, goal.ident.shown, why)
-        self._end(goal, Ros1Status.REJECTED, f"SERN: {why}")
+    def _give_up(self, goal: _Goal, status: Ros1Status, why: str) -> None:
+        """What its client believes dead must not drive a robot, should it be under way."""
+        _log.warning("%s: goal %s is given up and cancelled: %s", self._name, goal.ident.shown, why)
+        self._end(goal, status, f"SERN: {why}")
+        self._cancelling.begin(GoalInfo(goal.uuid, NO_STAMP), lambda: True)
 
     def _end(self, goal: _Goal, status: Ros1Status, text: str, own: bytes | None = None) -> None:
         if self._closed or self.goals.has_ended(goal):

@@ -27,6 +27,7 @@ from sern_client.action_conversion.types import (
 )
 from sern_client.actions import STATUS_TYPE
 from sern_client.endpoints.base import Publisher, ServiceHandler, ServiceInfo, ServiceServer, Sink
+from sern_client.endpoints.common.saying import SayOnce
 from sern_client.endpoints.conversion import Converter
 from sern_core.vocabulary.errors import ConfigError
 from sern_core.vocabulary.message import TopicInfo
@@ -147,8 +148,8 @@ class Ros2Stage:
             self._name,
             types,
             answer_s=self._answer_s,
-            publish_status=_publish(here.advertise_own(status), stack),
-            publish_feedback=_publish(here.advertise_own(feedback), stack),
+            publish_status=_publish(status.name, here.advertise_own(status), stack),
+            publish_feedback=_publish(feedback.name, here.advertise_own(feedback), stack),
             idle=self._idle,
             counts=self._here.converter,
         )
@@ -256,10 +257,10 @@ class Ros1Stage:
     def _open(self, types: ActionTypes, stack: ExitStack) -> ServerForRos1:
         here = self._here
 
-        def topic(part: str, type_name: str, text: ros_types.TypeText, *, latched: bool = False) -> Publisher:
+        def topic(part: str, kind: str, text: ros_types.TypeText, *, latched: bool = False) -> Callable[[bytes], None]:
             name = TopicName(f"{self._name}/{part}")
-            info = TopicInfo(name, type_name, Encoding.ROS1, text.type_hash, text.definition, latched, reliable=True)
-            return here.advertise_own(info)
+            info = TopicInfo(name, kind, Encoding.ROS1, text.type_hash, text.definition, latched, reliable=True)
+            return _publish(name, here.advertise_own(info), stack)
 
         status = ros_types.describe(STATUS_TYPE, Encoding.ROS1)
         assert status is not None
@@ -268,9 +269,9 @@ class Ros1Stage:
             types,
             self._calls,
             self._cancelling,
-            publish_status=_publish(topic("status", STATUS_TYPE, status, latched=True), stack),
-            publish_feedback=_publish(topic("feedback", *types.feedback.topic), stack),
-            publish_result=_publish(topic("result", *types.result.topic), stack),
+            publish_status=topic("status", STATUS_TYPE, status, latched=True),
+            publish_feedback=topic("feedback", *types.feedback.topic),
+            publish_result=topic("result", *types.result.topic),
             idle=self._idle,
             counts=self._here.converter,
         )
@@ -294,9 +295,18 @@ class Ros1Stage:
         return server
 
 
-def _publish(publisher: Publisher, stack: ExitStack) -> Callable[[bytes], None]:
+def _publish(name: str, publisher: Publisher, stack: ExitStack) -> Callable[[bytes], None]:
+    """What publishes. A fault there is said once, and holds up nothing else."""
     stack.callback(publisher.close)
-    return lambda body: publisher.publish(body, time.time_ns())
+    said = SayOnce(_log, most=1)
+
+    def publish(body: bytes) -> None:
+        try:
+            publisher.publish(body, time.time_ns())
+        except Exception as error:  # noqa: BLE001  (of one topic; the goals go on)
+            said(f"{name} could not be published here", error=error)
+
+    return publish
 
 
 def _taken(take: Callable[[bytes], None], body: bytes, stamp_ns: int) -> bool:

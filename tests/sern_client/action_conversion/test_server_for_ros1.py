@@ -246,18 +246,28 @@ async def test_a_goal_that_is_not_accepted(site: Site, robot: Robot, tmp_path: P
     assert statuses(site) == {IDENT.text: Ros1Status.REJECTED}
 
 
-@pytest.mark.parametrize("error", [ServiceError("no link"), None])
-async def test_a_goal_that_nobody_answers(site: Site, robot: Robot, tmp_path: Path, error: ServiceError | None) -> None:
+@pytest.mark.parametrize(
+    ("answer", "status", "text"),
+    [
+        (ServiceError("no link"), Ros1Status.REJECTED, "SERN: no link"),
+        (b"\1", Ros1Status.REJECTED, "SERN: 1 bytes cannot be read"),
+        (OSError("broken"), Ros1Status.ABORTED, "SERN: it failed at its client's site"),
+    ],
+)
+async def test_a_goal_that_nobody_answers(
+    site: Site, robot: Robot, tmp_path: Path, answer: bytes | Exception, status: Ros1Status, text: str
+) -> None:
+    """It may have got there, so it is cancelled."""
     client_appears(site, tmp_path)
     give(site)
     call = await robot.call("send_goal")
-    if error is None:
-        call.answer.set_result(b"\1")
+    if isinstance(answer, bytes):
+        call.answer.set_result(answer)
     else:
-        call.answer.set_exception(error)
+        call.answer.set_exception(answer)
     await until(lambda: results(site), "it is told")
-    (told,) = results(site)
-    assert told.status == Ros1Status.REJECTED and ("no link" in told.text or "1 bytes cannot be read" in told.text)
+    assert [(told.status, told.text) for told in results(site)] == [(status, text)]
+    assert (await robot.call("cancel_goal")).uuid == call.uuid
 
 
 @pytest.mark.parametrize("answer", [response(Ros2Status.UNKNOWN), b"\1", response(77), ServiceError("no link")])
@@ -590,3 +600,18 @@ def test_whatever_comes_stops_nothing(said: list[tuple[str, bytes]]) -> None:
         await server.ended()
 
     asyncio.run(play())
+
+
+async def test_a_topic_that_cannot_be_published_holds_up_nothing(
+    site: Site, robot: Robot, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def broken(body: bytes, stamp_ns: int) -> None:
+        raise OSError("no message")
+
+    client_appears(site, tmp_path)
+    monkeypatch.setattr(site.nodes.published[TopicName(f"{ACTION}/status")], "publish", broken)
+    await accepted(site, robot)
+    (await robot.call("get_result")).answer.set_result(response(Ros2Status.SUCCEEDED))
+    await until(lambda: results(site), "its result is told")
+    server(site)._due()
+    assert caplog.text.count(f"{ACTION}/status could not be published here") == 1

@@ -404,6 +404,22 @@ async def test_a_server_that_comes_back_goes_on_with_its_goals(site: Site, robot
     await accepted(site, robot, OTHER)
 
 
+async def test_a_server_of_another_type_takes_the_place_of_the_one_before(tmp_path: Path) -> None:
+    """Its streams may be there before those of the first have ended."""
+    other = "int64 order\n---\n---\nbool more\n"
+    site = await Site(Encoding.CDR, tmp_path, count__Count=FIBONACCI, other__Other=other).start()
+    first, second = (Robot(site, types_of(name, list(site.endpoint.files))) for name in ("count/Count", "other/Other"))
+    await first.appears()
+    second.open()
+    sent = TopicName(f"{ACTION}/_action/send_goal")
+    await until(lambda: site.nodes.served[sent].info.type_name == "other/action/Other_SendGoal", "it is the other's")
+    first.close()
+    await asyncio.sleep(0)
+    assert len(site.nodes.served) == 3 and site.events.infos[GOAL].type_name == "other/msg/OtherActionGoal"
+    second.close()
+    await site.endpoint.stop()
+
+
 async def test_whoever_waits_is_answered_when_this_site_stops(tmp_path: Path) -> None:
     site = await Site(Encoding.CDR, tmp_path).start()
     robot = Robot(site, types_of("count/Count", list(site.endpoint.files)))
