@@ -188,7 +188,8 @@ class Part:
         here = ros_types.counterpart(sent, text, Encoding.CDR)
         self._to_ros1 = body_converter(there, here)
         self._to_ros2 = body_converter(here.type, Counterpart(there, here.same_layout))
-        inner = ros_types.counterpart(own, ros2, Encoding.CDR).type
+        # The part is in there, so it is known to the same store.
+        inner = here.type._replace(name=own, text=TypeText(*here.type.store.generate_msgdef(own, ros_version=1)))
         package, name = names.ros1.split("/")
         own = f"{package}/msg/{name}{part.capitalize()}"
         self._inward: Convert | None = None
@@ -263,13 +264,9 @@ def in_steps(names: Names, ros2: Mapping[str, str], ros1: Mapping[str, str]) -> 
     the actions do not correspond."""
     parts = []
     for part in PARTS:
-        own, sent, text = _sent(names, part, ros2[part])
-        for read, name, definition in (
-            (ros_types.resolve, sent, text),
-            (ros_types.counterpart, sent, text),
-            (ros_types.counterpart, own, ros2[part]),
-        ):
-            read(name, definition, Encoding.CDR)  # both keep what they have found
+        _, sent, text = _sent(names, part, ros2[part])
+        for read in (ros_types.resolve, ros_types.counterpart):
+            read(sent, text, Encoding.CDR)  # both keep what they have found
             yield
         parts.append(Part(names, part, ros2[part], ros1.get(part)))
         yield

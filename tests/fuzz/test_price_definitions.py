@@ -3,11 +3,13 @@
 import random
 import struct
 from contextlib import suppress
+from functools import partial
 from typing import Final
 
 import pytest
 
 from sern_client import actions
+from sern_client.action_conversion import types
 from sern_client.action_conversion.bodies import split_statuses
 from sern_client.endpoints import conversion
 from sern_client.frames import FramePrefixer
@@ -21,6 +23,8 @@ from tests.exploring import seeds
 from tests.fuzz.price import Input, Make, within_budget, within_memory
 
 INPUTS: Final[dict[str, Make]] = {}
+ACTIONS: Final[dict[str, Make]] = {}
+"""The definitions again, each as that of all parts of an action."""
 
 SEP: Final = ros_text.SEPARATOR
 _serial = iter(range(10**9))
@@ -50,6 +54,23 @@ def definition(label: str, text: str) -> None:
             return Input(len(text), take)
 
         INPUTS[f"definition: {label}, {encoding}"] = make
+        ACTIONS[f"{label}, {encoding}"] = partial(parts, text, encoding)
+
+
+def parts(text: str, encoding: Encoding) -> Input:
+    """The definition as that of all parts of an action, whose types are made in steps."""
+    name = f"T{next(_serial)}"
+    same = dict.fromkeys(types.PARTS, text.replace("evil/msg/A", f"evil/msg/{name}Goal"))
+    names = types.Names(f"evil/{name}", f"evil/action/{name}", None)
+    steps = types.in_steps(names, same, same if encoding is Encoding.ROS1 else {})
+
+    def step() -> bool:
+        try:
+            return next(steps, steps) is None
+        except ConfigError:
+            return False
+
+    return Input(3 * len(text), step, rest=step)
 
 
 definition("blank lines", "\n" * 2**18)
@@ -221,6 +242,12 @@ def test_an_input_holds_the_loop_for_a_bounded_time(name: str) -> None:
 @pytest.mark.parametrize("name", list(INPUTS))
 def test_an_input_adds_a_bounded_multiple_of_its_size_to_memory(name: str) -> None:
     assert within_memory(INPUTS[name])
+
+
+@pytest.mark.parametrize("name", list(ACTIONS))
+def test_types_of_an_action_have_the_price_of_their_parts(name: str) -> None:
+    assert within_budget(ACTIONS[name])
+    assert any(within_memory(ACTIONS[name]) for _ in range(3))  # a table of the interpreter's own may grow meanwhile
 
 
 WORDS: Final = (
