@@ -24,7 +24,7 @@ from sern_client.endpoints.conversion import Converter
 from sern_core.vocabulary.errors import ServiceError
 from sern_core.vocabulary.message import TopicInfo
 from sern_core.vocabulary.types import Encoding, TopicName
-from sern_runtime import clock, ros_services, ros_types
+from sern_runtime import clock
 from tests.sern_client.action_conversion.files import FIBONACCI, files, types_of
 from tests.sern_client.action_conversion.nodes import ACTION, Site, publish, refuse, ros1_topic
 from tests.support import until
@@ -551,30 +551,6 @@ async def test_the_tables_are_compared_as_they_are(site: Site, robot: Robot, tmp
     assert site.endpoint.validate(held) == []
     own = [TopicName(f"{ACTION}/{part}") for part in ("status", "feedback", "result")]
     assert site.nodes.held == Held(Counter([TopicName("/other"), *own]), Counter([TopicName("/more"), GOAL, CANCEL]))
-
-
-async def test_all_else_passes(site: Site) -> None:
-    """Also actions of the nodes' own ROS, and services."""
-    publisher = site.endpoint.advertise(ros1_topic("status", STATUS_TYPE))
-    assert list(site.nodes.published) == [f"{ACTION}/status"]
-    publisher.close()
-    text = ros_services.resolve("std_srvs/srv/SetBool", "", Encoding.ROS1).text
-    info = ServiceInfo(TopicName("/robot1/set"), "std_srvs/srv/SetBool", Encoding.ROS1, *reversed(text))
-
-    async def handler(request: bytes) -> bytes:
-        return request
-
-    served = site.endpoint.serve(info, handler)
-    assert list(site.nodes.served) == ["/robot1/set"]
-    served.close()
-    assert await site.endpoint.call(TopicName("/own"), b"!", timeout_s=1.0) == b"/own!"
-    odometry = ros_types.topic_info("/robot1/odom", "nav_msgs/msg/Odometry", Encoding.ROS1)
-    site.nodes.add(odometry)
-    taken = site.endpoint.subscribe(odometry.name, lambda _body, _stamp_ns: True)
-    site.endpoint.interest(odometry.name, False)
-    assert site.events.infos == {odometry.name: odometry} and site.nodes.interests == {odometry.name: False}
-    taken.close()
-    assert site.endpoint.encoding is None and site.endpoint.drops == {} and site.endpoint.keepers == []
 
 
 @given(
