@@ -397,8 +397,8 @@ class ActionSection(Section):
 
 
 class ActionsSection(Section):
-    """Actions across the link, of ROS 1 (actionlib) and ROS 2, also from one to the other. Their rules come before those
-    of `topics`."""
+    """Actions across the link, of ROS 1 (actionlib) and ROS 2, also from one to the other. Their rules come before
+    those of `topics`."""
 
     offer: tuple[ActionSection, ...] = ()
     """Actions whose server is at this site."""

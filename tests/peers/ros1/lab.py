@@ -51,6 +51,10 @@ def need(*paths: str) -> None:
             pytest.skip(f"needs {path}: install the Debian package {PACKAGES[path]}")
 
 
+LOGGED: Final = ("[DEBUG]", "[INFO]", "[WARN]", "[ERROR]", "[FATAL]")
+"""How what rospy logs begins."""
+
+
 class RosLab:
     """`async with RosLab(tmp_path) as ros:` one master, and what is started at it."""
 
@@ -177,9 +181,10 @@ class RosLab:
         return endpoint, events
 
     def lines(self, name: str) -> list[Any]:
-        """The JSON lines that a script has printed; its last line may be under way."""
+        """The JSON lines that a script has printed; its last line may be under way. What rospy logs is among them."""
         complete = self.printed(name).rpartition("\n")[0]
-        return [json.loads(line) for line in complete.splitlines() if line.startswith(("{", "["))]
+        said = [line for line in complete.splitlines() if line.startswith(("{", "["))]
+        return [json.loads(line) for line in said if not line.startswith(LOGGED)]
 
     def line_count(self, name: str) -> int:
         """How many lines it has printed, which is quicker to tell."""

@@ -316,7 +316,10 @@ async def test_a_node_of_nav2_moves_a_robot_with_move_base(tmp_path: Path) -> No
 
     router = Router()
     router.start()
-    client, events = ZenohEndpoint(ZenohOptions(router.options, 9, "navigator")), Events()
+    client, events = (
+        ZenohEndpoint(ZenohOptions(router.options, 9, "navigator", accept_bridged=True, enclave="/")),
+        Events(),
+    )
     client.watch_services(events)
     definitions = folder(tmp_path / "nav2", nav2_msgs__NavigateToPose=NAVIGATE)
     try:

@@ -63,6 +63,19 @@ async def until_answered(ask: Callable[[], Awaitable[dict[str, Any]]], count: in
         assert not patience.over(), f"{answer} in place of {count}"
 
 
+async def until_fed(node: "RosNode", what: str, **goal: Any) -> None:
+    """Give goals until feedback of one comes. A goal is over so soon that its feedback may be earlier than whoever
+    wants it at the far side is known to its server's node."""
+    patience = Patience()
+    for number in itertools.count():
+        key = f"first {number}"
+        await node.do(what, key=key, **goal)
+        await node.event("result", key=key)
+        if node.of("feedback"):
+            return
+        assert not patience.over(), "no feedback"
+
+
 class RosNode:
     """A real node in a process of its own. `events` keeps what it says unasked."""
 

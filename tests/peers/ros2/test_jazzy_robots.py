@@ -17,7 +17,7 @@ from sern_runtime import ros_types
 from sern_tools.ports import free_ports
 from tests.daemons import Lab, Process
 from tests.peers.dds.peer import free_domain
-from tests.peers.ros2.sourced import PLACE, RosNode, RosNodes, before, sourced, until_answered
+from tests.peers.ros2.sourced import PLACE, RosNode, RosNodes, before, sourced, until_answered, until_fed
 from tests.sern_client.messages import made_up
 from tests.support import until
 
@@ -150,6 +150,7 @@ async def commands(scene: Scene) -> None:
 
 async def goals(scene: Scene) -> None:
     await scene.machine.do("navigator", action=scene.name("navigate_to_pose"))
+    await until_fed(scene.desk, "navigate", action=scene.name("navigate_to_pose"), x=1.0)
     await scene.goal("done", 5.0)
     await scene.ends("done", SUCCEEDED)
     left = sorted(each["left"] for each in scene.desk.of("feedback", key="done"))  # its node has several threads

@@ -13,7 +13,7 @@ from sern_core.vocabulary.types import Encoding
 from sern_runtime import ros_types
 from tests.daemons import Lab, Process
 from tests.peers.dds.peer import free_domain
-from tests.peers.ros2.sourced import PLACE, RosNode, RosNodes, before, sourced, until_answered
+from tests.peers.ros2.sourced import PLACE, RosNode, RosNodes, before, sourced, until_answered, until_fed
 from tests.sern_client.messages import made_up
 from tests.support import DEADLINE_S
 
@@ -145,6 +145,7 @@ async def services_both_ways(both: Sites) -> None:
 async def goals(both: Sites) -> None:
     """Accepted with feedback and result, refused, aborted, cancelled."""
     await both.robot.do("action_server", action="/fibonacci")
+    await until_fed(both.site, "send_goal", action="/robot1/fibonacci", order=3)
     for key, order, status in (("done", 5, SUCCEEDED), ("aborted", -1, ABORTED)):
         await both.site.do("send_goal", action="/robot1/fibonacci", order=order, key=key)
         assert (await both.site.event("accepted", key=key))["accepted"]
