@@ -66,6 +66,8 @@ README_SYSTEMS: Final = {
     "rospy+zenoh": "rospy, zenoh, rospy",
 }
 """Words for people in a hurry, in place of the names that the other documents explain."""
+YARDSTICKS: Final = frozenset({"forwarder"})
+"""Systems that figures are compared with and that nobody would use: not for people in a hurry."""
 TOGETHER: Final = frozenset({"codecs", "footprint", "summaries", "thin_link", "mmcf_replay", "matrix"})
 """Benchmarks whose cases are rows of one table, as far as they have a metric in common."""
 BY_POLICY: Final = frozenset({"mmcf"})
@@ -181,7 +183,7 @@ def headline(document: Mapping[str, Any]) -> str:
     shown: dict[str, dict[str, Any]] = {}
     metrics: list[str] = []
     for case, wanted in IN_README[document["benchmark"]].items():
-        rows = [row for row in document["rows"] if row["case"] == case]
+        rows = [row for row in document["rows"] if row["case"] == case and row["system"] not in YARDSTICKS]
         found = [name for name in wanted if any(name in row for row in rows)]
         if not found:
             raise ConfigError(

@@ -122,6 +122,7 @@ def test_the_readme_gets_what_it_shows_of_a_case() -> None:
     found.row("4 Mbit/s 50 ms, idle", "sern-udp", pose_p50_ms=1.0)
     found.row("4 Mbit/s 50 ms, 2x", "sern-udp", pose_p50_ms=28.44, goodput_Mbps=3.612, relay_cpu_percent=5.0)
     found.row("4 Mbit/s 50 ms, 2x", "tcpros", pose_p50_ms=239.0, goodput_Mbps=3.77)
+    found.row("4 Mbit/s 50 ms, 2x", "forwarder", pose_p50_ms=27.0)
     found.row("4 Mbit/s 50 ms, blackout 10 s", "sern-udp", fresh_s=0.2)
     found.row("4 Mbit/s 50 ms, blackout 30 s", "zenoh", fresh_s=0.3)
     assert headline({**found.as_json(), "commit": "abc"}).splitlines() == [
