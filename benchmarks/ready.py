@@ -4,6 +4,7 @@ The steps take two hours together, and what one of them lacks would be told when
 is missing is a line of its own; what is only made up (recordings) is said and is no failure.
 """
 
+import argparse
 import importlib.util
 import os
 import sys
@@ -66,7 +67,9 @@ def _writable(folder: Path) -> bool:
     return there.is_dir() and os.access(there, os.W_OK)
 
 
-def main(problems: Sequence[str] | None = None) -> int:
+def main(problems: Sequence[str] | None = None, arguments: Sequence[str] = ()) -> int:
+    about = (__doc__ or "").splitlines()[0]
+    argparse.ArgumentParser(prog="python -m benchmarks.ready", description=about).parse_args(arguments)
     found = list(lacking()) if problems is None else problems
     for problem in found:
         print(f"benchmarks.ready: {problem}", file=sys.stderr)
@@ -75,4 +78,4 @@ def main(problems: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(main(arguments=sys.argv[1:]))

@@ -55,6 +55,9 @@ def test_who_lacks_something_is_stopped(capsys: pytest.CaptureFixture[str]) -> N
     assert ready.main(["robots: nothing there"]) == 1
     assert capsys.readouterr().err == "benchmarks.ready: robots: nothing there\n"
     assert ready.main([]) == 0
+    with pytest.raises(SystemExit, match="0"):
+        ready.main([], ["--help"])
+    assert "Whether everything is there" in capsys.readouterr().out
 
 
 def steps(verb: str) -> list[list[str]]:
