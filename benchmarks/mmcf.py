@@ -239,7 +239,7 @@ def measure(options: argparse.Namespace, report: Report) -> None:
         from benchmarks.mmcf_plots import draw
 
         for path in draw(options.plots, {(r.trace, r.profile): r.runs for r in reversed(results)}):
-            report.note(f"wrote {path}")
+            report.detail(f"wrote {path}")
 
 
 def _reaches(report: Report, results: Sequence[Result], names: Sequence[str]) -> None:

@@ -301,7 +301,7 @@ def measure(options: argparse.Namespace, report: Report) -> None:
     report.reach("longest gap between poses (50 ms apart) of the others, s", found.gap_s, 0.15)
     if options.plots is not None:
         draw(options.plots / "mmcf-reconfigure.png", found)
-        report.note(f"wrote {options.plots / 'mmcf-reconfigure.png'}")
+        report.detail(f"wrote {options.plots / 'mmcf-reconfigure.png'}")
 
 
 if __name__ == "__main__":
