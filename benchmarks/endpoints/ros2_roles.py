@@ -94,22 +94,15 @@ class Source(End):
     def matched(self, said):
         return {"count": min(publisher.get_subscription_count() for publisher in self.publishers.values())}
 
-    def flood(self, said):
-        """Publish both, side by side."""
-        threads = [threading.Thread(target=self.send, args=(topic, *load)) for topic, load in said["loads"].items()]
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            thread.join()
-
-    def send(self, topic, rate_hz, count):
+    def send(self, said):
+        topic = said["topic"]
         message = self.odom if topic == ODOM else self.cloud
 
         def step(_number):
             message.header.stamp.sec, message.header.stamp.nanosec = divmod(time.monotonic_ns(), 10**9)
             self.publishers[topic].publish(message)
 
-        paced(rate_hz, count, step)
+        paced(said["rate_hz"], said["count"], step)
 
 
 class Sink(End):
