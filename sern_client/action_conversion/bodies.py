@@ -12,10 +12,10 @@ from sern_client.actions import MAX_STATUSES, GoalId, goal_id
 from sern_core.vocabulary.errors import ConfigError
 
 HEAD: Final = b"\0\1\0\0"
-"""Of CDR, little endian."""
+"""The encapsulation of CDR, little endian."""
 UUID_BYTES: Final = 16
 NO_UUID: Final = bytes(UUID_BYTES)
-"""In a request to cancel: whatever there is."""
+"""Whatever there is, in a request to cancel."""
 
 NONE, REJECTED, UNKNOWN_GOAL, TERMINATED = range(4)
 """Return codes of action_msgs/CancelGoal."""

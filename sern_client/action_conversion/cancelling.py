@@ -24,7 +24,7 @@ _log = logging.getLogger(__name__)
 
 
 class Cancelling:
-    """Of one action. It goes on while nodes here do not see the action, until `stop`.
+    """The cancellings of one action. They go on while nodes here do not see the action, until `stop`.
 
     `calls`: the services of the action by the last part of their names, as they are now. `done` is called when one is
     over.
