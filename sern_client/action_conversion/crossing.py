@@ -171,7 +171,7 @@ class Crossing:
         self.settle_soon()
 
     def message(self, kind: str, body: bytes) -> None:
-        """A message of one of its topics. Before nodes here see it there are no goals of theirs that it could be about."""
+        """A message of one of its topics. Before nodes here see the action they have no goal that it could be about."""
         if self.active:
             self.stage.message(kind, body)
 
