@@ -131,7 +131,7 @@ def _actions(word: str, match: str, timeout_s: float = DEADLINE_S) -> dict[str, 
 
 
 def in_order(fed: list[list[int]]) -> None:
-    """Of feedback of ROS 1 the newest counts: of five in a row any may be missing on the link."""
+    """Any of five in a row may be missing on the link: the newest feedback of ROS 1 counts."""
     lengths = [len(sequence) for sequence in fed]
     assert lengths == sorted(set(lengths)) and all(
         sequence == [0, 1, 1, 2, 3, 5, 8][: len(sequence)] for sequence in fed

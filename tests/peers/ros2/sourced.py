@@ -157,7 +157,7 @@ class RosNodes:
         return node
 
     def kill(self, name: str) -> None:
-        """As a crash: it says goodbye to nobody."""
+        """Kill it, as a crash does: it says goodbye to nobody."""
         (child,) = [child for child in self._children.children if child.name == name]
         child.stopping = True
         child.signal(9)

@@ -34,7 +34,7 @@ CHAT: Final = TopicName("/chat")
 
 
 class Heard(Events):
-    """Of a site with no rule for services."""
+    """What a site hears that has no rule for services."""
 
     def wants_service(self, name: TopicName) -> bool:
         return False
