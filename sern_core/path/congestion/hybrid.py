@@ -24,6 +24,8 @@ Theory of operation
     *Draining.* When no empty queue was seen for a while, one round trip at 0.6 of the product shows it. A queue that
     stays although we made way is either a longer path (constant: taken as the new empty path) or somebody else's:
     then the window follows CUBIC (RFC 9438) until a drain finds the queue gone.
+    *Silence* (`on_stall`) ends with the first acknowledgement: what was sent into it says nothing of the path, so
+    start-up begins there once more.
     *Loss* alone changes nothing (radio): it counts only against a rival, and when a fifth is lost in start-up.
 """
 
@@ -79,11 +81,13 @@ class HybridWindow(CapacityEstimator):
         self._variability = Variability(params)
         self._variable = VariableWindow(params)
         self._rtt_s: float | None = None  # with our own queue on the way out empty
+        self._resumed_s = -inf  # when the first acknowledgement after a silence came
         self._restart()
         self._start.begin_round(-inf, self._window, None)
 
     def _restart(self) -> None:
         """What was under way says nothing about what will be."""
+        self._silent = False
         self._epoch_s: float | None = None
         self._samples: list[tuple[float, float]] = []  # (queue, way back) of the epoch
         self._limited = 0
@@ -162,6 +166,8 @@ class HybridWindow(CapacityEstimator):
         now, receiver_s, cum_bytes = sample.now, sample.receiver_s, sample.cum_bytes
         rtt_s, nbytes = sample.rtt_s, sample.packet_bytes
         rate = self._rate
+        if self._silent:
+            self._answers_again(now)
         if self._receiver.went_back(receiver_s, cum_bytes):
             rate.measure_anew()
             self._variability.measure_anew()
@@ -192,7 +198,7 @@ class HybridWindow(CapacityEstimator):
             if self._rtt_s is None or rtt_s < self._rtt_s:
                 self._rtt_s = rtt_s
             if not sample.app_limited and sent_s >= self._start.since_s:
-                self._ramp(now, receiver_s, cum_bytes, sample.acked_bytes)
+                self._ramp(now, receiver_s, cum_bytes, sample.acked_bytes, sample.sent_s)
         elif mode.varying:
             self._follow(sample, queue_s)
         elif queue_s > 3 * high_s and not (mode.competing or mode.draining):
@@ -264,6 +270,13 @@ class HybridWindow(CapacityEstimator):
         self._growth.restart(now)
         self._window = max(min(self._window, self._initial_bytes), self._least_window)
         self._start_again(now)
+        self._silent = True
+
+    def _answers_again(self, now: float) -> None:
+        """A silence is over. What left in it was lost, or comes in a trickle that is no train."""
+        self._restart()
+        self._resumed_s = now
+        self._start.begin_round(now, self._window, self._pace.value, resumed=True)
 
     # --- the rate -------------------------------------------------------------------------------------------------
 
@@ -329,11 +342,11 @@ class HybridWindow(CapacityEstimator):
         self._set_pace()
         self._start.begin_round(now, self._window, self._pace.value)
 
-    def _ramp(self, now: float, receiver_s: float, cum_bytes: int, acked_bytes: int) -> None:
+    def _ramp(self, now: float, receiver_s: float, cum_bytes: int, acked_bytes: int, sent_s: float | None) -> None:
         """One acknowledgement of start-up."""
         rtt_s = self._rtt_s or self._params.min_epoch_s
         ramp = self._start.ramp(
-            receiver_s, cum_bytes, acked_bytes, window=self._window, rtt_s=rtt_s, fragment=self._fragment
+            receiver_s, cum_bytes, acked_bytes, sent_s, window=self._window, rtt_s=rtt_s, fragment=self._fragment
         )
         if ramp is None:
             return
@@ -382,7 +395,9 @@ class HybridWindow(CapacityEstimator):
                 drain.end(now)
                 self._happens(Event.MADE_WAY)
         elif self._mode.starting:
-            if limited and (queue_s > view.high_s / 2 or lost > 0.2):
+            # What left before a silence was over is known to be lost within two round trips.
+            told = (self._epoch_s or now) >= self._resumed_s + 2 * rtt_s
+            if limited and (queue_s > view.high_s / 2 or (told and lost > 0.2)):
                 rate = self._rate.arrived.rate()
                 self._end_startup(min(self._window, rate * rtt_s) if rate else self._window / 2)
         elif self._mode.varying:

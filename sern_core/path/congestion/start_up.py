@@ -18,14 +18,16 @@ class Ramp(NamedTuple):
 class StartUp:
     """One round of start-up. Packets sent after `since_s` belong to it."""
 
-    __slots__ = ("_pace", "_params", "_train", "_window", "since_s")
+    __slots__ = ("_pace", "_params", "_resumed", "_train", "_window", "since_s")
 
     def __init__(self, params: HybridParams) -> None:
         self._params = params
         self.begin_round(-inf, 0.0, None)
 
-    def begin_round(self, now: float, window: float, pace: float | None) -> None:
+    def begin_round(self, now: float, window: float, pace: float | None, *, resumed: bool = False) -> None:
+        """`resumed`: the first round after a silence, of what we have left to send and not of a full window."""
         self.since_s = now
+        self._resumed = resumed
         self._window = window
         self._pace = pace
         self.measure_anew()
@@ -40,14 +42,24 @@ class StartUp:
         return self._train.rate
 
     def ramp(
-        self, receiver_s: float, cum_bytes: int, acked_bytes: int, *, window: float, rtt_s: float, fragment: float
+        self,
+        receiver_s: float,
+        cum_bytes: int,
+        acked_bytes: int,
+        sent_s: float | None,
+        *,
+        window: float,
+        rtt_s: float,
+        fragment: float,
     ) -> Ramp | None:
-        """One acknowledgement; None: it shows nothing new."""
+        """One acknowledgement of a packet that left at `sent_s` (None: unknown); None: it shows nothing new."""
         train, params = self._train, self._params
-        if not train.note(receiver_s, cum_bytes, acked_bytes):
+        if not train.note(receiver_s, cum_bytes, acked_bytes, sent_s):
             return None
         seen = train.rate * rtt_s
         held = self._pace is None or train.rate < 0.75 * self._pace  # by the bottleneck, not by our own pacing
+        if self._resumed and not train.spread:
+            held, seen = False, inf
         if held and window > seen + 2 * fragment:
             return Ramp(seen + fragment, filled=True, round_over=False)
         if train.nbytes < self._window / 4:

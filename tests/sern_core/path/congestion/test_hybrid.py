@@ -255,6 +255,30 @@ def test_a_reset_forgets_and_a_stall_keeps_the_path() -> None:
     assert reset["rtprop_s"] is None and reset["window_bytes"] == 12_600
 
 
+def test_what_was_sent_into_a_silence_does_not_end_start_up() -> None:
+    """A few poses, most of them lost before the path was back, say nothing of what it carries."""
+    estimator = HybridWindow()
+    cum_bytes = 0
+
+    def acked(now: float, nbytes: int) -> None:
+        nonlocal cum_bytes
+        cum_bytes += nbytes
+        sent_s = now - 0.5
+        estimator.on_sent(now=sent_s, nbytes=nbytes, inflight_bytes=nbytes)
+        estimator.on_ack(AckSample(now, 0.5, nbytes, 0, 7e4 + sent_s + 0.25, cum_bytes, False, sent_s, nbytes))
+
+    for n in range(200):
+        acked(10.0 + 0.02 * n, 1260)
+    estimator.on_stall(now=15.0)
+    for n in range(6):
+        estimator.on_loss(now=20.0 + 0.1 * n, nbytes=208)
+        acked(20.0 + 0.1 * n, 208)
+    assert estimator.snapshot()["startup"] == 1.0
+    for _ in range(10):
+        acked(21.5, 1260)
+    assert estimator.window_bytes >= 12_600
+
+
 @pytest.mark.parametrize(("rtt_s", "longer_s"), [(0.05, 0.05), (0.15, -0.05)])
 def test_another_route_is_not_taken_for_a_queue_for_ever(rtt_s: float, longer_s: float) -> None:
     """The way out gets longer, or shorter."""
