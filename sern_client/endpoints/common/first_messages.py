@@ -19,8 +19,9 @@ FIRST_MESSAGES_S: Final = 1.0
 some 10 ms; a subscriber that is known and does not come is a node that crashed."""
 SETTLE_S: Final = 0.1
 """How long it may take the subscriber to see that we are connected, once we do. There is no sign of that here."""
-LEARN_S: Final = 2.0
-"""How long after its start an endpoint may not know all subscribers yet: DDS says who is there again and again."""
+LEARN_S: Final = 4.0
+"""How long after its start an endpoint may not know all subscribers yet: DDS says who is there again and again, and
+Fast DDS says after 3 s what was lost of that."""
 _POLL_S: Final = 0.01
 
 _log = logging.getLogger(__name__)
