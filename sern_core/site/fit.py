@@ -16,9 +16,9 @@ from sern_core.summaries.spec import SummaryLevel
 from sern_core.vocabulary.types import DropReason
 
 MISSES: Final = 3
-"""So many in a row that could not arrive."""
+"""Messages in a row that could not arrive, after which summaries go in their place."""
 ARRIVALS: Final = 2
-"""So many in a row that did, while summaries go."""
+"""Messages in a row that did arrive, after which all go whole again."""
 MIN_PAUSE_S, MAX_PAUSE_S = 2.0, 30.0
 """After the first message that was in vain, and after many: the pause doubles each time."""
 SETTLED_S: Final = 30.0

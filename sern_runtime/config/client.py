@@ -223,8 +223,9 @@ class TopicSection(Section):
     """Send something smaller in place of heavy messages, or beside them: one mapping, or a list of them. `kind`
     selects what it is."""
     too_large: Literal["summary", "drop"] = "summary"
-    """Of point clouds of class bulk that are best effort and have no `summary`, while the link is too slow for one to
-    arrive within its lifespan: `summary` sends each thinned to a point in 0.2 m under the same name, `drop` nothing."""
+    """What goes while the link is too slow for a point cloud to arrive within its lifespan: `summary` sends each one
+    thinned to a point in 0.2 m under the same name, `drop` nothing. It holds for clouds of class bulk that are best
+    effort and have no `summary`."""
     merge_tf: bool | None = None
     """For tf2_msgs/TFMessage: many messages become one with the newest transform of each pair of frames, at most
     `max_rate_hz` (20) a second, of /tf_static one with all there are; null: /tf_static always, others in class state

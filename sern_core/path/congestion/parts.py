@@ -15,6 +15,7 @@ MAX_MARKS: Final = 16
 SWING_AFTER_S: Final = 2.0
 TRAIN_BYTES: Final = 8 * 1200
 TRAIN_SPREAD: Final = 1.1
+"""A train was spread by the path if it takes so many times as long to arrive as it took to leave."""
 STALL_S: Final = 0.1
 AGREE_S: Final = 2.0
 EASED_S: Final = 0.001

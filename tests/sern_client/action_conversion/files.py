@@ -38,7 +38,7 @@ def files(place: Path, **actions: str) -> list[TypeFiles]:
 
 
 def types_of(action: str, known: list[TypeFiles], ros1: dict[str, str] | None = None) -> ActionTypes:
-    """Of an action of ROS 1, PACKAGE/NAME."""
+    """The types of an action of ROS 1, PACKAGE/NAME."""
     names = names_of_ros1(action)
     texts = ros2_texts(names.ros2, known)
     assert texts is not None

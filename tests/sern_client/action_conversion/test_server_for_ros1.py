@@ -291,7 +291,7 @@ async def test_a_result_that_nobody_knows(
 
 
 async def test_cancelling_one(site: Site, robot: Robot, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As long as nobody takes it: the link may be away."""
+    """A cancel is sent again as long as nobody takes it: the link may be away."""
     monkeypatch.setattr(cancelling, "CANCEL_AGAIN_S", (0.001, 0.002))
     client_appears(site, tmp_path)
     uuid = await accepted(site, robot)
@@ -557,7 +557,7 @@ async def test_the_tables_are_compared_as_they_are(site: Site, robot: Robot, tmp
     st.lists(st.tuples(st.sampled_from(["goal", "cancel", "status", "feedback"]), st.binary(max_size=80)), max_size=5)
 )
 def test_whatever_comes_stops_nothing(said: list[tuple[str, bytes]]) -> None:
-    """Nor what may begin as it should."""
+    """No body raises, random from its first byte or after a beginning as it should be."""
 
     async def play() -> None:
         with TemporaryDirectory() as place:
