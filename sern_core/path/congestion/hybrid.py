@@ -30,6 +30,7 @@ Theory of operation
 """
 
 from math import inf
+from typing import Final
 
 from sern_core.path.capacity import AckSample, CapacityEstimator, Receiver
 from sern_core.path.congestion.company import Drain, Rival
@@ -42,8 +43,12 @@ from sern_core.path.congestion.params import DEFAULT_HYBRID, HybridParams
 from sern_core.path.congestion.parts import Cubic, Eased
 from sern_core.path.congestion.path_delay import PathDelay
 from sern_core.path.congestion.queue_view import QueueView
+from sern_core.path.congestion.sooner import Sooner
 from sern_core.path.congestion.start_up import StartUp
 from sern_core.path.congestion.variable import Variability, VariableWindow
+
+SOONER_ROOM: Final = 4
+"""Packets."""
 
 
 class HybridWindow(CapacityEstimator):
@@ -78,6 +83,7 @@ class HybridWindow(CapacityEstimator):
         self._rival = Rival(params)
         self._drain = Drain(params)
         self._eased = Eased()
+        self._sooner = Sooner(params)
         self._variability = Variability(params)
         self._variable = VariableWindow(params)
         self._rtt_s: float | None = None  # with our own queue on the way out empty
@@ -99,6 +105,7 @@ class HybridWindow(CapacityEstimator):
         self._rival.restart()
         self._drain.restart()
         self._slowdown = Slowdown(self._params)
+        self._sooner.restart()
         self._growth.restart(-inf)
         self._variability.measure_anew()
         self._variable.restart()
@@ -208,6 +215,10 @@ class HybridWindow(CapacityEstimator):
                 self._emergency(now, queue_s)
         else:
             self._high_since_s = None
+        if mode is not STEADY:
+            self._sooner.hold(now, self._rtt_s or 0.0)
+        elif 2 * nbytes >= self._fragment:
+            self._look_for_faster_link(now, queue_s)
         if self._follows:
             self._look_for_swings(sample, queue_s)
         if queue_s <= high_s or sample.app_limited or mode.competing:
@@ -290,6 +301,16 @@ class HybridWindow(CapacityEstimator):
         paced = self._pace.capped and self._view.queue_s <= self._view.target_s
         if rate > (self._rate.value or 0.0) or not (bound or paced):
             self._rate.note(now, rate, rtt_s)
+
+    def _look_for_faster_link(self, now: float, queue_s: float) -> None:
+        """Go at once to what the packets say that the link carries; start-up finds how much more it is."""
+        if self._window <= SOONER_ROOM * self._fragment:
+            return  # a round trip holds so few packets that a window of so many more would be a queue
+        times = self._sooner.times(now, -queue_s, self._view)
+        if times > 1.0:
+            self._growth.got_quicker(now)
+            self._window *= times
+            self._start_again(now)
 
     def _look_for_slower_link(self, sample: AckSample) -> None:
         """While a queue stays the link is never idle: what arrives is all it can do, whatever was seen before."""

@@ -103,9 +103,22 @@ def test_the_estimate_follows_the_capacity(off_s: float, tick_s: float) -> None:
         rate_bps=8e6, delay_s=0.025, overhead_bytes=60, rate_steps=(RateStep(down_s, 1e6), RateStep(up_s, 4e6))
     )
     world = run(model, 18.0, tick_s=tick_s)
-    for from_s, to_s, rate_bps, within_s in ((down_s, up_s, 1e6, 0.5), (up_s, 18.0, 4e6, 1.0)):
+    for from_s, to_s, rate_bps, within_s in ((down_s, up_s, 1e6, 0.5), (up_s, 18.0, 4e6, 0.6)):
         off = [t for t, rate in world.rates() if from_s <= t < to_s and not 0.75 * rate_bps <= rate <= 1.25 * rate_bps]
         assert off[-1] - from_s < within_s
+
+
+@pytest.mark.parametrize(("rate_bps", "faster_bps"), [(1e6, 2e6), (2e6, 8e6), (4e6, 20e6)])
+@pytest.mark.parametrize("tick_s", [0.0, 0.001])
+def test_a_link_that_gets_faster_is_found_by_packets_that_come_sooner(
+    rate_bps: float, faster_bps: float, tick_s: float
+) -> None:
+    up_s = 6.1
+    model = LinkModel(rate_bps=rate_bps, delay_s=0.025, overhead_bytes=60, rate_steps=(RateStep(up_s, faster_bps),))
+    world = run(model, 9.0, tick_s=tick_s)
+    off = [t for t, rate in world.rates() if t >= up_s and not 0.75 * faster_bps <= rate <= 1.25 * faster_bps]
+    assert off[-1] - up_s < 0.6
+    assert at(world.poses_ms(up_s, up_s + 2.0), 0.99) < 3.0 * floor_ms(rate_bps, 0.05)
 
 
 def test_a_link_that_gets_faster_shows_in_what_little_is_sent_and_nothing_else_does() -> None:
