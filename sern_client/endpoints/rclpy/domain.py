@@ -20,8 +20,9 @@ from sern_runtime import clock, ros_installation, ros_types
 
 if TYPE_CHECKING:
     from rclpy.context import Context
-    from rclpy.executors import SingleThreadedExecutor
     from rclpy.node import Node
+
+    from sern_client.endpoints.rclpy.executor import Executor
 
 ENCLAVE: Final = "/sern"
 """The enclave of our nodes, by which SERN endpoints know each other: what their nodes publish came over a link."""
@@ -63,8 +64,9 @@ class Domain:
         try:
             import rclpy
             from rclpy.context import Context
-            from rclpy.executors import SingleThreadedExecutor
             from rclpy.node import Node
+
+            from sern_client.endpoints.rclpy.executor import Executor
         except ImportError as error:
             raise ConfigError(
                 f"endpoint rclpy: rclpy cannot be imported ({ros_types.one_line(error)}); {ros_installation.remedy()}"
@@ -78,7 +80,7 @@ class Domain:
                 self._options.node_name, context=context, use_global_arguments=False, enable_rosout=False,
                 start_parameter_services=False,
             )  # fmt: skip
-            executor = SingleThreadedExecutor(context=context)
+            executor = Executor(context=context)
             executor.add_node(node)
             failed.pop_all()
         handover = Handover(asyncio.get_running_loop(), max_bytes=self._options.max_buffer_bytes)
@@ -131,7 +133,7 @@ class Domain:
             raise UsageError("the rclpy endpoint is not running")
         return self._open
 
-    def _spin(self, executor: "SingleThreadedExecutor", handover: Handover) -> None:
+    def _spin(self, executor: "Executor", handover: Handover) -> None:
         """Runs in the thread."""
         from rclpy.executors import ExternalShutdownException
 
@@ -165,7 +167,7 @@ class Domain:
 
 class _Open:
     def __init__(
-        self, context: "Context", node: "Node", executor: "SingleThreadedExecutor", handover: Handover, thread: Thread
+        self, context: "Context", node: "Node", executor: "Executor", handover: Handover, thread: Thread
     ) -> None:
         self.context = context
         self.node = node
