@@ -25,7 +25,7 @@ HEADER_BYTES: Final = 56
 """Datagram and fragment header; the rest of a bulk datagram is payload."""
 POSE_BYTES: Final = 100
 POSE_PERIOD_S: Final = 0.020
-PROBE_INTERVAL_S: Final = 0.2
+PROBE_INTERVAL_S: Final = 0.1
 THIN_DATAGRAMS: Final = 32
 """Half of what an acknowledgement's map covers."""
 

@@ -29,7 +29,7 @@ OVERHEAD_BYTES: Final = 60
 PROVEN_ACKS: Final = 3
 """A lane that failed while another one worked is used again after so many acknowledged questions."""
 PING_INTERVAL_S: Final = 0.5
-PROBE_INTERVAL_S: Final = 0.2
+PROBE_INTERVAL_S: Final = 0.1
 """While stalled, one fresh class-0 message goes out this often and finds out whether the path is back."""
 
 

@@ -119,7 +119,7 @@ class HybridParams:
     """The queue that is kept while it does; None: it is treated as any other link."""
     variable_rate_s: float = 0.050
     """Time over which what arrives is what the link carries now."""
-    variable_growth: float = 0.3
+    variable_growth: float = 0.6
     """The window grows by this share of the bytes that are acknowledged, while nothing queues."""
     variable_ahead: float = 1.5
     variable_ahead_packets: float = 6.0
