@@ -2,6 +2,7 @@
 
 import asyncio
 import logging
+import os
 import time
 from collections.abc import AsyncIterator
 from contextlib import AsyncExitStack
@@ -77,7 +78,7 @@ class Place:
 @pytest.fixture
 async def place(tmp_path: Path) -> AsyncIterator[Place]:
     async with AsyncExitStack() as stack:
-        nodes = await stack.enter_async_context(RosNodes(tmp_path))
+        nodes = await stack.enter_async_context(RosNodes(tmp_path, os.environ["ROS_DISTRO"]))
         yield Place(nodes, stack)
 
 

@@ -19,6 +19,7 @@ from tests.support import Patience, until
 HERE: Final = Path(__file__).parents[3]
 PLACES: Final = Path(os.environ.get("SERN_ROS2_PEERS") or HERE / ".venv-ros2")
 """Where tests/peers/ros2/setup makes the environments: venvs, whose rclpy is for the Python that made them."""
+DISTROS: Final = ("jazzy", "kilted")
 PLACE: Final = PLACES / "jazzy"
 PROGRAM: Final = Path(__file__).with_name("rclpy_node.py")
 LOOPBACK: Final = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_STATIC_PEERS": ""}
@@ -46,14 +47,15 @@ def environment(distro: str) -> dict[str, str]:
         "PYTHONPATH": os.pathsep.join([str(packages), str(HERE)]),
         "LD_LIBRARY_PATH": os.pathsep.join(map(str, libraries)),
         "AMENT_PREFIX_PATH": str(place),
+        "ROS_DISTRO": distro,
         "_ROS_WHEELS_BOOTSTRAP_COMPLETE": "1",  # else its start-up hook would run this Python once more
         **LOOPBACK,
     }
 
 
-def before() -> list[str]:
+def before(distro: str = "jazzy") -> list[str]:
     """What to put before the command of a daemon that is to run sourced."""
-    return ["env", *(f"{key}={value}" for key, value in sourced().items())]
+    return ["env", *(f"{key}={value}" for key, value in sourced(distro).items())]
 
 
 async def until_answered(ask: Callable[[], Awaitable[dict[str, Any]]], count: int) -> None:

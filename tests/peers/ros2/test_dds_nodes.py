@@ -20,11 +20,10 @@ from sern_core.vocabulary.errors import ConfigError
 from sern_core.vocabulary.types import Encoding, TopicName
 from sern_runtime import ros_types
 from tests.peers.dds.peer import free_domain
-from tests.peers.ros2.sourced import PLACES, RosNode, RosNodes, until_answered
+from tests.peers.ros2.sourced import DISTROS, PLACES, RosNode, RosNodes, until_answered
 from tests.sern_client.messages import made_up
 from tests.support import Events, until
 
-DISTROS: Final = ("jazzy", "kilted")
 PACKAGES: Final = ("test_msgs", "std_msgs", "sensor_msgs", "geometry_msgs", "nav_msgs")
 NAMED: Final = {"test_msgs/msg/WStrings"}
 """Types that docs/ros2-dds.md says do not pass."""

@@ -13,7 +13,7 @@ from sern_core.vocabulary.types import Encoding
 from sern_runtime import ros_types
 from tests.daemons import Lab, Process
 from tests.peers.dds.peer import free_domain
-from tests.peers.ros2.sourced import PLACE, RosNode, RosNodes, before, sourced, until_answered, until_fed
+from tests.peers.ros2.sourced import DISTROS, PLACE, RosNode, RosNodes, before, sourced, until_answered, until_fed
 from tests.sern_client.messages import made_up
 from tests.support import DEADLINE_S
 
@@ -47,19 +47,24 @@ class Sites:
 
 @asynccontextmanager
 async def sites(
-    directory: Path, robot: dict[str, Any], site: dict[str, Any], *, kinds: tuple[Any, Any] | None = None
+    directory: Path,
+    robot: dict[str, Any],
+    site: dict[str, Any],
+    *,
+    kinds: tuple[Any, Any] | None = None,
+    distro: str = "jazzy",
 ) -> AsyncIterator[Sites]:
     """`robot`, `site`: sections of the clients' files. `kinds`: endpoints by domain in place of `rclpy`."""
-    sourced()
+    sourced(distro)
     domains = free_domain(), free_domain()
     first, second = kinds or (lambda domain: {"kind": "rclpy", "domain": domain, "poll_hz": 20},) * 2
-    async with RosNodes(directory) as nodes, Lab(directory, "robot1", "site") as lab:
+    async with RosNodes(directory, distro) as nodes, Lab(directory, "robot1", "site") as lab:
         await lab.process(lab.relay_file()).ready()
         here, there = await nodes.start(domains[0], "machine"), await nodes.start(domains[1], "desk")
         robot = {"topics": [{"match": ".*", "reliability": "reliable", "lifespan_s": None}]} | robot
-        one = lab.process(lab.client_file("robot1", first(domains[0]), **robot), before=before())
+        one = lab.process(lab.client_file("robot1", first(domains[0]), **robot), before=before(distro))
         site = {"client": {"namespace": "/"}, "subscribe": ["/robot1/.*"]} | site
-        two = lab.process(lab.client_file("site", second(domains[1]), **site), before=before())
+        two = lab.process(lab.client_file("site", second(domains[1]), **site), before=before(distro))
         await one.said("connected to relay")
         await two.said("connected to relay")
         yield Sites(nodes, domains, here, there, one, two)
@@ -86,9 +91,10 @@ SITE: Final[dict[str, Any]] = {
 }
 
 
-async def test_topics_services_and_actions_cross(tmp_path: Path) -> None:
+@pytest.mark.parametrize("distro", DISTROS)
+async def test_topics_services_and_actions_cross(distro: str, tmp_path: Path) -> None:
     """One pair of clients for all of it: to start them costs more than what they do."""
-    async with sites(tmp_path, ROBOT, SITE) as both:
+    async with sites(tmp_path, ROBOT, SITE, distro=distro) as both:
         await topics_by_value(both)
         await services_both_ways(both)
         await goals(both)
