@@ -31,13 +31,18 @@ class Handover:
     """`put` and `news` from any thread; `deliver` items run on the loop in the order they came.
 
     At most `max_bytes` of messages wait; beyond, the oldest are dropped, and counted in `dropped`: a loop that is
-    behind serves what is fresh. The newest message is never dropped.
+    behind serves what is fresh. The newest message is never dropped. `rest` is called in the thread that has just woken
+    the loop.
     """
 
-    def __init__(self, loop: asyncio.AbstractEventLoop, *, max_bytes: int = DEFAULT_MAX_BYTES) -> None:
+    def __init__(
+        self, loop: asyncio.AbstractEventLoop, *, max_bytes: int = DEFAULT_MAX_BYTES,
+        rest: Callable[[], None] = lambda: None,
+    ) -> None:  # fmt: skip
         self.dropped = 0
         """Messages, because more than `max_bytes` waited (queue_full)."""
         self._loop = loop
+        self._rest = rest
         self._lock = Lock()
         self._count = 0
         self._news: deque[_News] = deque()
@@ -56,6 +61,7 @@ class Handover:
             wake = self._wakes()
         if wake:
             self._loop.call_soon_threadsafe(self._run)
+            self._rest()
 
     def put(self, deliver: Callable[[], None], nbytes: int, shed: Callable[[], None] | None = None) -> None:
         """A message that keeps `nbytes` in memory. `shed` is called in its place when it is dropped, in whatever thread
@@ -69,6 +75,7 @@ class Handover:
             wake = self._wakes()
         if wake:
             self._loop.call_soon_threadsafe(self._run)
+            self._rest()
         for message in dropped:
             if message.shed is not None:
                 message.shed()

@@ -40,6 +40,20 @@ async def test_a_loop_that_is_behind_gets_what_is_fresh_and_all_the_news() -> No
     assert handover.dropped == 7
 
 
+async def test_the_thread_that_wakes_the_loop_rests_and_no_other_time() -> None:
+    loop, rests = asyncio.get_running_loop(), list[str]()
+    handover = Handover(loop, rest=lambda: rests.append("rest"))
+    for _ in range(3):
+        handover.put(lambda: None, 1)
+        handover.news(lambda: None)
+    assert rests == ["rest"]
+    done = asyncio.Event()
+    loop.call_soon(done.set)  # the loop has served them by then
+    await done.wait()
+    handover.put(lambda: None, 1)
+    assert rests == ["rest", "rest"]
+
+
 async def test_nothing_arrives_after_the_end() -> None:
     handover, got = Handover(asyncio.get_running_loop()), list[int]()
     handover.put(lambda: got.append(1), 1)
