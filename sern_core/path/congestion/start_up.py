@@ -3,6 +3,7 @@
 from math import inf
 from typing import NamedTuple
 
+from sern_core.path.capacity import AckSample
 from sern_core.path.congestion.params import HybridParams
 from sern_core.path.congestion.parts import Train
 
@@ -41,20 +42,10 @@ class StartUp:
         """Bytes/s, the greatest that a train of the round showed."""
         return self._train.rate
 
-    def ramp(
-        self,
-        receiver_s: float,
-        cum_bytes: int,
-        acked_bytes: int,
-        sent_s: float | None,
-        *,
-        window: float,
-        rtt_s: float,
-        fragment: float,
-    ) -> Ramp | None:
-        """One acknowledgement of a packet that left at `sent_s` (None: unknown); None: it shows nothing new."""
+    def ramp(self, sample: AckSample, *, window: float, rtt_s: float, fragment: float) -> Ramp | None:
+        """One acknowledgement of a packet of the round; None: it shows nothing new."""
         train, params = self._train, self._params
-        if not train.note(receiver_s, cum_bytes, acked_bytes, sent_s):
+        if not train.note(sample.receiver_s, sample.cum_bytes, sample.acked_bytes, sample.sent_s):
             return None
         seen = train.rate * rtt_s
         held = self._pace is None or train.rate < 0.75 * self._pace  # by the bottleneck, not by our own pacing

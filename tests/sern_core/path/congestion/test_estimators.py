@@ -14,10 +14,6 @@ from sern_core.path.capacity import AckSample, CapacityEstimator, Pacer
 from sern_core.path.clocksync import ClockSync
 from sern_core.path.congestion.fixed import FixedWindow
 from sern_core.path.congestion.hybrid import HybridWindow
-from sern_core.path.congestion.link_rate import LinkRate
-from sern_core.path.congestion.pace import Pace
-from sern_core.path.congestion.params import DEFAULT_HYBRID
-from sern_core.path.congestion.queue_view import QueueView
 from sern_core.vocabulary.errors import WireError
 from sern_core.vocabulary.types import PriorityClass
 from sern_core.wire import framing
@@ -180,16 +176,6 @@ def test_a_link_takes_any_acknowledgement(
     world.run(1.0)
     assert len(site.on("/robot/pose")) >= before + 15
     world.validate()
-
-
-def test_start_up_may_end_with_a_rate_and_before_any_epoch_has_seen_one() -> None:
-    """An epoch without a rate says that the path is calm; the first rate may come just before start-up ends."""
-    rate, view, pace = LinkRate(DEFAULT_HYBRID), QueueView(DEFAULT_HYBRID), Pace(DEFAULT_HYBRID)
-    view.queue_s = view.target_s = 0.001
-    view.calm, rate.value = True, 1e5
-    assert rate.peak == 0.0
-    pace.steer(10_000.0, 0.01, rate, view, 0.0, 1.0)
-    assert pace.value is not None and 8 * pace.value > 8e6 and not pace.capped
 
 
 @st.composite

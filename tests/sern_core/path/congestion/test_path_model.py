@@ -1,0 +1,84 @@
+"""What is known of the path, epoch by epoch."""
+
+import pytest
+
+from sern_core.path.congestion.params import DEFAULT_HYBRID
+from tests.sern_core.path.congestion.acknowledged import FRAGMENT_BYTES, RTT_S, Path
+
+
+def test_an_epoch_lasts_for_a_round_trip_and_shows_the_queue() -> None:
+    path = Path().settled()
+    before_s = path.now
+    seen = path.epoch(0.004)
+    assert RTT_S <= path.now - before_s < 2 * RTT_S
+    assert seen.queue_s == pytest.approx(0.004, abs=1e-6) and seen.rtt_s == pytest.approx(RTT_S)
+    assert not seen.early and not seen.quicker
+
+
+def test_an_epoch_of_too_few_packets_goes_on() -> None:
+    model = Path().model
+    model.begin_epoch(100.0)
+    assert not model.epoch_over(200.0)
+
+
+def test_whether_there_was_more_to_send_is_judged_by_half_of_the_epoch() -> None:
+    path = Path().settled()
+    assert path.epoch().limited
+    assert not path.epoch(app_limited=True).limited
+
+
+def test_the_rate_is_what_arrives() -> None:
+    assert Path(250e3).settled().model.rate.value == pytest.approx(250e3, rel=0.01)
+
+
+def test_a_queue_that_stays_shows_a_slower_link() -> None:
+    path = Path().settled()
+    path.rate = 100e3
+    slower = [path.model.slower_rate(path.packet(0.05)) for _ in range(30)]
+    found = [rate for rate in slower if rate is not None]
+    assert found and found[0] == pytest.approx(100e3, rel=0.05)
+    assert path.model.replace_rate(path.now, found[0]), "that is clearly less"
+    assert path.model.rate.value == found[0]
+    assert not path.model.replace_rate(path.now, 0.9 * found[0])
+
+
+def test_when_the_queue_of_a_slower_link_has_gone_its_rate_is_all_that_it_can_do() -> None:
+    path = Path().settled()
+    path.rate = 100e3
+    path.epoch(0.05)
+    assert path.model.replace_rate(path.now, 100e3) and path.model.rate.peak > 400e3
+    path.epoch()
+    assert path.model.rate.peak == path.model.rate.value and path.model.slowdown.faster_rate is None
+
+
+def test_a_longer_path_is_no_queue_any_more() -> None:
+    path = Path().settled()
+    path.epoch(0.03)
+    path.model.longer_path(path.now, 0.03)
+    assert path.model.rtt_s == pytest.approx(RTT_S + 0.03) and path.model.view.queue_s == 0.0
+    assert path.epoch(0.03).queue_s == pytest.approx(0.0, abs=1e-6)
+
+
+def test_packets_that_come_sooner_than_over_the_empty_path_are_noticed() -> None:
+    path = Path().settled()
+    path.epoch(0.05)
+    path.model.longer_path(path.now, 0.05)
+    path.epoch(0.05)
+    assert path.epoch().early
+
+
+def test_a_larger_packet_takes_longer_and_is_no_queue_for_it() -> None:
+    path = Path().settled()
+    rate = path.model.rate.peak
+    base_s = path.model.delay.empty_s
+    path.model.larger_packet(2 * FRAGMENT_BYTES)
+    assert path.model.fragment == 2 * FRAGMENT_BYTES
+    assert path.model.delay.empty_s - base_s == pytest.approx(FRAGMENT_BYTES / rate)
+
+
+def test_a_restart_keeps_length_and_rate() -> None:
+    path = Path().settled()
+    rate, rtt_s = path.model.rate.value, path.model.rtt_s
+    path.model.restart()
+    assert (path.model.rate.value, path.model.rtt_s, path.model.epoch_s) == (rate, rtt_s, None)
+    assert path.epoch().queue_s <= DEFAULT_HYBRID.target_s
