@@ -8,7 +8,7 @@ from unittest.mock import patch
 
 from sern_core.link.control_reader import ControlReader
 from sern_core.link.handler import LinkHandler
-from sern_core.link.link import Link
+from sern_core.link.housekeeping import Housekeeping
 from sern_core.link.streams_out import StreamsOut
 from sern_core.path.congestion.hybrid import HybridWindow
 from sern_core.path.flight import Flight
@@ -68,7 +68,7 @@ INSIDE: list[Place] = [
     (Scheduler, "charge"),
     (ControlReader, "handle"),
     (StreamsOut, "control_sent"),
-    (Link, "_sweep"),
+    (Housekeeping, "sweep"),
     (OutChannel, "submit"),
     (ObjectRegistry, "observe"),
 ]

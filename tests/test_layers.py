@@ -11,8 +11,8 @@ PURE_PACKAGES = ("sern_core", "sern_sim")
 RANDOM_ALLOWED = {"Random"}
 OWN_CLOCK = {"loop.py", "logs.py"}  # how long the loop was held, how often a line was written: nothing of the core
 PARTS_OF_A_LINK = {
-    "answers", "control", "end", "handshake", "lane", "lanes", "outgoing", "plane", "reading", "reassembly", "receiver",
-    "sender", "taking", "texts",
+    "answers", "control", "end", "handshake", "housekeeping", "lane", "lanes", "outgoing", "plane", "reading",
+    "reassembly", "receiver", "sender", "taking", "texts",
 }  # fmt: skip
 
 

@@ -1,7 +1,7 @@
 """The data plane of one end of a hop: datagrams out, acknowledgements in, losses and time, lane by lane. Pure."""
 
 from collections.abc import Callable
-from typing import Any, Final
+from typing import Any
 
 from sern_core.link.answers import Answers
 from sern_core.link.composer import Composer
@@ -9,6 +9,7 @@ from sern_core.link.control_stream import CONTROL_CHANNEL_ID, ControlStream
 from sern_core.link.datagram import Datagram, SentData, SentWatermark
 from sern_core.link.end import End
 from sern_core.link.holds import Holds
+from sern_core.link.housekeeping import Housekeeping
 from sern_core.link.lane_set import LaneSet
 from sern_core.link.sender import Sender
 from sern_core.link.streams_in import StreamsIn
@@ -19,11 +20,9 @@ from sern_core.vocabulary.message import Message, TopicSpec
 from sern_core.vocabulary.types import PriorityClass
 from sern_core.wire import framing
 
-SWEEP_INTERVAL_S: Final = 0.25
-
 
 class DataPlane:
-    """`sweep` is called every `SWEEP_INTERVAL_S`, also while the link is down; True: that was all there was to do."""
+    """Moves datagrams of an established session, and says when a lane has something to do by time alone."""
 
     def __init__(
         self,
@@ -34,9 +33,7 @@ class DataPlane:
         taking: StreamsIn,
         answers: Answers,
         composer: Composer,
-        *,
-        sweep: Callable[[float], bool],
-        now: float,
+        housekeeping: Housekeeping,
     ) -> None:
         self._end = end
         self._lanes = lanes
@@ -45,10 +42,9 @@ class DataPlane:
         self._taking = taking
         self._answers = answers
         self._composer = composer
-        self._sweep = sweep
+        self._housekeeping = housekeeping
         self.holds = Holds(end, lanes, control, sender)
         """Why what waits does."""
-        self.sweep_due_s = now + SWEEP_INTERVAL_S
         self.on_arrived: Callable[[TopicSpec, Message, float], None] | None = None
         """Called when the peer has a message whole: what holds for its topic, the message, now."""
 
@@ -219,8 +215,8 @@ class DataPlane:
         deadline = lane.ping_due_s
         if lane is self._lanes.lane and self._sender.held_back_due_s < deadline:
             deadline = self._sender.held_back_due_s
-        if lane.id == LANE_ZMQ and self.sweep_due_s < deadline:
-            deadline = self.sweep_due_s
+        if lane.id == LANE_ZMQ and (due_s := self._housekeeping.due_s) < deadline:
+            deadline = due_s
         if self._answers.unsaid and (due_s := self._answers.deadline_s) < deadline:
             deadline = due_s
         arrivals = lane.arrivals
@@ -263,15 +259,9 @@ class DataPlane:
         if now >= lane.ping_due_s:
             lane.ping = True
             lane.ping_due_s = now + PING_INTERVAL_S
-        if lane.id == LANE_ZMQ and now >= self.sweep_due_s:
-            self.sweep(now)
+        if lane.id == LANE_ZMQ and now >= self._housekeeping.due_s:
+            self._housekeeping.sweep(now)
         self._end.dirty = True
-
-    def sweep(self, now: float) -> None:
-        """Let go of what nobody needs any more, also while the link is down."""
-        self.sweep_due_s = now + SWEEP_INTERVAL_S
-        if not self._sweep(now):
-            self.sweep_due_s = now  # the rest in another turn of the loop
 
 
 def _urgent(channel: OutChannel) -> bool:

@@ -17,6 +17,7 @@ class End:
 
     __slots__ = (
         "boot",
+        "data_prefix",
         "dirty",
         "established",
         "fates",
@@ -65,6 +66,8 @@ class End:
         self.version = framing.VERSION_MAX
         self.tag = boot % 255
         """The session's number. The first follows from the boot: what an earlier process was sent is none of ours."""
+        self.data_prefix = b""
+        """How a data datagram of the session begins; empty: there is no session."""
         self.up_since_s = now
         self.now = now
         """The time of the call under way."""

@@ -11,11 +11,13 @@ not know yet that its session is over.
 """
 
 from collections import deque
-from typing import Final, Protocol
+from typing import Final
 
 from sern_core.link.end import End, microseconds
+from sern_core.link.events import Events
 from sern_core.link.lane_set import LaneSet
-from sern_core.path.lanes import LANE_UDP
+from sern_core.link.session import Session
+from sern_core.path.lanes import LANE_UDP, LANE_ZMQ
 from sern_core.stream.in_stream import Reassembly
 from sern_core.vocabulary.errors import WireError
 from sern_core.vocabulary.types import ClientName
@@ -48,30 +50,15 @@ NEW_SESSION: Final = "the session could not go on, and another begins"
 """The reason of an end on a connection that is up."""
 
 
-class Sessions(Protocol):
-    """What a session is made of; `Link`."""
-
-    def begin_session(self, peer_boot: int, now: float) -> None:
-        """Begin one with that process. May raise what the owner raises."""
-
-    def end_session(self, reason: str, now: float) -> None:
-        """End the one there is, if any, and let go of what belongs to it."""
-
-    def kept_messages(self) -> int:
-        """How many messages are kept for the peer."""
-
-    def refused(self, code: str, text: str, now: float) -> None:
-        """The peer does not want a session."""
-
-
 class Handshake:
     """Says and hears what is no datagram of a session."""
 
-    def __init__(self, end: End, lanes: LaneSet, reassembly: Reassembly, sessions: Sessions) -> None:
+    def __init__(self, end: End, lanes: LaneSet, reassembly: Reassembly, session: Session, events: Events) -> None:
         self._end = end
         self._reassembly = reassembly
         self._lanes = lanes
-        self._sessions = sessions
+        self._session = session
+        self._events = events
         self.transport_up = False
         self.reads = True
         """False: the owner is about to end the session; what comes now is for the process after it."""
@@ -115,7 +102,7 @@ class Handshake:
             self.cut_off = udp.stalled and now - udp.stalled_at_s >= CUT_OFF_S
             self._lanes.lost_stream(udp, now)
             return
-        self._sessions.end_session(reason, now)
+        self._session.end(reason, now)
 
     # --- out ------------------------------------------------------------------------------------------------------
 
@@ -128,10 +115,6 @@ class Handshake:
     def hello_due_s(self) -> float | None:
         """When to say HELLO."""
         return self._hello_due_s
-
-    def greeted(self) -> None:
-        """There is a session: no HELLO."""
-        self._hello_due_s = None
 
     def next_datagram(self, now: float) -> bytes | None:
         """What is to be said before anything of a session."""
@@ -149,7 +132,7 @@ class Handshake:
 
     def _greet(self, due_s: float, now: float) -> None:
         """Ask for a session at `due_s`."""
-        self._sessions.end_session(NEW_SESSION, now)
+        self._session.end(NEW_SESSION, now)
         self._end.tag = self._end.tag % 255 + 1
         self._hello_due_s = due_s
         self._end.dirty = True
@@ -168,14 +151,14 @@ class Handshake:
             why = {"why": reason[:200]}
             self._out.append(framing.encode_handshake(framing.Kind.CLOSE, end.tag, microseconds(now), why))
             end.dirty = True
-        self._sessions.end_session(reason, now)
+        self._session.end(reason, now)
 
     def abort(self, reason: str, now: float) -> None:
         """End the session because of what went wrong in it, and see to it that the peer begins another one."""
         end = self._end
         if not end.established:
             return
-        self._sessions.end_session(reason, now)
+        self._session.end(reason, now)
         if end.initiator:
             due_s = max(now, self._abort_due_s)
             self._abort_due_s = due_s + ABORT_INTERVAL_S
@@ -188,7 +171,7 @@ class Handshake:
         if self._end.initiator:
             self._greet(now, now)
         else:
-            self._sessions.end_session("packet numbers used up", now)
+            self._session.end("packet numbers used up", now)
             self.send_reset(self._end.tag, now)
 
     # --- priority connections -------------------------------------------------------------------------------------
@@ -230,7 +213,7 @@ class Handshake:
         self.transport_up = True
         stream = self._lanes.stream
         if not again:
-            self._sessions.end_session(NEW_SESSION, now)
+            self._session.end(NEW_SESSION, now)
             end.tag = tag
             end.version = version
         elif another_connection:
@@ -255,21 +238,38 @@ class Handshake:
     def _begin(self, boot: int, now: float) -> None:
         """Begin a session and charge the peer's HELLOs with it: a hundred bytes announce thousands of streams anew."""
         reassembly = self._reassembly
-        reassembly.work_us = BEGIN_US + KEPT_US * self._sessions.kept_messages()
+        reassembly.work_us = BEGIN_US + KEPT_US * self._session.kept_messages()
         try:
-            self._sessions.begin_session(boot, now)
+            self._session.establish(boot)
+            self._session.begin(now)
         finally:
             self._begun_paid_s = max(now, self._begun_paid_s) + reassembly.work_us * 1e-6 / BEGIN_SHARE
 
-    def receive(self, header: framing.Header, data: bytes, now: float) -> None:
-        """A datagram of the handshake. Raises WireError or VersionError."""
+    def receive(self, data: bytes, lane_id: int, now: float) -> None:
+        """What is no datagram of the session. Raises WireError or VersionError."""
+        end = self._end
+        header = framing.decode_header(data)
+        if header.kind != framing.Kind.DATA:
+            if lane_id != LANE_ZMQ:
+                raise WireError("a handshake has no place on the datagram lane")
+            end.now = now
+            self._said(header, data, now)
+            return
+        if header.tag == end.tag and end.established:
+            raise WireError(f"version {header.version} was not agreed, {end.version} was")
+        if not end.initiator and lane_id == LANE_ZMQ:
+            # Of another session; if that one is the peer's latest, it does not know yet that it is over.
+            self.send_reset(header.tag, now)
+
+    def _said(self, header: framing.Header, data: bytes, now: float) -> None:
+        """A datagram of the handshake."""
         end = self._end
         envelope = framing.decode_handshake(data)
         kind = framing.Kind(header.kind)
         if kind is framing.Kind.CLOSE:
             if header.tag == end.tag and end.established:
                 why = f"{end.peer} closed the session: {framing.take_str(envelope, 'why')}"
-                self._sessions.end_session(why, now)
+                self._session.end(why, now)
                 if end.initiator:
                     self._greet(now + HELLO_INTERVAL_S, now)
             return
@@ -284,11 +284,11 @@ class Handshake:
             self.displaced = code == DISPLACED
             if self.displaced:
                 pause_s = self._yield_s(now) if end.established else REFUSED_INTERVAL_S
-                self._sessions.end_session(text, now)
+                self._session.end(text, now)
             else:
                 pause_s = REFUSED_INTERVAL_S
             self._greet(now + pause_s, now)
-            self._sessions.refused(code, text, now)
+            self._events.rejected(code, text, now=now)
         elif kind is framing.Kind.RESET and end.established:
             self._greet(now + self._displaced_pause_s(now), now)
 
@@ -306,8 +306,10 @@ class Handshake:
             stream.stalled = False
             self._lanes.choose(now)
         else:
-            self._sessions.end_session(NEW_SESSION, now)
-            self._sessions.begin_session(boot, now)
+            self._session.end(NEW_SESSION, now)
+            self._session.establish(boot)
+            self._hello_due_s = None
+            self._session.begin(now)
         self._lanes.clock.sample(echo_us * 1e-6, at_us * 1e-6, header.stamp_us * 1e-6, now)
         # Without it the first packets on a long path would be given up before they can be acknowledged.
         self._lanes.stream.flight.rtt.sample(max(1e-6, now - echo_us * 1e-6), now=now)

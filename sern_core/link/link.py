@@ -32,27 +32,28 @@ from sern_core.link.definitions import DefinitionStore, PeerDefinitions
 from sern_core.link.end import End
 from sern_core.link.handler import LinkHandler, Owner
 from sern_core.link.handshake import Handshake
+from sern_core.link.housekeeping import Housekeeping
 from sern_core.link.lane_set import LaneSet
 from sern_core.link.name_lists import NameLists
 from sern_core.link.reading import Reading
 from sern_core.link.receiver import Receiver
 from sern_core.link.send_trace import SendTrace
 from sern_core.link.sender import Sender
+from sern_core.link.session import Session
 from sern_core.link.streams_in import StreamsIn
 from sern_core.link.streams_out import StreamsOut
 from sern_core.link.view import Held, LinkSettings, LinkView, Sending, TopicView, Undelivered
 from sern_core.path.lanes import LANE_UDP, LANE_ZMQ, Lane
 from sern_core.stream.in_stream import Reassembly
 from sern_core.stream.out_channel import OutChannel
-from sern_core.vocabulary.errors import RemoteError, WireError
+from sern_core.vocabulary.errors import RemoteError
 from sern_core.vocabulary.ledger import SendCounters
 from sern_core.vocabulary.message import Message, StreamId, StreamInfo, TopicSpec
 from sern_core.vocabulary.params import LinkParams, SchedulerParams
-from sern_core.vocabulary.trace import LINK, DecisionTrace, TraceEvent
+from sern_core.vocabulary.trace import DecisionTrace
 from sern_core.vocabulary.types import ClientName, PriorityClass, TopicName
 from sern_core.wire import framing
 
-TIDY_S: Final = 60.0
 NUMBER_AND_STAMP: Final = struct.Struct("!IQ")
 
 
@@ -80,12 +81,8 @@ class Link:
         auto_confirm: bool = True,
     ) -> None:
         self.definitions = definitions
-        self.on_tidy: Callable[[float], None] | None = None
-        """Called now and then, with the time, for the owner to let go of what nobody needs any more."""
         self.finish: Callable[[Link, float], bool] | None = None
         """Called before more is read: whether all that came of what was read before is done by now."""
-        self._tidy_due_s = now + TIDY_S
-        self._data_prefix = b""  # how a data datagram of the session begins
         self._unreadable: RemoteError | None = None  # found at a time when nobody could be told
         end = self.end = End(name=name, boot=boot, peer=peer, initiator=initiator, params=link, trace=trace, now=now)
         owner = self._owner = Owner(self, handler, end)
@@ -132,12 +129,25 @@ class Link:
             answered=self._answered,
         )
         composer = Composer(end, lanes, control, sender, taking, self.outgoing.control_sent, now=now)
-        plane = self.plane = DataPlane(
-            end, lanes, control, sender, taking, answers, composer, sweep=self._sweep, now=now
-        )
+        housekeeping = self.housekeeping = Housekeeping(sender, taking, now=now)
+        plane = self.plane = DataPlane(end, lanes, control, sender, taking, answers, composer, housekeeping)
         self.receiver = Receiver(end, lanes, control, sender, taking, plane, reassembly, owner)
         self.reading = Reading(end, lanes, self.receiver, reassembly, taking.go_on)
-        self.handshake = Handshake(end, lanes, reassembly, self)
+        session = self._session = Session(
+            end,
+            lanes,
+            control,
+            sender,
+            self.outgoing,
+            taking,
+            answers,
+            self.texts,
+            self._name_lists,
+            reassembly,
+            self.reading,
+            owner,
+        )
+        self.handshake = Handshake(end, lanes, reassembly, session, owner)
 
     # --- how the parts hang together ------------------------------------------------------------------------------
 
@@ -171,18 +181,6 @@ class Link:
 
     def _answered(self, count: int) -> None:
         self.control.answered(count, streams=len(self.sender.channels) + len(self.taking.incoming))
-
-    def _sweep(self, now: float) -> bool:
-        """What is done now and then. True: all of it is done."""
-        done = self.sender.sweep(now)
-        self.taking.sweep_acked()
-        if now >= self._tidy_due_s:
-            self._tidy_due_s = now + TIDY_S
-            self.sender.ledger.tidy({channel.counters.topic for channel in self.sender.channels.values()}, now=now)
-            if self.on_tidy is not None:
-                self.on_tidy(now)
-        self.taking.sweep(now)
-        return done
 
     # --- sessions -------------------------------------------------------------------------------------------------
 
@@ -236,72 +234,7 @@ class Link:
         self.end.now = now
         self.lanes.close(lane, now)
         if self.end.established and not self.handshake.transport_up:
-            self.end_session(reason, now)
-
-    def begin_session(self, peer_boot: int, now: float) -> None:
-        """`Sessions`: the handshake is through."""
-        end, lanes = self.end, self.lanes
-        end.resumed = end.peer_boot == peer_boot
-        if not end.resumed:
-            for channel in self.sender.channels.values():
-                channel.peer_restarted()
-            lanes.forget_clock()
-        end.peer_boot = peer_boot
-        end.established = True
-        self._data_prefix = bytes((framing.MAGIC, end.version, framing.Kind.DATA, end.tag))
-        self.handshake.greeted()
-        lanes.begin(now)
-        end.up_since_s = now
-        self.taking.watermarks.clear()
-        self.control.begin()
-        end.trace.record(now, LINK, TraceEvent.LINK_UP, peer=end.peer)
-        try:
-            self._begin_parts(now)
-        except Exception:  # goes on to whoever called; only the state is put right here
-            end.peer_boot = None  # the owner may not have begun: to it the next session is the first with that peer
-            raise
-
-    def _begin_parts(self, now: float) -> None:
-        self.texts.peer = self.end.peer
-        self.texts.begin()
-        self.answers.begin()
-        self._name_lists.begin()
-        self.outgoing.forget_announced()
-        self.taking.begin(resumed=self.end.resumed, now=now)
-        self._owner.up(now=now)
-        self.outgoing.begin(now)
-        self.control.send({"t": "synced", "batch": True}, now=now)
-
-    def end_session(self, reason: str, now: float) -> None:
-        """`Sessions`: what is in flight goes back to where it waits."""
-        end = self.end
-        end.now = now
-        self.taking.hand_on(now)
-        self.lanes.recall_all(now)
-        self.taking.leave()
-        self.reading.leave()
-        self.reassembly.behind.pop(self.control.incoming, None)
-        had_datagrams = self.lanes.leave()
-        if not end.established:
-            return
-        end.established = False
-        self._data_prefix = b""
-        if had_datagrams:
-            self._owner.lane_closed()
-        for channel in self.sender.channels.values():
-            channel.ready = False
-            self.sender.refresh(channel, now)
-        end.trace.record(now, LINK, TraceEvent.LINK_DOWN, peer=end.peer, reason=reason)
-        self.taking.forget_gone()
-        self._owner.down(reason, now=now)
-
-    def kept_messages(self) -> int:
-        """`Sessions`: how many messages are kept for the peer."""
-        return sum(channel.kept for channel in self.sender.channels.values())
-
-    def refused(self, code: str, text: str, now: float) -> None:
-        """`Sessions`: the peer does not want one."""
-        self._owner.rejected(code, text, now=now)
+            self._session.end(reason, now)
 
     # --- bytes and time -------------------------------------------------------------------------------------------
 
@@ -333,37 +266,21 @@ class Link:
         """One datagram from the lane. Raises WireError or VersionError for bytes no honest peer sends; the session has
         ended then, as it has after an error of ours, of which the owner is told (`on_fault`)."""
         try:
-            if data[:4] == self._data_prefix and framing.HEADER_BYTES <= len(data) <= framing.MAX_DATAGRAM_BYTES:
+            if data[:4] == self.end.data_prefix and framing.HEADER_BYTES <= len(data) <= framing.MAX_DATAGRAM_BYTES:
                 state = self.lanes.by_id.get(lane)
                 if state is not None:
                     number, stamp_us = NUMBER_AND_STAMP.unpack_from(data, 4)
                     self.reading.receive(state, number, stamp_us, data, now)
             else:
-                self._receive_other(bytes(data), lane, now)
+                if self._unreadable is not None:
+                    error, self._unreadable = self._unreadable, None
+                    raise error
+                self.handshake.receive(bytes(data), lane, now)
         except RemoteError:
             self.handshake.abort("what it sent could not be read", now)
             raise
         except Exception as error:  # noqa: BLE001  (the one place for errors of ours while a datagram is read)
             self.failed(error, now=now)
-
-    def _receive_other(self, data: bytes, lane: int, now: float) -> None:
-        """What is no datagram of the session."""
-        end = self.end
-        if self._unreadable is not None:
-            error, self._unreadable = self._unreadable, None
-            raise error
-        header = framing.decode_header(data)
-        if header.kind != framing.Kind.DATA:
-            if lane != LANE_ZMQ:
-                raise WireError("a handshake has no place on the datagram lane")
-            end.now = now
-            self.handshake.receive(header, data, now)
-            return
-        if header.tag == end.tag and end.established:
-            raise WireError(f"version {header.version} was not agreed, {end.version} was")
-        if not end.initiator and lane == LANE_ZMQ:
-            # Of another session; if that one is the peer's latest, it does not know yet that it is over.
-            self.handshake.send_reset(header.tag, now)
 
     def next_deadline(self, lane: int = LANE_ZMQ) -> float | None:
         """When to call `handle_timeout` and `next_datagram` at the latest, if nothing else happens."""
@@ -376,10 +293,10 @@ class Link:
             return self.plane.deadline_s(state) if established and state is not None else None
         hello_due_s = self.handshake.hello_due_s
         if hello_due_s is not None and self.handshake.transport_up:
-            return min(hello_due_s, self.plane.sweep_due_s)
+            return min(hello_due_s, self.housekeeping.due_s)
         if established and state is not None and state.up:
             return self.plane.deadline_s(state)
-        return self.plane.sweep_due_s
+        return self.housekeeping.due_s
 
     def handle_timeout(self, *, now: float, lane: int = LANE_ZMQ) -> None:
         """Time has passed for the lane: to be called at `next_deadline`, and harmless before."""
@@ -393,9 +310,9 @@ class Link:
             greets = lane == LANE_ZMQ and self.handshake.hello_due_s
             if end.established and state is not None and state.up and not greets:
                 self.plane.handle_timeout(state, now)
-            elif lane == LANE_ZMQ and now >= self.plane.sweep_due_s:
+            elif lane == LANE_ZMQ and now >= self.housekeeping.due_s:
                 end.now = now
-                self.plane.sweep(now)
+                self.housekeeping.sweep(now)
         except RemoteError as unreadable:
             self._unreadable = unreadable
             self.handshake.abort(f"what it sent could not be read: {unreadable}", now)

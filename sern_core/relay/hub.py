@@ -17,7 +17,8 @@ from functools import partial
 from typing import Final
 
 from sern_core.link.definitions import DefinitionStore
-from sern_core.link.link import TIDY_S, Link
+from sern_core.link.housekeeping import TIDY_S
+from sern_core.link.link import Link
 from sern_core.path.lanes import LANE_PRIORITY
 from sern_core.relay.absent import AbsentClients
 from sern_core.relay.access import AccessTable

@@ -148,7 +148,7 @@ class ClientCore:
             now=now,
             lossless=lossless,
         )
-        self.link.on_tidy = self._tidy
+        self.link.housekeeping.on_tidy = self._tidy
         self.link.receiver.on_stray = self.received.stray
         if coder is not None:
             self.link.encode_with(coder)

@@ -183,7 +183,7 @@ def backlog_that_lapses() -> Input:
         reader.port.handle_timeout(now=reader.now)
 
     def rest() -> bool:
-        more = link.plane.sweep_due_s <= reader.now
+        more = link.housekeeping.due_s <= reader.now
         if more:
             sweep()
         else:

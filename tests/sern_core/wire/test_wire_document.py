@@ -30,7 +30,7 @@ CORE = [
         "relay/hub.py",
         "relay/hub_port.py",
         "relay/relayed_streams.py",
-        "link/link.py",
+        "link/session.py",
         "link/control_reader.py",
         "relay/presence.py",
         "link/handshake.py",
