@@ -13,8 +13,9 @@ from typing import Final, Protocol
 
 from sern_core.path.capacity import AckSample, CapacityEstimator, Pacer
 from sern_core.path.flight import ACK_DELAY_S, Arrivals, Flight
+from sern_sim.hop import Hop
 from sern_sim.models import LinkModel
-from sern_sim.network import Hop, Network
+from sern_sim.network import Network
 
 OVERHEAD_BYTES: Final = 60
 """What a datagram costs on the wire beside its own bytes."""

@@ -20,51 +20,24 @@ from random import Random
 from typing import Any, Final
 
 from sern_core.vocabulary.errors import UsageError
-from sern_sim.events import EventLog, SimulationStuck, SimulationTimeoutError
+from sern_sim.events import EventLog, SimulationTimeoutError
+from sern_sim.hop import Hop
+from sern_sim.hosts import Hosts
 from sern_sim.links import NEVER, NS, Link, to_ns
 from sern_sim.models import LinkModel
-from sern_sim.ports import Direction, Node, NodeState, Port, Slot, SoloNode
+from sern_sim.ports import Direction, Node, NodeState, Port, Slot
+from sern_sim.watchdog import Watchdog
 
 MAX_EVENTS_PER_INSTANT: Final = 100_000
 """More events and datagrams than this at one instant are an endless loop, not traffic (a stall of a fast stream
 delivers tens of thousands at once)."""
-REPORTED_EVENTS: Final = 12
 EARLIEST_START_S: Final = 1e5
 LATEST_START_S: Final = 1.3e5
 """Clock readings at the start. More than a day, so that a clock reading handed to a function that takes scenario time
 is caught; below 2^17 s, where a float resolves 0.015 ns and the offset changes nothing that a port computes."""
 
 _DELIVER, _TIMER, _CALL, _CONNECT, _BREAK = range(5)
-
-
-class Hop:
-    """Two ports and the links between them. `forward` is a to b, `backward` b to a."""
-
-    __slots__ = ("_a", "_b", "_generation", "_network", "_wait_ns", "backward", "connected", "forward", "name")
-
-    def __init__(self, network: "Network", name: str, a: Slot, b: Slot, forward: Link, backward: Link) -> None:
-        self._network = network
-        self.name = name
-        self._a = a
-        self._b = b
-        self.forward = Direction(network, forward, b, f"{name}>")
-        self.backward = Direction(network, backward, a, f"{name}<")
-        a.out = self.forward
-        b.out = self.backward
-        self.connected = False
-        self._generation = 0  # of the connection; scheduled attempts and breaks of an older one are void
-        self._wait_ns = 0  # how long the path must be there before it connects
-
-    @property
-    def streaming(self) -> bool:
-        return self.forward.model.streaming
-
-    def break_connection(self, *, reconnect_s: float | None = None) -> None:
-        """Cut the connection now: what is under way is lost, both ports are told.
-
-        It comes back by itself `reconnect_s` later (default: the links' own), or that long after the path is back.
-        """
-        self._network.break_hop(self, reconnect_s=reconnect_s)
+_NAMES: Final = ("arrival", "deadline", "call", "connect", "break")
 
 
 class Call:
@@ -100,18 +73,14 @@ class Network:
         self._random = Random(seed)
         offset_s = self._random.uniform(EARLIEST_START_S, LATEST_START_S)
         self._start_ns = to_ns(offset_s if start_s is None else start_s)
-        self._limit = max_events_per_instant
-        self._note_from = max_events_per_instant - REPORTED_EVENTS
+        self._watchdog = Watchdog(max_events_per_instant)
         self._log = log
         self._heap: list[tuple[int, int, int, Any, bytes, int]] = []
         self._sequence = 0
-        self._nodes: dict[int, NodeState] = {}
-        self._slots: dict[int, Slot] = {}
+        self._hosts = Hosts()
         self.hops: list[Hop] = []
         self.elapsed_ns = 0
         self.now = self._start_ns / NS
-        self._at_instant = 0
-        self._last_events: list[str] = []
         self.event_count = 0
         self._running = False
 
@@ -138,43 +107,28 @@ class Network:
         if forward.mode is not backward.mode:
             raise UsageError("forward and backward are of different modes: make both datagram or both stream")
         name = name or f"hop{len(self.hops)}"
-        slot_a = self._add_slot(port_a, node_a, f"{name}.a")
-        slot_b = self._add_slot(port_b, node_b, f"{name}.b")
+        slot_a = self._hosts.add(port_a, node_a, f"{name}.a")
+        slot_b = self._hosts.add(port_b, node_b, f"{name}.b")
         shared = (beside.forward.link, beside.backward.link) if beside is not None else (None, None)
         link_f = Link(forward, Random(self._random.getrandbits(64)), shared[0])
         link_b = Link(backward, Random(self._random.getrandbits(64)), shared[1])
-        hop = Hop(self, name, slot_a, slot_b, link_f, link_b)
+        hop = Hop(self, name, slot_a, slot_b, link_f, link_b, self._break_hop)
         self.hops.append(hop)
         self._schedule_connect(hop, 0)
         return hop
 
-    def _add_slot(self, port: Port, node: Node | None, name: str) -> Slot:
-        if id(port) in self._slots:
-            raise UsageError(f"{name}: this port is joined already; a port is one side of one hop")
-        if node is None:
-            node = SoloNode(port)
-        elif not any(each is port for each in node.ports()):
-            raise UsageError(f"{name}: the node does not list this port in ports()")
-        state = self._nodes.get(id(node))
-        if state is None:
-            state = self._nodes[id(node)] = NodeState(node)
-        slot = self._slots[id(port)] = Slot(port, state, name)
-        state.slots.append(slot)
-        return slot
-
     def crash_node(self, node: Node) -> None:
         """The node is gone: it is asked nothing more, stream peers see their connections break, datagrams vanish."""
-        state = self._state_of(node)
+        state = self._hosts.state_of(node)
         if not state.alive:
             raise UsageError("crash_node: the node is gone already")
         state.alive = False
         for hop in self.hops:
-            if hop._a.node is state or hop._b.node is state:
-                hop._generation += 1  # a pending attempt to connect is void
+            if gone := hop.slots_of(state):
+                hop.generation += 1  # a pending attempt to connect is void
                 if hop.connected:
                     # A stream's peer sees the connection break; nothing tells a datagram's peer.
-                    gone = tuple(slot for slot in (hop._a, hop._b) if slot.node is state)
-                    self._disconnect(hop, (hop._a, hop._b) if hop.streaming else gone)
+                    self._disconnect(hop, hop.slots if hop.streaming else gone)
 
     def replace_node(self, old: Node, new: Node, ports: Sequence[tuple[Port, Port]] | None = None) -> None:
         """A new object takes the place of `old` (crashed now, or before by `crash_node`): a process started again.
@@ -182,36 +136,16 @@ class Network:
         `ports` pairs old and new ports; by default those of both nodes in their order. Its hops connect as after any
         break; in datagram mode only the new node's ports are told, as nothing tells a datagram's peer.
         """
-        state = self._state_of(old)
-        if ports is None:
-            ports = list(zip(old.ports(), new.ports(), strict=True))
-        replacements = {id(before): after for before, after in ports}
-        missing = [slot.name for slot in state.slots if id(slot.port) not in replacements]
-        if missing:
-            raise UsageError(f"replace_node: no new port for {', '.join(missing)}")
+        state = self._hosts.state_of(old)
+        replacements = self._hosts.replacements(old, new, ports)
         if state.alive:
             self.crash_node(old)
-        del self._nodes[id(state.node)]
-        self._nodes[id(new)] = state
-        state.adopt(new)
-        for slot in state.slots:
-            after = replacements[id(slot.port)]
-            del self._slots[id(slot.port)]
-            self._slots[id(after)] = slot
-            slot.adopt(after)
+        self._hosts.replace(state, new, replacements)
         for hop in self.hops:
-            if hop._a.node is state or hop._b.node is state:
-                self._schedule_connect(hop, _reconnect_ns(hop, None))
+            if hop.slots_of(state):
+                self._schedule_connect(hop, hop.reconnect_ns(None))
         for slot in state.slots:
             self._settle(state, slot)
-
-    def _state_of(self, node: Node | Port) -> NodeState:
-        state = self._nodes.get(id(node))
-        if state is None and id(node) in self._slots:
-            state = self._slots[id(node)].node
-        if state is None:
-            raise UsageError("this node has no port in the network")
-        return state
 
     # ------------------------------------------------------------------ scripts
 
@@ -250,7 +184,7 @@ class Network:
     def _schedule(
         self, at_ns: int, callback: Callable[[float], object], node: Node | Port | None, period_ns: int
     ) -> Call:
-        call = Call(callback, None if node is None else self._state_of(node), period_ns)
+        call = Call(callback, None if node is None else self._hosts.state_of(node), period_ns)
         self._push(at_ns, _CALL, call, 0)
         return call
 
@@ -300,12 +234,15 @@ class Network:
             self._running = False
 
     def _run_events(self, end_ns: int, condition: Callable[[], object] | None) -> bool:
-        heap = self._heap
+        heap, watchdog = self._heap, self._watchdog
         while heap and heap[0][0] <= end_ns:
             at_ns, _, kind, subject, data, epoch = heappop(heap)
             if at_ns != self.elapsed_ns:
                 self._set_time(at_ns)
-            self._count(kind, subject)
+            self.event_count += 1
+            watchdog.count += 1
+            if watchdog.count > watchdog.quiet:
+                watchdog.note(self.elapsed_s, f"{_NAMES[kind]} {subject.callback if kind == _CALL else subject.name}")
             if kind == _DELIVER:
                 self._on_arrival(subject, data, epoch)
             elif kind == _TIMER:
@@ -314,8 +251,8 @@ class Network:
                 self._on_call(subject)
             elif kind == _CONNECT:
                 self._on_connect(subject, epoch)
-            elif epoch == subject._generation:
-                self.break_hop(subject)
+            elif epoch == subject.generation:
+                self._break_hop(subject, None)
             if condition is not None and condition():
                 return True
         return False
@@ -324,21 +261,10 @@ class Network:
         if at_ns > self.elapsed_ns:
             self.elapsed_ns = at_ns
             self.now = (self._start_ns + at_ns) / NS
-            self._at_instant = 0
-            if self._last_events:
-                self._last_events.clear()
-
-    def _count(self, kind: int, subject: Any) -> None:
-        self.event_count += 1
-        self._at_instant += 1
-        if self._at_instant > self._note_from:
-            name = subject.callback if kind == _CALL else subject.name
-            self._note(f"{('arrival', 'deadline', 'call', 'connect', 'break')[kind]} {name}")
-
-    def _note(self, text: str) -> None:
-        self._last_events.append(text)
-        if self._at_instant >= self._limit:
-            raise SimulationStuck(self.elapsed_s, self._limit, self._last_events[-REPORTED_EVENTS:])
+            watchdog = self._watchdog
+            if watchdog.count > watchdog.quiet:
+                watchdog.forget()
+            watchdog.count = 0
 
     def _push(self, at_ns: int, kind: int, subject: Any, epoch: int) -> None:
         self._sequence += 1
@@ -359,6 +285,7 @@ class Network:
         else:
             slots = touched = {} if slot is None else {slot: None}
             self._add_dirty(state.take_dirty, touched)
+        watchdog = self._watchdog
         while True:
             for each in slots:
                 if each.connected:
@@ -368,16 +295,19 @@ class Network:
                 more |= self._add_dirty(state.take_dirty, touched)
             if not more:
                 break
-            self._at_instant += 1
-            if self._at_instant > self._note_from:
-                self._note("more to send after sending")
+            watchdog.count += 1
+            if watchdog.count > watchdog.quiet:
+                watchdog.note(self.elapsed_s, "more to send after sending")
         for each in slots:
-            self._arm(each)
+            due_ns = each.arm(self._start_ns, self.elapsed_ns)
+            if due_ns < NEVER:
+                self._sequence += 1
+                heappush(self._heap, (due_ns, self._sequence, _TIMER, each, b"", 0))
 
     def _add_dirty(self, take_dirty: Callable[[], Iterable[Port]], touched: dict[Slot, None]) -> bool:
         before = len(touched)
         for port in take_dirty():
-            slot = self._slots.get(id(port))
+            slot = self._hosts.slots.get(id(port))
             if slot is not None:
                 touched[slot] = None
         return len(touched) > before
@@ -390,11 +320,11 @@ class Network:
         direction = slot.out
         link = direction.link
         send = link.send if direction.open else link.send_nowhere
-        elapsed_ns = self.elapsed_ns
+        elapsed_ns, watchdog = self.elapsed_ns, self._watchdog
         while data is not None:
-            self._at_instant += 1
-            if self._at_instant > self._note_from:
-                self._note(f"datagram of {len(data)} bytes from {slot.name}")
+            watchdog.count += 1
+            if watchdog.count > watchdog.quiet:
+                watchdog.note(self.elapsed_s, f"datagram of {len(data)} bytes from {slot.name}")
             arrival_ns = send(len(data), elapsed_ns)
             if arrival_ns >= 0:
                 self._sequence += 1
@@ -405,22 +335,6 @@ class Network:
             if self._log is not None:
                 self._log.add(elapsed_ns, "send" if arrival_ns >= 0 else "lost", slot.name, data)
             data = next_datagram(now=self.now)
-
-    def _arm(self, slot: Slot) -> None:
-        deadline_s = slot.next_deadline()
-        if deadline_s is None or deadline_s >= NEVER / NS:
-            slot.due_ns = NEVER
-            return
-        # A deadline made as now + delay carries the rounding of floats; to the nearest nanosecond it is exact again,
-        # whatever the clock's offset.
-        due_ns = max(round(deadline_s * NS) - self._start_ns, self.elapsed_ns)
-        slot.due_ns = due_ns
-        slot.due_s = deadline_s
-        pending = slot.pending
-        if not pending or due_ns < pending[-1]:
-            pending.append(due_ns)
-            self._sequence += 1
-            heappush(self._heap, (due_ns, self._sequence, _TIMER, slot, b"", 0))
 
     def _on_arrival(self, direction: Direction, data: bytes, epoch: int) -> None:
         link = direction.link
@@ -461,71 +375,49 @@ class Network:
         call.callback(self.now)
         if call.period_ns and not call.cancelled:
             self._push(self.elapsed_ns + call.period_ns, _CALL, call, 0)
-        for state in list(self._nodes.values()) if call.node is None else (call.node,):
+        for state in self._hosts.states() if call.node is None else (call.node,):
             self._settle(state, None)
 
     # ------------------------------------------------------------------ connections
 
     def _schedule_connect(self, hop: Hop, wait_ns: int) -> None:
         """Connect once the path has been there for `wait_ns`."""
-        hop._wait_ns = wait_ns
-        self._push(self.elapsed_ns + wait_ns, _CONNECT, hop, hop._generation)
+        hop.wait_ns = wait_ns
+        self._push(self.elapsed_ns + wait_ns, _CONNECT, hop, hop.generation)
 
     def _on_connect(self, hop: Hop, generation: int) -> None:
         """A connection attempt. It succeeds when both nodes live and, for a stream, the path was there all along."""
-        if hop.connected or generation != hop._generation or not (hop._a.node.alive and hop._b.node.alive):
+        if not hop.may_connect(generation):
             return
-        if hop.streaming:
-            back_ns = 0
-            for direction in (hop.forward, hop.backward):
-                start_ns, end_ns = direction.link.blackout_after(self.elapsed_ns - hop._wait_ns)
-                if start_ns <= self.elapsed_ns:
-                    back_ns = max(back_ns, end_ns)
-            if back_ns:
-                self._push(back_ns + hop._wait_ns, _CONNECT, hop, generation)
-                for slot in (hop._a, hop._b):
-                    self._settle(slot.node, slot)  # deadlines are served from the beginning
-                return
-        hop.connected = True
-        for direction in (hop.forward, hop.backward):
-            direction.open = True
-            direction.link.reset(self.elapsed_ns)
-        if hop.streaming:
-            self._schedule_break(hop)
-        for slot in (hop._a, hop._b):
+        back_ns = hop.path_back_ns(self.elapsed_ns) if hop.streaming else 0
+        if back_ns:
+            self._push(back_ns + hop.wait_ns, _CONNECT, hop, generation)
+        else:
+            hop.open(self.elapsed_ns)
+            if hop.streaming and (break_ns := hop.fatal_blackout_ns(self.elapsed_ns)) < NEVER:
+                self._push(break_ns, _BREAK, hop, hop.generation)
+            self._tell_connected(hop)
+        for slot in hop.slots:
+            self._settle(slot.node, slot)  # deadlines are served from the beginning
+
+    def _tell_connected(self, hop: Hop) -> None:
+        for slot in hop.slots:
             # A datagram peer that lived on while the other node was replaced has been connected all the time.
             if not slot.connected:
                 slot.connected = True
                 if self._log is not None:
                     self._log.add(self.elapsed_ns, "connected", slot.name)
                 slot.port.connected(now=self.now)
-        for slot in (hop._a, hop._b):
-            self._settle(slot.node, slot)
 
-    def _schedule_break(self, hop: Hop) -> None:
-        """The next blackout, in either direction, that the connection will not survive."""
-        patience_ns = to_ns(min(hop.forward.model.disconnect_after_s, hop.backward.model.disconnect_after_s))
-        start_ns = min(
-            direction.link.long_blackout_after(self.elapsed_ns, patience_ns)
-            for direction in (hop.forward, hop.backward)
-        )
-        if start_ns < NEVER:
-            self._push(start_ns + patience_ns, _BREAK, hop, hop._generation)
-
-    def break_hop(self, hop: Hop, *, reconnect_s: float | None = None) -> None:
+    def _break_hop(self, hop: Hop, reconnect_s: float | None) -> None:
         """See `Hop.break_connection`; nothing happens when it is down already."""
         if hop.connected:
-            self._disconnect(hop, (hop._a, hop._b))
-            self._schedule_connect(hop, _reconnect_ns(hop, reconnect_s))
+            self._disconnect(hop, hop.slots)
+            self._schedule_connect(hop, hop.reconnect_ns(reconnect_s))
 
     def _disconnect(self, hop: Hop, told: tuple[Slot, ...]) -> None:
         """Lose what is under way and tell the ports of `told` that live."""
-        hop.connected = False
-        hop._generation += 1
-        for direction in (hop.forward, hop.backward):
-            direction.open = False
-            direction.epoch += 1
-            direction.link.reset(self.elapsed_ns)
+        hop.close(self.elapsed_ns)
         for slot in told:
             slot.connected = False
             if slot.node.alive:
@@ -534,9 +426,3 @@ class Network:
                 slot.port.disconnected(now=self.now)
         for slot in told:
             self._settle(slot.node, slot)
-
-
-def _reconnect_ns(hop: Hop, reconnect_s: float | None) -> int:
-    if reconnect_s is None:
-        reconnect_s = max(hop.forward.model.reconnect_s, hop.backward.model.reconnect_s)
-    return to_ns(reconnect_s)

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterable, Sequence
 from typing import Protocol
 
-from sern_sim.links import NEVER, Link, LinkStats
+from sern_sim.links import NEVER, NS, Link, LinkStats
 from sern_sim.models import LinkModel
 
 
@@ -141,3 +141,20 @@ class Slot:
         # Times at which a timer event of this slot is in the heap, latest first. A new one is made only when the
         # deadline is before all of them; an event that finds nothing due looks further. So none pile up.
         self.pending: list[int] = []
+
+    def arm(self, start_ns: int, elapsed_ns: int) -> int:
+        """Take the port's deadline. Returns when a timer event is to be made for it; `NEVER`: none, or there is one."""
+        deadline_s = self.next_deadline()
+        if deadline_s is None or deadline_s >= NEVER / NS:
+            self.due_ns = NEVER
+            return NEVER
+        # A deadline made as now + delay carries the rounding of floats; to the nearest nanosecond it is exact again,
+        # whatever the clock's offset.
+        due_ns = max(round(deadline_s * NS) - start_ns, elapsed_ns)
+        self.due_ns = due_ns
+        self.due_s = deadline_s
+        pending = self.pending
+        if pending and due_ns >= pending[-1]:
+            return NEVER
+        pending.append(due_ns)
+        return due_ns

@@ -35,8 +35,9 @@ from sern_core.vocabulary.types import (
     TopicName,
 )
 from sern_core.wire import framing
+from sern_sim.hop import Hop
 from sern_sim.models import LinkModel
-from sern_sim.network import Hop, Network
+from sern_sim.network import Network
 from sern_sim.ports import Port
 
 OPEN_ACCESS = AccessTable([AccessRule(client=".*", publish=(".*",), subscribe=(".*",), replay=(".*",))])

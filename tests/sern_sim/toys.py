@@ -3,8 +3,9 @@
 from collections import deque
 from collections.abc import Sequence
 
+from sern_sim.hop import Hop
 from sern_sim.models import PERFECT, LinkModel
-from sern_sim.network import Hop, Network
+from sern_sim.network import Network
 from sern_sim.ports import Port
 
 

@@ -9,8 +9,8 @@ from sern_core.site.client import ClientCore
 from sern_core.vocabulary.errors import WireError
 from sern_core.vocabulary.types import ClientName, PriorityClass
 from sern_core.wire import framing
+from sern_sim.hop import Hop
 from sern_sim.models import LinkModel, Window
-from sern_sim.network import Hop
 from tests.world import World, spec
 
 RATE_BPS = 4e6
