@@ -83,10 +83,8 @@ class Cloud:
         if any(column.dtype.kind != "f" for column in columns):
             raise BodyError("x, y and z must be FLOAT32 or FLOAT64")
         wide = any(column.dtype.itemsize > 4 for column in columns)
-        out: NDArray[Any] = np.empty((len(self.points), 3), np.float64 if wide else np.float32)
-        for i, column in enumerate(columns):
-            out[:, i] = column
-        return out
+        # Column by column in memory: what is done with all x takes a third of the time.
+        return np.stack([column.astype(np.float64 if wide else np.float32) for column in columns]).T
 
     def put_xyz(self, values: NDArray[Any]) -> None:
         """Overwrite the coordinates; `points` must be writable."""

@@ -67,7 +67,7 @@ def thin_rows(
     valid = valid_rows(xyz)
     rows = np.flatnonzero(valid)
     if len(rows) < len(xyz):
-        xyz = xyz[rows]
+        xyz = np.stack([xyz[rows, axis] for axis in range(3)]).T
     if not len(xyz):
         return rows, np.empty((0, 3)) if centroid else None
     order, starts = _order(_cells(xyz, voxel_m))
@@ -76,9 +76,9 @@ def thin_rows(
     first = first[ascending]
     if not centroid:
         return rows[first], None
-    sums = np.add.reduceat(xyz[order].astype(np.float64), starts, axis=0)
     counts = np.diff(starts, append=len(order))
-    return rows[first], (sums / counts[:, None])[ascending]
+    means = [np.add.reduceat(xyz[order, axis].astype(np.float64), starts) / counts for axis in range(3)]
+    return rows[first], np.stack(means, axis=1)[ascending]
 
 
 def thin_cloud(
