@@ -13,7 +13,15 @@ from sern_core.link.housekeeping import Housekeeping
 from sern_core.link.lane_set import LaneSet
 from sern_core.link.sender import Sender
 from sern_core.link.streams_in import StreamsIn
-from sern_core.path.lanes import COPY_DELAY_S, LANE_ZMQ, OVERHEAD_BYTES, PING_INTERVAL_S, PROBE_INTERVAL_S, Lane
+from sern_core.path.lanes import (
+    COPY_DELAY_S,
+    LANE_ZMQ,
+    MAX_PROBE_INTERVAL_S,
+    OVERHEAD_BYTES,
+    PING_INTERVAL_S,
+    PROBE_INTERVAL_S,
+    Lane,
+)
 from sern_core.stream.out_channel import OutChannel
 from sern_core.stream.out_message import OutMessage
 from sern_core.vocabulary.message import Message, TopicSpec
@@ -103,7 +111,7 @@ class DataPlane:
             datagram.ping()
         lane.ping = False
         if lane.stalled:
-            lane.probe_due_s = now + PROBE_INTERVAL_S
+            lane.probe_due_s = now + min(max(PROBE_INTERVAL_S, lane.flight.rtt.srtt_s), MAX_PROBE_INTERVAL_S)
 
     def _sent(self, draft: Datagram, lane: Lane, now: float) -> bytes:
         """Number a datagram and take it into account; returns its bytes."""

@@ -30,7 +30,9 @@ PROVEN_ACKS: Final = 3
 """A lane that failed while another one worked is used again after so many acknowledged questions."""
 PING_INTERVAL_S: Final = 0.5
 PROBE_INTERVAL_S: Final = 0.1
-"""While stalled, one fresh class-0 message goes out this often and finds out whether the path is back."""
+MAX_PROBE_INTERVAL_S: Final = 0.2
+"""While stalled, one fresh class-0 message goes out this often and finds out whether the path is back: once in a round
+trip, between these two. On 64 kbit/s a probe every 0.1 s is a share of the link that poses wait for."""
 
 
 COPY_DELAY_S: Final = 0.007

@@ -244,14 +244,14 @@ def test_a_stall_is_found_and_probed_with_fresh_poses_and_the_first_after_it_is_
     tap = Tap(robot)
     world.run(5.0)
     probes = list(tap.of(pose))
-    assert 24 <= len({probe.seq for probe in probes}) <= 26, "one every 200 ms"
+    assert 49 <= len({probe.seq for probe in probes}) <= 51, "one every 100 ms"
     first_at_s = {probe.seq: probe.at_s for probe in reversed(probes)}  # a copy may follow
     assert all(at_s - robot.sent["/robot/odom", seq][0] < 0.021 for seq, at_s in first_at_s.items())
     assert not list(tap.of(cloud)), "nothing else"
     world.run(4.0)
     came_back_s = world.network.start_s + 15.0
     first = next(got for got in site.got if got.at_s > came_back_s)
-    assert first.topic == "/robot/odom" and first.at_s - came_back_s < 0.3 and first.age_s < 0.06
+    assert first.topic == "/robot/odom" and first.at_s - came_back_s < 0.2 and first.age_s < 0.06
     world.run(10.0)
     assert not link.lane.stalled
     assert len([g for g in site.on("/robot/cloud") if g.at_s > world.now - 5.0]) >= 40
