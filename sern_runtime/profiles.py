@@ -55,10 +55,12 @@ class LinkSection(Section):
     """Probability that a packet is lost."""
     burst_loss: BurstLossSection | None = None
     """Loss in bursts, in addition to `loss`."""
+    rate_after_jitter: bool = False
+    """Whether packets that waited for one that jitter held back come as fast as the rate allows, not together."""
     reorder: float = 0.0
-    """Probability that a packet is held back."""
+    """Probability that a packet is held back, or overtakes those before it where `reorder_delay_s` is 0."""
     reorder_delay_s: float = 0.0
-    """How long it lasts."""
+    """For how long it is held back."""
     duplicate: float = 0.0
     """Probability that a packet arrives twice."""
     queue_packets: int = LinkModel().queue_packets

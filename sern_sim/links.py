@@ -221,21 +221,22 @@ class Link:
                 self.blackout_packets += 1
                 return LOST
             return arrival_ns
-        return self._disturb(size_bytes, arrival_ns)
+        return self._disturb(size_bytes, departure_ns - start_ns, departure_ns)
 
-    def _disturb(self, size_bytes: int, arrival_ns: int) -> int:
-        """The random stages of a datagram, each drawing only when it is on."""
+    def _disturb(self, size_bytes: int, took_ns: int, departure_ns: int) -> int:
+        """The random stages of a datagram that the rate took `took_ns` for, each drawing only when it is on."""
         model = self.model
+        arrival_ns = departure_ns + self._delay_ns
         if self._lose():
             self.lost_packets += 1
             return LOST
         if self._jitter_ns:
             arrival_ns += self._jitter()
         if model.reorder and self._draw() < model.reorder:
-            arrival_ns += self._reorder_ns
+            arrival_ns = arrival_ns + self._reorder_ns if self._reorder_ns else departure_ns
             self.reordered_packets += 1
         else:
-            arrival_ns = max(arrival_ns, self._last_arrival_ns)
+            arrival_ns = max(arrival_ns, self._last_arrival_ns + (took_ns if model.rate_after_jitter else 0))
             self._last_arrival_ns = arrival_ns
         twice = model.duplicate > 0.0 and self._draw() < model.duplicate
         if arrival_ns >= self._down_start_ns:

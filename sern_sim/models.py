@@ -96,7 +96,9 @@ class LinkModel:
     """One direction of a hop. The default is a perfect wire.
 
     Jitter alone never reorders (a packet waits for the one before it, as in netem with a rate); reordering does:
-    with probability `reorder` a packet is held back by `reorder_delay_s` and others overtake it.
+    with probability `reorder` a packet is held back by `reorder_delay_s` and others overtake it; where that is 0 it
+    overtakes those before it, as in netem, for it skips delay and jitter. `rate_after_jitter`: packets that waited for
+    one that jitter held back come as fast as the rate allows, as in netem, and not together; so jitter costs capacity.
 
     `path_steps`: delay and loss change over time; in the virtual-time network only. A falling delay does not reorder.
 
@@ -114,6 +116,7 @@ class LinkModel:
     jitter: Jitter = Jitter.NORMAL
     loss: float = 0.0
     burst_loss: BurstLoss | None = None
+    rate_after_jitter: bool = False
     reorder: float = 0.0
     reorder_delay_s: float = 0.0
     duplicate: float = 0.0

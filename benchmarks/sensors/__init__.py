@@ -13,9 +13,9 @@ WIFI: Final = LinkModel(
     rate_bps=25e6,
     delay_s=0.020,
     jitter_s=0.010,
+    rate_after_jitter=True,
     loss=0.005,
     reorder=0.01,
-    reorder_delay_s=0.010,
     duplicate=0.001,
     queue_packets=1000,
 )

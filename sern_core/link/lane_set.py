@@ -220,6 +220,7 @@ class LaneSet:
                         newest is not None and newest.app_limited,
                         sent_s,
                         newest.nbytes if newest is not None and named else 0,
+                        named and not sack & 1 and highest - 1 in flight.packets,
                     )
                 )
                 lane.pacer.paced(now=now, pacing_bps=lane.estimator.pacing_bps)

@@ -30,6 +30,7 @@ class AckSample:
     app_limited: bool  # the sender had nothing to send when that packet left
     sent_s: float | None = None  # our clock when it left; with it the queue is told from forward delay alone
     packet_bytes: int = 0  # its size, 0 when unknown: what it took to serialise is no queue
+    overtook: bool = False  # the one before it had not arrived by then: it was lost, or is on a longer way
 
 
 class Receiver:

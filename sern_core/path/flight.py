@@ -3,7 +3,9 @@
 The sender numbers every acknowledgement-eliciting datagram from 1. A packet is lost when one that is three numbers
 later, and not more urgent, has been acknowledged (a network that heeds marks lets the urgent overtake), or when it is
 older than max(100 ms, 2 srtt + 30 ms, RTO); on a stream lane (TCP) nothing is lost while
-the connection lasts. A round trip is measured from every acknowledgement that names a newer packet, whether or not
+the connection lasts. Where packets came that were given up because later ones had come, the path changes their order,
+and a packet has as long to come as those took, and a quarter more, up to a round trip (the reordering window of RACK,
+RFC 8985, section 6.2). A round trip is measured from every acknowledgement that names a newer packet, whether or not
 that packet was given up meanwhile: else a path slower than the first guess would never be measured.
 The receiver's half says what to acknowledge and when: every second datagram (large ones of a stream lane
 at most once in `ACK_SPACING_S`), at once on a gap or on class control, else within `ACK_DELAY_S`.
@@ -20,6 +22,9 @@ REORDER_THRESHOLD: Final = 3
 MIN_LOSS_TIMEOUT_S: Final = 0.100
 FIRST_LOSS_TIMEOUT_S: Final = 2.0
 """Before any round trip was measured: a path of 1 s and its first queue must not look like loss."""
+REORDER_MARGIN: Final = 1.25
+REORDER_MEMORY_S: Final = 10.0
+"""A path that has kept the order for so long keeps it."""
 STALL_MIN_S: Final = 0.5
 STALL_RTTS: Final = 4.0
 FIRST_STALL_S: Final = 3.0
@@ -41,7 +46,7 @@ Items = list[Any]
 class Packet:
     """One packet in flight."""
 
-    __slots__ = ("app_limited", "items", "nbytes", "number", "priority", "sent_s")
+    __slots__ = ("app_limited", "items", "nbytes", "number", "passed_s", "priority", "sent_s")
 
     def __init__(
         self, number: int, sent_s: float, nbytes: int, items: Items, app_limited: bool, priority: PriorityClass
@@ -52,6 +57,7 @@ class Packet:
         self.items = items
         self.app_limited = app_limited
         self.priority = priority
+        self.passed_s: float | None = None  # when it was first seen that later ones had come
 
 
 class Flight:
@@ -65,6 +71,11 @@ class Flight:
         self.highest_acked = 0
         self._acked_by_class = [0] * len(CLASSES)
         """The highest number that was acknowledged of a packet of a class, or of a less urgent one, by class."""
+        self.reorder_s = 0.0
+        """How long a packet may yet come after later ones; 0: the path keeps the order."""
+        self._reordered_s = -inf  # when one came so late last
+        self._given_up: dict[int, float] = {}  # when later ones had come, by number, of those that may come yet
+        self._passed_due_s = inf  # when the first of those that wait is lost
         self.rtt = RttEstimator()
         self.waiting_since_s: float | None = None  # last acknowledgement, or the first packet since all were acked
 
@@ -116,7 +127,20 @@ class Flight:
                     by_class[priority] = packet.number
         if not packets:
             self.waiting_since_s = None
+        if self._given_up:
+            self._look_for_late(highest, sack, now)
         return result
+
+    def _look_for_late(self, highest: int, sack: int, now: float) -> None:
+        """See whether packets that were given up have come after all."""
+        for number, passed_s in list(self._given_up.items()):
+            behind = highest - number - 1
+            if behind >= SACK_BITS:
+                del self._given_up[number]  # nothing tells of it any more
+            elif behind >= 0 and sack >> behind & 1:
+                del self._given_up[number]
+                self._reordered_s = now
+                self.reorder_s = max(self.reorder_s, min(REORDER_MARGIN * (now - passed_s), self.rtt.srtt_s))
 
     def loss_timeout_s(self) -> float:
         if not self.rtt.samples:
@@ -133,10 +157,23 @@ class Flight:
         sent_before_s = now - self.loss_timeout_s()
         by_class = self._acked_by_class
         last = self.highest_acked - REORDER_THRESHOLD
+        if now > self._reordered_s + REORDER_MEMORY_S:
+            self.reorder_s = 0.0
+        self._passed_due_s = inf
         gone = []
         for packet in self.packets.values():
-            if packet.number <= by_class[packet.priority] - REORDER_THRESHOLD or packet.sent_s <= sent_before_s:
+            if packet.sent_s <= sent_before_s:
                 gone.append(packet)
+            elif packet.number <= by_class[packet.priority] - REORDER_THRESHOLD:
+                if packet.passed_s is None:
+                    packet.passed_s = now
+                due_s = packet.passed_s + self.reorder_s
+                if now >= due_s:
+                    if self.highest_acked - packet.number <= SACK_BITS:
+                        self._given_up[packet.number] = packet.passed_s
+                    gone.append(packet)
+                elif due_s < self._passed_due_s:
+                    self._passed_due_s = due_s
             elif packet.number > last:
                 break
         for packet in gone:
@@ -148,12 +185,15 @@ class Flight:
         """When the oldest packet is lost by time alone; a hair late, so that `lost` agrees whatever the rounding."""
         if self.lossless or not self.packets:
             return None
-        return next(iter(self.packets.values())).sent_s + self.loss_timeout_s() + 1e-6
+        oldest_s = next(iter(self.packets.values())).sent_s + self.loss_timeout_s()
+        return min(oldest_s, self._passed_due_s) + 1e-6
 
     def abandon(self) -> list[Packet]:
         """The transport is gone: everything in flight comes back, oldest first. Numbers go on."""
         result = list(self.packets.values())
         self.packets.clear()
+        self._given_up.clear()
+        self._passed_due_s = inf
         self.inflight_bytes = 0
         self.waiting_since_s = None
         return result
@@ -162,6 +202,7 @@ class Flight:
         check(self.inflight_bytes == sum(p.nbytes for p in self.packets.values()), "in-flight bytes do not add up")
         numbers = list(self.packets)
         check(numbers == sorted(numbers), "packets in flight are out of order")
+        check(len(self._given_up) <= SACK_BITS, "too much is kept of packets that were given up")
         check(not self.packets or self.waiting_since_s is not None, "nobody waits for what is in flight")
 
 

@@ -1,6 +1,8 @@
 """What links do to packets and connections: loss, order, queues, blackouts, broken connections, crashes."""
 
 import math
+from dataclasses import replace
+from itertools import pairwise
 from random import Random
 
 import pytest
@@ -105,6 +107,22 @@ def test_reordering_holds_packets_back() -> None:
     numbers = [number_of(data) for data in b.inbox]
     assert numbers != sorted(numbers)
     assert sorted(numbers) == list(range(SAMPLES))
+
+
+def test_what_waited_for_jitter_comes_as_fast_as_the_rate_allows() -> None:
+    model = LinkModel(rate_bps=80_000, delay_s=0.05, jitter_s=0.02, rate_after_jitter=True, queue_packets=10_000)
+    network, b, _ = flooded(model, count=1000)
+    at = list(elapsed(network, b))
+    took_s = 8 * len(b.inbox[0]) / 80_000
+    assert min(later - earlier for earlier, later in pairwise(at)) >= took_s - 1e-9
+    together = elapsed(*flooded(replace(model, rate_after_jitter=False), count=1000)[:2])
+    assert min(later - earlier for earlier, later in pairwise(together)) < took_s / 2
+
+
+def test_one_that_is_not_held_back_overtakes() -> None:
+    network, b, link = flooded(LinkModel(delay_s=0.01, reorder=0.1))
+    delays = [round(at_s - number_of(data) / 1000, 6) for at_s, data in zip(elapsed(network, b), b.inbox, strict=True)]
+    assert sorted(set(delays)) == [0.0, 0.01] and delays.count(0.0) == link.reordered_packets
 
 
 def test_duplicates_arrive_twice_and_are_counted() -> None:

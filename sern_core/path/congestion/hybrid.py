@@ -282,7 +282,7 @@ class HybridWindow(CapacityEstimator):
     def _ramp(self, sample: AckSample) -> None:
         """One acknowledgement of start-up."""
         path, start, now = self._path, self._start, sample.now
-        if path.rtt_s is None or sample.rtt_s < path.rtt_s:
+        if path.rtt_s is None or (sample.rtt_s < path.rtt_s and not sample.overtook):
             path.rtt_s = sample.rtt_s
         sent_s = now - sample.rtt_s if sample.sent_s is None else sample.sent_s
         if sample.app_limited or sent_s < start.since_s:

@@ -26,8 +26,9 @@ class PathDelay:
         self._leasts: deque[float] = deque(maxlen=self._params.quicker_epochs)  # of the delay of large packets
         self._early_s = 0.0  # by how much the packets of the last epoch came sooner than the least delay
 
-    def queue_s(self, delay_s: float, nbytes: int, fragment: float, rate: LinkRate) -> float:
-        """A packet of `nbytes` (0: unknown) came after `delay_s`: how long it has queued."""
+    def queue_s(self, delay_s: float, nbytes: int, fragment: float, rate: LinkRate, *, overtook: bool) -> float:
+        """A packet of `nbytes` (0: unknown) came after `delay_s`: how long it has queued. One that came sooner than any
+        could on the way that is known, because it overtook others, had a way of its own and says nothing."""
         base = self._large if nbytes == 0 or 2 * nbytes >= fragment else self._small
         if base is self._large and 0 < nbytes < fragment:
             # As if it had been a full one: else the least delay would be that of shorter ones. While there was never
@@ -36,8 +37,10 @@ class PathDelay:
                 delay_s += (fragment - nbytes) / rate.peak
             elif 10 * nbytes < 9 * fragment:
                 base = self._small
-        base.epoch.append(delay_s)
         least = base.least
+        if overtook and least and delay_s < least[0][1] + self.held_s:
+            return 0.0
+        base.epoch.append(delay_s)
         return delay_s - least[0][1] - self.held_s if least else 0.0
 
     def close_epoch(self, now: float, window_s: float) -> None:

@@ -90,7 +90,7 @@ class PathModel:
             delay_s = rtt_s
         else:
             delay_s = receiver_s - sent_s
-        queue_s = self.delay.queue_s(delay_s, nbytes, self.fragment, rate)
+        queue_s = self.delay.queue_s(delay_s, nbytes, self.fragment, rate, overtook=sample.overtook)
         self._samples.append((queue_s, rtt_s - delay_s))
         carried = rate.value
         if carried is not None and rate.saturated:

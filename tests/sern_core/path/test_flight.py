@@ -8,6 +8,7 @@ from sern_core.path.flight import (
     ACK_DELAY_S,
     ACK_SPACING_S,
     FIRST_LOSS_TIMEOUT_S,
+    REORDER_MEMORY_S,
     SACK_BITS,
     SPACED_BYTES,
     Arrivals,
@@ -55,6 +56,44 @@ def test_lost_when_three_later_ones_have_arrived() -> None:
     subject.acked(4, 0b11, now=0.05)  # 4, 3, 2
     assert [p.number for p in subject.lost(now=0.05)] == [1]
     assert list(subject.packets) == [5, 6]
+
+
+def test_after_one_came_late_the_next_has_as_long_to_come_and_a_quarter_more() -> None:
+    subject = flight(6)
+    subject.acked(4, 0b11, now=0.05)  # 4, 3, 2
+    assert [p.number for p in subject.lost(now=0.05)] == [1] and subject.reorder_s == 0.0
+    subject.acked(4, 0b111, now=0.07)  # 1, after all
+    assert subject.reorder_s == pytest.approx(1.25 * 0.02)
+    for number in (7, 8, 9):
+        subject.sent(now=0.08, nbytes=100, items=[number], app_limited=False)
+    subject.acked(9, 0b1111, now=0.2)  # 9, and 8 to 5
+    for number in (10, 11, 12, 13):
+        subject.sent(now=0.2, nbytes=100, items=[number], app_limited=False)
+    subject.acked(13, 0b11, now=0.25)  # 13, 12, 11; 10 is behind
+    assert subject.lost(now=0.25) == []
+    deadline_s = subject.loss_deadline()
+    assert deadline_s == pytest.approx(0.25 + 1.25 * 0.02, abs=1e-5)
+    assert subject.lost(now=0.26) == []
+    assert [p.number for p in subject.lost(now=deadline_s)] == [10]
+    valid(subject)
+
+
+def test_no_packet_has_more_than_a_round_trip_to_come_late_and_a_path_is_forgiven() -> None:
+    subject = flight(6, rtt_s=0.1)
+    subject.acked(4, 0b11, now=0.05)
+    assert len(subject.lost(now=0.05)) == 1
+    subject.acked(4, 0b111, now=5.0)
+    assert subject.reorder_s == pytest.approx(0.1)
+    subject.lost(now=5.0 + REORDER_MEMORY_S + 0.1)
+    assert subject.reorder_s == 0.0
+
+
+def test_what_is_kept_of_packets_that_were_given_up_is_bounded() -> None:
+    subject = flight(2000)
+    for highest in range(4, 2000, 4):
+        subject.acked(highest, 0b11, now=0.01)
+        subject.lost(now=0.01)
+        valid(subject)
 
 
 def test_a_more_urgent_packet_that_overtakes_shows_no_loss() -> None:

@@ -19,7 +19,7 @@ class Path:
         self.window = 1e6
         self._cum_bytes = 0
 
-    def packet(self, queue_s: float = 0.0, *, app_limited: bool = False) -> AckSample:
+    def packet(self, queue_s: float = 0.0, *, app_limited: bool = False, overtook: bool = False) -> AckSample:
         """One packet more has arrived, and queued for so long."""
         self.now += FRAGMENT_BYTES / self.rate
         self._cum_bytes += FRAGMENT_BYTES
@@ -35,6 +35,7 @@ class Path:
             app_limited,
             sent_s,
             FRAGMENT_BYTES,
+            overtook,
         )
 
     def epoch(self, queue_s: float = 0.0, *, app_limited: bool = False) -> Seen:

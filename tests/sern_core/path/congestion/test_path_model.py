@@ -21,6 +21,15 @@ def test_an_epoch_of_too_few_packets_goes_on() -> None:
     assert not model.epoch_over(200.0)
 
 
+def test_one_that_overtook_others_does_not_show_how_long_the_path_is() -> None:
+    path = Path().settled()
+    for _ in range(50):
+        assert path.model.note(path.packet(-0.02, overtook=True)) == 0.0
+    seen = path.epoch()
+    assert seen.rtt_s == pytest.approx(RTT_S) and not seen.early
+    assert path.model.note(path.packet(0.01, overtook=True)) == pytest.approx(0.01), "behind a lost one it queued"
+
+
 def test_whether_there_was_more_to_send_is_judged_by_half_of_the_epoch() -> None:
     path = Path().settled()
     assert path.epoch().limited
