@@ -19,7 +19,7 @@ from sern_core.vocabulary.errors import SernError
 from sern_runtime import clock
 from sern_tools.harness.processes import failure
 
-ROOT: Final = Path(__file__).resolve().parents[1]
+ROOT: Final = Path(__file__).absolute().parents[1]
 PATIENCE_S: Final = 2.0
 """How long a worker may take to end by itself, and after SIGTERM."""
 
