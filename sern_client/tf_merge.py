@@ -7,7 +7,7 @@ newest of every pair, and nothing in it can be superseded together with the pair
 import logging
 from typing import Final
 
-from sern_client.summarise import POLL_S, Send
+from sern_client.summaries.topic_summary import POLL_S, Send
 from sern_core.site.client import ClientCore
 from sern_core.stream.out_channel import OutChannel
 from sern_core.summaries.transforms import StaticTransforms, TransformMerger

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sern_client.summarise import (
+from sern_client.summaries.topic_summary import (
     INLINE_BYTES,
     MAX_WAITING,
     PROBE_EVERY,

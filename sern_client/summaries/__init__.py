@@ -1,0 +1,1 @@
+"""Summaries that go in place of heavy messages, or beside them."""
