@@ -8,7 +8,7 @@ from sern_client.connection import Connection
 from sern_client.endpoints.base import CountingEndpoint
 from sern_client.guard import Guard
 from sern_client.link_state import LinkState
-from sern_client.summaries.topic_summary import register_summaries
+from sern_client.summaries.client_summaries import register_summaries
 from sern_runtime.adaptation import Adaptation
 from sern_runtime.collector import CollectorWatch
 from sern_runtime.internal_errors import InternalErrors

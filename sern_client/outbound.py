@@ -11,7 +11,9 @@ from sern_client.endpoints.base import Difference, Sink, Subscription
 from sern_client.frames import Rewrite
 from sern_client.leaving import Leaving
 from sern_client.site import Site
-from sern_client.summaries.topic_summary import Send, Source, Summaries, streams_of
+from sern_client.summaries.client_summaries import Summaries
+from sern_client.summaries.source import Source, streams_of
+from sern_client.summaries.topic_summary import Send
 from sern_client.tf_merge import LatchedTransforms, MergedTransforms
 from sern_core.site.client import ClientCore
 from sern_core.stream.out_channel import OutChannel

@@ -10,18 +10,17 @@ from typing import Any
 import numpy as np
 import pytest
 
+from sern_client.summaries.client_summaries import Summaries
+from sern_client.summaries.makers import patch_work
+from sern_client.summaries.source import SummarisedTopic, streams_of
 from sern_client.summaries.topic_summary import (
     INLINE_BYTES,
     MAX_WAITING,
     PROBE_EVERY,
     Job,
     Send,
-    Summaries,
-    SummarisedTopic,
     TopicSummary,
     Work,
-    patch_work,
-    streams_of,
 )
 from sern_client.tf_merge import LatchedTransforms, MergedTransforms
 from sern_core.site.client import ClientCore
