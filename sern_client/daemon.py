@@ -285,7 +285,7 @@ class ClientDaemon:
     def _put_node(self) -> None:
         """Tell the relay's registry who we are."""
         model = self.loaded.model
-        self.core.put_object(
+        self.core.objects.put(
             f"node:{model.name}",
             ObjectKind.NODE,
             "sern/client",

@@ -104,7 +104,7 @@ class Inbound:
         self._again = Timer(self._reconsider)
         self._again_s = AGAIN_S[0]
         self.rebuilds = Rebuilds(self._grid_shown, self._settle)
-        self._updates = UpdateTopics(lambda: core.patterns, self._subscribe)
+        self._updates = UpdateTopics(lambda: core.subscription.patterns, self._subscribe)
         self.keeping = Keeping(keepers_of(site.endpoint), core.hold, self._release_kept, self._keep_in)
         self._keep_timer = Timer(self.keeping.keep_soon)
 

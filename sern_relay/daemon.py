@@ -16,16 +16,16 @@ from sern_core.link.link import Link
 from sern_core.relay.access import AccessTable
 from sern_core.relay.hub import Hub, HubParams
 from sern_core.relay.traces import Traces
-from sern_core.stream.decoding import Decoder
 from sern_core.stream.out_channel import OutChannel
 from sern_core.topics.rules import FeedRole
 from sern_core.vocabulary.errors import ConfigError
-from sern_core.vocabulary.ledger import MAX_TOPICS
 from sern_core.vocabulary.message import Message, StreamInfo
-from sern_core.vocabulary.types import ClientName, DropReason, TopicName
+from sern_core.vocabulary.types import ClientName
 from sern_relay.admission import ZAP_DOMAIN, Admission, read_directory
+from sern_relay.comings import Comings
 from sern_relay.feed import RelayFeed
 from sern_relay.objects_view import objects_view
+from sern_relay.readers import Readers
 from sern_relay.relay_metrics import register_relay
 from sern_relay.reload_state import ReloadState
 from sern_relay.server import RelayServer
@@ -44,12 +44,10 @@ from sern_runtime.draining import Progress
 from sern_runtime.entry import blamed_on, end_tasks, log_warnings, serve
 from sern_runtime.http_routes import Health
 from sern_runtime.internal_errors import InternalErrors
-from sern_runtime.link_metrics import AgeHistograms
 from sern_runtime.loop import Shutdown
 from sern_runtime.message_log import LoggedFates, MessageLog
 from sern_runtime.metrics import Metrics
 from sern_runtime.optional import OptionalParts
-from sern_runtime.outages import Outages
 from sern_runtime.sdnotify import Notifier, Watchdog
 from sern_runtime.topics_view import announced_summary, link_summary, received_summary
 from sern_runtime.trace_view import trace_view
@@ -102,7 +100,6 @@ class RelayDaemon:
         model = loaded.model
         self.notifier = Notifier.from_environment()
         self.admission = Admission(self._directory(loaded))
-        self.ages = AgeHistograms()
         self.errors = InternalErrors()
         self.collector = CollectorWatch()
         self.refusals = dict.fromkeys((*sorted(REFUSAL_CODES), OTHER_CODE), 0)
@@ -130,12 +127,8 @@ class RelayDaemon:
             self.fates = self.hub.forwarding.fates = LoggedFates(self.message_log, self.parts)
         self.codecs = CodecPool(after=self._after, parts=self.parts)
         self.coder = make_coder(model.link.params(), self.codecs)
-        self._decoder = Decoder[StreamInfo](
-            self.coder, lambda stream: stream, self._deliver, self._undecodable, fault=self.errors.core
-        )
-        self._told: set[TopicName] = set()
-        self._away_since_s: dict[ClientName, float] = {}
-        self._outages = Outages(_log, logging.INFO)  # as clients that come and go
+        self.readers = Readers(self.coder, self.parts, self.errors)
+        self._comings = Comings()
         self.adaptation: Adaptation | None = None
         if model.adaptation is not None:
             with blamed_on(loaded.path, "adaptation"):
@@ -148,14 +141,12 @@ class RelayDaemon:
                 )
         self.zap: ZapHandler | None = None
         self.server: RelayServer | None = None
-        self.feed: RelayFeed | None = None
         self.lanes: RelayLanes | None = None
         self.datagrams = DatagramWatch(
             lambda: list(self.hub.links.values()),
             lambda link, within_s: self.lanes.problem(link, within_s) if self.lanes is not None else None,
             lambda link: link.peer,
         )
-        self.transforms: TransformObjects | None = None
         self._ctx: zmq.Context[zmq.Socket[bytes]] | None = None
         self._http: HttpServer | None = None
         self.tasks: list[asyncio.Task[None]] = []
@@ -179,7 +170,7 @@ class RelayDaemon:
                 self._http = self._make_http(model.http.listen)
                 await self._http.start()
         self._ctx = zmq.Context()
-        self.transforms = TransformObjects(self.hub.objects, parts=self.parts)
+        self.readers.transforms = TransformObjects(self.hub.objects, parts=self.parts)
         if keys is not None:
             self.zap = ZapHandler(self._ctx)
             self.zap.add_domain(ZAP_DOMAIN, self.admission.lookup)
@@ -214,7 +205,7 @@ class RelayDaemon:
             _log.warning("insecure: true: clients are not authenticated and nothing is encrypted")
         if model.feed.roles:
             with blamed_on(self.loaded.path, "feed", "roles"):
-                self.feed = self._make_feed(self._ctx, model.feed_roles())
+                self.readers.feed = self._make_feed(self._ctx, model.feed_roles())
         self.tasks.append(asyncio.create_task(self._tick(), name="relay-tick"))
         if self.adaptation is not None:
             kept = self.parts.keep("adaptation", self.adaptation.run, reset=self.adaptation.reset)
@@ -267,32 +258,20 @@ class RelayDaemon:
             if self.message_log is not None:
                 with self.parts.survive("message_log"):
                     self.message_log.flush()
-            if self.feed is not None:
+            if self.readers.feed is not None:
                 with self.parts.survive("feed"):
-                    self.feed.sweep(now=now)
+                    self.readers.feed.sweep(now=now)
                     self._retry_feed(now)
-                    if self.feed.over:
-                        feed, self.feed = self.feed, None
+                    if self.readers.feed.over:
+                        feed, self.readers.feed = self.readers.feed, None
                         feed.close()
             self._flush()
             if self.zap is not None:
                 self.zap.ping()
             if watchdog.interval_s is not None:
                 watchdog.check()
-            self._look_at_clients(now)
+            self._comings.look(self.hub.links, now)
             self.notifier.status(self._status())
-
-    def _look_at_clients(self, now: float) -> None:
-        """Say which client has been silent for a while in a session that goes on, and when it is not any more."""
-        for client, link in self.hub.links.items():
-            if not link.established:
-                continue
-            self._outages.look(
-                client, lost=link.lane.stalled, now=now,
-                gone=f"{client} does not answer; its session waits for it", back=f"{client} answers again",
-            )  # fmt: skip
-        for client in self._away_since_s.keys() - self.hub.links.keys():  # nobody waits for it any more
-            del self._away_since_s[client]
 
     def _status(self) -> str:
         """One line for `systemctl status`."""
@@ -371,19 +350,19 @@ class RelayDaemon:
     def _update_feed(self, model: RelayFile, now: float) -> None:
         """Make the feed's roles those of `model`. The first one brings the feed; it goes soon after the last one."""
         roles = model.feed_roles()
-        if self.feed is None:
+        if self.readers.feed is None:
             if not roles or self._ctx is None:
                 return
-            self.feed = self._make_feed(self._ctx, ())  # then as any other: what can be had is in force
+            self.readers.feed = self._make_feed(self._ctx, ())  # then as any other: what can be had is in force
         try:
-            self.feed.update(roles, now=now)
+            self.readers.feed.update(roles, now=now)
         except ConfigError as error:
             self.reloads.failed_in_part("feed.roles", str(error), now=now)
             _log.error("%s: feed.roles: not all of them are in force: %s", self.loaded.path, error)
 
     def _retry_feed(self, now: float) -> None:
         """What was in use at a reload may be free by now; that it was not has been said and counted."""
-        if self.feed is not None and self.feed.feed.missing and self.feed.open_missing():
+        if self.readers.feed is not None and self.readers.feed.feed.missing and self.readers.feed.open_missing():
             self.reloads.part_in_force()
             self._in_force(now)
 
@@ -439,7 +418,7 @@ class RelayDaemon:
                 stack.callback(self.fates.all_held, self.hub.links.values())
             if self._ctx is not None:
                 stack.callback(self._ctx.destroy, linger=0)
-            for part in (self.zap, self.server, self.lanes, self.feed, self.transforms):
+            for part in (self.zap, self.server, self.lanes, self.readers):
                 if part is not None:
                     stack.callback(part.close)
             if self._http is not None:
@@ -465,11 +444,7 @@ class RelayDaemon:
     # --- HubEvents ----------------------------------------------------------------------------------------------------
 
     def client_up(self, client: ClientName, *, resumed: bool) -> None:
-        away_since_s = self._away_since_s.pop(client, None)
-        if away_since_s is None:
-            _log.info("%s connected%s", client, " again" if resumed else "")
-        else:
-            _log.info("%s connected again, after %.0f s", client, clock.now() - away_since_s)
+        self._comings.up(client, resumed=resumed)
 
     def lane_asked(self, client: ClientName, ciphers: list[str]) -> None:
         if self.lanes is not None:
@@ -483,59 +458,18 @@ class RelayDaemon:
         self.errors.core(error, client or "")
 
     def client_down(self, client: ClientName, reason: str) -> None:
-        self._away_since_s[client] = clock.now()
-        self._outages.forget(client)
-        _log.info("%s is away: %s", client, reason)
+        self._comings.down(client, reason)
 
     def stream_added(self, stream: StreamInfo) -> None:
         _log.info("%s announces %s (%s)", stream.id.origin, stream.id.topic, stream.info.type_name)
-        self._owners_changed()
+        self.readers.stream_added()
 
     def stream_removed(self, stream: StreamInfo) -> None:
         _log.info("%s of %s has ended", stream.id.topic, stream.id.origin)
-        self._decoder.forget(stream.id, now=clock.now())
-        if self.transforms is not None:
-            with self.parts.survive("objects"):
-                self.transforms.stream_removed(stream)
-        self._owners_changed()
-
-    def _owners_changed(self) -> None:
-        if self.feed is not None:
-            with self.parts.survive("feed"):
-                self.feed.owners_changed()
+        self.readers.stream_removed(stream)
 
     def message(self, stream: StreamInfo, message: Message, *, now: float) -> None:
-        try:
-            self.ages.observe(stream.spec.priority, now - message.born_s)
-            if not message.codec or self._reads(stream):  # else it goes on as it is
-                self._decoder.message(stream, message, now=now)
-        except Exception as error:  # noqa: BLE001  (none of it is needed for the message's own way)
-            self.parts.failed("metrics", error)
-
-    def _reads(self, stream: StreamInfo) -> bool:
-        """Whether anything here, beside the clients' links, wants the stream's messages."""
-        if self.transforms is not None and self.transforms.reads(stream):
-            return True
-        return self.feed is not None and self.feed.feed.wants(stream.id.topic)
-
-    def _undecodable(self, stream: StreamInfo, message: Message, reason: DropReason, problem: str, now: float) -> None:
-        topic = stream.id.topic
-        if reason is DropReason.UNDECODABLE and topic not in self._told and len(self._told) < MAX_TOPICS:
-            self._told.add(topic)
-            _log.error("%s of %s cannot be decoded for the feed or the registry: %s", topic, stream.id.origin, problem)
-
-    def _deliver(self, stream: StreamInfo, message: Message, now: float) -> None:
-        """A message in its turn, decoded, for what reads messages at the relay itself."""
-        try:
-            if self.transforms is not None:
-                self.transforms.message(stream, message, now=now)
-        except Exception as error:  # noqa: BLE001  (of the registry alone)
-            self.parts.failed("objects", error)
-        try:
-            if self.feed is not None:
-                self.feed.publish(stream, message, now=now)
-        except Exception as error:  # noqa: BLE001  (of the feed alone)
-            self.parts.failed("feed", error)
+        self.readers.message(stream, message, now=now)
 
     def refused(self, client: ClientName, code: str, text: str) -> None:
         self.refusals[code if code in REFUSAL_CODES else OTHER_CODE] += 1

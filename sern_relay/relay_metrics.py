@@ -49,7 +49,7 @@ def register_relay(metrics: Metrics, relay: Counting) -> None:
     hub = relay.hub
     register_links(metrics, lambda: list(hub.links.values()))
     relay.datagrams.register(metrics)
-    register_received(metrics, hub.received, relay.ages)
+    register_received(metrics, hub.received, relay.readers.ages)
     register_codecs(metrics, relay.coder)
     relay.errors.register(metrics)
     relay.collector.register(metrics)
@@ -77,9 +77,9 @@ def register_relay(metrics: Metrics, relay: Counting) -> None:
     metrics.gauge("sern_relay_replay_bytes", "Latched messages kept for late joiners, bytes.",
                   read=lambda: [((), float(hub.streams.replays.held_bytes))])  # fmt: skip
     metrics.counter("sern_relay_transforms_refused_total", "Transforms not taken as objects, by client and reason.",
-                    ("client", "code"), lambda: _transforms_refused(relay.transforms))  # fmt: skip
+                    ("client", "code"), lambda: _transforms_refused(relay.readers.transforms))  # fmt: skip
     metrics.counter("sern_feed_messages_total", "Messages of the plain feed, by role and what became of them.",
-                    ("role", "result"), lambda: _fed(relay.feed))  # fmt: skip
+                    ("role", "result"), lambda: _fed(relay.readers.feed))  # fmt: skip
     metrics.gauge("sern_relay_reload_failed", "1 while what the last reload read is not all in force.",
                   read=lambda: [((), float(relay.reloads.failing))])  # fmt: skip
     metrics.counter("sern_relay_reload_failures_total", "Reloads that kept the old configuration.",

@@ -240,7 +240,7 @@ class Run:
         if not topic.spec.reliable:
             wanted = wanted[-1:]
         for client in self.world.clients.values():
-            if client is self.robot or not client.core.patterns:
+            if client is self.robot or not client.core.subscription.patterns:
                 continue
             seqs = client.seqs(channel.stream.id.topic)
             assert seqs[-len(wanted) :] == wanted, f"{client.name} {channel.stream.id.topic}: {seqs[-5:]} not {wanted}"

@@ -501,7 +501,8 @@ class World:
     def restart_client(self, name: str, *, patterns: Iterable[str] | None = None) -> SimClient:
         """kill -9 of a client: a new process in its place that knows nothing. Returns it; the old one is the record."""
         old = self.clients[name]
-        new = self._process(name, old.clock, SchedulerParams(), old.core.patterns if patterns is None else patterns)
+        wanted = old.core.subscription.patterns if patterns is None else patterns
+        new = self._process(name, old.clock, SchedulerParams(), wanted)
         self.network.replace_node(old, new, [(old.port, new.port)])
         return new
 

@@ -12,7 +12,9 @@ from typing import ParamSpec, Protocol
 from sern_core.bodies.codecs import CodecProfile, Coder
 from sern_core.link.definitions import DefinitionStore
 from sern_core.link.link import Link
+from sern_core.site.own_objects import OwnObjects
 from sern_core.site.peers import Peers, PeerView
+from sern_core.site.subscription import Subscription
 from sern_core.stream.decoding import Decoder
 from sern_core.stream.in_stream import InStream
 from sern_core.stream.latched import LatchedCache
@@ -25,9 +27,9 @@ from sern_core.vocabulary.ledger import MAX_TOPICS, ReceiveLedger
 from sern_core.vocabulary.message import Message, StreamId, StreamInfo, TopicInfo, TopicSpec
 from sern_core.vocabulary.params import LinkParams, SchedulerParams
 from sern_core.vocabulary.trace import LINK, DecisionTrace, TraceEvent
-from sern_core.vocabulary.types import ClientName, DropReason, ObjectKind, TopicName
+from sern_core.vocabulary.types import ClientName, DropReason, TopicName
 from sern_core.wire import framing
-from sern_core.wire.announce import MAX_STRINGS, Announcement, check_stream
+from sern_core.wire.announce import Announcement, check_stream
 from sern_core.wire.numbering import Numbering
 
 P = ParamSpec("P")
@@ -122,7 +124,6 @@ class ClientCore:
         """Errors of ours so far that nobody expects."""
         self.peers = Peers()
         """The clients whose streams this one takes, and whether they are there."""
-        self.patterns: tuple[str, ...] = ()
         self.attributes: dict[str, str] = {}
         """Metadata of this node, for the object registry."""
         self._numbering = Numbering()  # of topics that were offered before
@@ -148,6 +149,8 @@ class ClientCore:
             now=now,
             lossless=lossless,
         )
+        self.subscription = Subscription(self.link.control)
+        self.objects = OwnObjects(self.link.control)
         self.link.housekeeping.on_tidy = self._tidy
         self.link.receiver.on_stray = self.received.stray
         if coder is not None:
@@ -222,61 +225,16 @@ class ClientCore:
 
     def subscribe(self, patterns: tuple[str, ...], *, now: float) -> None:
         """Full-match patterns of the global names this site wants; replaces the earlier ones."""
-        self.patterns = patterns
+        self.subscription.patterns = patterns
         self._tell(self.peers.subscribed, patterns, now=now)
         if self.link.established:
-            self._send_subscription(now)
-
-    def _send_subscription(self, now: float, known: Sequence[ClientName] = ()) -> None:
-        """`known`: of whom the relay is asked whether they are here."""
-        for start in range(0, len(known), MAX_STRINGS):
-            names = list(known[start : start + MAX_STRINGS])
-            self.link.control.send({"t": "subscribe", "patterns": [], "more": True, "known": names}, now=now)
-        parts = [self.patterns[i : i + MAX_STRINGS] for i in range(0, len(self.patterns), MAX_STRINGS)] or [()]
-        batch: list[str] = []
-        for part in parts:
-            for pattern in part:
-                # An envelope holds 4 KiB: long patterns travel in more parts.
-                if sum(len(item) + 4 for item in batch) + len(pattern) > framing.MAX_ENVELOPE_BYTES // 2:
-                    self.link.control.send({"t": "subscribe", "patterns": batch, "more": True}, now=now)
-                    batch = []
-                batch.append(pattern)
-            if part is not parts[-1]:
-                self.link.control.send({"t": "subscribe", "patterns": batch, "more": True}, now=now)
-                batch = []
-        self.link.control.send({"t": "subscribe", "patterns": batch, "more": False, "peers": True}, now=now)
+            self.subscription.send(now)
 
     def look_at_peers(self, *, now: float) -> list[PeerView]:
         """Who is there of those whose streams we take, by name. Call about once a second: that the own link has fallen
         silent is found here."""
         self.peers.reached(self.link.observe(now=now).up, now=now)
         return self.peers.look(now=now)
-
-    def put_object(
-        self,
-        object_id: str,
-        kind: ObjectKind,
-        type_name: str,
-        *,
-        wall_ns: int,
-        now: float,
-        attributes: dict[str, str] | None = None,
-        value: bytes = b"",
-    ) -> None:
-        """Create or replace a cross-reality object of ours at the relay (node metadata, a transform, a patch)."""
-        envelope: framing.Envelope = {
-            "t": "object",
-            "op": "put",
-            "id": object_id,
-            "kind": str(kind),
-            "type": type_name,
-            "attr": dict(attributes or {}),
-            "wall": wall_ns,
-        }
-        self.link.control.send(envelope, value, now=now)
-
-    def delete_object(self, object_id: str, *, now: float) -> None:
-        self.link.control.send({"t": "object", "op": "delete", "id": object_id}, now=now)
 
     # --- errors of ours -------------------------------------------------------------------------------------------
 
@@ -303,7 +261,7 @@ class ClientCore:
             for identity, cache in self._latched.items():
                 link.outgoing.prime(link.outgoing.by_stream[identity], cache.replay(), now=now)
         self.peers.session_began(now=now)
-        self._send_subscription(now, self.peers.asked())
+        self.subscription.send(now, self.peers.asked())
         self._tell(self.events.link_up, resumed=resumed)
 
     def on_down(self, link: Link, reason: str, *, now: float) -> None:

@@ -155,7 +155,7 @@ class RefusingCore:
     """A core that keeps what could not be published, and counts how often it is to try again."""
 
     def __init__(self) -> None:
-        self.patterns: tuple[str, ...] = ()
+        self.subscription = SimpleNamespace(patterns=())
         self.refused = {stream(POSE).id}
         self.opened: set[StreamId] = set()
         self.again = 0

@@ -108,7 +108,7 @@ class Visits:
         odd.publish(f"/robot0/stolen{self.day}", spec(reliable=True))
         odd.publish("/tf", spec(many_writers=True))
         for object_id in (f"/{robot.name}/o{self.day}@{robot.name}", f"node:{robot.name}", "node:other", "forbidden"):
-            robot.core.put_object(
+            robot.core.objects.put(
                 object_id, ObjectKind.NODE, "a", attributes={"a": "b"}, value=b"x" * 100, wall_ns=0, now=robot.now
             )
         world.run(1.0)

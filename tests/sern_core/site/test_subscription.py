@@ -1,0 +1,63 @@
+"""What a site wants, as envelopes."""
+
+from typing import Any
+
+from sern_core.site.own_objects import OwnObjects
+from sern_core.site.subscription import Subscription
+from sern_core.vocabulary.types import ClientName, ObjectKind
+from sern_core.wire import framing
+from sern_core.wire.announce import MAX_STRINGS
+
+
+class Control:
+    """Keeps what is sent, and sees that it can be."""
+
+    def __init__(self) -> None:
+        self.sent: list[tuple[framing.Envelope, bytes]] = []
+
+    def send(self, envelope: framing.Envelope, attachment: bytes = b"", *, now: float) -> int:
+        assert len(framing.encode_envelope(envelope)) <= framing.MAX_ENVELOPE_BYTES
+        self.sent.append((envelope, attachment))
+        return len(self.sent)
+
+
+def subscribed(patterns: tuple[str, ...], known: tuple[str, ...] = ()) -> list[dict[str, Any]]:
+    control: Any = Control()
+    subscription = Subscription(control)
+    subscription.patterns = patterns
+    subscription.send(0.0, [ClientName(name) for name in known])
+    return [envelope for envelope, _ in control.sent]
+
+
+def test_few_patterns_go_in_one_envelope_that_is_the_last() -> None:
+    assert subscribed(("/a/.*", "/b/.*")) == [
+        {"t": "subscribe", "patterns": ["/a/.*", "/b/.*"], "more": False, "peers": True}
+    ]
+    assert subscribed(()) == [{"t": "subscribe", "patterns": [], "more": False, "peers": True}]
+
+
+def test_many_and_long_ones_go_in_several_whole_and_in_order() -> None:
+    for patterns in (
+        tuple(f"/robot{number}/.*" for number in range(3 * MAX_STRINGS + 1)),
+        tuple(f"/{'x' * 900}{number}" for number in range(20)),
+    ):
+        parts = subscribed(patterns)
+        assert tuple(pattern for part in parts for pattern in part["patterns"]) == patterns
+        assert [part["more"] for part in parts] == [True] * (len(parts) - 1) + [False]
+        assert all(len(part["patterns"]) <= MAX_STRINGS for part in parts) and len(parts) > 1
+
+
+def test_who_is_asked_after_goes_first() -> None:
+    first, last = subscribed(("/a",), ("robot1", "robot2"))
+    assert first == {"t": "subscribe", "patterns": [], "more": True, "known": ["robot1", "robot2"]}
+    assert last["patterns"] == ["/a"] and not last["more"]
+
+
+def test_an_object_is_put_with_its_value_and_deleted_by_its_id() -> None:
+    control: Any = Control()
+    objects = OwnObjects(control)
+    objects.put("node", ObjectKind.NODE, "sern/node", wall_ns=5, now=0.0, attributes={"a": "b"}, value=b"v")
+    objects.delete("node", now=0.0)
+    (put, value), (deleted, _) = control.sent
+    assert put["id"] == "node" and put["attr"] == {"a": "b"} and put["wall"] == 5 and value == b"v"
+    assert deleted == {"t": "object", "op": "delete", "id": "node"}
