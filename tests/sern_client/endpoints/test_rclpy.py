@@ -214,6 +214,7 @@ def graph(monkeypatch: pytest.MonkeyPatch) -> Graph:
             "DurabilityPolicy": Durability,
         },
     }
+    monkeypatch.delitem(sys.modules, "sern_client.endpoints.rclpy.executor", raising=False)  # of another test's rclpy
     for name, content in modules.items():
         module = ModuleType(name)
         vars(module).update(content)
@@ -495,6 +496,15 @@ async def test_services_only_leaves_topics_alone(graph: Graph) -> None:
     with pytest.raises(ConfigError, match="services_only"):
         endpoint.advertise(ros_types.topic_info(CHAT, STRING, Encoding.CDR))
     await endpoint.stop()
+
+
+async def test_what_is_to_be_done_of_a_response_is_done_at_once(graph: Graph) -> None:
+    from sern_client.endpoints.rclpy.executor import Executor
+
+    done: list[tuple[int, int]] = []
+    executor: Any = Executor(context=sys.modules["rclpy.context"].Context())
+    assert executor.create_task(lambda one, two: done.append((one, two)), 1, two=2) is None
+    assert done == [(1, 2)]
 
 
 async def test_a_callback_that_fails_is_said_once_and_an_executor_that_ends_ends_the_domain(
