@@ -6,6 +6,7 @@ from typing import Protocol
 from sern_core.bodies.codecs import Coder
 from sern_core.relay.hub import Hub
 from sern_relay.feed import RelayFeed
+from sern_relay.readers import Readers
 from sern_relay.reload_state import ReloadState
 from sern_relay.server import RelayServer
 from sern_relay.transforms import TransformObjects
@@ -13,7 +14,7 @@ from sern_runtime.adaptation import Adaptation
 from sern_runtime.collector import CollectorWatch
 from sern_runtime.datagram_watch import DatagramWatch
 from sern_runtime.internal_errors import InternalErrors
-from sern_runtime.link_metrics import AgeHistograms, register_codecs, register_links, register_received
+from sern_runtime.link_metrics import register_codecs, register_links, register_received
 from sern_runtime.metrics import Metrics
 from sern_runtime.optional import OptionalParts
 from sern_runtime.zap import ZapHandler
@@ -24,7 +25,6 @@ class Counting(Protocol):
 
     hub: Hub
     datagrams: DatagramWatch
-    ages: AgeHistograms
     coder: Coder
     errors: InternalErrors
     collector: CollectorWatch
@@ -32,8 +32,7 @@ class Counting(Protocol):
     adaptation: Adaptation | None
     server: RelayServer | None
     zap: ZapHandler | None
-    feed: RelayFeed | None
-    transforms: TransformObjects | None
+    readers: Readers
     reloads: ReloadState
 
     @property

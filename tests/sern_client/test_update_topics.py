@@ -120,13 +120,13 @@ async def test_a_bridge_subscribes_as_grids_come_and_go(tmp_path: Any, monkeypat
     wholes = [of(stream(number).topic, GRID_TYPE, number) for number in range(3)]
     for whole in wholes:
         bridge.stream_opened(whole)
-    await until(lambda: core.patterns == ("/evil/.*/map", updates(0), updates(1), updates(2)))
+    await until(lambda: core.subscription.patterns == ("/evil/.*/map", updates(0), updates(1), updates(2)))
     changes = of(updates(1), UPDATE_TYPE, 1)
     bridge.stream_opened(changes)
     assert +endpoint.publishers == {whole.info.name: 1 for whole in wholes}, "updates are for the grids alone"
     for each in (*wholes, changes):
         bridge.stream_closed(each)
-    await until(lambda: core.patterns == ("/evil/.*/map",))
+    await until(lambda: core.subscription.patterns == ("/evil/.*/map",))
     assert shell.faults == []
     bridge.close()
     await endpoint.stop()
