@@ -97,8 +97,8 @@ def programs() -> Iterator[Programs]:
 
 
 def feed_of(relay: RelayDaemon) -> RelayFeed:
-    assert relay.feed is not None
-    return relay.feed
+    assert relay.readers.feed is not None
+    return relay.readers.feed
 
 
 def counters(relay: RelayDaemon) -> InjectCounters:

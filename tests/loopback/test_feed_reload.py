@@ -68,7 +68,7 @@ async def comes(socket: "zmq.Socket[bytes]", frame: bytes) -> None:
 async def test_the_first_role_of_a_relay_may_come_and_the_last_may_go(tmp_path: Path, programs: Programs) -> None:
     async with Lab(tmp_path, "jackal1") as lab:
         relay = await lab.relay()
-        assert relay.feed is None
+        assert relay.readers.feed is None
         robot = await lab.connected(lab.client_file("jackal1", ROBOT))
         await until(lambda: sends(robot) is False, "nobody wants its odometry")
         subscriber = programs.subscriber(b"")
@@ -77,7 +77,7 @@ async def test_the_first_role_of_a_relay_may_come_and_the_last_may_go(tmp_path: 
             await comes(subscriber, FRAME)
             reload(lab, relay)
             await until(lambda: sends(robot) is False, "it sends for nobody any more")
-            await until(lambda: relay.feed is None, "the feed is gone")
+            await until(lambda: relay.readers.feed is None, "the feed is gone")
         await lab.end(robot)
         await lab.end(relay)
 
@@ -87,7 +87,10 @@ async def test_what_a_role_may_see_is_told_to_the_robots(tmp_path: Path, program
         relay = await lab.relay(lab.relay_file(feed={"roles": [programs.role(**VIEWER, subscribe=["/hello"])]}))
         robot = await lab.connected(lab.client_file("jackal1", ROBOT))
         subscriber = programs.subscriber(b"")
-        await until(lambda: relay.feed is not None and relay.feed.feed.prefixes()["viewer"] == (b"",), "subscribed")
+        await until(
+            lambda: relay.readers.feed is not None and relay.readers.feed.feed.prefixes()["viewer"] == (b"",),
+            "subscribed",
+        )
         await until(lambda: sends(robot) is False, "nobody may see its odometry")
         reload(lab, relay, programs.role(**VIEWER, subscribe=["/jackal1/.*"]))
         await comes(subscriber, FRAME)
@@ -163,14 +166,14 @@ async def test_an_endpoint_that_is_in_use_is_taken_when_it_is_free(
         other = programs.role(**VIEWER | {"name": "other"}, publish_endpoint=f"tcp://127.0.0.1:{free}")
         with socketlib.create_server(("127.0.0.1", programs.publish_port)):
             reload(lab, relay, viewer, other)
-            assert relay.feed is not None
-            assert list(relay.feed.feed.endpoints()) == ["other"], "what can be had is in force"
+            assert relay.readers.feed is not None
+            assert list(relay.readers.feed.feed.endpoints()) == ["other"], "what can be had is in force"
             for _ in range(3):
                 relay._retry_feed(clock.now())
-            assert list(relay.feed.feed.endpoints()) == ["other"]
+            assert list(relay.readers.feed.feed.endpoints()) == ["other"]
             assert "not all of feed.roles are in force" in relay._status()
         await comes(programs.subscriber(b""), FRAME)
-        assert set(relay.feed.feed.endpoints()) == {"viewer", "other"}
+        assert set(relay.readers.feed.feed.endpoints()) == {"viewer", "other"}
         assert "in force" not in relay._status()
         assert relay.reloads.failures == 1
         assert caplog.text.count("not all of them are in force") == 1

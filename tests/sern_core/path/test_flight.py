@@ -72,7 +72,7 @@ def test_after_one_came_late_the_next_has_as_long_to_come_and_a_quarter_more() -
     subject.acked(13, 0b11, now=0.25)  # 13, 12, 11; 10 is behind
     assert subject.lost(now=0.25) == []
     deadline_s = subject.loss_deadline()
-    assert deadline_s == pytest.approx(0.25 + 1.25 * 0.02, abs=1e-5)
+    assert deadline_s is not None and deadline_s == pytest.approx(0.25 + 1.25 * 0.02, abs=1e-5)
     assert subject.lost(now=0.26) == []
     assert [p.number for p in subject.lost(now=deadline_s)] == [10]
     valid(subject)
