@@ -246,7 +246,7 @@ def test_a_stall_is_found_and_probed_with_fresh_poses_and_the_first_after_it_is_
     probes = list(tap.of(pose))
     assert 49 <= len({probe.seq for probe in probes}) <= 51, "one every 100 ms"
     first_at_s = {probe.seq: probe.at_s for probe in reversed(probes)}  # a copy may follow
-    assert all(at_s - robot.sent["/robot/odom", seq][0] < 0.021 for seq, at_s in first_at_s.items())
+    assert all(at_s - robot.sent["/robot/odom", seq][0] < 0.041 for seq, at_s in first_at_s.items())
     assert not list(tap.of(cloud)), "nothing else"
     world.run(4.0)
     came_back_s = world.network.start_s + 15.0

@@ -24,7 +24,7 @@ CORE = [
     for name in (
         "wire/announce.py",
         "link/answers.py",
-        "site/client.py",
+        "site/client.py", "site/subscription.py", "site/own_objects.py",
         "link/streams_in.py",
         "link/streams_out.py",
         "relay/hub.py",
