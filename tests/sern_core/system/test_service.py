@@ -238,15 +238,15 @@ def test_a_stall_is_found_and_probed_with_fresh_poses_and_the_first_after_it_is_
     world.run(2.0)
     robot.every(0.02, pose, bytes(100))
     robot.every(0.05, cloud, bytes(10_000))
-    world.run(5.0)
+    world.run(5.01)  # not between a probe and its copy
     link = robot.core.link
     assert [link.lane.stalled, link.lane.estimator.rate_bps] == [True, None]
     tap = Tap(robot)
-    world.run(5.0)
+    world.run(4.99)
     probes = list(tap.of(pose))
     assert 49 <= len({probe.seq for probe in probes}) <= 51, "one every 100 ms"
     first_at_s = {probe.seq: probe.at_s for probe in reversed(probes)}  # a copy may follow
-    assert all(at_s - robot.sent["/robot/odom", seq][0] < 0.041 for seq, at_s in first_at_s.items())
+    assert all(at_s - robot.sent["/robot/odom", seq][0] < 0.021 for seq, at_s in first_at_s.items())
     assert not list(tap.of(cloud)), "nothing else"
     world.run(4.0)
     came_back_s = world.network.start_s + 15.0
