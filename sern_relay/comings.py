@@ -13,7 +13,7 @@ _log: Final = logging.getLogger(__name__)
 
 
 class Comings:
-    """Call `look` about once a second."""
+    """Says of each client when it comes, goes, or falls silent. Call `look` about once a second."""
 
     def __init__(self) -> None:
         self._away_since_s: dict[ClientName, float] = {}

@@ -462,7 +462,7 @@ class RelayDaemon:
 
     def stream_added(self, stream: StreamInfo) -> None:
         _log.info("%s announces %s (%s)", stream.id.origin, stream.id.topic, stream.info.type_name)
-        self.readers.stream_added()
+        self.readers.owners_changed()
 
     def stream_removed(self, stream: StreamInfo) -> None:
         _log.info("%s of %s has ended", stream.id.topic, stream.id.origin)

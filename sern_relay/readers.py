@@ -19,8 +19,8 @@ _log: Final = logging.getLogger(__name__)
 
 
 class Readers:
-    """Each message of the hub is handed to them decoded, in its turn. What fails in one of them is that one's alone: no
-    client waits for it. `feed` and `transforms` are whoever's who makes them; None: there is none."""
+    """Hands each message of the hub to them, decoded and in its turn. What fails in one of them costs neither the other
+    one nor a client anything. The owner sets `feed` and `transforms`; None: there is none."""
 
     def __init__(self, coder: Coder, parts: OptionalParts, errors: InternalErrors) -> None:
         self.ages = AgeHistograms()
@@ -42,15 +42,12 @@ class Readers:
         except Exception as error:  # noqa: BLE001  (none of it is needed for the message's own way)
             self._parts.failed("metrics", error)
 
-    def stream_added(self) -> None:
-        self._owners_changed()
-
     def stream_removed(self, stream: StreamInfo) -> None:
         self._decoder.forget(stream.id, now=clock.now())
         if self.transforms is not None:
             with self._parts.survive("objects"):
                 self.transforms.stream_removed(stream)
-        self._owners_changed()
+        self.owners_changed()
 
     def close(self) -> None:
         """Close what there is, the last made first, also when one fails."""
@@ -61,7 +58,8 @@ class Readers:
             if self.feed is not None:
                 self.feed.close()
 
-    def _owners_changed(self) -> None:
+    def owners_changed(self) -> None:
+        """A stream has come or gone, and so may have who owns a topic."""
         if self.feed is not None:
             with self._parts.survive("feed"):
                 self.feed.owners_changed()

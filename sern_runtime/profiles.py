@@ -60,7 +60,7 @@ class LinkSection(Section):
     reorder: float = 0.0
     """Probability that a packet is held back, or overtakes those before it where `reorder_delay_s` is 0."""
     reorder_delay_s: float = 0.0
-    """For how long it is held back."""
+    """How long it is held back."""
     duplicate: float = 0.0
     """Probability that a packet arrives twice."""
     queue_packets: int = LinkModel().queue_packets

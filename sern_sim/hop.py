@@ -33,7 +33,7 @@ class Hop:
         self._on_break = on_break
         self.connected = False
         self.generation = 0
-        """Of the connection; scheduled attempts and breaks of an older one are void."""
+        """Number of the connection; attempts and breaks that were scheduled for an older one are void."""
         self.wait_ns = 0
         """How long the path must be there before it connects."""
 

@@ -127,6 +127,7 @@ class Flight:
                     by_class[priority] = packet.number
         if not packets:
             self.waiting_since_s = None
+            self._passed_due_s = inf
         if self._given_up:
             self._look_for_late(highest, sack, now)
         return result

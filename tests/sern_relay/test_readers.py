@@ -64,7 +64,7 @@ def test_what_fails_in_one_is_counted_and_the_other_has_its_message(broken: str)
     transforms, feed = Reader(raises=broken == "transforms"), Reader(raises=broken == "feed")
     readers, parts, stream = reading(transforms, feed)
     readers.message(stream, message(stream, 1), now=1.0)
-    readers.stream_added()
+    readers.owners_changed()
     readers.stream_removed(stream)
     whole, part = (feed, "objects") if broken == "transforms" else (transforms, "feed")
     assert whole.got == [b"body"] and parts.failures[part] >= 1

@@ -26,6 +26,7 @@ Theory of operation
     then the window follows CUBIC (RFC 9438) until a drain finds the queue gone.
     *Silence* (`on_stall`) ends with the first acknowledgement: what was sent into it says nothing of the path, so
     start-up begins there once more.
+    *Order.* A packet that overtook others, sooner than any could come, had a way of its own: it says nothing of q.
     *Loss* alone changes nothing (radio): it counts only against a rival, and when a fifth is lost in start-up.
 """
 

@@ -13,7 +13,7 @@ SOONER_SUM: Final = 1.8
 """... and so much together, one after the other, is believed: jitter makes one packet in five come sooner than the
 least delay that is gone by."""
 SOONER_TIMES: Final = 2.0
-"""Of more one is not sure: the least delay may have been that of a short queue."""
+"""The window grows by no more at once: the least delay may have been that of a short queue."""
 HOLD_S: Final = 1.0
 HOLD_RTTS: Final = 4
 """After anything else than steering a queue may have gone, which the least delay is not free of at once."""

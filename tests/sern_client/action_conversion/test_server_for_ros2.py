@@ -543,7 +543,7 @@ def _count(*names: str) -> Counter[TopicName]:
     )
 )
 def test_whatever_comes_stops_nothing(said: list[tuple[str, bytes]]) -> None:
-    """Nor what may begin as it should; and every call is answered."""
+    """Every call is answered, also where it begins as it should."""
 
     async def play() -> None:
         with TemporaryDirectory() as place:

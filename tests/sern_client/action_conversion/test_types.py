@@ -84,7 +84,7 @@ def test_the_action_of_a_service_of_ros_2(type_name: str, end: str, action: str 
 
 
 def test_the_topics_of_ros_1_are_those_that_actionlib_makes(tmp_path: Path) -> None:
-    """Of actionlib/Test, whose messages every installation of ROS 1 has, rosbags too."""
+    """actionlib/Test is the example: every installation of ROS 1 has its messages, rosbags too."""
     found = types_of(
         "actionlib/Test", files(tmp_path, actionlib__Test="int32 goal\n---\nint32 result\n---\nint32 feedback\n")
     )

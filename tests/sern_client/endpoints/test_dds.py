@@ -268,7 +268,7 @@ def test_definitions_by_hash(tmp_path: Path) -> None:
 
 
 def test_definitions_of_what_is_installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of what is sourced and, where its hash is another, of an installation beside it; types_paths come before both."""
+    """What is sourced comes before an installation beside it, unless its hash is another; type_paths before both."""
     texts = {"sourced": "int8 a\n", "jazzy": "int8 b\n", "own": "int8 c\n"}
     for name, text in texts.items():
         folder = tmp_path / name / "share" / "robot_msgs" / "msg"

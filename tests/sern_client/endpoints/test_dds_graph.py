@@ -112,7 +112,7 @@ def test_node_information() -> None:
 
 
 def test_node_information_of_before_iron() -> None:
-    """As Humble writes it: ids of 24 bytes, of which the last eight are zeros."""
+    """Humble writes ids of 24 bytes, of which the last eight are zeros."""
 
     def old(guid: UUID) -> bytes:
         return guid.bytes + bytes(8)

@@ -80,7 +80,7 @@ class Graph:
         self.publishers.setdefault(topic, []).append((node, type_name, profile))
 
     def types(self) -> dict[str, list[str]]:
-        """Of the publishers of each topic."""
+        """Types of the publishers of each topic."""
         return {name: [kind for _, kind, _ in offers] for name, offers in self.publishers.items()}
 
     # rclpy.node.Node
