@@ -2,31 +2,40 @@
 
 from typing import Any
 
+from sern_core.link.control_stream import ControlStream
+from sern_core.link.end import End
 from sern_core.site.own_objects import OwnObjects
 from sern_core.site.subscription import Subscription
+from sern_core.stream.in_stream import Reassembly
+from sern_core.vocabulary.params import LinkParams
+from sern_core.vocabulary.trace import DecisionTrace
 from sern_core.vocabulary.types import ClientName, ObjectKind
 from sern_core.wire import framing
 from sern_core.wire.announce import MAX_STRINGS
 
 
-class Control:
-    """Keeps what is sent, and sees that it can be."""
+class Session:
+    """The control stream of a session that is there, and what was said over it."""
 
     def __init__(self) -> None:
-        self.sent: list[tuple[framing.Envelope, bytes]] = []
+        end = End(
+            name=ClientName("site"), boot=1, peer=ClientName("relay"), initiator=True, params=LinkParams(),
+            trace=DecisionTrace(enabled=False), now=0.0,
+        )  # fmt: skip
+        end.established = True
+        self.control = ControlStream(end, Reassembly(2**20, end.params.limits), lambda _message: None)
 
-    def send(self, envelope: framing.Envelope, attachment: bytes = b"", *, now: float) -> int:
-        assert len(framing.encode_envelope(envelope)) <= framing.MAX_ENVELOPE_BYTES
-        self.sent.append((envelope, attachment))
-        return len(self.sent)
+    @property
+    def said(self) -> list[tuple[framing.Envelope, bytes]]:
+        return [framing.decode_control(out.message.body) for out in self.control.out.queue]
 
 
 def subscribed(patterns: tuple[str, ...], known: tuple[str, ...] = ()) -> list[dict[str, Any]]:
-    control: Any = Control()
-    subscription = Subscription(control)
+    session = Session()
+    subscription = Subscription(session.control)
     subscription.patterns = patterns
     subscription.send(0.0, [ClientName(name) for name in known])
-    return [envelope for envelope, _ in control.sent]
+    return [envelope for envelope, _ in session.said]
 
 
 def test_few_patterns_go_in_one_envelope_that_is_the_last() -> None:
@@ -54,10 +63,10 @@ def test_who_is_asked_after_goes_first() -> None:
 
 
 def test_an_object_is_put_with_its_value_and_deleted_by_its_id() -> None:
-    control: Any = Control()
-    objects = OwnObjects(control)
+    session = Session()
+    objects = OwnObjects(session.control)
     objects.put("node", ObjectKind.NODE, "sern/node", wall_ns=5, now=0.0, attributes={"a": "b"}, value=b"v")
     objects.delete("node", now=0.0)
-    (put, value), (deleted, _) = control.sent
+    (put, value), (deleted, _) = session.said
     assert put["id"] == "node" and put["attr"] == {"a": "b"} and put["wall"] == 5 and value == b"v"
     assert deleted == {"t": "object", "op": "delete", "id": "node"}
