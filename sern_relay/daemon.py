@@ -232,10 +232,10 @@ class RelayDaemon:
 
     def _flush(self) -> None:
         self._flush_due = None
+        if self.lanes is not None:  # first: where there is one it has the messages
+            self.lanes.flush()
         if self.server is not None:
             self.server.flush()
-        if self.lanes is not None:
-            self.lanes.flush()
 
     async def _tick(self) -> None:
         progress = {"socket": lambda: self.server.socket.drains if self.server else 0}

@@ -155,10 +155,19 @@ class RelayLanes:
         )
 
     def flush(self) -> None:
-        """Let every lane that has something to say say it."""
+        """Let every lane that has something to say say it: first those with messages, which somebody waits for, then
+        those that only acknowledge."""
+        patient: list[Pump] = []
         for session, pump in self._lanes.values():
-            if self.hub.links[session.client].dirty:
+            link = self.hub.links[session.client]
+            if not link.dirty:
+                continue
+            if link.sender.pending:
                 pump.kick()
+            else:
+                patient.append(pump)
+        for pump in patient:
+            pump.kick()
 
     def _received(self, session: UdpSession, data: bytes, now: float) -> None:
         link = self.hub.links.get(session.client)

@@ -7,6 +7,7 @@ all of that. Both name no quality of service but a depth of 10. Both publish one
     sern-chain       what a user runs: sern-client, sern-relay, sern-client (CURVE) from one domain to another, with the
                      endpoints of the shipped Jazzy files: topics through dds, services and actions through rclpy
     sern-in-process  two dds endpoints in one process: topics alone, from one domain to the other
+    bare rclpy       the least that a bridge in rclpy can be: one process in both domains, without link, queues and keys
 
 Needs the environment that tests/peers/ros2/setup makes. CPU is that of all processes in between.
 """
@@ -37,7 +38,8 @@ LATE_S: Final = 2.0
 RATES_HZ: Final = {"odom": 50.0, "cloud": 5.0}
 TALK_HZ: Final = 20.0
 CALLS, QUICK_CALLS = 200, 30
-SYSTEMS: Final = (DIRECT, CHAIN, ALONE)
+BARE: Final = "bare rclpy"
+SYSTEMS: Final = (DIRECT, CHAIN, ALONE, BARE)
 CASE: Final = "ros2 50 Hz, then 5 MB/s"
 ROLES: Final = Path(__file__).with_name("ros2_roles.py")
 LAMP, FIBONACCI = "/bench/lamp", "/bench/fibonacci"
@@ -61,12 +63,12 @@ class End:
                 return answer
 
 
-async def _end(children: Children, role: str, domain: int, sourced: Mapping[str, str]) -> End:
+async def _role(children: Children, role: str, *domains: int, sourced: Mapping[str, str]) -> Child:
     process = await children.start(
-        role, [sys.executable, "-P", str(ROLES), role, str(domain)], talks=True, environment=dict(sourced)
+        role, [sys.executable, "-P", str(ROLES), role, *map(str, domains)], talks=True, environment=dict(sourced)
     )
-    await children.within(said(process, "ready"), START_S, f"the node {role} was not ready")
-    return End(process)
+    await children.within(said(process, "ready"), START_S, f"{role} was not ready")
+    return process
 
 
 async def _between(
@@ -75,6 +77,8 @@ async def _between(
     if system == ALONE:
         command = python("-m", "benchmarks.endpoints.dds_roles", "bridge", str(source), str(target))
         return [await children.start("bridge", command, environment=child.environment())]
+    if system == BARE:
+        return [await _role(children, "bridge", source, target, sourced=sourced)]
     if system == DIRECT:
         return []
     endpoints = {
@@ -147,8 +151,8 @@ async def _through(
 ) -> Figures:
     source_domain = free_domain()
     target_domain = source_domain if system == DIRECT else free_domain()
-    source = await _end(children, "source", source_domain, sourced)
-    sink = await _end(children, "sink", target_domain, sourced)
+    source = End(await _role(children, "source", source_domain, sourced=sourced))
+    sink = End(await _role(children, "sink", target_domain, sourced=sourced))
     pids = [each.process.pid for each in await _between(children, system, source_domain, target_domain, sourced)]
 
     async def matched() -> None:
@@ -158,7 +162,7 @@ async def _through(
     await children.within(matched(), START_S, "the nodes did not find each other")
     await asyncio.sleep(2.0)  # the topic of both is wanted a moment after it is there
     before_s, began_s = cpu_s(*pids), time.monotonic()
-    found = await _topics(source, sink, measure_s, both_ways=system != ALONE)
+    found = await _topics(source, sink, measure_s, both_ways=system in (DIRECT, CHAIN))
     cpu_percent = 100 * (cpu_s(*pids) - before_s) / (time.monotonic() - began_s)
     if system != ALONE:
         found |= await _services(sink, calls)
@@ -189,6 +193,7 @@ def bench(options: argparse.Namespace, report: common.Report) -> None:
     found = shared.bench_rounds(report, CASE, runs, options.rounds)
     report.note("ros2: rclpy nodes of Jazzy, rmw_fastrtps, default quality of service, on this host")
     ours = found.figures(CHAIN)
+    beside_bare = []
     for metric, limit in (
         ("odom_p50_ms", 2.5),
         ("odom_p99_ms", 3.0),
@@ -197,6 +202,8 @@ def bench(options: argparse.Namespace, report: common.Report) -> None:
     ):
         what = metric.removesuffix("_ms").replace("_", " ")
         report.reach(f"ros2: {what}, times that of direct", found.times(CHAIN, DIRECT, metric), limit)
+        beside_bare.append(f"{what} {found.times(CHAIN, BARE, metric):.2g}")
+    report.note(f"ros2 sern-chain, times a bare bridge in rclpy: {', '.join(beside_bare)}")
     for name in ("odom", "cloud", "talk"):
         report.reach(f"ros2: {name} lost", ours[f"{name}_lost"], 0)
     report.reach("ros2: messages doubled or echoed", ours["talk_doubled"], 0)

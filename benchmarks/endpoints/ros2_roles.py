@@ -3,6 +3,12 @@
 It imports nothing of SERN. Each line of input is `{"do": ..., ...}` and is answered with one line of JSON; the first
 says that it is ready. `source` publishes and serves, `sink` listens and calls. Times are of the monotonic clock, which
 all processes of a host share; a message has the time of its publishing in its stamp.
+
+`ros2_roles.py bridge SOURCE TARGET` is the least that a bridge in rclpy can be: one process in both domains that passes
+the source's topics, calls and goals on, without a link, queues or anything that may fail.
+
+Nodes have the executor that `rclpy.spin` takes. A MultiThreadedExecutor of Jazzy at times spins on one core for as long
+as it lives: a sink with it lost 193 of 500 odometry messages of a source in its own domain, with nothing in between.
 """
 
 # mypy: ignore-errors
@@ -18,9 +24,10 @@ from collections import Counter
 
 import rclpy
 from nav_msgs.msg import Odometry
-from rclpy.action import ActionClient, ActionServer
+from rclpy.action import ActionClient, ActionServer, GoalResponse
 from rclpy.callback_groups import ReentrantCallbackGroup
-from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor
+from rclpy.context import Context
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import String
@@ -162,19 +169,68 @@ class Sink(End):
         return {"accepted_ms": accepted_ms, "feedback_ms": feedback_ms, "result_ms": result_ms}
 
 
+class Bridge:
+    """Each domain has a thread; what one waits for comes in the other's. Goals one by one."""
+
+    def __init__(self, source, target):
+        for topic, kind in ((ODOM, Odometry), (CLOUD, PointCloud2)):
+            publisher = target.create_publisher(kind, topic, DEPTH)
+            source.create_subscription(kind, topic, publisher.publish, DEPTH, raw=True)
+        calls = source.create_client(SetBool, LAMP)
+        target.create_service(SetBool, LAMP, lambda request, _response: calls.call(request))
+        self.goals = ActionClient(source, Fibonacci, FIBONACCI)
+        self.server = ActionServer(target, Fibonacci, FIBONACCI, self.execute, goal_callback=self.accept)
+
+    def accept(self, goal):
+        accepted = threading.Event()
+        self.feedback = []
+        self.given = self.goals.send_goal_async(goal, feedback_callback=self.fed)
+        self.handle = None
+        self.given.add_done_callback(lambda _: accepted.set())
+        assert accepted.wait(WAIT_S), "no answer"
+        return GoalResponse.ACCEPT if self.given.result().accepted else GoalResponse.REJECT
+
+    def fed(self, message):
+        with _lock:
+            if self.handle is None:
+                self.feedback.append(message.feedback)  # the goal is not accepted here yet
+                return
+        self.handle.publish_feedback(message.feedback)
+
+    def execute(self, handle):
+        ended = threading.Event()
+        with _lock:
+            self.handle, early = handle, self.feedback
+        for feedback in early:
+            handle.publish_feedback(feedback)
+        result = self.given.result().get_result_async()
+        result.add_done_callback(lambda _: ended.set())
+        assert ended.wait(WAIT_S), "no result"
+        handle.succeed()
+        return result.result().result
+
+
 def spin(executor):
     with contextlib.suppress(ExternalShutdownException):
         executor.spin()
 
 
-def main():
-    role, domain = sys.argv[1], int(sys.argv[2])
-    rclpy.init(domain_id=domain)
-    node = Node(role)
-    end = {"source": Source, "sink": Sink}[role](node)
-    executor = MultiThreadedExecutor(4)
+def join(role, domain):
+    """A node in a domain, and the thread that spins it, to be started when the node has all that it has."""
+    context = Context()
+    rclpy.init(domain_id=domain, context=context)
+    node = Node(role, context=context)
+    executor = SingleThreadedExecutor(context=context)
     executor.add_node(node)
-    threading.Thread(target=spin, args=(executor,), daemon=True).start()
+    return node, threading.Thread(target=spin, args=(executor,), daemon=True)
+
+
+def main():
+    role, *domains = sys.argv[1:]
+    nodes, threads = zip(*(join(role, int(domain)) for domain in domains), strict=True)
+    end = {"source": Source, "sink": Sink, "bridge": Bridge}[role](*nodes)
+    for thread in threads:
+        thread.start()
     say(ready=True)
     for line in sys.stdin:
         said = json.loads(line)
@@ -186,7 +242,6 @@ def main():
                 say(problem=f"{said['do']}: {type(error).__name__}: {error}")
 
         threading.Thread(target=work, daemon=True).start()
-    rclpy.shutdown()
 
 
 if __name__ == "__main__":
