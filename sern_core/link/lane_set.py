@@ -8,6 +8,7 @@ from sern_core.path.capacity import AckSample
 from sern_core.path.clocksync import ClockSync
 from sern_core.path.flight import Packet
 from sern_core.path.lanes import LANE_PRIORITY, LANE_UDP, LANE_ZMQ, PROVEN_ACKS, Lane
+from sern_core.path.stream_choice import StreamChoice
 from sern_core.vocabulary.errors import WireError
 from sern_core.vocabulary.trace import LINK, Field, TraceEvent
 
@@ -38,6 +39,8 @@ class LaneSet:
         self._on_rate = on_rate
         self._rate_due_s = now
         self._told_bps = 0.0
+        self._choice = StreamChoice(end.params.stream_from_bps)
+        self._choice_due_s = now
         self.clock = ClockSync()
         """The peer's clock, as the stamps of all lanes tell."""
         self.lane = Lane(LANE_ZMQ, end.params, lossless=lossless)
@@ -61,6 +64,7 @@ class LaneSet:
         lane.up = True
         lane.new_session(now)
         lane.estimator.on_reset(now=now)
+        self._choice = StreamChoice(self._end.params.stream_from_bps)
         self._rate_known(now)
 
     def forget_clock(self) -> None:
@@ -114,15 +118,28 @@ class LaneSet:
     # --- which carries what ---------------------------------------------------------------------------------------
 
     def choose(self, now: float) -> None:
-        """UDP where it works, else ZMQ; in a blackout stay, and be found by whichever lane answers first."""
+        """UDP where it works and ZMQ is not much the cheaper (`StreamChoice`), else ZMQ; in a blackout stay, and be
+        found by whichever lane answers first."""
         zmq, udp = self.stream, self.by_id.get(LANE_UDP)
         if udp is not None and udp.usable and udp.proofs >= (PROVEN_ACKS if zmq.usable else 1):
-            # What the peer was told over the stream must be there before data can overtake it.
-            if self.lane is udp or self._settled() or not zmq.usable:
-                self._use(udp, now)
+            lane = zmq if self._streams(zmq, now) else udp
+            # What the peer was told over the one must be there before data can overtake it on the other.
+            if self.lane is lane or self._settled() or not self.lane.usable:
+                self._use(lane, now)
         elif zmq.usable:
             self._use(zmq, now)
         self._choose_priority_lane(now)
+
+    def _streams(self, zmq: Lane, now: float) -> bool:
+        """Whether data goes over the stream although datagrams get through."""
+        if not zmq.lossless:
+            return False
+        if not zmq.usable:
+            self._choice.failed(now)
+        elif now >= self._choice_due_s:
+            self._choice_due_s = now + RATE_INTERVAL_S
+            self._choice.look(self.lane, now=now)
+        return self._choice.stream
 
     def _choose_priority_lane(self, now: float) -> None:
         """Class control goes beside the stream while that works; what the peer was told must be there before it."""
@@ -143,7 +160,7 @@ class LaneSet:
         if lane is old:
             return
         self.lane = lane
-        if not old.lossless or not old.usable:
+        if not old.usable:  # else it delivers what it has, or gives back what it loses
             self.recall(old, now)
         self._tell(now, TraceEvent.LANE_USED, lane=lane.name, what="data")
         self._end.dirty = True

@@ -148,6 +148,11 @@ class Flight:
             return FIRST_LOSS_TIMEOUT_S
         return max(MIN_LOSS_TIMEOUT_S, 2 * self.rtt.srtt_s + 0.030, self.rtt.rto_s)
 
+    @property
+    def oldest_s(self) -> float:
+        """When the oldest packet in flight left; inf: there is none."""
+        return next(iter(self.packets.values())).sent_s if self.packets else inf
+
     def stall_timeout_s(self) -> float:
         return max(STALL_MIN_S, STALL_RTTS * self.rtt.srtt_s) if self.rtt.samples else FIRST_STALL_S
 
@@ -186,8 +191,7 @@ class Flight:
         """When the oldest packet is lost by time alone; a hair late, so that `lost` agrees whatever the rounding."""
         if self.lossless or not self.packets:
             return None
-        oldest_s = next(iter(self.packets.values())).sent_s + self.loss_timeout_s()
-        return min(oldest_s, self._passed_due_s) + 1e-6
+        return min(self.oldest_s + self.loss_timeout_s(), self._passed_due_s) + 1e-6
 
     def abandon(self) -> list[Packet]:
         """The transport is gone: everything in flight comes back, oldest first. Numbers go on."""

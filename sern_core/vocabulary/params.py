@@ -89,6 +89,8 @@ class LinkParams:
     window: WindowParams = field(default_factory=WindowParams)
     fragment_bytes_max: int = 65_000
     """Fragments on the ZMQ lane are clamp(3 ms · B, 1200, this)."""
+    stream_from_bps: float = 40e6
+    """Data takes the ZMQ lane though datagrams pass while they carry so much over a short, clean path; inf: never."""
     heartbeat_timeout_s: float = 5.0
     """A peer that says nothing for so long is gone; its connection is closed and rebuilt."""
     retention_s: float = DEFAULT_RETENTION_S
@@ -103,6 +105,7 @@ class LinkParams:
     def __post_init__(self) -> None:
         for name, ok in (
             ("fragment_bytes_max", self.fragment_bytes_max >= 1200),
+            ("stream_from_bps", self.stream_from_bps > 0.0),
             ("heartbeat_timeout_s", 0.0 < self.heartbeat_timeout_s < float("inf")),
             ("retention_s", 0.0 < self.retention_s < float("inf")),
             ("max_message_bytes", self.max_message_bytes >= 1),

@@ -4,6 +4,7 @@ import os
 import time
 from collections.abc import Iterator
 from enum import StrEnum
+from math import inf
 from pathlib import Path
 from typing import Annotated, Literal, get_args
 
@@ -124,6 +125,10 @@ class LinkSection(Section):
     """The window of bytes in flight."""
     fragment_bytes_max: Annotated[int, Field(ge=1200, le=65_000)] = _LINK.fragment_bytes_max
     """Largest fragment; the size used is what the link carries in 3 ms, at least 1200."""
+    stream_from_bps: Annotated[float, Field(gt=0)] | None = _LINK.stream_from_bps
+    """While datagrams carry so many bits per second, lose nothing, and take at most 30 ms there and back, data goes
+    over TCP in large pieces, which cost a fraction of the CPU, and back to datagrams when the path gets thin or stands
+    still. null: data stays with the datagrams."""
     heartbeat_timeout_s: Annotated[float, Field(ge=0.5, le=600)] = _LINK.heartbeat_timeout_s
     """A peer that is silent for so long is gone, and its connection is rebuilt. Satellite links need more than 2 s."""
     retention_s: Seconds = _LINK.retention_s
@@ -143,6 +148,7 @@ class LinkSection(Section):
         return LinkParams(
             window=self.window.params(),
             fragment_bytes_max=self.fragment_bytes_max,
+            stream_from_bps=inf if self.stream_from_bps is None else self.stream_from_bps,
             heartbeat_timeout_s=self.heartbeat_timeout_s,
             retention_s=self.retention_s,
             redundancy=self.redundancy,

@@ -1,5 +1,7 @@
 """Two lanes under one session: which carries data, what a lost lane costs, and how a session outlives its stream."""
 
+from dataclasses import replace
+
 import pytest
 
 from sern_core.link.lane_port import LanePort
@@ -10,7 +12,7 @@ from sern_core.vocabulary.params import LinkParams, Redundancy
 from sern_core.vocabulary.types import ClientName, PriorityClass
 from sern_core.wire import framing
 from sern_sim.hop import Hop
-from sern_sim.models import LinkModel, Window
+from sern_sim.models import LinkModel, RateStep, Window
 from tests.world import SimClient, World, spec
 
 RATE_BPS = 4e6
@@ -25,8 +27,10 @@ def models(*blackouts: Window, loss: float = 0.0) -> tuple[LinkModel, LinkModel]
 class TwoLanes:
     """A robot that reaches the relay over both lanes, and a site beside the relay."""
 
-    def __init__(self, *, stream: LinkModel, datagrams: LinkModel, open_at_s: float = 1.0) -> None:
-        self.world = World()
+    def __init__(
+        self, *, stream: LinkModel, datagrams: LinkModel, open_at_s: float = 1.0, link: LinkParams | None = None
+    ) -> None:
+        self.world = World(link=link)
         self.robot = self.world.client("robot", stream)
         self.site = self.world.client("site", patterns=["/robot/.*"])
         self.hop = self._join(self.robot, datagrams)
@@ -82,6 +86,60 @@ def test_data_moves_to_the_datagram_lane_once_it_answers() -> None:
     lanes.run(9.1)
     assert lanes.core.link.lane.id == LANE_UDP
     assert lanes.hop.forward.stats.goodput_bps > 0.8 * RATE_BPS * 0.85
+    lanes.check_log()
+
+
+class ShortPath(TwoLanes):
+    """A path so short and so full that the stream is the cheaper; `slower` is its rate from 8 s on."""
+
+    def __init__(self, *, stream_loss: float = 0.0, slower_bps: float | None = None) -> None:
+        steps = () if slower_bps is None else (RateStep(8.0, slower_bps),)
+        path = LinkModel(rate_bps=8e6, delay_s=0.002, rate_steps=steps)
+        super().__init__(
+            stream=replace(path, loss=stream_loss).as_stream(), datagrams=path, link=LinkParams(stream_from_bps=3e6)
+        )
+        self.used: list[int] = []
+        self.sizes: list[int] = []
+        self.robot.port.sent = lambda data, _now: self.sizes.append(len(data))
+        self.world.network.every(0.01, self._look)
+
+    def _look(self, _now: float) -> None:
+        lane = self.core.link.lane.id
+        if not self.used or self.used[-1] != lane:
+            self.used.append(lane)
+            self.sizes.clear()
+
+    def check(self) -> None:
+        """Nothing was lost or repeated at a change: poses and log are complete, no cloud came twice."""
+        self.check_log()
+        poses = [got.seq for got in self.site.on("/robot/pose")]
+        assert poses == list(range(poses[0], poses[0] + len(poses)))
+        clouds = [got.seq for got in self.site.on("/robot/points")]
+        assert clouds == sorted(set(clouds))
+
+
+def test_much_over_a_short_clean_path_takes_the_stream_in_large_pieces() -> None:
+    lanes = ShortPath()
+    lanes.run(12.0)
+    assert lanes.used == [LANE_ZMQ, LANE_UDP, LANE_ZMQ]
+    assert lanes.core.link.lanes.by_id[LANE_UDP].usable, "datagrams would get through"
+    assert max(lanes.sizes) > 2 * DATAGRAM_BYTES
+    lanes.check()
+
+
+def test_data_is_back_with_the_datagrams_when_the_path_gets_thin() -> None:
+    lanes = ShortPath(slower_bps=0.5e6)
+    lanes.run(7.9)
+    assert lanes.used == [LANE_ZMQ, LANE_UDP, LANE_ZMQ]
+    lanes.run(12.1)
+    assert lanes.used == [LANE_ZMQ, LANE_UDP, LANE_ZMQ, LANE_UDP]
+    lanes.check_log()
+
+
+def test_a_stream_that_loses_segments_gives_the_data_back() -> None:
+    lanes = ShortPath(stream_loss=0.2)
+    lanes.run(10.0)
+    assert lanes.used == [LANE_ZMQ, LANE_UDP, LANE_ZMQ, LANE_UDP]
     lanes.check_log()
 
 
