@@ -23,7 +23,7 @@ from sern_runtime.config.client import RelayConnection
 from sern_runtime.config.shared import LinkSection
 from sern_runtime.datagram_watch import DatagramWatch
 from sern_runtime.draining import Progress
-from sern_runtime.zmq_socket import CurvePair
+from sern_runtime.zmq_setup import CurvePair
 
 PATIENCE_S: Final = 2.0
 """How long a stopping client waits, beside some round trips, for the next sign that what it still owes gets further."""

@@ -17,7 +17,8 @@ from sern_runtime.inflow import Inflow
 from sern_runtime.monitor import TcpHandle
 from sern_runtime.pump import LANE_MESSAGE_BYTES, Pump
 from sern_runtime.transport_watch import TransportWatch
-from sern_runtime.zmq_socket import HANDSHAKE_IVL_MS, CurvePair, DealerSocket, SendResult, make_client
+from sern_runtime.zmq_setup import HANDSHAKE_IVL_MS, CurvePair, make_client
+from sern_runtime.zmq_socket import DealerSocket, SendResult
 
 REBUILD_MIN_S: Final = 1.0
 REBUILD_MAX_S: Final = 30.0

@@ -21,7 +21,8 @@ from sern_runtime.dscp import Marks
 from sern_runtime.inflow import Inflow
 from sern_runtime.monitor import ConnectionTable, TcpHandle
 from sern_runtime.pump import LANE_MESSAGE_BYTES, Pump
-from sern_runtime.zmq_socket import CurvePair, RouterSocket, SendResult, make_server
+from sern_runtime.zmq_setup import CurvePair, make_server
+from sern_runtime.zmq_socket import RouterSocket, SendResult
 
 MAX_PORTS: Final = 4
 """Connections of one client for its session: the one that has it, another process under the same name, and those that

@@ -41,13 +41,8 @@ from sern_core.vocabulary.types import CLASSES, PriorityClass, TopicName
 from sern_runtime.clock import now
 from sern_runtime.feed_inflow import SUBSCRIBER_BYTES, TOLD_BYTES, FeedInflow
 from sern_runtime.feed_subscriptions import Subscriptions
-from sern_runtime.zmq_socket import (
-    BACKLOG,
-    ZERO_COPY_BYTES,
-    DrainedSocket,
-    apply_common_options,
-    bind_all,
-)
+from sern_runtime.zmq_setup import BACKLOG, apply_common_options, bind_all
+from sern_runtime.zmq_socket import ZERO_COPY_BYTES, DrainedSocket
 
 VERSION: Final = 1
 HEADER: Final = struct.Struct("!BBHIqQ")

@@ -26,7 +26,8 @@ import zmq
 
 from sern_runtime.addresses import plain_host
 from sern_runtime.clock import now
-from sern_runtime.zmq_socket import HANDSHAKE_IVL_MS, FrameSocket
+from sern_runtime.zmq_setup import HANDSHAKE_IVL_MS
+from sern_runtime.zmq_socket import FrameSocket
 
 EventKind = zmq.Event
 EVENTS: Final = int(

@@ -24,7 +24,8 @@ from zmq.utils import z85
 from sern_core.vocabulary.errors import ConfigError, SernError, UsageError
 from sern_runtime.addresses import plain_host
 from sern_runtime.monitor import EventKind, MonitorEvent, SocketMonitor
-from sern_runtime.zmq_socket import DealerSocket, FrameSocket, connect_curve
+from sern_runtime.zmq_setup import connect_curve
+from sern_runtime.zmq_socket import DealerSocket, FrameSocket
 
 ENDPOINT: Final = "inproc://zeromq.zap.01"
 SELF_TEST_TIMEOUT_S: Final = 10.0

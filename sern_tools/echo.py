@@ -41,7 +41,7 @@ from sern_runtime import clock
 from sern_runtime.config.client import RelayConnection, load_client
 from sern_runtime.config.keys import SecretKey, load_secret, load_server_keys
 from sern_runtime.loop import Shutdown, run
-from sern_runtime.zmq_socket import HANDSHAKE_IVL_MS
+from sern_runtime.zmq_setup import HANDSHAKE_IVL_MS
 from sern_tools.api import NotFoundError, checked_api, drop_output, get_json, is_stream, local_api, say
 from sern_tools.echo_text import Decoder
 

@@ -13,7 +13,7 @@ from sern_core.topics.rules import FeedRole
 from sern_core.vocabulary.types import PriorityClass, TopicName
 from sern_runtime import feed as feed_module
 from sern_runtime.feed import Feed, FeedHeader, topic_frame
-from sern_runtime.zmq_socket import bind_all
+from sern_runtime.zmq_setup import bind_all
 from tests.loopback.test_feed_subscriptions import Raw, joined, names, port_of, room_for
 from tests.support import until
 

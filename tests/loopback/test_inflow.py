@@ -10,7 +10,8 @@ import zmq
 
 from sern_runtime.inflow import LIMIT_BYTES, TRIM_AFTER_S, Inflow, Trimmer
 from sern_runtime.monitor import ConnectionTable, TcpHandle
-from sern_runtime.zmq_socket import SKIP_FRAMES, DealerSocket, FrameSocket, RouterSocket, make_client, make_server
+from sern_runtime.zmq_setup import make_client, make_server
+from sern_runtime.zmq_socket import SKIP_FRAMES, DealerSocket, FrameSocket, RouterSocket
 from tests.support import DEADLINE_S, until
 
 Context = zmq.Context[zmq.Socket[bytes]]

@@ -23,7 +23,8 @@ from sern_runtime.monitor import (
 )
 from sern_runtime.transport_watch import CUT, ENDED, HALF_WAY, OTHER, SHUT, SILENT, UNFINISHED, TransportWatch
 from sern_runtime.zap import ZapHandler
-from sern_runtime.zmq_socket import BATCH, HANDSHAKE_IVL_MS, DealerSocket, RouterSocket, make_client, make_server
+from sern_runtime.zmq_setup import HANDSHAKE_IVL_MS, make_client, make_server
+from sern_runtime.zmq_socket import BATCH, DealerSocket, RouterSocket
 from sern_tools.ports import free_ports
 from tests.support import DEADLINE_S, until
 

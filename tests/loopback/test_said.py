@@ -17,7 +17,7 @@ from sern_core.vocabulary.message import TopicInfo
 from sern_core.vocabulary.types import Encoding, TopicName
 from sern_runtime import clock
 from sern_runtime.transport_watch import WAITING
-from sern_runtime.zmq_socket import make_client
+from sern_runtime.zmq_setup import make_client
 from tests.daemons import Lab, write_bag
 from tests.loopback.test_http_api import get
 from tests.support import until

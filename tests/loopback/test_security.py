@@ -37,7 +37,8 @@ from sern_runtime.config.keys import (
 )
 from sern_runtime.monitor import SocketMonitor
 from sern_runtime.udp import UdpSession
-from sern_runtime.zmq_socket import DealerSocket, make_client
+from sern_runtime.zmq_setup import make_client
+from sern_runtime.zmq_socket import DealerSocket
 from sern_tools.harness.files import ALLOW_ALL
 from tests.daemons import HOST, Lab, bodies, write_bag
 from tests.support import until

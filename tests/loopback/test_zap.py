@@ -11,7 +11,8 @@ from sern_runtime.config.keys import SecretKey
 from sern_runtime.monitor import EventKind, MonitorEvent, SocketMonitor
 from sern_runtime.transport_watch import TransportWatch
 from sern_runtime.zap import Refusal, TemporaryRefusal, ZapHandler, reachable, self_test
-from sern_runtime.zmq_socket import DealerSocket, RouterSocket, make_client, make_server
+from sern_runtime.zmq_setup import make_client, make_server
+from sern_runtime.zmq_socket import DealerSocket, RouterSocket
 from tests.support import until
 
 Context = zmq.Context[zmq.Socket[bytes]]

@@ -10,20 +10,10 @@ import pytest
 import zmq
 
 from sern_core.vocabulary.errors import ConfigError, UsageError
-from sern_runtime import zmq_socket
 from sern_runtime.config.keys import SecretKey
 from sern_runtime.zap import ZapHandler
-from sern_runtime.zmq_socket import (
-    BATCH,
-    VIEW_BYTES,
-    DealerSocket,
-    FrameSocket,
-    RouterSocket,
-    SendResult,
-    is_local,
-    make_client,
-    make_server,
-)
+from sern_runtime.zmq_setup import bind_all, is_local, make_client, make_server
+from sern_runtime.zmq_socket import BATCH, VIEW_BYTES, DealerSocket, FrameSocket, RouterSocket, SendResult
 from tests.support import DEADLINE_S, until
 
 Context = zmq.Context[zmq.Socket[bytes]]
@@ -334,7 +324,7 @@ async def test_peer_details_name_address_and_descriptor(zmq_context: Context) ->
 async def test_several_endpoints_on_one_router(zmq_context: Context) -> None:
     seen: list[bytes] = []
     socket = zmq_context.socket(zmq.ROUTER)
-    bound = zmq_socket.bind_all(socket, ["tcp://127.0.0.1:*", "tcp://127.0.0.1:*"])
+    bound = bind_all(socket, ["tcp://127.0.0.1:*", "tcp://127.0.0.1:*"])
     router = RouterSocket(socket, lambda _id, _user, body: seen.append(body))
     clients = [DealerSocket(make_client(zmq_context, at, None, None), lambda _body: None) for at in bound]
     for number, client in enumerate(clients):

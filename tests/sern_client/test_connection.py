@@ -17,7 +17,7 @@ from sern_runtime import clock, ros_types
 from sern_runtime.config.client import RelayConnection
 from sern_runtime.config.keys import SecretKey
 from sern_runtime.config.shared import LinkSection
-from sern_runtime.zmq_socket import CurvePair
+from sern_runtime.zmq_setup import CurvePair
 from tests.sern_client.sessions import Ignored
 from tests.support import until
 from tests.world import spec
