@@ -13,6 +13,10 @@ from sern_core.vocabulary.errors import ConfigError
 MAX_DOMAIN: Final = 232
 LOOPBACK_FRAGMENT_BYTES: Final = 62_000
 """Larger datagrams than a network takes whole: on loopback every datagram costs a system call, and none is lost."""
+HEARTBEAT_MS: Final = 10
+"""How soon a writer asks whether all has come, where the last of a large message may be lost. A cloud of 1 MB runs over
+the socket buffer that Fast DDS has by default; with the 100 ms of Cyclone DDS that took 122 ms in place of 25
+(measured)."""
 FAST_DDS_VENDOR: Final = "1.15"
 """The vendor id of eProsima (RTPS 2.5, 9.3.1.2), as Cyclone DDS's configuration has it."""
 PARTICIPANTS_A_HOST: Final = 32
@@ -41,6 +45,7 @@ class DomainOptions:
         general, discovery, internal = "", "", ""
         # Fast DDS does not notice that a reader, writer or participant went when the key hash is not sent.
         internal += "<GenerateKeyhash>true</GenerateKeyhash>"
+        internal += f'<HeartbeatInterval min="5ms" minsched="5ms" max="8s">{HEARTBEAT_MS}ms</HeartbeatInterval>'
         if interface:
             key = "address" if interface[0].isdigit() or ":" in interface else "name"
             extra = ' multicast="false"' if multicast is False else ""

@@ -20,7 +20,13 @@ from cyclonedds.qos import _CQos
 
 from sern_client.endpoints.dds import names, raw
 from sern_client.endpoints.dds.definitions import Definitions
-from sern_client.endpoints.dds.domain import DomainOptions, close_domain, environment_domain, open_domain
+from sern_client.endpoints.dds.domain import (
+    HEARTBEAT_MS,
+    DomainOptions,
+    close_domain,
+    environment_domain,
+    open_domain,
+)
 from sern_client.endpoints.dds.graph import Remote, puts_header
 from sern_client.endpoints.dds.names import Role, RosName
 from sern_client.endpoints.dds.qos import (
@@ -200,6 +206,7 @@ def test_who_puts_the_number_of_a_call_into_its_messages() -> None:
 
 def test_settings_become_xml() -> None:
     assert "<Interfaces>" not in DomainOptions().to_xml()
+    assert f">{HEARTBEAT_MS}ms</HeartbeatInterval>" in DomainOptions().to_xml()
     text = DomainOptions(localhost_only=True, lease_s=2.5).to_xml()
     for part in ('name="lo"', "<AllowMulticast>false", '<Peer address="127.0.0.1"/>', "62000B", "2500ms", "4194304B"):
         assert part in text
