@@ -2,10 +2,11 @@
 
 import json
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from ruamel.yaml import YAML
@@ -56,9 +57,11 @@ class Run:
     carried_bps: float
 
 
-def files_for(scenario: Scenario, directory: Path, relay: Node, *, udp: bool) -> dict[str, Path]:
+def files_for(
+    scenario: Scenario, directory: Path, relay: Node, *, udp: bool, link: Mapping[str, object]
+) -> dict[str, Path]:
     """The demo's files, with the relay where the lab has it, over TCP, with `udp` from the robot over both lanes, and
-    nothing thinned."""
+    nothing thinned; `link` on top of the section of every daemon."""
     files = write_files(directory / "config", scenario, PORTS)
     endpoint = f"tcp://{relay.address}:{PORTS.relay}"
     for name, path in files.items():
@@ -67,6 +70,7 @@ def files_for(scenario: Scenario, directory: Path, relay: Node, *, udp: bool) ->
             content["relay"]["listen"] = [endpoint]
         else:
             content["relay"] |= {"endpoint": endpoint, "udp": udp and name == ROBOT}
+        content["link"] = {**content.get("link", {}), **link}
         content.pop("adaptation", None)
         path.write_text(json.dumps(content))
     return files
@@ -96,13 +100,14 @@ class Stage:
     """The three daemons, connected over the lab's link, and what is known of the run."""
 
     def __init__(
-        self, lab: Lab, directory: Path, profile: LinkProfile, overload: float, run_s: float, *, udp: bool
-    ) -> None:
+        self, lab: Lab, directory: Path, profile: LinkProfile, overload: float, run_s: float, *, udp: bool,
+        link: Mapping[str, object],
+    ) -> None:  # fmt: skip
         self.lab = lab
         self.profile = profile
         self.run_s = run_s
         self.scenario = Scenario(profile, run_s, overload)
-        self.files = files_for(self.scenario, directory, lab.b, udp=udp)
+        self.files = files_for(self.scenario, directory, lab.b, udp=udp, link=link)
         self.daemons: dict[str, Placed] = {}
 
     @property
@@ -181,12 +186,13 @@ async def staged(
     run_s: float = RUN_S,
     lane: str = UDP,
     udp: bool = True,
+    link: Mapping[str, object] = MappingProxyType({}),
 ) -> AsyncIterator[Stage]:
     """A stage whose robot has come to use `lane`; what is left of it in the end is killed.
 
     `udp`: whether the robot asks for datagrams.
     """
-    stage = Stage(lab, directory, profile, overload, run_s, udp=udp)
+    stage = Stage(lab, directory, profile, overload, run_s, udp=udp, link=link)
     try:
         await stage.start()
         await stage.uses(lane)

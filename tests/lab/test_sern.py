@@ -12,7 +12,7 @@ from sern_sim.profiles import LinkProfile
 from sern_tools.demo_scenario import COMMAND_TOPIC, POSE_TOPIC, STATE_OVERTAKEN_LIMIT
 from sern_tools.lab.lab import Lab
 from sern_tools.summary import judge
-from tests.lab.stage import BUSY_S, COUNTER, ZMQ, Run, staged
+from tests.lab.stage import BUSY_S, COUNTER, UDP, ZMQ, Run, Stage, staged
 
 pytestmark = pytest.mark.root
 RUN_S = 6.0
@@ -57,6 +57,26 @@ async def test_field_wifi(lab: Lab, tmp_path: Path, overload: float) -> None:
     assert longest_silence_s(played) < POSE_SILENCE_S
     poses = played.result.topics[POSE_TOPIC]
     assert poses.delivered_share > 0.5
+
+
+async def test_data_takes_the_stream_and_leaves_it_when_the_path_gets_thin(lab: Lab, tmp_path: Path) -> None:
+    """12 Mbit/s over 8 ms, more than datagrams are to carry here, then 1 Mbit/s."""
+    profile = load_profile("field-wifi")
+    path = replace(profile.up, rate_bps=12 * MEGABIT, delay_s=0.004, loss=0.0)
+    profile = replace(profile, up=path, down=path)
+
+    async def during(stage: Stage) -> None:
+        await stage.uses(ZMQ)
+        await stage.hears()
+        lab.change(rate_bps=1 * MEGABIT)
+        await stage.uses(UDP)
+        await stage.hears()
+
+    link = {"stream_from_bps": 4 * MEGABIT}
+    async with staged(lab, tmp_path, profile, overload=1.2, link=link) as stage:
+        played = await stage.play(during)
+    check(played)
+    assert longest_silence_s(played) < POSE_SILENCE_S
 
 
 @pytest.mark.lab_long
