@@ -10,13 +10,14 @@ PACKAGES := sern_core sern_runtime sern_relay sern_client sern_sim sern_tools be
 # quarter less of CPU, and each worker of the tests would rewrite all of them anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help setup lint format types test wheel test-compiled explore standstills lab bench performance endpoints figures cellular picture demo schemas clean
+.PHONY: help setup lint format types test wheel compiled test-compiled explore standstills lab bench performance endpoints figures cellular picture demo schemas clean
 
 help:
 	@echo "make setup    create $(VENV) with pinned dependencies"
 	@echo "make demo     relay, robot and site over a bad link, on this machine, next to plain ZMQ"
 	@echo "make test     the tests but the longer ones of make lab;  make lint, make types: static checks"
 	@echo "make wheel    a wheel in dist/ whose core is compiled;  make test-compiled: the tests of the core and of the daemons on it"
+	@echo "make compiled an environment with that wheel, .venv-compiled, also for benchmarks"
 	@echo "make explore  the tests with random input, with new cases and ten times as many; SEED=... repeats a run"
 	@echo "make standstills   the tests whose processes stand still for moments, as on a loaded machine; SEED=..."
 	@echo "make lab      the whole matrix of bad links, and the longer runs over tc netem, which need root"
@@ -62,13 +63,15 @@ wheel: setup
 # The wheel in an environment of its own, and no source beside it: of the checkout only the tests are to be found.
 COMPILED := $(VENV)-compiled
 CORE_TESTS := tests/sern_core tests/sern_sim tests/fuzz tests/test_vectors.py tests/test_compiled.py
-test-compiled: wheel
+compiled: wheel
 	$(PYTHON) -m venv $(COMPILED)
 	$(COMPILED)/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt "$$(ls dist/sern-*.whl)[dev,bench,report,lossy,dds,zenoh]"
 	$(COMPILED)/bin/python -m pip install --quiet --disable-pip-version-check --no-deps --force-reinstall dist/sern-*.whl
 	mkdir -p build/checkout
 	ln -sfn ../../tests build/checkout/tests
 	ln -sfn ../../benchmarks build/checkout/benchmarks
+
+test-compiled: compiled
 	SERN_CORE=compiled PYTHONSAFEPATH=1 PYTHONPATH=$(CURDIR)/build/checkout $(COMPILED)/bin/python -m pytest \
 		-o pythonpath=build/checkout -n $(TEST_PROCESSES) --dist loadgroup $(CORE_TESTS) tests/loopback
 

@@ -2,7 +2,7 @@
 
 `python -m benchmarks.NAME [--quick] [--json FILE]` prints a table and, with --json, writes
 
-    {"benchmark": NAME, "commit": HASH,
+    {"benchmark": NAME, "commit": HASH, "compiled": whether the core was,
      "rows":  [{"case": ..., "system": ..., "<metric>_<unit>": number, ...}, ...],
      "reach": [{"name": ..., "value": number, "limit": number, "at_least": bool, "ok": bool}, ...],
      "notes": [...], "details": [...]}
@@ -29,6 +29,7 @@ from rich.console import Console
 from rich.table import Table
 
 from sern_core.vocabulary.errors import ConfigError, SernError
+from sern_runtime.version import compiled
 from sern_tools.checkout import commit
 
 REALTIME_PRIORITY = 10
@@ -97,6 +98,7 @@ class Report:
         return {
             "benchmark": self.benchmark,
             "commit": commit(),
+            "compiled": compiled(),
             "rows": [{"case": row.case, "system": row.system, **row.metrics} for row in self.rows],
             "reach": [
                 {"name": r.name, "value": r.value, "limit": r.limit, "at_least": r.at_least, "ok": r.ok}

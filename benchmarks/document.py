@@ -1,7 +1,8 @@
 """Put the figures of benchmarks into the documents: `python -m benchmarks.document FILE...` (what --json wrote).
 
 Replaces what stands between `<!-- NAME begin -->` and `<!-- NAME end -->` in the document of the benchmark NAME, and in
-README.md what that shows of it. The rest of the documents is left alone.
+README.md what that shows of it. The rest of the documents is left alone. Of a benchmark that was run with a compiled
+core as well, give both files: SERN's rows and figures with it stand beside the others.
 """
 
 import argparse
@@ -108,6 +109,8 @@ COUNT: Final = "count"
 UNITS: Final = {"percent": "%", "Mbps": "Mbit/s", "us": "µs", "hz": "Hz"}
 FIXED: Final = ("case", "system")
 OURS: Final = "mmcf"
+OURS_PREFIX: Final = "sern"
+COMPILED: Final = "compiled"
 
 
 def _title(metric: str) -> str:
@@ -183,7 +186,10 @@ def headline(document: Mapping[str, Any]) -> str:
     shown: dict[str, dict[str, Any]] = {}
     metrics: list[str] = []
     for case, wanted in IN_README[document["benchmark"]].items():
-        rows = [row for row in document["rows"] if row["case"] == case and row["system"] not in YARDSTICKS]
+        rows = [
+            row for row in document["rows"]
+            if row["case"] == case and row["system"] not in YARDSTICKS and not row["system"].endswith(COMPILED)
+        ]  # fmt: skip
         found = [name for name in wanted if any(name in row for row in rows)]
         if not found:
             raise ConfigError(
@@ -201,11 +207,67 @@ def headline(document: Mapping[str, Any]) -> str:
     return "\n".join([f"Commit {document['commit']}:", "", *_table(head, body)])
 
 
+def beside(document: Mapping[str, Any], compiled: Mapping[str, Any]) -> dict[str, Any]:
+    """The document of a benchmark with SERN's rows and figures of another run of it, with a compiled core.
+
+    Raises ConfigError where the two are of different commits.
+    """
+    if document["commit"] != compiled["commit"]:
+        raise ConfigError(
+            f"{document['benchmark']}: {document['commit']} was measured, and {compiled['commit']} with a compiled "
+            "core: measure one commit"
+        )
+    theirs = {(row["case"], row["system"]): row for row in compiled["rows"]}
+    rows = []
+    for row in document["rows"]:
+        rows.append(row)
+        other = theirs.get((row["case"], row["system"]))
+        if other is not None and row["system"].startswith(OURS_PREFIX):
+            rows.append({**other, "system": f"{row['system']}, {COMPILED}"})
+    reaches = {reach["name"]: reach for reach in compiled["reach"]}
+    return {
+        **document,
+        "rows": rows,
+        "reach": [{**reach, COMPILED: reaches.get(reach["name"])} for reach in document["reach"]],
+        "notes": [*document["notes"], f"`{COMPILED}`: another run, with the core compiled (`make wheel`)"],
+    }
+
+
+def _value(reach: Mapping[str, Any]) -> str:
+    return "never" if reach["value"] >= NEVER_S else f"{reach['value']:.3g}"
+
+
+def _wanted(reach: Mapping[str, Any]) -> str:
+    return f"{'≥' if reach['at_least'] else '≤'} {reach['limit']:g}"
+
+
+def _verdict(reach: Mapping[str, Any]) -> str:
+    return "reached" if reach["ok"] else "**missed**"
+
+
+def _against(reaches: Sequence[Mapping[str, Any]]) -> list[str]:
+    """The table of what was set out; with a column more where there are figures with a compiled core."""
+    if not any(reach.get(COMPILED) for reach in reaches):
+        body = [[reach["name"], _value(reach), _wanted(reach), _verdict(reach)] for reach in reaches]
+        return _table(["figure", "value", "wanted", ""], body)
+    body = []
+    for reach in reaches:
+        other = reach.get(COMPILED)
+        cells = ["–", ""] if other is None else [_value(other), _verdict(other)]
+        limits = _wanted(reach)
+        if other is not None and other["limit"] != reach["limit"]:
+            limits += f", {COMPILED} {_wanted(other)}"
+        body.append([reach["name"], limits, _value(reach), _verdict(reach), *cells])
+    return _table(["figure", "wanted", "plain", "", COMPILED, ""], body)
+
+
 def render(document: Mapping[str, Any]) -> str:
     """The figures of one benchmark as Markdown: the conditions, a table a case, and what was set out."""
     rows, reaches = document["rows"], document["reach"]
     lines = [f"Commit {document['commit']}; {'; '.join(document['notes'])}."]
-    if document["benchmark"] in TOGETHER:
+    if document["benchmark"] in TOGETHER or (
+        len(systems := {row["system"] for row in rows}) == 2 and any(name.endswith(COMPILED) for name in systems)
+    ):
         for table in _together(rows):
             lines += ["", *table]
     elif document["benchmark"] in BY_POLICY:
@@ -217,17 +279,7 @@ def render(document: Mapping[str, Any]) -> str:
         for case, group in groupby(rows, key=lambda row: row["case"]):
             lines += ["", f"### {case}", "", *_figures(list(group), {"system": "system"})]
     if reaches:
-        body = [
-            [
-                reach["name"],
-                "never" if reach["value"] >= NEVER_S else f"{reach['value']:.3g}",
-                f"{'≥' if reach['at_least'] else '≤'} {reach['limit']:g}",
-                "reached" if reach["ok"] else "**missed**",
-            ]
-            for reach in reaches
-        ]
-        lines += ["", f"### Against what was set out: {document['benchmark']}", ""]
-        lines += _table(["figure", "value", "wanted", ""], body)
+        lines += ["", f"### Against what was set out: {document['benchmark']}", "", *_against(reaches)]
     return "\n".join(lines)
 
 
@@ -257,6 +309,32 @@ def contents(document: Mapping[str, Any], into: Path | None = None) -> Iterator[
         yield README, headline(document)
 
 
+def _unlike(path: Path, error: Exception) -> ConfigError:
+    return ConfigError(f"not what a benchmark writes with --json ({error!r})", file=str(path))
+
+
+def _read(paths: Sequence[Path]) -> Iterator[tuple[Path, Mapping[str, Any]]]:
+    """The documents in the order of the files; those with a compiled core are in the ones without."""
+    plain: dict[str, tuple[Path, Mapping[str, Any]]] = {}
+    compiled: dict[str, tuple[Path, Mapping[str, Any]]] = {}
+    for path in paths:
+        try:
+            document = json.loads(path.read_text(encoding="utf-8"))
+            (compiled if document.get(COMPILED) else plain)[document["benchmark"]] = path, document
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            raise _unlike(path, error) from error
+    for name, (path, _) in compiled.items():
+        if name not in plain:
+            raise ConfigError(
+                f"was measured with a compiled core: give the file of {name} without one, too", file=str(path)
+            )
+    for name, (path, document) in plain.items():
+        try:
+            yield path, beside(document, compiled[name][1]) if name in compiled else document
+        except (KeyError, TypeError) as error:
+            raise _unlike(path, error) from error
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.document", description=__doc__)
     parser.add_argument("files", nargs="+", type=Path, metavar="FILE", help="what --json of a benchmark wrote")
@@ -264,15 +342,14 @@ def main() -> int:
     options = parser.parse_args()
     texts: dict[Path, str] = {}
     try:
-        for path in options.files:
+        for path, document in _read(options.files):
             try:
-                document = json.loads(path.read_text(encoding="utf-8"))
                 for into, content in contents(document, options.into):
                     if into not in texts:
                         texts[into] = into.read_text(encoding="utf-8")
                     texts[into] = insert(texts[into], document["benchmark"], content)
             except (ValueError, KeyError, TypeError) as error:
-                raise ConfigError(f"not what a benchmark writes with --json ({error!r})", file=str(path)) from error
+                raise _unlike(path, error) from error
         for into, text in texts.items():
             into.write_text(text, encoding="utf-8")
     except (SernError, OSError) as error:

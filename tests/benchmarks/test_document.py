@@ -15,6 +15,7 @@ from benchmarks.document import (
     README,
     README_SYSTEMS,
     README_TITLES,
+    beside,
     contents,
     headline,
     insert,
@@ -47,6 +48,50 @@ def test_a_table_for_each_case_and_the_limits() -> None:
     assert "| p50, times the floor | 1.13 | ≤ 1.1 | **missed** |" in text
     assert "| goodput, share | 0.99 | ≥ 0.97 | reached |" in text
     assert "lab: native" in text
+
+
+def compiled(found: Report) -> dict[str, object]:
+    return {**found.as_json(), "compiled": True}
+
+
+def test_figures_with_a_compiled_core_stand_beside_the_others() -> None:
+    other = Report("link")
+    other.row("4 Mbit/s, 2x", "sern-udp", pose_p50_ms=27.0, goodput_Mbps=3.7, relay_cpu_percent=2.5)
+    other.row("4 Mbit/s, 2x", "tcpros", pose_p50_ms=1.0, goodput_Mbps=9.0)
+    other.reach("p50, times the floor", 1.05, 1.08)
+    text = render(beside(report().as_json(), compiled(other)))
+    assert "| sern-udp | 28.4 | 3.61 | 5.0 |\n| sern-udp, compiled | 27.0 | 3.70 | 2.5 |\n| tcpros | 9,672 |" in text
+    assert "tcpros, compiled" not in text
+    assert "| figure | wanted | plain |  | compiled |  |" in text
+    assert "| p50, times the floor | ≤ 1.1, compiled ≤ 1.08 | 1.13 | **missed** | 1.05 | reached |" in text
+    assert "| goodput, share | ≥ 0.97 | 0.99 | reached | – |  |" in text
+
+
+def test_one_system_with_both_cores_gets_one_table() -> None:
+    fleet = Report("robots")
+    fleet.row("1 robots", "sern", relay_cpu_us=99.0)
+    fleet.row("50 robots", "sern", relay_cpu_us=88.0)
+    lines = render(beside(fleet.as_json(), compiled(fleet))).splitlines()
+    assert lines[2] == "| case | system | relay CPU a message, µs |"
+    assert lines[5] == "| 1 robots | sern, compiled | 99.0 |" and len(lines) == 8
+
+
+@pytest.mark.parametrize("given", ["alone", "another commit"])
+def test_figures_with_a_compiled_core_need_those_without(
+    given: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    plain, other, into = tmp_path / "plain.json", tmp_path / "compiled.json", tmp_path / "page.md"
+    into.write_text("<!-- link begin -->\n<!-- link end -->\n")
+    plain.write_text(json.dumps(report().as_json()))
+    written = compiled(report())
+    if given == "another commit":
+        written["commit"] = "0123456789ab"
+    other.write_text(json.dumps(written))
+    files = [str(other)] if given == "alone" else [str(plain), str(other)]
+    monkeypatch.setattr(sys, "argv", ["document", *files, "--into", str(into)])
+    assert main() == 1 and into.read_text().count("\n") == 2
+    said = capsys.readouterr().err
+    assert ("give the file of link without one, too" if given == "alone" else "measure one commit") in said
 
 
 def test_one_system_gets_one_table() -> None:
