@@ -101,6 +101,8 @@ class Lane:
         self.ping_due_s = 0.0
         self.loss = 0.0
         """Share of recent packets that were lost."""
+        self.acked_packets = 0
+        self.lost_packets = 0
         self.copies: deque[tuple[float, int, bytes]] = deque()
         """Second copies to send: when, of which packet, the datagram."""
         self._copied_packets = 0  # so many more will have copies
@@ -178,6 +180,8 @@ class Lane:
 
     def resolved(self, *, acked: int = 0, lost: int = 0) -> None:
         """The fate of packets is known: follow the share of losses, over about the last hundred."""
+        self.acked_packets += acked
+        self.lost_packets += lost
         self.loss *= (1.0 - LOSS_GAIN) ** (acked + lost)
         self.loss = min(1.0, self.loss + LOSS_GAIN * lost)
         self._copied_packets = COPY_PACKETS if self.loss > COPY_LOSS else self._copied_packets - acked - lost

@@ -12,8 +12,8 @@ from sern_core.path.lanes import Lane
 
 LOOK_S: Final = 1.0
 """What is carried is measured over so long."""
-CLEAN_LOSS: Final = 0.01
-"""The largest share of datagrams that are lost. A receiver whose core is busy loses some, too."""
+CLEAN_LOSS: Final = 0.003
+"""The largest share of datagrams that are lost. Beyond it TCP carries less of such a path."""
 SHORT_S: Final = 0.030
 """The longest round trip of the empty path: a lost segment costs the stream one or two of them."""
 IDLE: Final = 0.25
@@ -34,7 +34,9 @@ class StreamChoice:
     """
 
     __slots__ = (
+        "_begin_acked",
         "_begin_bytes",
+        "_begin_lost",
         "_begin_s",
         "_expected_bps",
         "_from_bps",
@@ -51,9 +53,9 @@ class StreamChoice:
         self.stream = False
         self._from_bps = from_bps
         self._lane: Lane | None = None
-        """Which lane is measured, from `_begin_s` and `_begin_bytes` on."""
+        """Which lane is measured, from `_begin_s` on; what it had by then."""
         self._begin_s = 0.0
-        self._begin_bytes = 0
+        self._begin_bytes = self._begin_acked = self._begin_lost = 0
         self._looks = 0
         self._held = 0
         """In so many of them something waited for the window."""
@@ -98,9 +100,10 @@ class StreamChoice:
 
     def _consider(self, lane: Lane, carried_bps: float, now: float) -> None:
         rtprop_s = lane.estimator.rtprop_s
+        lost = lane.lost_packets - self._begin_lost
         if (
             carried_bps >= self._from_bps
-            and lane.loss <= CLEAN_LOSS
+            and lost <= CLEAN_LOSS * (lost + lane.acked_packets - self._begin_acked)
             and rtprop_s is not None
             and rtprop_s <= SHORT_S
             and now >= self._until_s
@@ -116,4 +119,5 @@ class StreamChoice:
 
     def _measure(self, lane: Lane, now: float) -> None:
         self._begin_s, self._begin_bytes = now, lane.path.arrived_bytes
+        self._begin_acked, self._begin_lost = lane.acked_packets, lane.lost_packets
         self._looks = self._held = 0

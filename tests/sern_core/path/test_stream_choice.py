@@ -64,18 +64,26 @@ def test_much_over_a_short_clean_path_goes_over_the_stream_and_stays_there() -> 
     [
         (30e6, 0.002, 0.0, FROM_BPS),
         (60e6, SHORT_S * 1.5, 0.0, FROM_BPS),
-        (60e6, 0.002, CLEAN_LOSS * 1.5, FROM_BPS),
+        (60e6, 0.002, CLEAN_LOSS + 0.001, FROM_BPS),
         (600e6, 0.002, 0.0, inf),
     ],
     ids=["little", "a long path", "losses", "never"],
 )
 def test_data_stays_with_the_datagrams(bps: float, rtt_s: float, loss: float, from_bps: float) -> None:
     scene = Scene(from_bps=from_bps, rtt_s=rtt_s)
-    scene.datagrams.loss = loss
     for _ in range(100):
         scene.now += STEP_S
+        scene.datagrams.resolved(acked=round(1000 * (1 - loss)), lost=round(1000 * loss))
         scene.carry(scene.datagrams, round(bps * STEP_S / 8), rtt_s)
         assert not scene.look(scene.datagrams)
+
+
+def test_a_loss_now_and_then_is_no_lossy_path() -> None:
+    scene = Scene()
+    for number in range(60):
+        scene.datagrams.resolved(acked=1000, lost=number % 2)
+        scene.run(STEP_S, 60e6)
+    assert scene.choice.stream
 
 
 def test_a_path_of_unknown_length_is_not_short() -> None:
