@@ -155,19 +155,16 @@ class RelayLanes:
         )
 
     def flush(self) -> None:
-        """Let every lane that has something to say say it: first those with messages, which somebody waits for, then
-        those that only acknowledge."""
-        patient: list[Pump] = []
-        for session, pump in self._lanes.values():
+        """Let every lane that has something to say say it: messages, which somebody waits for, now, the rest when the
+        loop comes round."""
+        for session, pump in list(self._lanes.values()):  # one whose key is used up is replaced meanwhile
             link = self.hub.links[session.client]
             if not link.dirty:
                 continue
             if link.sender.pending:
-                pump.kick()
+                pump.run()
             else:
-                patient.append(pump)
-        for pump in patient:
-            pump.kick()
+                pump.kick()
 
     def _received(self, session: UdpSession, data: bytes, now: float) -> None:
         link = self.hub.links.get(session.client)

@@ -22,15 +22,19 @@ class FakeServer:
 
 
 class FakePump:
-    """`Pump` that says for whom it was kicked."""
+    """`Pump` that says for whom it sends now, and for whom when the loop comes round."""
 
-    kicked: list[ClientName]
+    now: list[ClientName]
+    later: list[ClientName]
 
     def __init__(self, port: Any, *_: object, **_more: object) -> None:
         self._client: ClientName = port.link.peer
 
+    def run(self) -> None:
+        self.now.append(self._client)
+
     def kick(self) -> None:
-        self.kicked.append(self._client)
+        self.later.append(self._client)
 
     def close(self) -> None: ...
 
@@ -38,7 +42,8 @@ class FakePump:
 async def test_messages_leave_before_acknowledgements(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(udp, "UdpServer", FakeServer)
     monkeypatch.setattr(udp, "Pump", FakePump)
-    monkeypatch.setattr(FakePump, "kicked", [], raising=False)
+    for when in ("now", "later"):
+        monkeypatch.setattr(FakePump, when, [], raising=False)
     quiet, hears_of_it, waits, more = (ClientName(name) for name in ("quiet", "hears_of_it", "waits", "more"))
     links = {
         name: SimpleNamespace(
@@ -51,7 +56,7 @@ async def test_messages_leave_before_acknowledgements(monkeypatch: pytest.Monkey
     lanes = RelayLanes(hub, ["tcp://192.0.2.9:1"], port_of=lambda _client: 1, after=lambda: None)
     for name in links:
         lanes.asked(name, ())
-    FakePump.kicked.clear()
+    FakePump.later.clear()
     lanes.flush()
-    assert FakePump.kicked == [waits, more, hears_of_it]
+    assert (FakePump.now, FakePump.later) == ([waits, more], [hears_of_it])
     lanes.close()

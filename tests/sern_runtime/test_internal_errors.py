@@ -2,6 +2,7 @@
 
 import asyncio
 import logging
+from collections.abc import Callable
 
 import pytest
 from prometheus_client import CollectorRegistry
@@ -61,7 +62,10 @@ class OnePort:
     def handle_timeout(self, *, now: float) -> None: ...
 
 
-async def test_a_lane_whose_socket_fails_is_asked_again_by_itself(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("begin", [Pump.kick, Pump.run], ids=["later", "now"])
+async def test_a_lane_whose_socket_fails_is_asked_again_by_itself(
+    begin: Callable[[Pump], None], monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(pumps, "AGAIN_S", 0.01)
     errors = InternalErrors()
     loop = asyncio.get_running_loop()
@@ -78,7 +82,7 @@ async def test_a_lane_whose_socket_fails_is_asked_again_by_itself(monkeypatch: p
     pump = Pump(port, send, on_gone=lambda: None)
     errors.watch(loop)
     try:
-        pump.kick()
+        begin(pump)
         await until(lambda: sent == [b"two"])
     finally:
         errors.unwatch(loop)
