@@ -220,15 +220,9 @@ class RelayServer:
         return framing.take_str(framing.decode_handshake(data), "name", max_length=64)
 
     def flush(self) -> None:
-        """Let every port that has something to say say it: messages, which somebody waits for, now, the rest when the
-        loop comes round."""
-        for _connection, served in list(self.clients.sessions()):  # what is sent may end one
-            if not served.port.dirty:
-                continue
-            link = served.port.link
-            if link is not None and link.sender.pending:
-                served.pump.run()
-            else:
+        """Let every port that has something to say say it."""
+        for _connection, served in self.clients.sessions():
+            if served.port.dirty:
                 served.pump.kick()
         self.priority_lanes.flush()
 

@@ -155,16 +155,19 @@ class RelayLanes:
         )
 
     def flush(self) -> None:
-        """Let every lane that has something to say say it: messages, which somebody waits for, now, the rest when the
-        loop comes round."""
-        for session, pump in list(self._lanes.values()):  # one whose key is used up is replaced meanwhile
+        """Let every lane that has something to say say it: first those with messages, which somebody waits for, then
+        those that only acknowledge."""
+        patient: list[Pump] = []
+        for session, pump in self._lanes.values():
             link = self.hub.links[session.client]
             if not link.dirty:
                 continue
             if link.sender.pending:
-                pump.run()
-            else:
                 pump.kick()
+            else:
+                patient.append(pump)
+        for pump in patient:
+            pump.kick()
 
     def _received(self, session: UdpSession, data: bytes, now: float) -> None:
         link = self.hub.links.get(session.client)

@@ -74,11 +74,9 @@ class Pump:
             self._scheduled = self._loop.call_soon(self._run)
 
     def run(self) -> None:
-        """Send now instead of when the loop comes round. What goes wrong is told to the loop, as if it had called."""
-        try:
+        """Send now instead of when the loop comes round."""
+        if not self._closed:
             self._run()
-        except Exception as error:  # noqa: BLE001  (of one port: those that are served after it are not held up)
-            self._loop.call_exception_handler({"message": "a port could not be served", "exception": error})
 
     def reset(self) -> None:
         """The transport is another one: forget what waited for the old one."""
