@@ -232,6 +232,7 @@ class RelayDaemon:
 
     def _flush(self) -> None:
         self._flush_due = None
+        # All are kicked before any sends: the lanes of a link share one sign that there is something to send.
         if self.lanes is not None:  # first: where there is one it has the messages
             self.lanes.flush()
         if self.server is not None:
