@@ -229,7 +229,7 @@ def beside(document: Mapping[str, Any], compiled: Mapping[str, Any]) -> dict[str
         **document,
         "rows": rows,
         "reach": [{**reach, COMPILED: reaches.get(reach["name"])} for reach in document["reach"]],
-        "notes": [*document["notes"], f"`{COMPILED}`: another run, with the core compiled (`make wheel`)"],
+        "notes": [*document["notes"], f"`{COMPILED}`: another run, with the core compiled (`make compiled`)"],
     }
 
 

@@ -183,9 +183,9 @@ class Bridge:
 
     def accept(self, goal):
         accepted = threading.Event()
-        self.feedback = []
+        with _lock:  # before its feedback can come
+            self.handle, self.feedback = None, []
         self.given = self.goals.send_goal_async(goal, feedback_callback=self.fed)
-        self.handle = None
         self.given.add_done_callback(lambda _: accepted.set())
         assert accepted.wait(WAIT_S), "no answer"
         return GoalResponse.ACCEPT if self.given.result().accepted else GoalResponse.REJECT

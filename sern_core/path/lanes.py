@@ -103,6 +103,7 @@ class Lane:
         """Share of recent packets that were lost."""
         self.acked_packets = 0
         self.lost_packets = 0
+        """Both since the lane was opened."""
         self.copies: deque[tuple[float, int, bytes]] = deque()
         """Second copies to send: when, of which packet, the datagram."""
         self._copied_packets = 0  # so many more will have copies

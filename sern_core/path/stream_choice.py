@@ -58,7 +58,7 @@ class StreamChoice:
         self._begin_bytes = self._begin_acked = self._begin_lost = 0
         self._looks = 0
         self._held = 0
-        """In so many of them something waited for the window."""
+        """Looks that found something waiting for the window."""
         self._since_s = 0.0
         """When the stream was chosen."""
         self._expected_bps = 0.0

@@ -36,7 +36,7 @@ class Scene:
         return self.choice.stream
 
     def run(self, seconds: float, bps: float, *, held: bool = False) -> bool:
-        """So much is carried by the lane of choice; whether it is the stream in the end."""
+        """The lane of choice carries `bps`. Returns whether it is the stream in the end."""
         for _ in range(round(seconds / STEP_S)):
             self.now += STEP_S
             lane = self.stream if self.choice.stream else self.datagrams
