@@ -135,7 +135,7 @@ class Graph:
     def participant_added(self, participant: Participant) -> None:
         """It came, or says something else of itself than before, which may change whose its readers and writers are."""
         self.participants[participant.guid] = participant
-        if participant.sern:
+        if participant.sern and participant.guid != self.own:  # discovery shows us ourselves too
             self._is_modern()
         early = self._early_nodes.pop(participant.guid, None)
         if early is not None:

@@ -133,6 +133,7 @@ def test_node_information_of_before_iron() -> None:
 def test_node_information_is_told_to_iron_and_later_only() -> None:
     seen: list[bool] = []
     graph = Graph(OWN, Heard(), modern_seen=lambda: seen.append(graph.modern))
+    graph.participant_added(Participant(OWN, "sern", "sern"))  # discovery shows us ourselves too
     graph.participant_added(Participant(OTHER, "robot"))
     graph.remote_added(remote(11))
     assert (graph.modern, seen) == (False, [])
