@@ -102,8 +102,9 @@ performance: setup
 	$(BIN)/python -m benchmarks.link --plots docs/images --json build/link.json
 	$(BIN)/python -m benchmarks.sensors --json build/sensors.json
 	$(BIN)/python -m benchmarks.robots --figure docs/images/perf-robots.png --json build/robots.json
+	$(BIN)/python -m benchmarks.relay --json build/relay.json
 	$(BIN)/python -m benchmarks.mmcf_lab --runs 20 --json build/mmcf_lab.json
-	$(BIN)/python -m benchmarks.document build/link.json build/sensors.json build/robots.json build/mmcf_lab.json
+	$(BIN)/python -m benchmarks.document build/link.json build/sensors.json build/robots.json build/relay.json build/mmcf_lab.json
 
 endpoints: setup
 	mkdir -p build

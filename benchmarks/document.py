@@ -22,7 +22,8 @@ DOCUMENT: Final = ROOT / "docs" / "performance.md"
 THEORY: Final = ROOT / "docs" / "adaptation-theory.md"
 DOCUMENTS: Final = {
     **dict.fromkeys(
-        ("link", "sensors", "robots", "footprint", "endpoints", "mmcf_lab", "thin_link", "cellular", "codecs"), DOCUMENT
+        ("link", "sensors", "robots", "relay", "footprint", "endpoints", "mmcf_lab", "thin_link", "cellular", "codecs"),
+        DOCUMENT,
     ),
     **dict.fromkeys(("mmcf", "mmcf_replay", "mmcf_recovery"), THEORY),
     "summaries": ROOT / "docs" / "summaries.md",

@@ -19,7 +19,7 @@ from sern_core.vocabulary.errors import SernError
 from sern_tools.explain_replay import read_bag
 from sern_tools.lab.backends import choose
 
-STEPS: Final = ("link", "sensors", "robots", "mmcf_lab")
+STEPS: Final = ("link", "sensors", "robots", "relay", "mmcf_lab")
 MODULES: Final[Mapping[str, str]] = {"psutil": "bench", "zenoh": "bench", "matplotlib": "report"}
 """The extra that each is in."""
 FOLDERS: Final = ("build", "docs/images")
@@ -36,7 +36,7 @@ def lacking(
         yield f"link, sensors, mmcf_lab: {error}"
     for module, extra in MODULES.items():
         if importlib.util.find_spec(module) is None:
-            yield f"link, sensors, robots: {module} is not installed: pip install '.[{extra}]'"
+            yield f"link, sensors, robots, relay: {module} is not installed: pip install '.[{extra}]'"
     for name in (recordings.DRIVE, *recordings.SCANS):
         path = data / name
         if path.exists():

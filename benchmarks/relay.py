@@ -4,10 +4,13 @@ Every system carries the same messages in closed loop: the publisher keeps a bou
 shared memory, so that nothing is dropped and the figure is what the relay carries, not what it loses. Systems are
 measured in interleaved rounds; ratios are taken within a round and their median is reported.
 
-    proxy   zmq.proxy between XSUB and XPUB, in C: the least a relay can cost
-    feed    sern_runtime.feed: the same sockets and frames, with access rules
-    sern    the scheduled link: sern-relay between two clients, acknowledged hop by hop
-    zenoh   a zenoh router and two clients, shared memory off
+    proxy         zmq.proxy between XSUB and XPUB, in C: the least a relay can cost
+    proxy-curve   the same with CURVE on all connections
+    feed          sern_runtime.feed: the same sockets and frames, with access rules, without keys
+    sern          the scheduled link over TCP: sern-relay between two clients, acknowledged hop by hop, with keys as
+                  installed
+    sern-plain    the same without keys
+    zenoh         a zenoh router and two clients, shared memory off, without TLS
 
 A further system is one more subclass of `System` in `SYSTEMS`, and its limits in `CPU_LIMITS` and `RATE_LIMITS`.
 """
@@ -44,10 +47,14 @@ from sern_core.vocabulary.errors import SernError
 from sern_core.vocabulary.message import Message, StreamInfo, TopicInfo, TopicSpec
 from sern_core.vocabulary.types import ClientName, Encoding, PriorityClass, TopicName
 from sern_runtime import clock
+from sern_runtime.config.keys import load_secret
 from sern_runtime.feed import Feed, FeedHeader, topic_frame
 from sern_runtime.loop import Shutdown, keep_freed_memory, run
 from sern_runtime.pump import Pump
-from sern_tools.harness.files import relay_content, write
+from sern_runtime.version import compiled
+from sern_runtime.zmq_setup import connect_curve
+from sern_tools.harness.files import RELAY, relay_content, write
+from sern_tools.keygen import make_keys
 from sern_tools.ports import free_ports
 
 SIZES: Final = {"100 B": 100, "1 kB": 1000, "64 kB": 64_000, "1 MB": 1_000_000}
@@ -61,15 +68,22 @@ STALL_S: Final = 1.0
 HIGH_WATER: Final = 10_000  # above what is in flight: the closed loop alone decides
 
 TOPIC: Final = "/bench/odom"
-CPU_LIMITS: Final = {("feed", "1 kB"): 3.0, ("sern", "1 kB"): 8.0}
-"""(system, case): relay CPU a message, at most this many times that of zmq.proxy."""
-RATE_LIMITS: Final = {("feed", "64 kB"): 0.8, ("sern", "64 kB"): 0.8}
-"""(system, case): MB/s, at least this share of zenoh's."""
+CLIENTS: Final = ("publisher", "subscriber")
+CPU_LIMITS: Final = {
+    ("feed", "1 kB"): ("proxy", 3.0),
+    ("sern", "1 kB"): ("proxy-curve", 3.0 if compiled() else 6.0),
+    ("sern-plain", "1 kB"): ("proxy", 8.0),
+}
+"""(system, case): relay CPU a message, at most so many times that of the other."""
+RATE_LIMITS: Final = {("feed", "64 kB"): 0.8, ("sern-plain", "64 kB"): 1.0, ("sern-plain", "1 MB"): 1.0}
+"""(system, case): MB/s, at least this share of zenoh's, which has no keys either."""
 
 
 class Ports(NamedTuple):
     ingest: int
     publish: int
+    keys: Path
+    """The folder of the keys of `RELAY` and `CLIENTS`."""
 
 
 @dataclass
@@ -130,10 +144,14 @@ class System(ABC):
 class ZmqSystem(System):
     """The two ends of the plain sockets: three frames, the feed's layout."""
 
+    def secure(self, socket: "zmq.Socket[bytes]", ports: Ports, name: str) -> None:
+        """Give a socket the keys of this name, before it is bound or connected."""
+
     def publisher(self, ports: Ports, flow: Flow) -> None:
         with zmq.Context() as context, context.socket(zmq.PUB) as out:
             out.setsockopt(zmq.LINGER, 0)
             out.setsockopt(zmq.SNDHWM, HIGH_WATER)
+            self.secure(out, ports, "publisher")
             out.connect(f"tcp://127.0.0.1:{ports.ingest}")
             frames = (topic_frame(TOPIC), FeedHeader(PriorityClass.BULK, 1, 1).pack(), bytes(flow.size_bytes))
             flow.drive(partial(out.send_multipart, frames, copy=flow.size_bytes < 32_000))
@@ -144,6 +162,7 @@ class ZmqSystem(System):
             inlet.setsockopt(zmq.RCVHWM, HIGH_WATER)
             inlet.setsockopt(zmq.RCVTIMEO, 100)
             inlet.subscribe(topic_frame(TOPIC))
+            self.secure(inlet, ports, "subscriber")
             inlet.connect(f"tcp://127.0.0.1:{ports.publish}")
             while not flow.stopped.value:
                 try:
@@ -164,10 +183,24 @@ class Proxy(ZmqSystem):
         ingest, publish = context.socket(zmq.XSUB), context.socket(zmq.XPUB)
         ingest.setsockopt(zmq.RCVHWM, HIGH_WATER)
         publish.setsockopt(zmq.SNDHWM, HIGH_WATER)
+        for socket in (ingest, publish):
+            self.secure(socket, ports, RELAY)
         ingest.bind(f"tcp://127.0.0.1:{ports.ingest}")
         publish.bind(f"tcp://127.0.0.1:{ports.publish}")
         ready()
         zmq.proxy(ingest, publish)
+
+
+class SecuredProxy(Proxy):
+    name = "proxy-curve"
+
+    def secure(self, socket: "zmq.Socket[bytes]", ports: Ports, name: str) -> None:
+        keys = load_secret(ports.keys / f"{name}.key")
+        if name == RELAY:  # whoever has a key of any kind may come: nobody is asked, which is the cheapest
+            socket.setsockopt(zmq.CURVE_SERVER, 1)
+            socket.setsockopt(zmq.CURVE_SECRETKEY, keys.secret_key.encode())
+        else:
+            connect_curve(socket, keys, load_secret(ports.keys / f"{RELAY}.key").public_key)
 
 
 class FeedRelay(ZmqSystem):
@@ -257,16 +290,17 @@ Work = Callable[[ClientCore, Pump, _Site], Awaitable[None]]
 
 
 class ScheduledLink(System):
-    """A real relay daemon between two clients: schedulers, windows and acknowledgements on both hops, no CURVE."""
+    """A real relay daemon between two clients: schedulers, windows and acknowledgements on both hops."""
 
-    name = "sern"
+    def __init__(self, name: str, *, secure: bool) -> None:
+        self.name = name
+        self._secure = secure
 
     def relay(self, ports: Ports, ready: Callable[[], None]) -> None:
         content = relay_content(
-            f"tcp://127.0.0.1:{ports.ingest}", secure=False, http={"listen": None}, log={"level": "error"}
+            f"tcp://127.0.0.1:{ports.ingest}", secure=self._secure, http={"listen": None}, log={"level": "error"}
         )
-        with tempfile.TemporaryDirectory() as folder:
-            serve(write(Path(folder), "relay", content), ready)
+        serve(write(ports.keys, f"{self.name}-relay", content), ready)
 
     async def _client(
         self, ports: Ports, flow: Flow, name: str, work: Callable[[ClientCore, Pump, _Site], Any]
@@ -274,7 +308,10 @@ class ScheduledLink(System):
         keep_freed_memory()  # as a daemon does
         site = _Site(flow)
         with zmq.Context() as context:
-            core, transport = connect(context, ClientName(name), site, f"tcp://127.0.0.1:{ports.ingest}")
+            key = load_secret(ports.keys / f"{name}.key") if self._secure else None
+            relay_keys = (load_secret(ports.keys / f"{RELAY}.key").public_key,) if self._secure else ()
+            address = f"tcp://127.0.0.1:{ports.ingest}"
+            core, transport = connect(context, ClientName(name), site, address, key, relay_keys)
             try:
                 await work(core, transport.pump, site)
             finally:
@@ -318,7 +355,14 @@ class ScheduledLink(System):
             runner.run(self._client(ports, flow, "subscriber", work))
 
 
-SYSTEMS: Final[tuple[System, ...]] = (Proxy(), FeedRelay(), ScheduledLink(), Zenoh())
+SYSTEMS: Final[tuple[System, ...]] = (
+    Proxy(),
+    SecuredProxy(),
+    FeedRelay(),
+    ScheduledLink("sern", secure=True),
+    ScheduledLink("sern-plain", secure=False),
+    Zenoh(),
+)
 
 
 class Sample(NamedTuple):
@@ -335,7 +379,15 @@ def _relay_main(system: System, ports: Ports, ready: Any) -> None:
 
 def measure(system: System, size_bytes: int, duration_s: float) -> Sample:
     """Start the three processes, wait until messages flow, and look at both ends of `duration_s`."""
-    ports, flow, ready = Ports(*free_ports(2)), Flow(size_bytes), multiprocessing.get_context("spawn").Event()
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name) / "keys"
+        make_keys(folder, RELAY, *CLIENTS)
+        ingest, publish = free_ports(2)
+        return _measure(system, size_bytes, duration_s, Ports(ingest, publish, folder))
+
+
+def _measure(system: System, size_bytes: int, duration_s: float, ports: Ports) -> Sample:
+    flow, ready = Flow(size_bytes), multiprocessing.get_context("spawn").Event()
     relay = Worker(f"{system.name}, relay", _relay_main, system, ports, ready)
     ends = [Worker(f"{system.name}, {end.__name__}", end, ports, flow) for end in (system.subscriber, system.publisher)]
     with running(relay, ends, ready, flow.stopped, START_S) as workers:
@@ -371,11 +423,11 @@ def bench(options: argparse.Namespace, report: common.Report) -> None:
 
 
 def _reaches(report: common.Report, case: str, samples: dict[str, list[Sample]]) -> None:
-    for (name, at), limit in CPU_LIMITS.items():
-        if at == case and name in samples and "proxy" in samples:
-            pairs = zip(samples[name], samples["proxy"], strict=True)
+    for (name, at), (least, limit) in CPU_LIMITS.items():
+        if at == case and name in samples and least in samples:
+            pairs = zip(samples[name], samples[least], strict=True)
             ratio = statistics.median(ours.relay_cpu_us / max(theirs.relay_cpu_us, 1e-3) for ours, theirs in pairs)
-            report.reach(f"{name}: relay CPU a message, times zmq.proxy, {case}", ratio, limit)
+            report.reach(f"{name}: relay CPU a message, times that of {least}, {case}", ratio, limit)
     for (name, at), limit in RATE_LIMITS.items():
         if at == case and name in samples and "zenoh" in samples:
             pairs = zip(samples[name], samples["zenoh"], strict=True)

@@ -214,8 +214,8 @@ def test_what_the_demo_writes_goes_into_the_readme_alone() -> None:
 
 
 def test_a_benchmark_that_is_in_no_document_is_refused() -> None:
-    with pytest.raises(ConfigError, match="relay is in no document"):
-        list(contents(Report("relay").as_json()))
+    with pytest.raises(ConfigError, match="scheduler is in no document"):
+        list(contents(Report("scheduler").as_json()))
 
 
 def test_all_documents_are_written_at_once_or_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
