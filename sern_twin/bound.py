@@ -86,8 +86,8 @@ class GapReport:
     mismatch_mps2: float
     error_m: float
     """The estimate's, at the first message after the gap, against the twin's own past at its stamp."""
-    shown_error_m: float
-    """The same of the twin as it was shown."""
+    shown_error_m: float | None
+    """The same of the twin as it was shown; None where that is no longer known."""
     bound_m: float
     reachable_m: float
 
@@ -112,7 +112,7 @@ def gap_report(
     mismatch_mps2: float,
     max_speed_mps: float,
     error_m: float,
-    shown_error_m: float,
+    shown_error_m: float | None,
 ) -> GapReport:
     return GapReport(
         gap_s,
