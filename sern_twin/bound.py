@@ -29,7 +29,8 @@ def reachable_bound_m(
     error_m: float, error_mps: float, mismatch_mps2: float, gap_s: float, max_speed_mps: float
 ) -> float:
     """B_eff(τ): B(τ), and no more than two robots of this top speed get apart; at 30 s B alone says nothing."""
-    return error_m + min(error_mps * gap_s + mismatch_mps2 * gap_s**2 / 2, 2 * max_speed_mps * gap_s)
+    bound_m = position_bound_m(error_m, error_mps, mismatch_mps2, gap_s)
+    return min(bound_m, error_m + 2 * max_speed_mps * gap_s)
 
 
 def lipschitz_bound(
@@ -76,7 +77,7 @@ class Mismatch:
         return self._bound_mps2
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class GapReport:
     """One gap: what was known when it began, what was bounded, and what was found when it ended."""
 
@@ -84,12 +85,23 @@ class GapReport:
     start_error_m: float
     start_error_mps: float
     mismatch_mps2: float
+    max_speed_mps: float
     error_m: float
     """The estimate's, at the first message after the gap, against the twin's own past at its stamp."""
     shown_error_m: float | None
     """The same of the twin as it was shown; None where that is no longer known."""
-    bound_m: float
-    reachable_m: float
+
+    @property
+    def bound_m(self) -> float:
+        """B(τ) of eq. (gap_bound)."""
+        return position_bound_m(self.start_error_m, self.start_error_mps, self.mismatch_mps2, self.gap_s)
+
+    @property
+    def reachable_m(self) -> float:
+        """B_eff(τ)."""
+        return reachable_bound_m(
+            self.start_error_m, self.start_error_mps, self.mismatch_mps2, self.gap_s, self.max_speed_mps
+        )
 
     @property
     def ratio(self) -> float:
@@ -102,25 +114,3 @@ class GapReport:
     def violated(self) -> bool:
         """An assumption did not hold: the robot did something else than was predicted."""
         return self.error_m > self.reachable_m
-
-
-def gap_report(
-    gap_s: float,
-    *,
-    start_error_m: float,
-    start_error_mps: float,
-    mismatch_mps2: float,
-    max_speed_mps: float,
-    error_m: float,
-    shown_error_m: float | None,
-) -> GapReport:
-    return GapReport(
-        gap_s,
-        start_error_m,
-        start_error_mps,
-        mismatch_mps2,
-        error_m,
-        shown_error_m,
-        position_bound_m(start_error_m, start_error_mps, mismatch_mps2, gap_s),
-        reachable_bound_m(start_error_m, start_error_mps, mismatch_mps2, gap_s, max_speed_mps),
-    )

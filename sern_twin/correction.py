@@ -10,6 +10,7 @@ import math
 from dataclasses import dataclass
 
 from sern_core.vocabulary.errors import UsageError
+from sern_twin.motion import TAU
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,7 +156,7 @@ class Offset:
             raise UsageError(f"the estimate jumped by {(x_m, y_m, yaw_rad, x_mps, y_mps)}, which is no motion")
         self.x_m -= x_m
         self.y_m -= y_m
-        self.yaw_rad = math.remainder(self.yaw_rad - yaw_rad, 2 * math.pi)
+        self.yaw_rad = math.remainder(self.yaw_rad - yaw_rad, TAU)
         self._x_mps -= x_mps
         self._y_mps -= y_mps
         self._limit_speed()
@@ -196,7 +197,7 @@ class Offset:
         before_radps = self._yaw_radps
         rate = before_radps + turn * step_s
         self._yaw_radps = min(max(rate, -options.max_yaw_rate_radps), options.max_yaw_rate_radps)
-        self.yaw_rad = math.remainder(self.yaw_rad + (before_radps + self._yaw_radps) / 2 * step_s, 2 * math.pi)
+        self.yaw_rad = math.remainder(self.yaw_rad + (before_radps + self._yaw_radps) / 2 * step_s, TAU)
 
     def _limit_speed(self) -> None:
         speed_mps = self.speed_mps

@@ -72,7 +72,7 @@ class TangentPlane:
     def from_degrees(
         cls, latitude_deg: float, longitude_deg: float, height_m: float = 0.0, model: Model = "wgs84"
     ) -> "TangentPlane":
-        """As sensor_msgs/NavSatFix has it."""
+        """The same from degrees, as sensor_msgs/NavSatFix has them."""
         return cls(math.radians(latitude_deg), math.radians(longitude_deg), height_m, model)
 
     def east_radius_m(self) -> float:

@@ -18,6 +18,14 @@ class Twist:
     left_mps: float = 0.0
     yaw_radps: float = 0.0
 
+    def towards(self, other: "Twist", share: float) -> "Twist":
+        """The twist that lies by this share between this one and the other."""
+        return Twist(
+            self.forward_mps + (other.forward_mps - self.forward_mps) * share,
+            self.left_mps + (other.left_mps - self.left_mps) * share,
+            self.yaw_radps + (other.yaw_radps - self.yaw_radps) * share,
+        )
+
 
 STILL: Final = Twist()
 
@@ -47,7 +55,7 @@ class Motion:
         return math.hypot(self.twist.forward_mps, self.twist.left_mps)
 
     def velocity_mps(self) -> tuple[float, float]:
-        """In the site's axes."""
+        """Speeds in the site's axes, x and y."""
         cos, sin = math.cos(self.yaw_rad), math.sin(self.yaw_rad)
         forward, left = self.twist.forward_mps, self.twist.left_mps
         return cos * forward - sin * left, sin * forward + cos * left

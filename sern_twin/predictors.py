@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
-from sern_twin.motion import TAU, Motion, Twist
+from sern_twin.motion import STILL, TAU, Motion, Twist
 from sern_twin.slip import Slip
 from sern_twin.trajectory import Trajectory
 
@@ -21,12 +21,26 @@ RESPONSE_S: Final = 0.15
 """The time constant with which a base follows a command."""
 CLOSES_S: Final = 1.0
 """The time constant with which a robot that follows a plan comes back to it."""
+SOON_S: Final = 1e-9
+"""What is left of a time below this is rounding."""
+MOST_STEPS: Final = 3000
+"""A minute of steps of 20 ms; a longer time is predicted in as many longer ones."""
 
 
 class Predictor(ABC):
     @abstractmethod
     def advance(self, motion: Motion, start_s: float, step_s: float, *, heard_s: float) -> Motion:
         """The state at `start_s` + `step_s` of a robot that was heard last at `heard_s` and is at `motion` now."""
+
+    def reach(self, motion: Motion, start_s: float, end_s: float, step_s: float, *, heard_s: float) -> Motion:
+        """The state at `end_s`, in steps of at most `step_s`, or in `MOST_STEPS`."""
+        step_s = max(step_s, (end_s - start_s) / MOST_STEPS)
+        time_s = start_s
+        while end_s - time_s > SOON_S:
+            part_s = min(step_s, end_s - time_s)
+            motion = self.advance(motion, time_s, part_s, heard_s=heard_s)
+            time_s += part_s
+        return motion
 
 
 class ConstantTwist(Predictor):
@@ -48,7 +62,7 @@ class ConstantAcceleration(Predictor):
             motion.twist.left_mps,
             motion.twist.yaw_radps + motion.yaw_radps2 * speeds_up_s,
         )
-        mean = _between(motion.twist, then, 0.5)
+        mean = motion.twist.towards(then, 0.5)
         there = motion.moved(mean, speeds_up_s, then)
         return there.moved(then, step_s - speeds_up_s, then) if step_s > speeds_up_s else there
 
@@ -82,7 +96,7 @@ class CommandStream(Predictor):
         if place < 0:
             return None
         command = self._commands[place]
-        return command.twist if time_s < command.time_s + self._holds_s else Twist()
+        return command.twist if time_s < command.time_s + self._holds_s else STILL
 
     def advance(self, motion: Motion, start_s: float, step_s: float, *, heard_s: float) -> Motion:
         told = self.told(start_s)
@@ -94,7 +108,7 @@ class CommandStream(Predictor):
         # The mean of wanted + (now - wanted) exp(-t / response) over the step, and its value at the end.
         left = math.exp(-step_s / self._response_s)
         mean_left = self._response_s / step_s * (1 - left) if step_s > 0 else 1.0
-        return motion.moved(_between(wanted, motion.twist, mean_left), step_s, _between(wanted, motion.twist, left))
+        return motion.moved(wanted.towards(motion.twist, mean_left), step_s, wanted.towards(motion.twist, left))
 
 
 class LastCommand(CommandStream):
@@ -127,11 +141,3 @@ class PlanTracking(Predictor):
 
 def _time_s(command: Command) -> float:
     return command.time_s
-
-
-def _between(start: Twist, end: Twist, share: float) -> Twist:
-    return Twist(
-        start.forward_mps + (end.forward_mps - start.forward_mps) * share,
-        start.left_mps + (end.left_mps - start.left_mps) * share,
-        start.yaw_radps + (end.yaw_radps - start.yaw_radps) * share,
-    )

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from sern_core.vocabulary.errors import UsageError
 from sern_twin.motion import Motion
-from sern_twin.predictors import Predictor
+from sern_twin.predictors import SOON_S, Predictor
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,23 +40,17 @@ class Reckoner:
         """Whether to send this motion of now. If so, it counts as sent. One that is not finite never is."""
         if not motion.finite:
             return False
-        twin = self._predict(now)
-        options = self._options
-        if (
-            twin is None
-            or now < self._sent_s
-            or now - self._sent_s >= options.silence_s - 1e-9
-            or twin.distance_m(motion) > options.error_m
-            or abs(twin.turn_rad(motion)) > options.error_rad
-        ):
-            self._sent_s = self._time_s = now
-            self._twin = motion
-            return True
-        return False
+        if not self._wrong(motion, now):
+            return False
+        self._sent_s = self._time_s = now
+        self._twin = motion
+        return True
 
-    def _predict(self, now: float) -> Motion | None:
-        while self._twin is not None and now - self._time_s > 1e-9:
-            part_s = min(self._options.step_s, now - self._time_s)
-            self._twin = self._predictor.advance(self._twin, self._time_s, part_s, heard_s=self._sent_s)
-            self._time_s += part_s
-        return self._twin
+    def _wrong(self, motion: Motion, now: float) -> bool:
+        """Whether the twin would be wrong, or has not heard for too long. A clock that goes back is that, too."""
+        options = self._options
+        if self._twin is None or not 0.0 <= now - self._sent_s < options.silence_s - SOON_S:
+            return True
+        self._twin = self._predictor.reach(self._twin, self._time_s, now, options.step_s, heard_s=self._sent_s)
+        self._time_s = max(self._time_s, now)
+        return self._twin.distance_m(motion) > options.error_m or abs(self._twin.turn_rad(motion)) > options.error_rad

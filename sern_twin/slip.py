@@ -27,13 +27,13 @@ class Slip:
         self.speed_scale = 1.0
         self.yaw_scale = 1.0
         self.yaw_bias_radps = 0.0
-        self._speed_squared = PRIOR_S
-        self._speed_found = PRIOR_S
+        self._speed_squared = 0.0
+        self._speed_found = 0.0
         # Normal equations of found = scale · command + bias.
-        self._yaw_squared = PRIOR_S
-        self._yaw_found = PRIOR_S
+        self._yaw_squared = 0.0
+        self._yaw_found = 0.0
         self._yaw_sum = 0.0
-        self._time_s = 4 * PRIOR_S
+        self._time_s = 0.0
         self._found_sum = 0.0
 
     def twist(self, command: Twist) -> Twist:
@@ -57,27 +57,22 @@ class Slip:
         if command.forward_mps == 0 and command.yaw_radps == 0:
             return
         kept = math.exp(-duration_s / WINDOW_S)
-        self._speed_squared = self._faded(self._speed_squared, kept, PRIOR_S) + command.forward_mps**2 * duration_s
-        self._speed_found = (
-            self._faded(self._speed_found, kept, PRIOR_S) + command.forward_mps * found.forward_mps * duration_s
-        )
-        self._yaw_squared = self._faded(self._yaw_squared, kept, PRIOR_S) + command.yaw_radps**2 * duration_s
-        self._yaw_found = self._faded(self._yaw_found, kept, PRIOR_S) + command.yaw_radps * found.yaw_radps * duration_s
-        self._yaw_sum = self._faded(self._yaw_sum, kept, 0.0) + command.yaw_radps * duration_s
-        self._time_s = self._faded(self._time_s, kept, 4 * PRIOR_S) + duration_s
-        self._found_sum = self._faded(self._found_sum, kept, 0.0) + found.yaw_radps * duration_s
+        self._speed_squared = self._speed_squared * kept + command.forward_mps**2 * duration_s
+        self._speed_found = self._speed_found * kept + command.forward_mps * found.forward_mps * duration_s
+        self._yaw_squared = self._yaw_squared * kept + command.yaw_radps**2 * duration_s
+        self._yaw_found = self._yaw_found * kept + command.yaw_radps * found.yaw_radps * duration_s
+        self._yaw_sum = self._yaw_sum * kept + command.yaw_radps * duration_s
+        self._time_s = self._time_s * kept + duration_s
+        self._found_sum = self._found_sum * kept + found.yaw_radps * duration_s
         self._solve()
 
-    @staticmethod
-    def _faded(total: float, kept: float, prior: float) -> float:
-        """What is left of a sum; the prior stays."""
-        return prior + (total - prior) * kept
-
     def _solve(self) -> None:
-        self.speed_scale = min(max(self._speed_found / self._speed_squared, LEAST), MOST)
-        # The prior makes it positive: what was commanded was never the same all the time.
-        determinant = self._yaw_squared * self._time_s - self._yaw_sum**2
-        scale = (self._yaw_found * self._time_s - self._yaw_sum * self._found_sum) / determinant
-        self.yaw_scale = min(max(scale, LEAST), MOST)
-        bias = (self._found_sum - self.yaw_scale * self._yaw_sum) / self._time_s
-        self.yaw_bias_radps = min(max(bias, -MOST_BIAS_RADPS), MOST_BIAS_RADPS)
+        """Least squares of what was found and of the ideal model, `PRIOR_S` of each scale and four times that of no
+        bias: so there is always a solution."""
+        speed_scale = (self._speed_found + PRIOR_S) / (self._speed_squared + PRIOR_S)
+        self.speed_scale = min(max(speed_scale, LEAST), MOST)
+        squared, found, time_s = self._yaw_squared + PRIOR_S, self._yaw_found + PRIOR_S, self._time_s + 4 * PRIOR_S
+        yaw_scale = (found * time_s - self._yaw_sum * self._found_sum) / (squared * time_s - self._yaw_sum**2)
+        self.yaw_scale = min(max(yaw_scale, LEAST), MOST)
+        bias_radps = (self._found_sum - self.yaw_scale * self._yaw_sum) / time_s
+        self.yaw_bias_radps = min(max(bias_radps, -MOST_BIAS_RADPS), MOST_BIAS_RADPS)

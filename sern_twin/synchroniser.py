@@ -16,14 +16,12 @@ from enum import Enum
 from typing import Final
 
 from sern_core.vocabulary.errors import UsageError
-from sern_twin.bound import GapReport, Mismatch, gap_report, reachable_bound_m
+from sern_twin.bound import GapReport, Mismatch, reachable_bound_m
 from sern_twin.correction import CorrectionOptions, Offset, Outage
-from sern_twin.motion import TAU, Motion, Twist
-from sern_twin.predictors import Predictor
+from sern_twin.motion import TAU, Motion
+from sern_twin.predictors import MOST_STEPS, SOON_S, Predictor
 
 HISTORY_S: Final = 2.0
-MOST_STEPS: Final = 3000
-"""A minute of steps; a longer time is predicted in as many longer ones, and is a minute to the correction."""
 TRIAL_S: Final = 0.5
 """How far ahead each prediction is tried while the robot is heard, to learn how wrong it gets."""
 
@@ -52,7 +50,7 @@ class SynchroniserOptions:
     """UsageError: a number that is not above 0, or not finite."""
 
     max_speed_mps: float = 2.0
-    """Of the robot."""
+    """The robot's top speed."""
     error_m: float = 0.02
     error_mps: float = 0.05
     """How far off a measurement may be: e_p and e_v at the start of each gap."""
@@ -65,7 +63,7 @@ class SynchroniserOptions:
     jump_m: float = 0.5
     """A measurement may be so much further away than the robot can have gone."""
     agreeing: int = 3
-    """So many measurements in a row that were too far away, and agree, are where the robot is."""
+    """The robot is where so many measurements in a row say it is that were too far away and agree."""
     restart_s: float = 2.0
     """After so long of stamps that are older than what is known, they are believed."""
     moving_mps: float = 0.1
@@ -169,8 +167,9 @@ class Synchroniser:
         self._strange.clear()
         self._old = None
         self._advance(now)
-        gap = self._gap(stamp_s, found, now) if outcome is Outcome.TAKEN else None
+        gap = None
         if outcome is Outcome.TAKEN:
+            gap = self._gap(stamp_s, found, now)
             self._try_prediction(stamp_s, found)
         else:
             self._trial = None
@@ -195,9 +194,7 @@ class Synchroniser:
 
     def _outcome_of_old(self, stamp_s: float, now: float) -> Outcome:
         """What was overtaken comes beside what is newer. A clock that was set back gives nothing newer."""
-        if self._old is None or stamp_s <= self._old[1]:
-            self._old = (now, stamp_s)
-        since_s, _ = self._old
+        since_s = now if self._old is None or stamp_s <= self._old[1] else self._old[0]
         self._old = (since_s, stamp_s)
         return Outcome.RESTARTED if now - since_s >= self._options.restart_s else Outcome.OLD
 
@@ -220,8 +217,8 @@ class Synchroniser:
         # The first message after a gap may be an old one: then there is only what was predicted for its stamp.
         moment = self._moment(stamp_s)
         estimate = self._predicted(self._heard, self._heard_s, stamp_s) if moment is None else moment.estimate
-        report = gap_report(
-            gap_s,
+        report = GapReport(
+            gap_s=gap_s,
             start_error_m=options.error_m,
             start_error_mps=options.error_mps,
             mismatch_mps2=self._mismatch.bound_mps2,
@@ -270,20 +267,14 @@ class Synchroniser:
 
     def _predicted(self, motion: Motion, start_s: float, end_s: float) -> Motion:
         """From a measurement on, in steps of the correction."""
-        step_s = max(self._options.correction.step_s, (end_s - start_s) / MOST_STEPS)
-        time_s = start_s
-        while end_s - time_s > 1e-9:
-            part_s = min(step_s, end_s - time_s)
-            motion = self._predictor.advance(motion, time_s, part_s, heard_s=start_s)
-            time_s += part_s
-        return motion
+        return self._predictor.reach(motion, start_s, end_s, self._options.correction.step_s, heard_s=start_s)
 
     def _advance(self, now: float) -> None:
-        """Bring estimate and offset to this time, and remember them."""
+        """Bring estimate and offset to this time, and remember them. The correction sees a minute of it at most."""
         if self._estimate is None or self._outage is None:
             return
         step_s = max(self._options.correction.step_s, (now - self._now_s) / MOST_STEPS)
-        while now - self._now_s > 1e-9:
+        while now - self._now_s > SOON_S:
             part_s = min(step_s, now - self._now_s)
             self._estimate = self._predictor.advance(self._estimate, self._now_s, part_s, heard_s=self._heard_s)
             self._now_s += part_s
@@ -330,15 +321,10 @@ def _time_s(moment: _Moment) -> float:
 
 
 def _between(start: Motion, end: Motion, share: float) -> Motion:
-    first, last = start.twist, end.twist
     return replace(
         end,
         x_m=start.x_m + (end.x_m - start.x_m) * share,
         y_m=start.y_m + (end.y_m - start.y_m) * share,
         yaw_rad=math.remainder(start.yaw_rad + start.turn_rad(end) * share, TAU),
-        twist=Twist(
-            first.forward_mps + (last.forward_mps - first.forward_mps) * share,
-            first.left_mps + (last.left_mps - first.left_mps) * share,
-            first.yaw_radps + (last.yaw_radps - first.yaw_radps) * share,
-        ),
+        twist=start.twist.towards(end.twist, share),
     )

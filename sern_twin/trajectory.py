@@ -99,7 +99,7 @@ class Trajectory:
 
 
 def _slopes(times_s: Sequence[float], values: Sequence[float], still: set[int]) -> list[float]:
-    """Of the parabola through three neighbours; at the ends of that there, with two waypoints of the line."""
+    """Slopes of the parabola through three neighbours, at the ends of the nearest; of the line through two points."""
     if len(values) == 2:
         slope = 0.0 if still else (values[1] - values[0]) / (times_s[1] - times_s[0])
         return [slope, slope]

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+pytest.importorskip("scipy", reason="the Python package scipy (extra twin) is not installed")
+
 from sern_core.vocabulary.errors import UsageError
 from sern_twin.detail import DetailOptions, Level, LevelOfDetail, proximity_m
 

@@ -18,8 +18,8 @@ from sern_twin.geodesy import (
 )
 from tests.sern_twin.rotations import random_attitudes, turned
 
-pymap3d = pytest.importorskip("pymap3d", reason="the tests of geodesy need pymap3d")
-pyproj = pytest.importorskip("pyproj", reason="the tests of geodesy need pyproj")
+pymap3d = pytest.importorskip("pymap3d", reason="the Python package pymap3d (extra dev) is not installed")
+pyproj = pytest.importorskip("pyproj", reason="the Python package pyproj (extra dev) is not installed")
 
 SITE = TangentPlane.from_degrees(39.25, -76.71, 60.0)
 
@@ -52,7 +52,7 @@ def test_haversine_is_near_the_geodesic(start: tuple[float, float], end: tuple[f
 
 
 def test_haversine_on_its_sphere() -> None:
-    """As pyproj has it where the ellipsoid is that sphere; opposite points are half a turn, and no NaN."""
+    """It says what pyproj says where the ellipsoid is that sphere; opposite points are half a turn, and no NaN."""
     random = np.random.default_rng(2)
     start, end = np.radians(random.uniform((-90, -180), (90, 180), (2, 1000, 2)))
     _, _, sphere_m = pyproj.Geod(a=6_371_008.771, b=6_371_008.771).inv(

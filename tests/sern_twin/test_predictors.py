@@ -22,9 +22,9 @@ from sern_twin.predictors import (
 )
 from sern_twin.slip import Slip
 from sern_twin.trajectory import Trajectory, Waypoint
+from tests.daemons import recording
 
 STEP_S = 0.02
-DRIVE = Path(__file__).resolve().parents[3] / "shared" / "data" / "husky_drive.csv.gz"
 START = Motion(0.0, 0.0, 0.0, Twist(1.0, 0.0, 0.0))
 
 
@@ -146,10 +146,10 @@ def test_slip_is_not_learned_from_nonsense(found_mps: float, duration_s: float) 
     assert slip.speed_scale == 1.0
 
 
-def windows() -> Iterator[list[tuple[Twist, Motion]]]:
+def windows(drive: Path) -> Iterator[list[tuple[Twist, Motion]]]:
     """Windows of 2 s of a real Husky: what it was told, and where LiDAR odometry saw it, at 20 Hz."""
     radius_m, track_m = 0.1651, 0.5708
-    with gzip.open(DRIVE, "rt") as file:
+    with gzip.open(drive, "rt") as file:
         for row in csv.DictReader(file):
             window = []
             for number in range(40):
@@ -159,12 +159,11 @@ def windows() -> Iterator[list[tuple[Twist, Motion]]]:
             yield window
 
 
-@pytest.mark.skipif(not DRIVE.exists(), reason="needs the recording husky_drive.csv.gz")
 def test_learned_slip_beats_the_ideal_model_on_a_real_husky() -> None:
     """Two seconds ahead, learned on what came before: median of the error at the end of each window."""
     slip = Slip()
     errors: dict[str, list[float]] = {"ideal": [], "learned": []}
-    for window in windows():
+    for window in windows(recording("husky_drive.csv.gz")):
         commands = [Command(0.05 * number, command) for number, (command, _) in enumerate(window)]
         start, end = window[0][1], window[-1][1]
         for name, model in (("ideal", Slip()), ("learned", slip)):

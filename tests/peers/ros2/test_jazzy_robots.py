@@ -34,10 +34,12 @@ class Sent(NamedTuple):
     topic: str
     type_name: str
     latched: bool = False
+    expires: bool = False
+    """Its messages are worth nothing after half a second, which the first may take: it is written until one came."""
 
 
 SENT: Final = (
-    Sent("platform/odom/filtered", "nav_msgs/msg/Odometry"),
+    Sent("platform/odom/filtered", "nav_msgs/msg/Odometry", expires=True),
     Sent("platform/emergency_stop", "std_msgs/msg/Bool"),
     Sent("platform/mcu/status", "clearpath_platform_msgs/msg/Status"),
     Sent("sensors/gps_0/fix", "sensor_msgs/msg/NavSatFix"),
@@ -130,8 +132,7 @@ async def topics(scene: Scene) -> None:
         await matched(scene.machine, scene.name(sent.topic))
         write = partial(scene.machine.do, "write", topic=scene.name(sent.topic), body=scene.body(sent.type_name, seed))
         written = await write()
-        # Odometry is worth nothing after half a second, which the first may take: there is more of it.
-        for _ in range(5000 if sent is SENT[0] else 0):
+        for _ in range(5000 if sent.expires else 0):
             if scene.desk.of("got", topic=scene.name(sent.topic)):
                 break
             await write()
