@@ -96,5 +96,7 @@ def held_bytes(make: Make) -> tuple[int, int]:
 
 
 def within_memory(make: Make) -> bool:
-    peak, allowed_bytes = held_bytes(make)
-    return peak <= BASE_BYTES + allowed_bytes
+    """Whether one of two inputs is. The interpreter's table of names doubles at one of them: all names of the process
+    are in it, so that it adds megabytes to whatever comes at that moment, and not to what comes after it.
+    """
+    return any(peak <= BASE_BYTES + allowed_bytes for peak, allowed_bytes in (held_bytes(make) for _ in range(2)))
