@@ -88,6 +88,8 @@ class GapReport:
     max_speed_mps: float
     error_m: float
     """The estimate's, at the first message after the gap, against the twin's own past at its stamp."""
+    end_error_m: float
+    """How far off that message may be itself."""
     shown_error_m: float | None
     """The same of the twin as it was shown; None where that is no longer known."""
 
@@ -112,5 +114,8 @@ class GapReport:
 
     @property
     def violated(self) -> bool:
-        """An assumption did not hold: the robot did something else than was predicted."""
-        return self.error_m > self.reachable_m
+        """An assumption did not hold: the robot did something else than was predicted.
+
+        What the message that ended the gap is off by itself is no part of what was predicted.
+        """
+        return self.error_m > self.reachable_m + self.end_error_m

@@ -139,5 +139,36 @@ class PlanTracking(Predictor):
         )
 
 
+class Limited(Predictor):
+    """What another says, as far as the robot can have done it: a plan that jumps, or an acceleration that was measured
+    wrong, leads nobody away faster than at these speeds."""
+
+    def __init__(self, predictor: Predictor, max_speed_mps: float, max_yaw_rate_radps: float) -> None:
+        self._predictor = predictor
+        self._max_speed_mps = max_speed_mps
+        self._max_yaw_rate_radps = max_yaw_rate_radps
+
+    def advance(self, motion: Motion, start_s: float, step_s: float, *, heard_s: float) -> Motion:
+        then = self._predictor.advance(motion, start_s, step_s, heard_s=heard_s)
+        if not then.finite:
+            return replace(motion, twist=STILL)
+        way_m, most_m = motion.distance_m(then), self._max_speed_mps * step_s
+        turn, most_rad = motion.turn_rad(then), self._max_yaw_rate_radps * step_s
+        too_fast = then.speed_mps > self._max_speed_mps or abs(then.twist.yaw_radps) > self._max_yaw_rate_radps
+        if way_m <= most_m and abs(turn) <= most_rad and not too_fast:
+            return then
+        share = min(1.0, most_m / way_m) if way_m > 0 else 1.0
+        slower = min(1.0, self._max_speed_mps / then.speed_mps) if then.speed_mps > 0 else 1.0
+        twist = then.twist
+        rate = min(max(twist.yaw_radps, -self._max_yaw_rate_radps), self._max_yaw_rate_radps)
+        return replace(
+            then,
+            x_m=motion.x_m + (then.x_m - motion.x_m) * share,
+            y_m=motion.y_m + (then.y_m - motion.y_m) * share,
+            yaw_rad=math.remainder(motion.yaw_rad + min(max(turn, -most_rad), most_rad), TAU),
+            twist=Twist(twist.forward_mps * slower, twist.left_mps * slower, rate),
+        )
+
+
 def _time_s(command: Command) -> float:
     return command.time_s

@@ -19,11 +19,17 @@ from sern_core.vocabulary.errors import UsageError
 from sern_twin.bound import GapReport, Mismatch, reachable_bound_m
 from sern_twin.correction import CorrectionOptions, Offset, Outage
 from sern_twin.motion import TAU, Motion
-from sern_twin.predictors import MOST_STEPS, SOON_S, Predictor
+from sern_twin.predictors import MOST_STEPS, SOON_S, Limited, Predictor
 
 HISTORY_S: Final = 2.0
 TRIAL_S: Final = 0.5
 """How far ahead each prediction is tried while the robot is heard, to learn how wrong it gets."""
+TOO_MUCH: Final = 1.5
+"""Times its limit: what is measured is noisy. More is a fault, and would lead the twin away at that speed."""
+MOST_M: Final = 1e7
+"""No place of a site is further from its origin: a quarter of the way round the Earth."""
+MOST_S: Final = 1e10
+"""Nothing that is told now is of 300 years ago."""
 
 
 class Outcome(Enum):
@@ -37,6 +43,8 @@ class Outcome(Enum):
     OLD = "old"
     """Not newer than what is known."""
     NOT_FINITE = "not_finite"
+    IMPLAUSIBLE = "implausible"
+    """Faster than the robot can be, further away than there are places, or longer ago than there are robots."""
     FUTURE = "future"
     JUMP = "jump"
     """Further away than the robot can have gone."""
@@ -50,7 +58,10 @@ class SynchroniserOptions:
     """UsageError: a number that is not above 0, or not finite."""
 
     max_speed_mps: float = 2.0
-    """The robot's top speed."""
+    """The robot's top speed; it is not measured to be more than `TOO_MUCH` times as fast."""
+    max_yaw_rate_radps: float = 6.0
+    max_accel_mps2: float = 10.0
+    max_yaw_accel_radps2: float = 40.0
     error_m: float = 0.02
     error_mps: float = 0.05
     """How far off a measurement may be: e_p and e_v at the start of each gap."""
@@ -114,7 +125,7 @@ class Synchroniser:
 
     def __init__(self, predictor: Predictor, options: SynchroniserOptions | None = None) -> None:
         self._options = options or SynchroniserOptions()
-        self._predictor = predictor
+        self._predictor = self._limited(predictor)
         self._offset = Offset(self._options.correction)
         self._outage: Outage | None = None
         self._mismatch = Mismatch(self._options.least_mismatch_mps2)
@@ -144,7 +155,7 @@ class Synchroniser:
     def predict_with(self, predictor: Predictor, *, now: float) -> None:
         """Go on with another predictor from now: a plan came, or it is over. The shown twin does not jump."""
         self._advance(now)
-        self._predictor = predictor
+        self._predictor = self._limited(predictor)
         self._trial = None
 
     def twin(self, *, now: float) -> Twin | None:
@@ -178,9 +189,15 @@ class Synchroniser:
 
     # In here
 
+    def _limited(self, predictor: Predictor) -> Limited:
+        options = self._options
+        return Limited(predictor, TOO_MUCH * options.max_speed_mps, TOO_MUCH * options.max_yaw_rate_radps)
+
     def _outcome(self, stamp_s: float, found: Motion, now: float) -> Outcome:
         if not (math.isfinite(stamp_s) and found.finite):
             return Outcome.NOT_FINITE
+        if not self._plausible(found) or abs(now - stamp_s) > MOST_S:
+            return Outcome.IMPLAUSIBLE
         if stamp_s > now + self._options.future_s:
             return Outcome.FUTURE
         if stamp_s <= self._heard_s:
@@ -191,6 +208,16 @@ class Synchroniser:
             self._strange.clear()
         self._strange.append((stamp_s, found))
         return Outcome.RELOCATED if len(self._strange) >= self._options.agreeing else Outcome.JUMP
+
+    def _plausible(self, found: Motion) -> bool:
+        options, twist = self._options, found.twist
+        return (
+            max(abs(found.x_m), abs(found.y_m)) <= MOST_M
+            and found.speed_mps <= TOO_MUCH * options.max_speed_mps
+            and abs(twist.yaw_radps) <= TOO_MUCH * options.max_yaw_rate_radps
+            and abs(found.forward_mps2) <= TOO_MUCH * options.max_accel_mps2
+            and abs(found.yaw_radps2) <= TOO_MUCH * options.max_yaw_accel_radps2
+        )
 
     def _outcome_of_old(self, stamp_s: float, now: float) -> Outcome:
         """What was overtaken comes beside what is newer. A clock that was set back gives nothing newer."""
@@ -224,10 +251,10 @@ class Synchroniser:
             mismatch_mps2=self._mismatch.bound_mps2,
             max_speed_mps=options.max_speed_mps,
             error_m=estimate.distance_m(found),
+            end_error_m=options.error_m,
             shown_error_m=None if moment is None else moment.shown.distance_m(found),
         )
-        # What is measured may be off by its own error, beside the bound.
-        self._outside = report.error_m > report.reachable_m + options.error_m
+        self._outside = report.violated
         stopped = estimate.speed_mps > options.moving_mps and found.speed_mps < options.moving_mps / 2
         return Gap(report, stopped)
 

@@ -95,12 +95,12 @@ def test_a_mismatch_that_is_none(wrong: float) -> None:
 
 
 @pytest.mark.parametrize(
-    ("error_m", "violated"), [(0.0, False), (0.05, False), (0.269, False), (0.271, True), (0.5, True)]
+    ("error_m", "violated"), [(0.0, False), (0.05, False), (0.279, False), (0.281, True), (0.5, True)]
 )
 def test_a_gap_is_reported(error_m: float, violated: bool) -> None:
     report = GapReport(
         gap_s=1.0, start_error_m=0.02, start_error_mps=0.2, mismatch_mps2=0.1, max_speed_mps=1.0, error_m=error_m,
-        shown_error_m=0.4,
+        end_error_m=0.01, shown_error_m=0.4,
     )  # fmt: skip
     assert [report.bound_m, report.reachable_m] == pytest.approx([0.27, 0.27])
     assert report.violated is violated
@@ -109,7 +109,13 @@ def test_a_gap_is_reported(error_m: float, violated: bool) -> None:
 
 
 def test_a_gap_where_nothing_was_allowed() -> None:
-    certain = {"start_error_m": 0.0, "start_error_mps": 0.0, "mismatch_mps2": 0.0, "shown_error_m": 0.0}
+    certain = {
+        "start_error_m": 0.0,
+        "start_error_mps": 0.0,
+        "mismatch_mps2": 0.0,
+        "end_error_m": 0.0,
+        "shown_error_m": 0.0,
+    }
     assert GapReport(gap_s=1.0, max_speed_mps=1.0, error_m=0.0, **certain).ratio == 0.0
     report = GapReport(gap_s=1.0, max_speed_mps=1.0, error_m=0.1, **certain)
     assert (report.ratio, report.violated) == (math.inf, True)

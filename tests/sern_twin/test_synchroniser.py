@@ -7,9 +7,10 @@ import pytest
 
 from sern_core.vocabulary.errors import UsageError
 from sern_twin.motion import STILL, Motion, Twist
-from sern_twin.predictors import ConstantTwist, PlanTracking
+from sern_twin.predictors import ConstantAcceleration, ConstantTwist, PlanTracking
 from sern_twin.synchroniser import Gap, Outcome, Synchroniser, SynchroniserOptions
 from sern_twin.trajectory import Trajectory, Waypoint
+from tests.exploring import seeds
 
 STEP_S = 0.02
 AHEAD = Twist(1.0, 0.0, 0.0)
@@ -66,11 +67,28 @@ def test_what_was_overtaken_changes_nothing() -> None:
         (math.nan, ahead(1.0), Outcome.NOT_FINITE),
         (1.1, Motion(math.nan, 0.0, 0.0), Outcome.NOT_FINITE),
         (1.1, Motion(1.0, 0.0, 0.0, Twist(math.inf)), Outcome.NOT_FINITE),
+        (1.1, Motion(1.1, 0.0, 0.0, Twist(1e3)), Outcome.IMPLAUSIBLE),
+        (1.1, Motion(1.1, 0.0, 0.0, Twist(1.0, 0.0, 1e300)), Outcome.IMPLAUSIBLE),
+        (1.1, Motion(1.1, 0.0, 0.0, AHEAD, 1e300), Outcome.IMPLAUSIBLE),
+        (1.1, Motion(1.1, 0.0, 0.0, AHEAD, 0.0, -1e300), Outcome.IMPLAUSIBLE),
+        (1.1, Motion(1e300, 0.0, 0.0, AHEAD), Outcome.IMPLAUSIBLE),
         (1.26 + 0.1, ahead(1.0), Outcome.FUTURE),
         (1.1, ahead(1.1, y_m=40.0), Outcome.JUMP),
         (0.5, ahead(0.5), Outcome.OLD),
     ],
-    ids=["no stamp", "no place", "no speed", "future", "jump of GPS", "old"],
+    ids=[
+        "no stamp",
+        "no place",
+        "no speed",
+        "absurd speed",
+        "absurd turn",
+        "absurd acceleration",
+        "absurd turning",
+        "no place on Earth",
+        "future",
+        "jump of GPS",
+        "old",
+    ],
 )
 def test_what_is_not_taken_moves_nothing_and_is_counted(stamp_s: float, found: Motion, outcome: Outcome) -> None:
     twin, beside = Synchroniser(ConstantTwist()), Synchroniser(ConstantTwist())
@@ -236,6 +254,35 @@ def test_the_bound_holds_where_its_assumption_does() -> None:
         assert said.shown.distance_m(found) <= said.error_m
         _, gap = twin.measured(now, found, now=now)
         assert gap is not None and not gap.report.violated
+
+
+@pytest.mark.parametrize("seed", seeds(30))
+def test_whatever_is_said_of_a_robot_what_is_shown_keeps_its_limits(seed: int) -> None:
+    """Whoever plays with stamps, places and speeds moves what is shown no faster than a robot goes and a correction
+    leads; only a snap, which is counted, is further."""
+    random = Random(seed)
+    options = SynchroniserOptions()
+    limit_mps = 1.5 * options.max_speed_mps + options.correction.max_speed_mps
+    wild = (math.nan, math.inf, -1e308, 1e308, 1e300, 1e12, 1e4, -3.0, 0.0, 1.0)
+    twin = Synchroniser(random.choice((ConstantTwist(), ConstantAcceleration())), options)
+    now, before, snaps = 0.0, None, 0
+
+    def near(value: float, spread: float) -> float:
+        return random.choice(wild) if random.random() < 0.1 else value + random.gauss(0.0, spread)
+
+    for _ in range(600):
+        now += random.choice((0.02, 0.02, 0.02, 0.3))
+        stamp_s = near(now - random.choice((0.0, 0.1, 1.0)), 0.1)
+        speeds = Twist(near(1.0, 1.0), near(0.0, 0.3), near(0.0, 2.0))
+        x_m = near(now, random.choice((0.1, 1.0, 10.0)))
+        twin.measured(stamp_s, Motion(x_m, near(0.0, 1.0), near(0.0, 1.0), speeds, near(0.0, 5.0)), now=now)
+        said = twin.twin(now=now)
+        if said is None:
+            continue
+        assert said.shown.finite and math.isfinite(said.error_m)
+        if before is not None and twin.snaps == snaps:
+            assert said.shown.distance_m(before[1]) <= limit_mps * (now - before[0]) + 1e-9
+        before, snaps = (now, said.shown), twin.snaps
 
 
 def test_how_wrong_the_predictor_gets_is_learned() -> None:
