@@ -30,10 +30,10 @@ class CorrectionOptions:
     the update is stable if and only if Kp > 0 and Kp T / 2 < Kd < 2 / T.
     """
 
-    proportional: float = 9.0
+    proportional: float = 16.0
     proportional_min: float = 0.25
     proportional_decay_per_s: float = 0.2
-    derivative: float = 6.0
+    derivative: float = 8.0
     derivative_min: float = 1.0
     derivative_decay_per_s: float = 0.1
     """The first gains are the most, too: Kp⁰ = Kp^max."""
@@ -46,7 +46,7 @@ class CorrectionOptions:
     tolerance_rad: float = math.radians(1.0)
     tolerance_growth: float = 0.05
     """How much of the way that the robot would go in a gap is tolerated: α_ε is this times its speed."""
-    recovery_s: float = 1.0
+    recovery_s: float = 0.3
     """How fast a gap is forgotten once the robot is heard again."""
     step_s: float = 0.02
     """The longest step that `Offset.step` takes; longer ones are cut into such."""

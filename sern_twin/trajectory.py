@@ -98,6 +98,44 @@ class Trajectory:
         return (x_m, y_m) if math.hypot(x_m, y_m) >= _SAME_M else (0.0, 0.0)
 
 
+def paced(way: Sequence[tuple[float, float]], start: Motion, start_s: float, speed_mps: float) -> Trajectory:
+    """A path without times, as a robot drives it that is at `start` and goes on at this speed: from the place of the
+    path that is nearest to it, to the end. BodyError as above, and for a speed that is not above 0 or a path whose end
+    is where the robot is."""
+    if not (math.isfinite(speed_mps) and speed_mps > 0):
+        raise BodyError(f"a path cannot be driven at {speed_mps} m/s")
+    if len(way) < 2 or not all(math.isfinite(value) for point in way for value in point):
+        raise BodyError(f"a path of {len(way)} points, all finite: it takes two")
+    _, part, foot = min(
+        (
+            (math.dist(at, (start.x_m, start.y_m)), number, at)
+            for number in range(len(way) - 1)
+            for at in (_foot(way[number], way[number + 1], start),)
+        ),
+    )
+    points = [Waypoint(start_s, *foot)]
+    time_s, last = start_s, foot
+    for point in way[part + 1 :]:
+        length_m = math.dist(last, point)
+        if length_m < _SAME_M:
+            continue
+        time_s += length_m / speed_mps
+        points.append(Waypoint(time_s, *point))
+        last = point
+    return Trajectory(points)
+
+
+def _foot(begin: tuple[float, float], end: tuple[float, float], motion: Motion) -> tuple[float, float]:
+    """The place between the two that is nearest."""
+    x_m, y_m = end[0] - begin[0], end[1] - begin[1]
+    squared = x_m**2 + y_m**2
+    if squared == 0:
+        return begin
+    share = ((motion.x_m - begin[0]) * x_m + (motion.y_m - begin[1]) * y_m) / squared
+    share = min(max(share, 0.0), 1.0)
+    return begin[0] + share * x_m, begin[1] + share * y_m
+
+
 def _slopes(times_s: Sequence[float], values: Sequence[float], still: set[int]) -> list[float]:
     """Slopes of the parabola through three neighbours, at the ends of the nearest; of the line through two points."""
     if len(values) == 2:

@@ -29,9 +29,9 @@ def led(offset: Offset, gap_s: float, duration_s: float) -> list[float]:
 
 
 def test_gains_fall_with_the_gap_and_stay_within_their_limits() -> None:
-    assert OPTIONS.gains(0.0) == Gains(9.0, 6.0)
+    assert OPTIONS.gains(0.0) == Gains(16.0, 8.0)
     softer = OPTIONS.gains(5.0)
-    assert [softer.proportional, softer.derivative] == pytest.approx([9 / math.e, 6 * math.exp(-0.5)])
+    assert [softer.proportional, softer.derivative] == pytest.approx([16 / math.e, 8 * math.exp(-0.5)])
     assert OPTIONS.gains(1000.0) == Gains(0.25, 1.0)
 
 
@@ -154,8 +154,8 @@ def test_a_gap_is_remembered() -> None:
 @pytest.mark.parametrize(
     "wrong",
     [{"proportional": -1.0}, {"derivative": math.nan}, {"snap_m": math.inf}, {"proportional_min": 0.0},
-     {"proportional_min": 10.0}, {"derivative_min": 7.0}, {"step_s": 0.0}, {"recovery_s": 0.0}, {"step_s": 0.4},
-     {"proportional": 700.0}],
+     {"proportional_min": 17.0}, {"derivative_min": 9.0}, {"step_s": 0.0}, {"recovery_s": 0.0}, {"step_s": 0.4},
+     {"proportional": 900.0}],
 )  # fmt: skip
 def test_options_that_cannot_be(wrong: dict[str, float]) -> None:
     with pytest.raises(UsageError, match="correction"):

@@ -17,6 +17,7 @@ from sern_twin.predictors import (
     ConstantAcceleration,
     ConstantTwist,
     LastCommand,
+    Limited,
     PlanTracking,
     Predictor,
 )
@@ -179,3 +180,31 @@ def test_learned_slip_beats_the_ideal_model_on_a_real_husky() -> None:
     assert len(errors["ideal"]) > 500
     assert median(errors["learned"][60:]) < 0.8 * median(errors["ideal"][60:])
     assert slip.yaw_scale < 0.7, "it turns less than an ideal drive"
+
+
+@pytest.mark.parametrize(
+    "wild",
+    [
+        Motion(1e9, 0.0, 0.0, Twist(1e9)),
+        Motion(0.0, -1e300, 3.0, Twist(0.0, 0.0, 1e300)),
+        Motion(math.nan, 0.0, 0.0),
+        Motion(math.inf, 0.0, 0.0),
+    ],
+)
+def test_what_a_robot_cannot_do_is_not_predicted(wild: Motion) -> None:
+    class Wild(Predictor):
+        def advance(self, motion: Motion, start_s: float, step_s: float, *, heard_s: float) -> Motion:
+            return wild
+
+    start = Motion(1.0, 1.0, 0.5, Twist(1.0))
+    then = Limited(Wild(), 3.0, 6.0).advance(start, 0.0, 0.02, heard_s=0.0)
+    assert then.finite and start.distance_m(then) <= 0.06 + 1e-9 and abs(start.turn_rad(then)) <= 0.12 + 1e-9
+    assert then.speed_mps <= 3.0 + 1e-9 and abs(then.twist.yaw_radps) <= 6.0
+
+
+def test_what_a_robot_can_do_is_predicted_as_it_is() -> None:
+    start = Motion(1.0, 1.0, 0.5, Twist(1.0, 0.0, 0.7))
+    limited = Limited(ConstantTwist(), 3.0, 6.0)
+    assert limited.reach(start, 0.0, 2.0, 0.02, heard_s=0.0) == ConstantTwist().reach(
+        start, 0.0, 2.0, 0.02, heard_s=0.0
+    )

@@ -1,0 +1,56 @@
+"""A robot that follows a plan: where it is to be now, where it thinks it is, and what it tells its wheels.
+
+The law is that of Kanayama et al. (ICRA 1990). A skid-steered base turns less than its wheels say, so the wheels are
+told the more; the integrals take up what is left of that.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from sern_sim.robot import STEP_S, Pose2
+
+
+class Reference(NamedTuple):
+    """Where the plan has the robot now, and how fast; speeds in the body's axes."""
+
+    pose: Pose2
+    speed_mps: float
+    yaw_rate_radps: float
+
+
+@dataclass(frozen=True, slots=True)
+class FollowerOptions:
+    along_per_s: float = 1.5
+    across_per_m2: float = 8.0
+    heading_per_m: float = 4.0
+    turn_per_s: float = 0.5
+    """How fast the integral of the turn grows: what the base turns less than it is told."""
+    most_turn_radps: float = 2.0
+    """The integral at the most: a robot that is held must not spin when it is let go."""
+
+
+class Follower:
+    """`command` is asked once a step. `yaw_scale`: what the base makes of a turn, as far as its maker knows."""
+
+    def __init__(self, yaw_scale: float, options: FollowerOptions | None = None) -> None:
+        self._yaw_scale = yaw_scale
+        self._options = options or FollowerOptions()
+        self._turn_radps = 0.0
+
+    def command(self, reference: Reference, found: Pose2) -> tuple[float, float]:
+        """Speed m/s and yaw rate rad/s for the wheels, of a robot that thinks it is at `found`."""
+        options = self._options
+        x_m, y_m = reference.pose.x_m - found.x_m, reference.pose.y_m - found.y_m
+        cos, sin = math.cos(found.yaw_rad), math.sin(found.yaw_rad)
+        ahead_m, left_m = cos * x_m + sin * y_m, cos * y_m - sin * x_m
+        turn_rad = math.remainder(reference.pose.yaw_rad - found.yaw_rad, 2 * math.pi)
+        speed = reference.speed_mps * math.cos(turn_rad) + options.along_per_s * ahead_m
+        lead = abs(reference.speed_mps) * (
+            options.across_per_m2 * math.copysign(1.0, reference.speed_mps) * left_m
+            + options.heading_per_m * math.sin(turn_rad)
+        )
+        if abs(reference.speed_mps) > 0.05:
+            grown = self._turn_radps + options.turn_per_s * lead * STEP_S
+            self._turn_radps = min(max(grown, -options.most_turn_radps), options.most_turn_radps)
+        return speed, (reference.yaw_rate_radps + lead + self._turn_radps) / self._yaw_scale
