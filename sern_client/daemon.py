@@ -19,7 +19,7 @@ from sern_client.bridge import Bridge
 from sern_client.checks import TableCheck
 from sern_client.client_metrics import Counting, register_client
 from sern_client.connection import Connection
-from sern_client.endpoints.base import Endpoint
+from sern_client.endpoints.base import Endpoint, ServedEndpoint
 from sern_client.endpoints.composite import with_services
 from sern_client.factory import make_endpoint, make_link_topics
 from sern_client.guard import Guard
@@ -332,6 +332,7 @@ class ClientDaemon:
                 "/api/trace": trace_view(of_client(self.core.link, self.core.trace), clock.now),
                 "/api/values": self.site.values.view(),
                 **({} if adaptation is None else {"/api/mmcf": adaptation.to_json}),
+                **(self.site.endpoint.json_routes if isinstance(self.site.endpoint, ServedEndpoint) else {}),
             },
             parts=self.parts,
         )

@@ -9,7 +9,7 @@ from math import inf
 from typing import Final
 
 from sern_client.actions import GoalWatch
-from sern_client.endpoints.base import Difference, Publisher, keepers_of, publisher_within
+from sern_client.endpoints.base import Difference, Publisher, keepers_of, publisher_within, teller_of_age
 from sern_client.frames import Rewrite
 from sern_client.guard import Guard
 from sern_client.keeping import Keeping
@@ -40,7 +40,19 @@ class Incoming:
     """A stream from elsewhere that is published here, as `info`. `stop` is the body that a lost link makes us publish.
     `publisher` None: it is of use to another stream only. `guarded`: what the guard calls it; None: it has none."""
 
-    __slots__ = ("guarded", "info", "kept", "lease", "local", "publish", "publisher", "rewrite", "stop", "withdrawn")
+    __slots__ = (
+        "aged",
+        "guarded",
+        "info",
+        "kept",
+        "lease",
+        "local",
+        "publish",
+        "publisher",
+        "rewrite",
+        "stop",
+        "withdrawn",
+    )
 
     def __init__(
         self,
@@ -66,6 +78,7 @@ class Incoming:
     def use(self, publisher: Publisher | None) -> None:
         self.publisher = publisher
         self.publish = None if publisher is None else publisher_within(publisher)
+        self.aged = None if publisher is None else teller_of_age(publisher)
 
 
 class Inbound:
@@ -250,6 +263,8 @@ class Inbound:
         if not self.rebuilds.message(stream, message, owed=mark is not None):
             lifespan_s = stream.spec.lifespan_s
             left_s = inf if lifespan_s is None else max(lifespan_s - age_s, 0.0)
+            if incoming.aged is not None:
+                incoming.aged(age_s)
             self._show(incoming, message.body, message.stamp_ns, left_s)
         if mark is None:
             pass

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, TypeVar, get_args, get_type_hints
 from sern_client.endpoints.base import Endpoint
 from sern_core.vocabulary.errors import ConfigError, UsageError
 from sern_runtime.config import endpoints as sections
+from sern_runtime.config.base import EndpointBase
+from sern_runtime.config.twin import TwinEndpoint
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -39,6 +41,8 @@ def make_section(section: sections.EndpointSection, resolve: Resolve, *, second:
             return ZenohEndpoint(options_of(ZenohOptions, section, resolve, second=second))
         case sections.DdsEndpoint():
             return _dds(section, resolve)
+        case TwinEndpoint():
+            return _twin(section, resolve)
         case sections.SyntheticEndpoint():
             from sern_client.endpoints.synthetic import SyntheticEndpoint, SyntheticOptions
 
@@ -50,7 +54,7 @@ def make_section(section: sections.EndpointSection, resolve: Resolve, *, second:
     raise UsageError(f"no endpoint for a section of type {type(section).__name__}")
 
 
-def options_of(kind: type[Options], section: sections.EndpointBase, resolve: Resolve, **given: object) -> Options:
+def options_of(kind: type[Options], section: EndpointBase, resolve: Resolve, **given: object) -> Options:
     """The options of an endpoint: each field is the key of its name in the section, a test holds the two together.
 
     Paths are those that the file means. Options within options come from the same section. `given`: what no file says.
@@ -72,6 +76,14 @@ def _resolved(value: str | Sequence[str] | None, resolve: Resolve) -> Path | tup
     if value is None:
         return None
     return resolve(value) if isinstance(value, str) else tuple(resolve(path) for path in value)
+
+
+def _twin(section: TwinEndpoint, resolve: Resolve) -> Endpoint:
+    from sern_client.endpoints.twin.endpoint import TwinEndpoint
+    from sern_client.endpoints.twin.options import RobotOptions, TwinOptions
+
+    robots = tuple(RobotOptions(**robot.model_dump()) for robot in section.robots)
+    return TwinEndpoint(options_of(TwinOptions, section.model_copy(update={"robots": robots}), resolve))
 
 
 def _dds(section: sections.DdsEndpoint, resolve: Resolve) -> Endpoint:

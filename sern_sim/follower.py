@@ -1,7 +1,7 @@
 """A robot that follows a plan: where it is to be now, where it thinks it is, and what it tells its wheels.
 
 The law is that of Kanayama et al. (ICRA 1990). A skid-steered base turns less than its wheels say, so the wheels are
-told the more; the integrals take up what is left of that.
+told the more; the integral of what its gyroscope misses takes up what is left of that.
 """
 
 import math
@@ -22,10 +22,10 @@ class Reference(NamedTuple):
 @dataclass(frozen=True, slots=True)
 class FollowerOptions:
     along_per_s: float = 1.5
-    across_per_m2: float = 8.0
+    across_per_m2: float = 4.0
     heading_per_m: float = 4.0
-    turn_per_s: float = 0.5
-    """How fast the integral of the turn grows: what the base turns less than it is told."""
+    turn_per_s: float = 4.0
+    """How fast the integral of the turn grows: what the base turns less than it is to."""
     most_turn_radps: float = 2.0
     """The integral at the most: a robot that is held must not spin when it is let go."""
 
@@ -38,8 +38,8 @@ class Follower:
         self._options = options or FollowerOptions()
         self._turn_radps = 0.0
 
-    def command(self, reference: Reference, found: Pose2) -> tuple[float, float]:
-        """Speed m/s and yaw rate rad/s for the wheels, of a robot that thinks it is at `found`."""
+    def command(self, reference: Reference, found: Pose2, turning_radps: float) -> tuple[float, float]:
+        """Speed m/s and yaw rate rad/s for the wheels, of a robot that thinks it is at `found`, and turns so."""
         options = self._options
         x_m, y_m = reference.pose.x_m - found.x_m, reference.pose.y_m - found.y_m
         cos, sin = math.cos(found.yaw_rad), math.sin(found.yaw_rad)
@@ -50,7 +50,7 @@ class Follower:
             options.across_per_m2 * math.copysign(1.0, reference.speed_mps) * left_m
             + options.heading_per_m * math.sin(turn_rad)
         )
-        if abs(reference.speed_mps) > 0.05:
-            grown = self._turn_radps + options.turn_per_s * lead * STEP_S
-            self._turn_radps = min(max(grown, -options.most_turn_radps), options.most_turn_radps)
-        return speed, (reference.yaw_rate_radps + lead + self._turn_radps) / self._yaw_scale
+        wanted_radps = reference.yaw_rate_radps + lead
+        grown = self._turn_radps + options.turn_per_s * (wanted_radps - turning_radps) * STEP_S
+        self._turn_radps = min(max(grown, -options.most_turn_radps), options.most_turn_radps)
+        return speed, (wanted_radps + self._turn_radps) / self._yaw_scale

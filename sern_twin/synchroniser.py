@@ -152,6 +152,11 @@ class Synchroniser:
         """How often the shown twin was set to the estimate because it was too far from it."""
         return self._offset.snaps
 
+    @property
+    def correction_mps(self) -> float:
+        """How fast what is shown is led beside what is known."""
+        return self._offset.speed_mps
+
     def predict_with(self, predictor: Predictor, *, now: float) -> None:
         """Go on with another predictor from now: a plan came, or it is over. The shown twin does not jump."""
         self._advance(now)

@@ -4,6 +4,7 @@ trajectory_msgs)."""
 import math
 from bisect import bisect_right
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import Final, NamedTuple
 
 from sern_core.vocabulary.errors import BodyError
@@ -11,6 +12,8 @@ from sern_twin.motion import TAU, Motion, Twist
 
 MOST_POINTS: Final = 100_000
 """More are of no plan: a robot that sends them would fill the twin's memory."""
+PART_M: Final = 0.25
+"""How far apart the points of a path without times are at the most."""
 _SAME_M: Final = 1e-3
 
 
@@ -113,14 +116,25 @@ def paced(way: Sequence[tuple[float, float]], start: Motion, start_s: float, spe
             for at in (_foot(way[number], way[number + 1], start),)
         ),
     )
+    # Curves through points that are far apart would cut corners.
+    part_m = max(PART_M, sum(math.dist(a, b) for a, b in pairwise(way)) / MOST_POINTS * 2)
     points = [Waypoint(start_s, *foot)]
     time_s, last = start_s, foot
     for point in way[part + 1 :]:
         length_m = math.dist(last, point)
         if length_m < _SAME_M:
             continue
+        parts = max(1, math.ceil(length_m / part_m))
+        for number in range(1, parts + 1):
+            share = number / parts
+            points.append(
+                Waypoint(
+                    time_s + share * length_m / speed_mps,
+                    last[0] + share * (point[0] - last[0]),
+                    last[1] + share * (point[1] - last[1]),
+                )
+            )
         time_s += length_m / speed_mps
-        points.append(Waypoint(time_s, *point))
         last = point
     return Trajectory(points)
 

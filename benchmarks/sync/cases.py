@@ -6,7 +6,6 @@ import math
 import time
 from collections.abc import Callable, Iterator
 from functools import partial
-from itertools import pairwise
 from pathlib import Path
 from random import Random
 from statistics import median
@@ -143,7 +142,7 @@ def stop(seeds: int, report: Report) -> None:
             flagged += first <= (step + 1) * STEP_S and gap.stopped
             snapped += played.snaps > 0
             back_s.append(_until_back(recording, played, step) * STEP_S)
-            fastest_mps.append(_fastest_mps(played, step))
+            fastest_mps.append(max(played.corrections_mps[step:]))
         report.row(
             "stop in the gap", f"{before_s:g} s before its end",
             flagged_percent=100 * flagged / seeds, snapped_percent=100 * snapped / seeds,
@@ -169,12 +168,6 @@ def _until_back(recording: Recording, played: Played, step: int) -> int:
         if twin is None or recording.truth[number].distance_m(twin.shown) > BACK_M:
             last = number + 1
     return last - step
-
-
-def _fastest_mps(played: Played, step: int) -> float:
-    """How fast what is shown moves beside a robot that stands: a correction, and nothing else, once it is known."""
-    shown = [twin.shown for twin in played.twins[step + 25 :] if twin is not None]
-    return max(before.distance_m(after) / STEP_S for before, after in pairwise(shown))
 
 
 # --- motion of real robots --------------------------------------------------------------------------------------------

@@ -101,6 +101,7 @@ class Played:
     twins: list[Twin | None] = field(default_factory=list)
     gaps: list[tuple[float, Gap]] = field(default_factory=list)
     snaps: int = 0
+    corrections_mps: list[float] = field(default_factory=list)
 
 
 def play(recording: Recording, way: Way, options: SynchroniserOptions | None = None) -> Played:
@@ -122,6 +123,7 @@ def play(recording: Recording, way: Way, options: SynchroniserOptions | None = N
                 learned_s = coming.at_s + LEARNS_S
             coming = next(heard, None)
         made.twins.append(twin.twin(now=now))
+        made.corrections_mps.append(twin.correction_mps)
     made.snaps = twin.snaps
     return made
 

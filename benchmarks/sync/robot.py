@@ -91,6 +91,7 @@ class Robot:
                 Pose2(planned.x_m, planned.y_m, planned.yaw_rad), planned.twist.forward_mps, planned.twist.yaw_radps
             ),
             found,
+            before.yaw_rate_radps + random.gauss(0.0, NOISE_RADPS),
         )
         if before.time_s >= self._stops_s:
             command = 0.0, 0.0

@@ -52,6 +52,19 @@ class AgingPublisher(Protocol):
         """Publish as `publish` does, and never later than in `left_s`, when the message is too old."""
 
 
+@runtime_checkable
+class AgedPublisher(Protocol):
+    """A `Publisher` to which the age of a message matters."""
+
+    def tell_age(self, age_s: float) -> None:
+        """How old the message is that is published next: since its origin took it, without comparing clocks."""
+
+
+def teller_of_age(publisher: Publisher) -> Callable[[float], None] | None:
+    """`tell_age` of a publisher to which it matters; None: it does not."""
+    return publisher.tell_age if isinstance(publisher, AgedPublisher) else None
+
+
 PublishWithin = Callable[[bytes, int, float], None]
 
 
@@ -141,6 +154,16 @@ class CountingEndpoint(Protocol):
     @property
     def drops(self) -> Mapping[DropReason, int]:
         """Messages it has dropped so far, by reason."""
+        ...
+
+
+@runtime_checkable
+class ServedEndpoint(Protocol):
+    """An endpoint of which the client's HTTP server tells something."""
+
+    @property
+    def json_routes(self) -> Mapping[str, Callable[[], object]]:
+        """What to serve, by path."""
         ...
 
 

@@ -77,6 +77,15 @@ class FileProblem:
     warning: bool = False
 
 
+class EndpointBase(Section):
+    """What all endpoint sections share."""
+
+    def file_problems(self, base_dir: Path, loc: Loc) -> Iterator[FileProblem]:
+        """Problems with the files this endpoint reads or writes; `loc` is its place. By default it has none."""
+        del base_dir, loc
+        return iter(())
+
+
 class FileModel(Section):
     """A whole file. `file_problems` is the second step of checking: it looks at the other files that this one names."""
 

@@ -66,6 +66,7 @@ from sern_runtime.config.shared import (
     secret_key_problems,
 )
 from sern_runtime.config.summaries import OneOrMoreSummaries, one_or_list, specs
+from sern_runtime.config.twin import TwinEndpoint
 from sern_runtime.config.yaml import Data
 
 
@@ -480,6 +481,13 @@ class ClientFile(FileModel):
             raise fault(f"all that it subscribes to: {what}{error}", *at) from error
         return self
 
+    @model_validator(mode="after")
+    def _twins_are_alone(self) -> "ClientFile":
+        for index, section in enumerate(self.endpoints):
+            if isinstance(section, TwinEndpoint) and len(self.endpoints) > 1:
+                raise fault("twins are the only endpoint of their client: run them in another", "endpoint", index)
+        return self
+
     @property
     def name(self) -> ClientName:
         return ClientName(self.client.name)
@@ -495,7 +503,10 @@ class ClientFile(FileModel):
 
     def rules(self) -> RuleSet:
         """The topic rules as the core reads them."""
-        implied = self.actions.topic_rules()
+        twins = (
+            rule for section in self.endpoints if isinstance(section, TwinEndpoint) for rule in section.topic_rules()
+        )
+        implied = (*self.actions.topic_rules(), *twins)
         rules = (*implied, *(section.rule() for section in self.topics))
         return RuleSet(rules, retention_s=self.link.retention_s, implied=len(implied))
 

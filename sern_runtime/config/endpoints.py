@@ -18,6 +18,7 @@ from sern_runtime import ros_installation
 from sern_runtime.config.base import (
     Bytes,
     Count,
+    EndpointBase,
     FileProblem,
     HertzOrOff,
     NamespaceText,
@@ -25,7 +26,6 @@ from sern_runtime.config.base import (
     Pattern,
     Seconds,
     SecondsOrZero,
-    Section,
     TopicText,
     fault,
     pattern_problems,
@@ -34,6 +34,7 @@ from sern_runtime.config.base import (
     unit_makes,
     unit_problems,
 )
+from sern_runtime.config.twin import TwinEndpoint
 from sern_runtime.config.yaml import Loc
 
 MAX_SYNTHETIC_TOPICS = 20
@@ -54,15 +55,6 @@ def missing_package(package: str, remedy: str, loc: Loc) -> Iterator[FileProblem
     if not installed(package):
         problem = f"needs the Python package {package}, which is not on this machine: {remedy}"
         yield FileProblem((*loc, "kind"), problem, warning=True)
-
-
-class EndpointBase(Section):
-    """What all endpoint sections share."""
-
-    def file_problems(self, base_dir: Path, loc: Loc) -> Iterator[FileProblem]:
-        """Problems with the files this endpoint reads or writes; `loc` is its place. By default it has none."""
-        del base_dir, loc
-        return iter(())
 
 
 class BagEndpoint(EndpointBase):
@@ -366,6 +358,13 @@ def missing_directories(base_dir: Path, paths: tuple[str, ...], loc: Loc) -> Ite
 
 
 EndpointSection = Annotated[
-    BagEndpoint | SyntheticEndpoint | RecordEndpoint | Ros1Endpoint | DdsEndpoint | ZenohEndpoint | RclpyEndpoint,
+    BagEndpoint
+    | SyntheticEndpoint
+    | RecordEndpoint
+    | Ros1Endpoint
+    | DdsEndpoint
+    | ZenohEndpoint
+    | RclpyEndpoint
+    | TwinEndpoint,
     Field(discriminator="kind"),
 ]

@@ -15,19 +15,21 @@ from sern_client.endpoints.rclpy import RclpyOptions
 from sern_client.endpoints.record import RecordOptions
 from sern_client.endpoints.ros1 import Ros1Options
 from sern_client.endpoints.synthetic import SyntheticOptions
+from sern_client.endpoints.twin.options import RobotOptions, TwinOptions
 from sern_client.endpoints.zenoh.options import ZenohOptions
-from sern_client.sections import options_of
+from sern_client.sections import make_section, options_of
+from sern_runtime.config.base import EndpointBase
 from sern_runtime.config.endpoints import (
     MAX_SYNTHETIC_TOPICS,
     BagEndpoint,
     DdsEndpoint,
-    EndpointBase,
     RclpyEndpoint,
     RecordEndpoint,
     Ros1Endpoint,
     SyntheticEndpoint,
     ZenohEndpoint,
 )
+from sern_runtime.config.twin import TwinEndpoint, TwinRobot
 
 PAIRS = [
     (BagEndpoint, BagOptions),
@@ -37,6 +39,7 @@ PAIRS = [
     (DdsEndpoint, DdsOptions),
     (ZenohEndpoint, ZenohOptions),
     (RclpyEndpoint, RclpyOptions),
+    (TwinEndpoint, TwinOptions),
 ]
 SAID_BY_NO_FILE = {"second", "publishes_only", "enclave"}
 OTHERWISE_BY_DEFAULT = {(DdsOptions, "domain")}
@@ -92,3 +95,12 @@ def test_every_key_of_a_section_reaches_the_options(section: type[EndpointBase],
 
 def test_as_many_topics_as_the_robot_has() -> None:
     assert len(JACKAL) == MAX_SYNTHETIC_TOPICS
+
+
+def test_robots_of_a_twin() -> None:
+    assert {field.name for field in fields(RobotOptions)} == set(TwinRobot.model_fields)
+    robot = TwinRobot(name="jackal1", pose="/jackal1/odom", plan="/jackal1/plan", max_speed_mps=1.5)
+    endpoint: Any = make_section(TwinEndpoint(kind="twin", robots=(robot,)), Path)
+    assert [twin.options for twin in endpoint.robots.values()] == [
+        RobotOptions("jackal1", "/jackal1/odom", "/jackal1/plan", max_speed_mps=1.5)
+    ]

@@ -1,0 +1,155 @@
+"""Messages about robots and their twins: from bodies to motions and plans, and back."""
+
+import math
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+
+from sern_core.vocabulary.errors import BodyError, ConfigError
+from sern_core.vocabulary.types import Encoding
+from sern_runtime import ros_types
+from sern_twin.motion import Motion, Twist
+from sern_twin.trajectory import MOST_POINTS
+
+ODOMETRY: Final = "nav_msgs/msg/Odometry"
+PATH: Final = "nav_msgs/msg/Path"
+FLOAT: Final = "std_msgs/msg/Float32"
+DIAGNOSTICS: Final = "diagnostic_msgs/msg/DiagnosticArray"
+UNBOUNDED_M2: Final = 1e6
+"""The variance of what is passed on as it came: height, roll, pitch."""
+
+
+class Pose(NamedTuple):
+    """`stamp_ns`: of the robot's clock."""
+
+    stamp_ns: int
+    frame_id: str
+    child_frame_id: str
+    motion: Motion
+    z_m: float
+
+
+class Planned(NamedTuple):
+    """Places of a plan in order; `times_ns` of the robot's clock, None where the plan has none."""
+
+    frame_id: str
+    places: tuple[tuple[float, float], ...]
+    times_ns: tuple[int, ...] | None
+
+
+def read_pose(body: bytes, encoding: Encoding) -> Pose:
+    """A nav_msgs/Odometry. BodyError: it is none."""
+    message = _read(body, ODOMETRY, encoding)
+    pose, twist = message.pose.pose, message.twist.twist
+    motion = Motion(
+        pose.position.x, pose.position.y, _yaw_rad(pose.orientation),
+        Twist(twist.linear.x, twist.linear.y, twist.angular.z),
+    )  # fmt: skip
+    return Pose(
+        _stamp_ns(message.header.stamp), message.header.frame_id, message.child_frame_id, motion, pose.position.z
+    )
+
+
+def read_plan(body: bytes, encoding: Encoding) -> Planned:
+    """A nav_msgs/Path; one whose stamps do not all rise has no times. BodyError: it is none, or has too many places."""
+    message = _read(body, PATH, encoding)
+    if len(message.poses) > MOST_POINTS:
+        raise BodyError(f"a path of {len(message.poses)} poses: {MOST_POINTS} at most")
+    places = tuple((each.pose.position.x, each.pose.position.y) for each in message.poses)
+    times_ns = tuple(_stamp_ns(each.header.stamp) for each in message.poses)
+    timed = len(times_ns) > 1 and times_ns[0] > 0 and all(a < b for a, b in pairwise(times_ns))
+    return Planned(message.header.frame_id, places, times_ns if timed else None)
+
+
+def _read(body: bytes, type_name: str, encoding: Encoding) -> Any:
+    try:
+        return ros_types.deserialise(body, type_name, encoding)
+    except ConfigError as error:
+        raise BodyError(str(error)) from error
+
+
+def _stamp_ns(stamp: Any) -> int:
+    return int(stamp.sec) * 10**9 + int(stamp.nanosec)
+
+
+def _yaw_rad(orientation: Any) -> float:
+    """Of a quaternion of any length; NaN where it has none."""
+    x, y, z, w = (getattr(orientation, axis) for axis in "xyzw")
+    if not x * x + y * y + z * z + w * w > 0:
+        return math.nan
+    return math.atan2(2 * (w * z + x * y), w * w + x * x - y * y - z * z)
+
+
+class Writer:
+    """Bodies in one encoding."""
+
+    def __init__(self, encoding: Encoding) -> None:
+        self._encoding = encoding
+
+    def odometry(
+        self, motion: Motion, error_m: float, *, z_m: float, stamp_ns: int, frame_id: str, child_frame_id: str
+    ) -> bytes:
+        """`error_m`, a bound, is two sigmas of x and of y; the yaw is not bounded, and has a variance of π²."""
+        covariance = np.zeros(36)
+        covariance[[0, 7]] = (error_m / 2) ** 2
+        covariance[[14, 21, 28]] = UNBOUNDED_M2
+        covariance[35] = math.pi**2
+        twist = motion.twist
+        return self._body(
+            ODOMETRY,
+            header=self._header(stamp_ns, frame_id),
+            child_frame_id=child_frame_id,
+            pose=self._new("geometry_msgs/msg/PoseWithCovariance", pose=self._pose(motion, z_m), covariance=covariance),
+            twist=self._new(
+                "geometry_msgs/msg/TwistWithCovariance",
+                twist=self._new(
+                    "geometry_msgs/msg/Twist",
+                    linear=self._vector(twist.forward_mps, twist.left_mps, 0.0),
+                    angular=self._vector(0.0, 0.0, twist.yaw_radps),
+                ),
+                covariance=np.zeros(36),
+            ),
+        )
+
+    def path(self, motions: Sequence[Motion], *, z_m: float, stamps_ns: Sequence[int], frame_id: str) -> bytes:
+        poses = [
+            self._new(
+                "geometry_msgs/msg/PoseStamped", header=self._header(stamp_ns, frame_id), pose=self._pose(motion, z_m)
+            )
+            for motion, stamp_ns in zip(motions, stamps_ns, strict=True)
+        ]
+        return self._body(PATH, header=self._header(stamps_ns[0], frame_id), poses=poses)
+
+    def number(self, value: float) -> bytes:
+        return self._body(FLOAT, data=value)
+
+    def status(self, name: str, level: int, text: str, values: Sequence[tuple[str, str]], *, stamp_ns: int) -> bytes:
+        """`level`: 0 OK, 1 warning, 2 error, 3 stale."""
+        pairs = [self._new("diagnostic_msgs/msg/KeyValue", key=key, value=value) for key, value in values]
+        status = self._new(
+            "diagnostic_msgs/msg/DiagnosticStatus",
+            level=level, name=f"twin: {name}", message=text, hardware_id=name, values=pairs,
+        )  # fmt: skip
+        return self._body(DIAGNOSTICS, header=self._header(stamp_ns, ""), status=[status])
+
+    def _pose(self, motion: Motion, z_m: float) -> Any:
+        half = motion.yaw_rad / 2
+        return self._new(
+            "geometry_msgs/msg/Pose",
+            position=self._new("geometry_msgs/msg/Point", x=motion.x_m, y=motion.y_m, z=z_m),
+            orientation=self._new("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=math.sin(half), w=math.cos(half)),
+        )
+
+    def _vector(self, x: float, y: float, z: float) -> Any:
+        return self._new("geometry_msgs/msg/Vector3", x=x, y=y, z=z)
+
+    def _header(self, stamp_ns: int, frame_id: str) -> Any:
+        return ros_types.header(stamp_ns, frame_id, self._encoding)
+
+    def _new(self, type_name: str, **fields: Any) -> Any:
+        return ros_types.new(type_name, self._encoding, **fields)
+
+    def _body(self, type_name: str, **fields: Any) -> bytes:
+        return ros_types.serialise(self._new(type_name, **fields), type_name, self._encoding)

@@ -1,0 +1,23 @@
+"""What a twin endpoint is told by its file; `sern_runtime/config/twin.py` says what each means."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+
+@dataclass(frozen=True, slots=True)
+class RobotOptions:
+    name: str
+    pose: str
+    plan: str | None = None
+    max_speed_mps: float = 2.0
+    max_yaw_rate_radps: float = 6.0
+    gap_s: float = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class TwinOptions:
+    robots: tuple[RobotOptions, ...]
+    encoding: Literal["ros1", "cdr"] = "cdr"
+    rate_hz: float = 20.0
+    ahead_s: float = 5.0
+    prefix: str = "/twin"

@@ -1,0 +1,201 @@
+"""The twin of one robot, as messages make it: poses, plans and times in, the twin out.
+
+A robot's clock is never compared with ours. A message says when the robot's client took it, by the robot's clock, and
+the link says how long ago that was; a stamp is as much older as it is before that. So the robot may think it is 1970.
+"""
+
+import logging
+import math
+from collections import Counter
+from dataclasses import dataclass
+from statistics import fmean
+from typing import Final
+
+from sern_client.endpoints.twin.bodies import Planned, Pose
+from sern_client.endpoints.twin.options import RobotOptions
+from sern_core.vocabulary.errors import BodyError
+from sern_twin.following import Following
+from sern_twin.motion import Motion
+from sern_twin.predictors import ConstantAcceleration, PlanTracking, Predictor
+from sern_twin.synchroniser import Gap, Outcome, Synchroniser, SynchroniserOptions, Twin
+from sern_twin.trajectory import Trajectory, Waypoint, paced
+
+LEARNS_S: Final = 2.0
+"""How often what was learned of a plan goes into the prediction."""
+SPEED_SAMPLES: Final = 50
+ACCELERATION_S: Final = 0.2
+"""Speeds so far apart or closer tell the acceleration."""
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    frame_id: str
+    child_frame_id: str
+    z_m: float
+
+
+class RobotTwin:
+    """`gaps` are the gaps so far that ended, the newest last, some of them; `refused` counts plans by why they are not
+    used."""
+
+    def __init__(self, options: RobotOptions) -> None:
+        self.options = options
+        self.frame = Frame("", "", 0.0)
+        self.refused: Counter[str] = Counter()
+        self.gaps = 0
+        self.violated = 0
+        self.stops = 0
+        self.last_gap: Gap | None = None
+        self._synchroniser = Synchroniser(
+            ConstantAcceleration(),
+            SynchroniserOptions(
+                max_speed_mps=options.max_speed_mps,
+                max_yaw_rate_radps=options.max_yaw_rate_radps,
+                gap_s=options.gap_s,
+            ),
+        )
+        self._following: Following | None = None
+        self._path: tuple[tuple[float, float], ...] = ()
+        self._predictor: Predictor = ConstantAcceleration()
+        self._learned_s = -math.inf
+        self._followed = False
+        self._heard: list[tuple[float, Motion]] = []
+
+    @property
+    def counts(self) -> dict[str, int]:
+        return {outcome.value: count for outcome, count in self._synchroniser.counts.items()}
+
+    @property
+    def snaps(self) -> int:
+        return self._synchroniser.snaps
+
+    @property
+    def goes_by(self) -> str:
+        """What it goes on by while nothing is heard."""
+        if not self._followed:
+            return "acceleration"
+        return "path" if self._path else "trajectory"
+
+    def twin(self, *, now: float) -> Twin | None:
+        return self._synchroniser.twin(now=now)
+
+    def ahead(self, start: Motion, steps: int, step_s: float, *, now: float) -> list[Motion]:
+        """Where the twin is going to be, from `start` now on."""
+        found = [start]
+        for number in range(steps):
+            begin_s = now + number * step_s
+            found.append(self._predictor.reach(found[-1], begin_s, begin_s + step_s, 0.1, heard_s=now))
+        return found
+
+    def pose(self, pose: Pose, *, taken_ns: int, age_s: float, now: float) -> Outcome:
+        """`taken_ns`: when the robot's client took the message, by its own clock, which is `age_s` ago."""
+        stamp_s = now - age_s - (taken_ns - pose.stamp_ns) / 1e9
+        motion = self._accelerating(stamp_s, pose.motion)
+        outcome, gap = self._synchroniser.measured(stamp_s, motion, now=now)
+        if gap is not None:
+            self._report(gap)
+        if outcome in (Outcome.TAKEN, Outcome.RELOCATED, Outcome.RESTARTED):
+            if self.frame.frame_id not in ("", pose.frame_id):
+                _log.warning(
+                    "%s: %s is in frame %r now, and was in %r: a plan of the old frame is dropped",
+                    self.options.name, self.options.pose, pose.frame_id, self.frame.frame_id,
+                )  # fmt: skip
+                self._drop_plan()
+            self.frame = Frame(pose.frame_id, pose.child_frame_id, pose.z_m)
+            self._heard.append((stamp_s, motion))
+            del self._heard[:-SPEED_SAMPLES]
+            if self._following is not None:
+                self._following.heard(stamp_s, motion)
+            self._learn(now)
+        return outcome
+
+    def plan(self, plan: Planned, *, taken_ns: int, age_s: float, now: float) -> None:
+        """A plan takes the place of the one before. BodyError: it cannot be used; the one before is dropped, too."""
+        self._drop_plan()
+        try:
+            if self.frame.frame_id and plan.frame_id != self.frame.frame_id:
+                self.refused["frame"] += 1
+                raise BodyError(f"its frame is {plan.frame_id!r}, and that of the poses {self.frame.frame_id!r}")
+            if len(plan.places) < 2:
+                self.refused["short"] += 1
+                raise BodyError(f"it has {len(plan.places)} poses: a plan has two at least")
+            if plan.times_ns is None:
+                self._path = plan.places
+                return
+            base_s = now - age_s
+            points = [
+                Waypoint(base_s + (time_ns - taken_ns) / 1e9, x_m, y_m)
+                for time_ns, (x_m, y_m) in zip(plan.times_ns, plan.places, strict=True)
+            ]
+            if points[-1].time_s <= now:
+                self.refused["past"] += 1
+                raise BodyError(f"it ended {now - points[-1].time_s:.1f} s ago")
+            try:
+                self._following = Following(Trajectory(points))
+            except BodyError:
+                self.refused["bad"] += 1
+                raise
+        finally:
+            self._learned_s = -math.inf
+            self._learn(now)
+
+    def _drop_plan(self) -> None:
+        self._following, self._path = None, ()
+
+    def _accelerating(self, stamp_s: float, motion: Motion) -> Motion:
+        """Odometry says no acceleration: that of the speeds since the message before."""
+        if not self._heard or not motion.finite:
+            return motion
+        before_s, before = self._heard[-1]
+        length_s = stamp_s - before_s
+        if not 0 < length_s <= ACCELERATION_S:
+            return motion
+        share = min(1.0, length_s / ACCELERATION_S)  # a low pass: one message alone is noisy
+        forward = (motion.twist.forward_mps - before.twist.forward_mps) / length_s
+        yaw = (motion.twist.yaw_radps - before.twist.yaw_radps) / length_s
+        return Motion(
+            motion.x_m, motion.y_m, motion.yaw_rad, motion.twist,
+            before.forward_mps2 + (forward - before.forward_mps2) * share,
+            before.yaw_radps2 + (yaw - before.yaw_radps2) * share,
+        )  # fmt: skip
+
+    def _learn(self, now: float) -> None:
+        """Take the best way to go on, from time to time, and at once when it is another."""
+        following = self._following
+        if self._path and self._heard:
+            if now - self._learned_s < LEARNS_S:
+                return
+            following = self._along()
+        follows = following is not None and (following.follows or bool(self._path))
+        if follows == self._followed and now - self._learned_s < LEARNS_S:
+            return
+        self._learned_s, self._followed = now, follows
+        if following is not None and follows:
+            self._predictor = PlanTracking(following.plan, delay_s=following.delay_s)
+        else:
+            self._predictor = ConstantAcceleration()
+        self._synchroniser.predict_with(self._predictor, now=now)
+
+    def _along(self) -> Following | None:
+        """A path without times, at the speed that the robot has had."""
+        stamp_s, last = self._heard[-1]
+        try:
+            return Following(paced(self._path, last, stamp_s, fmean(motion.speed_mps for _, motion in self._heard)))
+        except BodyError:
+            return None  # it stands, or is at the end
+
+    def _report(self, gap: Gap) -> None:
+        report = gap.report
+        self.gaps += 1
+        self.last_gap = gap
+        self.stops += gap.stopped
+        if report.violated:
+            self.violated += 1
+        if report.violated or gap.stopped:
+            _log.warning(
+                "%s: after %.1f s of silence it is %.2f m from where its twin was, bounded by %.2f m%s",
+                self.options.name, report.gap_s, report.error_m, report.reachable_m,
+                ": it stands, and was to move" if gap.stopped else "",
+            )  # fmt: skip

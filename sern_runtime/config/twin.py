@@ -1,0 +1,75 @@
+"""The section of an endpoint of kind `twin`: whose twins to keep, and by what."""
+
+from collections import Counter
+from collections.abc import Iterator
+from typing import Annotated, Final, Literal
+
+from pydantic import Field, model_validator
+
+from sern_core.topics.patterns import compile_pattern
+from sern_core.topics.rules import Direction, TopicRule
+from sern_core.vocabulary.types import PriorityClass
+from sern_runtime.config.base import ClientText, EndpointBase, Hertz, Section, TopicText, fault
+
+SLOW_PARTS: Final = ("path", "status")
+FAST_PARTS: Final = ("odom", "estimate", "age", "error")
+
+
+class TwinRobot(Section):
+    """One robot."""
+
+    name: ClientText
+    """What its twin is called: its topics are PREFIX/NAME/odom and so on."""
+    pose: TopicText
+    """Where it says where it is (local name): nav_msgs/Odometry, best from its localisation."""
+    plan: TopicText | None = None
+    """The plan that it follows (local name): nav_msgs/Path. Where its poses have stamps that rise, they are when the
+    robot is to be there, and the twin follows it through a blackout to the centimetre; null: there is none."""
+    max_speed_mps: Annotated[float, Field(gt=0, le=100)] = 2.0
+    """Its top speed. What it says of itself beyond one and a half times this is not believed."""
+    max_yaw_rate_radps: Annotated[float, Field(gt=0, le=100)] = 6.0
+    """The same for turning."""
+    gap_s: Annotated[float, Field(gt=0, le=3600)] = 0.5
+    """Silence from here on is a gap, which is reported when it ends."""
+
+
+class TwinEndpoint(EndpointBase):
+    """Keeps the twins of robots elsewhere: hears their poses and plans, and publishes where they are by now. Run it
+    with sern-twin; it is the only endpoint of its client."""
+
+    kind: Literal["twin"]
+    """Keeps the twins of robots."""
+    robots: Annotated[tuple[TwinRobot, ...], Field(min_length=1, max_length=200)]
+    """Whose twins."""
+    encoding: Literal["ros1", "cdr"] = "cdr"
+    """How twins are serialised: `ros1` or `cdr` (ROS 2). What robots say is read either way."""
+    rate_hz: Annotated[Hertz, Field(le=100)] = 20.0
+    """How often the twins are published; path and status twice a second."""
+    ahead_s: Annotated[float, Field(gt=0, le=60)] = 5.0
+    """How far ahead the path goes that is published."""
+    prefix: TopicText = "/twin"
+    """Under which name the topics of the twins are."""
+
+    @model_validator(mode="after")
+    def _apart(self) -> "TwinEndpoint":
+        seen: Counter[str] = Counter()
+        for index, robot in enumerate(self.robots):
+            for key, value in (("name", robot.name), ("pose", robot.pose), ("plan", robot.plan)):
+                if value is None:
+                    continue
+                seen[f"{'name' if key == 'name' else 'topic'} {value}"] += 1
+                if max(seen.values()) > 1:
+                    raise fault(f"{value} is another robot's already: each has its own", "robots", index, key)
+                if key != "name" and value.startswith(f"{self.prefix}/"):
+                    raise fault(f"{value} is a topic of the twins themselves (prefix)", "robots", index, key)
+        return self
+
+    def topic_rules(self) -> Iterator[TopicRule]:
+        """What robots say is received, and the twins are sent. A name is its own pattern: it has only letters, digits,
+        _ and /."""
+        for robot in self.robots:
+            for topic, priority in ((robot.pose, PriorityClass.CONTROL), (robot.plan, PriorityClass.STATE)):
+                if topic is not None:
+                    yield TopicRule(compile_pattern(topic), None, priority, Direction.RECEIVE)
+        for parts, priority in ((FAST_PARTS, PriorityClass.CONTROL), (SLOW_PARTS, PriorityClass.STATE)):
+            yield TopicRule(compile_pattern(f"{self.prefix}/[^/]*/({'|'.join(parts)})"), None, priority, Direction.SEND)

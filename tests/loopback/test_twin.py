@@ -1,0 +1,97 @@
+"""A robot, a relay, its twin and a site, as daemons: what the site gets is where the robot is."""
+
+import math
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from sern_client.endpoints.synthetic import SyntheticEndpoint
+from sern_client.endpoints.twin.endpoint import TwinEndpoint
+from sern_core.vocabulary.types import TopicName
+from sern_runtime import clock
+from tests.daemons import Lab, endpoint_of
+from tests.support import until
+
+TWIN = {"kind": "twin", "robots": [{"name": "robot1", "pose": "/robot1/odometry/filtered"}]}
+ODOM = TopicName("/twin/robot1/odom")
+
+
+@pytest.mark.parametrize("encoding", ["ros1", "cdr"])
+async def test_a_site_gets_the_twin_of_a_robot(tmp_path: Path, encoding: str) -> None:
+    robot_side = {
+        "kind": "synthetic",
+        "role": "robot",
+        "topics": ["/odometry/filtered"],
+        "patrol": True,
+        "encoding": encoding,
+    }
+    rule = {"match": "/odometry/filtered", "class": "control"}
+    async with Lab(tmp_path, "robot1", "twin", "site") as lab:
+        await lab.relay()
+        site = await lab.connected(lab.recorder_file("site", "/twin/.*"))
+        twin = await lab.connected(
+            lab.client_file("twin", TWIN, client={"namespace": "/"}, discovery={"mode": "manual"})
+        )
+        robot = await lab.connected(lab.client_file("robot1", robot_side, topics=[rule]))
+        arrived = site.core.received.topics
+        await until(lambda: ODOM in arrived and arrived[ODOM].delivered >= 20)
+        endpoint: TwinEndpoint = endpoint_of(twin, TwinEndpoint)
+        source: SyntheticEndpoint = endpoint_of(robot, SyntheticEndpoint)
+        shown = endpoint.robots["robot1"].twin(now=clock.now())
+        assert shown is not None
+        pose = source.state().pose
+        assert math.dist((shown.shown.x_m, shown.shown.y_m), (pose.x_m, pose.y_m)) < 0.5
+        assert endpoint.robots["robot1"].counts["taken"] > 10
+        assert {f"/twin/robot1/{part}" for part in ("odom", "estimate", "age", "error")} <= set(arrived)
+
+
+async def test_the_state_of_twins_over_http(tmp_path: Path) -> None:
+    async with Lab(tmp_path, "robot1", "twin") as lab:
+        await lab.relay()
+        twin = lab.process(lab.client_file("twin", TWIN, client={"namespace": "/"}))
+        await twin.ready()
+        told = twin.json("/api/twins")
+        assert told["robot1"]["says"] == "not heard yet: /robot1/odometry/filtered" and told["robot1"]["pose"] is None
+
+
+def run(config: Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "sern_client.twin_cli", "--config", str(config)],
+        capture_output=True, text=True, timeout=60, check=False,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("endpoint", "problem"),
+    [
+        (
+            "{kind: synthetic, role: robot}",
+            "endpoint: is of no twins: sern-twin needs kind: twin (for others there is sern-client)",
+        ),
+        ("{kind: twin, robots: []}", "endpoint.robots: "),
+        (
+            "[{kind: twin, robots: [{name: a, pose: /a/odom}]}, {kind: synthetic, role: robot}]",
+            "twins are the only endpoint of their client: run them in another",
+        ),
+        (
+            "{kind: twin, robots: [{name: a, pose: /a/odom}, {name: b, pose: /a/odom}]}",
+            "endpoint.robots.1.pose: /a/odom is another robot's already: each has its own",
+        ),
+        (
+            "{kind: twin, robots: [{name: a, pose: /twin/a/odom}]}",
+            "endpoint.robots.0.pose: /twin/a/odom is a topic of the twins themselves (prefix)",
+        ),
+    ],
+)
+def test_a_wrong_file_is_one_line(tmp_path: Path, endpoint: str, problem: str) -> None:
+    config = tmp_path / "twin.yaml"
+    config.write_text(
+        "client: {name: twin, namespace: /}\n"
+        "relay: {endpoint: 'tcp://127.0.0.1:5555', insecure: true}\n"
+        f"endpoint: {endpoint}\n"
+    )
+    ended = run(config)
+    assert ended.returncode == 2 and ended.stdout == ""
+    assert len(ended.stderr.splitlines()) == 1 and problem in ended.stderr, ended.stderr
