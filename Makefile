@@ -121,7 +121,8 @@ figures: setup
 	$(BIN)/python -m benchmarks.mmcf_recovery --json build/mmcf_recovery.json
 	$(BIN)/python -m benchmarks.mmcf_replay --plots docs/images --json build/mmcf_replay.json
 	$(BIN)/python -m benchmarks.mmcf --plots docs/images --json build/mmcf.json
-	$(BIN)/python -m benchmarks.document $(addprefix build/,$(addsuffix .json,footprint thin_link codecs summaries mmcf_recovery mmcf_replay mmcf))
+	$(BIN)/python -m benchmarks.sync --json build/sync.json
+	$(BIN)/python -m benchmarks.document $(addprefix build/,$(addsuffix .json,footprint thin_link codecs summaries mmcf_recovery mmcf_replay mmcf sync))
 
 # The recordings are not ours to ship: make cellular RECORDINGS=DIR.
 RECORDINGS := ../shared/data/cellular

@@ -28,6 +28,7 @@ DOCUMENTS: Final = {
     **dict.fromkeys(("mmcf", "mmcf_replay", "mmcf_recovery"), THEORY),
     "summaries": ROOT / "docs" / "summaries.md",
     "matrix": ROOT / "docs" / "lab.md",
+    "sync": ROOT / "docs" / "twin.md",
 }
 """The document of each benchmark that has a place in one."""
 IN_README: Final[Mapping[str, Mapping[str, tuple[str, ...]]]] = {

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from sern_client.bridge import Bridge
 from sern_client.checks import TableCheck
 from sern_client.connection import Connection
-from sern_client.endpoints.base import CountingEndpoint
+from sern_client.endpoints.base import CountingEndpoint, MeasuredEndpoint
 from sern_client.guard import Guard
 from sern_client.link_state import LinkState
 from sern_client.summaries.client_summaries import register_summaries
@@ -69,6 +69,8 @@ def _register_endpoint(metrics: Metrics, parts: Counting) -> None:
         ("reason",),
         dropped,
     )
+    if isinstance(endpoint, MeasuredEndpoint):
+        endpoint.register_metrics(metrics)
     parts.bridge.site.parts.register(metrics)
     metrics.gauge(
         "sern_endpoint_differences",

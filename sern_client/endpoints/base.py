@@ -8,10 +8,13 @@ its business. All calls happen on the event-loop thread; an endpoint with thread
 from collections import Counter
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Final, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Final, Protocol, runtime_checkable
 
 from sern_core.vocabulary.message import TopicInfo
 from sern_core.vocabulary.types import DropReason, Encoding, TopicName
+
+if TYPE_CHECKING:
+    from sern_runtime.metrics import Metrics
 
 GUARD_SUFFIX: Final = "_guard"
 """What the node of a client's guard (sern_client/guard.py) has behind the name of the client's own node. It publishes
@@ -155,6 +158,13 @@ class CountingEndpoint(Protocol):
     def drops(self) -> Mapping[DropReason, int]:
         """Messages it has dropped so far, by reason."""
         ...
+
+
+@runtime_checkable
+class MeasuredEndpoint(Protocol):
+    """An endpoint with metrics of its own."""
+
+    def register_metrics(self, metrics: "Metrics") -> None: ...
 
 
 @runtime_checkable

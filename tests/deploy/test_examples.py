@@ -134,6 +134,13 @@ def test_the_relay_lets_through_what_a_client_needs(name: str) -> None:
         assert not table.may_publish(own, TopicName(robot + "/dock/_call/jackal1"))
         assert table.may_subscribe(own, TopicName(robot + "/map"))
         return
+    if name == "twin.yaml":
+        for topic in ("/odometry/filtered", "/platform/odom/filtered", "/jackal_velocity_controller/odom", "/plan"):
+            assert table.may_subscribe(own, TopicName(f"/jackal1{topic}")), topic
+        assert not table.may_subscribe(own, TopicName("/jackal1/cmd_vel"))
+        assert table.may_publish(own, TopicName("/twin/jackal1/odom"))
+        assert not table.may_publish(own, TopicName("/jackal1/odom"))
+        return
     robot = f"/{own}"
     for topic in ("/odom", "/map", "/points/scan"):
         assert table.may_publish(own, TopicName(robot + topic))
@@ -143,7 +150,13 @@ def test_the_relay_lets_through_what_a_client_needs(name: str) -> None:
     assert not table.may_subscribe(own, TopicName("/other1/cmd_vel"))
 
 
-@pytest.mark.parametrize("name", [name for name in CLIENTS if not name.startswith("site")])
+def test_the_feed_shows_twins_with_their_age_and_error() -> None:
+    (role,) = load_relay(EXAMPLES / "relay.yaml", files=False).model.feed_roles()
+    for part in ("odom", "age", "error"):
+        assert any(pattern.fullmatch(f"/twin/jackal1/{part}") for pattern in role.subscribe), part
+
+
+@pytest.mark.parametrize("name", [name for name in CLIENTS if not name.startswith(("site", "twin"))])
 def test_the_feed_shows_where_each_robot_is_and_what_is_around_it(name: str) -> None:
     """Cover each robot that there is a file for, by topics that its file sends."""
     (role,) = load_relay(EXAMPLES / "relay.yaml", files=False).model.feed_roles()

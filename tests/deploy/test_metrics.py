@@ -47,19 +47,21 @@ def metrics(tmp_path_factory: pytest.TempPathFactory) -> dict[str, set[str]]:
 
     async def collect() -> list[str]:
         directory = tmp_path_factory.mktemp("metrics")
-        async with Lab(directory, "robot1", "site") as lab:
+        async with Lab(directory, "robot1", "site", "twin") as lab:
             relay = lab.process(lab.relay_file())
             site = lab.process(lab.recorder_file("site", "/robot1/.*"))
             bag = write_bag(directory / "a.bag", {"/text": 20})
+            twins = {"kind": "twin", "robots": [{"name": "robot1", "pose": "/robot1/odom"}]}
+            twin = lab.process(lab.client_file("twin", twins, client={"namespace": "/"}))
             adaptation = {"interval_s": 0.2}
             robot = lab.process(lab.player_file("robot1", bag, play={"rate": 1.0, "loop": True}, adaptation=adaptation))
-            for process in (relay, site, robot):
+            for process in (relay, site, robot, twin):
                 await process.ready()
             known = 'sern_link_rtt_seconds{peer="site"}'
             await site.until(lambda: "sern_topic_age_seconds{" in site.get("/metrics")[1], "receives")
             await relay.until(lambda: known in relay.get("/metrics")[1], "knows the link")
             await robot.until(lambda: "sern_mmcf_predicted_term{" in robot.get("/metrics")[1], "adapts")
-            return [process.get("/metrics")[1] for process in (relay, site, robot)]
+            return [process.get("/metrics")[1] for process in (relay, site, robot, twin)]
 
     found: dict[str, set[str]] = {}
     for text in asyncio.run(collect()):

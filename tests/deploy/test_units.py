@@ -13,7 +13,7 @@ import pytest
 from tests.support import child
 
 UNITS: Final = Path(__file__).resolve().parents[2] / "deploy" / "systemd"
-NAMES: Final = ("sern-relay.service", "sern-client.service", "sern-client@.service")
+NAMES: Final = ("sern-relay.service", "sern-client.service", "sern-client@.service", "sern-twin.service")
 ONCE: Final = {
     ("Unit", "StartLimitIntervalSec"): "0",
     ("Service", "Type"): "notify",
@@ -101,6 +101,12 @@ def test_the_template_is_the_client_with_its_name_in_it() -> None:
     }
     single = read("sern-client.service")
     assert read("sern-client@.service") == [(s, key, expected.get(key, value)) for s, key, value in single]
+
+
+def test_that_of_the_twins_is_the_client_with_another_program() -> None:
+    expected = {"Description": "SERN twins", "ExecStart": "/opt/sern/bin/sern-twin --config /etc/sern/twin.yaml"}
+    client = read("sern-client.service")
+    assert read("sern-twin.service") == [(s, key, expected.get(key, value)) for s, key, value in client]
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -22,6 +22,7 @@ from sern_client.endpoints.base import Difference, Held, Sink, TopicEvents
 from sern_client.endpoints.common.held import HeldSubscription
 from sern_client.endpoints.common.saying import SayOnce, say_failure
 from sern_client.endpoints.twin import bodies
+from sern_client.endpoints.twin.metrics import register_twins
 from sern_client.endpoints.twin.options import TwinOptions
 from sern_client.endpoints.twin.robot import RobotTwin
 from sern_core.vocabulary.errors import BodyError, ConfigError, UsageError
@@ -30,6 +31,7 @@ from sern_core.vocabulary.names import plain_type
 from sern_core.vocabulary.types import DropReason, Encoding, TopicName
 from sern_runtime import clock, ros_types
 from sern_runtime.entry import end_tasks
+from sern_runtime.metrics import Metrics
 from sern_twin.synchroniser import Twin
 
 _log = logging.getLogger(__name__)
@@ -183,6 +185,9 @@ class TwinEndpoint:
     @property
     def drops(self) -> Mapping[DropReason, int]:
         return self._drops
+
+    def register_metrics(self, metrics: Metrics) -> None:
+        register_twins(metrics, lambda: iter(self.robots.items()), self._now)
 
     @property
     def json_routes(self) -> Mapping[str, Callable[[], object]]:
