@@ -11,12 +11,13 @@ from sern_core.vocabulary.errors import BodyError, ConfigError
 from sern_core.vocabulary.types import Encoding
 from sern_runtime import ros_types
 from sern_twin.motion import Motion, Twist
-from sern_twin.trajectory import MOST_POINTS
 
 ODOMETRY: Final = "nav_msgs/msg/Odometry"
 PATH: Final = "nav_msgs/msg/Path"
 FLOAT: Final = "std_msgs/msg/Float32"
 DIAGNOSTICS: Final = "diagnostic_msgs/msg/DiagnosticArray"
+MOST_PLAN_BYTES: Final = 512 * 1024
+"""About 7000 poses, which take 50 ms to read. All twins wait for it."""
 UNBOUNDED_M2: Final = 1e6
 """The variance of what is passed on as it came: height, roll, pitch."""
 
@@ -53,10 +54,10 @@ def read_pose(body: bytes, encoding: Encoding) -> Pose:
 
 
 def read_plan(body: bytes, encoding: Encoding) -> Planned:
-    """A nav_msgs/Path; one whose stamps do not all rise has no times. BodyError: it is none, or has too many places."""
+    """A nav_msgs/Path; one whose stamps do not all rise has no times. BodyError: it is none, or too large."""
+    if len(body) > MOST_PLAN_BYTES:
+        raise BodyError(f"a plan of {len(body)} bytes: {MOST_PLAN_BYTES} at most, so publish fewer of its poses")
     message = _read(body, PATH, encoding)
-    if len(message.poses) > MOST_POINTS:
-        raise BodyError(f"a path of {len(message.poses)} poses: {MOST_POINTS} at most")
     places = tuple((each.pose.position.x, each.pose.position.y) for each in message.poses)
     times_ns = tuple(_stamp_ns(each.header.stamp) for each in message.poses)
     timed = len(times_ns) > 1 and times_ns[0] > 0 and all(a < b for a, b in pairwise(times_ns))

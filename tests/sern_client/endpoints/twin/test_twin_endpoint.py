@@ -197,6 +197,15 @@ def test_a_plan_that_cannot_be_used(
     assert world.shown().distance_m(beside.shown()) < 1e-6
 
 
+def test_a_plan_that_takes_too_long_to_read_is_not_read(caplog: pytest.LogCaptureFixture) -> None:
+    world = World()
+    plan = world.publisher("/jackal1/plan", bodies.PATH)
+    with caplog.at_level(logging.WARNING):
+        world.plan(plan, [(float(n), 0.0, float(n)) for n in range(8_000)])
+    assert "524288 at most, so publish fewer of its poses" in caplog.text
+    assert world.endpoint.drops == {DropReason.UNDECODABLE: 1}
+
+
 def test_poses_that_are_none_move_nothing(caplog: pytest.LogCaptureFixture) -> None:
     world, beside = World(), World()
     pose = world.publisher("/jackal1/odom")
