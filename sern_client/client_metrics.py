@@ -50,6 +50,11 @@ def _register_link(metrics: Metrics, parts: Counting) -> None:
     parts.collector.register(metrics)
     register_summaries(metrics, bridge.outbound.summaries)
     metrics.counter(
+        "sern_reckoned_poses_total",
+        "Poses that were not sent, because the twin of who receives them is right without.",
+        read=lambda: [((), float(bridge.outbound.reckoned))],
+    )
+    metrics.counter(
         "sern_patch_gaps_total",
         "Times a grid of patches could not go on, and waited for the next whole one.",
         read=lambda: [((), float(bridge.inbound.rebuilds.gaps))],

@@ -60,6 +60,8 @@ class Outbound:
     def __init__(self, site: Site, core: ClientCore, discovery: Discovery, *, goals: GoalWatch | None = None) -> None:
         self.refusals = 0
         """Publications that the relay did not take."""
+        self.reckoned = 0
+        """Poses that were not sent, because whoever receives them is right without."""
         self.summaries = Summaries(self._sender, site.parts)
         self.leaving = Leaving(self._unpublish)
         self._site = site
@@ -128,6 +130,8 @@ class Outbound:
             _log.error("%s cannot be offered as %s: %s", info.name, name, error)
             return
         sink = self._sink(channel, self._site.frames.outgoing(info)) if source is None else source.sink
+        if resolved.dead_reckoning and source is None and info.encoding is not Encoding.RAW:
+            sink = self._reckoned(info, sink)
         if self._goals is not None:
             sink = self._goals.outgoing(info, channel, sink)
         try:
@@ -199,6 +203,14 @@ class Outbound:
     def _sink(self, channel: OutChannel, rewrite: Rewrite | None) -> Sink:
         send = self._send(channel, rewrite)
         return lambda body, stamp_ns: send(body, stamp_ns, None)
+
+    def _reckoned(self, info: TopicInfo, sink: Sink) -> Sink:
+        from sern_client.reckoned import ReckonedPoses  # who does not ask for it need not load it
+
+        def kept() -> None:
+            self.reckoned += 1
+
+        return ReckonedPoses(info.name, info.encoding, sink, kept).sink
 
     def _sender(self, channel: OutChannel, info: TopicInfo) -> Send:
         """What puts bodies of the type `info` into a channel; for topics of which something else is made."""

@@ -37,6 +37,8 @@ LEASE_REPEAT_S: Final = 1.0
 
 COMMAND_TYPES: Final = frozenset({"geometry_msgs/Twist", "geometry_msgs/TwistStamped"})
 """Types whose all-zero message means "stand still": the only ones that `on_link_loss` may publish."""
+ODOMETRY_TYPE: Final = "nav_msgs/Odometry"
+"""The one type of poses that `dead_reckoning` is for: it says how fast the robot is."""
 MANY_WRITER_TOPICS: Final = frozenset({"/tf", "/tf_static"})
 """Topics that several nodes own by convention of ROS; `many_writers` defaults to true for them."""
 
@@ -118,6 +120,7 @@ class TopicRule:
     summaries: tuple[SummarySpec, ...] = ()
     too_large: TooLarge = TooLarge.SUMMARY
     merge_tf: bool | None = None
+    dead_reckoning: bool = False
     lossy: tuple[Compression, ...] = ()
     lossy_params: LossyParams = DEFAULT_LOSSY
 
@@ -140,7 +143,8 @@ class ResolvedTopic:
     """What the rules say about one topic. `rule` is the index of the rule, None when no rule matched.
 
     `name` is the local name after `remap`: the one to give to `to_global`. `merge_tf`: it carries transforms, to be
-    merged on their way out.
+    merged on their way out. `dead_reckoning`: it carries poses, and those go out that a twin would be wrong
+    without.
     """
 
     spec: TopicSpec
@@ -150,6 +154,7 @@ class ResolvedTopic:
     rule: int | None
     summaries: tuple[SummarySpec, ...] = ()
     merge_tf: bool = False
+    dead_reckoning: bool = False
 
 
 class RuleError(UsageError):
@@ -218,6 +223,7 @@ class RuleSet:
         - lifespan: 0.3 s for a velocity command in class control; for ever if reliable or latched; else 1 s;
         - summaries: for clouds of class bulk that are best effort, a thinner one where the link is too slow for them;
         - weight κ: by class; many_writers: true for `/tf` and `/tf_static`;
+        - dead_reckoning: for no topic, and for none but of odometry;
         - merge_tf: for transforms in class state unless the rule makes them reliable, and for `/tf_static` and other
           latched ones with or without a rule.
 
@@ -283,7 +289,8 @@ class RuleSet:
         summaries = rule.summaries
         if not summaries and rule.too_large is TooLarge.SUMMARY:
             summaries = stand_ins(info, spec)
-        return ResolvedTopic(spec, rule.direction, name, rule.lease, index, summaries, merge_tf)
+        reckoned = rule.dead_reckoning and plain_type(info.type_name) == ODOMETRY_TYPE
+        return ResolvedTopic(spec, rule.direction, name, rule.lease, index, summaries, merge_tf, reckoned)
 
     def outward(self, info: TopicInfo, *, local_name: TopicName, namespace: str) -> TopicName:
         """The global name of a local topic: `remap`, then the namespace."""

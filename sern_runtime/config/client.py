@@ -231,6 +231,10 @@ class TopicSection(Section):
     """For tf2_msgs/TFMessage: many messages become one with the newest transform of each pair of frames, at most
     `max_rate_hz` (20) a second, of /tf_static one with all there are; null: /tf_static always, others in class state
     unless `reliability` is reliable."""
+    dead_reckoning: bool = False
+    """For nav_msgs/Odometry: a pose is sent when the twin of who receives it would be off by 2 cm or a degree without,
+    and 0.2 s after the one before at the latest. A fifth to a tenth of 50 a second is left. Leave it out for receivers
+    that need every pose, such as a recording for later."""
 
     @model_validator(mode="after")
     def _summaries_fit(self) -> "TopicSection":
@@ -256,6 +260,10 @@ class TopicSection(Section):
     def _consistent(self) -> "TopicSection":
         if self.compression in ("voxel_draco", "jpeg") and self.compression not in self.lossy:
             raise fault(f"{self.compression} loses something; name it in lossy as well", "compression")
+        if self.dead_reckoning and self.reliability == "reliable":
+            raise fault(
+                "leaves poses out, and of a reliable topic every message counts; use best_effort", "dead_reckoning"
+            )
         if self.on_link_loss is not None:
             if self.direction is Direction.SEND:
                 raise fault("acts where commands arrive; direction is send", "on_link_loss")
@@ -312,6 +320,7 @@ class TopicSection(Section):
             summaries=specs(self.summary),
             too_large=TooLarge(self.too_large),
             merge_tf=self.merge_tf,
+            dead_reckoning=self.dead_reckoning,
         )
 
 

@@ -47,6 +47,26 @@ async def test_a_site_gets_the_twin_of_a_robot(tmp_path: Path, encoding: str) ->
         assert {f"/twin/robot1/{part}" for part in ("odom", "estimate", "age", "error")} <= set(arrived)
 
 
+async def test_a_robot_that_reckons_says_less_and_its_twin_is_as_right(tmp_path: Path) -> None:
+    side = {"kind": "synthetic", "role": "robot", "topics": ["/odometry/filtered"], "patrol": True, "encoding": "cdr"}
+    rule = {"match": "/odometry/filtered", "class": "control", "reliability": "best_effort", "dead_reckoning": True}
+    async with Lab(tmp_path, "robot1", "twin") as lab:
+        await lab.relay()
+        twin = await lab.connected(
+            lab.client_file("twin", TWIN, client={"namespace": "/"}, discovery={"mode": "manual"})
+        )
+        robot = await lab.connected(lab.client_file("robot1", side, topics=[rule]))
+        endpoint: TwinEndpoint = endpoint_of(twin, TwinEndpoint)
+        source: SyntheticEndpoint = endpoint_of(robot, SyntheticEndpoint)
+        known = endpoint.robots["robot1"]
+        await until(lambda: known.counts["taken"] >= 15)
+        shown = known.twin(now=clock.now())
+        assert shown is not None
+        pose = source.state().pose
+        assert math.dist((shown.shown.x_m, shown.shown.y_m), (pose.x_m, pose.y_m)) < 0.5
+        assert robot.bridge.outbound.reckoned > known.counts["taken"]
+
+
 async def test_the_state_of_twins_over_http(tmp_path: Path) -> None:
     async with Lab(tmp_path, "robot1", "twin") as lab:
         await lab.relay()

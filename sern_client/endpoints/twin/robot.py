@@ -14,6 +14,7 @@ from typing import Final
 from sern_client.endpoints.twin.bodies import Planned, Pose
 from sern_client.endpoints.twin.options import RobotOptions
 from sern_core.vocabulary.errors import BodyError
+from sern_twin.acceleration import Accelerations
 from sern_twin.following import Following
 from sern_twin.motion import Motion
 from sern_twin.predictors import ConstantAcceleration, PlanTracking, Predictor
@@ -23,8 +24,6 @@ from sern_twin.trajectory import Trajectory, Waypoint, paced
 LEARNS_S: Final = 2.0
 """How often what was learned of a plan goes into the prediction."""
 SPEED_SAMPLES: Final = 50
-ACCELERATION_S: Final = 0.2
-"""Speeds so far apart or closer tell the acceleration."""
 
 _log = logging.getLogger(__name__)
 
@@ -61,6 +60,7 @@ class RobotTwin:
         self._predictor: Predictor = ConstantAcceleration()
         self._learned_s = -math.inf
         self._followed = False
+        self._accelerations = Accelerations()
         self._heard: list[tuple[float, Motion]] = []
 
     @property
@@ -92,7 +92,7 @@ class RobotTwin:
     def pose(self, pose: Pose, *, taken_ns: int, age_s: float, now: float) -> Outcome:
         """`taken_ns`: when the robot's client took the message, by its own clock, which is `age_s` ago."""
         stamp_s = now - age_s - (taken_ns - pose.stamp_ns) / 1e9
-        motion = self._accelerating(stamp_s, pose.motion)
+        motion = self._accelerations.of(stamp_s, pose.motion)
         outcome, gap = self._synchroniser.measured(stamp_s, motion, now=now)
         if gap is not None:
             self._report(gap)
@@ -104,6 +104,7 @@ class RobotTwin:
                 )  # fmt: skip
                 self._drop_plan()
             self.frame = Frame(pose.frame_id, pose.child_frame_id, pose.z_m)
+            self._accelerations.took(stamp_s, motion)
             self._heard.append((stamp_s, motion))
             del self._heard[:-SPEED_SAMPLES]
             if self._following is not None:
@@ -143,23 +144,6 @@ class RobotTwin:
 
     def _drop_plan(self) -> None:
         self._following, self._path = None, ()
-
-    def _accelerating(self, stamp_s: float, motion: Motion) -> Motion:
-        """Odometry says no acceleration: that of the speeds since the message before."""
-        if not self._heard or not motion.finite:
-            return motion
-        before_s, before = self._heard[-1]
-        length_s = stamp_s - before_s
-        if not 0 < length_s <= ACCELERATION_S:
-            return motion
-        share = min(1.0, length_s / ACCELERATION_S)  # a low pass: one message alone is noisy
-        forward = (motion.twist.forward_mps - before.twist.forward_mps) / length_s
-        yaw = (motion.twist.yaw_radps - before.twist.yaw_radps) / length_s
-        return Motion(
-            motion.x_m, motion.y_m, motion.yaw_rad, motion.twist,
-            before.forward_mps2 + (forward - before.forward_mps2) * share,
-            before.yaw_radps2 + (yaw - before.yaw_radps2) * share,
-        )  # fmt: skip
 
     def _learn(self, now: float) -> None:
         """Take the best way to go on, from time to time, and at once when it is another."""

@@ -362,3 +362,14 @@ def test_which_transforms_are_merged(name: str, type_name: str, rule: dict[str, 
     rules = RuleSet(() if rule is None else (TopicRule(compile_pattern(".*"), **rule),))
     info = TopicInfo(TopicName(name), type_name, Encoding.CDR)
     assert rules.resolve(info, local_name=info.name).merge_tf is merged
+
+
+@pytest.mark.parametrize(
+    ("type_name", "reckoned"),
+    [("nav_msgs/msg/Odometry", True), ("nav_msgs/Odometry", True), ("geometry_msgs/msg/PoseStamped", False)],
+)
+def test_dead_reckoning_is_for_odometry(type_name: str, reckoned: bool) -> None:
+    info = TopicInfo(TopicName("/odom"), type_name, Encoding.CDR, "")
+    rule = TopicRule(compile_pattern("/odom"), dead_reckoning=True)
+    assert RuleSet((rule,)).resolve(info, local_name=info.name).dead_reckoning is reckoned
+    assert not RuleSet((TopicRule(compile_pattern("/odom")),)).resolve(info, local_name=info.name).dead_reckoning
