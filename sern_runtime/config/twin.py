@@ -12,7 +12,7 @@ from sern_core.vocabulary.types import PriorityClass
 from sern_runtime.config.base import ClientText, EndpointBase, Hertz, Section, TopicText, fault
 
 SLOW_PARTS: Final = ("path", "status")
-FAST_PARTS: Final = ("odom", "estimate", "age", "error")
+FAST_PARTS: Final = ("odom", "estimate", "age", "error", "unity")
 
 
 class TwinRobot(Section):
@@ -23,8 +23,9 @@ class TwinRobot(Section):
     pose: TopicText
     """Where it says where it is (local name): nav_msgs/Odometry, best from its localisation."""
     plan: TopicText | None = None
-    """The plan that it follows (local name): nav_msgs/Path. Where its poses have stamps that rise, they are when the
-    robot is to be there, and the twin follows it through a blackout to the centimetre; null: there is none."""
+    """The plan that it follows (local name): nav_msgs/Path, or trajectory_msgs/MultiDOFJointTrajectory. Where the poses
+    of a path have stamps that rise, they are when the robot is to be there. A twin follows a plan with times through a
+    blackout to the centimetre; null: there is none."""
     max_speed_mps: Annotated[float, Field(gt=0, le=100)] = 2.0
     """Its top speed. What it says of itself beyond one and a half times this is not believed."""
     max_yaw_rate_radps: Annotated[float, Field(gt=0, le=100)] = 6.0
@@ -49,6 +50,8 @@ class TwinEndpoint(EndpointBase):
     """How far ahead the path goes that is published."""
     prefix: TopicText = "/twin"
     """Under which name the topics of the twins are."""
+    unity: bool = False
+    """Also PREFIX/NAME/unity, geometry_msgs/PoseStamped: the twin in Unity's axes, x east, y up, z north."""
 
     @model_validator(mode="after")
     def _apart(self) -> "TwinEndpoint":

@@ -8,12 +8,16 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from sern_core.vocabulary.errors import BodyError, ConfigError
+from sern_core.vocabulary.names import plain_type
 from sern_core.vocabulary.types import Encoding
 from sern_runtime import ros_types
+from sern_twin.geodesy import UNITY_FROM_ENU
 from sern_twin.motion import Motion, Twist
 
 ODOMETRY: Final = "nav_msgs/msg/Odometry"
 PATH: Final = "nav_msgs/msg/Path"
+TRAJECTORY: Final = "trajectory_msgs/msg/MultiDOFJointTrajectory"
+POSE: Final = "geometry_msgs/msg/PoseStamped"
 FLOAT: Final = "std_msgs/msg/Float32"
 DIAGNOSTICS: Final = "diagnostic_msgs/msg/DiagnosticArray"
 MOST_PLAN_BYTES: Final = 512 * 1024
@@ -53,15 +57,28 @@ def read_pose(body: bytes, encoding: Encoding) -> Pose:
     )
 
 
-def read_plan(body: bytes, encoding: Encoding) -> Planned:
-    """A nav_msgs/Path; one whose stamps do not all rise has no times. BodyError: it is none, or too large."""
+def read_plan(body: bytes, type_name: str, encoding: Encoding, *, taken_ns: int) -> Planned:
+    """A nav_msgs/Path, of which one whose stamps do not all rise has no times, or a MultiDOFJointTrajectory, which
+    begins when it was taken if it says no other time. BodyError: it is none, or too large."""
     if len(body) > MOST_PLAN_BYTES:
         raise BodyError(f"a plan of {len(body)} bytes: {MOST_PLAN_BYTES} at most, so publish fewer of its poses")
+    if plain_type(type_name) == plain_type(TRAJECTORY):
+        return _read_trajectory(_read(body, TRAJECTORY, encoding), taken_ns)
     message = _read(body, PATH, encoding)
     places = tuple((each.pose.position.x, each.pose.position.y) for each in message.poses)
     times_ns = tuple(_stamp_ns(each.header.stamp) for each in message.poses)
     timed = len(times_ns) > 1 and times_ns[0] > 0 and all(a < b for a, b in pairwise(times_ns))
     return Planned(message.header.frame_id, places, times_ns if timed else None)
+
+
+def _read_trajectory(message: Any, taken_ns: int) -> Planned:
+    """Of a base with joints only the first one moves in the world."""
+    begin_ns = _stamp_ns(message.header.stamp) or taken_ns
+    if not all(point.transforms for point in message.points):
+        raise BodyError("a trajectory with a point that has no transform")
+    places = [point.transforms[0].translation for point in message.points]
+    times_ns = tuple(begin_ns + _stamp_ns(point.time_from_start) for point in message.points)
+    return Planned(message.header.frame_id, tuple((place.x, place.y) for place in places), times_ns)
 
 
 def _read(body: bytes, type_name: str, encoding: Encoding) -> Any:
@@ -122,6 +139,17 @@ class Writer:
             for motion, stamp_ns in zip(motions, stamps_ns, strict=True)
         ]
         return self._body(PATH, header=self._header(stamps_ns[0], frame_id), poses=poses)
+
+    def unity(self, motion: Motion, *, z_m: float, stamp_ns: int, frame_id: str) -> bytes:
+        """In Unity's axes (x east, y up, z north; left-handed): a body's forward is z there, and turns clockwise."""
+        x_m, y_m, north_m = (float(value) for value in UNITY_FROM_ENU.points((motion.x_m, motion.y_m, z_m)))
+        half = (math.pi / 2 - motion.yaw_rad) / 2
+        pose = self._new(
+            "geometry_msgs/msg/Pose",
+            position=self._new("geometry_msgs/msg/Point", x=x_m, y=y_m, z=north_m),
+            orientation=self._new("geometry_msgs/msg/Quaternion", x=0.0, y=math.sin(half), z=0.0, w=math.cos(half)),
+        )
+        return self._body(POSE, header=self._header(stamp_ns, frame_id), pose=pose)
 
     def number(self, value: float) -> bytes:
         return self._body(FLOAT, data=value)

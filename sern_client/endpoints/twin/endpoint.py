@@ -7,6 +7,7 @@ For each robot NAME, under the prefix:
     NAME/age        std_msgs/Float32, seconds since the last pose that was taken
     NAME/error      std_msgs/Float32, metres that the shown twin may be off
     NAME/path       nav_msgs/Path, where it is going to be
+    NAME/unity      geometry_msgs/PoseStamped, the shown twin in Unity's axes, where the file asks for it
     NAME/status     diagnostic_msgs/DiagnosticArray, the same in words, with counts
 """
 
@@ -46,6 +47,7 @@ TYPES: Final = {
     "error": bodies.FLOAT,
     "path": bodies.PATH,
     "status": bodies.DIAGNOSTICS,
+    "unity": bodies.POSE,
 }
 SLOW: Final = frozenset({"path", "status"})
 
@@ -100,6 +102,8 @@ class TwinEndpoint:
         self._topics: dict[TopicName, _Topic] = {}
         for name, robot in self.robots.items():
             for part, type_name in TYPES.items():
+                if part == "unity" and not options.unity:
+                    continue
                 info = ros_types.topic_info(f"{options.prefix}/{name}/{part}", type_name, self._encoding)
                 self._topics[info.name] = _Topic(info, robot, part)
         self._hearers: list[_Hearer] = []
@@ -131,35 +135,37 @@ class TwinEndpoint:
         """ConfigError: it is no pose or plan of a robot, or of a type that is not read."""
         for robot in self.robots.values():
             for topic, wanted, hear in (
-                (robot.options.pose, bodies.ODOMETRY, self._pose),
-                (robot.options.plan, bodies.PATH, self._plan),
+                (robot.options.pose, (bodies.ODOMETRY,), self._pose),
+                (robot.options.plan, (bodies.PATH, bodies.TRAJECTORY), self._plan),
             ):
                 if topic != info.name:
                     continue
-                if plain_type(info.type_name) != plain_type(wanted) or info.encoding is Encoding.RAW:
+                if plain_type(info.type_name) not in map(plain_type, wanted) or info.encoding is Encoding.RAW:
+                    reads = " or ".join(wanted)
                     raise ConfigError(
-                        f"{info.name}: the twin of {robot.options.name} reads {wanted}, not {info.type_name}"
+                        f"{info.name}: the twin of {robot.options.name} reads {reads}, not {info.type_name}"
                     )
                 return self._hearer(info, robot, hear)
         raise ConfigError(f"{info.name}: no robot of the twins has it as its pose or plan")
 
     def _hearer(
-        self, info: TopicInfo, robot: RobotTwin, hear: Callable[[RobotTwin, Encoding, bytes, int, float], None]
+        self, info: TopicInfo, robot: RobotTwin, hear: Callable[[RobotTwin, TopicInfo, bytes, int, float], None]
     ) -> _Hearer:
         def heard(body: bytes, stamp_ns: int, age_s: float) -> None:
             try:
-                hear(robot, info.encoding, body, stamp_ns, age_s)
+                hear(robot, info, body, stamp_ns, age_s)
             except BodyError as error:
                 self._drops[DropReason.UNDECODABLE] += 1
                 self._said(f"{info.name}: {error}", str(info.name))
 
         return _Hearer(info.name, heard, self._hearers)
 
-    def _pose(self, robot: RobotTwin, encoding: Encoding, body: bytes, stamp_ns: int, age_s: float) -> None:
-        robot.pose(bodies.read_pose(body, encoding), taken_ns=stamp_ns, age_s=age_s, now=self._now())
+    def _pose(self, robot: RobotTwin, info: TopicInfo, body: bytes, stamp_ns: int, age_s: float) -> None:
+        robot.pose(bodies.read_pose(body, info.encoding), taken_ns=stamp_ns, age_s=age_s, now=self._now())
 
-    def _plan(self, robot: RobotTwin, encoding: Encoding, body: bytes, stamp_ns: int, age_s: float) -> None:
-        robot.plan(bodies.read_plan(body, encoding), taken_ns=stamp_ns, age_s=age_s, now=self._now())
+    def _plan(self, robot: RobotTwin, info: TopicInfo, body: bytes, stamp_ns: int, age_s: float) -> None:
+        plan = bodies.read_plan(body, info.type_name, info.encoding, taken_ns=stamp_ns)
+        robot.plan(plan, taken_ns=stamp_ns, age_s=age_s, now=self._now())
 
     def interest(self, name: TopicName, wanted: bool) -> None:
         """Makes no difference: what nobody subscribes to is not made."""
@@ -238,6 +244,9 @@ class TwinEndpoint:
             stamps_ns = [wall_ns + round(number * AHEAD_STEP_S * 1e9) for number in range(steps + 1)]
             motions = robot.ahead(twin.shown, steps, AHEAD_STEP_S, now=now)
             return self._writer.path(motions, z_m=frame.z_m, stamps_ns=stamps_ns, frame_id=frame.frame_id)
+        if part == "unity":
+            frame_id = f"unity/{frame.frame_id}"
+            return self._writer.unity(twin.shown, z_m=frame.z_m, stamp_ns=wall_ns, frame_id=frame_id)
         motion = twin.shown if part == "odom" else twin.estimate
         return self._writer.odometry(
             motion, twin.error_m, z_m=frame.z_m, stamp_ns=wall_ns, frame_id=frame.frame_id, child_frame_id=child

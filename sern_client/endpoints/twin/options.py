@@ -21,3 +21,4 @@ class TwinOptions:
     rate_hz: float = 20.0
     ahead_s: float = 5.0
     prefix: str = "/twin"
+    unity: bool = False

@@ -32,7 +32,7 @@ class World:
         self.encoding = encoding
         self.writer = bodies.Writer(encoding)
         self.endpoint = TwinEndpoint(
-            TwinOptions(robots or (JACKAL,), encoding=encoding.value),  # type: ignore[arg-type]
+            TwinOptions(robots or (JACKAL,), encoding=encoding.value, unity=True),  # type: ignore[arg-type]
             now=lambda: self.now,
             wall_ns=lambda: round((1.7e9 + self.now) * 1e9),
         )
@@ -156,6 +156,50 @@ def test_a_stop_in_the_gap_is_reported(caplog: pytest.LogCaptureFixture) -> None
     assert "it stands, and was to move" in caplog.text and "after 15.0 s of silence it is 14.00 m" in caplog.text
     robot = world.endpoint.robots["jackal1"]
     assert (robot.gaps, robot.stops, robot.snaps) == (1, 1, 1)
+
+
+@pytest.mark.parametrize("begin_s", [0.0, 2.0], ids=["now", "in two seconds"])
+def test_a_trajectory_is_a_plan(begin_s: float) -> None:
+    """trajectory_msgs: it says when it begins, or begins when it comes."""
+    world = World()
+    pose, plan = world.publisher("/jackal1/odom"), world.publisher("/jackal1/plan", bodies.TRAJECTORY)
+
+    def new(type_name: str, **fields: Any) -> Any:
+        return ros_types.new(type_name, world.encoding, **fields)
+
+    points = [
+        new(
+            "trajectory_msgs/msg/MultiDOFJointTrajectoryPoint",
+            transforms=[new("geometry_msgs/msg/Transform", translation=new("geometry_msgs/msg/Vector3", x=float(n)))],
+            velocities=[], accelerations=[],
+            time_from_start=new("builtin_interfaces/msg/Duration", sec=n, nanosec=0),
+        )
+        for n in range(100)
+    ]  # fmt: skip
+    stamp_ns = world.stamp_ns(begin_s) if begin_s else 0
+    trajectory = new(
+        bodies.TRAJECTORY, header=ros_types.header(stamp_ns, "map", world.encoding), joint_names=["base"], points=points
+    )
+    plan.publish(ros_types.serialise(trajectory, bodies.TRAJECTORY, world.encoding), world.stamp_ns(0.0))
+    for step in range(200):
+        world.now = begin_s + step * STEP_S
+        world.say(pose, ahead(step * STEP_S), at_s=world.now)
+    assert world.endpoint.robots["jackal1"].goes_by == "trajectory"
+    world.now += 30.0
+    assert world.shown().distance_m(ahead(world.now - begin_s)) < 0.05
+
+
+@pytest.mark.parametrize("yaw_rad", [0.0, 0.7, math.pi / 2, -2.0])
+def test_in_unity_it_looks_where_it_looks_here(yaw_rad: float) -> None:
+    world = World()
+    world.say(world.publisher("/jackal1/odom"), Motion(3.0, 4.0, yaw_rad), at_s=0.0)
+    world.endpoint.publish(slow=False)
+    (said,) = world.got["/twin/jackal1/unity"]
+    assert (said.pose.position.x, said.pose.position.y, said.pose.position.z) == (3.0, 0.3, 4.0)
+    assert said.header.frame_id == "unity/map"
+    turn = 2 * math.atan2(said.pose.orientation.y, said.pose.orientation.w)
+    # Unity's forward is z, and it turns about y from z to x.
+    assert (math.sin(turn), math.cos(turn)) == pytest.approx((math.cos(yaw_rad), math.sin(yaw_rad)))
 
 
 def test_a_path_without_times_is_followed_at_the_robots_speed() -> None:
@@ -287,6 +331,7 @@ class Told:
 async def test_it_announces_its_topics_and_ends() -> None:
     world, told = World(), Told()
     await world.endpoint.start(told)
+    assert "/twin/jackal1/unity" in told.added
     assert set(told.added) == {f"/twin/jackal1/{part}" for part in TYPES}
     await until(lambda: world.got["/twin/jackal1/status"])
     await world.endpoint.stop()
