@@ -46,7 +46,7 @@ def deployed(tmp_path: Path) -> Path:
     shutil.copytree(EXAMPLES, tmp_path, dirs_exist_ok=True)
     (tmp_path / "clients").mkdir()
     run_keygen("relay", "relay", out=tmp_path)
-    for name in ("jackal1", "husky1", "j100_0000", "a200_0000", "site1"):
+    for name in ("jackal1", "husky1", "j100_0000", "a200_0000", "site1", "twin"):
         run_keygen("client", name, out=tmp_path)
         shutil.copy(tmp_path / f"{name}.pub", tmp_path / "clients")
     return tmp_path

@@ -88,8 +88,8 @@ def onwards(far: Publisher) -> Callable[[bytes, int], bool]:
     return sink
 
 
-def named(type_name: str, lines: list[str]) -> Callable[[], bool]:
-    return lambda: any(type_name in line for line in lines)
+def named(type_name: str, caplog: pytest.LogCaptureFixture) -> Callable[[], bool]:
+    return lambda: any(type_name in line for line in caplog.messages)  # a list of what there is, made at each look
 
 
 async def matched(node: RosNode, topic: str, count: int = 1) -> None:
@@ -122,7 +122,7 @@ async def test_every_type_crosses_to_a_late_joiner(place: Place, caplog: pytest.
     assert {each["topic"]: each["value"] for each in desk.of("got")} == sent
     assert len(desk.of("got")) == len(sent), "each once"
     for type_name in NAMED:
-        await until(named(type_name, caplog.messages))
+        await until(named(type_name, caplog))
 
 
 async def test_nodes_that_name_no_quality_of_service_hear_a_best_effort_stream(place: Place) -> None:
