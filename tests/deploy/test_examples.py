@@ -14,6 +14,7 @@ from sern_core.vocabulary.message import TopicInfo
 from sern_core.vocabulary.types import ClientName, Encoding, PriorityClass, TopicName
 from sern_runtime.config.client import ClientFile, load_client
 from sern_runtime.config.relay import load_relay
+from sern_runtime.config.twin import TwinEndpoint
 
 EXAMPLES: Final = Path(__file__).resolve().parents[2] / "deploy" / "examples"
 CLIENTS: Final = sorted(path.name for path in EXAMPLES.glob("*.yaml") if path.name != "relay.yaml")
@@ -148,6 +149,20 @@ def test_the_relay_lets_through_what_a_client_needs(name: str) -> None:
     for topic in ("/cmd_vel", "/move_base/goal", "/dock/_call/site1"):
         assert table.may_subscribe(own, TopicName(robot + topic))
     assert not table.may_subscribe(own, TopicName("/other1/cmd_vel"))
+
+
+def test_twins_are_made_of_what_the_robot_sends() -> None:
+    (section,) = client("twin.yaml").endpoints
+    assert isinstance(section, TwinEndpoint)
+    (robot,) = section.robots
+    sender = client("jackal-noetic.yaml")
+    for topic, type_name in ((robot.pose, "nav_msgs/Odometry"), (robot.plan, "nav_msgs/Path")):
+        assert topic is not None
+        found = treated(sender, topic.removeprefix("/jackal1"), type_name, Encoding.ROS1)
+        assert found is not None and found.direction is Direction.SEND, topic
+    rules = load_relay(EXAMPLES / "relay.yaml", files=False).model.access_rules()
+    for topic in (robot.pose, robot.plan, "/j100_0000/platform/odom/filtered", "/j100_0000/plan"):
+        assert AccessTable(rules).may_subscribe(ClientName("twin"), TopicName(topic or "")), topic
 
 
 def test_the_feed_shows_twins_with_their_age_and_error() -> None:
