@@ -50,7 +50,8 @@ class Outcome(Enum):
     """Further away than the robot can have gone."""
 
 
-_TAKEN: Final = frozenset({Outcome.TAKEN, Outcome.RELOCATED, Outcome.RESTARTED})
+TAKEN: Final = frozenset({Outcome.TAKEN, Outcome.RELOCATED, Outcome.RESTARTED})
+"""Those of measurements that are what is known now."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,7 +179,7 @@ class Synchroniser:
         """The robot was at `found` at `stamp_s`. What became of it, and the gap that it ended, if it was one."""
         outcome = self._outcome(stamp_s, found, now)
         self._counts[outcome] += 1
-        if outcome not in _TAKEN:
+        if outcome not in TAKEN:
             return outcome, None
         self._strange.clear()
         self._old = None

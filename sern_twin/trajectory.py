@@ -14,6 +14,8 @@ MOST_POINTS: Final = 100_000
 """More are of no plan: a robot that sends them would fill the twin's memory."""
 PART_M: Final = 0.25
 """How far apart the points of a path without times are at the most."""
+MOST_PARTS: Final = 5_000
+"""Of a path of more than 1.25 km they are longer: it is cut anew every few seconds, and all twins wait for that."""
 _SAME_M: Final = 1e-3
 
 
@@ -117,7 +119,7 @@ def paced(way: Sequence[tuple[float, float]], start: Motion, start_s: float, spe
         ),
     )
     # Curves through points that are far apart would cut corners.
-    part_m = max(PART_M, sum(math.dist(a, b) for a, b in pairwise(way)) / MOST_POINTS * 2)
+    part_m = max(PART_M, sum(math.dist(a, b) for a, b in pairwise(way)) / MOST_PARTS)
     points = [Waypoint(start_s, *foot)]
     time_s, last = start_s, foot
     for point in way[part + 1 :]:

@@ -5,6 +5,7 @@ import gzip
 import math
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from random import Random
@@ -15,8 +16,11 @@ from benchmarks.common import Report, half_width_95, percentile
 from benchmarks.sync.playing import Played, errors, play, ways
 from benchmarks.sync.recording import Recording, record
 from benchmarks.sync.robot import Said, plan
+from sern_client.endpoints.twin.bodies import read_pose
+from sern_core.vocabulary.types import Encoding
 from sern_sim.models import LinkModel, Window
 from sern_sim.robot import STEP_S
+from sern_twin.acceleration import Accelerations
 from sern_twin.correction import CorrectionOptions
 from sern_twin.motion import Motion, Twist
 from sern_twin.predictors import (
@@ -31,6 +35,7 @@ from sern_twin.predictors import (
 from sern_twin.reckoning import Reckoner, ReckoningOptions
 from sern_twin.slip import Slip
 from sern_twin.synchroniser import Synchroniser, SynchroniserOptions
+from sern_twin.trajectory import Trajectory
 
 MODERATE: Final = LinkModel(delay_s=0.1, jitter_s=0.02, loss=0.05)
 HEADLINE: Final = "shared trajectory"
@@ -220,18 +225,13 @@ def _odometry(bag: Path) -> Iterator[tuple[float, Motion]]:
 
     with AnyReader([bag]) as reader:
         connections = [each for each in reader.connections if each.topic.endswith("/odom")]
-        before: tuple[float, Motion] | None = None
-        for connection, _, body in reader.messages(connections):
-            message: Any = reader.deserialize(body, connection.msgtype)
-            stamp_s = message.header.stamp.sec + message.header.stamp.nanosec / 1e9
-            pose, twist = message.pose.pose, message.twist.twist
-            yaw_rad = 2 * math.atan2(pose.orientation.z, pose.orientation.w)
-            speeds = Twist(twist.linear.x, twist.linear.y, twist.angular.z)
-            accel_mps2 = 0.0
-            if before is not None and stamp_s > before[0]:
-                accel_mps2 = (speeds.forward_mps - before[1].twist.forward_mps) / (stamp_s - before[0])
-            before = stamp_s, Motion(pose.position.x, pose.position.y, yaw_rad, speeds, accel_mps2)
-            yield before
+        accelerations = Accelerations()
+        for _, _, body in reader.messages(connections):
+            pose = read_pose(body, Encoding.ROS1)
+            stamp_s = pose.stamp_ns / 1e9
+            motion = accelerations.of(stamp_s, pose.motion)
+            accelerations.took(stamp_s, motion)
+            yield stamp_s, motion
 
 
 def _open_loop(motions: list[tuple[float, Motion]], gap_s: float, predictor: Predictor | None) -> Iterator[float]:
@@ -374,6 +374,12 @@ def reckoning(seeds: int, report: Report) -> None:
                 fewer.append(streamed.sent_bytes / sparse.sent_bytes)
                 p95s.append(p95_m)
                 other.append(alike)
+        client, streamed = _as_the_client_does(seed, way, streamed)
+        fewer, p95s, other = rows.setdefault(CLIENTS, ([], [], []))
+        fewer.append(streamed.sent_bytes / client.sent_bytes)
+        for recording, found in ((client, p95s), (streamed, other)):
+            played = play(recording, ways(recording)["constant acceleration"])
+            found.append(shares(errors(recording, played, 5.0, 60.0)[0])[1])
     for name, (fewer, p95s, other) in rows.items():
         report.row(
             "dead reckoning", name, times_fewer_bytes=sum(fewer) / seeds, p95_cm=100 * sum(p95s) / seeds,
@@ -383,6 +389,35 @@ def reckoning(seeds: int, report: Report) -> None:
     fewer, p95s, other = rows[name]
     report.reach("dead reckoning: times fewer bytes than 50 Hz", sum(fewer) / seeds, 5.0, at_least=True)
     report.reach("dead reckoning: p95 over that of 50 Hz", sum(p95s) / sum(other), 1.05)
+
+
+CLIENTS: Final = "dead_reckoning: true"
+"""What a topic's rule gives: accelerations are those of the speeds that were sent."""
+
+
+def _as_the_client_does(seed: int, way: Trajectory, streamed: Recording) -> tuple[Recording, Recording]:
+    """What is heard of a robot whose rule has `dead_reckoning`, and of one that streams."""
+    reckoner, accelerations = Reckoner(ConstantAcceleration()), Accelerations()
+
+    def due(said: Said) -> bool:
+        motion = accelerations.of(said.time_s, replace(said.found, forward_mps2=0.0))
+        if not reckoner.due(motion, now=said.time_s):
+            return False
+        accelerations.took(said.time_s, motion)
+        return True
+
+    return _accelerating(record(seed, way, 60.0, MODERATE, due=due)), _accelerating(streamed)
+
+
+def _accelerating(recording: Recording) -> Recording:
+    """The same with accelerations of the speeds that were heard, as odometry has none."""
+    accelerations = Accelerations()
+    heard = []
+    for each in recording.heard:
+        found = accelerations.of(each.stamp_s, replace(each.found, forward_mps2=0.0))
+        accelerations.took(each.stamp_s, found)
+        heard.append(each._replace(found=found))
+    return replace(recording, heard=heard)
 
 
 def _due(reckoner: Reckoner, said: Said) -> bool:

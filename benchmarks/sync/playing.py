@@ -129,7 +129,7 @@ def play(recording: Recording, way: Way, options: SynchroniserOptions | None = N
 
 
 def errors(recording: Recording, played: Played, start_s: float, end_s: float) -> tuple[list[float], list[float]]:
-    """Of what was shown in this time: metres and degrees from where the robot was, one a step."""
+    """Metres and degrees between what was shown in this time and where the robot was, one a step."""
     first, last = round(start_s / STEP_S), round(end_s / STEP_S)
     off_m, off_deg = [], []
     for truth, twin in zip(recording.truth[first:last], played.twins[first:last], strict=True):

@@ -233,8 +233,8 @@ class TopicSection(Section):
     unless `reliability` is reliable."""
     dead_reckoning: bool = False
     """For nav_msgs/Odometry: a pose is sent when the twin of who receives it would be off by 2 cm or a degree without,
-    and 0.2 s after the one before at the latest. A fifth to a tenth of 50 a second is left. Leave it out for receivers
-    that need every pose, such as a recording for later."""
+    and 0.2 s after the one before at the latest. At the best a tenth of 50 a second is left. Leave it out for
+    receivers that need every pose, such as a recording for later."""
 
     @model_validator(mode="after")
     def _summaries_fit(self) -> "TopicSection":

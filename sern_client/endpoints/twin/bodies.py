@@ -72,7 +72,7 @@ def read_plan(body: bytes, type_name: str, encoding: Encoding, *, taken_ns: int)
 
 
 def _read_trajectory(message: Any, taken_ns: int) -> Planned:
-    """Of a base with joints only the first one moves in the world."""
+    """The places of the first joint: that of the base in the world."""
     begin_ns = _stamp_ns(message.header.stamp) or taken_ns
     if not all(point.transforms for point in message.points):
         raise BodyError("a trajectory with a point that has no transform")
@@ -93,7 +93,7 @@ def _stamp_ns(stamp: Any) -> int:
 
 
 def _yaw_rad(orientation: Any) -> float:
-    """Of a quaternion of any length; NaN where it has none."""
+    """The heading of a quaternion, whatever its length; NaN where it has none."""
     x, y, z, w = (getattr(orientation, axis) for axis in "xyzw")
     if not x * x + y * y + z * z + w * w > 0:
         return math.nan
@@ -141,7 +141,7 @@ class Writer:
         return self._body(PATH, header=self._header(stamps_ns[0], frame_id), poses=poses)
 
     def unity(self, motion: Motion, *, z_m: float, stamp_ns: int, frame_id: str) -> bytes:
-        """In Unity's axes (x east, y up, z north; left-handed): a body's forward is z there, and turns clockwise."""
+        """A PoseStamped in Unity's axes: x east, y up, z north, left-handed. A body looks along z and turns clockwise."""
         x_m, y_m, north_m = (float(value) for value in UNITY_FROM_ENU.points((motion.x_m, motion.y_m, z_m)))
         half = (math.pi / 2 - motion.yaw_rad) / 2
         pose = self._new(

@@ -193,7 +193,7 @@ class TwinEndpoint:
         return self._drops
 
     def register_metrics(self, metrics: Metrics) -> None:
-        register_twins(metrics, lambda: iter(self.robots.items()), self._now)
+        register_twins(metrics, self.robots, self._now)
 
     @property
     def json_routes(self) -> Mapping[str, Callable[[], object]]:
@@ -226,7 +226,7 @@ class TwinEndpoint:
                 continue
             for subscription in list(topic.subscriptions):
                 if not subscription.sink(body, wall_ns):
-                    self._drops[DropReason.QUEUE_FULL] += 1
+                    self._drops[DropReason.REFUSED] += 1
 
     def _body(self, robot: RobotTwin, part: str, twin: Twin | None, now: float, wall_ns: int) -> bytes | None:
         """None before the robot was heard, but for its status."""

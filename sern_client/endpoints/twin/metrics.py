@@ -1,6 +1,6 @@
 """The metrics of twins, read at scrape."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 
 from sern_client.endpoints.twin.robot import RobotTwin
@@ -8,17 +8,15 @@ from sern_runtime.metrics import Metrics
 from sern_twin.synchroniser import Twin
 
 
-def register_twins(
-    metrics: Metrics, robots: Callable[[], Iterator[tuple[str, RobotTwin]]], now: Callable[[], float]
-) -> None:
+def register_twins(metrics: Metrics, robots: Mapping[str, RobotTwin], now: Callable[[], float]) -> None:
     def each(value: Callable[[Twin], float]) -> Iterator[tuple[tuple[str], float]]:
-        for name, robot in robots():
+        for name, robot in robots.items():
             twin = robot.twin(now=now())
             if twin is not None:
                 yield (name,), value(twin)
 
     def counted(count: Callable[[RobotTwin], int]) -> Iterator[tuple[tuple[str], float]]:
-        for name, robot in robots():
+        for name, robot in robots.items():
             yield (name,), float(count(robot))
 
     gauges: tuple[tuple[str, str, Callable[[Twin], float]], ...] = (
@@ -37,14 +35,14 @@ def register_twins(
         "Poses that came, by what became of them.",
         ("robot", "outcome"),
         lambda: [
-            ((name, outcome), float(count)) for name, robot in robots() for outcome, count in robot.counts.items()
+            ((name, outcome), float(count)) for name, robot in robots.items() for outcome, count in robot.counts.items()
         ],
     )
     metrics.counter(
         "sern_twin_plans_refused_total",
         "Plans that could not be used, by why.",
         ("robot", "reason"),
-        lambda: [((name, why), float(count)) for name, robot in robots() for why, count in robot.refused.items()],
+        lambda: [((name, why), float(count)) for name, robot in robots.items() for why, count in robot.refused.items()],
     )
     counters: tuple[tuple[str, str, Callable[[RobotTwin], int]], ...] = (
         ("sern_twin_gaps_total", "Gaps in what was heard of the robot that have ended.", lambda robot: robot.gaps),

@@ -18,7 +18,7 @@ from sern_twin.acceleration import Accelerations
 from sern_twin.following import Following
 from sern_twin.motion import Motion
 from sern_twin.predictors import ConstantAcceleration, PlanTracking, Predictor
-from sern_twin.synchroniser import Gap, Outcome, Synchroniser, SynchroniserOptions, Twin
+from sern_twin.synchroniser import TAKEN, Gap, Outcome, Synchroniser, SynchroniserOptions, Twin
 from sern_twin.trajectory import Trajectory, Waypoint, paced
 
 LEARNS_S: Final = 2.0
@@ -36,8 +36,8 @@ class Frame:
 
 
 class RobotTwin:
-    """`gaps` are the gaps so far that ended, the newest last, some of them; `refused` counts plans by why they are not
-    used."""
+    """`gaps` counts those that have ended, `violated` and `stops` those of them beyond their bound, and after which the
+    robot stood and was to move; `refused` counts plans by why they are not used."""
 
     def __init__(self, options: RobotOptions) -> None:
         self.options = options
@@ -46,7 +46,6 @@ class RobotTwin:
         self.gaps = 0
         self.violated = 0
         self.stops = 0
-        self.last_gap: Gap | None = None
         self._synchroniser = Synchroniser(
             ConstantAcceleration(),
             SynchroniserOptions(
@@ -96,7 +95,7 @@ class RobotTwin:
         outcome, gap = self._synchroniser.measured(stamp_s, motion, now=now)
         if gap is not None:
             self._report(gap)
-        if outcome in (Outcome.TAKEN, Outcome.RELOCATED, Outcome.RESTARTED):
+        if outcome in TAKEN:
             if self.frame.frame_id not in ("", pose.frame_id):
                 _log.warning(
                     "%s: %s is in frame %r now, and was in %r: a plan of the old frame is dropped",
@@ -173,10 +172,8 @@ class RobotTwin:
     def _report(self, gap: Gap) -> None:
         report = gap.report
         self.gaps += 1
-        self.last_gap = gap
         self.stops += gap.stopped
-        if report.violated:
-            self.violated += 1
+        self.violated += report.violated
         if report.violated or gap.stopped:
             _log.warning(
                 "%s: after %.1f s of silence it is %.2f m from where its twin was, bounded by %.2f m%s",
