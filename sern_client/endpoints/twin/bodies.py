@@ -141,7 +141,7 @@ class Writer:
         return self._body(PATH, header=self._header(stamps_ns[0], frame_id), poses=poses)
 
     def unity(self, motion: Motion, *, z_m: float, stamp_ns: int, frame_id: str) -> bytes:
-        """A PoseStamped in Unity's axes: x east, y up, z north, left-handed. A body looks along z and turns clockwise."""
+        """A PoseStamped in Unity's axes: x east, y up, z north. A body looks along z there, and turns clockwise."""
         x_m, y_m, north_m = (float(value) for value in UNITY_FROM_ENU.points((motion.x_m, motion.y_m, z_m)))
         half = (math.pi / 2 - motion.yaw_rad) / 2
         pose = self._new(
