@@ -4,7 +4,7 @@ import base64
 from collections.abc import Mapping
 from typing import Any, Final
 
-from sern_core.relay.objects import topic_object_id
+from sern_core.objects.registry import topic_object_id
 from sern_core.vocabulary.errors import UsageError
 from sern_core.vocabulary.message import StreamId, StreamInfo
 from sern_core.wire.announce import definition_hash

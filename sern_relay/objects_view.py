@@ -24,9 +24,9 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 from sern_core.bodies.codecs import INLINE_BYTES
+from sern_core.objects.registry import ValueRequest, text_hash
+from sern_core.objects.xr_object import object_to_json
 from sern_core.relay.hub import Hub
-from sern_core.relay.objects import ValueRequest, text_hash
-from sern_core.relay.xr_object import object_to_json
 from sern_core.vocabulary.errors import UsageError
 from sern_core.vocabulary.types import ClientName, ObjectKind, TopicName
 from sern_core.wire.announce import definition_hash

@@ -23,7 +23,7 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from typing import Final
 
-from sern_core.relay.objects import ObjectRegistry
+from sern_core.objects.registry import ObjectRegistry
 from sern_core.summaries.transforms import Transform, read_transforms
 from sern_core.vocabulary.errors import BodyError, RefusedError
 from sern_core.vocabulary.message import Message, StreamId, StreamInfo

@@ -10,11 +10,11 @@ from sern_core.link.control_reader import ControlReader
 from sern_core.link.handler import LinkHandler
 from sern_core.link.housekeeping import Housekeeping
 from sern_core.link.streams_out import StreamsOut
+from sern_core.objects.registry import ObjectRegistry
 from sern_core.path.congestion.hybrid import HybridWindow
 from sern_core.path.flight import Flight
 from sern_core.relay.forwarding import Forwarding
 from sern_core.relay.hub import Hub
-from sern_core.relay.objects import ObjectRegistry
 from sern_core.site.client import ClientCore
 from sern_core.stream.in_stream import InStream
 from sern_core.stream.out_channel import OutChannel

@@ -3,9 +3,9 @@
 from typing import Final
 
 from sern_core.link.link import Link
+from sern_core.objects.registry import ObjectRegistry
 from sern_core.relay.clients import Clients
 from sern_core.relay.hub_events import GuardedEvents, Relayed
-from sern_core.relay.objects import ObjectRegistry
 from sern_core.relay.relayed_streams import RelayedStreams
 from sern_core.stream.in_stream import InStream
 from sern_core.stream.out_channel import OutChannel

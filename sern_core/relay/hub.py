@@ -19,6 +19,7 @@ from typing import Final
 from sern_core.link.definitions import DefinitionStore
 from sern_core.link.housekeeping import TIDY_S
 from sern_core.link.link import Link
+from sern_core.objects.registry import ObjectRegistry
 from sern_core.path.lanes import LANE_PRIORITY
 from sern_core.relay.absent import AbsentClients
 from sern_core.relay.access import AccessTable
@@ -29,7 +30,6 @@ from sern_core.relay.hub_matching import Matching
 from sern_core.relay.hub_port import HubPort
 from sern_core.relay.local_streams import LocalStreams
 from sern_core.relay.object_control import apply_object
-from sern_core.relay.objects import ObjectRegistry
 from sern_core.relay.presence import Presence
 from sern_core.relay.relayed_streams import RelayedStreams
 from sern_core.relay.routing import BadPatternError, RouteChange, RoutingLimits, RoutingTable

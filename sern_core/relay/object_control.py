@@ -4,8 +4,8 @@
 name: itself, without the `@client` at its end, under the leading `/` of names. Who may publish that name may put it.
 """
 
+from sern_core.objects.registry import ObjectRegistry
 from sern_core.relay.access import AccessTable
-from sern_core.relay.objects import ObjectRegistry
 from sern_core.vocabulary.errors import RefusedError, WireError
 from sern_core.vocabulary.types import ClientName, ObjectKind, TopicName
 from sern_core.wire import framing

@@ -5,12 +5,12 @@ from functools import partial
 from typing import Final
 
 from sern_core.link.link import Link
+from sern_core.objects.registry import ObjectRegistry
 from sern_core.relay.access import AccessTable
 from sern_core.relay.clients import Clients
 from sern_core.relay.draining import Draining
 from sern_core.relay.hub_events import GuardedEvents, Relayed
 from sern_core.relay.hub_fanout import Fanout
-from sern_core.relay.objects import ObjectRegistry
 from sern_core.relay.presence import Presence
 from sern_core.relay.routing import UNIT_S, RouteChange, RoutingTable
 from sern_core.stream.in_stream import InStream

@@ -8,7 +8,7 @@ from typing import Annotated, Final, Literal, Self
 
 from pydantic import Discriminator, Field, Tag, model_validator
 
-from sern_core.relay.objects import COMMAND_OBJECT_TYPES
+from sern_core.objects.registry import COMMAND_OBJECT_TYPES
 from sern_core.site.services import ServiceRule, subscriptions
 from sern_core.summaries.spec import TooLarge
 from sern_core.topics.patterns import MAX_CLIENT_PROGRAM, PatternError, PatternSet, compile_pattern

@@ -7,8 +7,8 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
+from sern_core.objects.registry import COMMAND_OBJECT_TYPES
 from sern_core.relay.access import DEFAULT_QUEUE_BYTES, AccessRule
-from sern_core.relay.objects import COMMAND_OBJECT_TYPES
 from sern_core.topics.patterns import PatternSet, compile_pattern
 from sern_core.topics.rules import AUTO, FeedRole, FeedTopic, TopicRule
 from sern_core.vocabulary.errors import ConfigError, UsageError

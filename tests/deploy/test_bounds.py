@@ -12,8 +12,8 @@ from sern_client.endpoints.common import first_messages
 from sern_client.endpoints.ros1 import Ros1Options
 from sern_client.endpoints.ros1 import first_messages as ros1_first_messages
 from sern_core.link import control_stream, definitions
+from sern_core.objects.values import ObjectLimits
 from sern_core.relay import absent, access, draining, routing
-from sern_core.relay.object_values import ObjectLimits
 from sern_core.site import peers
 from sern_core.stream import decoding, drop_reports, in_stream, latched, prices
 from sern_core.vocabulary import ledger

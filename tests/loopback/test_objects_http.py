@@ -123,7 +123,7 @@ async def test_an_encoded_cloud_is_decoded_beside_the_loop_when_somebody_asks(
         threads.add(threading.get_ident())
         return decode(codec, body, max_bytes=max_bytes)
 
-    monkeypatch.setattr("sern_core.relay.objects.decode", noted)
+    monkeypatch.setattr("sern_core.objects.registry.decode", noted)
     endpoint = {"kind": "synthetic", "role": "robot", "topics": ["/points"], "cloud_bytes": 200_000}
     rule = {"match": "/points", "compression": "zstd", "reliability": "reliable", "class": "state"}
     async with Lab(tmp_path, "jackal1", "operator1") as lab:

@@ -5,7 +5,7 @@ import math
 
 import pytest
 
-from sern_core.relay.objects import ObjectRegistry
+from sern_core.objects.registry import ObjectRegistry
 from sern_core.summaries.transforms import Transform, read_transforms
 from sern_core.vocabulary.message import Message, StreamId, StreamInfo, TopicInfo
 from sern_core.vocabulary.types import ClientName, Encoding, ObjectKind, TopicName

@@ -4,8 +4,8 @@ from typing import Any
 
 import pytest
 
+from sern_core.objects.registry import ObjectRegistry
 from sern_core.relay.access import AccessRule, AccessTable
-from sern_core.relay.objects import ObjectRegistry
 from sern_core.vocabulary.message import StreamId, StreamInfo, TopicInfo
 from sern_core.vocabulary.types import ClientName, Encoding, TopicName
 from tests.fuzz.test_hostile_peer import Hostile

@@ -26,8 +26,8 @@ from types import MappingProxyType
 from typing import Final
 
 from sern_core.bodies.codecs import Work, decode
-from sern_core.relay.object_values import Entry, ObjectLimits, ObjectValues
-from sern_core.relay.xr_object import ChangedIds, ObjectChanges, XrObject
+from sern_core.objects.values import Entry, ObjectLimits, ObjectValues
+from sern_core.objects.xr_object import ChangedIds, ObjectChanges, XrObject
 from sern_core.topics.rules import COMMAND_TYPES
 from sern_core.vocabulary.codec_names import Codec
 from sern_core.vocabulary.errors import CodecError, RefusedError
