@@ -63,6 +63,8 @@ class IdleSite:
     def fault(self, error: Exception) -> None:
         raise SystemExit(f"an internal error: {error!r}")
 
+    def object_refused(self, object_id: str, code: str, why: str) -> None: ...
+
     def subscription_refused(self, code: str, text: str) -> None: ...
 
 

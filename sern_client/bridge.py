@@ -5,6 +5,7 @@ from collections.abc import Callable
 from typing import Protocol
 
 from sern_client.actions import GoalWatch
+from sern_client.endpoints.common.saying import SayOnce
 from sern_client.guard import Guard
 from sern_client.inbound import Inbound
 from sern_client.outbound import Outbound
@@ -61,6 +62,7 @@ class Bridge:
         self.inbound = Inbound(site, self.core, guard=guard, goals=goals, withdraws=withdraws)
         self.goals = goals
         self.services = None if make_services is None else make_services(self.core)
+        self._said = SayOnce(_log)
         self.rejected_reason: str | None = None
         """Why the relay refuses us, in its words; None: it does not."""
 
@@ -123,6 +125,9 @@ class Bridge:
 
     def undecodable(self, stream: StreamInfo, problem: str) -> None:
         self.inbound.undecodable(stream, problem)
+
+    def object_refused(self, object_id: str, code: str, why: str) -> None:
+        self._said(f"the relay does not take the object {object_id} ({code}): {why}", code)
 
     def subscription_refused(self, code: str, text: str) -> None:
         self.inbound.subscription_refused(code, text)

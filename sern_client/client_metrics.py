@@ -49,6 +49,18 @@ def _register_link(metrics: Metrics, parts: Counting) -> None:
     parts.errors.register(metrics)
     parts.collector.register(metrics)
     register_summaries(metrics, bridge.outbound.summaries)
+    metrics.gauge(
+        "sern_objects",
+        "Cross-reality objects, of this client and of others.",
+        ("whose",),
+        lambda: [(("own",), float(len(core.objects.registry))), (("others",), float(len(core.mirror.objects)))],
+    )
+    metrics.counter(
+        "sern_object_changes_total",
+        "Changes of objects of others that came, by outcome.",
+        ("outcome",),
+        lambda: [((outcome,), float(count)) for outcome, count in core.mirror.counts.items()],
+    )
     metrics.counter(
         "sern_reckoned_poses_total",
         "Poses that were not sent, because the twin of who receives them is right without.",

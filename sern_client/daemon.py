@@ -25,10 +25,12 @@ from sern_client.factory import make_endpoint, make_link_topics
 from sern_client.guard import Guard
 from sern_client.link_news import SILENT, LinkNews
 from sern_client.link_state import LinkState
+from sern_client.objects_view import objects_view
 from sern_client.services import ServiceBridge
 from sern_client.site import Site
 from sern_client.tables import Tables
 from sern_core.bodies.lossy import missing
+from sern_core.objects.feed import PERIOD_S
 from sern_core.site.client import ClientCore, ClientEvents
 from sern_core.topics.patterns import compile_pattern
 from sern_core.vocabulary.errors import ConfigError
@@ -123,6 +125,7 @@ class ClientDaemon:
         )
         self.core = self.bridge.core
         self.core.subscribe(model.subscribe_patterns(), now=now)
+        self.core.subscribe_objects([section.selection() for section in model.objects], now=now)
         self.adaptation = self._make_adaptation()
         self.news = LinkNews(self.core.link, model.relay.endpoint)
         self.link_state = LinkState(
@@ -221,6 +224,7 @@ class ClientDaemon:
         with blamed_on(self.loaded.path, "relay", "endpoint"):
             self.connection.open(self._ctx, keys, server_keys)
         self.tasks.append(asyncio.create_task(self._tick(), name="client-tick"))
+        self.tasks.append(asyncio.create_task(self._tell_objects(), name="client-objects"))
         if self.adaptation is not None:
             kept = self.parts.keep("adaptation", self.adaptation.run, reset=self.adaptation.reset)
             self.tasks.append(asyncio.create_task(kept, name="adaptation"))
@@ -270,6 +274,13 @@ class ClientDaemon:
             link = self.core.link
             state = "up" if link.established and not link.lane.stalled else f"down: {self.why()}"
             self.notifier.status(f"link {state}")
+
+    async def _tell_objects(self) -> None:
+        while True:
+            await asyncio.sleep(PERIOD_S)
+            if not self.core.objects.settled:
+                self.core.objects.pump(now=clock.now())
+                self._kick()
 
     def why(self) -> str:
         """Why there is no link, as far as it is known."""
@@ -327,6 +338,7 @@ class ClientDaemon:
             ready=self.readiness,
             json_routes={
                 "/api/link": self._link_view,
+                "/api/site_objects": objects_view(self.core),
                 "/api/peers": self.link_state.to_json,
                 "/api/topics": self.topics,
                 "/api/trace": trace_view(of_client(self.core.link, self.core.trace), clock.now),

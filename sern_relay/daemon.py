@@ -13,6 +13,7 @@ import zmq
 from prometheus_client import CollectorRegistry
 
 from sern_core.link.link import Link
+from sern_core.objects.feed import PERIOD_S
 from sern_core.relay.access import AccessTable
 from sern_core.relay.hub import Hub, HubParams
 from sern_core.relay.traces import Traces
@@ -207,6 +208,7 @@ class RelayDaemon:
             with blamed_on(self.loaded.path, "feed", "roles"):
                 self.readers.feed = self._make_feed(self._ctx, model.feed_roles())
         self.tasks.append(asyncio.create_task(self._tick(), name="relay-tick"))
+        self.tasks.append(asyncio.create_task(self._tell_objects(), name="relay-objects"))
         if self.adaptation is not None:
             kept = self.parts.keep("adaptation", self.adaptation.run, reset=self.adaptation.reset)
             self.tasks.append(asyncio.create_task(kept, name="adaptation"))
@@ -273,6 +275,12 @@ class RelayDaemon:
                 watchdog.check()
             self._comings.look(self.hub.links, now)
             self.notifier.status(self._status())
+
+    async def _tell_objects(self) -> None:
+        while True:
+            await asyncio.sleep(PERIOD_S)
+            if self.hub.exchange.feeds:
+                self.hub.tell_objects(now=clock.now())
 
     def _status(self) -> str:
         """One line for `systemctl status`."""

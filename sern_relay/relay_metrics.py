@@ -61,6 +61,10 @@ def register_relay(metrics: Metrics, relay: Counting) -> None:
                   read=lambda: [((), float(len(hub.relayed)))])  # fmt: skip
     metrics.gauge("sern_relay_objects", "Cross-reality objects in the registry.",
                   read=lambda: [((), float(len(hub.objects)))])  # fmt: skip
+    metrics.counter("sern_object_changes_total", "Changes of objects that clients sent, by outcome.", ("outcome",),
+                    lambda: [((outcome,), float(n)) for outcome, n in hub.exchange.counts.items()])  # fmt: skip
+    metrics.gauge("sern_object_feeds", "Clients that subscribe to objects.",
+                  read=lambda: [((), float(len(hub.exchange.feeds)))])  # fmt: skip
     metrics.counter("sern_relay_refusals_total", "Announcements, subscriptions and objects refused, by code.",
                     ("code",), lambda: [((code,), float(n)) for code, n in relay.refusals.items()])  # fmt: skip
     metrics.counter("sern_bad_frames_total", "Frames that were not valid; their connections were closed.",

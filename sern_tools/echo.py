@@ -296,6 +296,8 @@ class Listener:
     def fault(self, error: Exception) -> None:
         self._warn(f"an internal error; please report it: {error!r}")
 
+    def object_refused(self, object_id: str, code: str, why: str) -> None: ...
+
     def subscription_refused(self, code: str, text: str) -> None:
         self.problem = RefusedError(code, f"the relay refuses us: {text}")
 

@@ -11,6 +11,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final
 
+from sern_core.objects.changes import Begin, Define, Delete, End, Put
+from sern_core.objects.changes import encode as encode_change
 from sern_core.vocabulary.errors import RemoteError
 from sern_core.vocabulary.message import StreamId, StreamInfo, TopicInfo, TopicSpec
 from sern_core.vocabulary.types import (
@@ -19,6 +21,7 @@ from sern_core.vocabulary.types import (
     DropReason,
     Durability,
     Encoding,
+    ObjectKind,
     PriorityClass,
     TopicName,
 )
@@ -194,6 +197,25 @@ def _frame(*flags: str, body: bytes, total: int | None = None, offset: int = 0, 
 
 def _control(name: str, what: str, envelope: Vector, attachment: str = "") -> Vector:
     return {"name": name, "what": what, "layer": "control", "envelope": envelope, "attachment": attachment}
+
+
+def _object(value: bytes | None, *, upto: int | None) -> Put:
+    return Put(
+        object_id="zones/hall",
+        owner="site1",
+        kind=ObjectKind.OBSTACLE,
+        type_name="shape_msgs/msg/SolidPrimitive",
+        definition_hash="RIHS01_" + "0f" * 32,
+        text_hash=definition_hash(DEFINITION),
+        attributes={"colour": "red"},
+        value=value,
+        value_bytes=100_000 if value is None else len(value),
+        value_sha256="ab" * 32 if value is None else "",
+        seq=3,
+        ros_stamp_ns=-1,
+        wall_ns=1_700_000_000_123_456_789,
+        upto=upto,
+    )
 
 
 def _announcement() -> Vector:
@@ -395,20 +417,27 @@ def valid() -> list[Vector]:
             {"t": "lane", "sid": 305419896, "secret": "5e" * 32, "cipher": "aes-256-gcm", "port": 5555},
         ),
         _control(
-            "object-put",
-            "an object of the sender, with its value",
-            {
-                "t": "object",
-                "op": "put",
-                "id": "node@jackal1",
-                "kind": "node",
-                "type": "sern/Node",
-                "attr": {"platform": "jackal"},
-                "wall": 1_700_000_000_123_456_789,
-            },
-            "value",
+            "objects",
+            "the objects that a client wants, and has",
+            {"t": "objects", "kinds": ["robot", ""], "match": [".*", "zones/.*"], "since": 120, "epoch": 2**63 - 1},
         ),
-        _control("object-delete", "it is gone", {"t": "object", "op": "delete", "id": "node@jackal1"}),
+        _control("objects-lost", "the relay has nothing of the client's objects", {"t": "objects_lost"}),
+        _control(
+            "object-refused",
+            "the relay did not take an object",
+            {"t": "object_refused", "id": "zones/hall", "code": "not_owner", "why": "site owns it"},
+        ),
+        *(
+            _data(f"object-{name}", what, _frame(body=encode_change(change)))
+            for name, what, change in (
+                ("begin", "all objects are told anew", Begin(77, whole=True)),
+                ("define", "the text of a definition", Define(definition_hash(DEFINITION), DEFINITION)),
+                ("put", "an object with its value", _object(b"value", upto=None)),
+                ("put-large", "an object whose value is too large", _object(None, upto=12)),
+                ("delete", "it is gone", Delete("zones/hall", 13)),
+                ("end", "all is told up to a version", End(14)),
+            )
+        ),
     ]
     for vector in vectors:
         vector["hex"] = encode(vector).hex()

@@ -12,6 +12,7 @@ from typing import NamedTuple
 from sern_core.bodies.codecs import Coder, Work, raw_size
 from sern_core.link.datagram import SentPing
 from sern_core.link.link import Link
+from sern_core.objects.feed import PERIOD_S
 from sern_core.relay.access import AccessRule, AccessTable
 from sern_core.relay.hub import Hub, HubParams
 from sern_core.relay.hub_port import HubPort
@@ -192,6 +193,7 @@ class SimClient:
     refused: dict[str, int] = field(default_factory=lambda: defaultdict(int))
     dropped_out: list[Dropped] = field(default_factory=list)
     refusals: list[tuple[str, str]] = field(default_factory=list)
+    objects_refused: list[tuple[str, str]] = field(default_factory=list)
     denials: list[tuple[str, str]] = field(default_factory=list)
     """Subscriptions that the relay refused."""
     rejections: list[tuple[str, str]] = field(default_factory=list)
@@ -286,6 +288,9 @@ class SimClient:
 
     def undecodable(self, stream: StreamInfo, problem: str) -> None:
         self.undecodables.append((stream.id.topic, problem))
+
+    def object_refused(self, object_id: str, code: str, why: str) -> None:
+        self.objects_refused.append((object_id, code))
 
     def subscription_refused(self, code: str, text: str) -> None:
         self.denials.append((code, text))
@@ -457,6 +462,16 @@ class World:
         hub.sweep(now=now)
         while hub.lapse(now=now):
             pass
+
+    def tell_objects(self) -> None:
+        """From now on relay and clients tell ten times a second what has changed of their objects, as daemons do."""
+
+        def pump(_now: float) -> None:
+            self.relay.hub.tell_objects(now=self.relay.now)
+            for client in self.clients.values():
+                client.core.objects.pump(now=client.now)
+
+        self.network.every(PERIOD_S, pump)
 
     def fault(self, error: Exception) -> None:
         """What a core tells its shell of errors that nobody expects: a test that expects one says so."""

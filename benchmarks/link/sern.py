@@ -174,6 +174,9 @@ class End:
     def fault(self, error: Exception) -> None:
         self.problems.append(repr(error))
 
+    def object_refused(self, object_id: str, code: str, why: str) -> None:
+        self.problems.append(why)
+
     def subscription_refused(self, code: str, text: str) -> None:
         self.problems.append(text)
 

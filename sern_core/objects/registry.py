@@ -21,7 +21,8 @@ Theory of operation
 import hashlib
 import re
 from collections import OrderedDict, deque
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
+from operator import attrgetter
 from types import MappingProxyType
 from typing import Final
 
@@ -88,10 +89,13 @@ class ObjectRegistry:
         self.inline_bytes: int | None = None
         """The largest value that is decoded where it is asked for; None: any."""
         self._version = 0
-        self._entries: OrderedDict[str, Entry] = OrderedDict()  # least recently changed first
+        self._entries: dict[str, Entry] = {}
+        self._by_kind: dict[ObjectKind, OrderedDict[str, Entry]] = {  # least recently changed first
+            kind: OrderedDict() for kind in ObjectKind
+        }
         self._by_stream: dict[StreamId, Entry] = {}
         self._owned: dict[ClientName, set[str]] = {}
-        self._deletions: deque[tuple[int, str]] = deque(maxlen=self.limits.deletions)
+        self._deletions: deque[tuple[int, str, ObjectKind]] = deque(maxlen=self.limits.deletions)
         self._forgotten_version = 0  # deletions up to this version may have left the log
         self._bytes_of: dict[ClientName, list[int]] = {}  # of owners: their share of total and held bytes
 
@@ -141,10 +145,14 @@ class ObjectRegistry:
         if entry is None:
             entry = Entry(object_id, owner, self._bytes_of.setdefault(owner, [0, 0]), now)
             self._entries[object_id] = entry
+            self._by_kind[entry.kind][object_id] = entry
             self._owned.setdefault(owner, set()).add(object_id)
         self._values.count(entry, fixed_bytes - entry.fixed_bytes)
         entry.fixed_bytes = fixed_bytes
-        entry.kind = kind
+        if entry.kind is not kind:
+            del self._by_kind[entry.kind][object_id]
+            self._by_kind[kind][object_id] = entry
+            entry.kind = kind
         entry.type_name = type_name
         entry.definition = definition
         entry.definition_hash = definition_hash or text_hash(definition)
@@ -303,14 +311,11 @@ class ObjectRegistry:
         """What has to be done before the values of these objects, changed after `version`, can be told. Nothing while
         `inline_bytes` is None."""
         found: list[ValueRequest] = []
-        entries: Iterable[Entry] = reversed(self._entries.values())
+        entries: Iterable[Entry] = reversed(self._newer(version, None if kind is None else (kind,)))
         if topic is not None:
-            of_topic = [self._entries[object_id] for object_id in self.named(owner=owner, topic=topic)]
-            entries = sorted(of_topic, key=lambda entry: -entry.version)
+            entries = [self._entries[object_id] for object_id in self.named(owner=owner, topic=topic)]
         for entry in entries:
-            if entry.version <= version:
-                break
-            wanted = kind in (None, entry.kind) and owner in (None, entry.owner)
+            wanted = entry.version > version and kind in (None, entry.kind) and owner in (None, entry.owner)
             if wanted and entry.body is not None and entry.sha256 is None and self._is_long(entry):
                 found.append(ValueRequest(self, entry, entry.body))
         return found
@@ -339,20 +344,41 @@ class ObjectRegistry:
             changed.deleted,
         )
 
-    def changed(self, version: int, *, epoch: int | None = None) -> ChangedIds:
-        """`since` for who looks at the objects one by one later on. One that is gone by then is among those deleted
-        after the version given here; one that has changed is told again."""
+    def changed(
+        self, version: int, *, epoch: int | None = None, kinds: Collection[ObjectKind] | None = None
+    ) -> ChangedIds:
+        """`since` for who looks at the objects one by one later on, those of some kinds or all. One that is gone by
+        then is among those deleted after the version given here; one that has changed is told again."""
         foreign = version < 0 or version > self._version or (epoch is not None and epoch != self.epoch)
         if foreign or (version and version < self._forgotten_version):
-            return ChangedIds(self.epoch, self._version, True, tuple(self._entries), ())
-        updated: list[str] = []
-        for entry in reversed(self._entries.values()):
-            if entry.version <= version:
+            whole = tuple(entry.id for entry in self._newer(0, kinds))
+            return ChangedIds(self.epoch, self._version, True, whole, (), whole)
+        updated = self._newer(version, kinds)
+        gone: dict[str, int] = {}
+        for at, object_id, kind in reversed(self._deletions) if version else ():
+            if at <= version:
                 break
-            updated.append(entry.id)
-        gone = dict.fromkeys(object_id for at, object_id in self._deletions if at > version and version)
-        deleted = tuple(object_id for object_id in gone if object_id not in self._entries)
-        return ChangedIds(self.epoch, self._version, False, tuple(reversed(updated)), deleted)
+            if object_id not in self._entries and (kinds is None or kind in kinds):
+                gone.setdefault(object_id, at)
+        ids = tuple(entry.id for entry in updated)
+        in_order = ids
+        if gone:
+            changes = [(entry.version, entry.id) for entry in updated] + [(at, each) for each, at in gone.items()]
+            in_order = tuple(object_id for _version, object_id in sorted(changes))
+        return ChangedIds(self.epoch, self._version, False, ids, tuple(reversed(gone)), in_order)
+
+    def _newer(self, version: int, kinds: Collection[ObjectKind] | None) -> list[Entry]:
+        """What has changed after a version, the oldest change first."""
+        found: list[Entry] = []
+        for kind, entries in self._by_kind.items():
+            if kinds is not None and kind not in kinds:
+                continue
+            for entry in reversed(entries.values()):
+                if entry.version <= version:
+                    break
+                found.append(entry)
+        found.sort(key=attrgetter("version"))
+        return found
 
     def validate(self) -> None:
         """Check counts, sums and orders against the objects; raises AssertionError."""
@@ -367,9 +393,12 @@ class ObjectRegistry:
             assert own_bytes <= self.limits.max_bytes_per_owner, "an owner has too much"
             assert own_held_bytes <= self.limits.max_held_per_owner, "an owner holds too much"
         assert self._bytes_of.keys() == self._owned.keys(), "owners by bytes"
-        versions = [entry.version for entry in entries.values()]
-        assert versions == sorted(set(versions)), "the order of changes"
-        assert not versions or versions[-1] <= self._version, "a version from the future"
+        assert sum(map(len, self._by_kind.values())) == len(entries), "objects by kind"
+        for kind, some in self._by_kind.items():
+            versions = [entry.version for entry in some.values()]
+            assert all(entry.kind is kind and entries[entry.id] is entry for entry in some.values()), "a kind"
+            assert versions == sorted(set(versions)), "the order of changes"
+            assert not versions or versions[-1] <= self._version, "a version from the future"
         assert {entry.id for entry in entries.values()} == set().union(*self._owned.values()), "owners"
         assert all(self._owned.values()), "an owner of nothing"
         assert {entry.stream: entry for entry in entries.values() if entry.stream} == self._by_stream, "streams"
@@ -417,7 +446,7 @@ class ObjectRegistry:
         self._version += 1
         entry.version = self._version
         entry.updated_s = now
-        self._entries.move_to_end(entry.id)
+        self._by_kind[entry.kind].move_to_end(entry.id)
 
     def _delete(self, entry: Entry) -> None:
         self._values.forget(entry)
@@ -425,6 +454,7 @@ class ObjectRegistry:
         if entry.stream is not None:
             del self._by_stream[entry.stream]
         del self._entries[entry.id]
+        del self._by_kind[entry.kind][entry.id]
         owned = self._owned[entry.owner]
         owned.discard(entry.id)
         if not owned:
@@ -432,7 +462,7 @@ class ObjectRegistry:
         self._version += 1
         if len(self._deletions) == self._deletions.maxlen:
             self._forgotten_version = self._deletions[0][0] if self._deletions else self._version
-        self._deletions.append((self._version, entry.id))
+        self._deletions.append((self._version, entry.id, entry.kind))
 
     def _is_long(self, entry: Entry) -> bool:
         """Whether telling the value takes longer than it may where somebody asks."""

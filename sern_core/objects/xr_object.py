@@ -68,6 +68,7 @@ class ChangedIds(NamedTuple):
     resync: bool
     updated: tuple[str, ...]
     deleted: tuple[str, ...]
+    in_order: tuple[str, ...]  # both, the oldest change first
 
 
 def object_to_json(item: XrObject, *, key: str = "", values: bool = True) -> dict[str, Any]:

@@ -20,6 +20,7 @@ from sern_core.link.definitions import DefinitionStore
 from sern_core.link.housekeeping import TIDY_S
 from sern_core.link.link import Link
 from sern_core.objects.registry import ObjectRegistry
+from sern_core.objects.xr_object import XrObject
 from sern_core.path.lanes import LANE_PRIORITY
 from sern_core.relay.absent import AbsentClients
 from sern_core.relay.access import AccessTable
@@ -29,7 +30,7 @@ from sern_core.relay.hub_events import GuardedEvents, HubEvents, Relayed
 from sern_core.relay.hub_matching import Matching
 from sern_core.relay.hub_port import HubPort
 from sern_core.relay.local_streams import LocalStreams
-from sern_core.relay.object_control import apply_object
+from sern_core.relay.object_exchange import OBJECTS_TOPIC, ObjectExchange
 from sern_core.relay.presence import Presence
 from sern_core.relay.relayed_streams import RelayedStreams
 from sern_core.relay.routing import BadPatternError, RouteChange, RoutingLimits, RoutingTable
@@ -127,6 +128,13 @@ class Hub:
         self.local = LocalStreams(
             boot, self.local_owners, clients.links, self.routing, self._numbering, streams, self.forwarding
         )
+        self.exchange = ObjectExchange(
+            self.objects,
+            clients.links,
+            access=lambda: clients.access,
+            text_of=self._text_of,
+            refused=self.events.refused,
+        )
         self.absent = AbsentClients(clients, streams, self.routing, self.events, known, link.limits)
 
     # --- how the parts hang together ------------------------------------------------------------------------------
@@ -151,6 +159,15 @@ class Hub:
         link.reading.on_read = self._was_read
         link.finish = self._finish
         return link
+
+    def _text_of(self, item: XrObject) -> str:
+        """The text of an object's definition: of a topic's it is kept once for all streams of a type."""
+        about = self.objects.about(item.id)
+        relayed = None if about is None or about[2] is None else self.relayed.get(about[2])
+        if item.definition or relayed is None:
+            return item.definition
+        digest = relayed.stream.stream.definition_hash
+        return self.definitions.get(digest) if digest in self.definitions else ""
 
     def _was_read(self) -> None:
         self.after()
@@ -191,6 +208,12 @@ class Hub:
                 self.streams.fanout.go_on(link, now=now)
         self.presence.sweep(now=now)
 
+    def tell_objects(self, *, now: float) -> None:
+        """Tell clients what has changed of the objects that they subscribe to. Call ten times a second."""
+        for client, feed in list(self.exchange.feeds.items()):
+            self.clients.attempt(client, now, partial(feed.pump, now=now))
+        self.after()
+
     def lapse(self, *, now: float) -> bool:
         """Retention goes on while clients are away, and clients are told of their peers. True: there is more to do;
         call again in another turn."""
@@ -220,11 +243,13 @@ class Hub:
         self.matching.forget(client)
         self.absent.forget(client)
         self.objects.delete_owned(client)
+        self.exchange.forget(client)
 
     def revoke(self, access: AccessTable, *, now: float) -> None:
         """New access rules: what they no longer allow ends now."""
         self.clients.limit(access, now)
         self.streams.revoke(access, now)
+        self.exchange.revoke()
         for client in self.links:
             self.matching.look(client, now=now)
 
@@ -267,6 +292,7 @@ class Hub:
         self._subscriptions.pop(link.peer, None)  # half of one that was said in an earlier session
         if not resumed:
             self.streams.prime(link, now)
+        self.exchange.came(link, resumed=resumed, now=now)
         self.presence.changed(link.peer, now=now)
         self.events.client_up(link.peer, resumed=resumed)
 
@@ -287,6 +313,8 @@ class Hub:
         identity = stream.stream.id
         if identity.origin != link.peer or identity.boot != link.end.peer_boot:
             raise RefusedError("origin", f"{link.peer} announced a stream of {identity.origin}")
+        if identity.topic == OBJECTS_TOPIC:
+            return True
         try:
             relayed = self.streams.take(link, stream, now)
         except RefusedError as refusal:
@@ -300,15 +328,20 @@ class Hub:
         return None
 
     def on_retract(self, link: Link, stream: InStream, *, now: float) -> None:
-        self.streams.retract(link, stream, now)
+        if stream.stream.id.topic != OBJECTS_TOPIC:
+            self.streams.retract(link, stream, now)
 
     def on_message(self, link: Link, stream: InStream, message: Message, *, now: float) -> None:
-        self.forwarding.message(link, stream, message, now)
+        if stream.stream.id.topic == OBJECTS_TOPIC:
+            self.exchange.message(link, stream, message, now=now)
+        else:
+            self.forwarding.message(link, stream, message, now)
 
     def on_in_drop(self, link: Link, stream: InStream, reason: DropReason, nbytes: int, count: int) -> None:
         self.received.of(stream.stream).drop_arrived(reason, count)
 
     def on_out_drop(self, link: Link, channel: OutChannel, outs: Sequence[OutMessage], reason: DropReason) -> None:
+        self.exchange.dropped(link, channel)
         relayed = self.streams.reports(link, channel, reason)
         if relayed is None or relayed.source is None:
             return
@@ -322,6 +355,8 @@ class Hub:
         if relayed is not None:
             link.reassembly.work_us += len(relayed.outs) // CONFIRMED_PER_US
             self.streams.confirm(relayed)
+        else:
+            self.exchange.delivered(link, channel, now=now)
 
     def on_refused(self, link: Link, channel: OutChannel, code: str, text: str, *, now: float) -> None:
         self.events.refused(link.peer, code, text)
@@ -347,11 +382,14 @@ class Hub:
         kind = envelope["t"]
         if kind == "subscribe":
             self._subscribe(link.peer, envelope, now)
-        elif kind == "object":
+        elif kind == "objects":
             try:
-                apply_object(self.objects, self.clients.access, link.peer, envelope, attachment, now=now)
+                self.exchange.subscribe(link, envelope, now=now)
             except RefusedError as refusal:
                 self.events.refused(link.peer, refusal.code, str(refusal))
+                self.clients.tell(
+                    link.peer, {"t": "denied", "pattern": "", "code": refusal.code, "why": str(refusal)[:400]}, now
+                )
         elif kind == "lane_ask":
             link.reassembly.work_us += LANE_US
             self.events.lane_asked(link.peer, framing.take_strings(envelope, "ciphers", max_length=64))
@@ -430,6 +468,8 @@ class Hub:
         held_channels = {id(pair[1]) for relayed in self.relayed.values() for pair in relayed.outs.values()}
         held_channels |= self.streams.fanout.closing()
         held_channels |= self.streams.draining.validate(self.links)
+        held_channels |= self.exchange.channels()
+        self.exchange.validate()
         for client, link in self.links.items():
             for channel in link.sender.channels.values():
                 assert id(channel) in held_channels, f"{channel.stream.id.topic}: nobody's channel to {client}"

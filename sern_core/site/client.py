@@ -12,6 +12,8 @@ from typing import ParamSpec, Protocol
 from sern_core.bodies.codecs import CodecProfile, Coder
 from sern_core.link.definitions import DefinitionStore
 from sern_core.link.link import Link
+from sern_core.objects.changes import OBJECTS_TOPIC
+from sern_core.site.object_mirror import ObjectMirror, Selection
 from sern_core.site.own_objects import OwnObjects
 from sern_core.site.peers import Peers, PeerView
 from sern_core.site.subscription import Subscription
@@ -79,6 +81,9 @@ class ClientEvents(Protocol):
 
     def subscription_refused(self, code: str, text: str) -> None:
         """Something that this site named is not ours to have, or the relay takes none of our patterns."""
+
+    def object_refused(self, object_id: str, code: str, why: str) -> None:
+        """The relay did not take an object of ours. Of many at once some are told."""
 
     def undecodable(self, stream: StreamInfo, problem: str) -> None:
         """The body of a message could not be decoded: it is dropped. Said once for each topic."""
@@ -150,7 +155,9 @@ class ClientCore:
             lossless=lossless,
         )
         self.subscription = Subscription(self.link.control)
-        self.objects = OwnObjects(self.link.control)
+        self.objects = OwnObjects(self.link, boot=boot)
+        self.mirror = ObjectMirror(self.link.control, self._tell)
+        """Objects of others that this site subscribes to."""
         self.link.housekeeping.on_tidy = self._tidy
         self.link.receiver.on_stray = self.received.stray
         if coder is not None:
@@ -230,6 +237,12 @@ class ClientCore:
         if self.link.established:
             self.subscription.send(now)
 
+    def subscribe_objects(self, selections: Sequence[Selection], *, now: float) -> None:
+        """The cross-reality objects that this site wants; replaces the earlier ones. UsageError: a pattern is none."""
+        self.mirror.select(selections)
+        if self.link.established:
+            self.mirror.send(now=now)
+
     def look_at_peers(self, *, now: float) -> list[PeerView]:
         """Who is there of those whose streams we take, by name. Call about once a second: that the own link has fallen
         silent is found here."""
@@ -262,6 +275,10 @@ class ClientCore:
                 link.outgoing.prime(link.outgoing.by_stream[identity], cache.replay(), now=now)
         self.peers.session_began(now=now)
         self.subscription.send(now, self.peers.asked())
+        self.mirror.send(now=now)
+        if not resumed:
+            self.objects.lost()
+        self.objects.pump(now=now)
         self._tell(self.events.link_up, resumed=resumed)
 
     def on_down(self, link: Link, reason: str, *, now: float) -> None:
@@ -279,6 +296,8 @@ class ClientCore:
         digest = announcement.definition_hash
         identity = stream.stream.id
         link.taking.outlived(identity.origin, identity.boot, now=now)
+        if identity.topic == OBJECTS_TOPIC:
+            return identity.origin == link.peer
         opened = self._open.get(identity)
         if opened is not None and opened != _announced(announcement.stream):
             # Its origin ended it and began it anew while we were away, as something else.
@@ -364,6 +383,10 @@ class ClientCore:
             self._close_stream(stream, now)
 
     def on_message(self, link: Link, stream: InStream, message: Message, *, now: float) -> None:
+        if stream.stream.id.topic == OBJECTS_TOPIC:
+            if not message.drop_marker:
+                self.mirror.message(message.body, now=now)
+            return
         decoder = self._decoder
         decoder.message(stream, message, now=now)
         stream.unhandled = self._oldest(message.stream) if decoder.running or self._held else 0
@@ -461,6 +484,8 @@ class ClientCore:
         self.trace.record(now, identity.topic, TraceEvent.LEASE_EXPIRED, origin=identity.origin, after_s=after_s)
 
     def on_out_drop(self, link: Link, channel: OutChannel, outs: Sequence[OutMessage], reason: DropReason) -> None:
+        if self.objects.dropped(channel):
+            return
         runs = list(in_sequence(outs))
         if channel.reliable and len(runs) > self._runs_told:
             runs = [outs]  # what lies between was told before
@@ -470,9 +495,13 @@ class ClientCore:
 
     def on_delivered(self, link: Link, channel: OutChannel, *, now: float) -> None:
         """The ledger has counted it."""
+        self.objects.delivered(channel, now=now)
 
     def on_wanted(self, link: Link, channel: OutChannel, *, now: float) -> None:
-        self._tell(self.events.wanted, channel.stream, bool(channel.wanted))
+        if channel.stream.id.topic == OBJECTS_TOPIC:
+            self.objects.pump(now=now)
+        else:
+            self._tell(self.events.wanted, channel.stream, bool(channel.wanted))
 
     def on_refused(self, link: Link, channel: OutChannel, code: str, text: str, *, now: float) -> None:
         self._tell(self.events.publication_refused, channel.stream, code, text)
@@ -490,6 +519,12 @@ class ClientCore:
             self._tell(self.events.subscription_refused, code, why)
         elif kind == "peers":
             self.peers.told(envelope, now=now)
+        elif kind == "objects_lost":
+            if link.end.resumed:  # else all is told anyway
+                self.objects.lost()
+        elif kind == "object_refused":
+            code, why = framing.take_str(envelope, "code", max_length=64), framing.take_str(envelope, "why")
+            self._tell(self.events.object_refused, framing.take_str(envelope, "id", default=""), code, why)
         else:
             raise WireError(f"unknown control message {kind!r}")
 

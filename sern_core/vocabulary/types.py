@@ -57,6 +57,9 @@ class ObjectKind(StrEnum):
     TOPIC = "topic"
     TRANSFORM = "transform"
     NODE = "node"
+    ROBOT = "robot"
+    OBSTACLE = "obstacle"
+    TERRAIN = "terrain"
     PATCH = "patch"
     COMMAND = "command"
 

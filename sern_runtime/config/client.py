@@ -9,6 +9,7 @@ from typing import Annotated, Final, Literal, Self
 from pydantic import Discriminator, Field, Tag, model_validator
 
 from sern_core.objects.registry import COMMAND_OBJECT_TYPES
+from sern_core.site.object_mirror import MAX_WANTS, Selection
 from sern_core.site.services import ServiceRule, subscriptions
 from sern_core.summaries.spec import TooLarge
 from sern_core.topics.patterns import MAX_CLIENT_PROGRAM, PatternError, PatternSet, compile_pattern
@@ -27,7 +28,7 @@ from sern_core.topics.rules import (
 from sern_core.vocabulary.codec_names import DEFAULT_LOSSY, Compression, LossyParams
 from sern_core.vocabulary.message import DEFAULT_RELIABLE_QUEUE_BYTES
 from sern_core.vocabulary.names import name_problem, normal_namespace
-from sern_core.vocabulary.types import ClientName, Durability, PriorityClass, Reliability, TopicName
+from sern_core.vocabulary.types import ClientName, Durability, ObjectKind, PriorityClass, Reliability, TopicName
 from sern_runtime.config.adaptation import AdaptationSection
 from sern_runtime.config.base import (
     Bytes,
@@ -426,6 +427,18 @@ class ActionsSection(Section):
         return tuple(section.under(part) for section in self.use for part in ("result", ACTION_STATE))
 
 
+class ObjectSelection(Section):
+    """Cross-reality objects of others that this site wants."""
+
+    kind: Literal["topic", "transform", "node", "robot", "obstacle", "terrain", "patch", "command"] | None = None
+    """Only objects of this kind; null: of any."""
+    match: Pattern = ".*"
+    """Only objects whose whole id matches, such as twin/.* or /jackal1/odom@jackal1."""
+
+    def selection(self) -> Selection:
+        return Selection(None if self.kind is None else ObjectKind(self.kind), self.match)
+
+
 class ClientFile(FileModel):
     """Configuration of one client daemon."""
 
@@ -445,6 +458,9 @@ class ClientFile(FileModel):
     """Rules for topics, first match wins. A topic without a rule: bulk, best effort, depth 1, lifespan 1 s."""
     subscribe: tuple[Pattern, ...] = ()
     """Regular expressions for the whole global names that this site wants, beside rules with direction `receive`."""
+    objects: Annotated[tuple[ObjectSelection, ...], Field(max_length=MAX_WANTS)] = ()
+    """Cross-reality objects that this site wants, as far as the relay's access rules let it have them: robots,
+    obstacles, patches, nodes, and topics with their latest values. It has them under /api/site_objects."""
     services: ServicesSection = ServicesSection()
     """Services offered to other sites and used from them."""
     actions: ActionsSection = ActionsSection()

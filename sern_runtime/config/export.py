@@ -87,13 +87,10 @@ def _sections(model: type[Section], path: tuple[str, ...]) -> Iterator[str]:
     for name, field in model.model_fields.items():
         for inner in dict.fromkeys(models_in(field.annotation)):
             inner_path = (*path, field.alias or name)
-            kind = f", kind `{_kind_of(inner)}`" if "kind" in inner.model_fields else ""
-            yield f"### `{'.'.join(inner_path)}`{kind}\n\n{_prose(inner)}\n"
+            kind = inner.model_json_schema()["properties"].get("kind", {}).get("const")
+            which = f", kind `{kind}`" if kind else ""
+            yield f"### `{'.'.join(inner_path)}`{which}\n\n{_prose(inner)}\n"
             yield from _sections(inner, inner_path)
-
-
-def _kind_of(model: type[Section]) -> str:
-    return str(model.model_json_schema()["properties"]["kind"]["const"])
 
 
 def _prose(model: type[Section]) -> str:

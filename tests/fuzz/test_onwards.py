@@ -190,7 +190,7 @@ def controls(draw: st.DrawFn) -> Action:
     """Any other message about a channel, a definition, or what is wanted."""
     envelope: dict[str, Any] = {
         "t": draw(
-            st.sampled_from(["want", "refuse", "dropped", "first", "retract", "need", "define", "subscribe", "object"])
+            st.sampled_from(["want", "refuse", "dropped", "first", "retract", "need", "define", "subscribe", "objects"])
         )
     }
     attachment = b""
@@ -202,8 +202,9 @@ def controls(draw: st.DrawFn) -> Action:
             envelope["dh"] = draw(st.sampled_from(["0" * 32, definition_hash(TEXT), "no hash"]))
         case "subscribe":
             envelope |= {"patterns": draw(st.lists(STRINGS, max_size=3)), "more": draw(st.booleans())}
-        case "object":
-            envelope |= {"op": draw(st.sampled_from(["put", "delete"])), "id": draw(STRINGS), "attr": draw(MAPS)}
+        case "objects":
+            envelope |= {"kinds": draw(st.lists(STRINGS, max_size=3)), "match": draw(st.lists(STRINGS, max_size=3))}
+            envelope |= {"since": draw(INTS), "epoch": draw(INTS)}
         case _:
             envelope |= {"ch": draw(CHANNELS), "seq": draw(INTS), "on": draw(st.booleans()), "to": draw(STRINGS)}
             envelope |= {"code": draw(INTS if envelope["t"] == "dropped" else STRINGS), "why": draw(STRINGS)}

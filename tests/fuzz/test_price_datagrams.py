@@ -11,6 +11,7 @@ from typing import Final
 import pytest
 
 from sern_core.bodies.codecs import encode
+from sern_core.objects.changes import MAX_TEXT_BYTES, OBJECTS_TOPIC
 from sern_core.vocabulary.codec_names import Compression
 from sern_core.vocabulary.errors import WireError
 from sern_core.vocabulary.message import StreamId, StreamInfo, TopicInfo
@@ -335,9 +336,29 @@ def runs_of_dropped_messages(peer: Hostile) -> list[bytes]:
 
 @for_fifty
 def objects_as_large_as_they_may_be(peer: Hostile) -> list[bytes]:
-    return filled(lambda index: control(peer, framing.encode_control(
-        {"t": "object", "op": "put", "id": f"robot/o{index}", "type": "a/b"}, bytes(framing.MAX_ATTACHMENT_BYTES)
+    peer.announce(1, OBJECTS_TOPIC, reliable=True)
+    return filled(lambda index: _whole(1, index + 1, framing.encode_control(
+        {"op": "put", "id": f"robot/o{index}", "kind": "node", "val": True, "n": MAX_TEXT_BYTES}, bytes(MAX_TEXT_BYTES)
     )))  # fmt: skip
+
+
+@for_fifty
+def definitions_of_objects(peer: Hostile) -> list[bytes]:
+    peer.announce(1, OBJECTS_TOPIC, reliable=True)
+    texts = [f"{index}" + "#" * (MAX_TEXT_BYTES - 9) for index in range(4)]
+    return filled(lambda index: _whole(1, index + 1, framing.encode_control(
+        {"op": "define", "dh": definition_hash(texts[index % 4])}, texts[index % 4].encode())))  # fmt: skip
+
+
+@for_fifty
+def subscriptions_to_objects(peer: Hostile) -> list[bytes]:
+    peer.announce(1, OBJECTS_TOPIC, reliable=True)
+    for index in range(1000):
+        said(peer, _whole(1, index + 1, framing.encode_control(
+            {"op": "put", "id": f"robot/o{index}", "kind": "node", "n": -1})))  # fmt: skip
+    patterns = [f"(a|b)*{number}" for number in range(24)]
+    return filled(lambda index: control(peer, framing.encode_control(
+        {"t": "objects", "kinds": [""] * 24, "match": [f"{each}_{index}" for each in patterns]})))  # fmt: skip
 
 
 @for_fifty
@@ -482,7 +503,7 @@ def fuzzed_frame(rng: random.Random, peer: Hostile) -> bytes:
     if what == 2:
         fields = {"ch": rng.randrange(9), "dh": "0" * 32, "seq": 7, "id": "a", "op": "put", "on": True}
         envelope: framing.Envelope = {key: value for key, value in fields.items() if rng.random() < 0.5}
-        kinds = ("announce", "subscribe", "object", "define", "need", "want", "first", "synced")
+        kinds = ("announce", "subscribe", "objects", "define", "need", "want", "first", "synced")
         envelope["t"] = rng.choice(kinds)
         return control(peer, framing.encode_control(envelope, bytes(rng.choice((0, 100, 10**6)))))
     if what == 3:

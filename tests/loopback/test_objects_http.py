@@ -1,4 +1,4 @@
-"""Everything that moves through a relay is an object: all five kinds, with their parameters over HTTP."""
+"""Everything that moves through a relay is an object: the kinds, over HTTP with its parameters and over the link."""
 
 import base64
 import json
@@ -13,6 +13,7 @@ import pytest
 from sern_core.bodies.codecs import decode
 from sern_core.vocabulary.types import ObjectKind, TopicName
 from sern_relay.daemon import RelayDaemon
+from sern_runtime import clock
 from tests.daemons import Lab
 from tests.support import until
 
@@ -32,7 +33,7 @@ def has_value(relay: RelayDaemon, object_id: str) -> bool:
     return found is not None and found.value_bytes > 0
 
 
-async def test_the_five_kinds_of_object(tmp_path: Path) -> None:
+async def test_kinds_of_object(tmp_path: Path) -> None:
     async with Lab(tmp_path, "jackal1", "operator1") as lab:
         relay = await lab.relay()
         topics = ["/odometry/filtered", "/tf", "/tf_static", "/map_updates"]
@@ -40,13 +41,14 @@ async def test_the_five_kinds_of_object(tmp_path: Path) -> None:
         command = {"match": "/cmd_vel", "class": "control", "direction": "receive"}
         robot = await lab.connected(lab.client_file("jackal1", robot_endpoint, topics=[command]))
         operator = {"kind": "synthetic", "role": "operator", "command_topic": "/jackal1/cmd_vel"}
-        await lab.connected(
+        site = await lab.connected(
             lab.client_file(
                 "operator1",
                 operator,
                 client={"namespace": "/"},
                 subscribe=["/jackal1/.*"],
                 topics=[{"match": "/jackal1/cmd_vel", "class": "control"}],
+                objects=[{}],
             )
         )
         expected = {
@@ -55,7 +57,9 @@ async def test_the_five_kinds_of_object(tmp_path: Path) -> None:
             ObjectKind.NODE: "node:jackal1",
             ObjectKind.PATCH: "/jackal1/map_updates@jackal1",
             ObjectKind.COMMAND: "/jackal1/cmd_vel@operator1",
+            ObjectKind.OBSTACLE: "jackal1/box",
         }
+        robot.core.objects.put("jackal1/box", ObjectKind.OBSTACLE, "shape", wall_ns=1, now=clock.now(), value=b"box")
         for kind, object_id in expected.items():
             await until(lambda k=kind, i=object_id: i in kinds(relay, k), f"{object_id} among {kind}")  # type: ignore[misc]
         for object_id in (expected[ObjectKind.TOPIC], expected[ObjectKind.COMMAND], expected[ObjectKind.TRANSFORM]):
@@ -63,8 +67,17 @@ async def test_the_five_kinds_of_object(tmp_path: Path) -> None:
 
         status, everything = await ask(relay, definitions="no")
         assert status == 200
-        assert {item["kind"] for item in everything["objects"]} == set(ObjectKind)
+        assert {item["kind"] for item in everything["objects"]} == set(expected)
         assert "definitions" not in everything
+
+        mirror = site.core.mirror.objects
+        await until(lambda: set(expected.values()) <= mirror.keys(), "the site has them as well")
+        url = f"http://{site.loaded.model.http.listen}/api/site_objects"
+        async with aiohttp.ClientSession() as session, session.get(f"{url}?id=jackal1/box") as answer:
+            told = json.loads(await answer.text())
+        assert [(item["owner"], item["value"]["base64"]) for item in told["objects"]] == [("jackal1", "Ym94")]
+        robot.core.objects.delete("jackal1/box", now=clock.now())
+        await until(lambda: "jackal1/box" not in mirror, "the site hears that it is gone")
 
         status, transforms = await ask(relay, kind="transform", owner="jackal1")
         assert status == 200
@@ -98,7 +111,10 @@ async def test_the_five_kinds_of_object(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("parameters", "said"),
     [
-        ({"kind": "thing"}, "kind is 'thing'; accepted: topic, transform, node, patch, command"),
+        (
+            {"kind": "thing"},
+            "kind is 'thing'; accepted: topic, transform, node, robot, obstacle, terrain, patch, command",
+        ),
         ({"kin": "node"}, "unknown parameter 'kin'; accepted: kind, owner, topic, definitions, values, since, epoch"),
         ({"since": "x"}, "since is 'x'; a version or epoch of an earlier answer is needed"),
         ({"since": "-1"}, "since is '-1'; a version or epoch of an earlier answer is needed"),

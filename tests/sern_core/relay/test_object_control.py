@@ -1,21 +1,38 @@
-"""Objects that clients put: what is whose, who may, and how much."""
+"""Objects that clients put by hand: what is whose, who may, how much, and what is none."""
 
 from typing import Any
 
 import pytest
 
+from sern_core.objects.changes import OBJECTS_TOPIC
 from sern_core.objects.registry import ObjectRegistry
 from sern_core.relay.access import AccessRule, AccessTable
+from sern_core.relay.object_exchange import name_of
+from sern_core.vocabulary.errors import WireError
 from sern_core.vocabulary.message import StreamId, StreamInfo, TopicInfo
 from sern_core.vocabulary.types import ClientName, Encoding, TopicName
+from sern_core.wire import framing
 from tests.fuzz.test_hostile_peer import Hostile
 from tests.world import World, spec
 
 RULES = AccessTable([AccessRule(client="robot", publish=("/{self}/.*", "/zones/.*"))])
 
 
-def put(object_id: str, **fields: Any) -> dict[str, Any]:
-    return {"t": "object", "op": "put", "id": object_id, "kind": "node", "type": "a", "attr": {}, "wall": 0, **fields}
+class Owner(Hostile):
+    """A client that puts objects by hand."""
+
+    def __init__(self, world: World, name: str = "robot") -> None:
+        super().__init__(world, name)
+        self.announce(1, OBJECTS_TOPIC, reliable=True)
+        self.seq = 0
+
+    def change(self, attachment: bytes = b"", **envelope: Any) -> None:
+        self.seq += 1
+        body = framing.encode_control(envelope, attachment)
+        self.say(framing.encode_data_first(0, 1, self.seq, len(body), len(body), 0, 0.0, 0) + body)
+
+    def put(self, object_id: str, **fields: Any) -> None:
+        self.change(**{"op": "put", "id": object_id, "kind": "node", "type": "a", "n": -1, **fields})
 
 
 @pytest.mark.parametrize(
@@ -40,34 +57,68 @@ def put(object_id: str, **fields: Any) -> dict[str, Any]:
 )
 def test_an_id_is_taken_from_who_may_publish_its_name(client: str, object_id: str, code: str | None) -> None:
     world = World(access=RULES)
-    peer = Hostile(world, client)
-    peer.control(put(object_id))
+    peer = Owner(world, client)
+    peer.put(object_id)
     assert [refused for refused, _text in world.relay.refusals] == ([code] if code else [])
     assert (peer.hub.objects.get(object_id) is not None) == (code is None)
-    peer.control({"t": "object", "op": "delete", "id": object_id})
+    peer.change(op="delete", id=object_id)
     assert len(peer.hub.objects) == 0
     peer.hub.validate()
 
 
-def test_a_client_fills_what_is_its_own_and_nobody_elses() -> None:
+@pytest.mark.parametrize(
+    ("object_id", "name"),
+    [
+        ("node:robot", "/robot/node"),
+        ("/robot/odom@robot", "/robot/odom"),
+        ("zones/hall", "/zones/hall"),
+        ("zones/hall@Robot", "/zones/hall@Robot"),
+        ("//zones/hall@a", "/zones/hall"),
+    ],
+)
+def test_the_name_that_an_id_stands_for(object_id: str, name: str) -> None:
+    assert name_of(object_id) == name
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"op": "put", "id": "robot/a"},
+        {"op": "put", "id": "robot/a", "kind": "thing", "n": -1},
+        {"op": "put", "id": "robot/a", "kind": "node", "n": -2},
+        {"op": "put", "id": "robot/a", "kind": "node", "n": 3, "val": True},
+        {"op": "put", "id": "robot/a", "kind": "node", "n": -1, "attr": {"a": 1}},
+        {"op": "put", "id": "robot/\x00", "kind": "node", "n": -1},
+        {"op": "define", "dh": "0" * 32},
+        {"op": "take", "id": "robot/a"},
+        {"op": "end"},
+        {"op": "begin", "epoch": -1},
+        {},
+    ],
+)
+def test_what_is_no_change_is_refused_and_changes_nothing(change: dict[str, Any]) -> None:
+    world = World(access=RULES)
+    peer = Owner(world)
+    peer.put("robot/kept")
+    peer.change(**change)
+    peer.put("robot/later")
+    assert [refused for refused, _text in world.relay.refusals] == ["bad_object"]
+    assert {item.id for item in peer.hub.objects.select()} == {"robot/kept", "robot/later"}
+    assert peer.hub.exchange.counts == {"taken": 2, "bad_object": 1}
+    peer.hub.validate()
+
+
+def test_a_subscription_that_is_none_ends_the_session_or_is_denied() -> None:
     world = World()
-    mallory, robot = Hostile(world, "mallory"), Hostile(world, "robot")
-    hub = world.relay.hub
-    large = {f"k{index}": "v" * 460 for index in range(6)}
-    for index in range(4095):
-        mallory.control(put(f"x{index:0200d}", attr=large), bytes(4096))
-        while mallory.port.next_datagram(now=mallory.now) is not None:
-            pass
-    limits = hub.objects.limits
-    assert hub.objects.total_bytes <= limits.max_bytes_per_owner < limits.max_total_bytes / 4
-    assert ("registry_full" in dict(world.relay.refusals)) and len(hub.objects) > 500
-    world.relay.refusals.clear()
-    robot.announce(1, "/robot/odom")
-    assert hub.objects.get("/robot/odom@robot") is not None and not world.relay.refusals
-    hub.validate()
-    hub.forget(ClientName("mallory"), "test", now=0.0)
-    assert len(hub.objects) == 1
-    hub.validate()
+    peer = Owner(world)
+    peer.control({"t": "objects", "kinds": [""], "match": ["(a"]})
+    assert [code for code, _text in world.relay.refusals] == ["bad_pattern"]
+    assert peer.hub.links[ClientName("robot")].established
+    for wrong in ({"kinds": ["thing"], "match": [".*"]}, {"kinds": [""]}, {"kinds": [""] * 25, "match": [".*"] * 25}):
+        again = Owner(World())
+        with pytest.raises(WireError, match="a subscription"):
+            again.control({"t": "objects", **wrong})
+    peer.hub.validate()
 
 
 def test_large_values_of_one_client_leave_room_for_those_of_others() -> None:

@@ -4,12 +4,11 @@ from typing import Any
 
 from sern_core.link.control_stream import ControlStream
 from sern_core.link.end import End
-from sern_core.site.own_objects import OwnObjects
 from sern_core.site.subscription import Subscription
 from sern_core.stream.in_stream import Reassembly
 from sern_core.vocabulary.params import LinkParams
 from sern_core.vocabulary.trace import DecisionTrace
-from sern_core.vocabulary.types import ClientName, ObjectKind
+from sern_core.vocabulary.types import ClientName
 from sern_core.wire import framing
 from sern_core.wire.announce import MAX_STRINGS
 
@@ -60,13 +59,3 @@ def test_who_is_asked_after_goes_first() -> None:
     first, last = subscribed(("/a",), ("robot1", "robot2"))
     assert first == {"t": "subscribe", "patterns": [], "more": True, "known": ["robot1", "robot2"]}
     assert last["patterns"] == ["/a"] and not last["more"]
-
-
-def test_an_object_is_put_with_its_value_and_deleted_by_its_id() -> None:
-    session = Session()
-    objects = OwnObjects(session.control)
-    objects.put("node", ObjectKind.NODE, "sern/node", wall_ns=5, now=0.0, attributes={"a": "b"}, value=b"v")
-    objects.delete("node", now=0.0)
-    (put, value), (deleted, _) = session.said
-    assert put["id"] == "node" and put["attr"] == {"a": "b"} and put["wall"] == 5 and value == b"v"
-    assert deleted == {"t": "object", "op": "delete", "id": "node"}

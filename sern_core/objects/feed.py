@@ -1,0 +1,186 @@
+"""Tells the other end of a hop what changes in a registry: each object's latest state, and no more than is read. Pure.
+
+Nothing is queued while there is no session, and little while there is one: what changes meanwhile is told once, as it
+is then. So a link that was gone for an hour brings only what is new, and a thin link tells of what changes all the time
+as often as it can.
+"""
+
+from collections.abc import Callable, Collection
+from typing import Final
+
+from sern_core.link.link import Link
+from sern_core.objects.changes import (
+    Begin,
+    Change,
+    Define,
+    Delete,
+    End,
+    encode,
+    object_stream,
+    put_of,
+    text_hash,
+)
+from sern_core.objects.registry import ObjectRegistry
+from sern_core.objects.xr_object import XrObject
+from sern_core.vocabulary.message import Message
+from sern_core.vocabulary.types import ObjectKind
+
+PERIOD_S: Final = 0.1
+"""How often a reader is told of one object at most: the paper's 10 Hz of patches."""
+LEAST_WINDOW_BYTES: Final = 4096
+MOST_WINDOW_BYTES: Final = 256 * 2**10
+"""What may be on its way to the reader. It is doubled while it is read in `QUICK_S`, and halved when that takes
+`SLOW_S`: what waits any longer has grown old."""
+QUICK_S: Final = 0.25
+SLOW_S: Final = 1.0
+LOOKS: Final = 256
+"""Objects that are looked at in one turn."""
+OVERHEAD_BYTES: Final = 40
+"""What a message costs beside its body."""
+
+Sees = Callable[[str, ObjectKind | None], bool]
+"""Whether the reader wants an object, and may have it. None: the kind of one that is gone is not known."""
+
+
+class ObjectFeed:
+    """`sees` and `kinds` say what it is about; to change them, set both and call `restart`. `text_of` gives the text of
+    an object's definition, empty where there is none."""
+
+    def __init__(
+        self,
+        registry: ObjectRegistry,
+        link: Link,
+        *,
+        sees: Sees,
+        text_of: Callable[[XrObject], str],
+        now: float,
+        kinds: Collection[ObjectKind] | None = None,
+        first: int = 1,
+    ) -> None:
+        self._registry = registry
+        self._link = link
+        self.sees = sees
+        self.kinds = kinds
+        self._text_of = text_of
+        self.channel = link.outgoing.open(object_stream(link.end.name, link.end.boot), first=first, now=now)
+        self.idle = False
+        """Nobody is to be told anything."""
+        self._pending: dict[str, None] = {}
+        self._told: dict[str, int] = {}  # version of each object that the reader has from us
+        self._texts: set[str] = set()  # hashes of the texts that it has
+        self._version = 0  # up to which `_pending` is what has changed
+        self._began = False
+        self._open = False  # a batch that was begun and is not ended
+        self._unsure = False  # the reader has objects from an earlier feed
+        self._poll_due_s = now
+        self._window_bytes = LEAST_WINDOW_BYTES
+        self._mark: tuple[int, float] | None = None  # seq and time of what the window is measured by
+        self._full = False  # the window was, since then
+        self.restart()
+
+    def restart(self, version: int = 0, epoch: int | None = None) -> None:
+        """The reader has everything up to this version of that epoch, and nothing else of us."""
+        changes = self._registry.changed(version, epoch=epoch, kinds=self.kinds)
+        whole = changes.resync or version == 0
+        self._began = False
+        self._unsure = not whole
+        self._told.clear()
+        self._texts.clear()
+        self._open = True
+        self._pending = dict.fromkeys(changes.in_order)
+        self._version = changes.version
+
+    def dropped(self) -> None:
+        """Something of what was told will not arrive: tell all anew."""
+        self.restart()
+
+    def pump(self, *, now: float) -> None:
+        """Tell what is due. Call when something has changed, when the reader has confirmed something, and every
+        `PERIOD_S`."""
+        if self.idle or not self._link.established or self.channel.wanted is False:
+            return
+        self._measure(now)
+        if self._mark is not None and now - self._mark[1] > SLOW_S:
+            return  # the link stands still: what changes until it goes on is told once
+        self._poll(now)
+        looks = LOOKS
+        while looks and self._waiting_bytes() < self._window_bytes:
+            looks -= 1
+            if not self._began:
+                self._began = True
+                self._say(Begin(self._registry.epoch, not self._unsure), now)
+            elif self._pending:
+                object_id = next(iter(self._pending))
+                del self._pending[object_id]
+                self._tell(object_id, now)
+            elif self._open:
+                self._open = False
+                self._say(End(self._version), now)
+            else:
+                return
+        if self._waiting_bytes() >= self._window_bytes:
+            self._full = True
+
+    @property
+    def settled(self) -> bool:
+        """Whether the reader has confirmed everything that there was to tell."""
+        return not (self._pending or self._open or self.channel.retained) and self._version == self._registry.version
+
+    def _poll(self, now: float) -> None:
+        if self._pending or self._open or now < self._poll_due_s or self._version == self._registry.version:
+            return
+        self._poll_due_s = now + PERIOD_S
+        changes = self._registry.changed(self._version, kinds=self.kinds)
+        if changes.resync:
+            self.restart()
+            return
+        self._pending = dict.fromkeys(changes.in_order)
+        self._version = changes.version
+
+    def _tell(self, object_id: str, now: float) -> None:
+        upto = None if self._pending else self._version
+        about = self._registry.about(object_id)
+        if about is None or not self.sees(object_id, about[0]):
+            known = self._told.pop(object_id, None) is not None
+            if known or (about is None and self._unsure and self.sees(object_id, None)):
+                self._say(Delete(object_id, upto), now)
+                self._open = bool(self._pending)
+            return
+        item = self._registry.get(object_id)
+        if item is None or self._told.get(object_id) == item.version:
+            return
+        text = self._text_of(item)
+        named = text_hash(text)
+        if text and named not in self._texts:
+            self._texts.add(named)
+            self._say(Define(named, text), now)
+        self._told[object_id] = item.version
+        self._say(put_of(item, text, upto=upto), now)
+        self._open = bool(self._pending)
+
+    def _say(self, change: Change, now: float) -> None:
+        channel = self.channel
+        seq = channel.next_seq
+        if self._mark is None:
+            self._mark = (seq, now)
+        message = Message(channel.stream.id, seq, encode(change), 0, now)
+        self._link.sender.submit(channel, message, now=now, forced=True)
+
+    def _waiting_bytes(self) -> int:
+        return self.channel.retained_bytes + OVERHEAD_BYTES * len(self.channel.retained)
+
+    def _measure(self, now: float) -> None:
+        if self._mark is None or self.channel.watermark < self._mark[0]:
+            return
+        took_s = now - self._mark[1]
+        if took_s < QUICK_S and self._full:
+            self._window_bytes = min(2 * self._window_bytes, MOST_WINDOW_BYTES)
+        elif took_s > SLOW_S:
+            self._window_bytes = max(self._window_bytes // 2, LEAST_WINDOW_BYTES)
+        self._mark, self._full = None, False
+
+    def validate(self) -> None:
+        """Internal consistency, for tests."""
+        assert self._version <= self._registry.version, "a feed that is ahead of its registry"
+        assert self._link.outgoing.by_stream.get(self.channel.stream.id) is self.channel, "a feed without its channel"
+        assert len(self._pending) <= len(self._registry) + self._registry.limits.deletions, "more to tell than there is"
